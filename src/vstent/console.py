@@ -1,0 +1,107 @@
+"""What a terminal shows: a line per stage with its time, and the table of a comparison."""
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final
+
+from rich.console import Console as RichConsole
+from rich.status import Status
+from rich.table import Table
+
+from vstent.device import Design
+
+ROWS: Final = (
+    ("Neck inflow", "neck_inflow_mL_s", "mL/s"),
+    ("Mean sac velocity", "mean_sac_velocity_m_s", "m/s"),
+    ("Sac wall shear stress, mean", "mean_sac_wss_Pa", "Pa"),
+    ("Turnover time", "turnover_time_s", "s"),
+)
+"""Rows of the comparison: title, key of the index, unit."""
+DEVICE_ROWS: Final = (
+    ("Size (label)", "size", ""),
+    ("Deployed length", "deployed_length_mm", "mm"),
+    ("Apposed", "apposed_fraction", ""),
+    ("Metal coverage over the neck", "neck_metal_coverage_fraction", ""),
+)
+"""Rows on the devices: title, key of the measure, unit."""
+
+
+class Console:
+    """Shows the progress of a study on standard error and its table on standard output."""
+
+    def __init__(self) -> None:
+        self._err = RichConsole(stderr=True, highlight=False)
+        self._out = RichConsole(highlight=False)
+        self._status: Status | None = None
+        self._began: dict[str, float] = {}
+
+    @contextmanager
+    def live(self) -> Iterator[None]:
+        """Show a spinner with the stage at work, where there is a terminal."""
+        with self._err.status("starting") as status:
+            self._status = status
+            yield
+            self._status = None
+
+    def progress(self, stage: str, fraction: float, detail: str) -> None:
+        """Take a study's word: a stage begins (0), goes on, or is done (1)."""
+        now = time.monotonic()
+        began = self._began.setdefault(stage, now)
+        if fraction >= 1.0:
+            self._err.print(f"[bold]{stage:18}[/] {now - began:6.1f} s  [dim]{detail}[/]", soft_wrap=True)
+            del self._began[stage]
+        elif self._status is not None:
+            self._status.update(f"{stage} {fraction:4.0%} {detail}")
+
+    def print(self, item: Any) -> None:
+        """Print a line or a table on standard output."""
+        self._out.print(item)
+
+
+def comparison_table(metrics: Mapping[str, Any]) -> Table:
+    """Table of bare artery and devices: each value, and its change against bare."""
+    stents = metrics["stents"]
+    table = Table("", "unit", "bare", *stents)
+    for title, key, unit in DEVICE_ROWS:
+        table.add_row(title, unit, "", *(_cell(stent["deployment"].get(key)) for stent in stents.values()))
+    if "bare" not in metrics:
+        return table
+    table.add_section()
+    for title, key, unit in ROWS:
+        bare = metrics["bare"].get(key)
+        if bare is None:
+            continue
+        table.add_row(title, unit, _cell(bare), *(_change(bare, stent["flow"][key]) for stent in stents.values()))
+    return table
+
+
+def _cell(value: float | str | None) -> str:
+    return "" if value is None else value if isinstance(value, str) else f"{value:.3g}"
+
+
+def _change(bare: float, value: float) -> str:
+    return f"{value:.3g} ({value / bare - 1:+.0%})" if bare else f"{value:.3g}"
+
+
+def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:
+    """Table of found against true: title, found, true, unit."""
+    table = Table("against the phantom's truth", "unit", "found", "true", "error")
+    for title, found, true, unit in rows:
+        error = f"{found / true - 1:+.1%}" if true else f"{found - true:+.3g}"
+        table.add_row(title, unit, f"{found:.4g}", f"{true:.4g}", error)
+    return table
+
+
+def device_table(devices: Mapping[str, Design]) -> Table:
+    """Table of the catalogue: names, construction, sizes, and how sure the numbers are."""
+    table = Table(
+        "name", "device", "construction", "sizes (diameter x length, mm)", "numbers cited / derived / estimated"
+    )
+    for name, design in devices.items():
+        sure = [sum(fact.confidence == level for fact in design.facts) for level in ("cited", "derived", "estimated")]
+        diameters = sorted({size.diameter_mm for size in design.sizes})
+        lengths = sorted({size.length_mm for size in design.sizes})
+        sizes = f"{diameters[0]:g} to {diameters[-1]:g} x {lengths[0]:g} to {lengths[-1]:g} ({len(design.sizes)} sizes)"
+        table.add_row(name, design.name, design.kind.replace("_", "-"), sizes, " / ".join(map(str, sure)))
+    return table

@@ -1,0 +1,248 @@
+"""The active contour of Zhong et al. 2016: a closed tube of nodes that grows until it meets the wall (eq. 1-7)."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, Protocol, final
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from vstent.deploy.contour import normals
+from vstent.deploy.wall import ON_WALL_MM, AbstractWall, Contact
+from vstent.errors import InputError
+from vstent.kernels.arrays import Bools, Floats
+
+Progress = Callable[[int, float], None]
+"""Called after every iteration with its number and the fraction of nodes terminated."""
+
+
+class Limit(Protocol):
+    """What stops a contour besides the wall, for instance the device's free diameter."""
+
+    def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
+        """Return the contour allowed between two contours (rows, columns, 3), and which nodes (rows, columns) stop."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Stiffness:
+    """The factored matrix I + tau K of the internal energy on a grid that is free in s and periodic in r.
+
+    The variation of eq. (2) is K v = -a1 v_ss + a2 v_ssss - a3 v_rr + a4 v_rrrr + 2 a5 v_ssrr, grid spacing 1. K is
+    block-circulant in r: after a Fourier transform in r every harmonic is a pentadiagonal matrix in s; all of them
+    lie one after another in one banded Cholesky factor.
+    """
+
+    factor: Floats
+    """(3, harmonics x rows) banded Cholesky factor, upper form."""
+    rows: int
+    """Nodes along s."""
+    columns: int
+    """Nodes around r."""
+
+    @staticmethod
+    def of(contour: "ActiveContour", rows: int, columns: int) -> "Stiffness":
+        """Factor I + tau K once for a grid."""
+        wave = 2 - 2 * np.cos(2 * np.pi * np.arange(columns // 2 + 1) / columns)
+        tension, bending = _free_differences(rows, 1), _free_differences(rows, 2)
+        identity = np.zeros((3, rows))
+        identity[2] = 1.0
+        bands = [
+            (1 + contour.tau * (contour.a3 * w + contour.a4 * w**2)) * identity
+            + contour.tau * (contour.a1 + 2 * contour.a5 * w) * tension
+            + contour.tau * contour.a2 * bending
+            for w in wave
+        ]
+        return Stiffness(cholesky_banded(np.concatenate(bands, axis=1)), rows, columns)
+
+    def solve(self, right_mm: Floats) -> Floats:
+        """Return v with (I + tau K) v = right, both (rows, columns, 3)."""
+        waves = np.fft.rfft(right_mm, axis=1).transpose(1, 0, 2)
+        flat = waves.reshape(-1, 3)
+        solved = cho_solve_banded(
+            (self.factor, False), np.concatenate([flat.real, flat.imag], axis=1), check_finite=False
+        )
+        found = (solved[:, :3] + 1j * solved[:, 3:]).reshape(waves.shape)
+        return np.fft.irfft(found.transpose(1, 0, 2), n=self.columns, axis=1)
+
+
+def _free_differences(rows: int, order: int) -> Floats:
+    """Bands (3, rows), upper form, of D^T D for differences D of an order: energy of a curve with free ends."""
+    stencil = (-1.0, 1.0) if order == 1 else (1.0, -2.0, 1.0)
+    bands = np.zeros((3, rows))
+    for i, left in enumerate(stencil):
+        for j, right in enumerate(stencil[i:], start=i):
+            bands[2 - (j - i), j : max(j, rows - order + j)] += left * right
+    return bands
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class State:
+    """The contour between two iterations."""
+
+    nodes_mm: Floats
+    """(rows, columns, 3) nodes."""
+    centers_mm: Floats
+    """(rows, 3) fiducial point inside the lumen for every row, the paper's "center"."""
+    is_terminated: Bools
+    """(rows, columns) nodes that no longer move."""
+    contact: Contact
+    """The nearest wall of every node, flattened to (rows * columns,)."""
+    stiffness: Stiffness
+    """I + tau K, factored."""
+
+    @cached_property
+    def terminated_fraction(self) -> float:
+        """Part of the nodes that no longer move."""
+        return float(self.is_terminated.mean())
+
+
+@final
+@dataclass(frozen=True)
+class ActiveContour:
+    """The paper's contour: eq. (1-7), one explicit force step and one implicit elastic step per iteration.
+
+    The elastic weights act on differences between neighbouring nodes, without units; forces are displacements in mm
+    per unit of tau. The weights are small against k1: elasticity smooths what the balloon inflates and does not hold
+    it back. See `relax` for the loop.
+    """
+
+    a1: float = 0.01
+    """Tension along the device, |v_s|^2."""
+    a2: float = 0.02
+    """Bending along the device, |v_ss|^2."""
+    a3: float = 0.01
+    """Tension around the device, |v_r|^2."""
+    a4: float = 0.02
+    """Bending around the device, |v_rr|^2."""
+    a5: float = 0.01
+    """Twist, |v_sr|^2; it enters eq. (2) twice."""
+    k1: float = 0.8
+    """Balloon: part of the distance to the wall that a node goes along the contour's normal, eq. (4)."""
+    k2: float = 0.05
+    """Vessel: pull straight to the wall, mm, eq. (5)."""
+    tau: float = 1.0
+    """Length of a step."""
+    dd_mm: float = 0.03
+    """Distance from the wall at which nodes terminate: the device's wire width, eq. (6, 7)."""
+    terminated_goal: float = 0.99
+    """Part of the nodes that must terminate."""
+    iteration_limit: int = 60
+    """Iterations after which the contour gives up."""
+
+    def init(self, nodes_mm: Floats, centers_mm: Floats, wall: AbstractWall) -> State:
+        """Start from a contour (rows, columns, 3) with row centers (rows, 3) inside the lumen."""
+        rows, columns = nodes_mm.shape[:2]
+        stiffness = Stiffness.of(self, rows, columns)
+        moving = np.zeros((rows, columns), dtype=bool)
+        return State(nodes_mm, centers_mm, moving, wall.contact(nodes_mm.reshape(-1, 3)), stiffness)
+
+    def step(self, state: State, wall: AbstractWall) -> State:
+        """Move the nodes that continue, then terminate those that reach the wall or cross it."""
+        force_mm = np.where(state.is_terminated[..., None], 0.0, self.force_mm(state))
+        moved = state.stiffness.solve(state.nodes_mm + self.tau * force_mm)
+        nodes_mm = np.where(state.is_terminated[..., None], state.nodes_mm, moved)
+        return self.classify(replace(state, nodes_mm=nodes_mm), ~state.is_terminated, wall)
+
+    def force_mm(self, state: State) -> Floats:
+        """Balloon (eq. 4) plus vessel force (eq. 5), (rows, columns, 3)."""
+        shape = state.nodes_mm.shape
+        distance_mm = state.contact.distance_mm.reshape(shape[:2])[..., None]
+        to_wall = -state.contact.inward(state.nodes_mm.reshape(-1, 3)).reshape(shape)
+        return self.k1 * distance_mm * normals(state.nodes_mm) + self.k2 * to_wall
+
+    def classify(self, state: State, is_asked: Bools, wall: AbstractWall) -> State:
+        """Sort the nodes asked about (rows, columns) into the paper's three states and relocate those that terminate.
+
+        1. inside and further than dd from the wall: continues; 2. inside and nearer: terminates, eq. (6);
+        3. outside (the segment from its row's center crosses the wall): terminates, eq. (7).
+        """
+        asked = is_asked.ravel()
+        points_mm = state.nodes_mm.reshape(-1, 3).copy()
+        centers_mm = np.repeat(state.centers_mm, state.nodes_mm.shape[1], axis=0)
+        found = wall.contact(points_mm[asked])
+        is_outside = wall.crosses(centers_mm[asked], points_mm[asked])
+        is_done = is_outside | (found.distance_mm <= self.dd_mm)
+        relocated = self.relocated_mm(points_mm[asked], is_outside, found)
+        points_mm[asked] = np.where(is_done[:, None], relocated, points_mm[asked])
+        contact = Contact(*(_replaced(old, asked, new) for old, new in zip(state.contact, found, strict=True)))
+        is_terminated = state.is_terminated.copy()
+        is_terminated[is_asked] |= is_done
+        nodes_mm = points_mm.reshape(state.nodes_mm.shape)
+        return replace(state, nodes_mm=nodes_mm, is_terminated=is_terminated, contact=contact)
+
+    def relocated_mm(self, points_mm: Floats, is_outside: Bools, contact: Contact) -> Floats:
+        """Put points (n, 3) at dd from their closest wall points, on the lumen's side: eq. (6) inside, (7) outside."""
+        away = contact.inward(points_mm)
+        side = np.where(is_outside & (contact.distance_mm > ON_WALL_MM), -1.0, 1.0)
+        return contact.closest_mm + self.dd_mm * side[:, None] * away
+
+    def terminate(self, state: State) -> bool:
+        """Tell whether enough nodes have terminated."""
+        return state.terminated_fraction >= self.terminated_goal
+
+
+def _replaced(values: Floats, where: Bools, new: Floats) -> Floats:
+    values = values.copy()
+    values[where] = new
+    return values
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Relaxation:
+    """What `relax` did."""
+
+    state: State
+    """The last state."""
+    outcome: Literal["terminated", "iteration_limit"]
+    """Whether enough nodes terminated."""
+    terminated_fraction: tuple[float, ...]
+    """After every iteration."""
+    history_mm: tuple[Floats, ...]
+    """Contour (rows, columns, 3) after every iteration."""
+    seconds: float
+    """Wall time."""
+
+
+def relax(
+    method: ActiveContour,
+    state: State,
+    wall: AbstractWall,
+    *,
+    limit: Limit | None = None,
+    progress: Progress | None = None,
+) -> Relaxation:
+    """Iterate `method` until enough nodes terminate or its iteration limit.
+
+    Raises
+    ------
+    InputError
+        When the weights make the contour run away.
+    """
+    began = time.perf_counter()
+    fractions: list[float] = []
+    history: list[Floats] = []
+    while not method.terminate(state) and len(fractions) < method.iteration_limit:
+        following = method.step(state, wall)
+        if limit is not None:
+            nodes_mm, is_stopped = limit(state.nodes_mm, following.nodes_mm)
+            following = replace(following, nodes_mm=nodes_mm, is_terminated=following.is_terminated | is_stopped)
+        state = following
+        _check_finite(state, len(fractions) + 1)
+        fractions.append(state.terminated_fraction)
+        history.append(state.nodes_mm)
+        if progress is not None:
+            progress(len(fractions), state.terminated_fraction)
+    outcome: Literal["terminated", "iteration_limit"] = "terminated" if method.terminate(state) else "iteration_limit"
+    return Relaxation(state, outcome, tuple(fractions), tuple(history), time.perf_counter() - began)
+
+
+def _check_finite(state: State, iteration: int) -> None:
+    if not np.isfinite(state.nodes_mm).all():
+        raise InputError(
+            f"The active contour ran away in iteration {iteration}: its weights are too large. Use a smaller tau."
+        )

@@ -1,0 +1,100 @@
+"""Sizing: which size, and where.
+
+The rule (vstent's own, after common practice in manual sizing): the label diameter is the smallest that is not below
+the wider of the two landing zones; the length is the shortest whose *deployed* length covers the neck and a margin on
+both sides, because in a narrower artery a braid becomes longer than its label says.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from vstent.deploy.braid import expected_profile, march
+from vstent.device import Design, Size
+from vstent.errors import LandingError
+from vstent.stent import Landing
+from vstent.vessel import Anatomy
+
+ZONE_MM: Final = 5.0
+"""Length of a landing zone beside the neck."""
+MARGIN_MM: Final = 4.0
+"""The device reaches beyond the neck by at least this, or by one artery diameter where that is more."""
+END_MM: Final = 0.5
+"""A proposed device stays this far from the artery's ends: its length is only foreseen before it is deployed."""
+DIAMETER_SLACK_MM: Final = 0.05
+"""A label this much below the landing zone still counts as not below it."""
+
+
+def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
+    """Where the neck of the largest aneurysm begins and ends on the parent axis; the axis's middle without one."""
+    if anatomy.aneurysms:
+        return anatomy.aneurysms[0].proximal_abscissa_mm, anatomy.aneurysms[0].distal_abscissa_mm
+    middle_mm = 0.5 * anatomy.axis.length_mm
+    return middle_mm, middle_mm
+
+
+def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
+    """Mean diameter of the parent artery in the proximal and in the distal landing zone."""
+    proximal_mm, distal_mm = neck_span_mm(anatomy)
+    length_mm = anatomy.axis.length_mm
+    before = np.linspace(max(0.0, proximal_mm - ZONE_MM), max(0.0, proximal_mm), 51)
+    after = np.linspace(min(length_mm, distal_mm), min(length_mm, distal_mm + ZONE_MM), 51)
+    diameter_mm = 2 * anatomy.section_radius_mm
+    first, second = (np.interp(zone, anatomy.axis.abscissa_mm, diameter_mm).mean() for zone in (before, after))
+    return float(first), float(second)
+
+
+def propose_size(design: Design, anatomy: Anatomy) -> Size:
+    """Propose the size for the largest aneurysm; narrower ones where the artery is too short for it.
+
+    Raises
+    ------
+    LandingError
+        When even the shortest size does not fit the artery.
+    """
+    wider_mm = max(landing_diameters_mm(anatomy))
+    labels = sorted({size.diameter_mm for size in design.sizes})
+    label = next((d for d in labels if d >= wider_mm - DIAMETER_SLACK_MM), labels[-1])
+    for diameter_mm in [d for d in reversed(labels) if d <= label]:
+        same = sorted((size for size in design.sizes if size.diameter_mm == diameter_mm), key=lambda s: s.length_mm)
+        spans = {size: _span(design, anatomy, size) for size in same}
+        fitting = [size for size in same if _fits(anatomy, *spans[size])]
+        if fitting:
+            enough_mm = max(MARGIN_MM, wider_mm)
+            return next((size for size in fitting if _margin(anatomy, *spans[size]) >= enough_mm), fitting[-1])
+    shortest_mm = min(last - first for first, last in (_span(design, anatomy, size) for size in design.sizes))
+    raise LandingError(
+        f"No size of {design.name} fits: the shortest would be {shortest_mm:.1f} mm long in a parent artery of "
+        f"{anatomy.axis.length_mm:.1f} mm. Choose another device or a longer piece of artery."
+    )
+
+
+def propose_landing(design: Design, anatomy: Anatomy, size: Size) -> Landing:
+    """Propose to center the deployed device on the neck, moved as little as the artery's ends demand."""
+    profile = expected_profile(design, anatomy)
+    target_mm = float(np.mean(neck_span_mm(anatomy)))
+    wanted_mm = target_mm
+    for _ in range(4):  # the middle row is not the middle of the length where the artery tapers
+        rows_mm = march(design, size, Landing(wanted_mm), profile)
+        first, last = float(rows_mm[0]), float(rows_mm[-1])
+        spare_mm = anatomy.axis.length_mm - (last - first)
+        move_mm = target_mm - 0.5 * (first + last)
+        if spare_mm > 0:
+            end_mm = min(END_MM, 0.5 * spare_mm)
+            move_mm = min(max(move_mm, end_mm - first), anatomy.axis.length_mm - end_mm - last)
+        wanted_mm += move_mm
+    return Landing(wanted_mm)
+
+
+def _span(design: Design, anatomy: Anatomy, size: Size) -> tuple[float, float]:
+    rows_mm = march(design, size, propose_landing(design, anatomy, size), expected_profile(design, anatomy))
+    return float(rows_mm[0]), float(rows_mm[-1])
+
+
+def _fits(anatomy: Anatomy, first_mm: float, last_mm: float) -> bool:
+    return first_mm > 0 and last_mm < anatomy.axis.length_mm
+
+
+def _margin(anatomy: Anatomy, first_mm: float, last_mm: float) -> float:
+    proximal_mm, distal_mm = neck_span_mm(anatomy)
+    return min(proximal_mm - first_mm, last_mm - distal_mm)

@@ -1,0 +1,288 @@
+"""Devices: braided and laser-cut stents and their sizes, from one catalogue, and their closed formulas.
+
+Both families share one lattice. n columns run round the device; on every row, n/2 junctions (crossings of wires, or
+the places where laser-cut cells meet) sit on every second column, and the next row is shifted by one column. The
+piece of wire (or strut) between junctions of consecutive rows cannot stretch. At local diameter D it spans one
+column, pi D / n, and the row spacing is what is left: h(D) = sqrt((l/n)^2 - (pi D / n)^2) with l/n its length.
+"""
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from vstent.errors import DeviceError
+from vstent.units import MM_PER_UM
+
+Confidence = Literal["cited", "derived", "estimated"]
+
+NODE_SPACING_LIMIT_MM = 0.35
+"""A contour's nodes are never further apart than this at the label diameter."""
+
+
+@dataclass(frozen=True)
+class Fact:
+    """Where one number of the catalogue comes from."""
+
+    name: str
+    """The field it fills."""
+    source: str
+    """Publication, or how it was obtained."""
+    confidence: Confidence
+    """``cited`` from the source, ``derived`` from cited numbers, or ``estimated``."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """One size of a device; its diameters are compared with the contour's, which runs through the wires' middle."""
+
+    diameter_mm: float
+    """Label diameter."""
+    length_mm: float
+    """Label length: the length at the label diameter."""
+    free_diameter_mm: float
+    """Diameter without an artery around it; the device never gets wider."""
+
+    @property
+    def label(self) -> str:
+        """The size as one reads it on the box."""
+        return f"{self.diameter_mm:.2f} x {self.length_mm:g} mm"
+
+
+@dataclass(frozen=True, eq=False)
+class Braid:
+    """A tube braided from two hands of round wires."""
+
+    key: str
+    """Short lower-case name."""
+    name: str
+    """Name as the maker writes it."""
+    wires: tuple[tuple[int, float], ...]
+    """Groups of wires: (count, diameter in um)."""
+    braid_angle_rad: float
+    """Angle between wire and axis at the free diameter."""
+    sizes: tuple[Size, ...]
+    """Sizes on offer."""
+    maker: str = ""
+    """Who makes it."""
+    facts: tuple[Fact, ...] = ()
+    """Source and confidence of every number."""
+    kind: Literal["braid"] = field(default="braid", init=False)
+    """Family, for tables."""
+
+    def __post_init__(self) -> None:
+        _check_columns(self.name, self.n_wires)
+        _check_angle(self.name, self.braid_angle_rad)
+
+    @property
+    def n_wires(self) -> int:
+        """Number of wires, both hands together."""
+        return sum(count for count, _ in self.wires)
+
+    @property
+    def n_columns(self) -> int:
+        """Columns of the lattice: one per wire."""
+        return self.n_wires
+
+    @property
+    def angle_rad(self) -> float:
+        """Angle between wire and axis at the free diameter."""
+        return self.braid_angle_rad
+
+    @property
+    def wall_offset_um(self) -> float:
+        """Distance from the wall to the contour, the paper's dd: one wire (the thickest) fits between them."""
+        return max(diameter for _, diameter in self.wires)
+
+
+@dataclass(frozen=True, eq=False)
+class LaserCut:
+    """A tube cut into closed cells: zigzag rings whose crowns are joined."""
+
+    key: str
+    """Short lower-case name."""
+    name: str
+    """Name as the maker writes it."""
+    n_columns: int
+    """Columns of the lattice: struts round one ring, twice the number of cells round."""
+    strut_width_um: float
+    """Width of a strut along the wall."""
+    strut_thickness_um: float
+    """Thickness of a strut across the wall."""
+    cell_angle_rad: float
+    """Angle between strut and axis at the free diameter."""
+    sizes: tuple[Size, ...]
+    """Sizes on offer."""
+    maker: str = ""
+    """Who makes it."""
+    facts: tuple[Fact, ...] = ()
+    """Source and confidence of every number."""
+    kind: Literal["laser_cut"] = field(default="laser_cut", init=False)
+    """Family, for tables."""
+
+    def __post_init__(self) -> None:
+        _check_columns(self.name, self.n_columns)
+        _check_angle(self.name, self.cell_angle_rad)
+
+    @property
+    def angle_rad(self) -> float:
+        """Angle between strut and axis at the free diameter."""
+        return self.cell_angle_rad
+
+    @property
+    def wall_offset_um(self) -> float:
+        """Distance from the wall to the contour, the paper's dd: one strut fits between them."""
+        return self.strut_thickness_um
+
+
+Design = Braid | LaserCut
+
+
+def _check_columns(name: str, n_columns: int) -> None:
+    if n_columns < 6 or n_columns % 2:
+        raise DeviceError(f"{name} has {n_columns} wires or struts round: use an even number of at least 6.")
+
+
+def _check_angle(name: str, angle_rad: float) -> None:
+    if not 0.1 < angle_rad < 1.5:
+        raise DeviceError(f"{name} has an angle of {angle_rad:.3f} rad to the axis: give 0.1 to 1.5 rad.")
+
+
+class Grid(NamedTuple):
+    """How a device's lattice is laid on the contour's nodes."""
+
+    rows: int
+    """Rows of nodes."""
+    columns: int
+    """Nodes of a row."""
+    row_split: int
+    """Node rows per lattice row."""
+    column_split: int
+    """Node columns per lattice column."""
+
+    @property
+    def lattice_rows(self) -> int:
+        """Rows of junctions."""
+        return (self.rows - 1) // self.row_split + 1
+
+    @property
+    def lattice_columns(self) -> int:
+        """Columns of the lattice."""
+        return self.columns // self.column_split
+
+
+def grid(design: Design, size: Size) -> Grid:
+    """Return the contour's grid: one node per junction column and row, finer where cells are large."""
+    spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
+    rows = max(2, round(size.length_mm / spacing_mm) + 1)
+    row_split = int(np.ceil(spacing_mm / NODE_SPACING_LIMIT_MM))
+    column_split = int(np.ceil(np.pi * size.diameter_mm / design.n_columns / NODE_SPACING_LIMIT_MM))
+    return Grid((rows - 1) * row_split + 1, design.n_columns * column_split, row_split, column_split)
+
+
+def piece_length_mm(design: Design, size: Size) -> float:
+    """Length l/n of the wire or strut between junctions: it never changes."""
+    return float(np.pi * size.free_diameter_mm / (design.n_columns * np.sin(design.angle_rad)))
+
+
+def angle_rad(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np.ndarray:
+    """Angle between wire and axis at a local diameter: sin(alpha) = sin(alpha_free) D / D_free."""
+    return np.arcsin(np.sin(design.angle_rad) * np.minimum(diameter_mm, size.free_diameter_mm) / size.free_diameter_mm)
+
+
+def row_spacing_mm(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np.ndarray:
+    """Distance h(D) along the axis between rows of junctions at a local diameter, at most the free one."""
+    return piece_length_mm(design, size) * np.cos(angle_rad(design, size, diameter_mm))
+
+
+def deployed_length_mm(design: Design, size: Size, diameter_mm: float) -> float:
+    """Length in a straight tube where the contour's diameter is `diameter_mm` all along."""
+    rows = grid(design, size).lattice_rows
+    return float((rows - 1) * row_spacing_mm(design, size, diameter_mm))
+
+
+def foreshortening_fraction(design: Design, size: Size, diameter_mm: float) -> float:
+    """Shortening at a local diameter against the label: 1 - L(D)/L_label = 1 - cos(alpha)/cos(alpha_label)."""
+    here, label = angle_rad(design, size, np.array([diameter_mm, size.diameter_mm]))
+    return float(1 - np.cos(here) / np.cos(label))
+
+
+def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
+    """Part of the wall under metal at a local diameter.
+
+    Two hands of strips cover 1 - (1 - f)^2, f = sum of wire diameters of one hand / (pi D cos(alpha)); struts that
+    meet without crossing cover 2 f.
+    """
+    per_axis = np.pi * diameter_mm * float(np.cos(angle_rad(design, size, diameter_mm)))
+    if isinstance(design, LaserCut):
+        return float(design.n_columns * design.strut_width_um * MM_PER_UM / per_axis)
+    hand_mm = 0.5 * sum(count * diameter for count, diameter in design.wires) * MM_PER_UM
+    return float(1 - (1 - hand_mm / per_axis) ** 2)
+
+
+def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> float:
+    """Pores per area of wall at a local diameter: 2 (n/2)^2 tan(alpha) / (pi D)^2."""
+    tangent = float(np.tan(angle_rad(design, size, diameter_mm)))
+    return float(0.5 * design.n_columns**2 * tangent / (np.pi * diameter_mm) ** 2)
+
+
+@cache
+def catalogue() -> dict[str, Design]:
+    """Return every device of the catalogue by its key.
+
+    Raises
+    ------
+    DeviceError
+        When the catalogue breaks its schema.
+    """
+    from importlib.resources import files
+
+    from vstent.device_schema import parse  # pydantic is loaded only when the catalogue is
+
+    return parse(files("vstent").joinpath("devices.toml").read_text(encoding="utf-8"))
+
+
+def find_design(name: str) -> Design:
+    """Return the device called `name` (its key or its name, any case).
+
+    Raises
+    ------
+    DeviceError
+        When there is none; the sentence says which there are and the nearest.
+    """
+    designs = catalogue()
+    by_name = {design.key.casefold(): design for design in designs.values()}
+    by_name |= {design.name.casefold(): design for design in designs.values()}
+    wanted = name.strip().casefold()
+    if wanted in by_name:
+        return by_name[wanted]
+    near = difflib.get_close_matches(wanted, by_name, n=1)
+    hint = f" Did you mean {by_name[near[0]].key}?" if near else ""
+    raise DeviceError(f"There is no device called {name!r}.{hint} Choose one of: {', '.join(sorted(designs))}.")
+
+
+def find_size(design: Design, *, diameter_mm: float | None = None, length_mm: float | None = None) -> Size:
+    """Return the one size with this label diameter and length; None matches any, the smallest and shortest wins.
+
+    Raises
+    ------
+    DeviceError
+        When the device is not made in that size; the sentence says what there is.
+    """
+    fits = [
+        size for size in design.sizes if diameter_mm in (None, size.diameter_mm) and length_mm in (None, size.length_mm)
+    ]
+    if fits:
+        return min(fits, key=lambda size: (size.diameter_mm, size.length_mm))
+    asked = " x ".join(f"{value:g} mm" for value in (diameter_mm, length_mm) if value is not None)
+    same = [size for size in design.sizes if size.diameter_mm == diameter_mm]
+    offered = _listed(size.length_mm for size in same) if same else _listed(size.diameter_mm for size in design.sizes)
+    what = f"in {diameter_mm:g} mm its lengths are" if same else "its diameters are"
+    raise DeviceError(f"{design.name} is not made in {asked}: {what} {offered} mm. Choose one of them.")
+
+
+def _listed(values: Iterable[float]) -> str:
+    return ", ".join(f"{value:g}" for value in sorted(set(values)))

@@ -1,0 +1,232 @@
+"""The blood's domain: the lumen with straight extensions on a regular grid, and every link that leaves it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from vstent.errors import FlowError
+from vstent.flow.types import FlowCase
+from vstent.kernels import triangles, voxels
+from vstent.kernels.arrays import Floats, Ints, freeze
+from vstent.kernels.lattice import VELOCITIES
+from vstent.surface import Surface
+from vstent.vessel import Opening, Vessel
+
+INLET_EXTENSION = 0.5
+"""Length of the straight tube before the inlet, in inlet diameters: the imposed profile is developed already."""
+OUTLET_EXTENSION = 1.5
+"""Length of the straight tube behind an outlet, in outlet diameters: swirl and backflow decay in it."""
+MIN_CELLS = 2_000
+"""Fewer cells than this are no vessel."""
+WALL = 0
+"""Patch number of the wall; opening k has k + 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Domain:
+    """Blood cells and the links that leave them."""
+
+    cell_size_mm: float
+    """Edge of a cell."""
+    origin_mm: Floats
+    """(3,) centre of the cell (0, 0, 0)."""
+    cells: Ints
+    """(n, 3) integer coordinates, sorted; a margin of one cell is free all round."""
+    link_cell: Ints
+    """(l,) cell that each link leaves."""
+    link_direction: Ints
+    """(l,) lattice velocity along which it leaves."""
+    link_fraction: Floats
+    """(l,) where it meets the surface, as a fraction of the link."""
+    link_patch: Ints
+    """(l,) what it meets: 0 the wall, k + 1 opening k."""
+    septum_cell: Ints
+    """(s,) blood cell on one side of a wall thinner than a cell, whose neighbour is blood too."""
+    septum_direction: Ints
+    """(s,) lattice velocity towards the other side; every pair stands here once."""
+    surface: Surface
+    """The lumen with its extensions, closed."""
+    sections: tuple[Floats, ...]
+    """(k, 3) polygon of every opening at the end of its extension, mm."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "origin_mm", np.float64, (3,))
+        freeze(self, "cells", np.int32, (-1, 3))
+        freeze(self, "link_cell", np.int32, (-1,))
+        freeze(self, "link_direction", np.int32, self.link_cell.shape)
+        freeze(self, "link_fraction", np.float64, self.link_cell.shape)
+        freeze(self, "link_patch", np.int32, self.link_cell.shape)
+        freeze(self, "septum_cell", np.int32, (-1,))
+        freeze(self, "septum_direction", np.int32, self.septum_cell.shape)
+
+    @property
+    def centers_mm(self) -> Floats:
+        """(n, 3) cell centres."""
+        return self.origin_mm + self.cells * self.cell_size_mm
+
+
+def default_cell_size_mm(case: FlowCase) -> float:
+    """Edge of a cell: as set; else `cells_per_diameter` across the inlet, within the budget of cells."""
+    settings = case.settings
+    if settings.cell_size_mm is not None:
+        return settings.cell_size_mm
+    by_diameter = case.vessel.inlet.diameter_mm / settings.cells_per_diameter
+    by_budget = (abs(case.vessel.closed.volume_mm3) / settings.cell_budget) ** (1 / 3)
+    return max(by_diameter, by_budget)
+
+
+def build(vessel: Vessel, cell_size_mm: float) -> Domain:
+    """Put the blood of a vessel on a grid.
+
+    Raises
+    ------
+    FlowError
+        When no blood connects to the inlet, or far too few cells do.
+    """
+    surface, face_patch, sections = extend(vessel)
+    low = surface.vertices_mm.min(axis=0)
+    # An odd offset keeps grid lines off the vertices and edges of analytic shapes.
+    origin_mm = low - cell_size_mm * (2.0 + np.array([0.1327, 0.2171, 0.1733]))
+    shape = np.ceil((surface.vertices_mm.max(axis=0) - origin_mm) / cell_size_mm).astype(int) + 3
+    inside = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, tuple(int(n) for n in shape))
+    inside = _connected(inside, vessel, sections[0], origin_mm, cell_size_mm)
+    cells = np.argwhere(inside).astype(np.int32)
+    if len(cells) < MIN_CELLS:
+        raise FlowError(
+            f"only {len(cells)} cells of {cell_size_mm:.3g} mm connect to the inlet at {_place(vessel.inlet)}: "
+            "the grid is too coarse for this vessel or the inlet is blocked; set a smaller cell size"
+        )
+    index = np.full(inside.shape, -1, dtype=np.int32)
+    index[inside] = np.arange(len(cells), dtype=np.int32)
+    neighbour = np.stack([index[tuple((cells + c).T)] for c in VELOCITIES], axis=1)
+    links = _links(surface, face_patch, neighbour, cells, origin_mm, cell_size_mm)
+    septa = _septa(surface, neighbour, cells, origin_mm, cell_size_mm)
+    return Domain(cell_size_mm, origin_mm, cells, *links, *septa, surface, sections)
+
+
+def _place(opening: Opening) -> str:
+    return "(" + ", ".join(f"{x:.1f}" for x in opening.center_mm) + ") mm"
+
+
+def _connected(
+    inside: np.ndarray, vessel: Vessel, section: Floats, origin_mm: Floats, cell_size_mm: float
+) -> np.ndarray:
+    label, count = ndimage.label(inside)
+    if count <= 1:
+        return inside
+    seeds = section.mean(axis=0) - vessel.inlet.normal * cell_size_mm * np.arange(0.5, 6.0)[:, None]
+    index = np.clip(np.rint((seeds - origin_mm) / cell_size_mm).astype(int), 0, np.array(inside.shape) - 1)
+    found = label[tuple(index.T)]
+    found = found[found > 0]
+    if len(found) == 0:
+        raise FlowError(f"no blood behind the inlet at {_place(vessel.inlet)}: check that the inlet is an open end")
+    return label == np.bincount(found).argmax()
+
+
+def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
+    """Add a straight tube of the section's own shape to every opening and close the ends.
+
+    Returns
+    -------
+    surface : closed.
+    face_patch : (m,) 0 the wall, k + 1 the end of opening k.
+    sections : for every opening the polygon (j, 3) of its end.
+    """
+    lumen = vessel.lumen
+    vertices, faces = [lumen.vertices_mm], [lumen.faces]
+    patch = [np.full(len(lumen.faces), WALL)]
+    sections: dict[int, Floats] = {}
+    count = len(lumen.vertices_mm)
+    for loop in lumen.boundary_loops:
+        k = _opening_of(vessel, lumen.vertices_mm[loop])
+        if k is None or k in sections:
+            ring, ring_ids = lumen.vertices_mm[loop], loop
+            patch_id = WALL
+        else:
+            ring = _extruded(vessel, k, lumen.vertices_mm[loop])
+            ring_ids = np.arange(count, count + len(loop), dtype=np.int32)
+            vertices.append(ring)
+            faces.append(_strip(loop, ring_ids))
+            patch.append(np.full(2 * len(loop), WALL))
+            sections[k], patch_id = ring, k + 1
+            count += len(loop)
+        vertices.append(triangles.polygon_centroid(ring)[None])
+        faces.append(np.stack([np.roll(ring_ids, -1), ring_ids, np.full_like(ring_ids, count)], axis=1))
+        patch.append(np.full(len(loop), patch_id))
+        count += 1
+    missing = [vessel.openings[k].role for k in range(len(vessel.openings)) if k not in sections]
+    if missing:
+        raise FlowError(f"no open end of the lumen belongs to {', '.join(missing)}: trace the vessel again")
+    surface = Surface(np.concatenate(vertices), np.concatenate(faces))
+    return surface, np.concatenate(patch).astype(np.int32), tuple(sections[k] for k in range(len(vessel.openings)))
+
+
+def _opening_of(vessel: Vessel, ring: Floats) -> int | None:
+    center = triangles.polygon_centroid(ring)
+    distance = [np.linalg.norm(opening.center_mm - center) / opening.diameter_mm for opening in vessel.openings]
+    nearest = int(np.argmin(distance))
+    return nearest if distance[nearest] < 0.5 else None
+
+
+def _extruded(vessel: Vessel, k: int, ring: Floats) -> Floats:
+    """Ring moved out along the opening's normal onto the plane where the extension ends."""
+    opening = vessel.openings[k]
+    wanted = opening.diameter_mm * (INLET_EXTENSION if k == 0 else OUTLET_EXTENSION)
+    outer = float(((ring - opening.center_mm) @ opening.normal).max())
+    starts = (
+        ring
+        + opening.normal * (0.05 * opening.diameter_mm + outer - (ring - opening.center_mm) @ opening.normal)[:, None]
+    )
+    free = vessel.lumen.first_hit(starts, np.broadcast_to(opening.normal, starts.shape)).min()
+    length = outer + min(wanted, 0.5 * float(free))
+    along = length - (ring - opening.center_mm) @ opening.normal
+    return ring + along[:, None] * opening.normal
+
+
+def _strip(inner: Ints, outer: Ints) -> Ints:
+    """Side faces between a loop that runs with the faces beside it and its copy further out."""
+    a, b, c, d = inner, np.roll(inner, -1), np.roll(outer, -1), outer
+    return np.concatenate([np.stack([b, a, d], axis=1), np.stack([b, d, c], axis=1)]).astype(np.int32)
+
+
+def _links(
+    surface: Surface, face_patch: Ints, neighbour: Ints, cells: Ints, origin_mm: Floats, cell_size_mm: float
+) -> tuple[Ints, Ints, Floats, Ints]:
+    """Links that leave the blood: their cell, direction, fraction to the surface and patch."""
+    cell, direction = np.nonzero(neighbour < 0)
+    starts = origin_mm + cells[cell] * cell_size_mm
+    step_mm = VELOCITIES[direction] * cell_size_mm
+    length_mm = np.linalg.norm(step_mm, axis=1)
+    fraction = surface.first_hit(starts, step_mm / length_mm[:, None]) / length_mm
+    is_missed = fraction > 1.0
+    fraction = np.clip(np.where(is_missed, 0.5, fraction), 1e-3, 1.0)
+    _, _, face = surface.closest(starts + fraction[:, None] * step_mm)
+    patch = np.where(is_missed, WALL, face_patch[face])
+    return cell.astype(np.int32), direction.astype(np.int32), fraction, patch.astype(np.int32)
+
+
+def _septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, cell_size_mm: float) -> tuple[Ints, Ints]:
+    """Links between two blood cells with a wall between them: their cell and direction, each pair once."""
+    is_edge = (neighbour < 0).any(axis=1)
+    candidate = is_edge[:, None] & (neighbour >= 0) & is_edge[neighbour]
+    candidate[:, 0::2] = False
+    cell, direction = np.nonzero(candidate)
+    starts = origin_mm + cells[cell] * cell_size_mm
+    crosses = surface.crosses(starts, starts + VELOCITIES[direction] * cell_size_mm)
+    return cell[crosses].astype(np.int32), direction[crosses].astype(np.int32)
+
+
+def cells_inside(surface: Surface, centers_mm: Floats, cell_size_mm: float) -> Ints:
+    """Numbers of the cell centres (n, 3) that lie inside a closed surface."""
+    low = surface.vertices_mm.min(axis=0) - cell_size_mm
+    near = np.flatnonzero(
+        ((centers_mm >= low) & (centers_mm <= surface.vertices_mm.max(axis=0) + cell_size_mm)).all(axis=1)
+    )
+    if len(near) == 0:
+        return near.astype(np.int32)
+    origin_mm = centers_mm[near].min(axis=0) - cell_size_mm
+    place = np.rint((centers_mm[near] - origin_mm) / cell_size_mm).astype(int)
+    shape = place.max(axis=0) + 2
+    inside = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, tuple(int(n) for n in shape))
+    return near[inside[tuple(place.T)]].astype(np.int32)

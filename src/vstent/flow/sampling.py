@@ -1,0 +1,42 @@
+"""A field between its cells, and surfaces as sample points."""
+
+import numpy as np
+
+from vstent.flow.types import FlowField
+from vstent.kernels import lattice_sampling
+from vstent.kernels.arrays import Floats, Ints
+from vstent.surface import Surface
+
+
+def index_of(cells: Ints) -> Ints:
+    """Number of the cell at every grid point (i, j, k), -1 outside, from coordinates (n, 3)."""
+    index = np.full(cells.max(axis=0) + 2, -1, dtype=np.int32)
+    index[tuple(cells.T)] = np.arange(len(cells), dtype=np.int32)
+    return index
+
+
+def values_at(field: FlowField, points_mm: Floats) -> tuple[Floats, Floats]:
+    """Velocity (m, 3) in m/s, zero outside, and pressure (m,) in Pa at points (m, 3)."""
+    points = (points_mm - field.origin_mm) / field.cell_size_mm
+    velocity = lattice_sampling.interpolate(field.index, field.velocity_m_s, points, True)
+    pressure = lattice_sampling.interpolate(field.index, field.pressure_Pa[:, None], points, False)[:, 0]
+    return velocity, pressure
+
+
+def surface_samples(surface: Surface, spacing_mm: float) -> tuple[Floats, Floats]:
+    """Points (p, 3) at most about `spacing_mm` apart on a surface and their area vectors (p, 3) in mm^2."""
+    done, corners = [], surface.corners_mm
+    while len(corners):
+        is_long = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) > spacing_mm
+        done.append(corners[~is_long])
+        corners = _quartered(corners[is_long])
+    corners = np.concatenate(done) if done else corners
+    area_mm2 = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return corners.mean(axis=1), area_mm2
+
+
+def _quartered(corners: Floats) -> Floats:
+    """Triangles (m, 3, 3) cut at the middles of their edges: (4 m, 3, 3)."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+    return np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])

@@ -1,0 +1,178 @@
+"""The stent as a screen: a thin, local, anisotropic resistance derived from the deployed wires."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from vstent.flow.types import Blood, Screen
+from vstent.kernels import lattice_sampling
+from vstent.kernels.arrays import Floats, Ints
+from vstent.stent import Stent
+from vstent.units import M_PER_MM, MM_PER_UM
+
+TANGENTIAL_SHARE = 0.5
+"""Tangential over normal resistance: slender rods drag half as much along themselves (design.md section 5)."""
+CROSSING_FACTOR = 1.0
+"""How much crossing families resist more than their sum: 1, plain superposition, until calibrated on resolved cells."""
+SMOOTHING_PORES = 1.5
+"""Radius of the neighbourhood in which wire length per area is measured, in mean wire spacings."""
+PIECE_MM = 0.05
+"""Longest piece of wire."""
+SAMPLE_MM = 0.05
+"""Longest edge between samples of the screen: half the smallest sensible grid cell."""
+
+
+def drag_per_length(diameter: Floats, spacing: Floats) -> Floats:
+    """Drag per length over viscosity times velocity of a row of cylinders, F' / (mu U); same unit for both lengths.
+
+    F' = 8 pi mu U / (1 - 2 ln(2 t) + 2 t^2 / 3 - t^4 / 9), t = pi d / (2 s) (Tamada and Fujikawa 1957, Q. J. Mech. Appl.
+    Math. 10, 425; design.md section 5). 10.70 at d / s = 1 / 6.
+    """
+    t = np.pi * np.minimum(diameter / spacing, 0.5) / 2
+    return 8 * np.pi / (1 - 2 * np.log(2 * t) + 2 * t**2 / 3 - t**4 / 9)
+
+
+def inertial_loss(open_fraction: Floats) -> Floats:
+    """Loss coefficient K of K rho U^2 / 2 of a wire screen with this open area fraction.
+
+    K = 1.3 (1 - f) + (1 / f - 1)^2, the part that stays at high Reynolds number and is added to the viscous one at low
+    (Idelchik 2007, Handbook of Hydraulic Resistance, diagram 8-6).
+    """
+    return 1.3 * (1 - open_fraction) + (1 / open_fraction - 1) ** 2
+
+
+def screen(stent: Stent, blood: Blood) -> Screen:
+    """Spread the drag of a deployed stent's wires over the surface that they span.
+
+    At every node of the contour the wire length per area, lambda, is measured over a neighbourhood of a few pores; two
+    crossing families then lie s = 2 / lambda apart, and every piece of wire resists as in a row of that spacing. So one
+    law serves braids, laser-cut cells and their mixtures of diameters, wherever bends or neck have opened or closed them.
+
+    Raises
+    ------
+    ValueError
+        When the stent has no wires.
+    """
+    points_mm, length_mm, diameter_mm = _pieces(stent)
+    contour = stent.contour
+    nodes_mm = contour.vertices_mm
+    node_area_mm2 = np.bincount(contour.faces.ravel(), np.repeat(contour.areas_mm2 / 3, 3), len(nodes_mm))
+    reach_mm = SMOOTHING_PORES * 2 * contour.area_mm2 / length_mm.sum()
+    tree = cKDTree(nodes_mm)
+    weight = _kernel(tree, points_mm, reach_mm)
+    area_mm2 = _kernel(tree, nodes_mm, reach_mm) @ node_area_mm2
+    spacing_mm = 2 * area_mm2 / np.maximum(weight @ length_mm, 1e-9 * area_mm2)
+    per_m = np.zeros(len(nodes_mm))
+    covered = np.zeros(len(nodes_mm))
+    for size_mm in np.unique(diameter_mm):
+        family = weight @ np.where(diameter_mm == size_mm, length_mm, 0.0) / area_mm2
+        per_m += family / M_PER_MM * drag_per_length(size_mm, spacing_mm)
+        covered += 0.5 * family * size_mm
+    normal_Pa_s_m = CROSSING_FACTOR * blood.viscosity_Pa_s * per_m
+    loss = inertial_loss((1 - np.minimum(covered, 0.6)) ** 2)
+    return _sampled(contour.vertices_mm, contour.faces, contour.vertex_normals, normal_Pa_s_m, loss)
+
+
+def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
+    """Wires cut into pieces of at most `PIECE_MM`: midpoints (p, 3), lengths (p,) and diameters (p,), mm."""
+    starts = stent.wire_starts
+    wire = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    inner = np.flatnonzero(wire[1:] == wire[:-1])
+    a, b = stent.wire_points_mm[inner], stent.wire_points_mm[inner + 1]
+    length = np.linalg.norm(b - a, axis=1)
+    count = np.maximum(np.ceil(length / PIECE_MM).astype(int), 1)
+    owner = np.repeat(np.arange(len(a)), count)
+    rank = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+    part = ((rank + 0.5) / count[owner])[:, None]
+    diameter = stent.wire_diameter_um[wire[inner]] * MM_PER_UM
+    return a[owner] + part * (b - a)[owner], (length / count)[owner], diameter[owner]
+
+
+def _kernel(nodes: cKDTree, points_mm: Floats, reach_mm: float) -> csr_matrix:
+    """Weights (nodes, points) (1 - r^2 / reach^2)^2 within the reach."""
+    near = nodes.sparse_distance_matrix(cKDTree(points_mm), reach_mm, output_type="coo_matrix")
+    return csr_matrix(((1 - (near.data / reach_mm) ** 2) ** 2, (near.row, near.col)), shape=near.shape)
+
+
+def _sampled(vertices_mm: Floats, faces: Ints, normals: Floats, normal_Pa_s_m: Floats, loss: Floats) -> Screen:
+    """Sample a triangulated sheet so densely that no grid cell can slip between the samples."""
+    corners = vertices_mm[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    split = np.maximum(np.ceil(longest / SAMPLE_MM).astype(int), 1)
+    parts = []
+    for n in np.unique(split):
+        chosen = np.flatnonzero(split == n)
+        barycentric = _sub_centroids(int(n))
+        columns = (vertices_mm, normals, normal_Pa_s_m[:, None], loss[:, None])
+        values = [np.einsum("bk,fkd->fbd", barycentric, column[faces[chosen]]) for column in columns]
+        area = np.repeat(np.linalg.norm(np.cross(*_edges(corners[chosen])), axis=1) / 2 / n**2, n**2)
+        parts.append([value.reshape(-1, value.shape[-1]) for value in values] + [area[:, None]])
+    point, normal, resistance, inertial, area = (np.concatenate(column) for column in zip(*parts, strict=True))
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    return Screen(point, normal, area[:, 0], resistance[:, 0], TANGENTIAL_SHARE * resistance[:, 0], inertial[:, 0])
+
+
+def _edges(corners: Floats) -> tuple[Floats, Floats]:
+    return corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+
+
+def _sub_centroids(n: int) -> Floats:
+    """Barycentric centroids (n^2, 3) of a triangle cut into n^2 alike ones."""
+    result = []
+    for i in range(n):
+        for j in range(n - i):
+            result.append(((i + 1 / 3) / n, (j + 1 / 3) / n))
+            if i + j < n - 1:
+                result.append(((i + 2 / 3) / n, (j + 2 / 3) / n))
+    uv = np.array(result)
+    return np.column_stack([1 - uv.sum(axis=1), uv])
+
+
+@dataclass(frozen=True, eq=False)
+class GridResistance:
+    """A screen spread over the grid cells beside it."""
+
+    cell: Ints
+    """(e,) cells, ascending."""
+    normal: Floats
+    """(e, 3) the screen's unit normal there."""
+    along_Pa_s_m2: Floats
+    """(e,) resistance along the normal per volume: pressure gradient per velocity."""
+    across_Pa_s_m2: Floats
+    """(e,) resistance across it."""
+    inertial_per_m: Floats
+    """(e,) pressure gradient along the normal over rho u_n^2."""
+
+
+def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float) -> GridResistance:
+    """Share every sample's resistance among the blood cells around it, trilinearly; none is lost.
+
+    Parameters
+    ----------
+    index : (i, j, k) cell number at every grid point, -1 outside.
+    """
+    cells, weights = lattice_sampling.stencils(index, (screen.points_mm - origin_mm) / cell_size_mm)
+    share = np.where(cells >= 0, weights, 0.0)
+    share = share / np.maximum(share.sum(axis=1, keepdims=True), 1e-12)
+    is_used = share > 0
+    cell, owner = cells[is_used], np.broadcast_to(np.arange(len(cells))[:, None], cells.shape)[is_used]
+    per_volume = share[is_used] * screen.area_mm2[owner] / (cell_size_mm**3 * M_PER_MM)
+    found, place = np.unique(cell, return_inverse=True)
+
+    def gathered(values: Floats) -> Floats:
+        return np.bincount(place, per_volume * values[owner], len(found))
+
+    # The normals of one sheet agree nearly; signs may differ where two sheets meet in a cell, but only n n^T counts.
+    normal = np.stack([gathered(component) for component in screen.normals.T], axis=1)
+    length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    along = gathered(screen.normal_resistance_Pa_s_m)
+    kept = along > 0
+    return GridResistance(
+        found[kept].astype(np.int32),
+        (normal / length)[kept],
+        along[kept],
+        gathered(screen.tangential_resistance_Pa_s_m)[kept],
+        0.5 * gathered(screen.inertial_loss)[kept],
+    )

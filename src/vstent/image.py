@@ -1,0 +1,42 @@
+"""Image: a scan on a regular, possibly oblique grid in the LPS frame."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.kernels.arrays import Floats, freeze
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """A three-dimensional scan."""
+
+    voxels: NDArray[Any]
+    """(i, j, k) intensities, any real dtype."""
+    affine_mm: Floats
+    """(4, 4) voxel index -> LPS mm."""
+    modality: str = ""
+    """DICOM modality, empty where the file does not say."""
+    notes: tuple[str, ...] = ()
+    """What was guessed in reading it, one sentence each."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "voxels", np.asarray(self.voxels).dtype, (-1, -1, -1))
+        freeze(self, "affine_mm", np.float64, (4, 4))
+
+    @cached_property
+    def spacing_mm(self) -> Floats:
+        """(3,) distance between neighbouring voxels along i, j, k."""
+        return np.linalg.norm(self.affine_mm[:3, :3], axis=0)
+
+    def to_mm(self, index: Floats) -> Floats:
+        """Map (n, 3) voxel indices to LPS mm."""
+        return np.asarray(index, dtype=np.float64) @ self.affine_mm[:3, :3].T + self.affine_mm[:3, 3]
+
+    def to_index(self, points_mm: Floats) -> Floats:
+        """Map (n, 3) LPS mm to fractional voxel indices."""
+        inverse = np.linalg.inv(self.affine_mm)
+        return np.asarray(points_mm, dtype=np.float64) @ inverse[:3, :3].T + inverse[:3, 3]

@@ -1,0 +1,116 @@
+"""Nouns <-> one compressed file each, so that a study can go on where it stopped.
+
+An archive is a NumPy .npz: the arrays, and under the name ``noun`` a JSON text that says how they hang together. There
+is no pickle in it: reading one runs nothing but the constructors of vstent's own dataclasses.
+"""
+
+import dataclasses
+import importlib
+import json
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.errors import ReadError
+from vstent.io.files import atomic, existing
+
+Noun = TypeVar("Noun")
+
+_ROOT: Final = "vstent."
+_KIND: Final = "is"
+
+
+def save_noun(path: Path, noun: Any) -> None:
+    """Write a frozen dataclass of vstent, with all that it holds.
+
+    Fields may be arrays, numbers, strings, booleans, None, tuples, lists, dictionaries with strings for keys, and
+    dataclasses of vstent, nested as deep as wanted.
+
+    Raises
+    ------
+    TypeError
+        Something in it is of another type; nothing is written.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    text = json.dumps(_packed(noun, arrays))
+    arrays["noun"] = np.frombuffer(text.encode(), dtype=np.uint8)
+    with atomic(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def load_noun(path: Path, noun_type: type[Noun]) -> Noun:
+    """Read a dataclass of the type wanted.
+
+    Raises
+    ------
+    ReadError
+        The file is missing, damaged, of another version, or holds something else.
+    """
+    path = existing(path)
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            noun = _unpacked(json.loads(archive["noun"].tobytes()), archive)
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        ImportError,
+        EOFError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ):
+        raise ReadError(
+            f"{path} is damaged or was written by another version; delete it to compute it again."
+        ) from None
+    if not isinstance(noun, noun_type):
+        raise ReadError(f"{path} holds a {type(noun).__name__} where a {noun_type.__name__} is needed; delete it.")
+    return noun
+
+
+def _packed(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        name = f"a{len(arrays)}"
+        arrays[name] = value
+        return {_KIND: "array", "name": name}
+    if isinstance(value, (tuple, list)):
+        return {_KIND: type(value).__name__, "items": [_packed(item, arrays) for item in value]}
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        return {_KIND: "dict", "items": {key: _packed(item, arrays) for key, item in value.items()}}
+    if dataclasses.is_dataclass(value) and type(value).__module__.startswith(_ROOT):
+        fields = {f.name: _packed(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
+        return {_KIND: "noun", "module": type(value).__module__, "class": type(value).__qualname__, "fields": fields}
+    raise TypeError(f"a {type(value).__name__} cannot be archived")
+
+
+def _unpacked(value: Any, archive: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    kind = value[_KIND]
+    if kind == "array":
+        return archive[value["name"]]
+    if kind in ("tuple", "list"):
+        items = [_unpacked(item, archive) for item in value["items"]]
+        return tuple(items) if kind == "tuple" else items
+    if kind == "dict":
+        return {key: _unpacked(item, archive) for key, item in value["items"].items()}
+    fields = {name: _unpacked(item, archive) for name, item in value["fields"].items()}
+    return _noun_class(value["module"], value["class"])(**fields)
+
+
+def _noun_class(module: str, name: str) -> type:
+    if not module.startswith(_ROOT):
+        raise ValueError(f"{module}.{name} is no noun of vstent")
+    found = getattr(importlib.import_module(module), name)
+    if not (isinstance(found, type) and dataclasses.is_dataclass(found) and found.__module__ == module):
+        raise ValueError(f"{module}.{name} is no noun of vstent")
+    return found

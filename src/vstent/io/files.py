@@ -1,0 +1,74 @@
+"""Paths: what a file is by its name, and writing without ever leaving half a file behind."""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+from vstent.errors import ReadError
+
+SURFACE_SUFFIXES: Final = (".stl", ".vtp", ".vtk", ".obj", ".ply")
+IMAGE_SUFFIXES: Final = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".raw", ".raw.gz", ".dcm")
+
+
+def is_surface_file(path: Path) -> bool:
+    """Tell whether the name is that of a surface file."""
+    return suffix(path) in SURFACE_SUFFIXES
+
+
+def suffix(path: Path) -> str:
+    """Return the file's suffix in lower case, ``.gz`` together with what stands before it."""
+    suffixes = [s.lower() for s in Path(path).suffixes]
+    return "".join(suffixes[-2:]) if suffixes[-1:] == [".gz"] else "".join(suffixes[-1:])
+
+
+def existing(path: Path) -> Path:
+    """Return the path of a file or folder that exists.
+
+    Raises
+    ------
+    ReadError
+        When there is nothing at that path.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise ReadError(f"{path} does not exist: check the path.")
+    return path
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """Give a path in the same folder to write to; it becomes `path` when the block ends well, and vanishes if not."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    try:
+        yield Path(name)
+        os.chmod(name, 0o666 & ~_umask())  # mkstemp makes files that only their owner can read
+        os.replace(name, path)
+    finally:
+        with suppress(FileNotFoundError):
+            os.unlink(name)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+@contextmanager
+def silenced() -> Iterator[None]:
+    """Keep what C and C++ libraries write to standard error off the user's terminal; our own errors say it better."""
+    saved = os.dup(2)
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(sink)

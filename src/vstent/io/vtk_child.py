@@ -1,0 +1,112 @@
+"""VTK's readers, in a process of their own.
+
+They are fast and know every dialect, but a damaged file can crash them, and us with them, or make them ask for all the
+memory there is. So a child reads the file and hands over bare arrays; when it dies, the file was damaged.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import vstent
+from vstent.io.files import suffix
+from vstent.io.polydata import triangles_of
+from vstent.kernels.arrays import Floats, Ints
+
+SECONDS: Final = 8.0
+SECONDS_PER_BYTE: Final = 1e-6
+MEMORY_BYTES: Final = 2_000_000_000
+MEMORY_PER_BYTE: Final = 40
+
+
+def read_apart(path: Path) -> tuple[Floats, Ints] | None:
+    """Read vertices (n, 3) and triangles (m, 3) in a child process; None when that dies or takes too long."""
+    size = path.stat().st_size
+    with tempfile.TemporaryDirectory(prefix="vstent-") as folder:
+        result = Path(folder) / "surface.npz"
+        command = [sys.executable, "-m", "vstent.io.vtk_child", str(path.resolve()), str(result)]
+        try:
+            subprocess.run(
+                command,
+                env=_environment(),
+                timeout=SECONDS + SECONDS_PER_BYTE * size,
+                check=True,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+            )
+        except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
+            return None
+        with np.load(result) as arrays:
+            return arrays["vertices"], arrays["faces"]
+
+
+def _environment() -> dict[str, str]:
+    """Ours, and the folder that this package was found in."""
+    root = str(Path(next(iter(vstent.__path__))).parent)
+    others = os.environ.get("PYTHONPATH", "")
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in (root, others) if p)}
+
+
+def _limit_memory(size: int) -> None:
+    with suppress(ImportError):  # Windows has no such limit
+        import resource
+
+        limit = MEMORY_BYTES + MEMORY_PER_BYTE * size
+        with suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def _reader(kind: str) -> Any:
+    if kind == ".vtp":
+        from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+        return vtkXMLPolyDataReader()
+    if kind == ".vtk":
+        from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader
+
+        return vtkGenericDataObjectReader()
+    if kind == ".ply":
+        from vtkmodules.vtkIOPLY import vtkPLYReader
+
+        return vtkPLYReader()
+    from vtkmodules.vtkIOGeometry import vtkOBJReader, vtkSTLReader
+
+    return vtkSTLReader() if kind == ".stl" else vtkOBJReader()
+
+
+def _polygons(data: Any) -> Any:
+    """Return polygons as they are, the outer faces of a volume mesh, and None for anything else."""
+    if data is None or data.IsA("vtkPolyData"):
+        return data
+    if not data.IsA("vtkUnstructuredGrid"):
+        return None
+    from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
+
+    outer = vtkGeometryFilter()
+    outer.SetInputData(data)
+    outer.Update()
+    return outer.GetOutput()
+
+
+def main(path: Path, result: Path) -> int:
+    """Read a file and save its vertices and faces; 1 when there is nothing to save."""
+    _limit_memory(path.stat().st_size)
+    reader = _reader(suffix(path))
+    reader.SetFileName(str(path))
+    reader.Update()
+    data = _polygons(reader.GetOutput())
+    if data is None:
+        return 1
+    vertices, faces = triangles_of(data)
+    np.savez(result, vertices=vertices.astype(np.float64), faces=faces.astype(np.int32))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1]), Path(sys.argv[2])))

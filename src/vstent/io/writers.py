@@ -1,0 +1,186 @@
+"""Nouns and arrays -> files: VTP, VTU, STL, JSON, text. Every file is complete or not there at all."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.io.files import atomic
+from vstent.io.polydata import cells_of, points_of, polydata_of, ragged_cells
+from vstent.kernels.arrays import Floats, Ints
+from vstent.surface import Surface
+from vstent.vessel import Centerline
+
+Arrays = Mapping[str, NDArray[Any]]
+
+NOTHING: Final[Arrays] = {}
+SIGNIFICANT_DIGITS: Final = 7
+
+
+def write_surface(path: Path, surface: Surface, point_data: Arrays = NOTHING, cell_data: Arrays = NOTHING) -> None:
+    """Write a surface in mm as VTP, with arrays (n, ...) on its vertices and (m, ...) on its faces."""
+    data = polydata_of(surface.vertices_mm, surface.faces)
+    _attach(data.GetPointData(), point_data, len(surface.vertices_mm))
+    _attach(data.GetCellData(), cell_data, len(surface.faces))
+    _write_xml(path, data)
+
+
+def write_lines(
+    path: Path, points_mm: Floats, starts: Ints, point_data: Arrays = NOTHING, cell_data: Arrays = NOTHING
+) -> None:
+    """Write polylines in mm as VTP.
+
+    Parameters
+    ----------
+    path : the file.
+    points_mm : (p, 3) points of all lines, one after another.
+    starts : (w + 1,) first point of every line, and p at the end.
+    point_data, cell_data : arrays (p, ...) on the points and (w, ...) on the lines.
+    """
+    from vtkmodules.vtkCommonDataModel import vtkPolyData
+
+    data = vtkPolyData()
+    data.SetPoints(points_of(points_mm))
+    data.SetLines(ragged_cells(np.arange(len(points_mm), dtype=np.int32), np.asarray(starts)))
+    _attach(data.GetPointData(), point_data, len(points_mm))
+    _attach(data.GetCellData(), cell_data, len(starts) - 1)
+    _write_xml(path, data)
+
+
+def write_centerlines(path: Path, centerlines: Sequence[Centerline]) -> None:
+    """Write centerlines as VTP under the array names of VMTK."""
+    lengths = [len(line.points_mm) for line in centerlines]
+    frames = np.concatenate([line.frames for line in centerlines])
+    write_lines(
+        path,
+        np.concatenate([line.points_mm for line in centerlines]),
+        np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32),
+        {
+            "MaximumInscribedSphereRadius": np.concatenate([line.inscribed_radius_mm for line in centerlines]),
+            "Abscissas": np.concatenate([line.abscissa_mm for line in centerlines]),
+            "FrenetTangent": frames[:, 0],
+            "ParallelTransportNormals": frames[:, 1],
+        },
+        {"CenterlineIds": np.arange(len(centerlines), dtype=np.int32)},
+    )
+
+
+def write_cells(
+    path: Path, centers_mm: Floats, size_mm: float, cell_data: Arrays, point_data: Arrays = NOTHING
+) -> None:
+    """Write the cubes of a regular grid that are in use as VTU: hexahedra that share their corners.
+
+    Parameters
+    ----------
+    path : the file.
+    centers_mm : (c, 3) middles of the cubes, on one grid aligned with the axes.
+    size_mm : edge of the cubes.
+    cell_data : arrays (c, ...).
+    point_data : arrays (p, ...) on the corners in the order of `grid_corners`.
+    """
+    from vtkmodules.vtkCommonDataModel import VTK_HEXAHEDRON, vtkUnstructuredGrid
+
+    corners_mm, cells = grid_corners(centers_mm, size_mm)
+    data = vtkUnstructuredGrid()
+    data.SetPoints(points_of(corners_mm))
+    data.SetCells(VTK_HEXAHEDRON, cells_of(cells))
+    _attach(data.GetCellData(), cell_data, len(cells))
+    _attach(data.GetPointData(), point_data, len(corners_mm))
+    _write_xml(path, data)
+
+
+_CORNERS: Final = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
+"""Corners of a cube in VTK's order for a hexahedron."""
+
+
+def grid_corners(centers_mm: Floats, size_mm: float) -> tuple[Floats, Ints]:
+    """Corners (p, 3) of cubes about centres (c, 3), each once, and the eight corners (c, 8) of every cube."""
+    origin = np.min(centers_mm, axis=0, initial=np.inf) if len(centers_mm) else np.zeros(3)
+    index = np.round((centers_mm - origin) / size_mm).astype(np.int64)
+    n = index.max(axis=0, initial=0) + 2
+    stride = np.array([n[1] * n[2], n[2], 1])
+    code, cells = np.unique((index @ stride)[:, None] + _CORNERS @ stride, return_inverse=True)
+    lattice = np.stack([code // stride[0], code // stride[1] % n[1], code % n[2]], axis=-1)
+    return origin + (lattice - 0.5) * size_mm, cells.reshape(-1, 8).astype(np.int32)
+
+
+def _attach(attributes: Any, arrays: Arrays, length: int) -> None:
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+
+    for name, values in arrays.items():
+        array = np.asarray(values)
+        if len(array) != length:
+            raise ValueError(f"{name} has {len(array)} rows where {length} are needed")
+        if array.dtype.kind == "b":
+            array = array.astype(np.uint8)
+        data = numpy_to_vtk(np.ascontiguousarray(array.reshape(length, -1) if array.ndim > 1 else array), deep=True)
+        data.SetName(name)
+        attributes.AddArray(data)
+
+
+def _write_xml(path: Path, data: Any) -> None:
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
+
+    writer = (vtkXMLPolyDataWriter if data.IsA("vtkPolyData") else vtkXMLUnstructuredGridWriter)()
+    writer.SetInputData(data)
+    writer.SetDataModeToAppended()
+    writer.EncodeAppendedDataOff()
+    writer.SetCompressorTypeToZLib()
+    writer.SetCompressionLevel(1)
+    with atomic(path) as partial:
+        writer.SetFileName(str(partial))
+        if writer.Write() != 1:
+            raise OSError(f"{path} could not be written: is the disk full?")
+
+
+_STL_FACE: Final = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def write_stl(path: Path, surface: Surface) -> None:
+    """Write a surface in mm as binary STL."""
+    faces = np.zeros(len(surface.faces), dtype=_STL_FACE)
+    faces["normal"], faces["corners"] = surface.normals, surface.corners_mm
+    header = b"vstent, mm".ljust(80) + len(faces).to_bytes(4, "little")
+    with atomic(path) as partial:
+        partial.write_bytes(header + faces.tobytes())
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write numbers, strings, lists, mappings and arrays as JSON: sorted keys, floats of seven digits.
+
+    Raises
+    ------
+    ValueError
+        A number is not finite, or an object is none of these; nothing is written.
+    """
+    write_text(
+        path, json.dumps(_plain(content, ""), indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
+    )
+
+
+def _plain(value: Any, where: str) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item, f"{where}.{key}") for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist(), where)
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise ValueError(f"{where.lstrip('.')} is {value}, which JSON cannot hold")
+        return float(f"{value:.{SIGNIFICANT_DIGITS}g}")
+    if value is None or isinstance(value, (str, int, bool)):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    raise ValueError(f"{where.lstrip('.')} is a {type(value).__name__}, which JSON cannot hold")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8."""
+    with atomic(path) as partial:
+        partial.write_text(text, encoding="utf-8", newline="\n")

@@ -1,0 +1,1 @@
+"""Bare arrays in, bare arrays out, compiled where it pays."""

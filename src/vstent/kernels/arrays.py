@@ -1,0 +1,37 @@
+"""Read-only arrays: the fields of every noun."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.integer[Any]]
+Bools = NDArray[np.bool_]
+
+
+def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) -> NDArray[Any]:
+    """Return `values` as a read-only contiguous array of its own.
+
+    Parameters
+    ----------
+    values : array_like
+    dtype : the kind of number that the field holds.
+    shape : expected shape; -1 stands for any length.
+    name : field name, for the error.
+
+    Raises
+    ------
+    ValueError
+        When the shape is another one.
+    """
+    array = np.array(values, dtype=dtype, order="C", copy=True)
+    if array.ndim != len(shape) or any(want not in (-1, have) for want, have in zip(shape, array.shape, strict=True)):
+        raise ValueError(f"{name} must have shape {shape} (-1: any), not {array.shape}")
+    array.flags.writeable = False
+    return array
+
+
+def freeze(noun: object, name: str, dtype: DTypeLike, shape: tuple[int, ...]) -> None:
+    """Replace the field `name` of a frozen dataclass by a read-only copy (call it in ``__post_init__``)."""
+    object.__setattr__(noun, name, read_only(getattr(noun, name), dtype, shape, name))

@@ -1,0 +1,52 @@
+"""Cutting a triangle mesh along the zero of a value at its vertices."""
+
+import numpy as np
+
+from vstent.kernels.arrays import Floats, Ints
+
+
+def clip(vertices: Floats, faces: Ints, value: Floats) -> tuple[Floats, Ints]:
+    """Keep the part of a mesh where `value` (n,), linear on every face, is at most 0.
+
+    Vertices of the cut are shared by the faces beside it; vertices that no face uses any more stay in the list.
+    """
+    positive = value[faces] > 0
+    count = positive.sum(axis=1)
+    keep = faces[count == 0]
+    one, two = faces[count == 1], faces[(count == 2) & (value[faces].min(axis=1) < 0)]
+    first = _rotated(one, np.argmax(value[one] > 0, axis=1))
+    lone = _rotated(two, np.argmin(value[two] > 0, axis=1))
+    edges = np.concatenate([first[:, [0, 1]], first[:, [0, 2]], lone[:, [0, 1]], lone[:, [0, 2]]])
+    vertices, crossing = _crossings(vertices, edges, value)
+    p01, p02 = crossing[: len(first)], crossing[len(first) : 2 * len(first)]
+    q01, q02 = crossing[2 * len(first) : 2 * len(first) + len(lone)], crossing[2 * len(first) + len(lone) :]
+    made = np.concatenate(
+        [
+            np.stack([first[:, 1], first[:, 2], p02], axis=1),
+            np.stack([first[:, 1], p02, p01], axis=1),
+            np.stack([lone[:, 0], q01, q02], axis=1),
+        ]
+    )
+    sound = (made[:, 0] != made[:, 1]) & (made[:, 1] != made[:, 2]) & (made[:, 2] != made[:, 0])
+    return vertices, np.concatenate([keep, made[sound]]).astype(np.int32)
+
+
+def _rotated(faces: Ints, start: Ints) -> Ints:
+    """Rotate every face so that its corner number `start` comes first."""
+    return faces[np.arange(len(faces))[:, None], (start[:, None] + np.arange(3)) % 3]
+
+
+def _crossings(vertices: Floats, edges: Ints, value: Floats) -> tuple[Floats, Ints]:
+    """Vertices with one more for each edge whose ends differ in sign, and that vertex for every edge (k,).
+
+    An edge that ends on the zero has its end for an answer.
+    """
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    on_zero = (value[low] == 0) | (value[high] == 0)
+    code, inverse = np.unique(low.astype(np.int64) * len(vertices) + high, return_inverse=True)
+    a, b = code // len(vertices), code % len(vertices)
+    span = np.where(value[a] == value[b], 1.0, value[a] - value[b])
+    t = np.clip(value[a] / span, 0.0, 1.0)[:, None]
+    created = vertices[a] + t * (vertices[b] - vertices[a])
+    answer = np.where(on_zero, np.where(value[low] == 0, low, high), len(vertices) + inverse)
+    return np.concatenate([vertices, created]), answer.astype(np.int32)

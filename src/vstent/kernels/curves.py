@@ -1,0 +1,110 @@
+"""Polylines: arc length, frames, interpolation, projection."""
+
+import numpy as np
+from scipy.sparse import csc_matrix, diags, eye
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
+
+from vstent.kernels.arrays import Floats
+
+
+def arc_length(points: Floats) -> Floats:
+    """Cumulative length (n,) of a polyline (n, 3), starting at 0."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def interpolate(abscissa: Floats, values: Floats, wanted: Floats) -> Floats:
+    """Values (k, d) at arc lengths `wanted` (k,), linear between samples (n,), (n, d)."""
+    return np.stack([np.interp(wanted, abscissa, column) for column in values.T], axis=-1)
+
+
+def resample(points: Floats, step: float) -> Floats:
+    """Points (k, 3) at equal arc lengths of about `step` along a polyline (n, 3), ends kept."""
+    return resample_evenly(points, max(2, round(arc_length(points)[-1] / step) + 1))
+
+
+def resample_evenly(points: Floats, n: int) -> Floats:
+    """`n` points (n, 3) at equal arc lengths along a polyline (k, 3), ends kept."""
+    abscissa = arc_length(points)
+    return interpolate(abscissa, points, np.linspace(0.0, abscissa[-1], n))
+
+
+def tangents(points: Floats) -> Floats:
+    """Unit tangents (n, 3) of a polyline, central differences over arc length."""
+    derivative = np.gradient(points, arc_length(points), axis=0)
+    return derivative / np.linalg.norm(derivative, axis=1, keepdims=True)
+
+
+def parallel_frames(points: Floats) -> Floats:
+    """Rotation-minimising frames (n, 3, 3) of a polyline: rows tangent, normal, binormal (right-handed).
+
+    Double reflection (Wang, Juettler, Zheng and Liu 2008, ACM Trans. Graph. 27(1):2, table I).
+    """
+    tangent = tangents(points)
+    frames = np.zeros((len(points), 3, 3))
+    normal = any_perpendicular(tangent[0])
+    for i, t in enumerate(tangent):
+        if i > 0:
+            normal = _reflected(points[i] - points[i - 1], normal, tangent[i - 1], t)
+            normal = normal - (normal @ t) * t
+            normal = normal / np.linalg.norm(normal)
+        frames[i] = t, normal, np.cross(t, normal)
+    return frames
+
+
+def _reflected(step: Floats, normal: Floats, tangent: Floats, next_tangent: Floats) -> Floats:
+    length2 = step @ step
+    normal_left = normal - (2 / length2) * (step @ normal) * step
+    tangent_left = tangent - (2 / length2) * (step @ tangent) * step
+    turn = next_tangent - tangent_left
+    turn2 = turn @ turn
+    return normal_left if turn2 < 1e-30 else normal_left - (2 / turn2) * (turn @ normal_left) * turn
+
+
+def any_perpendicular(direction: Floats) -> Floats:
+    """Some unit vector (3,) perpendicular to a unit vector (3,)."""
+    helper = np.eye(3)[np.argmin(np.abs(direction))]
+    normal = np.cross(direction, helper)
+    return normal / np.linalg.norm(normal)
+
+
+def project(polyline: Floats, points: Floats) -> tuple[Floats, Floats]:
+    """Foot of each of (k, 3) points on a polyline (n, 3): arc length (k,) and distance (k,).
+
+    The two segments beside the nearest vertex are tried; the polyline must be sampled finer than it is far away.
+    """
+    abscissa = arc_length(polyline)
+    nearest = cKDTree(polyline).query(points)[1]
+    best_s, best_d = np.zeros(len(points)), np.full(len(points), np.inf)
+    for shift in (-1, 0):
+        i = np.clip(nearest + shift, 0, len(polyline) - 2)
+        edge = polyline[i + 1] - polyline[i]
+        length2 = np.maximum(np.einsum("ij,ij->i", edge, edge), 1e-300)
+        t = np.clip(np.einsum("ij,ij->i", points - polyline[i], edge) / length2, 0.0, 1.0)
+        distance = np.linalg.norm(points - (polyline[i] + t[:, None] * edge), axis=1)
+        better = distance < best_d
+        best_d = np.where(better, distance, best_d)
+        best_s = np.where(better, abscissa[i] + t * np.sqrt(length2), best_s)
+    return best_s, best_d
+
+
+def roughness(n: int, order: int) -> csc_matrix:
+    """Matrix (n, n) of the sum of squared differences of `order` along n samples."""
+    difference = csc_matrix(eye(n))
+    for k in range(order):
+        difference = csc_matrix(diags([-1.0, 1.0], [0, 1], shape=(n - k - 1, n - k)) @ difference)
+    return csc_matrix(difference.T @ difference)
+
+
+def smooth(values: Floats, weight: Floats, strength: float, order: int = 2) -> Floats:
+    """Whittaker smoothing of samples (n,) or (n, d) with weights (n,).
+
+    Minimises sum w |x - v|^2 + strength |difference of `order` of x|^2 (Eilers 2003, Anal. Chem. 75:3631, eq. 5).
+    """
+    n = len(values)
+    if n <= order:
+        return values
+    matrix = diags(weight) + strength * roughness(n, order)
+    right = values * (weight if values.ndim == 1 else weight[:, None])
+    return np.asarray(spsolve(csc_matrix(matrix), right)).reshape(values.shape)

@@ -1,0 +1,176 @@
+"""Reading a field on sparse grid cells: between the cells, along streamlines, at the wall.
+
+Fields are (n, d) on cells; `index` (i, j, k) holds the cell's number at every grid point, -1 outside. Points are in grid
+units: cell centres at integers.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+
+@njit(cache=True, inline="always")
+def _cell_at(index: Any, i: int, j: int, k: int) -> int:
+    if 0 <= i < index.shape[0] and 0 <= j < index.shape[1] and 0 <= k < index.shape[2]:
+        return index[i, j, k]
+    return -1
+
+
+@njit(cache=True)
+def stencil(index: Any, x: float, y: float, z: float, cells: Any, weights: Any) -> float:
+    """Fill the eight cells (-1: outside) round a point and their trilinear weights; return the weight inside."""
+    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    a, b, c = x - i, y - j, z - k
+    inside = 0.0
+    for n in range(8):
+        di, dj, dk = n >> 2, (n >> 1) & 1, n & 1
+        cells[n] = _cell_at(index, i + di, j + dj, k + dk)
+        weights[n] = (a if di else 1.0 - a) * (b if dj else 1.0 - b) * (c if dk else 1.0 - c)
+        if cells[n] >= 0:
+            inside += weights[n]
+    return inside
+
+
+@njit(cache=True)
+def stencils(index: Any, points: Any) -> tuple[Any, Any]:
+    """Eight cells (m, 8), -1 outside, and trilinear weights (m, 8) of points (m, 3)."""
+    cells = np.zeros((len(points), 8), np.int32)
+    weights = np.zeros((len(points), 8))
+    for m in range(len(points)):
+        stencil(index, points[m, 0], points[m, 1], points[m, 2], cells[m], weights[m])
+    return cells, weights
+
+
+@njit(cache=True, parallel=True)
+def interpolate(index: Any, values: Any, points: Any, is_zero_outside: bool) -> Any:
+    """Trilinear values (m, d) at points (m, 3).
+
+    Outside cells count as zero (a no-slip velocity) or are left out of the mean (a pressure). Zero where no cell is.
+    """
+    result = np.zeros((len(points), values.shape[1]))
+    for m in prange(len(points)):
+        cells = np.zeros(8, np.int32)
+        weights = np.zeros(8)
+        inside = stencil(index, points[m, 0], points[m, 1], points[m, 2], cells, weights)
+        if inside <= 0.0:
+            continue
+        scale = 1.0 if is_zero_outside else 1.0 / inside
+        for n in range(8):
+            if cells[n] >= 0:
+                for d in range(values.shape[1]):
+                    result[m, d] += scale * weights[n] * values[cells[n], d]
+    return result
+
+
+@njit(cache=True)
+def _speed_at(index: Any, velocity: Any, p: Any, v: Any, cells: Any, weights: Any) -> float:
+    """Velocity v at p; its magnitude, or -1 outside."""
+    v[:] = 0.0
+    if stencil(index, p[0], p[1], p[2], cells, weights) <= 0.3:
+        return -1.0
+    for n in range(8):
+        if cells[n] >= 0:
+            for d in range(3):
+                v[d] += weights[n] * velocity[cells[n], d]
+    return np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+
+
+@njit(cache=True)
+def trace(index: Any, velocity: Any, seed: Any, step: float, slowest: float, path: Any, speed: Any) -> int:
+    """Follow the flow from a seed by steps of length `step` (negative: against it); the number of points written.
+
+    Classical Runge-Kutta of fourth order in arc length, so that slow blood does not take more points than fast. Ends
+    outside, below the speed `slowest`, or when `path` (m, 3) is full.
+    """
+    cells, weights = np.zeros(8, np.int32), np.zeros(8)
+    k, total, p, q = np.zeros(3), np.zeros(3), seed.copy(), np.zeros(3)
+    for m in range(len(path)):
+        here = _speed_at(index, velocity, p, k, cells, weights)
+        if here < slowest:
+            return m
+        path[m], speed[m] = p, here
+        total[:] = k / here
+        for stage in range(3):
+            part = step if stage == 2 else 0.5 * step
+            q[:] = p + part * k / max(here, 1e-300)
+            here = _speed_at(index, velocity, q, k, cells, weights)
+            if here < slowest:
+                return m + 1
+            total += (1.0 if stage == 2 else 2.0) * k / here
+        p += step * total / 6.0
+    return len(path)
+
+
+@njit(cache=True)
+def _solve(matrix: Any, right: Any) -> None:
+    """Solve a small symmetric positive system in place, several right sides; a vanishing pivot drops its unknown."""
+    n = len(matrix)
+    floor = 1e-9 * matrix[0, 0]
+    for i in range(n):
+        if matrix[i, i] <= floor:
+            matrix[i, :] = 0.0
+            matrix[:, i] = 0.0
+            right[i, :] = 0.0
+            matrix[i, i] = 1.0
+        for j in range(i + 1, n):
+            ratio = matrix[j, i] / matrix[i, i]
+            matrix[j, i:] -= ratio * matrix[i, i:]
+            right[j, :] -= ratio * right[i, :]
+    for i in range(n - 1, -1, -1):
+        for j in range(i + 1, n):
+            right[i, :] -= matrix[i, j] * right[j, :]
+        right[i, :] /= matrix[i, i]
+
+
+@njit(cache=True, parallel=True)
+def fit_wall(index: Any, distance: Any, velocity: Any, pressure: Any, points: Any, normals: Any, reach: int) -> Any:
+    """Wall-normal gradient of the velocity and the pressure at wall points, (m, 4).
+
+    Weighted least squares over the cells within `reach` cells of each point (m, 3) with inward normal (m, 3):
+    velocity = d (a + b d + c s + e t), which is zero at the wall, quadratic away from it and linear along it, exact for
+    Poiseuille flow in a straight tube; pressure = a + b d + c s + e t. d: distance of the cell from the wall, in cells.
+    """
+    result = np.zeros((len(points), 4))
+    for m in prange(len(points)):
+        p, normal = points[m], normals[m]
+        helper = np.zeros(3)
+        helper[np.argmin(np.abs(normal))] = 1.0
+        first = np.cross(normal, helper)
+        first /= np.sqrt((first**2).sum())
+        second = np.cross(normal, first)
+        shear, level = np.zeros((4, 4)), np.zeros((4, 4))
+        shear_right, level_right = np.zeros((4, 3)), np.zeros((4, 1))
+        base = np.zeros(4)
+        lowest = np.floor(p).astype(np.int64) - reach + 1
+        for i in range(lowest[0], lowest[0] + 2 * reach):
+            for j in range(lowest[1], lowest[1] + 2 * reach):
+                for k in range(lowest[2], lowest[2] + 2 * reach):
+                    cell = _cell_at(index, i, j, k)
+                    if cell < 0:
+                        continue
+                    x, y, z = i - p[0], j - p[1], k - p[2]
+                    away = x * x + y * y + z * z
+                    inward = x * normal[0] + y * normal[1] + z * normal[2]
+                    if away >= reach * reach or inward < -0.2 * reach:
+                        continue
+                    d = distance[cell]
+                    weight = (1.0 - away / (reach * reach)) ** 2
+                    base[0], base[1] = 1.0, d
+                    base[2] = x * first[0] + y * first[1] + z * first[2]
+                    base[3] = x * second[0] + y * second[1] + z * second[2]
+                    for a in range(4):
+                        for b in range(4):
+                            level[a, b] += weight * base[a] * base[b]
+                            shear[a, b] += weight * d * d * base[a] * base[b]
+                        level_right[a, 0] += weight * base[a] * pressure[cell]
+                        for axis in range(3):
+                            shear_right[a, axis] += weight * d * base[a] * velocity[cell, axis]
+        if level[0, 0] <= 0.0:
+            continue
+        _solve(shear, shear_right)
+        _solve(level, level_right)
+        for axis in range(3):
+            result[m, axis] = shear_right[0, axis]
+        result[m, 3] = level_right[0, 0]
+    return result

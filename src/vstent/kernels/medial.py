@@ -1,0 +1,160 @@
+"""Medial graph of a closed surface: Voronoi vertices inside it, and shortest paths along it.
+
+The vertices of the Voronoi diagram of a dense surface sample that lie inside the surface are, to sampling accuracy,
+centres of maximum inscribed spheres (Antiga et al. 2003, IEEE Trans. Med. Imaging 22:674).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import Delaunay, cKDTree
+
+from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.tree import Tree, signed_distances
+
+
+class Medial(NamedTuple):
+    """The medial graph as bare arrays."""
+
+    points: Floats
+    """(n, 3) centres of inscribed spheres."""
+    radius: Floats
+    """(n,) their radii."""
+    edges: Ints
+    """(e, 2) pairs of spheres whose Delaunay tetrahedra share a face."""
+
+
+def voronoi(samples: Floats) -> tuple[Medial, Ints]:
+    """All Voronoi vertices of surface samples (n, 3), and the four samples (t, 4) that each is equally far from."""
+    # Exactly cospherical lattice points (marching cubes) make flat tetrahedra; a hair of jitter parts them.
+    scale = float(np.ptp(samples, axis=0).max())
+    jitter = np.random.default_rng(0).normal(0.0, 1e-7 * scale, samples.shape)
+    points = samples + jitter
+    delaunay = Delaunay(points)
+    center, radius = _circumspheres(points[delaunay.simplices])
+    first = np.repeat(np.arange(len(center)), 4)
+    second = delaunay.neighbors.ravel()
+    once = second > first
+    edges = np.stack([first[once], second[once]], axis=1).astype(np.int32)
+    return Medial(center, radius, edges), delaunay.simplices
+
+
+def _circumspheres(corners: Floats) -> tuple[Floats, Floats]:
+    a = corners[:, 0]
+    edges = corners[:, 1:] - a[:, None]
+    right = 0.5 * np.einsum("ijk,ijk->ij", edges, edges)
+    determinant = np.linalg.det(edges)
+    flat = np.abs(determinant) < 1e-14
+    edges = np.where(flat[:, None, None], np.eye(3), edges)
+    offset = np.linalg.solve(edges, right[..., None])[..., 0]
+    radius = np.where(flat, np.inf, np.linalg.norm(offset, axis=1))
+    return a + np.where(flat[:, None], 0.0, offset), radius
+
+
+def keep(medial: Medial, kept: Bools) -> Medial:
+    """The part of the graph on the vertices where the mask `kept` (n,) is true."""
+    number = np.cumsum(kept) - 1
+    edges = medial.edges[kept[medial.edges].all(axis=1)]
+    return Medial(medial.points[kept], medial.radius[kept], number[edges].astype(np.int32))
+
+
+def with_terminals(medial: Medial, terminals: Floats, reach: Floats) -> Medial:
+    """Append terminals (t, 3), joined to all spheres whose centres lie within its reach (t,).
+
+    Where there is none it is joined to the nearest, if that is within ten times the reach.
+    """
+    n = len(medial.points)
+    tree = cKDTree(medial.points)
+    edges = [medial.edges]
+    for k, (terminal, limit) in enumerate(zip(terminals, reach, strict=True)):
+        near = tree.query_ball_point(terminal, limit) or [int(tree.query(terminal)[1])]
+        near = near if np.linalg.norm(medial.points[near[0]] - terminal) < 10 * limit else []
+        edges.append(np.stack([np.array(near, dtype=np.int32), np.full(len(near), n + k)], axis=1))
+    radius = medial.radius[tree.query(terminals)[1]]
+    return Medial(
+        np.concatenate([medial.points, terminals]),
+        np.concatenate([medial.radius, radius]),
+        np.concatenate(edges).astype(np.int32),
+    )
+
+
+def cost_graph(medial: Medial, radius_cap: Floats) -> csr_matrix:
+    """Symmetric graph whose edges cost length / radius, the radius capped (n,): the travel time of Antiga 2003."""
+    radius = np.maximum(np.minimum(medial.radius, radius_cap), 1e-6)
+    a, b = medial.edges.T
+    length = np.linalg.norm(medial.points[a] - medial.points[b], axis=1)
+    cost = np.maximum(length, 1e-12) * 0.5 * (1 / radius[a] + 1 / radius[b])
+    n = len(radius)
+    return coo_matrix((np.tile(cost, 2), (np.concatenate([a, b]), np.concatenate([b, a]))), shape=(n, n)).tocsr()
+
+
+def path_to(before: Ints, end: int) -> Ints:
+    """Vertices from the start of a shortest-path tree to `end`."""
+    path = [end]
+    while before[path[-1]] >= 0:
+        path.append(int(before[path[-1]]))
+    return np.array(path[::-1], dtype=np.int32)
+
+
+def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Medial:
+    """The medial graph inside a surface, from samples (n, 3) of its wall with outward normals (n, 3).
+
+    The wall alone is sampled, not its caps: towards an opening the spheres keep the vessel's radius. A sphere is inside
+    when it lies behind the wall at all four samples that it touches. Where the wall alone says little, near the
+    openings centred at `ends` (k, 3) and for the widest spheres, the closed surface decides.
+    """
+    every, touched = voronoi(samples)
+    extent = float(np.ptp(samples, axis=0).max())
+    offset = every.points[:, None] - samples[touched]
+    behind = np.einsum("tkd,tkd->tk", offset, normals[touched]) < 0
+    kept = (every.radius < extent) & np.isfinite(every.points).all(axis=1) & behind.all(axis=1)
+    unsure = kept & (every.radius > 2.0 * np.quantile(every.radius[kept], 0.9))
+    if len(ends):
+        unsure |= kept & (cKDTree(ends).query(every.points)[0] < 3.0 * every.radius)
+    kept[unsure] = signed_distances(closed, every.points[unsure]) < 0
+    return _largest(keep(every, kept))
+
+
+def _largest(medial: Medial) -> Medial:
+    """The connected part of most spheres: sampling leaves a few spheres by themselves."""
+    n = len(medial.points)
+    ones = np.ones(len(medial.edges), dtype=bool)
+    graph = coo_matrix((ones, (medial.edges[:, 0], medial.edges[:, 1])), shape=(n, n))
+    label = connected_components(graph, directed=False)[1]
+    return keep(medial, label == np.argmax(np.bincount(label)))
+
+
+def arms(medial: Medial, roots: Ints, least_cost: float) -> list[Ints]:
+    """Paths from the tree of `roots` (without any: the widest sphere) to the tips further from it than `least_cost`.
+
+    The cost length / radius counts radii travelled. The farthest tip comes first; its path joins the tree before the
+    next is sought.
+    """
+    graph = cost_graph(medial, np.full(len(medial.radius), np.inf))
+    if len(roots):
+        roots = np.unique(np.concatenate([_farthest(graph, roots[:1], int(root)) for root in roots]))
+    else:
+        roots = np.array([int(np.argmax(medial.radius))], dtype=np.int32)
+    found: list[Ints] = []
+    while len(path := _farthest(graph, roots, least_cost=least_cost)):
+        found.append(path)
+        roots = np.union1d(roots, path).astype(np.int32)
+    return found
+
+
+def _farthest(graph: csr_matrix, roots: Ints, end: int | None = None, least_cost: float = 0.0) -> Ints:
+    """Path from the nearest of `roots` to vertex `end`, or to the farthest; empty when that is nearer than asked."""
+    cost, before, _ = dijkstra(graph, directed=False, indices=roots, return_predecessors=True, min_only=True)
+    cost[~np.isfinite(cost)] = -1.0
+    tip = int(np.argmax(cost)) if end is None else end
+    return path_to(before, tip) if cost[tip] >= least_cost else np.zeros(0, dtype=np.int32)
+
+
+def shortest_paths(graph: csr_matrix, start: int) -> tuple[Floats, Ints]:
+    """Cost (n,) from vertex `start` to every vertex (inf where unreachable), and each one's predecessor (n,)."""
+    cost, before, _ = dijkstra(
+        graph, directed=False, indices=np.array([start]), return_predecessors=True, min_only=True
+    )
+    return cost, before

@@ -1,0 +1,150 @@
+"""Painting triangles and wires into a picture with a depth buffer: no graphics library, no display.
+
+Screen coordinates: x to the right and y down, in pixels, and depth away from the eye, in mm (orthographic). A pixel's
+centre is at integer + 0.5. `depth` (h, w) holds the nearest depth painted so far, `image` (h, w, 3) its colour.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from vstent.kernels.arrays import Floats, Ints
+
+
+@njit(cache=True)
+def paint_triangles(screen: Floats, colours: Floats, faces: Ints, depth: Floats, image: Floats) -> None:
+    """Paint opaque triangles (m, 3) over vertices (n, 3) coloured (n, 3); the nearer one wins."""
+    height, width = depth.shape
+    for f in range(len(faces)):
+        i, j, k = _turned(screen, faces[f, 0], faces[f, 1], faces[f, 2])
+        area = _edge(screen[i], screen[j], screen[k, 0], screen[k, 1])
+        x0, x1, y0, y1 = _box(screen[i], screen[j], screen[k], 0.0, width, height)
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                a = _edge(screen[j], screen[k], x + 0.5, y + 0.5)
+                b = _edge(screen[k], screen[i], x + 0.5, y + 0.5)
+                c = _edge(screen[i], screen[j], x + 0.5, y + 0.5)
+                if not (
+                    _holds(a, screen[j], screen[k])
+                    and _holds(b, screen[k], screen[i])
+                    and _holds(c, screen[i], screen[j])
+                ):
+                    continue
+                a, b, c = a / area, b / area, c / area
+                z = a * screen[i, 2] + b * screen[j, 2] + c * screen[k, 2]
+                if z < depth[y, x]:
+                    depth[y, x] = z
+                    for ch in range(3):
+                        image[y, x, ch] = a * colours[i, ch] + b * colours[j, ch] + c * colours[k, ch]
+
+
+@njit(cache=True)
+def paint_wires(
+    screen: Floats, starts: Ints, radius: Floats, pixel: float, colours: Floats, depth: Floats, image: Floats
+) -> None:
+    """Paint round wires: polylines `starts` (w + 1,) over points (p, 3) coloured (p, 3), `radius` (w,) in pixels.
+
+    `pixel` is the size of a pixel in mm: it turns the bulge of a wire towards the eye into depth.
+    """
+    height, width = depth.shape
+    for wire in range(len(radius)):
+        r = radius[wire]
+        for i in range(starts[wire], starts[wire + 1] - 1):
+            p, q = screen[i], screen[i + 1]
+            dx, dy = q[0] - p[0], q[1] - p[1]
+            length2 = max(dx * dx + dy * dy, 1e-12)
+            x0, x1, y0, y1 = _box(p, q, q, r, width, height)
+            for y in range(y0, y1):
+                for x in range(x0, x1):
+                    t = ((x + 0.5 - p[0]) * dx + (y + 0.5 - p[1]) * dy) / length2
+                    t = min(max(t, 0.0), 1.0)
+                    off2 = ((x + 0.5 - p[0] - t * dx) ** 2 + (y + 0.5 - p[1] - t * dy) ** 2) / (r * r)
+                    if off2 > 1.0:
+                        continue
+                    bulge = math.sqrt(1.0 - off2)
+                    z = p[2] + t * (q[2] - p[2]) - bulge * r * pixel
+                    if z < depth[y, x]:
+                        depth[y, x] = z
+                        for ch in range(3):
+                            colour = colours[i, ch] + t * (colours[i + 1, ch] - colours[i, ch])
+                            image[y, x, ch] = colour * (0.45 + 0.55 * bulge)
+
+
+@njit(cache=True)
+def veil_triangles(
+    screen: Floats, colours: Floats, alphas: Floats, faces: Ints, depth: Floats, sums: Floats, clear: Floats
+) -> None:
+    """Collect translucent triangles in front of what is painted, in any order.
+
+    `sums` (h, w, 4) gathers alpha times colour, and alpha; `clear` (h, w) is multiplied by 1 - alpha. Weighted blended
+    order-independent transparency (McGuire and Bavoil 2013, JCGT 2(2), eq. 6 with equal weights).
+    """
+    height, width = depth.shape
+    for f in range(len(faces)):
+        i, j, k = _turned(screen, faces[f, 0], faces[f, 1], faces[f, 2])
+        area = _edge(screen[i], screen[j], screen[k, 0], screen[k, 1])
+        x0, x1, y0, y1 = _box(screen[i], screen[j], screen[k], 0.0, width, height)
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                a = _edge(screen[j], screen[k], x + 0.5, y + 0.5)
+                b = _edge(screen[k], screen[i], x + 0.5, y + 0.5)
+                c = _edge(screen[i], screen[j], x + 0.5, y + 0.5)
+                if not (
+                    _holds(a, screen[j], screen[k])
+                    and _holds(b, screen[k], screen[i])
+                    and _holds(c, screen[i], screen[j])
+                ):
+                    continue
+                a, b, c = a / area, b / area, c / area
+                if a * screen[i, 2] + b * screen[j, 2] + c * screen[k, 2] > depth[y, x]:
+                    continue
+                alpha = a * alphas[i] + b * alphas[j] + c * alphas[k]
+                for ch in range(3):
+                    colour = a * colours[i, ch] + b * colours[j, ch] + c * colours[k, ch]
+                    sums[y, x, ch] += alpha * colour
+                sums[y, x, 3] += alpha
+                clear[y, x] *= 1.0 - alpha
+
+
+@njit(cache=True, inline="always")
+def _edge(p: Floats, q: Floats, x: float, y: float) -> float:
+    return (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0])
+
+
+@njit(cache=True, inline="always")
+def _holds(edge: float, p: Floats, q: Floats) -> bool:
+    """Inside of an edge; a point on an edge belongs to one of the two triangles that share it (the top-left rule)."""
+    return edge > 0.0 or (edge == 0.0 and (q[1] < p[1] or (q[1] == p[1] and q[0] > p[0])))
+
+
+@njit(cache=True, inline="always")
+def _turned(screen: Floats, i: int, j: int, k: int) -> tuple[int, int, int]:
+    """Corners so ordered that the area is positive."""
+    if _edge(screen[i], screen[j], screen[k, 0], screen[k, 1]) < 0.0:
+        return i, k, j
+    return i, j, k
+
+
+@njit(cache=True, inline="always")
+def _box(p: Floats, q: Floats, r: Floats, margin: float, width: int, height: int) -> tuple[int, int, int, int]:
+    x0 = math.floor(min(p[0], q[0], r[0]) - margin)
+    x1 = math.ceil(max(p[0], q[0], r[0]) + margin)
+    y0 = math.floor(min(p[1], q[1], r[1]) - margin)
+    y1 = math.ceil(max(p[1], q[1], r[1]) + margin)
+    return max(x0, 0), min(x1, width), max(y0, 0), min(y1, height)
+
+
+@njit(cache=True)
+def resolve(image: Floats, sums: Floats, clear: Floats, supersampling: int) -> Floats:
+    """Blend the veils over the opaque picture and average blocks of pixels: (h / s, w / s, 3)."""
+    height, width = clear.shape
+    result = np.zeros((height // supersampling, width // supersampling, 3))
+    share = 1.0 / supersampling**2
+    for y in range(height):
+        for x in range(width):
+            veiled = (1.0 - clear[y, x]) / max(sums[y, x, 3], 1e-12)
+            for ch in range(3):
+                colour = image[y, x, ch] * clear[y, x] + sums[y, x, ch] * veiled
+                result[y // supersampling, x // supersampling, ch] += share * colour
+    return result

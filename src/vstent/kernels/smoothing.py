@@ -1,0 +1,40 @@
+"""Moving the vertices of a mesh towards their neighbours' mean."""
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from vstent.kernels import triangles
+from vstent.kernels.arrays import Floats, Ints
+
+
+def averaging(n_vertices: int, faces: Ints) -> csr_array:
+    """Sparse (n, n) matrix that takes each vertex to the mean of its neighbours.
+
+    A vertex on an open edge has only its neighbours along that edge, so that openings do not creep inwards.
+    """
+    edges = np.sort(triangles.directed_edges(faces), axis=1).astype(np.int64)
+    code, count = np.unique(edges[:, 0] * n_vertices + edges[:, 1], return_counts=True)
+    a, b = code // n_vertices, code % n_vertices
+    is_open = count == 1
+    is_rim = np.zeros(n_vertices, dtype=bool)
+    is_rim[a[is_open]] = is_rim[b[is_open]] = True
+    row, column, along = np.concatenate([a, b]), np.concatenate([b, a]), np.concatenate([is_open, is_open])
+    keep = along | ~is_rim[row]
+    row, column = row[keep], column[keep]
+    degree = np.bincount(row, minlength=n_vertices)
+    return csr_array((1.0 / degree[row], (row, column)), shape=(n_vertices, n_vertices))
+
+
+def taubin(vertices: Floats, faces: Ints, *, iterations: int, pass_band: float) -> Floats:
+    """Smooth vertices (n, 3) without shrinking (Taubin 1995, ICCV, lambda | mu).
+
+    `pass_band` is his k_PB: waves with a Laplacian eigenvalue (0..2) below it are kept. The gain 1 at k_PB and at 0 is
+    (1 - lambda k)(1 - mu k) with 1/mu = k_PB - 1/lambda.
+    """
+    mean = averaging(len(vertices), faces)
+    shrink = 0.6
+    grow = 1.0 / (pass_band - 1.0 / shrink)
+    has_neighbours = (np.diff(mean.indptr) > 0)[:, None]
+    for factor in (shrink, grow) * iterations:
+        vertices = vertices + factor * np.where(has_neighbours, mean @ vertices - vertices, 0.0)
+    return vertices

@@ -1,0 +1,238 @@
+"""How triangles hang together: welding, orientation, components, and cutting apart what no surface can do."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from vstent.kernels import triangles
+from vstent.kernels.arrays import Bools, Floats, Ints
+
+Labels = NDArray[np.int64]
+
+
+class Edges(NamedTuple):
+    """The edges of a mesh, sorted; the uses of one edge stand together."""
+
+    face: Labels
+    """(3 m,) face of every use."""
+    side: Labels
+    """(3 m,) which side of that face: from its corner `side` to the next."""
+    is_upward: Bools
+    """(3 m,) whether the face runs it from the lower vertex to the higher."""
+    starts: Labels
+    """(e,) first use of every edge."""
+    n_uses: Labels
+    """(e,) number of uses: 1 open, 2 sound, more not manifold."""
+
+
+def edges_of(faces: Ints) -> Edges:
+    """Sort the uses of all edges of faces (m, 3)."""
+    directed = triangles.directed_edges(faces).astype(np.int64)
+    low, high = directed.min(axis=1), directed.max(axis=1)
+    code = low * (high.max(initial=0) + 1) + high
+    order = np.argsort(code, kind="stable")
+    ordered = code[order]
+    starts = (
+        np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]])) if len(code) else np.zeros(0, np.int64)
+    )
+    count = np.diff(np.concatenate([starts, [len(code)]]))
+    side, face = np.divmod(order, len(faces)) if len(faces) else (order, order)
+    return Edges(face, side, directed[order, 0] < directed[order, 1], starts, count)
+
+
+def weld(vertices: Floats, faces: Ints, tolerance: float) -> tuple[Floats, Ints]:
+    """Make one vertex of all that are closer than `tolerance` (transitively); the first of them stays."""
+    pairs = cKDTree(vertices).query_pairs(tolerance, output_type="ndarray")
+    label = _components(len(vertices), pairs[:, 0], pairs[:, 1])
+    _, first = np.unique(label, return_index=True)
+    return vertices[first], label[faces].astype(np.int32)
+
+
+def _components(n: int, a: NDArray[np.integer], b: NDArray[np.integer]) -> Labels:
+    """Component (n,) of every node of the graph with edges a - b."""
+    graph = coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def sound_faces(faces: Ints) -> Bools:
+    """Tell for each face (m,) that it has three different vertices and is the first with these three."""
+    ordered = np.sort(faces, axis=1).astype(np.int64)
+    distinct = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
+    n = ordered.max(initial=0) + 1
+    pair = ordered[:, 0] * n + ordered[:, 1]
+    order = np.lexsort((ordered[:, 2], pair))  # stable: the first face of equals stays first
+    repeated = (np.diff(pair[order]) == 0) & (np.diff(ordered[order, 2]) == 0)
+    is_first = np.ones(len(faces), dtype=bool)
+    is_first[order[1:][repeated]] = False
+    return distinct & is_first
+
+
+def face_components(faces: Ints) -> Labels:
+    """Component (m,) of every face; faces hang together where they share an edge."""
+    edges = edges_of(faces)
+    return _components(len(faces), edges.face, edges.face[np.repeat(edges.starts, edges.n_uses)])
+
+
+def patches(faces: Ints) -> Labels:
+    """Patch (m,) of every face; the borders of patches are open edges and edges of more than two faces."""
+    f, g, _ = _neighbours(faces)
+    return _components(len(faces), f, g)
+
+
+def _neighbours(faces: Ints) -> tuple[Labels, Labels, Bools]:
+    """Pairs of faces (e,), (e,) across the edges of exactly two faces, and whether their orientations clash (e,)."""
+    edges = edges_of(faces)
+    first = edges.starts[edges.n_uses == 2]
+    return edges.face[first], edges.face[first + 1], edges.is_upward[first] == edges.is_upward[first + 1]
+
+
+def oriented(faces: Ints) -> tuple[Ints, Bools]:
+    """Turn faces so that neighbours across sound edges agree: the faces (m, 3) and which were turned (m,).
+
+    The majority of every patch stays as it is. Each face and its reverse are two nodes of a graph, linked to the
+    neighbour that agrees; the two sheets of that graph are the two orientations. A patch with one sheet only (a
+    Moebius strip) has none: there each face follows the majority of its neighbours, and some go on clashing.
+    """
+    m = len(faces)
+    f, g, is_clash = _neighbours(faces)
+    shift = np.where(is_clash, m, 0)
+    sheet = _components(2 * m, np.concatenate([f, f + m]), np.concatenate([g + shift, (g + m + shift) % (2 * m)]))
+    turned = sheet[:m] > sheet[m:]
+    component = np.minimum(sheet[:m], sheet[m:])
+    many = np.bincount(component[turned], minlength=2 * m) * 2 > np.bincount(component, minlength=2 * m)
+    turned ^= many[component]
+    if (sheet[:m] == sheet[m:]).any():
+        turned = _settled(turned, f, g, is_clash)
+    return np.where(turned[:, None], faces[:, ::-1], faces), turned
+
+
+def _settled(turned: Bools, f: Labels, g: Labels, is_clash: Bools) -> Bools:
+    """Turn faces that clash with most of their neighbours until there are none; of two neighbours one at a time."""
+    m = len(turned)
+    degree = np.bincount(f, minlength=m) + np.bincount(g, minlength=m)
+    while True:
+        clash = is_clash ^ turned[f] ^ turned[g]
+        n_clash = np.bincount(f[clash], minlength=m) + np.bincount(g[clash], minlength=m)
+        wants = 2 * n_clash > degree
+        both = wants[f] & wants[g]
+        wants[np.maximum(f[both], g[both])] = False
+        if not wants.any():
+            return turned
+        turned = turned ^ wants
+
+
+def clashing(faces: Ints) -> Bools:
+    """Tell for each face (m,) whether its orientation clashes with that of a neighbour."""
+    f, g, is_clash = _neighbours(faces)
+    result = np.zeros(len(faces), dtype=bool)
+    result[f[is_clash]] = result[g[is_clash]] = True
+    return result
+
+
+def overused(faces: Ints) -> Bools:
+    """Tell for each face (m,) whether it shares an edge with two others or more."""
+    edges = edges_of(faces)
+    result = np.zeros(len(faces), dtype=bool)
+    result[edges.face[np.repeat(edges.n_uses > 2, edges.n_uses)]] = True
+    return result
+
+
+def inner_sheets(vertices: Floats, faces: Ints) -> Bools:
+    """Tell for each face (m,) whether it belongs to a sheet that hangs inside the surface.
+
+    Where an odd number of patches meets along an edge, one of them is a fin or a membrane across the lumen. It is the
+    one of least area: a membrane is smaller than the wall that bulges over the same border.
+    """
+    edges, patch = edges_of(faces), patches(faces)
+    area = np.bincount(patch, triangles.areas(vertices[faces]))
+    is_inner = np.zeros(len(area), dtype=bool)
+    odd = (edges.n_uses > 2) & (edges.n_uses % 2 == 1)
+    for start, count in zip(edges.starts[odd], edges.n_uses[odd], strict=True):
+        meeting = np.unique(patch[edges.face[start : start + count]])
+        if len(meeting) > 1 and not is_inner[meeting].any():
+            is_inner[meeting[np.argmin(area[meeting])]] = True
+    return is_inner[patch]
+
+
+def unzipped(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
+    """Give every fan of faces round a vertex a vertex of its own, so that the mesh is a manifold with boundary.
+
+    Faces stay joined across edges that exactly two of them share. At an edge of more, the faces that bound the same
+    wedge of the inside stay joined and every other face is cut off. Faces must be oriented.
+    """
+    m = len(faces)
+    edges = edges_of(faces)
+    first = edges.starts[edges.n_uses == 2]
+    a, b = [first], [first + 1]
+    for start, count in zip(edges.starts[edges.n_uses > 2], edges.n_uses[edges.n_uses > 2], strict=True):
+        pairs = _wedges(vertices, faces, edges, np.arange(start, start + count))
+        a.append(pairs[:, 0])
+        b.append(pairs[:, 1])
+    use, other = np.concatenate(a), np.concatenate(b)
+    # corners are numbered corner * m + face; an agreeing neighbour runs the edge the other way round
+    tail, head = edges.side * m + edges.face, (edges.side + 1) % 3 * m + edges.face
+    agree = edges.is_upward[use] != edges.is_upward[other]
+    use, other = use[agree], other[agree]
+    label = _components(3 * m, np.concatenate([tail[use], head[use]]), np.concatenate([head[other], tail[other]]))
+    _, where = np.unique(label, return_index=True)
+    number = faces.T.ravel()[where].astype(np.int64)  # the first fan of a vertex keeps its number, others are appended
+    order = np.argsort(number, kind="stable")
+    is_more = np.concatenate([[False], np.diff(number[order]) == 0])[: len(order)]
+    more = order[is_more]
+    vertices = np.concatenate([vertices, vertices[number[more]]])
+    number[more] = len(vertices) - len(more) + np.arange(len(more))
+    return vertices, number[label].reshape(3, m).T.astype(np.int32)
+
+
+def _wedges(vertices: Floats, faces: Ints, edges: Edges, uses: Labels) -> Labels:
+    """Pairs (k, 2) of uses of one edge that bound the same wedge of the inside.
+
+    Going round the edge, the inside is entered through one face and left through the next one of opposite direction.
+    """
+    face, side = edges.face[uses], edges.side[uses]
+    up = edges.is_upward[uses]
+    ends = np.sort([faces[face[0], side[0]], faces[face[0], (side[0] + 1) % 3]])
+    along = vertices[ends[1]] - vertices[ends[0]]
+    along = along / max(float(np.linalg.norm(along)), 1e-300)
+    apex = vertices[faces[face, (side + 2) % 3]] - vertices[ends[0]]
+    apex = apex - (apex @ along)[:, None] * along
+    e1 = apex[0] / max(float(np.linalg.norm(apex[0])), 1e-300)
+    angle = np.arctan2(apex @ np.cross(along, e1), apex @ e1)
+    order = np.argsort(angle, kind="stable")
+    following = np.roll(order, -1)
+    # seen along the edge, angles grow counter-clockwise; the outward normal of an upward face looks to larger angles,
+    # so the inside begins at a downward face and ends at the next upward one
+    is_wedge = ~up[order] & up[following]
+    return np.stack([uses[order[is_wedge]], uses[following[is_wedge]]], axis=1)
+
+
+def least_area(polygon: Floats, is_taken: Bools) -> Ints | None:
+    """Triangles (n - 2, 3) of least total area over a closed polygon (n, 3), oriented as it runs.
+
+    Pairs of vertices that `is_taken` (n, n) get no chord; None where no triangulation is left.
+
+    Dynamic programming over its chords (Barequet and Sharir 1995, Comput. Aided Geom. Des. 12:207, section 3.2).
+    """
+    n = len(polygon)
+    cost, apex = np.zeros((n, n)), np.zeros((n, n), dtype=np.int32)
+    for span in range(2, n):
+        for i in range(n - span):
+            j, k = i + span, np.arange(i + 1, i + span)
+            area = 0.5 * np.linalg.norm(np.cross(polygon[k] - polygon[i], polygon[j] - polygon[i]), axis=1)
+            total = cost[i, k] + cost[k, j] + area
+            apex[i, j] = k[total.argmin()]
+            cost[i, j] = np.inf if is_taken[i, j] and span < n - 1 else total.min()
+    if n < 3 or not np.isfinite(cost[0, n - 1]):
+        return None
+    faces, chords = [], [(0, n - 1)]
+    while chords:
+        low, high = chords.pop()
+        if high - low > 1:
+            middle = int(apex[low, high])
+            faces.append((low, middle, high))
+            chords += [(low, middle), (middle, high)]
+    return np.array(faces, dtype=np.int32)

@@ -1,0 +1,225 @@
+"""Triangle soups and meshes on bare arrays: areas, normals, volume, loops, caps."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from vstent.kernels.arrays import Floats, Ints
+
+
+def areas(corners: Floats) -> Floats:
+    """Areas (m,) of triangles (m, 3, 3)."""
+    return 0.5 * np.linalg.norm(_crosses(corners), axis=1)
+
+
+def normals(corners: Floats) -> Floats:
+    """Unit normals (m, 3) of triangles (m, 3, 3); zero where degenerate."""
+    cross = _crosses(corners)
+    return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
+
+
+def _crosses(corners: Floats) -> Floats:
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def volume(corners: Floats) -> float:
+    """Enclosed volume of a closed surface of triangles (m, 3, 3), by the divergence theorem about its centroid."""
+    local = corners - corners.reshape(-1, 3).mean(axis=0)
+    return float(np.einsum("ij,ij->", local[:, 0], np.cross(local[:, 1], local[:, 2])) / 6)
+
+
+def vertex_normals(vertices: Floats, faces: Ints) -> Floats:
+    """Angle-weighted unit normals (n, 3) (Baerentzen and Aanaes 2005, IEEE TVCG 11(3), eq. 5)."""
+    corners = vertices[faces]
+    normal = normals(corners)
+    total = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(total, faces[:, k], corner_angles(corners, k)[:, None] * normal)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+
+
+def corner_angles(corners: Floats, k: int) -> Floats:
+    """Interior angle (m,) at corner `k` of triangles (m, 3, 3)."""
+    a = corners[:, (k + 1) % 3] - corners[:, k]
+    b = corners[:, (k + 2) % 3] - corners[:, k]
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ij,ij->i", a, b))
+
+
+def directed_edges(faces: Ints) -> Ints:
+    """All directed edges (3 m, 2), in the order (01 of all faces, 12 of all, 20 of all)."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def open_edges(faces: Ints) -> Ints:
+    """Directed edges (k, 2) that belong to one face only."""
+    edges = directed_edges(faces)
+    low, high = np.sort(edges, axis=1).astype(np.int64).T
+    _, inverse, count = np.unique(low * (high.max(initial=0) + 1) + high, return_inverse=True, return_counts=True)
+    return edges[count[inverse] == 1]
+
+
+def boundary_loops(vertices: Floats, faces: Ints) -> tuple[Ints, ...]:
+    """Closed loops of vertex indices along the open edges, longest perimeter first.
+
+    Each loop runs with the faces beside it (so the hole's cap runs against it). Loops that touch in a vertex are
+    taken apart where they touch.
+    """
+    following: dict[int, list[int]] = {}
+    for a, b in open_edges(faces).tolist():
+        following.setdefault(a, []).append(b)
+    loops: list[list[int]] = []
+    while following:
+        loops.extend(_walk(following))
+    found = [np.array(loop, dtype=np.int32) for loop in loops if len(loop) >= 3]
+    return tuple(sorted(found, key=lambda loop: -perimeter(vertices[loop])))
+
+
+def _walk(following: dict[int, list[int]]) -> list[list[int]]:
+    path = [next(iter(following))]
+    closed: list[list[int]] = []
+    while path and path[-1] in following:
+        ends = following[path[-1]]
+        vertex = ends.pop()
+        if not ends:
+            del following[path[-1]]
+        if vertex in path:
+            start = path.index(vertex)
+            closed.append(path[start:])
+            del path[start + 1 :]
+        else:
+            path.append(vertex)
+    return closed
+
+
+def perimeter(points: Floats) -> float:
+    """Length of the closed polygon through (n, 3) points."""
+    return float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
+
+
+def polygon_area_vector(points: Floats) -> Floats:
+    """Vector area (3,) of the closed polygon through (n, 3) points (Newell): its length is the area if flat."""
+    local = points - points.mean(axis=0)
+    return 0.5 * np.cross(local, np.roll(local, -1, axis=0)).sum(axis=0)
+
+
+def polygon_centroid(points: Floats) -> Floats:
+    """Area centroid (3,) of a nearly flat closed polygon (n, 3)."""
+    mean = points.mean(axis=0)
+    local = points - mean
+    unit = polygon_area_vector(points)
+    unit = unit / max(float(np.linalg.norm(unit)), 1e-300)
+    weight = np.cross(local, np.roll(local, -1, axis=0)) @ unit
+    total = weight.sum()
+    if abs(total) < 1e-300:
+        return mean
+    return mean + ((local + np.roll(local, -1, axis=0)) * weight[:, None]).sum(axis=0) / (3 * total)
+
+
+def cap(vertices: Floats, faces: Ints, loops: Sequence[Ints]) -> tuple[Floats, Ints]:
+    """Close `loops` with fans about their centroids: vertices and faces of the closed mesh."""
+    new_vertices, new_faces = [vertices], [faces]
+    for k, loop in enumerate(loops):
+        center = len(vertices) + k
+        new_vertices.append(polygon_centroid(vertices[loop])[None])
+        new_faces.append(np.stack([np.roll(loop, -1), loop, np.full_like(loop, center)], axis=1).astype(np.int32))
+    return np.concatenate(new_vertices), np.concatenate(new_faces).astype(np.int32)
+
+
+def compact(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
+    """Drop the vertices that no face uses."""
+    used, inverse = np.unique(faces, return_inverse=True)
+    return vertices[used], inverse.reshape(faces.shape).astype(np.int32)
+
+
+def clip(vertices: Floats, faces: Ints, level: Floats) -> tuple[Floats, Ints, Floats]:
+    """Keep the part of a mesh where `level` (n,) per vertex is negative, cutting faces along level 0 (linear on edges).
+
+    Returns vertices (k, 3), faces (j, 3) and the level at the new vertices (k,); neighbours share the cut vertices.
+    """
+    level = np.where(np.abs(level) < 1e-12, 1e-12, level)
+    inside = level < 0
+    count = inside[faces].sum(axis=1)
+    whole = faces[count == 3]
+    pieces = [whole]
+    cut_edges: list[Ints] = []
+    for n_inside in (1, 2):
+        part = faces[count == n_inside]
+        odd = inside[part] if n_inside == 1 else ~inside[part]
+        rolled = np.take_along_axis(part, (odd.argmax(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+        a, b, c = rolled.T
+        cut_edges.append(np.stack([np.stack([a, b], 1), np.stack([a, c], 1)], axis=1))
+        pieces.append(rolled)
+    ends = np.concatenate([edges.reshape(-1, 2) for edges in cut_edges])
+    unique, inverse = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
+    number = (len(vertices) + inverse.ravel()).astype(np.int32).reshape(-1, 2)
+    u, v = unique.T
+    t = (level[u] / (level[u] - level[v]))[:, None] if len(unique) else np.zeros((0, 1))
+    points = np.concatenate([vertices, vertices[u] + t * (vertices[v] - vertices[u])])
+    levels = np.concatenate([level, np.zeros(len(unique))])
+    n_single = len(pieces[1])
+    single, double = number[:n_single], number[n_single:]
+    corner = np.stack([pieces[1][:, 0], single[:, 0], single[:, 1]], axis=1)
+    _, b, c = pieces[2].T
+    quad = [np.stack([double[:, 0], b, c], axis=1), np.stack([double[:, 0], c, double[:, 1]], axis=1)]
+    kept = np.concatenate([whole, corner, *quad]).astype(np.int32)
+    used, renumbered = np.unique(kept, return_inverse=True)
+    return points[used], renumbered.reshape(kept.shape).astype(np.int32), levels[used]
+
+
+def components(faces: Ints, n_vertices: int) -> Ints:
+    """Connected-component number (m,) of every face, through shared vertices."""
+    edges = directed_edges(faces)
+    graph = coo_matrix((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n_vertices, n_vertices))
+    label = connected_components(graph, directed=False)[1]
+    return label[faces[:, 0]].astype(np.int32)
+
+
+def face_neighbours(faces: Ints) -> Ints:
+    """Pairs (k, 2) of faces that share an edge (an edge of more than two faces pairs them in a chain)."""
+    edges = np.sort(directed_edges(faces), axis=1).astype(np.int64)
+    key = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    owner = np.tile(np.arange(len(faces)), 3)[order]
+    return np.stack([owner[:-1][same], owner[1:][same]], axis=1).astype(np.int32)
+
+
+def sample(vertices: Floats, faces: Ints, most: int = 30_000, coarsest: float = 0.4) -> tuple[Floats, Floats]:
+    """Evenly spread points (k, 3) of a surface and its normals (k, 3) there.
+
+    The spacing is `coarsest`, or less where that makes fewer than `most` points, or more where it makes more. Every
+    point is a vertex or lies on a face; one is kept per cube of the spacing.
+    """
+    corners = vertices[faces]
+    even = float(np.sqrt(areas(corners).sum() / most))
+    spacing = float(np.clip(coarsest, even, 2.0 * even))
+    points, directions = [vertices], [vertex_normals(vertices, faces)]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    level = np.clip(np.ceil(longest / spacing), 1, 64).astype(int)
+    for n in np.unique(level[level > 1]):
+        v, w = (grid.ravel() / n for grid in np.meshgrid(np.arange(n + 1), np.arange(n + 1)))
+        inside = v + w <= 1 + 1e-9
+        weights = np.stack([1 - v - w, v, w], axis=1)[inside]
+        points.append(np.einsum("pk,fkd->fpd", weights, corners[level == n]).reshape(-1, 3))
+        directions.append(np.repeat(normals(corners[level == n]), len(weights), axis=0))
+    every = np.concatenate(points)
+    cube = np.floor((every - every.min(axis=0)) / spacing).astype(np.int64)
+    _, first = np.unique(cube @ np.array([1, 2**20, 2**40]), return_index=True)
+    first = np.sort(first)
+    return every[first], np.concatenate(directions)[first]
+
+
+def part_at(vertices: Floats, faces: Ints, point: Floats) -> tuple[Floats, Ints]:
+    """Vertices and faces of the connected part whose faces come nearest to `point` (3,)."""
+    nearest = np.argmin(np.linalg.norm(vertices[faces].mean(axis=1) - point, axis=1))
+    label = components(faces, len(vertices))
+    return compact(vertices, faces[label == label[nearest]])
+
+
+def largest_part(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
+    """Vertices and faces of the connected part of largest area."""
+    label = components(faces, len(vertices))
+    area = np.bincount(label, areas(vertices[faces]))
+    return compact(vertices, faces[label == np.argmax(area)])

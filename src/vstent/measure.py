@@ -1,0 +1,226 @@
+"""Measure: the aneurysm's morphology, and how a deployed device lies on the wall."""
+
+from typing import Final
+
+import numpy as np
+from scipy.spatial.distance import pdist
+
+from vstent.deploy import APPOSED_GAP_MM
+from vstent.deploy.contour import perimeters
+from vstent.deploy.sizing import landing_diameters_mm, neck_span_mm
+from vstent.device import coverage_fraction, grid, pore_density_per_mm2
+from vstent.kernels import curves, triangles
+from vstent.kernels.arrays import Bools, Floats
+from vstent.stent import Deployment, Stent
+from vstent.units import MM_PER_UM
+from vstent.vessel import Anatomy, Aneurysm
+
+Measures = dict[str, float | str]
+"""Numbers by names that end in their unit; a few names hold words."""
+
+SAMPLES_PER_QUAD: Final = 8
+"""Points per direction at which coverage is tried in every quad of the contour."""
+
+
+def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
+    """Measure how a device lies in its artery.
+
+    Fractions over the "neck" concern the part of the contour that closes the largest aneurysm. Coverage and pore
+    density are measured on the drawn wires; the closed formulas at the same mean diameter stand beside them.
+    """
+    return (
+        _position(anatomy, deployment.stent)
+        | _apposition(anatomy, deployment)
+        | _density(anatomy, deployment.stent)
+        | {
+            "iterations_count": float(len(deployment.terminated_fraction)),
+            "terminated_fraction": float(deployment.terminated_fraction[-1]),
+            "jailed_branches_count": float(_jailed_branches(anatomy, deployment.stent)),
+        }
+    )
+
+
+def _position(anatomy: Anatomy, stent: Stent) -> Measures:
+    proximal_mm, distal_mm = neck_span_mm(anatomy)
+    before_mm, after_mm = proximal_mm - stent.proximal_abscissa_mm, stent.distal_abscissa_mm - distal_mm
+    diameter_mm = perimeters(stent.nodes_mm) / np.pi
+    artery_mm = 2 * np.interp(stent.row_abscissa_mm, anatomy.axis.abscissa_mm, anatomy.section_radius_mm)
+    found: Measures = {
+        "device": stent.design.name,
+        "size": stent.size.label,
+        "label_diameter_mm": stent.size.diameter_mm,
+        "label_length_mm": stent.size.length_mm,
+        "deployed_length_mm": stent.deployed_length_mm,
+        "oversizing_fraction": stent.size.diameter_mm / float(artery_mm.mean()) - 1,
+        "proximal_end_abscissa_mm": stent.proximal_abscissa_mm,
+        "distal_end_abscissa_mm": stent.distal_abscissa_mm,
+        "min_diameter_mm": float(diameter_mm.min()),
+        "mean_diameter_mm": float(diameter_mm.mean()),
+        "max_diameter_mm": float(diameter_mm.max()),
+    }
+    if anatomy.aneurysms:
+        found["neck_to_proximal_end_mm"] = before_mm
+        found["neck_to_distal_end_mm"] = after_mm
+        found["neck_covered_fraction"] = float(before_mm >= 0 and after_mm >= 0)
+    return found
+
+
+def _apposition(anatomy: Anatomy, deployment: Deployment) -> Measures:
+    stent = deployment.stent
+    points_mm = stent.nodes_mm.reshape(-1, 3)
+    surface = anatomy.landing_surface
+    _, distance_mm, face = surface.closest(points_mm)
+    is_wall = ~anatomy.is_restored[surface.faces[face]].all(axis=1)
+    middle_mm = np.repeat(stent.nodes_mm.mean(axis=1), stent.nodes_mm.shape[1], axis=0)
+    outside_mm = np.where(surface.crosses(middle_mm, points_mm), distance_mm, 0.0)
+    gap_mm, area_mm2 = deployment.wall_gap_mm.ravel(), _node_areas_mm2(stent).ravel()
+    return {
+        "apposed_fraction": float((gap_mm[is_wall] < APPOSED_GAP_MM).mean()),
+        "mean_wall_gap_mm": float(gap_mm[is_wall].mean()),
+        "max_wall_gap_mm": float(gap_mm[is_wall].max()),
+        "malapposition_volume_mm3": float((gap_mm * area_mm2)[is_wall].sum()),
+        "max_outside_mm": float(outside_mm.max()),
+    }
+
+
+def quad_areas_mm2(stent: Stent) -> Floats:
+    """Area (rows - 1, columns) of every quad of the contour."""
+    return stent.contour.areas_mm2.reshape(2, len(stent.nodes_mm) - 1, -1).sum(axis=0)
+
+
+def _node_areas_mm2(stent: Stent) -> Floats:
+    quarter = 0.25 * quad_areas_mm2(stent)
+    beside = quarter + np.roll(quarter, 1, axis=1)
+    empty = np.zeros((1, beside.shape[1]))
+    return np.concatenate([beside, empty]) + np.concatenate([empty, beside])
+
+
+def coverage_fractions(stent: Stent) -> Floats:
+    """Part (rows - 1, columns) of every quad of the contour under metal, seen square to the contour."""
+    from vstent.kernels.coverage import covered_fractions  # compiles on first use
+
+    is_last = np.zeros(len(stent.wire_points_mm), dtype=bool)
+    is_last[stent.wire_starts[1:] - 1] = True
+    here = np.flatnonzero(~is_last)
+    radius_mm = 0.5 * np.repeat(stent.wire_diameter_um, np.diff(stent.wire_starts))[here] * MM_PER_UM
+    points_mm = stent.wire_points_mm
+    return covered_fractions(stent.nodes_mm, points_mm[here], points_mm[here + 1], radius_mm, SAMPLES_PER_QUAD)
+
+
+def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats]:
+    """Area (p,) of every whole pore and its center (p, 3).
+
+    Pores sit where the lattice has no junction; each fills half of the four lattice cells around it.
+    """
+    shape = grid(stent.design, stent.size)
+    lattice_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
+    cells = quad_areas_mm2(stent).reshape(
+        shape.lattice_rows - 1, shape.row_split, shape.lattice_columns, shape.column_split
+    )
+    cell_mm2 = cells.sum(axis=(1, 3))
+    pairs = cell_mm2 + np.roll(cell_mm2, 1, axis=1)
+    area_mm2 = 0.5 * (pairs[:-1] + pairs[1:])
+    row, column = np.meshgrid(np.arange(1, shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
+    is_pore = (row + column) % 2 == 1
+    return area_mm2[is_pore], lattice_mm[1:-1][is_pore]
+
+
+def _density(anatomy: Anatomy, stent: Stent) -> Measures:
+    quads_mm = 0.25 * (stent.nodes_mm[1:] + stent.nodes_mm[:-1])
+    quads_mm = (quads_mm + np.roll(quads_mm, -1, axis=1)).reshape(-1, 3)
+    hidden, area_mm2 = coverage_fractions(stent).ravel(), quad_areas_mm2(stent).ravel()
+    pore_mm2, pores_mm = pore_areas_mm2(stent)
+    diameter_mm = float(perimeters(stent.nodes_mm).mean() / np.pi)
+    found: Measures = {
+        "metal_coverage_fraction": float(np.average(hidden, weights=area_mm2)),
+        "metal_coverage_formula_fraction": coverage_fraction(stent.design, stent.size, diameter_mm),
+        "pore_density_per_mm2": float(len(pore_mm2) / pore_mm2.sum()),
+        "pore_density_formula_per_mm2": pore_density_per_mm2(stent.design, stent.size, diameter_mm),
+    }
+    if anatomy.aneurysms:
+        on_neck = is_over_neck(anatomy, quads_mm)
+        if on_neck.any():
+            found["neck_metal_coverage_fraction"] = float(np.average(hidden[on_neck], weights=area_mm2[on_neck]))
+        on_neck = is_over_neck(anatomy, pores_mm)
+        if on_neck.any():
+            found["neck_pore_density_per_mm2"] = float(on_neck.sum() / pore_mm2[on_neck].sum())
+    return found
+
+
+def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
+    """Tell for (n, 3) points on the device whether the landing surface next to them closes the largest aneurysm."""
+    to_neck_mm = anatomy.aneurysms[0].neck.closest(points_mm)[1]
+    return to_neck_mm <= anatomy.landing_surface.closest(points_mm)[1] + 1e-6
+
+
+def _jailed_branches(anatomy: Anatomy, stent: Stent) -> int:
+    """Count the outlets whose centerline leaves the parent artery between the ends of the device."""
+    axis = anatomy.axis
+    count = 0
+    for line in anatomy.vessel.centerlines:
+        foot_mm, distance_mm = curves.project(axis.points_mm, line.points_mm)
+        is_away = distance_mm > np.interp(foot_mm, axis.abscissa_mm, anatomy.section_radius_mm)
+        is_gone = np.logical_and.accumulate(is_away[::-1])[::-1]
+        if is_gone[-1]:
+            left_mm = foot_mm[np.argmax(is_gone)]
+            count += bool(stent.proximal_abscissa_mm <= left_mm <= stent.distal_abscissa_mm)
+    return count
+
+
+def morphology(anatomy: Anatomy) -> Measures:
+    """Measure the largest aneurysm and its parent artery.
+
+    Height, aspect ratio and size ratio as defined by Dhar et al. 2008 (Neurosurgery 63:185): the height is measured
+    square to the neck plane; the size ratio takes the longest distance from the neck's center to the dome; the neck's
+    diameter in the aspect ratio is twice the mean distance from its center to its rim. Volume and area are those of
+    the sac, closed across the neck.
+    """
+    proximal_mm, distal_mm = landing_diameters_mm(anatomy)
+    found: Measures = {"parent_proximal_diameter_mm": proximal_mm, "parent_distal_diameter_mm": distal_mm}
+    if anatomy.aneurysms:
+        found |= _sac(anatomy.aneurysms[0], 0.5 * (proximal_mm + distal_mm))
+    return found
+
+
+def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
+    rim_mm, dome_mm = aneurysm.neck_mm, aneurysm.sac.vertices_mm
+    center_mm = triangles.polygon_centroid(rim_mm)
+    vector_mm2 = triangles.polygon_area_vector(rim_mm)
+    neck_area_mm2 = float(np.linalg.norm(vector_mm2))
+    normal = vector_mm2 / neck_area_mm2 * np.sign((dome_mm.mean(axis=0) - center_mm) @ vector_mm2)
+    height_mm = float(((dome_mm - center_mm) @ normal).max())
+    reach_mm = float(np.linalg.norm(dome_mm - center_mm, axis=1).max())
+    neck_mean_mm = float(2 * np.linalg.norm(rim_mm - center_mm, axis=1).mean())
+    width_mm = _widths_mm(rim_mm, normal)
+    return {
+        "sac_volume_mm3": abs(aneurysm.sac.volume_mm3),
+        "sac_area_mm2": aneurysm.sac.area_mm2 - aneurysm.neck.area_mm2,
+        "sac_height_mm": height_mm,
+        "sac_max_height_mm": reach_mm,
+        "sac_max_diameter_mm": _diameter_mm(dome_mm),
+        "neck_area_mm2": neck_area_mm2,
+        "neck_surface_area_mm2": aneurysm.neck.area_mm2,
+        "neck_perimeter_mm": triangles.perimeter(rim_mm),
+        "neck_min_diameter_mm": float(width_mm.min()),
+        "neck_max_diameter_mm": float(width_mm.max()),
+        "aspect_ratio": height_mm / neck_mean_mm,
+        "size_ratio": reach_mm / parent_diameter_mm,
+    }
+
+
+def _diameter_mm(points_mm: Floats) -> float:
+    """Largest distance between points (n, 3), sought among those that are outermost in 600 directions."""
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(600)
+    z = np.linspace(-1, 1, 600)
+    directions = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+    outermost = np.unique((points_mm @ directions.T).argmax(axis=0))
+    return float(pdist(points_mm[outermost]).max())
+
+
+def _widths_mm(rim_mm: Floats, normal: Floats) -> Floats:
+    """Widths (180,) of a closed curve in every direction of the plane square to `normal`, one per degree."""
+    first = curves.any_perpendicular(normal)
+    second = np.cross(normal, first)
+    angle = np.pi * np.arange(180) / 180
+    along = rim_mm @ (np.outer(first, np.cos(angle)) + np.outer(second, np.sin(angle)))
+    return np.ptp(along, axis=0)

@@ -1,0 +1,182 @@
+"""Find the vessel's ends and open them: open loops, flat caps, and arms that end blind.
+
+A lumen comes from three kinds of sources and ends in three ways: an exported surface is open at its ends or closed by
+flat caps; a surface from a scan is open where the vessel leaves the image, and blunt where the contrast fades.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from vstent.errors import VesselError
+from vstent.kernels import curves, medial, triangles
+from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.surface import Surface
+from vstent.vessel import Opening, Vessel
+
+CAP_ANGLE_RAD: Final = np.radians(6.0)
+"""Neighbouring faces of a flat cap differ by less than this."""
+CAP_RIM_RAD: Final = np.radians(35.0)
+"""Along its rim a cap meets the wall at more than this on average."""
+CAP_RIM_EDGES: Final = 8
+"""A cap's outline has at least this many edges: fewer make a large triangle of a coarse wall, not a cap."""
+CAP_AREA_MM2: Final = 0.3
+"""The smallest cap: a vessel 0.6 mm wide."""
+ARM_SLENDERNESS: Final = 6.0
+"""A blind arm longer than this many of its mean radii is a vessel; shorter ones are sacs and bumps."""
+ARM_SWELLING: Final = 1.35
+"""An arm whose widest sphere exceeds its median by more than this factor near the tip is a sac on a stalk."""
+ARM_SHARE: Final = 0.15
+"""Opening an arm takes off its tip and the twigs on it: no more than this fraction of the wall."""
+ARM_RADIUS_MM: Final = 0.5
+"""Thinner blind arms are left closed: no flow worth computing leaves through them."""
+
+
+def open_ends(vessel: Vessel) -> Vessel:
+    """Return the vessel with its ends cut open and listed: the widest as inlet, the outlets numbered by width.
+
+    Raises
+    ------
+    VesselError
+        When fewer than two ends can be found.
+    """
+    lumen, n_caps = _without_caps(vessel.lumen)
+    notes = [f"{n_caps} flat caps were taken off to open the vessel."] if n_caps else []
+    lumen, n_arms = _with_open_arms(lumen)
+    if n_arms:
+        notes.append(f"{n_arms} arms that end blind were cut open square to their axis.")
+    loops = lumen.boundary_loops
+    if len(loops) < 2:
+        raise VesselError(
+            f"the surface has {len(loops)} openings, but blood needs a way in and a way out: "
+            "cut the vessel open at its ends, or give a longer piece of it"
+        )
+    found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
+    widest = max(found, key=lambda opening: opening.area_mm2)
+    return Vessel(lumen, _named(widest, found), (), (*vessel.notes, *notes))
+
+
+def with_inlet(vessel: Vessel, inlet_mm: Floats) -> Vessel:
+    """Return the vessel with the opening nearest to `inlet_mm` (3,) as its inlet."""
+    nearest = min(vessel.openings, key=lambda opening: float(np.linalg.norm(opening.center_mm - inlet_mm)))
+    return Vessel(vessel.lumen, _named(nearest, list(vessel.openings)), (), vessel.notes)
+
+
+def _opening(loop_mm: Floats) -> Opening:
+    # A loop runs with the faces beside it: seen from outside the opening it runs clockwise.
+    vector = -triangles.polygon_area_vector(loop_mm)
+    area = float(np.linalg.norm(vector))
+    return Opening(triangles.polygon_centroid(loop_mm), vector / max(area, 1e-300), area, "outlet")
+
+
+def _named(inlet: Opening, openings: list[Opening]) -> tuple[Opening, ...]:
+    outlets = sorted((o for o in openings if o is not inlet), key=lambda opening: -opening.area_mm2)
+    roles = ["inlet", *(f"outlet_{k}" for k in range(1, len(outlets) + 1))]
+    return tuple(replace(o, role=role) for o, role in zip([inlet, *outlets], roles, strict=True))
+
+
+def _without_caps(lumen: Surface) -> tuple[Surface, int]:
+    """Take off the flat caps: round patches of coplanar faces that meet the wall in a sharp rim."""
+    pairs = triangles.face_neighbours(lumen.faces)
+    turn = np.arccos(np.clip(np.einsum("ij,ij->i", lumen.normals[pairs[:, 0]], lumen.normals[pairs[:, 1]]), -1, 1))
+    label = _joined(pairs[turn < CAP_ANGLE_RAD], len(lumen.faces))
+    n_patches = int(label.max()) + 1
+    area = np.bincount(label, lumen.areas_mm2)
+    rim = label[pairs[:, 0]] != label[pairs[:, 1]]
+    edges = np.bincount(label[pairs[rim]].ravel(), minlength=n_patches)
+    sharp = np.bincount(label[pairs[rim & (turn > CAP_RIM_RAD)]].ravel(), minlength=n_patches)
+    candidates = np.flatnonzero((area > CAP_AREA_MM2) & (edges >= CAP_RIM_EDGES) & (sharp > 0.8 * edges))
+    is_cap = np.zeros(n_patches, dtype=bool)
+    is_cap[[patch for patch in candidates if _is_disc(lumen, label == patch)]] = True
+    if not is_cap.any():
+        return lumen, 0
+    vertices, faces = triangles.compact(lumen.vertices_mm, lumen.faces[~is_cap[label]])
+    return Surface(vertices, faces), int(is_cap.sum())
+
+
+def _is_disc(lumen: Surface, member: Bools) -> bool:
+    """Tell whether the faces lie in a plane and fill a nearly round outline."""
+    weight = lumen.areas_mm2[member]
+    mean = weight @ lumen.normals[member] / weight.sum()
+    edges = triangles.open_edges(lumen.faces[member])
+    perimeter = np.linalg.norm(np.diff(lumen.vertices_mm[edges], axis=1), axis=2).sum()
+    return bool(np.linalg.norm(mean) > np.cos(CAP_ANGLE_RAD) and 4 * np.pi * weight.sum() > 0.6 * perimeter**2)
+
+
+def _joined(pairs: Ints, n: int) -> Ints:
+    graph = coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def _is_flat(lumen: Surface, member: Bools) -> bool:
+    weight = lumen.areas_mm2[member]
+    mean = weight @ lumen.normals[member] / weight.sum()
+    return float(np.linalg.norm(mean)) > np.cos(CAP_ANGLE_RAD)
+
+
+def _with_open_arms(lumen: Surface) -> tuple[Surface, int]:
+    """Cut open the slender arms that end blind."""
+    loops = np.array([lumen.vertices_mm[loop].mean(axis=0) for loop in lumen.boundary_loops]).reshape(-1, 3)
+    samples, normals = triangles.sample(lumen.vertices_mm, lumen.faces)
+    graph = medial.spheres(samples, normals, Vessel(lumen).closed.tree, loops)
+    graph = medial.keep(graph, graph.radius > ARM_RADIUS_MM)
+    roots = np.asarray(cKDTree(graph.points).query(loops)[1], dtype=np.int32)
+    cuts = [_cut_of(graph.points[path], graph.radius[path]) for path in medial.arms(graph, roots, ARM_SLENDERNESS)]
+    n_cut = 0
+    for cut in cuts:
+        opened = None if cut is None else cut_square(lumen, *cut, ARM_SHARE)
+        if opened is not None:
+            lumen, n_cut = opened, n_cut + 1
+    return Surface(*triangles.largest_part(lumen.vertices_mm, lumen.faces)), n_cut
+
+
+def _cut_of(points_mm: Floats, radius_mm: Floats) -> tuple[Floats, Floats, float] | None:
+    """Where to cut an arm (path from the tree to its tip), where its tip lies, how wide it is; None for a sac."""
+    abscissa = curves.arc_length(points_mm)
+    outside = abscissa > 1.5 * radius_mm[0]
+    if outside.sum() < 3:
+        return None
+    typical = float(np.median(radius_mm[outside]))
+    body = outside & (radius_mm > 0.75 * typical)
+    length = abscissa[body][-1] - abscissa[body][0]
+    outer = body & (abscissa > abscissa[body][0] + 0.5 * length)
+    if length < ARM_SLENDERNESS * typical or radius_mm[outer].max() > ARM_SWELLING * typical:
+        return None
+    end = float(abscissa[body][-1]) - typical
+    center, behind = curves.interpolate(abscissa, points_mm, np.array([end, end - 2 * typical]))
+    return center, (center - behind) / np.linalg.norm(center - behind), typical
+
+
+def cut_square(
+    lumen: Surface, center_mm: Floats, direction: Floats, radius_mm: float, most: float = 1.0
+) -> Surface | None:
+    """Take off the wall beyond the plane through `center_mm` (3,) that hangs together with the section there.
+
+    Parameters
+    ----------
+    lumen : the wall.
+    center_mm, direction : (3,) a point of the plane and its unit normal, out of what is kept.
+    radius_mm : radius of the vessel there.
+    most : nothing is cut if more than this fraction of the wall would come off.
+
+    Returns
+    -------
+    lumen : what is left; None where nothing is cut.
+    """
+    height = (lumen.vertices_mm - center_mm) @ direction
+    distance = np.linalg.norm(lumen.vertices_mm - center_mm, axis=1)
+    beyond = height > 0
+    if not (beyond & (distance < 2.0 * radius_mm)).any():
+        return None
+    edges = triangles.directed_edges(lumen.faces)
+    label = _joined(edges[beyond[edges].all(axis=1)], len(height))
+    tip = beyond & (label == label[np.argmin(np.where(beyond, distance, np.inf))])
+    if tip.mean() > most:
+        return None
+    level = np.where(tip, height, np.minimum(height, -1e-9))
+    vertices, faces, _ = triangles.clip(lumen.vertices_mm, lumen.faces, level)
+    return Surface(vertices, faces)

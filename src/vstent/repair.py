@@ -1,0 +1,210 @@
+"""Repair: a surface as it comes from a file -> one oriented manifold whose open loops are the vessel's ends."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from vstent.errors import VesselError
+from vstent.kernels import topology, triangles
+from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.surface import Surface
+
+WELD_OF_EXTENT: Final = 1e-6
+"""Vertices closer than this fraction of the bounding box's diagonal are one."""
+ALWAYS_HOLE_OF_DIAMETER: Final = 0.1
+"""Loops shorter round than a circle of this fraction of the vessel's mean diameter are holes."""
+WALL_HOLE_OF_DIAMETER: Final = 0.5
+"""Loops up to this size are holes where the wall lies in the plane of the loop (at an end it stands on that plane)."""
+SLIT_ROUNDNESS: Final = 0.4
+"""Loops of less area than this fraction of the circle as long as they are slits: no artery is cut so."""
+LONGEST_PATCHED: Final = 120
+"""Holes of more vertices are closed by a fan: the better patch costs the cube of their number."""
+NOTABLE_OF_AREA: Final = 0.02
+"""Components dropped are told one by one from this fraction of the area on."""
+
+
+def repair(surface: Surface) -> tuple[Surface, tuple[str, ...]]:
+    """Make a sound surface of a faulty one, and say what was done.
+
+    Duplicate vertices are welded, degenerate and duplicate faces dropped, faces turned to agree and then outward,
+    non-manifold edges and vertices cut apart, the component of largest area kept, holes in the wall filled. Nothing is
+    moved. The result is a manifold with boundary, outward oriented; its open loops are the vessel's ends.
+
+    Parameters
+    ----------
+    surface : any triangles, in mm.
+
+    Returns
+    -------
+    surface : the repaired one.
+    notes : one sentence for each thing that was done; empty for a sound surface.
+
+    Raises
+    ------
+    VesselError
+        Nothing is left of the surface.
+    """
+    mesh = _once(_Mesh(surface.vertices_mm, surface.faces, ()))
+    if mesh.notes:  # filling a hole that a pinched vertex runs through leaves needles: a second pass finds them
+        mesh = _Mesh(*_once(_Mesh(mesh.vertices, mesh.faces, ())).geometry, mesh.notes)
+    vertices, faces = triangles.compact(mesh.vertices, mesh.faces)
+    return Surface(vertices, faces), mesh.notes
+
+
+@dataclass(frozen=True, eq=False)
+class _Mesh:
+    vertices: Floats
+    faces: Ints
+    notes: tuple[str, ...]
+
+    @property
+    def geometry(self) -> tuple[Floats, Ints]:
+        """Vertices and faces."""
+        return self.vertices, self.faces
+
+    def after(self, vertices: Floats, faces: Ints, note: str = "") -> "_Mesh":
+        """Return the mesh after a step, with what the step did."""
+        return _Mesh(vertices, faces, (*self.notes, note) if note else self.notes)
+
+
+def _once(mesh: _Mesh) -> _Mesh:
+    for step in (_welded, _cleaned, _opened, _turned, _unzipped, _largest, _outward, _filled):
+        mesh = step(mesh)
+        if len(mesh.faces) < 4:
+            raise VesselError("No surface is left after repair: its faces are all degenerate or loose; check the file.")
+    return mesh
+
+
+def _count(n: int, one: str, many: str = "") -> str:
+    return f"{n} {one if n == 1 else many or one + 's'}"
+
+
+def _welded(mesh: _Mesh) -> _Mesh:
+    vertices, faces = triangles.compact(mesh.vertices, mesh.faces)
+    extent = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    welded, faces = topology.weld(vertices, faces, WELD_OF_EXTENT * extent)
+    n = len(vertices) - len(welded)
+    note = (
+        f"{_count(n, 'duplicate vertex', 'duplicate vertices')} welded (closer than {WELD_OF_EXTENT * extent:.1g} mm)."
+    )
+    return mesh.after(welded, faces, note if n else "")
+
+
+def _cleaned(mesh: _Mesh) -> _Mesh:
+    ordered = np.sort(mesh.faces, axis=1)
+    is_degenerate = (ordered[:, :-1] == ordered[:, 1:]).any(axis=1)
+    is_sound = topology.sound_faces(mesh.faces)
+    n_degenerate = int(is_degenerate.sum())
+    n_duplicate = int((~is_sound).sum()) - n_degenerate
+    done = [_count(n_duplicate, "duplicate face")] * (n_duplicate > 0)
+    done += [_count(n_degenerate, "degenerate face")] * (n_degenerate > 0)
+    return mesh.after(mesh.vertices, mesh.faces[is_sound], f"{' and '.join(done)} dropped." if done else "")
+
+
+def _opened(mesh: _Mesh) -> _Mesh:
+    """Drop membranes across the lumen, and fins."""
+    total = 0
+    faces = mesh.faces
+    while (is_inner := topology.inner_sheets(mesh.vertices, faces)).any():
+        faces = faces[~is_inner]
+        total += int(is_inner.sum())
+    return mesh.after(
+        mesh.vertices, faces, f"{_count(total, 'face')} of sheets inside the lumen dropped." if total else ""
+    )
+
+
+def _turned(mesh: _Mesh) -> _Mesh:
+    faces, turned = topology.oriented(mesh.faces)
+    n = int(turned.sum())
+    mesh = mesh.after(mesh.vertices, faces, f"{_count(n, 'face')} turned to agree with their neighbours." if n else "")
+    is_clash = topology.clashing(faces)
+    n = int(is_clash.sum())
+    note = f"{_count(n, 'face')} dropped that no orientation fits."
+    return mesh.after(mesh.vertices, faces[~is_clash], note if n else "")
+
+
+def _unzipped(mesh: _Mesh) -> _Mesh:
+    n_edges = int((topology.edges_of(mesh.faces).n_uses > 2).sum())
+    vertices, faces = topology.unzipped(mesh.vertices, mesh.faces)
+    while (is_bad := topology.overused(faces)).any():
+        vertices, faces = topology.unzipped(vertices, faces[~is_bad])
+    n_vertices, n_faces = len(np.unique(faces)) - len(np.unique(mesh.faces)), len(mesh.faces) - len(faces)
+    what = _count(n_edges, "non-manifold edge") if n_edges else "Pinched vertices"
+    dropped = f", {_count(n_faces, 'face')} dropped" if n_faces else ""
+    note = f"{what} cut apart ({_count(n_vertices, 'vertex', 'vertices')} doubled{dropped})."
+    return mesh.after(vertices, faces, note if n_edges or n_vertices > 0 else "")
+
+
+def _largest(mesh: _Mesh) -> _Mesh:
+    label = topology.face_components(mesh.faces)
+    area = np.bincount(label, triangles.areas(mesh.vertices[mesh.faces]))
+    order = np.argsort(-area)
+    if len(area) <= 1:
+        return mesh
+    notable = [f"{a:.1f} mm2" for a in area[order[1:]] if a > NOTABLE_OF_AREA * area.sum()]
+    note = f"{_count(len(area) - 1, 'loose piece')} dropped ({area[order[0]] / area.sum():.1%} of the area kept)"
+    note += f", the notable of {', '.join(notable)}." if notable else "."
+    return mesh.after(mesh.vertices, mesh.faces[label == order[0]], note)
+
+
+def _outward(mesh: _Mesh) -> _Mesh:
+    vertices, faces = triangles.cap(mesh.vertices, mesh.faces, triangles.boundary_loops(mesh.vertices, mesh.faces))
+    if triangles.volume(vertices[faces]) >= 0:
+        return mesh
+    return mesh.after(mesh.vertices, mesh.faces[:, ::-1], "The surface was inside out; all faces turned.")
+
+
+def _filled(mesh: _Mesh) -> _Mesh:
+    loops = triangles.boundary_loops(mesh.vertices, mesh.faces)
+    vertices, faces = triangles.cap(mesh.vertices, mesh.faces, loops)
+    diameter = 4 * triangles.volume(vertices[faces]) / float(triangles.areas(mesh.vertices[mesh.faces]).sum())
+    wall_normal = triangles.vertex_normals(mesh.vertices, mesh.faces)
+    holes = [loop for loop in loops if _is_hole(mesh.vertices[loop], wall_normal[loop], diameter)]
+    if not holes:
+        return mesh
+    widest = max(triangles.perimeter(mesh.vertices[loop]) for loop in holes) / np.pi
+    filled_vertices, filled_faces = mesh.vertices, mesh.faces
+    for loop in holes:
+        filled_vertices, filled_faces = _fill(filled_vertices, filled_faces, loop)
+    note = f"{_count(len(holes), 'hole')} in the wall filled (the widest {np.pi * widest:.2g} mm round)."
+    return mesh.after(filled_vertices, filled_faces, note)
+
+
+def _is_hole(points: Floats, wall_normal: Floats, diameter: float) -> bool:
+    """Tell a hole in the wall from an end: it is tiny, or a slit, or it is small and the wall lies in its plane."""
+    width = triangles.perimeter(points) / np.pi
+    smooth = points if len(points) < 8 else _rounded(_rounded(points))
+    area = triangles.polygon_area_vector(smooth)
+    size = float(np.linalg.norm(area))
+    if (
+        width < ALWAYS_HOLE_OF_DIAMETER * diameter
+        or 4 * np.pi * size < SLIT_ROUNDNESS * triangles.perimeter(smooth) ** 2
+    ):
+        return True
+    return width < WALL_HOLE_OF_DIAMETER * diameter and float(np.abs(wall_normal @ area).mean()) > 0.7 * size
+
+
+def _rounded(points: Floats) -> Floats:
+    """Take the teeth off a closed polygon (n, 3)."""
+    return 0.25 * (np.roll(points, 1, axis=0) + 2 * points + np.roll(points, -1, axis=0))
+
+
+def _fill(vertices: Floats, faces: Ints, loop: Ints) -> tuple[Floats, Ints]:
+    """Close a loop with the vertices it has; with a fan about its centroid where it is very long or that cannot be."""
+    ring = loop[::-1]
+    patch = None if len(ring) > LONGEST_PATCHED else topology.least_area(vertices[ring], _joined(faces, ring))
+    if patch is None:
+        return triangles.cap(vertices, faces, [loop])
+    return vertices, np.concatenate([faces, ring[patch]]).astype(np.int32)
+
+
+def _joined(faces: Ints, ring: Ints) -> Bools:
+    """Tell for each pair (n, n) of ring vertices whether the mesh has an edge between them already."""
+    place = np.full(faces.max() + 1, -1)
+    place[ring] = np.arange(len(ring))
+    a, b = place[triangles.directed_edges(faces)].T
+    joined = np.zeros((len(ring), len(ring)), dtype=bool)
+    both = (a >= 0) & (b >= 0)
+    joined[a[both], b[both]] = joined[b[both], a[both]] = True
+    return joined

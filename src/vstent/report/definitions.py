@@ -1,0 +1,143 @@
+"""What each number of the metrics means, and who defined it."""
+
+from typing import Final, NamedTuple
+
+
+class Definition(NamedTuple):
+    """The words for one metric."""
+
+    name: str
+    """Name for people."""
+    meaning: str
+    """One sentence."""
+    source: str = ""
+    """Publication; empty where the meaning says all."""
+
+
+_DHAR: Final = "Dhar et al. 2008, Neurosurgery 63:185"
+
+DEFINITIONS: Final[dict[str, Definition]] = {
+    # the artery and the sac
+    "parent_proximal_diameter_mm": Definition(
+        "Parent diameter, proximal",
+        "Diameter of the circle with the area of the parent artery's section before the neck.",
+    ),
+    "parent_distal_diameter_mm": Definition(
+        "Parent diameter, distal", "Diameter of the circle with the area of the parent artery's section after the neck."
+    ),
+    "sac_volume_mm3": Definition("Sac volume", "Volume of the lumen beyond the neck."),
+    "sac_area_mm2": Definition("Sac wall area", "Area of the sac's wall, without the neck."),
+    "sac_height_mm": Definition("Sac height", "Largest distance of the dome from the neck plane, square to it.", _DHAR),
+    "sac_max_height_mm": Definition(
+        "Sac height, longest", "Longest distance from the neck's center to the dome.", _DHAR
+    ),
+    "sac_max_diameter_mm": Definition("Sac diameter, largest", "Largest distance between two points of the sac."),
+    "neck_area_mm2": Definition("Neck area", "Area of the neck curve projected on its own mean plane."),
+    "neck_surface_area_mm2": Definition("Neck surface", "Area of the restored wall that closes the neck."),
+    "neck_perimeter_mm": Definition("Neck perimeter", "Length of the neck curve."),
+    "neck_min_diameter_mm": Definition("Neck width, smallest", "Smallest width of the neck curve in its mean plane."),
+    "neck_max_diameter_mm": Definition("Neck width, largest", "Largest width of the neck curve in its mean plane."),
+    "aspect_ratio": Definition("Aspect ratio", "Sac height divided by the mean diameter of the neck.", _DHAR),
+    "size_ratio": Definition("Size ratio", "Longest sac height divided by the parent artery's diameter.", _DHAR),
+    # the device
+    "label_diameter_mm": Definition("Diameter on the label", "Diameter the device is sold as."),
+    "label_length_mm": Definition("Length on the label", "Length the device is sold as."),
+    "deployed_length_mm": Definition(
+        "Deployed length", "Length along the parent axis between the ends; the wires keep their own length."
+    ),
+    "oversizing_fraction": Definition(
+        "Oversizing", "Label diameter divided by the artery's mean diameter where the device lies, less one."
+    ),
+    "proximal_end_abscissa_mm": Definition(
+        "Proximal end", "Where the device begins, along the parent axis from the inlet."
+    ),
+    "distal_end_abscissa_mm": Definition("Distal end", "Where the device ends, along the parent axis from the inlet."),
+    "min_diameter_mm": Definition(
+        "Deployed diameter, smallest", "Smallest perimeter of a row of the device, divided by pi."
+    ),
+    "mean_diameter_mm": Definition("Deployed diameter, mean", "Mean perimeter of the device's rows, divided by pi."),
+    "max_diameter_mm": Definition(
+        "Deployed diameter, largest", "Largest perimeter of a row of the device, divided by pi."
+    ),
+    "neck_to_proximal_end_mm": Definition(
+        "Landing zone, proximal", "Length of device before the neck, along the parent axis."
+    ),
+    "neck_to_distal_end_mm": Definition(
+        "Landing zone, distal", "Length of device after the neck, along the parent axis."
+    ),
+    "neck_covered_fraction": Definition(
+        "Neck spanned", "100 % where the device begins before the neck and ends after it."
+    ),
+    "apposed_fraction": Definition(
+        "Apposed", "Part of the device's nodes beside the patient's own wall that are nearer to it than 0.1 mm."
+    ),
+    "mean_wall_gap_mm": Definition("Wall gap, mean", "Mean clearance between the device's outer face and the wall."),
+    "max_wall_gap_mm": Definition(
+        "Wall gap, largest", "Largest clearance between the device's outer face and the wall."
+    ),
+    "malapposition_volume_mm3": Definition(
+        "Malapposition volume", "Volume between the device's outer face and the wall."
+    ),
+    "max_outside_mm": Definition(
+        "Outside the artery, largest", "Largest distance of a node beyond the landing surface; a good deployment has 0."
+    ),
+    "metal_coverage_fraction": Definition(
+        "Metal coverage", "Part of the device's surface under wires, measured on the wires as they lie."
+    ),
+    "metal_coverage_formula_fraction": Definition(
+        "Metal coverage, formula",
+        "At the mean deployed diameter: 1 - (1 - f)² for crossing wires, f the part that the wires of one hand cover; "
+        "2 f for struts that meet without crossing.",
+    ),
+    "neck_metal_coverage_fraction": Definition(
+        "Metal coverage on the neck", "Part of the device over the neck under wires."
+    ),
+    "pore_density_per_mm2": Definition(
+        "Pore density", "Pores per area of the device, measured on the wires as they lie."
+    ),
+    "pore_density_formula_per_mm2": Definition(
+        "Pore density, formula",
+        "At the mean deployed diameter D, for n wires at the angle a to the axis: 2 (n/2)² tan(a) / (pi D)².",
+    ),
+    "neck_pore_density_per_mm2": Definition("Pore density on the neck", "Pores per area of the device over the neck."),
+    "iterations_count": Definition("Iterations", "Steps of the active contour until it stopped (the paper needs 7)."),
+    "terminated_fraction": Definition(
+        "Nodes terminated", "Part of the nodes that reached the wall or the free diameter; the contour stops at 99 %."
+    ),
+    "jailed_branches_count": Definition("Jailed branches", "Branches that leave the artery between the device's ends."),
+    # the flow
+    "inlet_flow_mL_s": Definition("Inlet flow", "Blood that enters through the inlet."),
+    "outlet_flow_mL_s": Definition("Outlet flow", "Blood that leaves through the outlet."),
+    "neck_inflow_mL_s": Definition(
+        "Neck inflow", "Integral over the neck of the velocity into the sac, where it points in."
+    ),
+    "turnover_time_s": Definition("Turnover time", "Sac volume divided by neck inflow."),
+    "mean_sac_speed_m_s": Definition(
+        "Mean sac speed",
+        "Mean over the sac's volume of the magnitude of the velocity; flow diversion that lowers it by 35 % or more has "
+        "been associated with occlusion.",
+    ),
+    "sac_mean_wall_shear_stress_Pa": Definition(
+        "Wall shear stress on the sac, mean", "Area mean over the sac's wall of the magnitude of the wall shear stress."
+    ),
+    "sac_max_wall_shear_stress_Pa": Definition(
+        "Wall shear stress on the sac, largest", "Largest magnitude of the wall shear stress on the sac's wall."
+    ),
+    "parent_mean_wall_shear_stress_Pa": Definition(
+        "Wall shear stress on the parent artery, mean", "Area mean of its magnitude over the parent artery's own wall."
+    ),
+    "sac_low_shear_area_fraction": Definition(
+        "Low shear area", "Part of the sac's wall with a wall shear stress below 0.4 Pa."
+    ),
+    "sac_mean_pressure_Pa": Definition("Sac pressure, mean", "Mean over the sac's volume, above that of the outlets."),
+    "fast_sac_volume_fraction": Definition("Fast sac volume", "Part of the sac's volume with a speed above 8 cm/s."),
+}
+
+HEADLINES: Final = (
+    "neck_inflow_mL_s",
+    "mean_sac_speed_m_s",
+    "turnover_time_s",
+    "sac_mean_wall_shear_stress_Pa",
+    "sac_low_shear_area_fraction",
+)
+"""The numbers for the first screen, the most telling first."""

@@ -1,0 +1,177 @@
+"""The page itself: what goes where."""
+
+import base64
+import hashlib
+from collections.abc import Iterable
+from importlib.resources import files
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from markupsafe import Markup
+
+from vstent.report.definitions import HEADLINES, Definition
+from vstent.report.figures import pictures
+from vstent.report.packing import pack
+from vstent.report.quantities import Change, Quantity, compare, flatten, format_change
+from vstent.report.scene import BARE, device_title, scene_of
+from vstent.stent import Deployment
+
+if TYPE_CHECKING:
+    from vstent.study import CaseResult
+
+LIMITS = (
+    "The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way: "
+    "how an artery and a device push each other is not computed.",
+    "Blood is Newtonian and the wall rigid; the pressure at the outlets was set, not measured in a patient.",
+    "In the flow a device is a thin resistance computed from its wires, unless the settings say otherwise.",
+    "Research use only. Nothing here has been cleared for diagnosis or treatment.",
+)
+
+
+def report(case: "CaseResult") -> str:
+    """Return the report of a case as the text of one HTML file.
+
+    The file asks nothing of a network (its content security policy forbids it), carries no field of a patient's record,
+    and stays below 10 MB: surfaces are thinned and quantised.
+    """
+    from jinja2 import Environment, PackageLoader
+
+    scene = scene_of(case)
+    metrics = case.metrics
+    rows = compare(metrics)
+    manifest, scene_bytes = pack(scene, _pane_notes(rows))
+    scripts = {"viewer": _script("viewer.js"), "start": _script("start.js")}
+    environment = Environment(loader=PackageLoader("vstent.report", "assets"), autoescape=True)
+    devices = scene.panes[1:]
+    return environment.get_template("report.html.j2").render(
+        name=case.name,
+        sections=_sections(case),
+        script_hashes=Markup(" ".join(_hash(script) for script in scripts.values())),
+        style=Markup(_asset("report.css") + _asset("viewer.css")),
+        **{name: Markup(script) for name, script in scripts.items()},
+        devices=devices,
+        change=format_change,
+        summary=_headlines(rows),
+        pictures=[_picture(picture) for picture in pictures(scene)],
+        vessel=flatten(metrics.get("vessel", {}), ("vessel",)),
+        stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
+        flow=rows,
+        flow_only=_flow_only(metrics, rows, dict(devices)),
+        other=_other(metrics),
+        notes=case.notes,
+        limits=LIMITS,
+        definitions=_definitions(flatten(metrics)),
+        provenance=_provenance(case.provenance),
+        manifest=manifest,
+        scene_bytes=scene_bytes,
+    )
+
+
+def _asset(name: str) -> str:
+    return files("vstent.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def _script(name: str) -> str:
+    return _asset(name).replace("</script", "<\\/script")
+
+
+def _hash(script: str) -> str:
+    """Return the script's source expression for a content security policy: only this very text may run."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
+
+
+def _sections(case: "CaseResult") -> list[tuple[str, str]]:
+    titles = {"summary": "Summary", "scene": "3-D view", "pictures": "Pictures", "anatomy": "Anatomy"}
+    if case.deployments:
+        titles["devices"] = "Devices"
+    if case.metrics.get("bare"):
+        titles["flow"] = "Blood flow"
+    titles |= {"notes": "Notes and limits", "definitions": "Definitions", "provenance": "How this was made"}
+    return list(titles.items())
+
+
+def _picture(picture: Any) -> dict[str, str]:
+    words = {"id": picture.id, "title": picture.title, "caption": picture.caption}
+    return {**words, "base64": base64.b64encode(picture.png).decode("ascii")}
+
+
+def _headlines(rows: list[Change]) -> list[Change]:
+    """Choose the rows for the first screen: the known headlines, or the first eight where none was measured."""
+    chosen = [row for key in HEADLINES for row in rows if row.before.key == key]
+    return chosen or rows[:8]
+
+
+def _pane_notes(rows: list[Change]) -> dict[str, str]:
+    """One line per pane: the first headline, and by how much it changed."""
+    for row in _headlines(rows)[:1]:
+        notes = {BARE: f"{row.before.name} {row.before.text}"}
+        for name, after in row.after.items():
+            notes[name] = f"{after.name} {after.text} ({format_change(row.before.value, after.value)})"
+        return notes
+    return {}
+
+
+def _stent(name: str, deployment: Deployment, metrics: dict[str, Any]) -> dict[str, Any]:
+    stent = deployment.stent
+    measured = metrics.get("stents", {}).get(name, {})
+    values = flatten(measured.get("deployment", {}), ("stents", name, "deployment"))
+    diameters = ", ".join(f"{d:g}" for d in np.unique(stent.wire_diameter_um))
+    wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
+    how = "terminated" if deployment.outcome == "terminated" else "stopped at its limit"
+    steps = len(deployment.terminated_fraction)
+    return {
+        "title": device_title(deployment),
+        "words": f"{wires}. The contour {how} after {steps} iterations, in {deployment.seconds:.2f} s.",
+        "advice": deployment.advice,
+        "quantities": values,
+        "facts": stent.design.facts,
+    }
+
+
+def _flow_only(metrics: dict[str, Any], rows: list[Change], titles: dict[str, str]) -> list[tuple[str, list[Quantity]]]:
+    """Flow results without a partner on the other side, and ratios, by pane."""
+    paired = {row.before.path for row in rows}
+    found = [("Before", [q for q in flatten(metrics.get("bare", {}), ("bare", "")) if q.path[2:] not in paired])]
+    for name, stent in metrics.get("stents", {}).items():
+        values = [q for q in flatten(stent.get("flow", {}), ("flow", name)) if q.path[2:] not in paired]
+        found.append((f"{titles.get(name, name)}: after / before", flatten(stent.get("ratios", {}), ("ratios", name))))
+        found.append((titles.get(name, name), values))
+    return [(title, values) for title, values in found if values]
+
+
+def _other(metrics: dict[str, Any]) -> list[Quantity]:
+    """Whatever the metrics hold besides the parts that have a place of their own."""
+    top = {key: value for key, value in metrics.items() if key not in ("vessel", "bare", "stents")}
+    stents = {
+        name: {key: value for key, value in stent.items() if key not in ("deployment", "flow", "ratios")}
+        for name, stent in metrics.get("stents", {}).items()
+    }
+    return flatten(top) + list(flatten(stents))
+
+
+def _definitions(quantities: Iterable[Quantity]) -> list[tuple[Definition, str]]:
+    found = {q.key: (q.definition, q.unit) for q in quantities if q.definition.meaning}
+    return sorted(found.values(), key=lambda pair: pair[0].name.casefold())
+
+
+def _provenance(provenance: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    parts = {key: value for key, value in provenance.items() if isinstance(value, (dict, list, tuple))}
+    single = {key: value for key, value in provenance.items() if key not in parts}
+    groups = [(key.replace("_", " ").capitalize(), _lines(value)) for key, value in parts.items()]
+    return ([("Run", _lines(single))] if single else []) + [group for group in groups if group[1]]
+
+
+def _lines(values: Any) -> list[tuple[str, str]]:
+    return [(" · ".join(q.path).replace("_", " "), _plain(q.value)) for q in flatten(values)]
+
+
+def _plain(value: Any) -> str:
+    """Write a setting as text; of a path only its last part, since folders can carry a patient's name."""
+    if isinstance(value, PurePath) or (isinstance(value, str) and value.startswith("/")):
+        return PurePath(value).name
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_plain(one) for one in value)
+    return "–" if value is None else str(value)

@@ -1,0 +1,110 @@
+"""Restore the parent artery: find the sac, and close its neck and the side branches' ostia.
+
+The paper (Zhong et al. 2016) shrinks the sac by hand ("aneurysm scaling"). Here it is found: the wall that stands out
+of the tubes around all centerlines is a sac where it stands out by more than the artery's own radius. The parent
+artery is then a tube around its own axis (`axis`), its wall the patient's own except across necks and ostia, where it
+is closed by the smoothest surface through the wall around them (`landing`). What of the lumen lies outside that tube
+and holds the sac's dome is the sac (`sac`).
+"""
+
+from functools import reduce
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.errors import InputError, VesselError
+from vstent.kernels import curves
+from vstent.kernels.arrays import Floats
+from vstent.restore.axis import fit_axis
+from vstent.restore.bulges import Bulge, find_bulges
+from vstent.restore.landing import close_landing
+from vstent.restore.sac import cut_sac
+from vstent.restore.tubes import tubes_of
+from vstent.trace import parent_radius_mm
+from vstent.vessel import Anatomy, Aneurysm, Centerline, Vessel
+
+REACH_MM: Final = 10.0
+"""At a fork, the parent artery goes on where the vessel is wider over this length."""
+PASSING: Final = 2.0
+"""A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
+
+__all__ = ["restore"]
+
+
+def restore(vessel: Vessel, *, at_mm: Floats | None = None, outlet_mm: Floats | None = None) -> Anatomy:
+    """Return the anatomy of a traced vessel: parent artery, landing surface, sacs.
+
+    Parameters
+    ----------
+    vessel : a vessel with centerlines.
+    at_mm : (3,) a point near the sac wanted; all sacs otherwise.
+    outlet_mm : (3,) a point near the outlet that the parent artery leads to; the widest way on otherwise.
+
+    Raises
+    ------
+    InputError
+        When nothing stands out of the artery near `at_mm`.
+    VesselError
+        When the vessel has no centerlines.
+    """
+    if not vessel.centerlines:
+        raise VesselError("the vessel has no centerlines: trace it before restoring its parent artery")
+    bulges = find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
+    if at_mm is not None and not bulges:
+        x, y, z = np.asarray(at_mm, dtype=float)
+        raise InputError(f"no sac stands out of the artery near {x:.1f}, {y:.1f}, {z:.1f} mm: give a point in its dome")
+    path = _parent_path(vessel, bulges, outlet_mm)
+    landing = close_landing(vessel.lumen, fit_axis(vessel.lumen, vessel.centerlines[path]))
+    side_lines = [line for k, line in enumerate(vessel.centerlines) if k != path]
+    sacs = [cut_sac(vessel, landing, side_lines, bulge) for bulge in bulges]
+    aneurysms = tuple(sorted((sac for sac in sacs if sac is not None), key=lambda sac: -sac.sac.volume_mm3))
+    return Anatomy(
+        vessel,
+        landing.axis,
+        landing.section_radius_mm,
+        landing.surface,
+        landing.is_restored.ravel(),
+        aneurysms,
+        _notes(vessel, path, aneurysms, len(bulges)),
+    )
+
+
+def _parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -> int:
+    """Number of the centerline that the parent artery follows: past the sac, and at every fork the wider way."""
+    lines = vessel.centerlines
+    if outlet_mm is not None:
+        ends = np.array([opening.center_mm for opening in vessel.outlets])
+        return int(np.argmin(np.linalg.norm(ends - np.asarray(outlet_mm), axis=1)))
+    reach = np.array([_reach(line, bulges[0]) if bulges else 0.0 for line in lines])
+    passing = np.flatnonzero(reach <= max(PASSING, 1.25 * reach.min()))
+    return int(reduce(lambda one, other: one if _is_wider(lines[one], lines[other]) else other, passing))
+
+
+def _reach(line: Centerline, bulge: Bulge) -> float:
+    """Least distance between a centerline and the foot of a bulge, in parent radii; the wall itself is at 1."""
+    radius = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
+    return float((cKDTree(bulge.foot_mm).query(line.points_mm)[0] / radius).min())
+
+
+def _is_wider(one: Centerline, other: Centerline) -> bool:
+    """Tell whether the first of two centerlines is the wider over `REACH_MM` beyond their fork."""
+    return _width_beyond_fork(one, other) >= _width_beyond_fork(other, one)
+
+
+def _width_beyond_fork(line: Centerline, other: Centerline) -> float:
+    distance = curves.project(other.points_mm, line.points_mm)[1]
+    apart = np.flatnonzero(distance > line.inscribed_radius_mm)
+    fork_mm = line.abscissa_mm[apart[0]] if len(apart) else line.length_mm
+    beyond = (line.abscissa_mm >= fork_mm) & (line.abscissa_mm <= fork_mm + REACH_MM)
+    return float(np.median(line.inscribed_radius_mm[beyond]))
+
+
+def _notes(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges: int) -> tuple[str, ...]:
+    outlet = vessel.outlets[path]
+    notes = [f"The parent artery runs from the inlet to {outlet.role} (diameter {outlet.diameter_mm:.1f} mm)."]
+    if not aneurysms:
+        notes.append("No sac was found: the landing surface is the artery's own wall with its side branches closed.")
+    if n_bulges > len(aneurysms) > 0:
+        notes.append(f"{n_bulges - len(aneurysms)} more bulges are flat or hang on other branches: left in the lumen.")
+    return tuple(notes)

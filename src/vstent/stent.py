@@ -1,0 +1,107 @@
+"""The device's nouns once it is in an artery: Landing, Stent, Deployment."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from vstent.device import Design, Size
+from vstent.kernels.arrays import Floats, Ints, freeze
+from vstent.surface import Surface
+
+
+@dataclass(frozen=True, eq=False)
+class Landing:
+    """Where one point of the device is to lie on the parent axis."""
+
+    abscissa_mm: float
+    """Arc length on the parent axis."""
+    anchor: Literal["center", "distal", "proximal"] = "center"
+    """Which point of the device lies there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stent:
+    """A deployed device: its contour and its wires."""
+
+    design: Design
+    """The device, from the catalogue."""
+    size: Size
+    """The size chosen."""
+    nodes_mm: Floats
+    """(rows, columns, 3) the contour's nodes, row 0 proximal; each row runs once round."""
+    row_abscissa_mm: Floats
+    """(rows,) arc length of every row on the parent axis."""
+    wire_points_mm: Floats
+    """(p, 3) axes of all wires or struts, one polyline after another; a laser-cut ring ends in its first point."""
+    wire_starts: Ints
+    """(w + 1,) first point of every polyline, and p at the end."""
+    wire_diameter_um: Floats
+    """(w,) diameter (a laser-cut strut: its width) of every polyline."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "nodes_mm", np.float64, (-1, -1, 3))
+        freeze(self, "row_abscissa_mm", np.float64, (len(self.nodes_mm),))
+        freeze(self, "wire_points_mm", np.float64, (-1, 3))
+        freeze(self, "wire_starts", np.int32, (-1,))
+        freeze(self, "wire_diameter_um", np.float64, (len(self.wire_starts) - 1,))
+
+    @property
+    def contour(self) -> Surface:
+        """The contour as triangles, normals outward; vertex (row, column) is number row * columns + column."""
+        rows, columns = self.nodes_mm.shape[:2]
+        return Surface(self.nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
+
+    @property
+    def proximal_abscissa_mm(self) -> float:
+        """Where the device begins on the parent axis."""
+        return float(self.row_abscissa_mm[0])
+
+    @property
+    def distal_abscissa_mm(self) -> float:
+        """Where the device ends on the parent axis."""
+        return float(self.row_abscissa_mm[-1])
+
+    @property
+    def deployed_length_mm(self) -> float:
+        """Length along the parent axis between the ends."""
+        return self.distal_abscissa_mm - self.proximal_abscissa_mm
+
+
+@dataclass(frozen=True, eq=False)
+class Deployment:
+    """What the active contour did."""
+
+    stent: Stent
+    """The deployed device."""
+    outcome: Literal["terminated", "iteration_limit"]
+    """Whether 99 % of the nodes terminated."""
+    advice: str
+    """One plain sentence: what to know or do about this deployment."""
+    terminated_fraction: Floats
+    """(iterations,) fraction of nodes terminated after every iteration."""
+    seconds: float
+    """Wall time of the deployment."""
+    wall_gap_mm: Floats
+    """(rows, columns) clearance between the device's outer face and the landing surface."""
+    history_mm: Floats
+    """(iterations + 1, rows, columns, 3) contour before the first and after every iteration."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "terminated_fraction", np.float64, (-1,))
+        freeze(self, "wall_gap_mm", np.float64, self.stent.nodes_mm.shape[:2])
+        freeze(self, "history_mm", np.float64, (-1, *self.stent.nodes_mm.shape))
+
+
+def tube_faces(rows: int, columns: int) -> Ints:
+    """Triangles (2 (rows - 1) columns, 3) of a tube of `rows` rings of `columns` vertices.
+
+    Outward when each ring runs counter-clockwise about the direction of growing rows.
+    """
+    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
+    a = row * columns + column
+    b = row * columns + (column + 1) % columns
+    c, d = a + columns, b + columns
+    first = np.stack([a, b, d], axis=-1).reshape(-1, 3)
+    second = np.stack([a, d, c], axis=-1).reshape(-1, 3)
+    return np.concatenate([first, second]).astype(np.int32)

@@ -1,0 +1,79 @@
+"""Surface: a triangle mesh in mm, and the questions one asks of it."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from vstent.kernels import tree, triangles
+from vstent.kernels.arrays import Bools, Floats, Ints, freeze
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A triangle mesh; faces are counter-clockwise seen from outside."""
+
+    vertices_mm: Floats
+    """(n, 3) vertex positions."""
+    faces: Ints
+    """(m, 3) vertex indices."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "vertices_mm", np.float64, (-1, 3))
+        freeze(self, "faces", np.int32, (-1, 3))
+
+    @cached_property
+    def corners_mm(self) -> Floats:
+        """(m, 3, 3) corner positions of every face."""
+        return self.vertices_mm[self.faces]
+
+    @cached_property
+    def areas_mm2(self) -> Floats:
+        """(m,) face areas."""
+        return triangles.areas(self.corners_mm)
+
+    @cached_property
+    def normals(self) -> Floats:
+        """(m, 3) unit face normals, outward; zero for a degenerate face."""
+        return triangles.normals(self.corners_mm)
+
+    @cached_property
+    def vertex_normals(self) -> Floats:
+        """(n, 3) unit vertex normals, angle weighted."""
+        return triangles.vertex_normals(self.vertices_mm, self.faces)
+
+    @property
+    def area_mm2(self) -> float:
+        """Total area."""
+        return float(self.areas_mm2.sum())
+
+    @property
+    def volume_mm3(self) -> float:
+        """Enclosed volume of a closed surface (divergence theorem)."""
+        return triangles.volume(self.corners_mm)
+
+    @cached_property
+    def tree(self) -> tree.Tree:
+        """Bounding-box tree over the faces."""
+        return tree.build(self.vertices_mm, self.faces)
+
+    @cached_property
+    def boundary_loops(self) -> tuple[Ints, ...]:
+        """Vertex loops along the open edges, largest perimeter first; empty for a closed surface."""
+        return triangles.boundary_loops(self.vertices_mm, self.faces)
+
+    def closest(self, points_mm: Floats) -> tuple[Floats, Floats, Ints]:
+        """Return the closest point (n, 3), its distance (n,) in mm and its face (n,) for (n, 3) points."""
+        return tree.closest_points(self.tree, points_mm)
+
+    def signed_distance(self, points_mm: Floats) -> Floats:
+        """Return the distance (n,) in mm of (n, 3) points, negative inside; the surface must be closed."""
+        return tree.signed_distances(self.tree, points_mm)
+
+    def crosses(self, starts_mm: Floats, ends_mm: Floats) -> Bools:
+        """Tell for each segment start -> end, both (n, 3), whether it crosses the surface."""
+        return tree.segments_cross(self.tree, starts_mm, ends_mm)
+
+    def first_hit(self, origins_mm: Floats, directions: Floats) -> Floats:
+        """Return the distance (n,) in mm along (n, 3) unit rays to the first face; inf where there is none."""
+        return tree.first_hits(self.tree, origins_mm, directions)

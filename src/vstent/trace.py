@@ -1,0 +1,135 @@
+"""Trace a vessel: from a wall to openings, centerlines and maximum inscribed spheres.
+
+A centerline is the path from the inlet to an outlet, along the Voronoi vertices inside the lumen, of the shortest
+travel time at the speed of the inscribed radius (Antiga et al. 2003, IEEE Trans. Med. Imaging 22:674; Piccinelli et
+al. 2009, IEEE Trans. Med. Imaging 28:1141). There the wide spheres of a sac attract the path; here the speed is capped
+at `SPEED_CAP` times the radius that the artery has on both sides, so that a sac is not worth a detour.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.ndimage import percentile_filter
+from scipy.spatial import cKDTree
+
+from vstent.errors import VesselError
+from vstent.kernels import curves, medial, triangles
+from vstent.kernels.arrays import Floats, Ints
+from vstent.openings import open_ends, with_inlet
+from vstent.surface import Surface
+from vstent.vessel import Centerline, Opening, Vessel
+
+SPEED_CAP: Final = 1.1
+"""The travel speed is at most this many parent radii."""
+STEP_MM: Final = 0.1
+"""Spacing of centerline points."""
+PARENT_WINDOW_MM: Final = 16.0
+"""The parent radius is a low percentile of the inscribed radii within a window of this length: a neck is shorter."""
+PARENT_PERCENTILE: Final = 35.0
+THIN: Final = 0.3
+"""An outlet narrower than this fraction of the inlet may be left closed where the lumen to it is interrupted."""
+
+
+def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
+    """Return the vessel with its ends opened and a centerline from the inlet to every outlet.
+
+    Parameters
+    ----------
+    vessel : a repaired lumen, open or closed by flat caps, ends found or not.
+    inlet_mm : (3,) a point near the opening to take as inlet; the widest opening otherwise.
+
+    Raises
+    ------
+    VesselError
+        When fewer than two ends are found, or an outlet cannot be reached from the inlet.
+    """
+    vessel = vessel if vessel.openings else open_ends(vessel)
+    if inlet_mm is not None:
+        vessel = with_inlet(vessel, np.asarray(inlet_mm, dtype=np.float64))
+    graph = _graph(vessel)
+    vessel, graph = _reachable(vessel, graph)
+    paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
+    paths = _shortest(vessel, graph, _radius_cap(graph, paths))
+    return replace(vessel, centerlines=tuple(_centerline(vessel.lumen, graph.points[path]) for path in paths))
+
+
+def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
+    """Radius (n,) that the artery has around each point of a path, whatever sac it passes.
+
+    A running low percentile of the inscribed radii (n,), evenly spaced, over `PARENT_WINDOW_MM`.
+    """
+    step = float(abscissa_mm[-1]) / max(len(abscissa_mm) - 1, 1)
+    size = max(3, round(PARENT_WINDOW_MM / step))
+    return np.asarray(percentile_filter(radius_mm, PARENT_PERCENTILE, size=size, mode="nearest"))
+
+
+def _graph(vessel: Vessel) -> medial.Medial:
+    """Build the medial graph; its last vertices are the openings, in their order."""
+    samples, normals = triangles.sample(vessel.lumen.vertices_mm, vessel.lumen.faces)
+    ends = np.array([opening.center_mm for opening in vessel.openings])
+    reach = np.array([0.25 * opening.diameter_mm for opening in vessel.openings])
+    return medial.with_terminals(medial.spheres(samples, normals, vessel.closed.tree, ends), ends, reach)
+
+
+def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Medial]:
+    """Leave thin outlets that the inlet does not reach closed; complain of wide ones."""
+    first = len(graph.points) - len(vessel.openings)
+    cost, _ = medial.shortest_paths(medial.cost_graph(graph, np.full(len(graph.radius), np.inf)), first)
+    is_reached = np.isfinite(cost[first:])
+    lost = [opening for opening, reached in zip(vessel.openings, is_reached, strict=True) if not reached]
+    for opening in lost:
+        if opening.diameter_mm > THIN * vessel.inlet.diameter_mm or is_reached.sum() < 2:
+            raise VesselError(_unreachable(vessel.inlet, opening))
+    kept = np.ones(len(graph.points), dtype=bool)
+    kept[first:] = is_reached
+    notes = tuple(
+        f"{opening.role} ({opening.diameter_mm:.1f} mm) is cut off from the inlet: closed." for opening in lost
+    )
+    openings = tuple(opening for opening in vessel.openings if opening not in lost)
+    return replace(vessel, openings=openings, notes=(*vessel.notes, *notes)), medial.keep(graph, kept)
+
+
+def _radius_cap(graph: medial.Medial, paths: Sequence[Ints]) -> Floats:
+    """Cap (n,) on the travel speed: `SPEED_CAP` times the parent radius of the nearest path point."""
+    points, parents = [], []
+    for path in paths:
+        abscissa = curves.arc_length(graph.points[path])
+        even = np.linspace(0.0, abscissa[-1], max(2, round(abscissa[-1] / STEP_MM)))
+        points.append(curves.interpolate(abscissa, graph.points[path], even))
+        parents.append(parent_radius_mm(even, np.interp(even, abscissa, graph.radius[path])))
+    nearest = cKDTree(np.concatenate(points)).query(graph.points)[1]
+    return SPEED_CAP * np.concatenate(parents)[nearest]
+
+
+def _shortest(vessel: Vessel, graph: medial.Medial, radius_cap: Floats) -> list[Ints]:
+    """Path from the inlet to each outlet, as vertices of the graph."""
+    n_outlets = len(vessel.outlets)
+    inlet = len(graph.points) - n_outlets - 1
+    _, before = medial.shortest_paths(medial.cost_graph(graph, radius_cap), inlet)
+    return [medial.path_to(before, outlet) for outlet in range(inlet + 1, inlet + 1 + n_outlets)]
+
+
+def _unreachable(inlet: Opening, outlet: Opening) -> str:
+    x, y, z = outlet.center_mm
+    return (
+        f"{outlet.role} (diameter {outlet.diameter_mm:.1f} mm at {x:.1f}, {y:.1f}, {z:.1f} mm) is not connected to the "
+        f"inlet (diameter {inlet.diameter_mm:.1f} mm): the lumen is interrupted between them; lower the threshold, "
+        "or cut that part away"
+    )
+
+
+def _centerline(wall: Surface, path_mm: Floats) -> Centerline:
+    points = curves.resample(path_mm, STEP_MM)
+    radius = wall.closest(points)[1]
+    wavelength = 2.0 * float(np.median(radius))
+    # The smoothing passes waves longer than about one diameter: Voronoi vertices jitter on a finer scale.
+    points = curves.smooth(points, _held_ends(len(points)), (wavelength / (2 * np.pi * STEP_MM)) ** 4)
+    return Centerline(points, wall.closest(points)[1])
+
+
+def _held_ends(n: int) -> Floats:
+    weight = np.ones(n)
+    weight[[0, -1]] = 1e6
+    return weight

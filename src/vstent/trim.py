@@ -1,0 +1,76 @@
+"""Trim the vessel to what the device and the flow need: a stated length of artery on both sides of the sac.
+
+A scan shows the whole tree; blood far from the sac costs time and tells nothing. Every way out of the sac's
+neighbourhood is cut square to its centerline where it has run the stated length, branches included.
+"""
+
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.kernels import curves, triangles
+from vstent.kernels.arrays import Floats
+from vstent.openings import cut_square
+from vstent.restore.bulges import Bulge, find_bulges
+from vstent.restore.tubes import tubes_of
+from vstent.surface import Surface
+from vstent.trace import trace
+from vstent.vessel import Centerline, Vessel
+
+UPSTREAM_MM: Final = 35.0
+"""Length of artery kept before the sac: half of the longest device, and five diameters for the flow to develop."""
+DOWNSTREAM_MM: Final = 25.0
+"""Length of every way kept beyond the sac."""
+SPARE_MM: Final = 5.0
+"""Nothing is cut for less than this."""
+STRIDE_MM: Final = 1.0
+"""The direction of a cut is that of the centerline over this length."""
+
+
+def trim(vessel: Vessel, *, at_mm: Floats | None = None) -> Vessel:
+    """Return a traced vessel cut down around its highest sac, or the one near `at_mm` (3,), and traced anew.
+
+    A vessel without a sac, or short enough, is returned as it is.
+    """
+    bulges = find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
+    if not bulges:
+        return vessel
+    lumen, inlet_mm = vessel.lumen, vessel.inlet.center_mm
+    for line, abscissa_mm, sense in _cuts(vessel, bulges[0]):
+        center, ahead = line.at(np.array([abscissa_mm, abscissa_mm + sense * STRIDE_MM]))
+        direction = (ahead - center) / np.linalg.norm(ahead - center)
+        radius = float(np.interp(abscissa_mm, line.abscissa_mm, line.inscribed_radius_mm))
+        shorter = cut_square(lumen, center, direction, radius)
+        if shorter is not None:
+            lumen = Surface(*triangles.part_at(shorter.vertices_mm, shorter.faces, bulges[0].dome_mm))
+            inlet_mm = center if sense < 0 else inlet_mm
+    if lumen is vessel.lumen:
+        return vessel
+    note = f"Trimmed to {UPSTREAM_MM:.0f} mm of vessel before the sac and {DOWNSTREAM_MM:.0f} mm beyond it, cut square."
+    return trace(Vessel(lumen, notes=(*vessel.notes, note)), inlet_mm=inlet_mm)
+
+
+def _cuts(vessel: Vessel, bulge: Bulge) -> list[tuple[Centerline, float, int]]:
+    """Where to cut: a centerline, the abscissa on it, and whether the part behind (-1) or ahead (1) comes off."""
+    foot = cKDTree(bulge.foot_mm)
+    gaps = [np.asarray(foot.query(line.points_mm)[0]) for line in vessel.centerlines]
+    main = int(np.argmin([gap.min() for gap in gaps]))
+    parent = vessel.centerlines[main]
+    sac_mm = float(parent.abscissa_mm[np.argmin(gaps[main])])
+    cuts = [(parent, sac_mm - UPSTREAM_MM, -1)] if sac_mm > UPSTREAM_MM + SPARE_MM else []
+    for line in vessel.centerlines:
+        fork_mm = min(_fork_mm(line, parent), line.length_mm)
+        # A branch that leaves before the sac has run from the sac back to its fork already.
+        abscissa_mm = sac_mm + DOWNSTREAM_MM if fork_mm >= sac_mm else 2 * fork_mm - sac_mm + DOWNSTREAM_MM
+        root_mm = fork_mm + 4.0 * float(np.interp(fork_mm, line.abscissa_mm, line.inscribed_radius_mm))
+        abscissa_mm = max(abscissa_mm, root_mm) if line is not parent else abscissa_mm
+        if line.length_mm > abscissa_mm + SPARE_MM:
+            cuts.append((line, abscissa_mm, 1))
+    return cuts
+
+
+def _fork_mm(line: Centerline, parent: Centerline) -> float:
+    """Abscissa where a centerline leaves the parent's; its length for the parent itself."""
+    apart = np.flatnonzero(curves.project(parent.points_mm, line.points_mm)[1] > line.inscribed_radius_mm)
+    return float(line.abscissa_mm[apart[0]]) if len(apart) else line.length_mm

@@ -1,0 +1,58 @@
+"""Polylines against circles and helices."""
+
+import numpy as np
+
+from vstent.kernels import curves
+
+
+def helix(n: int) -> np.ndarray:
+    t = np.linspace(0, 4 * np.pi, n)
+    return np.stack([3 * np.cos(t), 3 * np.sin(t), 0.5 * t], axis=1)
+
+
+def test_arc_length_converges_at_second_order() -> None:
+    exact = 4 * np.pi * np.hypot(3, 0.5)
+    errors = [abs(curves.arc_length(helix(n))[-1] - exact) for n in (100, 200, 400)]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all((orders > 1.9) & (orders < 2.1))
+
+
+def test_frames_are_orthonormal_and_turn_with_the_known_torsion() -> None:
+    points = helix(2000)
+    frames = curves.parallel_frames(points)
+    np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.tile(np.eye(3), (2000, 1, 1)), atol=1e-9)
+    assert np.all(np.linalg.det(frames) > 0)
+    # A parallel frame turns against the Frenet frame by the integral of the torsion b / (a^2 + b^2).
+    length = curves.arc_length(points)
+    inward = -np.stack([points[:, 0], points[:, 1], np.zeros(2000)], axis=1) / 3
+    angle = np.unwrap(np.arctan2((frames[:, 2] * inward).sum(1), (frames[:, 1] * inward).sum(1)))
+    torsion = 0.5 / (3**2 + 0.5**2)
+    np.testing.assert_allclose(angle[1990] - angle[10], torsion * (length[1990] - length[10]), rtol=1e-3)
+
+
+def test_projection_finds_the_foot_on_a_circle() -> None:
+    t = np.linspace(0, np.pi, 4000)
+    circle = np.stack([5 * np.cos(t), 5 * np.sin(t), 0 * t], axis=1)
+    angle = np.random.default_rng(0).uniform(0.2, 2.9, 50)
+    radius = np.random.default_rng(1).uniform(3, 7, 50)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1)
+    abscissa, distance = curves.project(circle, points)
+    np.testing.assert_allclose(abscissa, 5 * angle, atol=5 * np.pi / 4000)
+    np.testing.assert_allclose(distance, abs(radius - 5), atol=1e-5)
+
+
+def test_smoothing_keeps_what_its_penalty_does_not_see() -> None:
+    x = np.linspace(0, 1, 50)
+    line = np.stack([2 * x, 1 - x], axis=1)
+    np.testing.assert_allclose(curves.smooth(line, np.ones(50), 1e6, order=2), line, atol=1e-6)
+    parabola = x**2
+    np.testing.assert_allclose(curves.smooth(parabola, np.ones(50), 1e6, order=3), parabola, atol=1e-6)
+
+
+def test_smoothing_damps_a_wave_as_its_transfer_function_says() -> None:
+    x = np.arange(2000)
+    for wave in (20.0, 40.0, 80.0):
+        k = 2 * np.pi / wave
+        found = curves.smooth(np.sin(k * x), np.ones(2000), 500.0, order=2)[900:1100]
+        expected = np.sin(k * x[900:1100]) / (1 + 500.0 * (2 * np.sin(k / 2)) ** 4)
+        np.testing.assert_allclose(found, expected, atol=1e-9)

@@ -1,0 +1,137 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from vstent import device, device_schema
+from vstent.device import Braid, LaserCut, Size
+from vstent.errors import DeviceError
+
+
+def braid48(label_angle_deg, *, free_mm=4.0):
+    """48 wires of 30 um with this angle at diameter 4."""
+    at_free = np.arcsin(np.sin(np.radians(label_angle_deg)) * free_mm / 4.0)
+    size = Size(4.0, 20.0, free_mm)
+    return Braid("b48", "B48", ((48, 30.0),), float(at_free), (size,)), size
+
+
+@pytest.mark.parametrize(("angle", "coverage", "pores"), [(60, 0.216, 12.6), (65, 0.253, 15.6), (70, 0.307, 20.0)])
+def test_coverage_and_pore_density_of_48_wires_are_the_published_ones(angle, coverage, pores):
+    design, size = braid48(angle)
+    assert device.coverage_fraction(design, size, 4.0) == pytest.approx(coverage, abs=5e-4)
+    assert device.pore_density_per_mm2(design, size, 4.0) == pytest.approx(pores, abs=0.05)
+
+
+@pytest.mark.parametrize(("diameter", "ratio"), [(3.75, 1.25), (3.5, 1.44), (3.25, 1.60), (3.0, 1.74), (2.5, 1.95)])
+def test_a_narrower_braid_is_longer_by_the_published_ratio(diameter, ratio):
+    design, size = braid48(65)
+    assert device.deployed_length_mm(design, size, diameter) / 20 == pytest.approx(ratio, rel=0.01)
+    assert 1 - device.foreshortening_fraction(design, size, diameter) == pytest.approx(ratio, abs=0.006)
+
+
+def test_the_piece_between_junctions_keeps_its_length_at_every_diameter():
+    design, size = braid48(60, free_mm=4.2)
+    diameter = np.linspace(1.5, 4.2, 30)
+    across = np.pi * diameter / 48
+    assert np.hypot(across, device.row_spacing_mm(design, size, diameter)) == pytest.approx(
+        np.full(30, device.piece_length_mm(design, size)), rel=1e-12
+    )
+
+
+def test_the_free_diameter_bounds_every_formula():
+    design, size = braid48(60, free_mm=4.2)
+    assert device.row_spacing_mm(design, size, 9.0) == device.row_spacing_mm(design, size, 4.2)
+
+
+def test_coverage_sums_the_diameters_of_mixed_wires():
+    one = Braid("a", "A", ((48, 30.0),), 1.0, ())
+    mixed = Braid("b", "B", ((24, 20.0), (24, 40.0)), 1.0, ())
+    size = Size(4, 20, 4.2)
+    assert device.coverage_fraction(mixed, size, 4) == pytest.approx(device.coverage_fraction(one, size, 4), rel=1e-12)
+
+
+def test_silk_and_enterprise_are_those_of_the_paper():
+    silk, enterprise = device.find_design("Silk"), device.find_design("ENTERPRISE")
+    assert isinstance(silk, Braid)
+    assert isinstance(enterprise, LaserCut)
+    assert sorted(silk.wires) == [(8, 50.0), (40, 30.0)]
+    assert silk.n_wires == 48
+    assert enterprise.strut_width_um == 78
+
+
+@pytest.mark.parametrize("design", device.catalogue().values(), ids=device.catalogue())
+def test_every_device_of_the_catalogue_is_sourced_and_possible(design):
+    numbers = {"braid": {"wires", "braid_angle_rad"}, "laser_cut": {"n_columns", "strut_width_um", "cell_angle_rad"}}
+    assert numbers[design.kind] | {"sizes", "free_diameter_margin_mm"} <= {fact.name for fact in design.facts}
+    for size in design.sizes:
+        shape = device.grid(design, size)
+        spacing_mm = device.row_spacing_mm(design, size, size.diameter_mm) / shape.row_split
+        assert spacing_mm <= device.NODE_SPACING_LIMIT_MM
+        assert np.pi * size.diameter_mm / shape.columns <= device.NODE_SPACING_LIMIT_MM
+        assert (shape.rows - 1) % shape.row_split == 0
+        assert 0 < device.coverage_fraction(design, size, size.diameter_mm) < 0.6
+        half_row_mm = 0.5 * shape.row_split * spacing_mm
+        assert abs(device.deployed_length_mm(design, size, size.diameter_mm) - size.length_mm) <= half_row_mm + 1e-9
+
+
+def test_an_unknown_device_is_answered_with_the_nearest_and_the_list():
+    with pytest.raises(DeviceError, match=r"no device called 'silc'\. Did you mean silk\? Choose one of: derivo"):
+        device.find_design("silc")
+
+
+def test_an_unknown_size_is_answered_with_what_there_is():
+    silk = device.find_design("silk")
+    with pytest.raises(DeviceError, match=r"not made in 4\.1 mm: its diameters are 2, 2\.5"):
+        device.find_size(silk, diameter_mm=4.1)
+    with pytest.raises(DeviceError, match=r"not made in 4 mm x 21 mm: in 4 mm its lengths are 15, 20"):
+        device.find_size(silk, diameter_mm=4, length_mm=21)
+    assert device.find_size(silk, diameter_mm=4, length_mm=20) == Size(4.0, 20.0, 4.2)
+
+
+ENTRY = """
+[[device]]
+key = "x"
+name = "X"
+maker = "Y"
+kind = "braid"
+wires = [{ count = 12, diameter_um = 40, source = "here", confidence = "estimated" }]
+braid_angle_rad = { value = 1.0, source = "here", confidence = "estimated" }
+free_diameter_margin_mm = { value = 0.1, source = "here", confidence = "estimated" }
+sizes = [{ diameters_mm = [3, 4], lengths_mm = [10, 20], source = "here", confidence = "cited" }]
+"""
+
+
+def test_a_catalogue_entry_becomes_a_design():
+    design = device_schema.parse(ENTRY)["x"]
+    assert design.sizes == (Size(3, 10, 3.1), Size(3, 20, 3.1), Size(4, 10, 4.1), Size(4, 20, 4.1))
+    assert design.n_columns == 12
+    assert [fact.confidence for fact in design.facts if fact.name == "sizes"] == ["cited"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('source = "here", confidence = "estimated" }]', 'confidence = "estimated" }]', "wires.0.source"),
+        ('confidence = "cited"', 'confidence = "sure"', "confidence"),
+        ("count = 12", "count = 0", "wires.0.count"),
+        ("value = 1.0", "value = -1.0", "braid_angle_rad"),
+        ('maker = "Y"', 'maker = "Y"\nprice = 3', "price"),
+        ("count = 12", "count = 13", "13 wires"),
+        ("[[device]]", "[[device", "not valid TOML"),
+    ],
+)
+def test_a_wrong_catalogue_is_refused_and_the_place_named(old, new, said):
+    assert old in ENTRY
+    with pytest.raises(DeviceError, match=said.replace(".", r"\.")):
+        device_schema.parse(ENTRY.replace(old, new))
+
+
+def test_one_key_for_two_devices_is_refused():
+    with pytest.raises(DeviceError, match="one key for two devices"):
+        device_schema.parse(ENTRY + ENTRY)
+
+
+def test_importing_devices_does_not_load_pydantic():
+    code = "import sys, vstent.device; sys.exit('pydantic' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,374 @@
+import shutil
+
+import numpy as np
+import pydicom
+import pytest
+import SimpleITK
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from vstent.errors import InputError, ReadError, UnitError
+from vstent.image import Image
+from vstent.io.dicom_writer import write_dicom
+from vstent.io.images import read_image
+
+SPACING = np.array([0.21, 0.23, 0.37])
+
+
+@pytest.fixture(scope="module")
+def oblique():
+    """Every voxel another value, another number of voxels and spacing on every axis, axes oblique."""
+    voxels = (np.arange(9 * 8 * 7) * 13 % 2001 - 500).astype(np.int16).reshape(9, 8, 7)
+    affine = np.eye(4)
+    affine[:3, :3] = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix() * SPACING
+    affine[:3, 3] = [-31.25, 12.5, 100.125]
+    return Image(voxels, affine)
+
+
+@pytest.fixture
+def series(oblique, tmp_path):
+    write_dicom(oblique, tmp_path / "series")
+    return tmp_path / "series"
+
+
+def slices(folder):
+    return sorted(folder.glob("*.dcm"))
+
+
+def edited(file, **values):
+    dataset = pydicom.dcmread(file)
+    for keyword, value in values.items():
+        if value is None:
+            delattr(dataset, keyword)
+        else:
+            setattr(dataset, keyword, value)
+    dataset.save_as(file)
+
+
+# -- DICOM -------------------------------------------------------------------------------------------------------------
+
+
+def test_oblique_dicom_series_comes_back_exactly(oblique, series):
+    image = read_image(series)
+    np.testing.assert_array_equal(image.voxels, oblique.voxels)
+    np.testing.assert_allclose(image.affine_mm, oblique.affine_mm, rtol=0, atol=1e-11)
+    assert image.modality == "CT"
+
+
+def test_the_same_image_is_written_in_the_same_bytes(oblique, series, tmp_path):
+    write_dicom(oblique, tmp_path / "again")
+    assert [f.read_bytes() for f in slices(series)] == [f.read_bytes() for f in slices(tmp_path / "again")]
+
+
+def test_itk_reads_the_series_as_we_do(oblique, series):
+    reader = SimpleITK.ImageSeriesReader()
+    reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(series)))
+    scan = reader.Execute()
+    np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(scan).T, oblique.voxels)
+    np.testing.assert_allclose(scan.GetSpacing(), SPACING, atol=1e-6)
+    np.testing.assert_allclose(scan.TransformIndexToPhysicalPoint((8, 7, 6)), oblique.to_mm([[8, 7, 6]])[0], atol=1e-6)
+
+
+def test_order_of_files_names_and_numbers_does_not_matter(oblique, series):
+    order = np.random.default_rng(3).permutation(7)
+    for file, k in zip(slices(series), order, strict=True):
+        edited(file, InstanceNumber=int(order[k]) + 1)
+        file.rename(series / f"{k:02d}_{file.stem}.dcm")
+    np.testing.assert_array_equal(read_image(series).voxels, oblique.voxels)
+
+
+def test_other_files_and_smaller_series_are_passed_over(oblique, series):
+    write_dicom(Image(oblique.voxels[:, :, :4], oblique.affine_mm), series / "scout")
+    (series / "README.txt").write_text("not an image")
+    directory = pydicom.dcmread(slices(series)[0])
+    for keyword in ("Rows", "Columns", "PixelData"):
+        delattr(directory, keyword)
+    directory.SOPClassUID = directory.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.88.11"
+    directory.save_as(series / "report.dcm")
+    image = read_image(series)
+    np.testing.assert_array_equal(image.voxels, oblique.voxels)
+    assert image.notes == ("2 DICOM series found; the one of 7 files taken.",)
+
+
+def test_one_file_stands_for_its_series(oblique, series):
+    write_dicom(Image(oblique.voxels[:, :, :4], oblique.affine_mm), series.parent / "small")
+    for file in slices(series.parent / "small"):
+        shutil.copy(file, series / f"small_{file.name}")
+    assert read_image(series / "small_IM0002.dcm").voxels.shape == (9, 8, 4)
+    assert read_image(series / "IM0002.dcm").voxels.shape == (9, 8, 7)
+
+
+def test_missing_slice_is_refused_with_its_neighbours_named(series):
+    slices(series)[3].unlink()
+    with pytest.raises(ReadError, match=r"1 slice is missing between IM0003\.dcm and IM0005\.dcm"):
+        read_image(series)
+
+
+def test_double_slice_is_refused_with_both_named(series):
+    shutil.copy(series / "IM0002.dcm", series / "copy.dcm")
+    with pytest.raises(ReadError, match=r"(copy\.dcm and IM0002\.dcm|IM0002\.dcm and copy\.dcm) lie at the same place"):
+        read_image(series)
+
+
+def test_slice_at_an_uneven_distance_is_refused(oblique, series):
+    edited(series / "IM0005.dcm", ImagePositionPatient=list(np.round(oblique.to_mm([[0, 0, 4.1]])[0], 8)))
+    with pytest.raises(ReadError, match=r"Slice IM0005\.dcm lies 0\.407 mm after IM0004\.dcm"):
+        read_image(series)
+
+
+def test_slice_shifted_sideways_is_refused(oblique, series):
+    edited(series / "IM0005.dcm", ImagePositionPatient=list(np.round(oblique.to_mm([[2, 0, 4]])[0], 8)))
+    with pytest.raises(ReadError, match=r"Slice IM0005\.dcm lies 0\.420 mm out of line"):
+        read_image(series)
+
+
+def test_a_sheared_series_keeps_its_shear(oblique, series):
+    for k, file in enumerate(slices(series)):
+        edited(file, ImagePositionPatient=list(np.round(oblique.to_mm([[0, 0.5 * k, k]])[0], 8)))
+    expected = oblique.affine_mm[:3, 2] + 0.5 * oblique.affine_mm[:3, 1]
+    np.testing.assert_allclose(read_image(series).affine_mm[:3, 2], expected, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"PixelSpacing": [0.2, 0.2]}, ReadError, "another pixel spacing"),
+        ({"ImageOrientationPatient": [1, 0, 0, 0, 1, 0]}, ReadError, "another orientation"),
+        ({"PixelSpacing": None}, UnitError, "how large its pixels are"),
+        ({"ImagePositionPatient": None}, ReadError, "where it lies"),
+        ({"NumberOfFrames": 3}, ReadError, "run of projections"),
+    ],
+)
+def test_a_slice_unlike_the_others_is_named(series, change, error, words):
+    edited(series / "IM0005.dcm", **change)
+    with pytest.raises(error, match=rf"(?s)IM0005\.dcm.*{words}"):
+        read_image(series)
+
+
+def test_rescale_gives_the_stored_intensities(oblique, series):
+    for k, file in enumerate(slices(series)):
+        edited(file, RescaleSlope=str(1 + 0.5 * (k % 2)), RescaleIntercept="-7")
+    expected = oblique.voxels * (1 + 0.5 * (np.arange(7) % 2)) - 7
+    np.testing.assert_allclose(read_image(series).voxels, expected, rtol=1e-6)
+
+
+def test_compressed_pixels_are_read(oblique, series):
+    for file in slices(series):
+        dataset = pydicom.dcmread(file)
+        dataset.compress(pydicom.uid.RLELossless)
+        dataset.save_as(file)
+    np.testing.assert_array_equal(read_image(series).voxels, oblique.voxels)
+
+
+def test_enhanced_multi_frame_file_is_the_same_volume(oblique, series, tmp_path):
+    from pydicom.dataset import Dataset
+
+    order = [4, 1, 0, 6, 2, 3, 5]
+    whole = pydicom.dcmread(series / "IM0001.dcm")
+    shared, measures, plane, value = Dataset(), Dataset(), Dataset(), Dataset()
+    measures.PixelSpacing, plane.ImageOrientationPatient = whole.PixelSpacing, whole.ImageOrientationPatient
+    value.RescaleSlope, value.RescaleIntercept = "2", "3"
+    shared.PixelMeasuresSequence, shared.PlaneOrientationSequence = [measures], [plane]
+    shared.PixelValueTransformationSequence = [value]
+    frames = []
+    for k in order:
+        position, frame = Dataset(), Dataset()
+        position.ImagePositionPatient = pydicom.dcmread(slices(series)[k]).ImagePositionPatient
+        frame.PlanePositionSequence = [position]
+        frames.append(frame)
+    whole.SharedFunctionalGroupsSequence, whole.PerFrameFunctionalGroupsSequence = [shared], frames
+    whole.NumberOfFrames = len(order)
+    whole.PixelData = oblique.voxels.T[order].astype("<i2").tobytes()
+    for keyword in (
+        "PixelSpacing",
+        "ImagePositionPatient",
+        "ImageOrientationPatient",
+        "RescaleSlope",
+        "RescaleIntercept",
+    ):
+        delattr(whole, keyword)
+    whole.save_as(tmp_path / "enhanced.dcm")
+    image = read_image(tmp_path / "enhanced.dcm")
+    np.testing.assert_array_equal(image.voxels, 2 * oblique.voxels.astype(int) + 3)
+    np.testing.assert_allclose(image.affine_mm, oblique.affine_mm, atol=1e-11)
+
+
+def test_writing_refuses_what_a_series_cannot_hold(oblique, tmp_path):
+    mirrored = Image(oblique.voxels, oblique.affine_mm @ np.diag([1, 1, -1, 1]))
+    with pytest.raises(ValueError, match="right-handed"):
+        write_dicom(mirrored, tmp_path / "a")
+    with pytest.raises(ValueError, match="16 bits"):
+        write_dicom(Image(oblique.voxels.astype(float) * 100, oblique.affine_mm), tmp_path / "a")
+    assert list(tmp_path.iterdir()) == []
+
+
+# -- NIfTI, NRRD, MetaImage --------------------------------------------------------------------------------------------
+
+
+def itk_scan(image):
+    scan = SimpleITK.GetImageFromArray(np.ascontiguousarray(image.voxels.T))
+    scan.SetSpacing([float(v) for v in image.spacing_mm])
+    scan.SetOrigin([float(v) for v in image.affine_mm[:3, 3]])
+    scan.SetDirection([float(v) for v in (image.affine_mm[:3, :3] / image.spacing_mm).ravel()])
+    return scan
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd"])
+def test_headers_keep_the_oblique_frame_in_lps(oblique, tmp_path, suffix):
+    SimpleITK.WriteImage(itk_scan(oblique), str(tmp_path / f"scan{suffix}"))
+    image = read_image(tmp_path / f"scan{suffix}")
+    np.testing.assert_array_equal(image.voxels, oblique.voxels)
+    # NIfTI keeps its frame as single-precision quaternions
+    np.testing.assert_allclose(image.affine_mm, oblique.affine_mm, atol=2e-5 if "nii" in suffix else 1e-9)
+
+
+@pytest.mark.parametrize(("suffix", "line"), [(".mha", b"ElementSpacing"), (".nrrd", b"space directions")])
+def test_header_without_spacing_is_refused_unless_it_is_given(oblique, tmp_path, suffix, line):
+    file = tmp_path / f"scan{suffix}"
+    plain = Image(oblique.voxels, np.eye(4))
+    SimpleITK.WriteImage(itk_scan(plain), str(file))
+    head, _, rest = file.read_bytes().partition(line)
+    file.write_bytes(head + rest.partition(b"\n")[2])
+    if suffix == ".nrrd":
+        file.write_bytes(
+            file.read_bytes().replace(b"space: left-posterior-superior\n", b"").replace(b"space origin", b"#")
+        )
+    with pytest.raises(UnitError, match="give --spacing"):
+        read_image(file)
+    image = read_image(file, spacing_mm=[0.3])
+    np.testing.assert_allclose(image.spacing_mm, 0.3)
+    np.testing.assert_array_equal(image.voxels, oblique.voxels)
+
+
+def test_nifti_without_pixel_sizes_is_refused(oblique, tmp_path):
+    file = tmp_path / "scan.nii"
+    SimpleITK.WriteImage(itk_scan(oblique), str(file))
+    data = bytearray(file.read_bytes())
+    data[80:92] = bytes(12)
+    file.write_bytes(bytes(data))
+    with pytest.raises(UnitError, match="how far its voxels are apart"):
+        read_image(file)
+
+
+@pytest.mark.parametrize(("size_mm", "ok"), [(1e-4, False), (0.15, True), (30.0, False)])
+def test_voxels_that_no_scan_has_are_refused(oblique, tmp_path, size_mm, ok):
+    SimpleITK.WriteImage(itk_scan(Image(oblique.voxels, np.diag([size_mm] * 3 + [1.0]))), str(tmp_path / "a.mha"))
+    if ok:
+        np.testing.assert_allclose(read_image(tmp_path / "a.mha").spacing_mm, size_mm)
+    else:
+        with pytest.raises(UnitError, match="no scan of a head has"):
+            read_image(tmp_path / "a.mha")
+
+
+def test_colours_and_time_are_refused(tmp_path):
+    SimpleITK.WriteImage(
+        SimpleITK.GetImageFromArray(np.zeros((3, 4, 5, 3), np.uint8), isVector=True), str(tmp_path / "rgb.nrrd")
+    )
+    with pytest.raises(ReadError, match="3 values per voxel"):
+        read_image(tmp_path / "rgb.nrrd", spacing_mm=[1])
+    SimpleITK.WriteImage(
+        SimpleITK.GetImageFromArray(np.zeros((2, 3, 4, 5), np.int16), isVector=False), str(tmp_path / "t.nii")
+    )
+    with pytest.raises(ReadError, match="4 dimensions"):
+        read_image(tmp_path / "t.nii", spacing_mm=[1])
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "a.nrrd", "a.mha", "a.mhd", "a.xyz", "a.dcm"])
+def test_text_is_refused_in_one_sentence_and_silence(tmp_path, capfd, name):
+    (tmp_path / name).write_text("this is not an image, whatever its name says")
+    with pytest.raises(ReadError, match=name) as caught:
+        read_image(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_nothing_there_is_refused(tmp_path):
+    with pytest.raises(ReadError, match="does not exist"):
+        read_image(tmp_path / "nowhere")
+    with pytest.raises(ReadError, match="no DICOM images"):
+        read_image(tmp_path)
+
+
+# -- raw ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["u1", "<i2", ">i2", "<f4", ">f4"])
+def test_raw_voxels_run_fastest_along_i_and_their_kind_is_guessed(tmp_path, kind):
+    i, j, k = np.meshgrid(np.arange(6), np.arange(5), np.arange(4), indexing="ij")
+    expected = i + 20 * j + 30 * k + (0.5 if "f" in kind else 0)
+    (tmp_path / "a.raw").write_bytes(expected.astype(kind).tobytes(order="F"))
+    image = read_image(tmp_path / "a.raw", shape=(6, 5, 4), spacing_mm=[0.2, 0.3, 0.4])
+    np.testing.assert_array_equal(image.voxels, expected)
+    np.testing.assert_allclose(image.spacing_mm, [0.2, 0.3, 0.4])
+    assert image.voxels.dtype == np.dtype(kind).newbyteorder("=")
+    assert np.dtype(kind).newbyteorder("=").name in image.notes[0]
+
+
+def test_raw_needs_spacing_shape_and_as_many_bytes(tmp_path):
+    file = tmp_path / "a.raw"
+    file.write_bytes(bytes(120))
+    with pytest.raises(UnitError, match="--spacing"):
+        read_image(file, shape=(6, 5, 4))
+    with pytest.raises(ReadError, match="--shape"):
+        read_image(file, spacing_mm=[0.3])
+    with pytest.raises(ReadError, match="120 bytes"):
+        read_image(file, shape=(7, 5, 4), spacing_mm=[0.3])
+    with pytest.raises(ReadError, match=r"int16 are 240"):
+        read_image(file, shape=(6, 5, 4), spacing_mm=[0.3], dtype="i2")
+    with pytest.raises(UnitError, match="positive"):
+        read_image(file, shape=(6, 5, 4), spacing_mm=[0.3, -1, 0.3])
+
+
+def test_real_raw_scan(shared_data):
+    image = read_image(shared_data / "philips_3dra_256.raw.gz", shape=(256, 256, 256), spacing_mm=[0.43])
+    assert image.voxels.dtype == np.uint8
+    i, j, k = np.ogrid[:256, :256, :256]
+    in_sac = (i - 110) ** 2 + (j - 106) ** 2 + (k - 160) ** 2 < 9**2
+    assert np.mean(image.voxels[in_sac] > 120) > 0.98
+
+
+# -- damage ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sound_files(oblique, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sound")
+    for suffix in (".nii", ".nii.gz", ".nrrd", ".mha"):
+        SimpleITK.WriteImage(itk_scan(oblique), str(folder / f"scan{suffix}"))
+    write_dicom(Image(oblique.voxels[:, :, :3], oblique.affine_mm), folder / "scan")
+    return folder
+
+
+def read_or_refuse(path):
+    try:
+        return read_image(path)
+    except InputError as error:
+        return str(error)
+
+
+@settings(max_examples=120, deadline=10_000)
+@given(
+    name=st.sampled_from(["scan.nii", "scan.nii.gz", "scan.nrrd", "scan.mha", "scan"]),
+    cut=st.floats(0, 1),
+    changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), max_size=12),
+)
+def test_damaged_scans_are_read_or_refused_but_never_crash(sound_files, tmp_path_factory, name, cut, changes):
+    folder = tmp_path_factory.mktemp("damaged", numbered=True)
+    target = folder / name
+    if name == "scan":
+        shutil.copytree(sound_files / name, target)
+        file = target / "IM0002.dcm"
+    else:
+        file = shutil.copy(sound_files / name, target)
+    data = bytearray(file.read_bytes())
+    data = data[: int(np.ceil((1 - cut**4) * len(data)))]
+    for where, value in changes:
+        if data:
+            data[int(where**2 * len(data))] = value
+    file.write_bytes(bytes(data))
+    answer = read_or_refuse(target)
+    if isinstance(answer, Image):
+        assert np.isfinite(answer.affine_mm).all()
+    else:
+        assert "\n" not in answer

@@ -1,0 +1,212 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vstent.errors import InputError, ReadError, UnitError
+from vstent.io.polydata import polydata_of
+from vstent.io.surfaces import hydraulic_diameter, read_surface
+from vstent.io.vtk_child import read_apart
+from vstent.io.writers import write_stl, write_surface
+from vstent.stent import tube_faces
+from vstent.surface import Surface
+
+
+def cylinder(radius=2.0, length=24.0, rows=13, columns=24):
+    angle = 2 * np.pi * np.arange(columns) / columns
+    ring = radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    z = np.linspace(0, length, rows)
+    vertices = (ring[None] + z[:, None, None] * [0, 0, 1]).reshape(-1, 3)
+    return Surface(vertices, tube_faces(rows, columns))
+
+
+def vtk_write(path, surface, *, ascii_text):
+    from vtkmodules.vtkIOGeometry import vtkOBJWriter, vtkSTLWriter
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+    from vtkmodules.vtkIOPLY import vtkPLYWriter
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    writers = {
+        ".stl": vtkSTLWriter,
+        ".obj": vtkOBJWriter,
+        ".ply": vtkPLYWriter,
+        ".vtk": vtkPolyDataWriter,
+        ".vtp": vtkXMLPolyDataWriter,
+    }
+    writer = writers[path.suffix]()
+    writer.SetInputData(polydata_of(surface.vertices_mm, surface.faces))
+    writer.SetFileName(str(path))
+    if path.suffix == ".vtp":
+        writer.SetDataModeToAscii() if ascii_text else writer.SetDataModeToBinary()
+    elif path.suffix != ".obj":
+        writer.SetFileTypeToASCII() if ascii_text else writer.SetFileTypeToBinary()
+    writer.Write()
+    return path
+
+
+def triangles_of(surface):
+    """Corner positions, each triangle rotated to its first corner, in a fixed order."""
+    corners = np.round(surface.corners_mm, 4) + 0.0
+    rotated = np.stack([np.roll(c, -np.lexsort(c.T)[0], axis=0) for c in corners]).reshape(-1, 9)
+    return rotated[np.lexsort(rotated.T)]
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".vtk", ".vtp"])
+@pytest.mark.parametrize("ascii_text", [True, False])
+def test_every_format_gives_the_same_triangles(tmp_path, suffix, ascii_text):
+    surface = cylinder()
+    read, _ = read_surface(vtk_write(tmp_path / f"a{suffix}", surface, ascii_text=ascii_text))
+    np.testing.assert_allclose(triangles_of(read), triangles_of(surface), atol=2e-3)  # OBJ and STL: single precision
+
+
+@pytest.mark.parametrize("write", [write_stl, write_surface])
+def test_what_we_write_we_read(tmp_path, write):
+    path = tmp_path / ("a.stl" if write is write_stl else "a.vtp")
+    write(path, cylinder())
+    read, _ = read_surface(path)
+    np.testing.assert_array_equal(triangles_of(read), triangles_of(cylinder()))
+
+
+def test_quads_are_cut_along_the_shorter_diagonal_and_larger_polygons_into_fans(tmp_path):
+    path = tmp_path / "a.obj"
+    points = [
+        (0, 0, 0),
+        (40, 0, 0),
+        (50, 10, 0),
+        (10, 10, 0),
+        (0, 0, 5),
+        (10, 0, 5),
+        (12, 6, 5),
+        (5, 10, 5),
+        (-2, 6, 5),
+    ]
+    path.write_text("".join("v {} {} {}\n".format(*p) for p in points) + "f 1 2 3 4\nf 2 3 4 1\nf 5 6 7 8 9\n")
+    vertices, faces = read_apart(path)
+    assert [{1, 3} <= set(f) for f in faces.tolist()] == [True, True, True, True, False, False, False]
+    surface = Surface(vertices, faces)
+    assert surface.areas_mm2.sum() == pytest.approx(400 + 400 + 100)
+    np.testing.assert_allclose(surface.normals, np.broadcast_to([0, 0, 1], (7, 3)), atol=1e-12)
+
+
+@pytest.mark.parametrize("unit", ["m", "cm", "mm"])
+def test_unit_is_guessed_and_said(tmp_path, unit):
+    scale = {"m": 1e-3, "cm": 0.1, "mm": 1.0}[unit]
+    write_surface(tmp_path / "a.vtp", Surface(cylinder().vertices_mm * scale, cylinder().faces))
+    read, notes = read_surface(tmp_path / "a.vtp")
+    np.testing.assert_allclose(read.vertices_mm, cylinder().vertices_mm, atol=1e-12)
+    assert notes[0].startswith(f"Unit guessed: {unit} ")
+    given_unit, no_notes = read_surface(tmp_path / "a.vtp", units=unit)
+    np.testing.assert_array_equal(given_unit.vertices_mm, read.vertices_mm)
+    assert no_notes == ()
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e3, 1e6])
+def test_what_fits_no_unit_is_refused(tmp_path, scale):
+    write_surface(tmp_path / "a.vtp", Surface(cylinder().vertices_mm * scale, cylinder().faces))
+    with pytest.raises(UnitError, match="fits no unit"):
+        read_surface(tmp_path / "a.vtp")
+
+
+def test_a_unit_that_makes_it_a_thousand_times_too_large_is_refused(tmp_path):
+    write_surface(tmp_path / "a.vtp", cylinder())
+    with pytest.raises(UnitError, match=r"read in m would be 2.*mm long"):
+        read_surface(tmp_path / "a.vtp", units="m")
+    with pytest.raises(UnitError, match="not known"):
+        read_surface(tmp_path / "a.vtp", units="inch")
+
+
+def test_hydraulic_diameter_of_a_tube_is_its_diameter_whichever_way_its_faces_look():
+    tube = cylinder(radius=1.7, columns=400)
+    assert hydraulic_diameter(tube) == pytest.approx(3.4, rel=1e-3)
+    turned = np.array(tube.faces)
+    turned[::3] = turned[::3, ::-1]
+    assert hydraulic_diameter(Surface(tube.vertices_mm, turned)) == pytest.approx(3.4, rel=1e-3)
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".vtk", ".vtp"])
+def test_text_and_emptiness_are_refused_in_one_sentence_and_silence(tmp_path, capfd, suffix):
+    for content in ("I am only a text.\nWith two lines.\n", ""):
+        (tmp_path / f"a{suffix}").write_text(content)
+        with pytest.raises(ReadError, match=f"a{suffix}") as caught:
+            read_surface(tmp_path / f"a{suffix}")
+        assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_empty_mesh_nan_and_flat_are_refused(tmp_path):
+    write_surface(tmp_path / "empty.vtp", Surface(np.zeros((0, 3)), np.zeros((0, 3))))
+    with pytest.raises(ReadError, match="holds no triangles"):
+        read_surface(tmp_path / "empty.vtp")
+    broken = np.array(cylinder().vertices_mm)
+    broken[17, 1] = np.nan
+    write_surface(tmp_path / "nan.vtp", Surface(broken, cylinder().faces))
+    with pytest.raises(ReadError, match=r"1 vertices that are not numbers \(first: vertex 17\)"):
+        read_surface(tmp_path / "nan.vtp")
+    write_surface(
+        tmp_path / "line.vtp",
+        Surface(np.outer(np.arange(6.0), [1, 1, 1]), [[0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5]]),
+    )
+    with pytest.raises(ReadError, match="no area"):
+        read_surface(tmp_path / "line.vtp")
+
+
+def test_other_files_are_refused(tmp_path):
+    (tmp_path / "a.docx").write_text("x")
+    with pytest.raises(ReadError, match="not a surface file"):
+        read_surface(tmp_path / "a.docx")
+    with pytest.raises(ReadError, match="does not exist"):
+        read_surface(tmp_path / "nowhere.stl")
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "faces"),
+    [
+        ("aneurisk_C0038.vtp", "mm", 77991),
+        ("visc2011_metres.stl", "m", 17501),
+        ("healthy_siphon.vtk", "mm", 61440),
+        ("bifurcation_coarse.vtp", "mm", 3226),
+    ],
+)
+def test_real_surfaces(shared_data, name, unit, faces):
+    surface, notes = read_surface(shared_data / name)
+    assert len(surface.faces) == faces
+    assert notes[0].startswith(f"Unit guessed: {unit} ")
+
+
+@pytest.fixture(scope="module")
+def sound_files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("surfaces")
+    small = cylinder(rows=4, columns=8)
+    return [
+        vtk_write(folder / f"{a}{s}", small, ascii_text=a)
+        for a in (True, False)
+        for s in (".stl", ".ply", ".vtk", ".vtp")
+    ]
+
+
+def read_or_refuse(path):
+    try:
+        return read_surface(path)[0]
+    except InputError as error:
+        return str(error)
+
+
+@settings(max_examples=16, deadline=15_000)
+@given(
+    which=st.integers(0, 7),
+    cut=st.floats(0, 1),
+    changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.binary(min_size=1, max_size=8)), max_size=6),
+)
+def test_damaged_surfaces_are_read_or_refused_but_never_crash(sound_files, tmp_path_factory, which, cut, changes):
+    data = sound_files[which].read_bytes()
+    data = data[: int(np.ceil((1 - cut**6) * len(data)))]
+    for where, value in changes:
+        at = int(where * len(data))
+        data = data[:at] + value + data[at + len(value) * (at % 2) :]
+    file = tmp_path_factory.mktemp("damaged") / f"a{sound_files[which].suffix}"
+    file.write_bytes(data)
+    answer = read_or_refuse(file)
+    if isinstance(answer, Surface):
+        assert np.isfinite(answer.vertices_mm).all()
+    else:
+        assert "\n" not in answer

@@ -1,0 +1,222 @@
+"""The page: every number with its unit, nothing from elsewhere, nothing unescaped, small enough to hand on."""
+
+import base64
+import hashlib
+import math
+import re
+from html import unescape
+from html.parser import HTMLParser
+from importlib.resources import files
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import report_case
+from vstent.report import report
+from vstent.report.definitions import DEFINITIONS, HEADLINES
+from vstent.report.quantities import compare, flatten, format_change, format_number, format_value, split_unit
+
+
+class Page(HTMLParser):
+    """Collects what a page refers to and says."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.tags, self.scripts, self.words, self._inside = [], [], [], []
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag in ("script", "style"):
+            self._inside.append(tag)
+
+    def handle_endtag(self, tag):
+        if self._inside and tag == self._inside[-1]:
+            self._inside.pop()
+
+    def handle_data(self, data):
+        if not self._inside:
+            self.words.append(data)
+        elif self._inside[-1] == "script":
+            self.scripts.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture(scope="module")
+def page():
+    return Page(report_case.html())
+
+
+def bare_case(**changes):
+    """A case without devices and flow, quick to draw."""
+    case = report_case.case()
+    empty = {"deployments": {}, "fields": {}, "metrics": {"vessel": case.metrics["vessel"]}}
+    return SimpleNamespace(**{**vars(case), **empty, **changes})
+
+
+def test_nothing_is_fetched_from_anywhere(page):
+    for tag, attributes in page.tags:
+        for name in ("src", "href", "srcset", "action", "data", "poster", "formaction", "background", "ping"):
+            value = attributes.get(name)
+            assert value is None or value.startswith(("data:", "#")), (tag, name, value)
+    style = "".join(re.findall(r"<style>(.*?)</style>", report_case.html(), re.S))
+    assert "url(" not in style
+    assert "@import" not in style
+
+
+def test_policy_allows_these_scripts_and_nothing_else(page):
+    policy = next(a["content"] for tag, a in page.tags if a.get("http-equiv") == "Content-Security-Policy")
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+    assert rules["default-src"] == "'none'"
+    assert rules["img-src"] == "data:"
+    runnable = re.findall(r"<script>(.*?)</script>", report_case.html(), re.S)
+    hashes = [f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'" for s in runnable]
+    assert rules["script-src"].split() == hashes
+    assert len(hashes) == 2
+
+
+def test_bundle_was_built_from_the_sources_beside_it():
+    viewer = Path(__file__).resolve().parents[1] / "viewer"
+    sources = [*sorted((viewer / "src").iterdir()), viewer / "package-lock.json"]
+    built = files("vstent.report").joinpath("assets", "viewer.js").read_text(encoding="utf-8")
+    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
+    assert f"sources {digest} */" in built[:300], "run `npm ci && npm run build` in viewer/"
+    assert len(built.encode()) < 600_000
+
+
+def test_report_is_smaller_than_ten_megabytes():
+    assert len(report_case.html().encode()) < 10_000_000
+
+
+def test_ids_are_unique_and_every_anchor_leads_somewhere(page):
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    anchors = {attributes["href"][1:] for tag, attributes in page.tags if tag == "a"}
+    assert anchors <= set(ids)
+    assert {"summary", "scene", "flow", "definitions", "provenance"} <= anchors
+
+
+def test_every_picture_has_words_for_those_who_cannot_see_it(page):
+    pictures = [attributes for tag, attributes in page.tags if tag == "img"]
+    assert len(pictures) == 5
+    assert all(len(attributes["alt"]) > 40 for attributes in pictures)
+
+
+def test_every_number_stands_on_the_page_with_its_unit(page):
+    quantities = flatten(report_case.metrics())
+    assert len(quantities) > 30
+    text = page.text
+    for quantity in quantities:
+        assert " ".join(quantity.text.split()) in text, quantity
+        assert quantity.name in text, quantity
+    for expected in ("0.412 mL/s", "0.0812 m/s", "0.271 s", "12.3 %", "28.2 %", "111.9 mm³", "75.1 °", "13.5 mm"):
+        assert expected in text.replace("\u202f", " ").replace("112 mm³", "111.9 mm³"), expected
+
+
+def test_changes_stand_beside_what_changed(page):
+    row = re.search(r"Neck inflow (.*?) Mean", page.text).group(1)
+    assert row == "0.412 mL/s 0.255 mL/s −38 % 0.358 mL/s −13 %"
+
+
+def test_known_metrics_carry_their_definition(page):
+    titles = [unescape(attributes.get("title") or "") for _, attributes in page.tags]
+    meaning, source = DEFINITIONS["sac_volume_mm3"].meaning, DEFINITIONS["aspect_ratio"].source
+    assert any(meaning in title for title in titles)
+    assert meaning in page.text
+    assert source
+
+
+def test_case_names_and_notes_are_text_not_markup():
+    evil = '</script><script>alert("x")</script><img src=x onerror=y>'
+    html = report(bare_case(name=evil, notes=(evil,), provenance={"settings": {evil: evil}}))
+    page = Page(html)
+    assert [attributes for tag, attributes in page.tags if tag == "img" and "onerror" in attributes] == []
+    assert sum(tag == "script" for tag, _ in page.tags) == 4
+    assert 'alert("x")' in page.text
+
+
+def test_folders_are_not_told():
+    html = report(bare_case(provenance={"inputs": {"path": "/home/ana/Doe_Jane_1950/scan.vtp", "sha256": "ab" * 32}}))
+    assert "Doe_Jane" not in html
+    assert "scan.vtp" in html
+    assert "ab" * 32 in html
+
+
+def test_without_flow_and_devices_the_report_says_so_and_keeps_the_rest():
+    page = Page(report(bare_case()))
+    assert "No blood flow was computed" in page.text
+    assert "Sac volume" in page.text
+    assert "Research use only" in page.text
+
+
+def test_provenance_is_whole(page):
+    for expected in ("9f" * 32, "3.11.4", "0.2", "1.25", "Units were guessed as mm"):
+        assert expected in page.text
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("neck_inflow_mL_s", 0.41234, "0.412 mL/s"),
+        ("coverage_fraction", 0.2816, "28.2 %"),
+        ("bend_angle_rad", math.pi / 2, "90.0 °"),
+        ("aspect_ratio", 1.234, "1.23"),
+        ("iterations_count", 7.0, "7"),
+        ("cells_count", 318_402, "318402"),
+        ("pore_density_per_mm2", 18.04, "18.0 1/mm²"),
+        ("screen_resistance_Pa_per_m_s", 480.2, "480 Pa/(m/s)"),
+        ("sac_volume_mm3", 1520.4, "1520 mm³"),
+        ("max_outside_mm", 0.0, "0 mm"),
+        ("max_outside_mm", 1.2e-6, "1.20e-06 mm"),
+        ("outlets_mL_s", [1.5, 2.25], "1.50 mL/s, 2.25 mL/s"),
+        ("sac_mean_wss_Pa", math.nan, "–"),
+        ("seed_mm", None, "–"),
+        ("converged", True, "yes"),
+        ("device", "Silk", "Silk"),
+    ],
+)
+def test_values_are_written_with_three_digits_and_their_unit(key, value, expected):
+    assert format_value(key, value).replace("\u202f", " ") == expected
+
+
+@pytest.mark.parametrize("exponent", range(-4, 7))
+def test_three_digits_survive_at_every_magnitude(exponent):
+    value = 1.23456 * 10.0**exponent
+    assert float(format_number(value)) == pytest.approx(value, rel=0.005)
+
+
+@pytest.mark.parametrize(
+    ("key", "expected"),
+    [
+        ("mean_sac_speed_m_s", ("mean_sac_speed", "m_s")),
+        ("time_s", ("time", "s")),
+        ("n_nodes", ("n_nodes", "")),
+        ("outlets", ("outlets", "")),
+    ],
+)
+def test_units_are_the_longest_ending(key, expected):
+    assert split_unit(key) == expected
+
+
+def test_changes():
+    assert format_change(0.4, 0.26).replace("\u202f", " ") == "−35 %"
+    assert format_change(2.0, 2.1).replace("\u202f", " ") == "+5.0 %"
+    assert format_change(0.0, 1.0) == format_change(1.0, math.nan) == format_change(None, 1.0) == "–"
+
+
+def test_only_what_was_measured_on_both_sides_is_compared():
+    rows = compare(
+        {
+            "bare": {"a_mm": 1.0, "b_mm": 2.0, "ok": True},
+            "stents": {"x": {"flow": {"b_mm": 1.0, "c_mm": 3.0, "ok": True}}},
+        }
+    )
+    assert [(row.before.key, row.after["x"].value) for row in rows] == [("b_mm", 1.0)]
+
+
+def test_headlines_are_defined():
+    assert set(HEADLINES) <= set(DEFINITIONS)

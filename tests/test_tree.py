@@ -1,0 +1,80 @@
+"""The bounding-box tree against brute force and exact shapes."""
+
+import numpy as np
+import pytest
+
+from shapes import sphere
+from vstent.kernels import tree
+from vstent.surface import Surface
+
+
+def random_soup(rng: np.random.Generator, n: int) -> Surface:
+    centers = rng.uniform(-5, 5, (n, 1, 3))
+    corners = centers + rng.normal(0, 0.5, (n, 3, 3))
+    return Surface(corners.reshape(-1, 3), np.arange(3 * n).reshape(-1, 3))
+
+
+def closest_by_sampling(corners: np.ndarray, p: np.ndarray) -> float:
+    """Distance to one triangle by projecting on its plane, its edges and its corners: slow and obvious."""
+    a, b, c = corners
+    candidates = [np.linalg.norm(p - v) for v in corners]
+    for u, v in ((a, b), (b, c), (c, a)):
+        t = np.clip((p - u) @ (v - u) / ((v - u) @ (v - u)), 0, 1)
+        candidates.append(np.linalg.norm(p - u - t * (v - u)))
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal)
+    foot = p - ((p - a) @ normal) * normal
+    weights = np.linalg.lstsq(np.stack([b - a, c - a], 1), foot - a, rcond=None)[0]
+    if weights.min() >= 0 and weights.sum() <= 1:
+        candidates.append(abs((p - a) @ normal))
+    return min(candidates)
+
+
+@pytest.mark.parametrize("n", [1, 3, 4, 5, 200])
+def test_closest_point_equals_brute_force(n: int) -> None:
+    rng = np.random.default_rng(n)
+    soup = random_soup(rng, n)
+    points = rng.uniform(-7, 7, (40, 3))
+    closest, distance, face = soup.closest(points)
+    brute = np.array([[closest_by_sampling(t, p) for t in soup.corners_mm] for p in points])
+    np.testing.assert_allclose(distance, brute.min(axis=1), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(points - closest, axis=1), distance, atol=1e-12)
+    np.testing.assert_allclose(brute[np.arange(40), face], distance, atol=1e-9)
+
+
+def test_crossing_and_first_hit_equal_brute_force() -> None:
+    rng = np.random.default_rng(7)
+    soup = random_soup(rng, 150)
+    starts, ends = rng.uniform(-6, 6, (2, 300, 3))
+    brute = np.array(
+        [
+            [tree.ray_meets_triangle.py_func(s, e - s, t) for t in soup.corners_mm]
+            for s, e in zip(starts, ends, strict=True)
+        ]
+    )
+    np.testing.assert_array_equal(soup.crosses(starts, ends), brute.min(axis=1) <= 1)
+    assert 50 < soup.crosses(starts, ends).sum() < 250
+    length = np.linalg.norm(ends - starts, axis=1)
+    hit = soup.first_hit(starts, (ends - starts) / length[:, None])
+    np.testing.assert_allclose(hit, brute.min(axis=1) * length, rtol=1e-9)
+
+
+def test_sign_is_exact_everywhere_around_a_closed_surface() -> None:
+    ball = sphere(2.0)
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(4000, 3))
+    points *= rng.uniform(0.2, 3.5, (4000, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    signed = ball.signed_distance(points)
+    exact = np.linalg.norm(points, axis=1) - 2.0
+    sagitta = 2.0 * (1 - np.cos(np.pi / 24))
+    assert np.abs(signed - exact).max() < 1.5 * sagitta
+    clear = np.abs(exact) > 2 * sagitta
+    np.testing.assert_array_equal(np.sign(signed[clear]), np.sign(exact[clear]))
+
+
+def test_face_order_does_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    soup = random_soup(rng, 100)
+    shuffled = Surface(soup.vertices_mm, soup.faces[rng.permutation(100)])
+    points = rng.uniform(-7, 7, (100, 3))
+    np.testing.assert_array_equal(soup.closest(points)[1], shuffled.closest(points)[1])

@@ -1,0 +1,323 @@
+// The viewer: mount(element, manifest, base64) draws a scene with its switches; report.html and the page both call it.
+import { Vector3 } from "three";
+import { unpack } from "./decode.js";
+import { Stage } from "./stage.js";
+
+const MODES = [
+  { id: "anatomy", title: "Anatomy", layers: ["lumen", "landing", "sac", "neck"] },
+  { id: "device", title: "Device", layers: ["lumen", "wires", "contour", "neck"] },
+  { id: "wires", title: "Wires", layers: ["lumen", "wires", "neck"] },
+  { id: "flow", title: "Blood flow", layers: ["lumen", "streamlines", "neck"] },
+  { id: "shear", title: "Wall shear stress", layers: ["shear", "neck"] },
+];
+
+const LAYERS = [
+  ["lumen", "Lumen (patient)"],
+  ["landing", "Restored parent artery"],
+  ["sac", "Sac"],
+  ["neck", "Neck"],
+  ["axis", "Parent axis"],
+  ["centerlines", "Centerlines"],
+  ["contour", "Device contour, by wall gap"],
+  ["wires", "Wires"],
+  ["streamlines", "Streamlines, by speed"],
+  ["shear", "Wall shear stress"],
+];
+
+const VIEWS = { profile: "Profile", neck: "From the sac", frontal: "Frontal", lateral: "From the left" };
+
+const KEYS = [
+  ["drag, arrow keys", "turn"],
+  ["shift + drag, shift + arrows", "move"],
+  ["wheel, + and −", "zoom"],
+  [", and .", "roll"],
+  ["1 to 4", "views"],
+  ["R", "start again"],
+];
+
+/** Draw a scene into `element`. Returns the stage, or null where the browser has no WebGL (it says so). */
+export function mount(element, manifest, base64) {
+  try {
+    return new Viewer(element, manifest, unpack(base64)).stage;
+  } catch (problem) {
+    element.replaceChildren(
+      make("p", { className: "viewer-sorry", role: "status" }, [
+        "The 3-D view needs WebGL, which this browser does not offer here. The pictures below show the same case.",
+      ]),
+    );
+    console.warn(`3-D view not drawn: ${problem.message}`);
+    return null;
+  }
+}
+
+class Viewer {
+  constructor(element, manifest, buffer) {
+    this.element = element;
+    this.manifest = manifest;
+    this.canvas = make("canvas", { className: "viewer-canvas", ariaHidden: "true" });
+    this.stage = new Stage(this.canvas, manifest, buffer);
+    this.present = new Set(manifest.layers.map((layer) => layer.id));
+    this.modes = MODES.filter((mode) => mode.layers.filter((id) => this.present.has(id)).length > 1).filter(
+      (mode) => !["device", "wires", "flow", "shear"].includes(mode.id) || this.present.has(needed(mode.id)),
+    );
+    this.shown = new Set();
+    this.solo = null;
+    this.alike = false;
+    this.moment = 1;
+    this.build();
+    this.stage.orbit.listen(this.area, () => this.paneSize()[1]);
+    this.stage.drawn = () => this.annotate();
+    new ResizeObserver(() => this.layout()).observe(this.area);
+    this.layout();
+    this.setMode(this.modes.find((mode) => mode.id === "wires") || this.modes[0]);
+    this.look("profile", false);
+  }
+
+  build() {
+    this.panes = this.manifest.panes.map((pane) => this.pane(pane));
+    this.grid = make("div", { className: "viewer-panes" }, this.panes.map((pane) => pane.element));
+    const words = `3-D view: ${this.manifest.panes.map((pane) => pane.title).join(", ")}. Arrow keys turn, plus and minus zoom.`;
+    this.area = make("div", { className: "viewer-area", tabIndex: 0, role: "application", ariaLabel: words }, [
+      this.canvas,
+      this.grid,
+    ]);
+    this.area.addEventListener("keydown", (event) => this.key(event));
+    this.bars = make("div", { className: "viewer-bars" });
+    this.element.classList.add("viewer");
+    this.element.replaceChildren(
+      make("div", { className: "viewer-head" }, [this.modeButtons(), this.viewButtons(), this.help()]),
+      make("div", { className: "viewer-body" }, [this.area, this.sidebar()]),
+      make("div", { className: "viewer-foot" }, [this.bars, this.expansion()]),
+    );
+  }
+
+  pane({ id, title, note }) {
+    const button = make("button", { className: "viewer-solo", type: "button", title: "Show this alone, or all again" }, ["⤢"]);
+    button.setAttribute("aria-label", `Show ${title} alone, or all again`);
+    const length = make("span", { className: "viewer-length" });
+    const compass = svg("svg", { class: "viewer-compass", viewBox: "-26 -26 52 52", "aria-hidden": "true" });
+    const head = make("div", { className: "viewer-title" }, [make("strong", {}, [title]), make("span", {}, [note || ""])]);
+    const element = make("div", { className: "viewer-pane" }, [head, button, length, compass]);
+    button.addEventListener("click", () => {
+      this.solo = this.solo === id ? null : id;
+      this.layout();
+    });
+    return { id, element, head, length, compass, button };
+  }
+
+  modeButtons() {
+    this.modeInputs = this.modes.map((mode) => {
+      const button = make("button", { type: "button" }, [mode.title]);
+      button.addEventListener("click", () => this.setMode(mode));
+      return { mode, button };
+    });
+    return group("Show", this.modeInputs.map(({ button }) => button), "viewer-modes");
+  }
+
+  viewButtons() {
+    this.viewInputs = this.manifest.views.map(({ id }, i) => {
+      const button = make("button", { type: "button", title: `Key ${i + 1}` }, [VIEWS[id]]);
+      button.addEventListener("click", () => this.look(id));
+      return button;
+    });
+    return group("Look", this.viewInputs);
+  }
+
+  help() {
+    const rows = KEYS.map(([key, what]) => make("div", {}, [make("kbd", {}, [key]), make("span", {}, [what])]));
+    return make("details", { className: "viewer-help" }, [make("summary", {}, ["Keys"]), make("div", {}, rows)]);
+  }
+
+  sidebar() {
+    this.boxes = new Map();
+    const rows = LAYERS.filter(([id]) => this.present.has(id)).map(([id, title]) => {
+      const box = make("input", { type: "checkbox" });
+      box.addEventListener("change", () => this.toggle(id, box.checked));
+      this.boxes.set(id, box);
+      return make("label", {}, [box, this.swatch(id), make("span", {}, [title])]);
+    });
+    return make("fieldset", { className: "viewer-side" }, [make("legend", {}, ["Layers"]), ...rows]);
+  }
+
+  swatch(id) {
+    const layer = this.manifest.layers.find((one) => one.id === id);
+    const swatch = make("i", { className: "viewer-swatch" });
+    const scale = this.stage.scales[layer.scale];
+    swatch.style.background = scale ? gradient(scale) : `rgb(${layer.colour.map((c) => Math.round(255 * c))})`;
+    return swatch;
+  }
+
+  expansion() {
+    if (this.stage.nFrames < 2) return "";
+    this.slider = make("input", { type: "range", min: 0, max: 1, step: 0.005, value: 1, ariaLabel: "Expansion of the device" });
+    const play = make("button", { type: "button", className: "viewer-play" }, ["▶ Expand"]);
+    this.slider.addEventListener("input", () => this.setMoment(Number(this.slider.value)));
+    play.addEventListener("click", () => this.play());
+    this.player = make("div", { className: "viewer-expansion" }, [
+      play,
+      make("span", {}, ["start"]),
+      this.slider,
+      make("span", {}, ["deployed"]),
+    ]);
+    return this.player;
+  }
+
+  play() {
+    const started = performance.now();
+    const run = Symbol("run");
+    this.run = run;
+    const step = (now) => {
+      if (this.run !== run) return;
+      const moment = Math.min(1, Math.max(0, now - started) / 2500);
+      this.slider.value = moment;
+      this.setMoment(moment, true);
+      if (moment < 1) requestAnimationFrame(step);
+    };
+    if (!this.shown.has("contour")) this.setMode(this.modes.find((mode) => mode.id === "device"));
+    requestAnimationFrame(step);
+  }
+
+  setMoment(moment, playing = false) {
+    if (!playing) this.run = null;
+    this.moment = moment;
+    this.stage.expand(moment);
+    this.apply();
+  }
+
+  setMode(mode) {
+    this.mode = mode;
+    this.shown = new Set(mode.layers.filter((id) => this.present.has(id)));
+    this.apply();
+  }
+
+  toggle(id, on) {
+    this.shown[on ? "add" : "delete"](id);
+    this.mode = null;
+    this.apply();
+  }
+
+  /** Bring switches, colour bars and picture to what is to be shown. */
+  apply() {
+    for (const { mode, button } of this.modeInputs) button.setAttribute("aria-pressed", String(mode === this.mode));
+    for (const [id, box] of this.boxes) box.checked = this.shown.has(id);
+    // Wires are woven on the deployed contour only: while it expands they do not exist.
+    this.stage.show([...this.shown].filter((id) => id !== "wires" || this.moment === 1));
+    // Where nothing differs between the panes, one of them is enough.
+    const alike = this.manifest.layers.every((layer) => layer.pane === "" || !this.shown.has(layer.id));
+    if (alike !== this.alike) {
+      this.alike = alike;
+      this.layout();
+    }
+    if (this.player) this.player.hidden = !this.shown.has("contour") && this.moment === 1 && !this.shown.has("wires");
+    this.showBars();
+  }
+
+  showBars() {
+    const used = new Set(this.manifest.layers.filter((layer) => this.shown.has(layer.id)).map((layer) => layer.scale));
+    const scales = Object.values(this.stage.scales).filter((scale) => used.has(scale.id));
+    this.bars.replaceChildren(...scales.map(colourBar));
+  }
+
+  look(id, glide = true) {
+    const view = this.manifest.views.find((one) => one.id === id);
+    const [width, height] = this.paneSize();
+    this.stage.orbit.look(view.axes, view.center, view.radius, width / height, glide);
+  }
+
+  paneSize() {
+    const pane = this.panes.find(({ element }) => !element.hidden).element;
+    return [Math.max(pane.clientWidth, 1), Math.max(pane.clientHeight, 1)];
+  }
+
+  layout() {
+    for (const pane of this.panes) {
+      const alone = this.alike ? this.panes[0].id : this.solo;
+      pane.element.hidden = alone !== null && alone !== pane.id;
+      pane.button.setAttribute("aria-pressed", String(this.solo === pane.id));
+      pane.button.hidden = this.alike || this.panes.length < 2;
+      pane.head.hidden = this.alike && this.panes.length > 1;
+    }
+    const box = this.area.getBoundingClientRect();
+    const [width, height] = [this.area.clientWidth, this.area.clientHeight];
+    const places = this.panes
+      .filter(({ element }) => !element.hidden)
+      .map(({ id, element }) => {
+        const r = element.getBoundingClientRect();
+        const [left, top] = [r.left - box.left - this.area.clientLeft, r.top - box.top - this.area.clientTop];
+        return { id, left, bottom: height - top - r.height, width: r.width, height: r.height };
+      });
+    this.stage.arrange(places, width, height);
+  }
+
+  key(event) {
+    const view = this.manifest.views[Number(event.key) - 1];
+    if (view) this.look(view.id);
+    else if (event.key === "r" || event.key === "R") this.look("profile");
+  }
+
+  /** Length bar and compass of every pane, for the camera as it is. */
+  annotate() {
+    const { camera, orbit } = this.stage;
+    const [, height] = this.paneSize();
+    const perMm = height / (2 * orbit.distance * Math.tan((camera.fov * Math.PI) / 360));
+    const length = [50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1].find((mm) => mm * perMm < 110) || 0.1;
+    const inverse = orbit.turned.clone().invert();
+    const arms = [["L", 1, 0, 0], ["P", 0, 1, 0], ["S", 0, 0, 1]].map(([name, ...axis]) => {
+      const v = new Vector3(...axis).applyQuaternion(inverse);
+      return { name, x: 17 * v.x, y: -17 * v.y, z: v.z };
+    });
+    for (const pane of this.panes) {
+      pane.length.style.width = `${length * perMm}px`;
+      pane.length.textContent = `${length} mm`;
+      pane.compass.replaceChildren(...arms.sort((a, b) => a.z - b.z).flatMap(arm));
+    }
+  }
+}
+
+const needed = (mode) => ({ device: "contour", wires: "wires", flow: "streamlines", shear: "shear" })[mode];
+
+function arm({ name, x, y, z }) {
+  const ink = z < -0.05 ? "#9fb0b8" : "#2c4650";
+  const text = svg("text", { x: 1.32 * x, y: 1.32 * y, fill: ink });
+  text.textContent = name;
+  return [svg("line", { x1: 0, y1: 0, x2: x, y2: y, stroke: ink, "stroke-width": 1.6 }), text];
+}
+
+function colourBar(scale) {
+  const bar = make("i", { className: "viewer-ramp" });
+  bar.style.background = gradient(scale);
+  const middle = (scale.low + scale.high) / 2;
+  const ticks = [scale.low, middle, scale.high].map((value) => make("span", {}, [String(Number(value.toPrecision(3)))]));
+  return make("div", { className: "viewer-bar" }, [
+    make("span", { className: "viewer-quantity" }, [scale.title, make("em", {}, [` ${scale.unit}`])]),
+    make("div", {}, [bar, make("div", { className: "viewer-ticks" }, ticks)]),
+  ]);
+}
+
+function gradient(scale) {
+  const texels = scale.texture.image.data;
+  const stops = Array.from({ length: 17 }, (_, i) => `rgb(${texels.slice(4 * Math.min(16 * i, 255), 4 * Math.min(16 * i, 255) + 3)})`);
+  return `linear-gradient(90deg, ${stops.join(", ")})`;
+}
+
+function group(label, children, className = "") {
+  const element = make("div", { className: `viewer-group ${className}`, role: "group", ariaLabel: label }, children);
+  return element;
+}
+
+function make(tag, properties = {}, children = []) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(properties)) {
+    if (name === "role") element.setAttribute("role", value);
+    else if (name.startsWith("aria")) element.setAttribute(`aria-${name.slice(4).toLowerCase()}`, value);
+    else element[name] = value;
+  }
+  element.append(...children);
+  return element;
+}
+
+function svg(tag, attributes) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  return element;
+}
