@@ -150,10 +150,10 @@ def field(strength):
 def flow_metrics(strength):
     return {
         "neck_inflow_mL_s": 0.412 * strength,
-        "mean_sac_speed_m_s": 0.0812 * strength,
+        "mean_sac_velocity_m_s": 0.0812 * strength,
         "turnover_time_s": 0.271 / strength,
-        "sac_mean_wall_shear_stress_Pa": 1.53 * strength,
-        "sac_low_shear_area_fraction": 0.123 / strength,
+        "mean_sac_wss_Pa": 1.53 * strength,
+        "low_shear_area_fraction": 0.123 / strength,
         "outlet_flow_mL_s": {"outlet_1": 3.37},
         "converged": True,
     }

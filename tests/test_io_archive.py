@@ -35,6 +35,11 @@ def same(a, b):
     return type(a) is type(b) and (a == b or (a != a and b != b))
 
 
+@dataclasses.dataclass
+class Foreign:
+    """A dataclass that is not vstent's."""
+
+
 def an_anatomy():
     surface = Surface([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     line = Centerline(np.linspace([0, 0, 0], [0, 0, 9], 10), np.linspace(1, 2, 10))
@@ -99,7 +104,13 @@ def test_other_things_cannot_be_archived(tmp_path):
 
 @pytest.mark.parametrize(
     ("module", "name"),
-    [("os", "stat_result"), ("vstent.errors", "ReadError"), ("vstent.surface", "np"), ("vstent.gone", "X")],
+    [
+        ("os", "stat_result"),
+        (__name__, "Foreign"),
+        ("vstent.errors", "ReadError"),
+        ("vstent.surface", "np"),
+        ("vstent.gone", "X"),
+    ],
 )
 def test_an_archive_builds_nothing_but_nouns_of_ours(tmp_path, module, name):
     text = json.dumps({"is": "noun", "module": module, "class": name, "fields": {}})

@@ -241,6 +241,15 @@ def test_header_without_spacing_is_refused_unless_it_is_given(oblique, tmp_path,
     np.testing.assert_array_equal(image.voxels, oblique.voxels)
 
 
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".nrrd", ".mha"])
+def test_a_file_that_breaks_off_is_refused(oblique, tmp_path, suffix):
+    file = tmp_path / f"scan{suffix}"
+    SimpleITK.WriteImage(itk_scan(oblique), str(file), suffix != ".mha")
+    file.write_bytes(file.read_bytes()[:-40])
+    with pytest.raises(ReadError, match="is damaged"):
+        read_image(file)
+
+
 def test_nifti_without_pixel_sizes_is_refused(oblique, tmp_path):
     file = tmp_path / "scan.nii"
     SimpleITK.WriteImage(itk_scan(oblique), str(file))

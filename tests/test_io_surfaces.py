@@ -191,7 +191,7 @@ def read_or_refuse(path):
         return str(error)
 
 
-@settings(max_examples=16, deadline=15_000)
+@settings(max_examples=12, deadline=15_000)
 @given(
     which=st.integers(0, 7),
     cut=st.floats(0, 1),

@@ -110,7 +110,7 @@ def test_trimming_cuts_a_long_artery_square_and_keeps_the_sac() -> None:
     vessel = trim(trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.35))))
     low, high = sorted(opening.center_mm[2] for opening in vessel.openings)
     assert 21.0 < low < 26.0
-    assert 83.0 < high < 90.0
+    assert 81.0 < high < 90.0
     np.testing.assert_allclose([o.area_mm2 for o in vessel.openings], np.pi * 4.0, rtol=0.02)
     assert restore(vessel).aneurysms[0].sac.volume_mm3 == pytest.approx(phantom.sac_volume_mm3, rel=0.03)
 

@@ -18,6 +18,8 @@ from vstent.vessel import Anatomy, Aneurysm
 Measures = dict[str, float | str]
 """Numbers by names that end in their unit; a few names hold words."""
 
+NECK_TOLERANCE_MM: Final = 0.05
+"""The neck's triangles lie on the landing surface to within this: they are other triangles than its own."""
 SAMPLES_PER_QUAD: Final = 8
 """Points per direction at which coverage is tried in every quad of the contour."""
 
@@ -150,7 +152,7 @@ def _density(anatomy: Anatomy, stent: Stent) -> Measures:
 def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
     """Tell for (n, 3) points on the device whether the landing surface next to them closes the largest aneurysm."""
     to_neck_mm = anatomy.aneurysms[0].neck.closest(points_mm)[1]
-    return to_neck_mm <= anatomy.landing_surface.closest(points_mm)[1] + 1e-6
+    return to_neck_mm <= anatomy.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM
 
 
 def _jailed_branches(anatomy: Anatomy, stent: Stent) -> int:

@@ -117,7 +117,7 @@ def _opened(mesh: _Mesh) -> _Mesh:
 def _turned(mesh: _Mesh) -> _Mesh:
     faces, turned = topology.oriented(mesh.faces)
     n = int(turned.sum())
-    mesh = mesh.after(mesh.vertices, faces, f"{_count(n, 'face')} turned to agree with their neighbours." if n else "")
+    mesh = mesh.after(mesh.vertices, faces, f"{_count(n, 'face')} turned to agree with the others." if n else "")
     is_clash = topology.clashing(faces)
     n = int(is_clash.sum())
     note = f"{_count(n, 'face')} dropped that no orientation fits."

@@ -121,7 +121,9 @@ def _band(lumen: Lumen, profile: "Profile") -> str:
 
 def _edge_level(voxels: NDArray[Any]) -> float:
     """Mean intensity weighted with the squared gradient, on every other voxel; gradients of the noise do not count."""
-    middle = tuple(slice(1, -1, 2) if n > 2 else slice(None) for n in voxels.shape)
+    if min(voxels.shape) < 3:
+        raise VesselError(f"A scan of {' x '.join(map(str, voxels.shape))} voxels is too thin to find a lumen in it.")
+    middle = (slice(1, -1, 2),) * 3
     squared = np.zeros(voxels[middle].shape, dtype=np.float32)
     for axis in range(3):
         ahead, behind = list(middle), list(middle)

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol, TypeVar
@@ -23,7 +22,8 @@ from numpy.typing import NDArray
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_design, find_size
 from vstent.errors import ReadError
-from vstent.flow import FlowField, FlowSettings, case_of, compare, indices, simulate_case
+from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, simulate_case
+from vstent.flow import Progress as FlowProgress
 from vstent.io import writers
 from vstent.io.archive import load_noun, save_noun
 from vstent.io.files import is_surface_file
@@ -91,7 +91,7 @@ class CaseResult:
     """All that a study found."""
 
     name: str
-    """The input's name."""
+    """The case folder's name (a scan's own name may be the patient's)."""
     anatomy: Anatomy
     """Vessel, parent artery, sacs."""
     deployments: dict[str, Deployment]
@@ -145,8 +145,8 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
         writers.write_json(out / "metrics.json", metrics)
     provenance = _provenance(path, source, settings, ledger)
     writers.write_json(out / "run.json", provenance)
-    notes = (*anatomy.vessel.notes, *anatomy.notes, *(deployment.advice for deployment in deployments.values()))
-    return CaseResult(path.stem, anatomy, deployments, fields, metrics, provenance, notes)
+    notes = (*anatomy.vessel.notes, *anatomy.notes)
+    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, provenance, notes)
 
 
 class _Ledger:
@@ -165,6 +165,15 @@ class _Ledger:
         yield found.append
         self.seconds[name] = time.perf_counter() - began
         self.progress(name, 1.0, " ".join(found))
+
+    def teller(self, name: str) -> Callable[[FlowProgress], None]:
+        """Return what a flow engine tells its progress to."""
+
+        def tell(progress: FlowProgress) -> None:
+            fraction = min(progress.fraction, 0.99)
+            self.progress(name, fraction, f"{progress.residual:.1%} left to settle, {progress.seconds_left:.0f} s")
+
+        return tell
 
     def recall(self, name: str, key: str, noun_type: type[Noun]) -> Noun | None:
         """Return what was kept under this key; None where it is missing or damaged."""
@@ -251,8 +260,8 @@ def _flows(
         field = ledger.recall(stage, key, FlowField)
         if field is None:
             with ledger.stage(stage) as tell:
-                case = case_of(anatomy, stent, settings.flow)
-                field = simulate_case(case, start=fields.get(BARE), progress=partial(ledger.progress, stage))
+                case = flow_case(anatomy, stent, settings.flow)
+                field = simulate_case(case, start=fields.get(BARE), progress=ledger.teller(stage))
                 tell(field.advice)
             ledger.keep(stage, key, field)
         fields[name] = field
@@ -263,7 +272,9 @@ def _flows(
 def _metrics(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]
 ) -> dict[str, Any]:
-    flow = {name: indices(field, anatomy) for name, field in fields.items()}
+    sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
+    shapes = (sac.sac, sac.neck) if sac else ()
+    flow = {name: indices(field, *shapes) for name, field in fields.items()}
     stents = {}
     for name, deployment in deployments.items():
         stents[name] = {"deployment": measure(anatomy, deployment)}
@@ -309,7 +320,7 @@ def _write_field(folder: Path, field: FlowField) -> None:
 def _provenance(path: Path, source: str, settings: Settings, ledger: _Ledger) -> dict[str, Any]:
     return {
         "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
-        "input": {"name": path.name, "sha256": source},
+        "input": {"name": "DICOM folder" if path.is_dir() else path.name, "sha256": source},
         "settings": asdict(settings),
         "seconds": ledger.seconds,
         "research_use_only": True,

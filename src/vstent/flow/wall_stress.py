@@ -8,7 +8,7 @@ from vstent.kernels.arrays import Floats, Ints
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
 
-REACH = 3
+REACH = 4
 """Radius of the neighbourhood of a wall point, in cells."""
 
 

@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import numpy as np
 
-import vstent
 from vstent.io.files import suffix
 from vstent.io.polydata import triangles_of
 from vstent.kernels.arrays import Floats, Ints
@@ -48,7 +47,7 @@ def read_apart(path: Path) -> tuple[Floats, Ints] | None:
 
 def _environment() -> dict[str, str]:
     """Ours, and the folder that this package was found in."""
-    root = str(Path(next(iter(vstent.__path__))).parent)
+    root = str(Path(__file__).resolve().parents[2])
     others = os.environ.get("PYTHONPATH", "")
     return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in (root, others) if p)}
 

@@ -44,81 +44,129 @@ SEGMENT: Final = 128
 
 _REST, _AXIS, _DIAGONAL = np.float32(1 / 3), np.float32(1 / 18), np.float32(1 / 36)
 _HALF, _ONE, _THREE_HALVES = np.float32(0.5), np.float32(1.0), np.float32(1.5)
-_THREE, _FOUR_AND_HALF, _NINE = np.float32(3.0), np.float32(4.5), np.float32(9.0)
+_TWO, _THREE, _FOUR_AND_HALF = np.float32(2.0), np.float32(3.0), np.float32(4.5)
 _U = np.uint64
 
 
-@njit(inline="always")
-def _relax_pair(f: Any, a: int, b: int, k: int, cu: float, isotropic: float, w: float, even: float, odd: float) -> None:
-    """Relax the populations a and b = opposite of a towards equilibrium, each part at its own rate, and swap them."""
-    fa, fb = f[a * SEGMENT + k], f[b * SEGMENT + k]
-    change_even = even * (_HALF * (fa + fb) - w * (isotropic + _FOUR_AND_HALF * cu * cu))
-    change_odd = odd * (_HALF * (fa - fb) - w * _THREE * cu)
-    f[a * SEGMENT + k] = fb - change_even + change_odd
-    f[b * SEGMENT + k] = fa - change_even - change_odd
+@njit(cache=True, inline="always")
+def _relax_pair(f: Any, a: int, b: int, k: int, even: float, odd: float, kept: float) -> None:
+    """Give the populations a and b = opposite of a their collided values, swapped, from their even and odd parts.
+
+    `even` is the whole even part, `odd` the equilibrium's odd part with its share of the force, `kept` how much of the
+    departure from it is kept.
+    """
+    odd += kept * (_HALF * (f[a * SEGMENT + k] - f[b * SEGMENT + k]) - odd)
+    f[a * SEGMENT + k] = even - odd
+    f[b * SEGMENT + k] = even + odd
+
+
+@njit(cache=True, inline="always")
+def _sums(f: Any, k: int) -> tuple[Any, ...]:
+    """Density deviation, momentum (3) and momentum flux xx, yy, zz, xy, xz, yz of cell k of the buffer."""
+    s1, s2, s3 = (
+        f[1 * SEGMENT + k] + f[2 * SEGMENT + k],
+        f[3 * SEGMENT + k] + f[4 * SEGMENT + k],
+        f[5 * SEGMENT + k] + f[6 * SEGMENT + k],
+    )
+    s4, s5 = f[7 * SEGMENT + k] + f[8 * SEGMENT + k], f[9 * SEGMENT + k] + f[10 * SEGMENT + k]
+    s6, s7 = f[11 * SEGMENT + k] + f[12 * SEGMENT + k], f[13 * SEGMENT + k] + f[14 * SEGMENT + k]
+    s8, s9 = f[15 * SEGMENT + k] + f[16 * SEGMENT + k], f[17 * SEGMENT + k] + f[18 * SEGMENT + k]
+    d1, d2, d3 = (
+        f[1 * SEGMENT + k] - f[2 * SEGMENT + k],
+        f[3 * SEGMENT + k] - f[4 * SEGMENT + k],
+        f[5 * SEGMENT + k] - f[6 * SEGMENT + k],
+    )
+    d4, d5 = f[7 * SEGMENT + k] - f[8 * SEGMENT + k], f[9 * SEGMENT + k] - f[10 * SEGMENT + k]
+    d6, d7 = f[11 * SEGMENT + k] - f[12 * SEGMENT + k], f[13 * SEGMENT + k] - f[14 * SEGMENT + k]
+    d8, d9 = f[15 * SEGMENT + k] - f[16 * SEGMENT + k], f[17 * SEGMENT + k] - f[18 * SEGMENT + k]
+    xx, yy, zz = s1 + s4 + s5 + s6 + s7, s2 + s4 + s5 + s8 + s9, s3 + s6 + s7 + s8 + s9
+    return (
+        f[k] + s1 + s2 + s3 + s4 + s5 + s6 + s7 + s8 + s9,
+        d1 + d4 + d5 + d6 + d7,
+        d2 + d4 - d5 + d8 + d9,
+        d3 + d6 - d7 + d8 - d9,
+        xx,
+        yy,
+        zz,
+        s4 - s5,
+        s6 - s7,
+        s8 - s9,
+    )
+
+
+@njit(cache=True, inline="always")
+def _relax(
+    f: Any,
+    k: int,
+    density: float,
+    ux: float,
+    uy: float,
+    uz: float,
+    xx: float,
+    yy: float,
+    zz: float,
+    xy: float,
+    xz: float,
+    yz: float,
+    fx: float,
+    fy: float,
+    fz: float,
+    kept: float,
+) -> None:
+    """Write the 19 collided populations from density, velocity, second moments (u u and stress) and force."""
+    isotropic = density - _THREE_HALVES * (xx + yy + zz)
+    f[k] = _REST * isotropic
+    isotropic_axis, isotropic_diagonal = _AXIS * isotropic, _DIAGONAL * isotropic
+    a2, d2, a1, d1 = _AXIS * _FOUR_AND_HALF, _DIAGONAL * _FOUR_AND_HALF, _AXIS * _THREE, _DIAGONAL * _THREE
+    ax, ay, az = ux + fx, uy + fy, uz + fz
+    _relax_pair(f, 1, 2, k, isotropic_axis + a2 * xx, a1 * ax, kept)
+    _relax_pair(f, 3, 4, k, isotropic_axis + a2 * yy, a1 * ay, kept)
+    _relax_pair(f, 5, 6, k, isotropic_axis + a2 * zz, a1 * az, kept)
+    _relax_pair(f, 7, 8, k, isotropic_diagonal + d2 * (xx + yy + xy + xy), d1 * (ax + ay), kept)
+    _relax_pair(f, 9, 10, k, isotropic_diagonal + d2 * (xx + yy - xy - xy), d1 * (ax - ay), kept)
+    _relax_pair(f, 11, 12, k, isotropic_diagonal + d2 * (xx + zz + xz + xz), d1 * (ax + az), kept)
+    _relax_pair(f, 13, 14, k, isotropic_diagonal + d2 * (xx + zz - xz - xz), d1 * (ax - az), kept)
+    _relax_pair(f, 15, 16, k, isotropic_diagonal + d2 * (yy + zz + yz + yz), d1 * (ay + az), kept)
+    _relax_pair(f, 17, 18, k, isotropic_diagonal + d2 * (yy + zz - yz - yz), d1 * (ay - az), kept)
 
 
 @njit(cache=True, fastmath=True)
-def _collide(f: Any, n: int, even_rate: Any, odd_rate: Any) -> None:
-    """Collide n cells of the buffer f (19 * SEGMENT), each at its own rates (n,), and swap opposite populations.
+def _collide(f: Any, n: int, rate: float, odd_rate: float) -> None:
+    """Collide n cells of the buffer f (19 * SEGMENT) and swap opposite populations.
 
-    Two relaxation times (Ginzburg, Verhaeghe and d'Humieres 2008, Commun. Comput. Phys. 3, 427), with the equilibrium
-    of incompressible flow (He and Luo 1997, J. Stat. Phys. 88, 927, eq. 20): its steady state is divergence-free.
+    Regularised: of the even part only the stress survives (Latt and Chopard 2006, Math. Comput. Simul. 72, 165, eq. 12),
+    without its trace, which only carries sound. The odd part has its own rate (Ginzburg, Verhaeghe and d'Humieres 2008,
+    Commun. Comput. Phys. 3, 427). Equilibrium of incompressible flow (He and Luo 1997, J. Stat. Phys. 88, 927, eq. 20):
+    the steady state is free of divergence, whatever the lattice speed.
     """
+    keep, kept_odd, zero = _ONE - rate, _ONE - odd_rate, np.float32(0.0)
     for k in range(n):
-        d1, d2, d3 = (
-            f[1 * SEGMENT + k] - f[2 * SEGMENT + k],
-            f[3 * SEGMENT + k] - f[4 * SEGMENT + k],
-            f[5 * SEGMENT + k] - f[6 * SEGMENT + k],
+        density, ux, uy, uz, pxx, pyy, pzz, pxy, pxz, pyz = _sums(f, k)
+        qxx, qyy, qzz = pxx - ux * ux, pyy - uy * uy, pzz - uz * uz
+        trace = (qxx + qyy + qzz) * _REST
+        _relax(
+            f,
+            k,
+            density,
+            ux,
+            uy,
+            uz,
+            ux * ux + keep * (qxx - trace),
+            uy * uy + keep * (qyy - trace),
+            uz * uz + keep * (qzz - trace),
+            ux * uy + keep * (pxy - ux * uy),
+            ux * uz + keep * (pxz - ux * uz),
+            uy * uz + keep * (pyz - uy * uz),
+            zero,
+            zero,
+            zero,
+            kept_odd,
         )
-        d4, d5 = f[7 * SEGMENT + k] - f[8 * SEGMENT + k], f[9 * SEGMENT + k] - f[10 * SEGMENT + k]
-        d6, d7 = f[11 * SEGMENT + k] - f[12 * SEGMENT + k], f[13 * SEGMENT + k] - f[14 * SEGMENT + k]
-        d8, d9 = f[15 * SEGMENT + k] - f[16 * SEGMENT + k], f[17 * SEGMENT + k] - f[18 * SEGMENT + k]
-        density = f[k]
-        for q in range(1, 19):
-            density += f[q * SEGMENT + k]
-        ux, uy, uz = d1 + d4 + d5 + d6 + d7, d2 + d4 - d5 + d8 + d9, d3 + d6 - d7 + d8 - d9
-        even, odd = even_rate[k], odd_rate[k]
-        isotropic = density - _THREE_HALVES * (ux * ux + uy * uy + uz * uz)
-        f[k] -= even * (f[k] - _REST * isotropic)
-        _relax_pair(f, 1, 2, k, ux, isotropic, _AXIS, even, odd)
-        _relax_pair(f, 3, 4, k, uy, isotropic, _AXIS, even, odd)
-        _relax_pair(f, 5, 6, k, uz, isotropic, _AXIS, even, odd)
-        _relax_pair(f, 7, 8, k, ux + uy, isotropic, _DIAGONAL, even, odd)
-        _relax_pair(f, 9, 10, k, ux - uy, isotropic, _DIAGONAL, even, odd)
-        _relax_pair(f, 11, 12, k, ux + uz, isotropic, _DIAGONAL, even, odd)
-        _relax_pair(f, 13, 14, k, ux - uz, isotropic, _DIAGONAL, even, odd)
-        _relax_pair(f, 15, 16, k, uy + uz, isotropic, _DIAGONAL, even, odd)
-        _relax_pair(f, 17, 18, k, uy - uz, isotropic, _DIAGONAL, even, odd)
-
-
-@njit(inline="always")
-def _relax_forced_pair(
-    f: Any,
-    a: int,
-    b: int,
-    k: int,
-    cu: float,
-    cf: float,
-    isotropic: float,
-    work: float,
-    w: float,
-    even: float,
-    odd: float,
-) -> None:
-    """As `_relax_pair`, with a body force: the source factors 1 - rate / 2 belong to the half-force velocity."""
-    fa, fb = f[a * SEGMENT + k], f[b * SEGMENT + k]
-    source_even = (_ONE - _HALF * even) * w * (_NINE * cu * cf - _THREE * work)
-    source_odd = (_ONE - _HALF * odd) * w * _THREE * cf
-    change_even = even * (_HALF * (fa + fb) - w * (isotropic + _FOUR_AND_HALF * cu * cu)) - source_even
-    change_odd = odd * (_HALF * (fa - fb) - w * _THREE * cu) - source_odd
-    f[a * SEGMENT + k] = fb - change_even + change_odd
-    f[b * SEGMENT + k] = fa - change_even - change_odd
 
 
 @njit(cache=True, inline="always")
 def _resist(entry: Any, ux: float, uy: float, uz: float) -> tuple[float, float, float]:
-    """Half-force velocity u behind a screen, from the velocity u* without it: u = u* + F(u) / 2.
+    """Half-force velocity u inside a screen, from the velocity u* without it: u = u* + F(u) / 2.
 
     `entry` holds the unit normal (3), the linear resistance along it and across it, and the quadratic one along it, all
     per cell and time step: F = -(across u_t + (along + quadratic |u_n|) u_n n). Solved exactly: no stability limit.
@@ -126,64 +174,59 @@ def _resist(entry: Any, ux: float, uy: float, uz: float) -> tuple[float, float, 
     nx, ny, nz, along, across, quadratic = entry[0], entry[1], entry[2], entry[3], entry[4], entry[5]
     normal = ux * nx + uy * ny + uz * nz
     linear = _ONE + _HALF * along
-    kept_normal = (
-        normal * np.float32(2.0) / (linear + np.sqrt(linear * linear + np.float32(2.0) * quadratic * abs(normal)))
-    )
+    root = np.sqrt(linear * linear + _TWO * quadratic * abs(normal))
     kept = _ONE / (_ONE + _HALF * across)
-    extra = kept_normal - kept * normal
+    extra = _TWO * normal / (linear + root) - kept * normal
     return kept * ux + extra * nx, kept * uy + extra * ny, kept * uz + extra * nz
 
 
 @njit(cache=True, fastmath=True)
-def _collide_screened(f: Any, g: Any, n: int, even_rate: Any, odd_rate: Any, place: Any, entries: Any) -> None:
+def _collide_screened(f: Any, g: Any, n: int, rate: float, odd_rate: float, place: Any, entries: Any) -> None:
     """As `_collide`, where the cells `place` of the segment carry the resistances `entries` (see `_resist`).
 
-    The force of Guo, Zheng and Shi 2002 (Phys. Rev. E 65, 046308, eq. 19 and 20), split over the two rates. `g` is a
-    buffer (7 * SEGMENT) for density, velocity and force.
+    The force of Guo, Zheng and Shi 2002 (Phys. Rev. E 65, 046308, eq. 19 and 20): velocity with half the force, and the
+    force's first and second moment with the factors 1 - rate / 2. `g` is a buffer (6 * SEGMENT) for velocity and force.
     """
+    keep, kept_odd = _ONE - rate, _ONE - odd_rate
+    half, half_odd = _ONE - _HALF * rate, (_ONE - _HALF * odd_rate) / odd_rate
     for k in range(n):
-        d1, d2, d3 = (
-            f[1 * SEGMENT + k] - f[2 * SEGMENT + k],
-            f[3 * SEGMENT + k] - f[4 * SEGMENT + k],
-            f[5 * SEGMENT + k] - f[6 * SEGMENT + k],
-        )
-        d4, d5 = f[7 * SEGMENT + k] - f[8 * SEGMENT + k], f[9 * SEGMENT + k] - f[10 * SEGMENT + k]
-        d6, d7 = f[11 * SEGMENT + k] - f[12 * SEGMENT + k], f[13 * SEGMENT + k] - f[14 * SEGMENT + k]
-        d8, d9 = f[15 * SEGMENT + k] - f[16 * SEGMENT + k], f[17 * SEGMENT + k] - f[18 * SEGMENT + k]
-        density = f[k]
-        for q in range(1, 19):
-            density += f[q * SEGMENT + k]
-        g[k] = density
-        g[1 * SEGMENT + k] = d1 + d4 + d5 + d6 + d7
-        g[2 * SEGMENT + k] = d2 + d4 - d5 + d8 + d9
-        g[3 * SEGMENT + k] = d3 + d6 - d7 + d8 - d9
-        g[4 * SEGMENT + k] = g[5 * SEGMENT + k] = g[6 * SEGMENT + k] = np.float32(0.0)
+        _, ux, uy, uz, _, _, _, _, _, _ = _sums(f, k)
+        g[k], g[SEGMENT + k], g[2 * SEGMENT + k] = ux, uy, uz
+        g[3 * SEGMENT + k] = g[4 * SEGMENT + k] = g[5 * SEGMENT + k] = np.float32(0.0)
     for e in range(len(place)):
         k = place[e]
-        ux, uy, uz = g[SEGMENT + k], g[2 * SEGMENT + k], g[3 * SEGMENT + k]
+        ux, uy, uz = g[k], g[SEGMENT + k], g[2 * SEGMENT + k]
         vx, vy, vz = _resist(entries[e], ux, uy, uz)
-        g[SEGMENT + k], g[2 * SEGMENT + k], g[3 * SEGMENT + k] = vx, vy, vz
-        g[4 * SEGMENT + k], g[5 * SEGMENT + k], g[6 * SEGMENT + k] = (
-            np.float32(2.0) * (vx - ux),
-            np.float32(2.0) * (vy - uy),
-            np.float32(2.0) * (vz - uz),
+        g[k], g[SEGMENT + k], g[2 * SEGMENT + k] = vx, vy, vz
+        g[3 * SEGMENT + k], g[4 * SEGMENT + k], g[5 * SEGMENT + k] = (
+            _TWO * (vx - ux),
+            _TWO * (vy - uy),
+            _TWO * (vz - uz),
         )
     for k in range(n):
-        ux, uy, uz = g[SEGMENT + k], g[2 * SEGMENT + k], g[3 * SEGMENT + k]
-        fx, fy, fz = g[4 * SEGMENT + k], g[5 * SEGMENT + k], g[6 * SEGMENT + k]
-        even, odd = even_rate[k], odd_rate[k]
-        work = ux * fx + uy * fy + uz * fz
-        isotropic = g[k] - _THREE_HALVES * (ux * ux + uy * uy + uz * uz)
-        f[k] += even * (_REST * isotropic - f[k]) - (_ONE - _HALF * even) * _THREE * _REST * work
-        _relax_forced_pair(f, 1, 2, k, ux, fx, isotropic, work, _AXIS, even, odd)
-        _relax_forced_pair(f, 3, 4, k, uy, fy, isotropic, work, _AXIS, even, odd)
-        _relax_forced_pair(f, 5, 6, k, uz, fz, isotropic, work, _AXIS, even, odd)
-        _relax_forced_pair(f, 7, 8, k, ux + uy, fx + fy, isotropic, work, _DIAGONAL, even, odd)
-        _relax_forced_pair(f, 9, 10, k, ux - uy, fx - fy, isotropic, work, _DIAGONAL, even, odd)
-        _relax_forced_pair(f, 11, 12, k, ux + uz, fx + fz, isotropic, work, _DIAGONAL, even, odd)
-        _relax_forced_pair(f, 13, 14, k, ux - uz, fx - fz, isotropic, work, _DIAGONAL, even, odd)
-        _relax_forced_pair(f, 15, 16, k, uy + uz, fy + fz, isotropic, work, _DIAGONAL, even, odd)
-        _relax_forced_pair(f, 17, 18, k, uy - uz, fy - fz, isotropic, work, _DIAGONAL, even, odd)
+        density, _, _, _, pxx, pyy, pzz, pxy, pxz, pyz = _sums(f, k)
+        ux, uy, uz = g[k], g[SEGMENT + k], g[2 * SEGMENT + k]
+        fx, fy, fz = g[3 * SEGMENT + k], g[4 * SEGMENT + k], g[5 * SEGMENT + k]
+        qxx, qyy, qzz = pxx - ux * ux, pyy - uy * uy, pzz - uz * uz
+        trace = (qxx + qyy + qzz) * _REST
+        _relax(
+            f,
+            k,
+            density,
+            ux,
+            uy,
+            uz,
+            ux * ux + keep * (qxx - trace) + half * _TWO * ux * fx,
+            uy * uy + keep * (qyy - trace) + half * _TWO * uy * fy,
+            uz * uz + keep * (qzz - trace) + half * _TWO * uz * fz,
+            ux * uy + keep * (pxy - ux * uy) + half * (ux * fy + uy * fx),
+            ux * uz + keep * (pxz - ux * uz) + half * (ux * fz + uz * fx),
+            uy * uz + keep * (pyz - uy * uz) + half * (uy * fz + uz * fy),
+            half_odd * fx,
+            half_odd * fy,
+            half_odd * fz,
+            kept_odd,
+        )
 
 
 @njit(cache=True, fastmath=True, inline="always")
@@ -217,8 +260,8 @@ def update(
     f: Any,
     address: Any,
     length: Any,
-    first: Any,
-    rate: Any,
+    rate: float,
+    odd_rate: float,
     screen_start: Any,
     screen_place: Any,
     screen: Any,
@@ -231,8 +274,8 @@ def update(
     f : (19 * stride + LANES,) float32 populations, in place.
     address : (segments, 19) int32, where the populations of each segment begin: its own in an even step, its
         neighbours' in an odd one.
-    length, first : (segments,) int32 cells of each segment, at most SEGMENT, and the number of the first.
-    rate : (2, cells + LANES) float32 relaxation rates of the even and the odd part.
+    length : (segments,) int32 cells of each segment, at most SEGMENT.
+    rate, odd_rate : float32 relaxation rates of the stress and of the odd part.
     screen_start : (segments + 1,) int32 first screen entry of every segment.
     screen_place, screen : (e,) int32 place within the segment and (e, 6) float32 resistance (see `_resist`).
     threads : number of chunks.
@@ -240,28 +283,29 @@ def update(
     n = length.size
     for chunk in prange(threads):
         buffer = np.zeros(19 * SEGMENT, np.float32)
-        extra = np.zeros(7 * SEGMENT, np.float32)
+        extra = np.zeros(6 * SEGMENT, np.float32)
         for s in range(n * chunk // threads, n * (chunk + 1) // threads):
             _load(f, address[s], length[s], buffer)
             lanes = (length[s] + LANES - 1) // LANES * LANES
-            even, odd = rate[0, first[s] : first[s] + lanes], rate[1, first[s] : first[s] + lanes]
             begin, end = screen_start[s], screen_start[s + 1]
             if begin == end:
-                _collide(buffer, lanes, even, odd)
+                _collide(buffer, lanes, rate, odd_rate)
             else:
-                _collide_screened(buffer, extra, lanes, even, odd, screen_place[begin:end], screen[begin:end])
+                _collide_screened(buffer, extra, lanes, rate, odd_rate, screen_place[begin:end], screen[begin:end])
             _store(buffer, address[s], length[s], f)
 
 
 @njit(cache=True, parallel=True, fastmath=True)
-def reflect(f: Any, address: Any, weight: Any, source: Any, after_even: bool) -> None:
+def reflect(f: Any, address: Any, weight: Any, source: Any, place: Any, refill: Any, after_even: bool) -> None:
     """Send back what crosses a wall or an opening: a weighted sum of three populations, and a source.
 
     Parameters
     ----------
-    address : (links, 4) int32 places a, b, c, d of, after an even step: what leaves along the link, what left the cell
-        behind, what leaves against the link, the mailbox. After an odd step the four stand in reverse order.
+    address : (links, 6) int32 places of, after an even step: what leaves along the link (a), what left the cell behind
+        (b), what leaves against the link (c), the mailbox (d); then (see `defer`) what left the second cell behind (e)
+        and what leaves the cell behind against the link (g). After an odd step a and d, b and c, e and g change roles.
     weight : (links, 3) float32; source : (links,) float32.
+    place, refill : (w,) int32 and float32: what is added to the rest populations of these places.
     """
     for k in prange(len(address)):
         a, b, c, d = _U(address[k, 0]), _U(address[k, 1]), _U(address[k, 2]), _U(address[k, 3])
@@ -269,6 +313,43 @@ def reflect(f: Any, address: Any, weight: Any, source: Any, after_even: bool) ->
             f[d] = weight[k, 0] * f[a] + weight[k, 1] * f[b] + weight[k, 2] * f[c] + source[k]
         else:
             f[a] = weight[k, 0] * f[d] + weight[k, 1] * f[c] + weight[k, 2] * f[b] + source[k]
+    for w in prange(len(place)):
+        f[_U(place[w])] += refill[w]
+
+
+@njit(cache=True, parallel=True, fastmath=True)
+def defer(f: Any, address: Any, correction: Any, source: Any, part: float) -> None:
+    """Move the walls' sources towards the difference between quadratic and linear interpolation (populations at home).
+
+    Quadratic reflection itself can be unstable; as a correction that lags behind it is not, and the steady state is the
+    same (deferred correction, Khosla and Rubin 1974, Comput. Fluids 2, 207).
+
+    Parameters
+    ----------
+    address : (links, 6) as in `reflect`; correction : (links, 5) float32 weights of a, b, c, e and g.
+    """
+    for k in prange(len(address)):
+        a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
+        e, g = _U(address[k, 5]), _U(address[k, 4])
+        wanted = correction[k, 0] * f[a] + correction[k, 1] * f[b] + correction[k, 2] * f[c]
+        wanted += correction[k, 3] * f[e] + correction[k, 4] * f[g]
+        source[k] += part * (wanted - source[k])
+
+
+@njit(cache=True)
+def balance(f: Any, address: Any, group: Any, count: Any, member: Any, refill: Any, part: float) -> None:
+    """Move the refill towards what the interpolated walls lose, spread over groups of wall cells (populations at home).
+
+    Parameters
+    ----------
+    address : (links, 6) of the walls; group : (links,) group of each link's cell.
+    count : (groups,) wall cells of each group; member : (w,) group of each wall cell; refill : (w,).
+    """
+    lost = np.zeros(len(count))
+    for k in range(len(address)):
+        lost[group[k]] += float(f[address[k, 3]]) - float(f[address[k, 0]])
+    for w in range(len(member)):
+        refill[w] += part * (lost[member[w]] / count[member[w]] - refill[w])
 
 
 @njit(cache=True)

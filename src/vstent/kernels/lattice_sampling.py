@@ -77,11 +77,11 @@ def _speed_at(index: Any, velocity: Any, p: Any, v: Any, cells: Any, weights: An
 
 
 @njit(cache=True)
-def trace(index: Any, velocity: Any, seed: Any, step: float, slowest: float, path: Any, speed: Any) -> int:
+def _trace(index: Any, velocity: Any, seed: Any, step: float, slowest: float, path: Any) -> int:
     """Follow the flow from a seed by steps of length `step` (negative: against it); the number of points written.
 
     Classical Runge-Kutta of fourth order in arc length, so that slow blood does not take more points than fast. Ends
-    outside, below the speed `slowest`, or when `path` (m, 3) is full.
+    outside, below the speed `slowest`, or when `path` (m, 4) of points and speeds is full.
     """
     cells, weights = np.zeros(8, np.int32), np.zeros(8)
     k, total, p, q = np.zeros(3), np.zeros(3), seed.copy(), np.zeros(3)
@@ -89,17 +89,27 @@ def trace(index: Any, velocity: Any, seed: Any, step: float, slowest: float, pat
         here = _speed_at(index, velocity, p, k, cells, weights)
         if here < slowest:
             return m
-        path[m], speed[m] = p, here
+        path[m, :3], path[m, 3] = p, here
         total[:] = k / here
         for stage in range(3):
             part = step if stage == 2 else 0.5 * step
-            q[:] = p + part * k / max(here, 1e-300)
+            q[:] = p + part * k / here
             here = _speed_at(index, velocity, q, k, cells, weights)
             if here < slowest:
                 return m + 1
             total += (1.0 if stage == 2 else 2.0) * k / here
         p += step * total / 6.0
     return len(path)
+
+
+@njit(cache=True, parallel=True)
+def trace_all(index: Any, velocity: Any, seeds: Any, step: float, slowest: float, most: int) -> tuple[Any, Any]:
+    """Paths (s, most, 4) of points and speeds from seeds (s, 3), and how many points each has (s,); see `_trace`."""
+    path = np.zeros((len(seeds), most, 4))
+    count = np.zeros(len(seeds), np.int32)
+    for s in prange(len(seeds)):
+        count[s] = _trace(index, velocity, seeds[s], step, slowest, path[s])
+    return path, count
 
 
 @njit(cache=True)

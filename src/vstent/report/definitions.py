@@ -109,35 +109,49 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "inlet_flow_mL_s": Definition("Inlet flow", "Blood that enters through the inlet."),
     "outlet_flow_mL_s": Definition("Outlet flow", "Blood that leaves through the outlet."),
     "neck_inflow_mL_s": Definition(
-        "Neck inflow", "Integral over the neck of the velocity into the sac, where it points in."
+        "Neck inflow", "Integral over the neck of the velocity where it points into the sac."
     ),
     "turnover_time_s": Definition("Turnover time", "Sac volume divided by neck inflow."),
-    "mean_sac_speed_m_s": Definition(
-        "Mean sac speed",
-        "Mean over the sac's volume of the magnitude of the velocity; flow diversion that lowers it by 35 % or more has "
-        "been associated with occlusion.",
+    "mean_sac_velocity_m_s": Definition(
+        "Mean sac velocity",
+        "Mean magnitude of the velocity over the sac; a reduction by 35 % or more has been associated with occlusion.",
     ),
-    "sac_mean_wall_shear_stress_Pa": Definition(
+    "mean_sac_wss_Pa": Definition(
         "Wall shear stress on the sac, mean", "Area mean over the sac's wall of the magnitude of the wall shear stress."
     ),
-    "sac_max_wall_shear_stress_Pa": Definition(
+    "max_sac_wss_Pa": Definition(
         "Wall shear stress on the sac, largest", "Largest magnitude of the wall shear stress on the sac's wall."
     ),
-    "parent_mean_wall_shear_stress_Pa": Definition(
+    "parent_wss_Pa": Definition(
         "Wall shear stress on the parent artery, mean", "Area mean of its magnitude over the parent artery's own wall."
     ),
-    "sac_low_shear_area_fraction": Definition(
+    "low_shear_area_fraction": Definition(
         "Low shear area", "Part of the sac's wall with a wall shear stress below 0.4 Pa."
     ),
-    "sac_mean_pressure_Pa": Definition("Sac pressure, mean", "Mean over the sac's volume, above that of the outlets."),
-    "fast_sac_volume_fraction": Definition("Fast sac volume", "Part of the sac's volume with a speed above 8 cm/s."),
+    "mean_sac_pressure_Pa": Definition("Sac pressure, mean", "Mean over the sac's volume, above that of the outlets."),
+    "fast_sac_volume_mm3": Definition("Fast sac volume", "Volume of the sac with a speed above 8 cm/s."),
+    "max_sac_velocity_m_s": Definition("Largest sac velocity", "Largest magnitude of the velocity in the sac."),
+    "neck_outflow_mL_s": Definition("Neck outflow", "Integral over the neck of the velocity where it leaves the sac."),
+    "sac_kinetic_energy_J": Definition("Kinetic energy of the sac", "Integral over the sac of density u² / 2."),
+    "inflow_concentration_index": Definition(
+        "Inflow concentration",
+        "(Neck inflow / inlet flow) / (inflow area / neck area).",
+        "Cebral et al. 2011, AJNR 32:145",
+    ),
+    "relative_low_shear_area_fraction": Definition(
+        "Low shear area, relative",
+        "Part of the sac's wall below a tenth of the parent artery's mean wall shear stress.",
+    ),
+    "mean_wss_Pa": Definition("Wall shear stress, mean", "Area mean of its magnitude over the whole wall."),
+    "inlet_pressure_Pa": Definition("Inlet pressure", "Mean over the inlet's section, above that of the outlets."),
+    "pressure_drop_Pa": Definition("Pressure drop", "Inlet pressure less that of the widest outlet."),
 }
 
 HEADLINES: Final = (
     "neck_inflow_mL_s",
-    "mean_sac_speed_m_s",
+    "mean_sac_velocity_m_s",
     "turnover_time_s",
-    "sac_mean_wall_shear_stress_Pa",
-    "sac_low_shear_area_fraction",
+    "mean_sac_wss_Pa",
+    "low_shear_area_fraction",
 )
 """The numbers for the first screen, the most telling first."""

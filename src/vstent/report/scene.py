@@ -5,13 +5,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vstent.flow.streamlines import inlet_seeds_mm, neck_seeds_mm, streamlines
 from vstent.flow.types import FlowField
 from vstent.kernels.arrays import Floats, Ints, freeze
-from vstent.report.streams import streamlines
 from vstent.report.thinning import thin_frames, thin_lines, thin_surface
 from vstent.stent import Deployment
 from vstent.surface import Surface
 from vstent.vessel import Anatomy
+
+N_INLET, N_NECK = 70, 60
+"""Streamlines through the inlet and through the neck."""
 
 if TYPE_CHECKING:
     from vstent.study import CaseResult
@@ -220,9 +223,9 @@ def _flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLaye
         values=np.linalg.norm(field.wall_shear_stress_Pa, axis=-1)[origin],
         surface=wall,
     )
-    points, starts, speed = streamlines(field, anatomy)
-    points, starts, speed = thin_lines(points, starts, speed, 24_000)
-    lines = LineLayer(
+    lines = streamlines(field, _seeds_mm(field, anatomy))
+    points, starts, speed = thin_lines(lines.points_mm, lines.starts, lines.speed_m_s, 24_000)
+    stream = LineLayer(
         id="streamlines",
         pane=name,
         colour=_INK,
@@ -232,7 +235,14 @@ def _flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLaye
         starts=starts,
         radius_mm=np.full(len(starts) - 1, 0.025),
     )
-    return [shear, lines]
+    return [shear, stream]
+
+
+def _seeds_mm(field: FlowField, anatomy: Anatomy) -> Floats:
+    """Points (s, 3) on the inlet's section and on the neck."""
+    seeds = [inlet_seeds_mm(field, anatomy.vessel, N_INLET)]
+    seeds += [neck_seeds_mm(field, sac.neck, N_NECK) for sac in anatomy.aneurysms[:1]]
+    return np.concatenate(seeds)
 
 
 _SCALES = {

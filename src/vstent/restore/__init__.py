@@ -55,7 +55,8 @@ def restore(vessel: Vessel, *, at_mm: Floats | None = None, outlet_mm: Floats | 
         x, y, z = np.asarray(at_mm, dtype=float)
         raise InputError(f"no sac stands out of the artery near {x:.1f}, {y:.1f}, {z:.1f} mm: give a point in its dome")
     path = _parent_path(vessel, bulges, outlet_mm)
-    landing = close_landing(vessel.lumen, fit_axis(vessel.lumen, vessel.centerlines[path]))
+    tube = fit_axis(vessel.lumen, vessel.centerlines[path], [bulge.foot_mm for bulge in bulges])
+    landing = close_landing(vessel.lumen, tube)
     side_lines = [line for k, line in enumerate(vessel.centerlines) if k != path]
     sacs = [cut_sac(vessel, landing, side_lines, bulge) for bulge in bulges]
     aneurysms = tuple(sorted((sac for sac in sacs if sac is not None), key=lambda sac: -sac.sac.volume_mm3))

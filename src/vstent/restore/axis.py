@@ -6,6 +6,7 @@ neither sac nor branch, and where a neck leaves few of them, smoothness along th
 fit alternate, the weights tightening.
 """
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.sparse import bmat, csc_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from vstent.kernels import curves
-from vstent.kernels.arrays import Floats
+from vstent.kernels.arrays import Bools, Floats
 from vstent.surface import Surface
 from vstent.trace import parent_radius_mm
 from vstent.vessel import Centerline
@@ -24,7 +25,13 @@ N_RAYS: Final = 48
 """Rays in a section."""
 WAVELENGTH: Final = 1.5
 """The axis and its radius follow waves along the artery longer than this many diameters where the wall is whole."""
-TOLERANCE: Final = ((0.25, 0.70),) * 4 + ((0.20, 0.50),) * 4 + ((0.12, 0.35),) * 4
+FLARE_LENGTH: Final = 1.5
+"""The artery flares into a neck over at most this many of its radii."""
+FAR_SIDE: Final = -0.2
+"""A ray looks at the far side of the neck if the cosine of its angle with the sac's direction is below this."""
+NECK_TRUST: Final = 10.0
+"""Weight of the interpolated radius across a neck against all rays of a section."""
+TOLERANCE: Final = ((0.40, 1.00),) * 4 + ((0.20, 0.50),) * 4 + ((0.12, 0.35),) * 4
 """Per iteration: relative excess of a ray over the radius up to which it counts fully, and from which not at all."""
 
 
@@ -37,18 +44,58 @@ class Tube(NamedTuple):
     """(n,) radius."""
 
 
-def fit_axis(lumen: Surface, line: Centerline) -> Tube:
-    """Fit the axis and radius of the artery along a centerline, blind to sacs and branches."""
+def fit_axis(lumen: Surface, line: Centerline, feet_mm: Sequence[Floats] = ()) -> Tube:
+    """Fit the axis and radius of the artery along a centerline, blind to sacs and branches.
+
+    Parameters
+    ----------
+    lumen : the wall.
+    line : where to begin from.
+    feet_mm : (k, 3) for each sac, where its wall rises from the artery: there the radius is interpolated between the
+        healthy stations on both sides, because the wall that is left flares into the neck.
+    """
     points = curves.resample(line.points_mm, STEP_MM)
     abscissa = curves.arc_length(points)
     parent = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
     radius = np.interp(abscissa / abscissa[-1], line.abscissa_mm / line.length_mm, parent)
     for full, none in TOLERANCE:
+        necks = _across_necks(points, radius, feet_mm)
         rho = section_rays(lumen, points, N_RAYS)
-        excess = rho / radius[:, None] - 1.0
-        weight = np.clip((none - excess) / (none - full), 0.0, 1.0)
-        points, radius = _fit(points, radius, np.where(weight > 0, rho, 0.0), weight)
+        excess = rho / necks.radius_mm[:, None] - 1.0
+        weight = np.where(necks.is_sacward, 0.0, np.clip((none - excess) / (none - full), 0.0, 1.0))
+        points, radius = _fit(points, necks.radius_mm, np.where(weight > 0, rho, 0.0), weight, necks.trust)
     return Tube(points, radius)
+
+
+class _Necks(NamedTuple):
+    radius_mm: Floats
+    """(n,) radius, interpolated across necks."""
+    trust: Floats
+    """(n,) weight of that radius, in rays."""
+    is_sacward: Bools
+    """(n, rays) rays into a neck: only the wall on the far side says where the artery is."""
+
+
+def _across_necks(points: Floats, radius: Floats, feet_mm: Sequence[Floats]) -> _Necks:
+    """Where the necks are, and what the healthy stations on both sides of them say."""
+    abscissa, healthy = curves.arc_length(points), np.ones(len(points), dtype=bool)
+    sacward = np.zeros((len(points), N_RAYS), dtype=bool)
+    directions = section_directions(points, N_RAYS)
+    for foot_mm in feet_mm:
+        place, distance = curves.project(points, foot_mm)
+        at_foot = place[distance < 3.0 * np.interp(place, abscissa, radius)]
+        if not len(at_foot):
+            continue
+        typical = float(np.median(np.interp(at_foot, abscissa, radius)))
+        neck = (abscissa > at_foot.min() - FLARE_LENGTH * typical) & (abscissa < at_foot.max() + FLARE_LENGTH * typical)
+        to_foot = np.einsum("nrd,nd->nr", directions, foot_mm.mean(axis=0) - points)
+        reach = to_foot.max(axis=1, keepdims=True)
+        sacward |= neck[:, None] & (reach > 0.5 * typical) & (to_foot > FAR_SIDE * reach)
+        healthy &= ~neck
+    if not healthy.any():
+        return _Necks(radius, np.zeros(len(points)), sacward)
+    trust = np.where(healthy, 0.0, NECK_TRUST * N_RAYS)
+    return _Necks(np.interp(abscissa, abscissa[healthy], radius[healthy]), trust, sacward)
 
 
 def section_rays(lumen: Surface, points_mm: Floats, n_rays: int) -> Floats:
@@ -65,13 +112,18 @@ def section_directions(points_mm: Floats, n_rays: int) -> Floats:
     return np.cos(angle)[None, :, None] * frames[:, None, 1] + np.sin(angle)[None, :, None] * frames[:, None, 2]
 
 
-def _fit(points: Floats, radius: Floats, rho: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """One least-squares step: rho = r + a cos + b sin with smooth radius r and smooth axis points + a n1 + b n2."""
+def _fit(points: Floats, radius: Floats, rho: Floats, weight: Floats, trust: Floats) -> tuple[Floats, Floats]:
+    """One least-squares step: rho = r + a cos + b sin with smooth radius r and smooth axis points + a n1 + b n2.
+
+    The radius so far counts as `trust` (n,) rays.
+    """
     n, n_rays = rho.shape
     angle = 2 * np.pi * np.arange(n_rays) / n_rays
     basis = np.stack([np.ones(n_rays), np.cos(angle), np.sin(angle)])
     normal = np.einsum("ik,nk,jk->ijn", basis, weight, basis)
     right = np.einsum("ik,nk,nk->in", basis, weight, rho)
+    normal[0, 0] += trust
+    right[0] += trust * radius
     frames = curves.parallel_frames(points)
     wave = WAVELENGTH * 2.0 * float(np.median(radius)) / (2 * np.pi * STEP_MM)
     stiff_radius = n_rays * wave**4 * curves.roughness(n, 2)

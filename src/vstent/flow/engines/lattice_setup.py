@@ -1,0 +1,329 @@
+"""What the lattice-Boltzmann engine needs before its first step: addresses, units, walls, openings, screen."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.flow import sampling
+from vstent.flow.domain import Domain
+from vstent.flow.profile import developed_profile
+from vstent.flow.screen import on_grid
+from vstent.flow.types import Blood, FlowCase
+from vstent.kernels import lattice, voxels
+from vstent.kernels.arrays import Floats, Ints
+from vstent.units import M3_PER_ML
+
+ODD_RATE = 0.7
+"""Relaxation rate of the odd part: lower is more isotropic, higher is more stable and leaks less."""
+REFILL_BLOCK = 4
+"""Edge, in cells, of the blocks within which the walls' losses are made up."""
+SOUND_MEMORY = 0.002
+"""Rate per step pair at which the inlet forgets the pressure that it takes for the mean."""
+
+
+@dataclass(frozen=True, eq=False)
+class Addressing:
+    """Where populations lie (see `vstent.kernels.lattice`)."""
+
+    stride: int
+    """Storage places."""
+    place: Ints
+    """(n,) storage place of every cell."""
+    length: Ints
+    """(s,) cells of every segment."""
+    first_cell: Ints
+    """(s,) first cell of every segment."""
+    even_address: Ints
+    """(s, 19) where the populations of every segment begin in an even step."""
+    odd_address: Ints
+    """(s, 19) the same in an odd step."""
+    link_address: Ints
+    """(l, 6) see `lattice.reflect`."""
+    link_has_one: NDArray[np.bool_]
+    """(l,) the cell behind the link's cell is blood."""
+    link_has_two: NDArray[np.bool_]
+    """(l,) so are the two cells behind it."""
+    swap_address: Ints
+    """(2, t) see `lattice.swap`."""
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Lattice units of one grid and time step."""
+
+    cell_m: float
+    """Edge of a cell."""
+    step_s: float
+    """Time step."""
+    blood: Blood
+    """The fluid."""
+
+    @property
+    def speed_m_s(self) -> float:
+        """One cell per time step."""
+        return self.cell_m / self.step_s
+
+    @property
+    def pressure_Pa(self) -> float:
+        """Pressure of unit density deviation: rho c^2 / 3."""
+        return self.blood.density_kg_m3 * self.speed_m_s**2 / 3
+
+    @property
+    def flow_mL_s(self) -> float:
+        """One cell volume per time step."""
+        return self.cell_m**3 / self.step_s / M3_PER_ML
+
+    @property
+    def viscosity(self) -> float:
+        """Kinematic viscosity, in squared cells per time step."""
+        return self.blood.kinematic_viscosity_m2_s * self.step_s / self.cell_m**2
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Coefficients of everything that is sent back, openings first, in order, then the wall; sources change in place."""
+
+    address: Ints
+    """(l, 6) see `lattice.reflect`."""
+    weight: NDArray[np.float32]
+    """(l, 3) see `lattice.reflect`."""
+    correction: NDArray[np.float32]
+    """(l, 5) see `lattice.defer`."""
+    source: NDArray[np.float32]
+    """(l,)."""
+    openings: Floats
+    """(k, 7) see `lattice.drive`."""
+    start: Ints
+    """(k + 1,) first link of every opening, and of the wall."""
+    place: Ints
+    """(o,) storage place of every opening link."""
+    direction: Ints
+    """(o,) lattice velocity of every opening link."""
+    shape: Floats
+    """(o,) what unit inflow sends back."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refill:
+    """What interpolated walls lose and get back (see `lattice.balance`); `refill` changes in place."""
+
+    place: Ints
+    """(w,) storage place of every wall cell."""
+    member: Ints
+    """(w,) its group: wall cells of a block of `REFILL_BLOCK` cells."""
+    count: Ints
+    """(g,) wall cells of every group."""
+    link_group: Ints
+    """(l,) group of every wall link's cell."""
+    refill: NDArray[np.float32]
+    """(w,) added in every step."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenEntries:
+    """A screen by segment (see `lattice.update`)."""
+
+    start: Ints
+    """(s + 1,)."""
+    place: Ints
+    """(e,) place within the segment."""
+    entry: NDArray[np.float32]
+    """(e, 6)."""
+    cell: Ints
+    """(e,) cell."""
+
+
+def address(domain: Domain) -> Addressing:
+    """Lay out the populations of a domain."""
+    cells = domain.cells
+    inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
+    inside[tuple(cells.T)] = True
+    stored = voxels.dilate(inside, lattice.VELOCITIES[1:])
+    number = np.full(inside.shape, -1, dtype=np.int32)
+    stride = int(stored.sum())
+    number[stored] = np.arange(stride, dtype=np.int32)
+    place = number[tuple(cells.T)]
+    first = np.flatnonzero(np.r_[True, (np.diff(cells[:, :2], axis=0) != 0).any(axis=1) | (np.diff(cells[:, 2]) != 1)])
+    length = np.diff(np.r_[first, len(cells)])
+    first, length = _cut(first, length)
+    start = cells[first]
+    behind = [number[tuple((start - c).T)] for c in lattice.VELOCITIES]
+    even = place[first][:, None] + stride * np.arange(19)
+    odd = np.stack([lattice.OPPOSITE[q] * stride + behind[q] for q in range(19)], axis=1)
+    links = _link_addresses(domain, number, inside, stride)
+    swaps = _swap_addresses(domain, number, stride)
+    to_int = np.int32
+    return Addressing(
+        stride,
+        place,
+        length.astype(to_int),
+        first.astype(to_int),
+        even.astype(to_int),
+        odd.astype(to_int),
+        *links,
+        swaps,
+    )
+
+
+def _cut(first: Ints, length: Ints) -> tuple[Ints, Ints]:
+    """Cut segments longer than the buffer."""
+    pieces = -(-length // lattice.SEGMENT)
+    owner = np.repeat(np.arange(len(first)), pieces)
+    rank = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    start = rank * lattice.SEGMENT
+    return first[owner] + start, np.minimum(length[owner] - start, lattice.SEGMENT)
+
+
+def _link_addresses(
+    domain: Domain, number: Ints, inside: NDArray[np.bool_], stride: int
+) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Addresses (l, 6) of `lattice.reflect`, and whether one and whether two blood cells lie behind the link's cell."""
+    q = domain.link_direction
+    p = lattice.OPPOSITE[q]
+    cell, c = domain.cells[domain.link_cell], lattice.VELOCITIES[q]
+    second = np.maximum(cell - 2 * c, 0)
+    has_one = inside[tuple((cell - c).T)]
+    has_two = has_one & inside[tuple(second.T)]
+    here, ahead, behind = (number[tuple(x.T)] for x in (cell, cell + c, cell - c))
+    further = np.where(has_two, number[tuple(second.T)], here)
+    rows = [
+        p * stride + here,
+        p * stride + behind,
+        q * stride + here,
+        q * stride + ahead,
+        p * stride + further,
+        q * stride + behind,
+    ]
+    return np.stack(rows, axis=1).astype(np.int32), has_one, has_two
+
+
+def _swap_addresses(domain: Domain, number: Ints, stride: int) -> Ints:
+    q = domain.septum_direction
+    cell = domain.cells[domain.septum_cell]
+    here, ahead = (number[tuple(x.T)] for x in (cell, cell + lattice.VELOCITIES[q]))
+    return np.stack([lattice.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
+
+
+def build_links(case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales) -> Links:
+    """Interpolated reflection at the wall, imposed flow or pressure at the openings."""
+    order = _link_order(domain)
+    patch = domain.link_patch[order]
+    start = np.searchsorted(patch[: int((patch > 0).sum())], np.arange(1, len(domain.sections) + 2)).astype(np.int32)
+    fraction = domain.link_fraction[order]
+    weight = _linear_weights(fraction, addressing.link_has_one[order])
+    correction = _quadratic_weights(fraction)
+    correction[:, :3] -= weight
+    correction[~addressing.link_has_two[order]] = 0.0
+    shape = np.zeros(start[-1])
+    openings = np.zeros((len(domain.sections), 7))
+    for k, flow_mL_s in enumerate(_imposed_flows_mL_s(case)):
+        links = slice(start[k], start[k + 1])
+        openings[k, 4:] = case.vessel.openings[k].normal
+        weight[links], correction[links] = (-1.0, 0.0, 0.0), 0.0
+        if flow_mL_s is not None:
+            weight[links] = (1.0, 0.0, 0.0)
+            area_mm2 = case.vessel.openings[k].area_mm2
+            openings[k, :4] = 1.0, flow_mL_s / area_mm2 / scales.speed_m_s, 0.0, SOUND_MEMORY
+            shape[links] = _unit_inflow(case, domain, k, order[links]) * area_mm2 / domain.cell_size_mm**2
+    opening_links = order[: start[-1]]
+    return Links(
+        addressing.link_address[order],
+        weight.astype(np.float32),
+        correction.astype(np.float32),
+        np.zeros(len(order), dtype=np.float32),
+        openings,
+        start,
+        addressing.place[domain.link_cell[opening_links]],
+        domain.link_direction[opening_links],
+        shape,
+    )
+
+
+def _link_order(domain: Domain) -> Ints:
+    """Openings first, in order, then the wall; by cell within each."""
+    return np.argsort(np.where(domain.link_patch == 0, len(domain.sections) + 1, domain.link_patch), kind="stable")
+
+
+def _linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
+    """Linear interpolated reflection (Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids 13, 3452, eq. 5).
+
+    Half-way where it would need the cell behind and that is no blood.
+    """
+    zero = np.zeros_like(fraction)
+    near = np.stack([2 * fraction, 1 - 2 * fraction, zero], axis=1)
+    far = np.stack([0.5 / fraction, zero, 1 - 0.5 / fraction], axis=1)
+    weight = np.where(fraction[:, None] < 0.5, near, far)
+    weight[~has_one & (fraction < 0.5)] = (1.0, 0.0, 0.0)
+    return weight
+
+
+def _quadratic_weights(fraction: Floats) -> Floats:
+    """Quadratic interpolated reflection (Lallemand and Luo 2003, J. Comput. Phys. 184, 406, eq. 10): (l, 5)."""
+    x, zero = fraction, np.zeros_like(fraction)
+    near = np.stack([x * (1 + 2 * x), 1 - 4 * x**2, zero, -x * (1 - 2 * x), zero], axis=1)
+    far = np.stack([1 / (x * (2 * x + 1)), zero, (2 * x - 1) / x, zero, (1 - 2 * x) / (1 + 2 * x)], axis=1)
+    return np.where(x[:, None] < 0.5, near, far)
+
+
+def _imposed_flows_mL_s(case: FlowCase) -> list[float | None]:
+    """Inflow through every opening, None where pressure is imposed; the widest outlet takes the rest."""
+    outlets = case.vessel.outlets
+    if case.settings.outlets == "zero_pressure" or len(outlets) < 2:
+        return [case.inflow_mL_s, *[None] * len(outlets)]
+    share = np.array([outlet.diameter_mm**3 for outlet in outlets])
+    widest = int(np.argmax(share))
+    return [case.inflow_mL_s] + [
+        None if k == widest else -case.inflow_mL_s * float(share[k] / share.sum()) for k in range(len(outlets))
+    ]
+
+
+def _unit_inflow(case: FlowCase, domain: Domain, k: int, links: Ints) -> Floats:
+    """What each link of opening k sends back so that the whole flow is one cell volume per time step."""
+    normal = case.vessel.openings[k].normal
+    c = lattice.VELOCITIES[domain.link_direction[links]]
+    halfway_mm = domain.origin_mm + (domain.cells[domain.link_cell[links]] + 0.5 * c) * domain.cell_size_mm
+    speed = developed_profile(domain.sections[k], normal, halfway_mm)
+    sent = lattice.WEIGHTS[domain.link_direction[links]] * speed * (c @ normal)
+    return sent / sent.sum()
+
+
+def build_refill(domain: Domain, addressing: Addressing) -> Refill:
+    """Group the wall cells into blocks."""
+    order = _link_order(domain)
+    cell = domain.link_cell[order][domain.link_patch[order] == 0]
+    wall_cell, of_link = np.unique(cell, return_inverse=True)
+    _, member, count = np.unique(
+        domain.cells[wall_cell] // REFILL_BLOCK, axis=0, return_inverse=True, return_counts=True
+    )
+    member = member.ravel().astype(np.int32)
+    return Refill(
+        addressing.place[wall_cell],
+        member,
+        count.astype(np.int32),
+        member[of_link],
+        np.zeros(len(wall_cell), np.float32),
+    )
+
+
+def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales) -> ScreenEntries:
+    """The case's screen in lattice units."""
+    segments = len(addressing.length)
+    if case.screen is None:
+        return ScreenEntries(
+            np.zeros(segments + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32), np.zeros(0, np.int32)
+        )
+    spread = on_grid(case.screen, sampling.index_of(domain.cells), domain.origin_mm, domain.cell_size_mm)
+    per_step = scales.step_s / case.blood.density_kg_m3
+    entry = np.column_stack(
+        [
+            spread.normal,
+            spread.along_Pa_s_m2 * per_step,
+            spread.across_Pa_s_m2 * per_step,
+            spread.inertial_per_m * scales.cell_m,
+        ]
+    )
+    segment = np.searchsorted(addressing.first_cell, spread.cell, side="right") - 1
+    start = np.searchsorted(segment, np.arange(segments + 1)).astype(np.int32)
+    place = (spread.cell - addressing.first_cell[segment]).astype(np.int32)
+    return ScreenEntries(start, place, entry.astype(np.float32), spread.cell)

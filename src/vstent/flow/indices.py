@@ -1,0 +1,118 @@
+"""Numbers that a flow is judged by, and their change when a stent is in."""
+
+import numpy as np
+
+from vstent.flow import sampling
+from vstent.flow.domain import cells_inside
+from vstent.flow.types import FlowField
+from vstent.kernels import lattice_sampling
+from vstent.kernels.arrays import Bools, Floats
+from vstent.surface import Surface
+from vstent.units import M_PER_MM
+
+LOW_SHEAR_PA = 0.4
+"""Below this wall shear stress endothelium degenerates (Malek, Alper and Izumo 1999, JAMA 282, 2035)."""
+LOW_SHEAR_SHARE = 0.1
+"""Low shear relative to the parent artery's mean (Xiang et al. 2011, Stroke 42, 144)."""
+FAST_M_S = 0.08
+"""Blood faster than this in a sac counts as its jet (design.md section 5)."""
+NEAR_MM = 10.0
+"""The parent wall is the wall within this distance of the neck (Cebral et al. 2011, AJNR 32, 145)."""
+
+
+def indices(field: FlowField, sac: Surface | None = None, neck: Surface | None = None) -> dict[str, float]:
+    """Every index of a flow, its unit in its key.
+
+    Of the vessel: ``inlet_flow_mL_s``, ``outlet_K_flow_mL_s``, ``inlet_pressure_Pa``, ``pressure_drop_Pa`` (inlet to
+    widest outlet), ``mean_wss_Pa``. With a sac (closed) and its neck (normals into the sac), besides:
+
+    - ``neck_inflow_mL_s`` = integral over the neck of max(u.n, 0), ``neck_outflow_mL_s`` of max(-u.n, 0);
+      ``turnover_time_s`` = sac volume / inflow;
+    - ``mean_sac_velocity_m_s``, ``max_sac_velocity_m_s``, ``mean_sac_pressure_Pa`` over the sac's cells;
+      ``sac_kinetic_energy_J`` = integral of rho u^2 / 2; ``fast_sac_volume_mm3`` where u > 0.08 m/s;
+    - ``mean_sac_wss_Pa``, ``max_sac_wss_Pa`` over the sac's wall; ``parent_wss_Pa`` over the other wall within 10 mm of
+      the neck; ``low_shear_area_fraction`` of the sac's wall below 0.4 Pa, ``relative_low_shear_area_fraction`` below a
+      tenth of the parent's mean;
+    - ``inflow_concentration_index`` = (inflow / inlet flow) / (inflow area / neck area) (Cebral et al. 2011, AJNR 32,
+      145).
+    """
+    result = _of_vessel(field)
+    if sac is not None and neck is not None:
+        result |= _of_neck(field, sac, neck) | _of_sac(field, sac) | _of_sac_wall(field, sac, neck)
+    return result
+
+
+def compare(bare: dict[str, float], stented: dict[str, float]) -> dict[str, float]:
+    """Ratios stented over bare of the indices that both have, ``KEY_ratio``; indices that are zero when bare drop out."""
+    return {f"{key}_ratio": stented[key] / value for key, value in bare.items() if key in stented and value != 0}
+
+
+def _of_vessel(field: FlowField) -> dict[str, float]:
+    outlets = {f"outlet_{k + 1}_flow_mL_s": float(flow) for k, flow in enumerate(field.outlets_mL_s)}
+    stress_Pa = np.linalg.norm(field.wall_shear_stress_Pa, axis=1)
+    return {
+        "inlet_flow_mL_s": field.inlet_mL_s,
+        **outlets,
+        "inlet_pressure_Pa": field.inlet_pressure_Pa,
+        "pressure_drop_Pa": field.inlet_pressure_Pa - float(field.outlet_pressure_Pa[0]),
+        "mean_wss_Pa": float(np.average(stress_Pa, weights=_vertex_areas_mm2(field.wall))),
+    }
+
+
+def _of_neck(field: FlowField, sac: Surface, neck: Surface) -> dict[str, float]:
+    points_mm, area_mm2 = sampling.surface_samples(neck, field.cell_size_mm)
+    points = (points_mm - field.origin_mm) / field.cell_size_mm
+    velocity_m_s = lattice_sampling.interpolate(field.index, field.velocity_m_s, points, True)
+    through_mL_s = np.einsum("ij,ij->i", velocity_m_s, area_mm2)  # m/s times mm^2 is mL/s
+    inflow_mL_s = float(through_mL_s[through_mL_s > 0].sum())
+    sizes_mm2 = np.linalg.norm(area_mm2, axis=1)
+    inflow_share = sizes_mm2[through_mL_s > 0].sum() / sizes_mm2.sum()
+    return {
+        "neck_inflow_mL_s": inflow_mL_s,
+        "neck_outflow_mL_s": float(-through_mL_s[through_mL_s < 0].sum()),
+        "turnover_time_s": abs(sac.volume_mm3) * 1e-3 / max(inflow_mL_s, 1e-12),
+        "inflow_concentration_index": inflow_mL_s / field.inlet_mL_s / max(float(inflow_share), 1e-12),
+    }
+
+
+def _of_sac(field: FlowField, sac: Surface) -> dict[str, float]:
+    cells = cells_inside(sac, field.centers_mm, field.cell_size_mm)
+    speed_m_s = field.speed_m_s[cells]
+    # Cells cut by the sac's wall count as a whole or not at all: integrals are scaled to the true volume.
+    volume_mm3 = abs(sac.volume_mm3)
+    energy_J = 0.5 * field.blood.density_kg_m3 * float((speed_m_s**2).mean()) * volume_mm3 * M_PER_MM**3
+    return {
+        "mean_sac_velocity_m_s": float(speed_m_s.mean()),
+        "max_sac_velocity_m_s": float(speed_m_s.max()),
+        "mean_sac_pressure_Pa": float(field.pressure_Pa[cells].mean()),
+        "sac_kinetic_energy_J": energy_J,
+        "fast_sac_volume_mm3": float((speed_m_s > FAST_M_S).mean()) * volume_mm3,
+    }
+
+
+def _of_sac_wall(field: FlowField, sac: Surface, neck: Surface) -> dict[str, float]:
+    stress_Pa = np.linalg.norm(field.wall_shear_stress_Pa, axis=1)
+    area_mm2 = _vertex_areas_mm2(field.wall)
+    is_sac = on_sac(field.wall, sac, 0.2 * field.cell_size_mm)
+    is_near = np.linalg.norm(field.wall.vertices_mm - neck.vertices_mm.mean(axis=0), axis=1) < NEAR_MM
+    parent_Pa = _mean(stress_Pa, area_mm2, is_near & ~is_sac)
+    return {
+        "mean_sac_wss_Pa": _mean(stress_Pa, area_mm2, is_sac),
+        "max_sac_wss_Pa": float(stress_Pa[is_sac].max()),
+        "parent_wss_Pa": parent_Pa,
+        "low_shear_area_fraction": _mean(stress_Pa < LOW_SHEAR_PA, area_mm2, is_sac),
+        "relative_low_shear_area_fraction": _mean(stress_Pa < LOW_SHEAR_SHARE * parent_Pa, area_mm2, is_sac),
+    }
+
+
+def on_sac(wall: Surface, sac: Surface, tolerance_mm: float) -> Bools:
+    """Tell which vertices (v,) of the wall lie on the sac's surface."""
+    return sac.closest(wall.vertices_mm)[1] < tolerance_mm
+
+
+def _vertex_areas_mm2(surface: Surface) -> Floats:
+    return np.bincount(surface.faces.ravel(), np.repeat(surface.areas_mm2 / 3, 3), len(surface.vertices_mm))
+
+
+def _mean(values: Floats | Bools, weights: Floats, chosen: Bools) -> float:
+    return float(np.average(values[chosen], weights=weights[chosen]))

@@ -1,0 +1,102 @@
+"""The command line as a user meets it: help, errors, exit codes, resume."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shapes import sphere
+from vstent import phantoms
+from vstent.cli import main
+from vstent.io.writers import write_stl
+from vstent.surface import Surface
+
+
+@pytest.fixture
+def artery(tmp_path: Path) -> Path:
+    """A curved artery with a sac, as an STL file."""
+    path = tmp_path / "ärtery with space.stl"
+    write_stl(path, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
+    return path
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from vstent.cli import main\n"
+        "try: main(['run', '--help'])\n"
+        "except SystemExit: pass\n"
+        "print(sorted({'numpy', 'numba', 'vtkmodules', 'scipy', 'rich'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert "Research use only" in done.stdout
+
+
+BAD = {
+    "a text file named .stl": ("text.stl", b"hello\n", [], "not a .stl"),
+    "an empty mesh": ("empty.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", [], "no triangles"),
+    "a volume without spacing": ("scan.raw", bytes(4096), ["--shape", "16,16,16"], "spacing"),
+    "a volume without shape": ("scan.raw", bytes(4096), ["--spacing", "0.4"], "shape"),
+    "a volume of zeros": ("scan.raw", bytes(4096), ["--shape", "16,16,16", "--spacing", "0.4"], "lumen"),
+    "a device that does not exist": ("text.stl", b"hello\n", ["--device", "slik"], "silk"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_ends_in_one_sentence(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, content, options, said = BAD[name]
+    (tmp_path / file).write_bytes(content)
+    out = tmp_path / "out"
+    assert main(["run", str(tmp_path / file), "--out", str(out), *options]) == 2
+    assert _complaint(capsys, said)
+    assert not out.exists()
+
+
+def _complaint(capsys: pytest.CaptureFixture[str], said: str) -> bool:
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("vstent: ")]
+    return said in line
+
+
+def test_a_missing_file_and_a_closed_sphere_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(tmp_path / "no.stl"), "--out", str(tmp_path / "out")]) == 2
+    assert _complaint(capsys, "does not exist")
+    write_stl(tmp_path / "sphere.stl", sphere(3.0))
+    assert main(["run", str(tmp_path / "sphere.stl"), "--out", str(tmp_path / "out"), "--units", "mm"]) == 2
+    assert _complaint(capsys, "openings")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_device_longer_than_the_artery_leaves_nothing_behind(
+    artery: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    code = main(["run", str(artery), "--out", str(out), "--device", "silk", "--length", "40", "--no-flow"])
+    assert code == 2
+    assert _complaint(capsys, "longer than the artery")
+    assert not out.exists()
+
+
+def test_a_surface_in_metres_gives_the_same_case(artery: Path, tmp_path: Path) -> None:
+    import json
+
+    from vstent.io.surfaces import read_surface
+
+    surface, _ = read_surface(artery, units="mm")
+    in_metres = tmp_path / "metres.stl"
+    write_stl(in_metres, Surface(surface.vertices_mm / 1000, surface.faces))
+    found = []
+    for path, name in ((artery, "mm"), (in_metres, "m")):
+        assert main(["run", str(path), "--out", str(tmp_path / name), "--device", "silk", "--no-flow"]) == 0
+        found.append(json.loads((tmp_path / name / "metrics.json").read_text()))
+    for key in ("sac_volume_mm3", "neck_area_mm2"):
+        np.testing.assert_allclose(found[1]["vessel"][key], found[0]["vessel"][key], rtol=2e-3)
+
+
+@pytest.mark.parametrize("text", ["1,2", "1,2,x", ""])
+def test_points_are_checked(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["run", "scan.nii", "--out", "out", f"--at={text}"])
+    assert stopped.value.code == 2
+    assert "--at" in capsys.readouterr().err
