@@ -172,7 +172,7 @@ def metrics():
                 "coverage_fraction": 0.2816,
             },
             "flow": flow,
-            "ratios": {"neck_inflow_ratio": strength, "mean_sac_speed_ratio": strength},
+            "ratios": {"neck_inflow_ratio": strength, "mean_sac_velocity_ratio": strength},
         }
     vessel = {
         "sac_volume_mm3": 111.9,

@@ -192,7 +192,7 @@ def test_three_digits_survive_at_every_magnitude(exponent):
 @pytest.mark.parametrize(
     ("key", "expected"),
     [
-        ("mean_sac_velocity_m_s", ("mean_sac_speed", "m_s")),
+        ("mean_sac_velocity_m_s", ("mean_sac_velocity", "m_s")),
         ("time_s", ("time", "s")),
         ("n_nodes", ("n_nodes", "")),
         ("outlets", ("outlets", "")),

@@ -1,6 +1,7 @@
 """Openings and centerlines on vessels with a known axis."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -107,7 +108,7 @@ def _domed(vessel: Vessel, loop: np.ndarray) -> Surface:
         vertices.append(ring)
     vertices.append((center + 2.0 * outward)[None])
     tip = sum(map(len, vertices)) - 1
-    for low, high in zip(rings, rings[1:], strict=False):
+    for low, high in pairwise(rings):
         n_low, n_high = np.roll(low, -1), np.roll(high, -1)
         faces += [np.stack([n_low, low, high], 1), np.stack([n_low, high, n_high], 1)]
     faces.append(np.stack([np.roll(rings[-1], -1), rings[-1], np.full(len(loop), tip)], 1))

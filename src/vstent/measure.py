@@ -18,7 +18,7 @@ from vstent.vessel import Anatomy, Aneurysm
 Measures = dict[str, float | str]
 """Numbers by names that end in their unit; a few names hold words."""
 
-NECK_TOLERANCE_MM: Final = 0.05
+NECK_TOLERANCE_MM: Final = 0.02
 """The neck's triangles lie on the landing surface to within this: they are other triangles than its own."""
 SAMPLES_PER_QUAD: Final = 8
 """Points per direction at which coverage is tried in every quad of the contour."""

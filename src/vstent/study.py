@@ -275,7 +275,7 @@ def _metrics(
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
     shapes = (sac.sac, sac.neck) if sac else ()
     flow = {name: indices(field, *shapes) for name, field in fields.items()}
-    stents = {}
+    stents: dict[str, dict[str, Any]] = {}
     for name, deployment in deployments.items():
         stents[name] = {"deployment": measure(anatomy, deployment)}
         if name in flow:

@@ -84,9 +84,7 @@ def flow_case(
     )
 
 
-def simulate_case(
-    case: FlowCase, *, start: FlowField | None = None, progress: OnProgress | None = None
-) -> FlowField:
+def simulate_case(case: FlowCase, *, start: FlowField | None = None, progress: OnProgress | None = None) -> FlowField:
     """Compute one steady flow.
 
     Parameters

@@ -67,12 +67,13 @@ class Domain:
 
 
 def default_cell_size_mm(case: FlowCase) -> float:
-    """Edge of a cell: as set; else `cells_per_diameter` across the inlet, within the budget of cells."""
+    """Edge of a cell: as set; else `cells_per_diameter` across the vessel's mean diameter, within the cell budget."""
     settings = case.settings
     if settings.cell_size_mm is not None:
         return settings.cell_size_mm
-    by_diameter = case.vessel.inlet.diameter_mm / settings.cells_per_diameter
-    by_budget = (abs(case.vessel.closed.volume_mm3) / settings.cell_budget) ** (1 / 3)
+    volume_mm3 = case.vessel.closed.volume_mm3
+    by_diameter = 4 * volume_mm3 / case.vessel.lumen.area_mm2 / settings.cells_per_diameter
+    by_budget = (volume_mm3 / settings.cell_budget) ** (1 / 3)
     return max(by_diameter, by_budget)
 
 
@@ -89,7 +90,7 @@ def build(vessel: Vessel, cell_size_mm: float) -> Domain:
     # An odd offset keeps grid lines off the vertices and edges of analytic shapes.
     origin_mm = low - cell_size_mm * (2.0 + np.array([0.1327, 0.2171, 0.1733]))
     shape = np.ceil((surface.vertices_mm.max(axis=0) - origin_mm) / cell_size_mm).astype(int) + 3
-    inside = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, tuple(int(n) for n in shape))
+    inside = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, (int(shape[0]), int(shape[1]), int(shape[2])))
     inside = _connected(inside, vessel, sections[0], origin_mm, cell_size_mm)
     cells = np.argwhere(inside).astype(np.int32)
     if len(cells) < MIN_CELLS:
@@ -208,7 +209,7 @@ def _links(
 
 def _septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, cell_size_mm: float) -> tuple[Ints, Ints]:
     """Links between two blood cells with a wall between them: their cell and direction, each pair once."""
-    is_edge = (neighbour < 0).any(axis=1)
+    is_edge = np.asarray((neighbour < 0).any(axis=1))
     candidate = is_edge[:, None] & (neighbour >= 0) & is_edge[neighbour]
     candidate[:, 0::2] = False
     cell, direction = np.nonzero(candidate)
@@ -228,5 +229,5 @@ def cells_inside(surface: Surface, centers_mm: Floats, cell_size_mm: float) -> I
     origin_mm = centers_mm[near].min(axis=0) - cell_size_mm
     place = np.rint((centers_mm[near] - origin_mm) / cell_size_mm).astype(int)
     shape = place.max(axis=0) + 2
-    inside = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, tuple(int(n) for n in shape))
+    inside = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, (int(shape[0]), int(shape[1]), int(shape[2])))
     return near[inside[tuple(place.T)]].astype(np.int32)

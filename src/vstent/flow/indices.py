@@ -43,7 +43,7 @@ def indices(field: FlowField, sac: Surface | None = None, neck: Surface | None =
 
 
 def compare(bare: dict[str, float], stented: dict[str, float]) -> dict[str, float]:
-    """Ratios stented over bare of the indices that both have, ``KEY_ratio``; indices that are zero when bare drop out."""
+    """Ratios stented over bare of the indices that both have, ``KEY_ratio``; those that are zero when bare drop out."""
     return {f"{key}_ratio": stented[key] / value for key, value in bare.items() if key in stented and value != 0}
 
 
@@ -111,7 +111,8 @@ def on_sac(wall: Surface, sac: Surface, tolerance_mm: float) -> Bools:
 
 
 def _vertex_areas_mm2(surface: Surface) -> Floats:
-    return np.bincount(surface.faces.ravel(), np.repeat(surface.areas_mm2 / 3, 3), len(surface.vertices_mm))
+    area_mm2 = np.repeat(surface.areas_mm2 / 3, 3)
+    return np.bincount(surface.faces.ravel(), area_mm2, len(surface.vertices_mm)).astype(np.float64)
 
 
 def _mean(values: Floats | Bools, weights: Floats, chosen: Bools) -> float:

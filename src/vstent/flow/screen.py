@@ -27,8 +27,8 @@ SAMPLE_MM = 0.05
 def drag_per_length(diameter: Floats, spacing: Floats) -> Floats:
     """Drag per length over viscosity times velocity of a row of cylinders, F' / (mu U); same unit for both lengths.
 
-    F' = 8 pi mu U / (1 - 2 ln(2 t) + 2 t^2 / 3 - t^4 / 9), t = pi d / (2 s) (Tamada and Fujikawa 1957, Q. J. Mech. Appl.
-    Math. 10, 425; design.md section 5). 10.70 at d / s = 1 / 6.
+    F' = 8 pi mu U / (1 - 2 ln(2 t) + 2 t^2 / 3 - t^4 / 9), t = pi d / (2 s) (Tamada and Fujikawa 1957, Q. J. Mech.
+    Appl. Math. 10, 425; design.md section 5). 10.70 at d / s = 1 / 6.
     """
     t = np.pi * np.minimum(diameter / spacing, 0.5) / 2
     return 8 * np.pi / (1 - 2 * np.log(2 * t) + 2 * t**2 / 3 - t**4 / 9)
@@ -48,7 +48,7 @@ def screen(stent: Stent, blood: Blood) -> Screen:
 
     At every node of the contour the wire length per area, lambda, is measured over a neighbourhood of a few pores; two
     crossing families then lie s = 2 / lambda apart, and every piece of wire resists as in a row of that spacing. So one
-    law serves braids, laser-cut cells and their mixtures of diameters, wherever bends or neck have opened or closed them.
+    law serves braids, laser-cut cells and their mixtures of diameters, wherever bends have opened or closed them.
 
     Raises
     ------
@@ -162,7 +162,7 @@ def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float)
     found, place = np.unique(cell, return_inverse=True)
 
     def gathered(values: Floats) -> Floats:
-        return np.bincount(place, per_volume * values[owner], len(found))
+        return np.bincount(place, per_volume * values[owner], len(found)).astype(np.float64)
 
     # The normals of one sheet agree nearly; signs may differ where two sheets meet in a cell, but only n n^T counts.
     normal = np.stack([gathered(component) for component in screen.normals.T], axis=1)

@@ -35,16 +35,16 @@ class FlowSettings:
     outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
     """Zero pressure at every outlet, or the flow split as radius cubed (Murray 1926, PNAS 12, 207)."""
     cell_size_mm: float | None = None
-    """Edge of a grid cell; None: `cells_per_diameter` across the inlet, but no more than `cell_budget` cells."""
-    cells_per_diameter: float = 26.0
-    """Cells across the inlet, where no cell size is given."""
+    """Edge of a grid cell; None: `cells_per_diameter` across the vessel, but no more than `cell_budget` cells."""
+    cells_per_diameter: float = 24.0
+    """Cells across the vessel's mean (hydraulic) diameter 4 V / A, where no cell size is given."""
     cell_budget: float = 320_000.0
     """Most cells of the vessel, where no cell size is given."""
-    tolerance: float = 0.005
+    tolerance: float = 0.01
     """Converged when every monitored quantity has less than this fraction of itself left to go."""
-    max_steps: int = 40_000
+    max_steps: int = 24_000
     """Most time steps on the fine grid."""
-    lattice_speed: float = 0.1
+    lattice_speed: float = 0.2
     """Peak speed in cells per time step: sets the time step."""
 
 

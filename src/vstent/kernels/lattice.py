@@ -134,7 +134,7 @@ def _relax(
 def _collide(f: Any, n: int, rate: float, odd_rate: float) -> None:
     """Collide n cells of the buffer f (19 * SEGMENT) and swap opposite populations.
 
-    Regularised: of the even part only the stress survives (Latt and Chopard 2006, Math. Comput. Simul. 72, 165, eq. 12),
+    Regularised: of the even part only the stress survives (Latt and Chopard 2006, Math. Comput. Simul. 72:165, eq 12),
     without its trace, which only carries sound. The odd part has its own rate (Ginzburg, Verhaeghe and d'Humieres 2008,
     Commun. Comput. Phys. 3, 427). Equilibrium of incompressible flow (He and Luo 1997, J. Stat. Phys. 88, 927, eq. 20):
     the steady state is free of divergence, whatever the lattice speed.
@@ -260,7 +260,7 @@ def update(
     f: Any,
     address: Any,
     length: Any,
-    rate: float,
+    rate: Any,
     odd_rate: float,
     screen_start: Any,
     screen_place: Any,
@@ -275,7 +275,8 @@ def update(
     address : (segments, 19) int32, where the populations of each segment begin: its own in an even step, its
         neighbours' in an odd one.
     length : (segments,) int32 cells of each segment, at most SEGMENT.
-    rate, odd_rate : float32 relaxation rates of the stress and of the odd part.
+    rate : (segments,) float32 relaxation rate of the stress in every segment.
+    odd_rate : float32 that of the odd part.
     screen_start : (segments + 1,) int32 first screen entry of every segment.
     screen_place, screen : (e,) int32 place within the segment and (e, 6) float32 resistance (see `_resist`).
     threads : number of chunks.
@@ -289,9 +290,9 @@ def update(
             lanes = (length[s] + LANES - 1) // LANES * LANES
             begin, end = screen_start[s], screen_start[s + 1]
             if begin == end:
-                _collide(buffer, lanes, rate, odd_rate)
+                _collide(buffer, lanes, rate[s], odd_rate)
             else:
-                _collide_screened(buffer, extra, lanes, rate, odd_rate, screen_place[begin:end], screen[begin:end])
+                _collide_screened(buffer, extra, lanes, rate[s], odd_rate, screen_place[begin:end], screen[begin:end])
             _store(buffer, address[s], length[s], f)
 
 

@@ -1,7 +1,7 @@
 """Reading a field on sparse grid cells: between the cells, along streamlines, at the wall.
 
-Fields are (n, d) on cells; `index` (i, j, k) holds the cell's number at every grid point, -1 outside. Points are in grid
-units: cell centres at integers.
+Fields are (n, d) on cells; `index` (i, j, k) holds the cell's number at every grid point, -1 outside. Points are in
+grid units: cell centres at integers.
 """
 
 from typing import Any

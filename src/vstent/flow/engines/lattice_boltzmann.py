@@ -21,6 +21,8 @@ from vstent.flow.engines.lattice_setup import (
     build_links,
     build_refill,
     build_screen,
+    relaxation_rates,
+    sponge,
 )
 from vstent.flow.types import FlowCase, FlowField
 from vstent.flow.wall_stress import wall_stress
@@ -68,6 +70,8 @@ class State:
     """Monitored quantities."""
     refill: Refill
     """What the walls lose."""
+    rate: NDArray[np.float32]
+    """(s,) relaxation rate of the stress in every segment."""
     populations: NDArray[np.float32]
     """(19 * stride + LANES,) shifted populations."""
     steps_per_check: int
@@ -90,7 +94,8 @@ class LatticeBoltzmann(AbstractEngine[State]):
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Build grid, storage and coefficients; begin at rest or from a field on any grid."""
         domain = domains.build(case.vessel, self.cell_size_mm)
-        addressing = address(domain)
+        level = sponge(case, domain)
+        addressing = address(domain, level)
         scales = _scales(case, self.cell_size_mm, start)
         populations = np.zeros(19 * addressing.stride + lattice.LANES, dtype=np.float32)
         state = State(
@@ -102,6 +107,7 @@ class LatticeBoltzmann(AbstractEngine[State]):
             build_screen(case, domain, addressing, scales),
             _probe(case, domain),
             build_refill(domain, addressing),
+            relaxation_rates(addressing, level, scales),
             populations,
             _steps_per_check(case, scales),
         )
@@ -135,7 +141,8 @@ def _scales(case: FlowCase, cell_size_mm: float, start: FlowField | None) -> Sca
     if start is not None:
         peak_m_s = 1.1 * float(start.speed_m_s.max())
     else:
-        peak_m_s = 3.0 * case.inflow_mL_s / case.vessel.inlet.area_mm2
+        narrowest_mm2 = min(case.vessel.inlet.area_mm2, sum(outlet.area_mm2 for outlet in case.vessel.outlets))
+        peak_m_s = 3.0 * case.inflow_mL_s / narrowest_mm2
     cell_m = cell_size_mm * M_PER_MM
     return Scales(cell_m, case.settings.lattice_speed * cell_m / peak_m_s, case.blood)
 
@@ -173,7 +180,7 @@ def _advance(state: State) -> None:
     """Make the time steps to the next check, in pairs."""
     f, links, refill = state.populations, state.links, state.refill
     a, screen = state.addressing, state.screen
-    rate, threads = np.float32(1 / (3 * state.scales.viscosity + 0.5)), numba.get_num_threads()
+    threads = numba.get_num_threads()
     opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
     for pair in range(state.steps_per_check // 2):
         lattice.drive(
@@ -181,7 +188,15 @@ def _advance(state: State) -> None:
         )
         for address_of, is_even in ((a.even_address, True), (a.odd_address, False)):
             lattice.update(
-                f, address_of, a.length, rate, np.float32(ODD_RATE), screen.start, screen.place, screen.entry, threads
+                f,
+                address_of,
+                a.length,
+                state.rate,
+                np.float32(ODD_RATE),
+                screen.start,
+                screen.place,
+                screen.entry,
+                threads,
             )
             lattice.reflect(f, links.address, links.weight, links.source, refill.place, refill.refill, is_even)
             lattice.swap(f, *a.swap_address)
@@ -257,7 +272,8 @@ def _field(state: State, outcome: Outcome) -> FlowField:
     advice = (
         "The flow has settled."
         if outcome.is_converged
-        else f"The flow still changes by {100 * outcome.residual[-1]:.1f} %: allow more steps, or compute it as pulsatile, for it may be unsteady."
+        else f"The flow still changes by {100 * outcome.residual[-1]:.1f} %: allow more steps, "
+        "or compute it as pulsatile, for it may be unsteady."
     )
     return FlowField(
         cells=domain.cells,

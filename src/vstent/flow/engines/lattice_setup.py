@@ -16,6 +16,10 @@ from vstent.units import M3_PER_ML
 
 ODD_RATE = 0.7
 """Relaxation rate of the odd part: lower is more isotropic, higher is more stable and leaks less."""
+SPONGE_VISCOSITY = 0.04
+"""Viscosity at the end of the extensions, in lattice units: fast blood through few cells is unstable at an end."""
+SPONGE_LEVELS = 4
+"""Steps in which the viscosity rises along an extension."""
 REFILL_BLOCK = 4
 """Edge, in cells, of the blocks within which the walls' losses are made up."""
 SOUND_MEMORY = 0.002
@@ -82,7 +86,7 @@ class Scales:
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """Coefficients of everything that is sent back, openings first, in order, then the wall; sources change in place."""
+    """Coefficients of everything that is sent back, openings first, then the wall; sources change in place."""
 
     address: Ints
     """(l, 6) see `lattice.reflect`."""
@@ -134,8 +138,29 @@ class ScreenEntries:
     """(e,) cell."""
 
 
-def address(domain: Domain) -> Addressing:
-    """Lay out the populations of a domain."""
+def sponge(case: FlowCase, domain: Domain) -> Ints:
+    """Level (n,) of every cell: 0 in the vessel, rising to `SPONGE_LEVELS` at the end of an opening's extension."""
+    level = np.zeros(len(domain.cells), dtype=np.int32)
+    for opening, section in zip(case.vessel.openings, domain.sections, strict=True):
+        offset = domain.centers_mm - opening.center_mm
+        ahead_mm = offset @ opening.normal
+        length_mm = float(((section - opening.center_mm) @ opening.normal).mean())
+        beside_mm = np.linalg.norm(offset - ahead_mm[:, None] * opening.normal, axis=1)
+        own = (ahead_mm > 0) & (ahead_mm < 1.5 * length_mm) & (beside_mm < opening.diameter_mm)
+        rise = np.ceil(SPONGE_LEVELS * np.clip(ahead_mm[own] / length_mm, 0.0, 1.0))
+        level[own] = np.maximum(level[own], rise.astype(np.int32))
+    return level
+
+
+def relaxation_rates(addressing: Addressing, level: Ints, scales: Scales) -> NDArray[np.float32]:
+    """Rate (s,) of the stress in every segment: the blood's own, slower where the sponge makes it thicker."""
+    share = level[addressing.first_cell] / SPONGE_LEVELS
+    viscosity = scales.viscosity + share * max(0.0, SPONGE_VISCOSITY - scales.viscosity)
+    return (1 / (3 * viscosity + 0.5)).astype(np.float32)
+
+
+def address(domain: Domain, level: Ints) -> Addressing:
+    """Lay out the populations of a domain; no segment spans two levels (n,) of the sponge."""
     cells = domain.cells
     inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
     inside[tuple(cells.T)] = True
@@ -144,7 +169,8 @@ def address(domain: Domain) -> Addressing:
     stride = int(stored.sum())
     number[stored] = np.arange(stride, dtype=np.int32)
     place = number[tuple(cells.T)]
-    first = np.flatnonzero(np.r_[True, (np.diff(cells[:, :2], axis=0) != 0).any(axis=1) | (np.diff(cells[:, 2]) != 1)])
+    is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(level) != 0)
+    first: Ints = np.flatnonzero(np.r_[True, is_new])
     length = np.diff(np.r_[first, len(cells)])
     first, length = _cut(first, length)
     start = cells[first]
