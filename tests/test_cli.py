@@ -72,7 +72,9 @@ def test_a_device_longer_than_the_artery_leaves_nothing_behind(
     artery: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    code = main(["run", str(artery), "--out", str(out), "--device", "silk", "--length", "40", "--diameter", "5", "--no-flow"])
+    code = main(
+        ["run", str(artery), "--out", str(out), "--device", "silk", "--length", "40", "--diameter", "5", "--no-flow"]
+    )
     assert code == 2
     assert _complaint(capsys, "longer than the artery")
     assert not out.exists()

@@ -129,15 +129,15 @@ def _guess(case: FlowCase, start: FlowField | None, cell_size_mm: float, progres
 
 
 def _run(case: FlowCase, cell_size_mm: float, start: FlowField | None, progress: OnProgress | None) -> FlowField:
-    """Run the engine; where it diverges, once more with half the time step."""
+    """Run the engine; where it diverges, once more with thick blood in the openings' extensions."""
     from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 
     engine = LatticeBoltzmann(cell_size_mm)
     try:
         return run(engine, case, start=start, progress=progress)
     except FlowError:
-        slower = replace(case.settings, lattice_speed=0.5 * case.settings.lattice_speed)
-        return run(engine, replace(case, settings=slower), start=start, progress=progress)
+        thick = replace(case.settings, has_thick_ends=True)
+        return run(engine, replace(case, settings=thick), start=start, progress=progress)
 
 
 def _stage(progress: OnProgress | None, begin: float, end: float) -> OnProgress | None:

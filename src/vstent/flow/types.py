@@ -44,8 +44,10 @@ class FlowSettings:
     """Converged when every monitored quantity has less than this fraction of itself left to go."""
     max_steps: int = 24_000
     """Most time steps on the fine grid."""
-    lattice_speed: float = 0.2
+    lattice_speed: float = 0.1
     """Peak speed in cells per time step: sets the time step."""
+    has_thick_ends: bool = False
+    """Make the blood thicker in the extensions of the openings: stable where fast blood leaves through few cells."""
 
 
 @dataclass(frozen=True, eq=False)

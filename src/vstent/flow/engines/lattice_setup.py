@@ -141,6 +141,8 @@ class ScreenEntries:
 def sponge(case: FlowCase, domain: Domain) -> Ints:
     """Level (n,) of every cell: 0 in the vessel, rising to `SPONGE_LEVELS` at the end of an opening's extension."""
     level = np.zeros(len(domain.cells), dtype=np.int32)
+    if not case.settings.has_thick_ends:
+        return level
     for opening, section in zip(case.vessel.openings, domain.sections, strict=True):
         offset = domain.centers_mm - opening.center_mm
         ahead_mm = offset @ opening.normal

@@ -1,0 +1,95 @@
+"""The flow engine against exact flows in a tube."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from vstent import phantoms
+from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, sampling, simulate_case
+from vstent.trace import trace
+from vstent.vessel import Vessel
+
+RADIUS_MM, LENGTH_MM, INFLOW_ML_S = 2.0, 14.0, 3.0
+SETTINGS = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.2, tolerance=0.002)
+
+
+@cache
+def tube() -> Vessel:
+    return trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM))))
+
+
+@cache
+def poiseuille() -> FlowField:
+    return simulate_case(FlowCase(tube(), settings=SETTINGS))
+
+
+def along(field: FlowField) -> float:
+    """Sign of the flow along z: either end may be the inlet."""
+    return np.sign(field.velocity_m_s[:, 2].mean())
+
+
+def test_blood_is_neither_made_nor_lost() -> None:
+    field = poiseuille()
+    assert field.is_converged
+    assert field.inlet_mL_s == pytest.approx(INFLOW_ML_S, rel=1e-3)
+    assert field.outlets_mL_s.sum() == pytest.approx(field.inlet_mL_s, rel=1e-3)
+
+
+def test_velocity_is_poiseuilles() -> None:
+    field = poiseuille()
+    z = np.linspace(5, 9, 9)
+    r = np.linspace(0, 0.9 * RADIUS_MM, 10)
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    r, angle, z = (a.ravel() for a in np.meshgrid(r, angle, z, indexing="ij"))
+    found = sampling.values_at(field, np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1))[0]
+    peak = 2 * INFLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 2)
+    expected = peak * (1 - (r / RADIUS_MM) ** 2)
+    assert np.abs(along(field) * found[:, 2] - expected).max() < 0.02 * peak
+    assert np.abs(found[:, :2]).max() < 0.01 * peak
+
+
+def test_pressure_falls_as_poiseuilles() -> None:
+    field = poiseuille()
+    points = np.stack([np.zeros(2), np.zeros(2), np.array([4.0, 10.0])], axis=1)
+    pressure = sampling.values_at(field, points)[1]
+    gradient = -along(field) * np.diff(pressure)[0] / 6e-3
+    expected = 8 * 0.004 * INFLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 4)
+    assert gradient == pytest.approx(expected, rel=0.03)
+
+
+def test_wall_shear_stress_is_poiseuilles() -> None:
+    field = poiseuille()
+    z = field.wall.vertices_mm[:, 2]
+    stress = along(field) * field.wall_shear_stress_Pa[(z > 5) & (z < 9)]
+    expected = 4 * 0.004 * INFLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 3)
+    assert stress[:, 2].mean() == pytest.approx(expected, rel=0.02)
+    assert np.abs(stress[:, 2] / expected - 1).max() < 0.08
+
+
+def disc(resistance_Pa_s_m: float) -> Screen:
+    """A screen across the tube at half its length."""
+    ticks = np.arange(-RADIUS_MM - 0.5, RADIUS_MM + 0.5, 0.05)
+    x, y = (a.ravel() for a in np.meshgrid(ticks, ticks))
+    n = len(x)
+    normals = np.tile([0.0, 0.0, 1.0], (n, 1))
+    points = np.stack([x, y, np.full(n, LENGTH_MM / 2)], axis=1)
+    across, loss = np.full(n, 0.5 * resistance_Pa_s_m), np.zeros(n)
+    return Screen(points, normals, np.full(n, 0.05**2), np.full(n, resistance_Pa_s_m), across, loss)
+
+
+def test_a_screen_without_resistance_changes_nothing() -> None:
+    bare = poiseuille()
+    open_ = simulate_case(FlowCase(tube(), screen=disc(0.0), settings=SETTINGS))
+    np.testing.assert_allclose(open_.velocity_m_s, bare.velocity_m_s, atol=1e-4 * bare.speed_m_s.max())
+
+
+def test_a_screen_costs_the_pressure_of_its_law() -> None:
+    resistance, slow_mL_s = 4000.0, 0.3  # so slow that evening out the profile and back costs nothing beside it
+    settings = replace(SETTINGS, cell_size_mm=0.25, inflow_mL_s=slow_mL_s)
+    field = simulate_case(FlowCase(tube(), screen=disc(resistance), settings=settings))
+    before, after = sampling.values_at(field, np.array([[0, 0, 3.0], [0, 0, 11.0]]))[1][:: int(along(field))]
+    gradient = 8 * 0.004 * slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 4)
+    mean_speed = slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 2)
+    assert before - after - gradient * 8e-3 == pytest.approx(resistance * mean_speed, rel=0.04)
