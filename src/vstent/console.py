@@ -27,6 +27,10 @@ DEVICE_ROWS: Final = (
 """Rows on the devices: title, key of the measure, unit."""
 
 
+QUIET_S: Final = 30.0
+"""Where there is no terminal, a stage at work says a line this often."""
+
+
 class Console:
     """Shows the progress of a study on standard error and its table on standard output."""
 
@@ -35,6 +39,7 @@ class Console:
         self._out = RichConsole(highlight=False)
         self._status: Status | None = None
         self._began: dict[str, float] = {}
+        self._told = time.monotonic()
 
     @contextmanager
     def live(self) -> Iterator[None]:
@@ -51,8 +56,11 @@ class Console:
         if fraction >= 1.0:
             self._err.print(f"[bold]{stage:18}[/] {now - began:6.1f} s  [dim]{detail}[/]", soft_wrap=True)
             del self._began[stage]
-        elif self._status is not None:
+        elif self._err.is_terminal and self._status is not None:
             self._status.update(f"{stage} {fraction:4.0%} {detail}")
+        elif now - self._told > QUIET_S and fraction > 0:
+            self._told = now
+            self._err.print(f"{stage:18} {fraction:4.0%} {detail}", soft_wrap=True)
 
     def print(self, item: Any) -> None:
         """Print a line or a table on standard output."""
