@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from importlib.metadata import version
+from math import isfinite
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol, TypeVar
 
@@ -171,7 +172,8 @@ class _Ledger:
 
         def tell(progress: FlowProgress) -> None:
             fraction = min(progress.fraction, 0.99)
-            self.progress(name, fraction, f"{progress.residual:.1%} left to settle, {progress.seconds_left:.0f} s")
+            settling = f"{progress.residual:.1%} left to settle, " if isfinite(progress.residual) else ""
+            self.progress(name, fraction, f"{settling}{progress.seconds_left:.0f} s left")
 
         return tell
 
