@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from vstent.errors import FlowError
 from vstent.flow import sampling
-from vstent.flow.domain import default_cell_size_mm
+from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
 from vstent.flow.engines import Progress, run
 from vstent.flow.indices import compare, indices
 from vstent.flow.screen import screen
@@ -108,16 +108,19 @@ def _coarse_runs(case: FlowCase, start: FlowField | None) -> int:
     return 0 if case.screen is None else 2
 
 
-def _guess(case: FlowCase, start: FlowField | None, cell_size_mm: float, progress: OnProgress | None) -> FlowField:
-    """First guess for the fine grid, from coarse ones.
+def _guess(
+    case: FlowCase, start: FlowField | None, cell_size_mm: float, progress: OnProgress | None
+) -> FlowField | None:
+    """First guess for the fine grid, from coarse ones; only `start` where the coarse grid would be too coarse.
 
     Where a bare flow is known, the coarse grid only has to say what the screen changes (the correction scheme of
     multigrid, Brandt 1977, Math. Comput. 31, 333).
     """
+    is_tiny = abs(case.vessel.closed.volume_mm3) < 4 * MIN_CELLS * cell_size_mm**3
+    if is_tiny or (start is not None and case.screen is None):
+        return start
     if start is None:
         return _run(case, cell_size_mm, None, _stage(progress, 0.0, COARSE_SHARE))
-    if case.screen is None:
-        return start
     bare = _run(replace(case, screen=None), cell_size_mm, start, _stage(progress, 0.0, COARSE_SHARE))
     stented = _run(case, cell_size_mm, bare, _stage(progress, COARSE_SHARE, 2 * COARSE_SHARE))
     before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from vstent.flow import sampling
 from vstent.flow.types import Blood, Screen
 from vstent.kernels import lattice_sampling
 from vstent.kernels.arrays import Floats, Ints
@@ -18,6 +19,8 @@ CROSSING_FACTOR = 1.0
 """How much crossing families resist more than their sum: 1, plain superposition, until calibrated on resolved cells."""
 SMOOTHING_PORES = 1.5
 """Radius of the neighbourhood in which wire length per area is measured, in mean wire spacings."""
+SAMPLE_REACHES = 0.2
+"""Longest edge between samples of the surface when its area is measured in such a neighbourhood, in radii of it."""
 PIECE_MM = 0.05
 """Longest piece of wire."""
 SAMPLE_MM = 0.05
@@ -58,11 +61,11 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     points_mm, length_mm, diameter_mm = _pieces(stent)
     contour = stent.contour
     nodes_mm = contour.vertices_mm
-    node_area_mm2 = np.bincount(contour.faces.ravel(), np.repeat(contour.areas_mm2 / 3, 3), len(nodes_mm))
     reach_mm = SMOOTHING_PORES * 2 * contour.area_mm2 / length_mm.sum()
     tree = cKDTree(nodes_mm)
     weight = _kernel(tree, points_mm, reach_mm)
-    area_mm2 = _kernel(tree, nodes_mm, reach_mm) @ node_area_mm2
+    sample_mm, sample_mm2 = sampling.surface_samples(contour, SAMPLE_REACHES * reach_mm)
+    area_mm2 = _kernel(tree, sample_mm, reach_mm) @ np.linalg.norm(sample_mm2, axis=1)
     spacing_mm = 2 * area_mm2 / np.maximum(weight @ length_mm, 1e-9 * area_mm2)
     per_m = np.zeros(len(nodes_mm))
     covered = np.zeros(len(nodes_mm))

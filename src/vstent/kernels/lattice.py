@@ -164,7 +164,7 @@ def _collide(f: Any, n: int, rate: float, odd_rate: float) -> None:
         )
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy")
 def _resist(entry: Any, ux: float, uy: float, uz: float) -> tuple[float, float, float]:
     """Half-force velocity u inside a screen, from the velocity u* without it: u = u* + F(u) / 2.
 
@@ -180,7 +180,7 @@ def _resist(entry: Any, ux: float, uy: float, uz: float) -> tuple[float, float, 
     return kept * ux + extra * nx, kept * uy + extra * ny, kept * uz + extra * nz
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _collide_screened(f: Any, g: Any, n: int, rate: float, odd_rate: float, place: Any, entries: Any) -> None:
     """As `_collide`, where the cells `place` of the segment carry the resistances `entries` (see `_resist`).
 
@@ -255,7 +255,7 @@ def _store(buffer: Any, address: Any, n: int, f: Any) -> None:
             f[target + k] = buffer[source + k]
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def update(
     f: Any,
     address: Any,

@@ -89,7 +89,7 @@ def run(
     limit = engine.max_checks(state)
     residual: list[float] = []
     while len(residual) < limit:
-        state = engine.step(state)
+        state = _step(engine, state)
         residual.append(engine.terminate(state))
         if np.isnan(residual[-1]):
             raise FlowError(
@@ -103,6 +103,16 @@ def run(
     now = perf_counter()
     is_converged = residual[-1] < case.settings.tolerance
     return engine.result(state, Outcome(is_converged, tuple(residual), now - began, now - loop_began))
+
+
+def _step(engine: AbstractEngine[State], state: State) -> State:
+    """Step; Ctrl-C that arrives inside a compiled kernel comes out of it as a SystemError and is put right."""
+    try:
+        return engine.step(state)
+    except SystemError as error:
+        if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
+        raise
 
 
 def _progress(residual: list[float], limit: int, tolerance: float, seconds: float) -> Progress:

@@ -32,6 +32,10 @@ from vstent.units import M_PER_MM
 
 CHECK_DIAMETERS = 0.5
 """Flow time between checks, in inlet diameters over mean inlet speed."""
+LEAST_CHECKS = 24
+"""The limit of time steps leaves room for at least this many checks: fewer cannot tell whether the flow has settled."""
+CHECKS_AGREEING = 3
+"""Checks that must agree: a quantity that swings passes its end by chance."""
 DEFER_PAIRS = 8
 """Step pairs between updates of what is deferred."""
 DEFER_PART = 0.15
@@ -124,8 +128,9 @@ class LatticeBoltzmann(AbstractEngine[State]):
         return state
 
     def terminate(self, state: State) -> float:
-        """Fraction that the monitored quantities have left to go."""
-        return fraction_left(np.array(state.history))
+        """Fraction that the monitored quantities have left to go, the worst of the last checks."""
+        history = np.array(state.history)
+        return max(fraction_left(history[: len(history) - k]) for k in range(min(CHECKS_AGREEING, len(history))))
 
     def max_checks(self, state: State) -> int:
         """Checks within the limit of time steps."""
@@ -150,7 +155,8 @@ def _scales(case: FlowCase, cell_size_mm: float, start: FlowField | None) -> Sca
 def _steps_per_check(case: FlowCase, scales: Scales) -> int:
     inlet = case.vessel.inlet
     speed_m_s = case.inflow_mL_s / inlet.area_mm2
-    return 2 * max(1, round(0.5 * CHECK_DIAMETERS * inlet.diameter_mm * M_PER_MM / speed_m_s / scales.step_s))
+    steps = CHECK_DIAMETERS * inlet.diameter_mm * M_PER_MM / speed_m_s / scales.step_s
+    return 2 * max(1, round(0.5 * min(steps, case.settings.max_steps / LEAST_CHECKS)))
 
 
 def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
@@ -243,7 +249,7 @@ def fraction_left(history: Floats) -> float:
     means = [history[len(history) - (k + 1) * window : len(history) - k * window].mean(axis=0) for k in range(3)]
     scale = np.maximum(np.abs(history[-1]), 1e-12)
     change, before = np.abs(means[0] - means[1]), np.abs(means[1] - means[2])
-    shrinking = np.clip(change / np.maximum(before, 1e-30), 0.1, 0.9)
+    shrinking = np.clip(change / np.maximum(before, 1e-30), 0.5, 0.9)
     return float((change / scale * shrinking / (1 - shrinking)).max())
 
 
@@ -272,7 +278,7 @@ def _field(state: State, outcome: Outcome) -> FlowField:
     advice = (
         "The flow has settled."
         if outcome.is_converged
-        else f"The flow still changes by {100 * outcome.residual[-1]:.1f} %: allow more steps, "
+        else f"The flow still changes by about {100 * outcome.residual[-1]:.1f} %: allow more steps, "
         "or compute it as pulsatile, for it may be unsteady."
     )
     return FlowField(

@@ -1,0 +1,119 @@
+"""The lattice-Boltzmann kernels against their algebra, and the grid and field kernels against geometry."""
+
+import numpy as np
+import pytest
+
+from shapes import sphere
+from vstent.kernels import lattice, lattice_sampling, voxels
+
+STRIDE = 40
+RATE, ODD_RATE = np.float32(1.6), np.float32(0.7)
+NO_SCREEN = (np.zeros(2, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
+
+
+def populations(seed=0):
+    """Random shifted populations of one segment of STRIDE cells."""
+    small = np.random.default_rng(seed).normal(scale=0.01, size=(19, STRIDE)).astype(np.float32)
+    return np.concatenate([small.ravel(), np.zeros(lattice.LANES, np.float32)])
+
+
+def even_step(f, screen=NO_SCREEN):
+    """Collide all cells and bring the populations home: the even step leaves each at its opposite's place."""
+    result = f.copy()
+    address = (np.arange(19) * STRIDE)[None].astype(np.int32)
+    lattice.update(result, address, np.array([STRIDE], np.int32), np.array([RATE]), ODD_RATE, *screen, 1)
+    return result[: -lattice.LANES].reshape(19, STRIDE)[lattice.OPPOSITE]
+
+
+def momentum(f):
+    return np.einsum("qd,qk->kd", lattice.VELOCITIES.astype(float), f.astype(float))
+
+
+def test_the_velocity_set_is_isotropic_to_fourth_order():
+    c, w = lattice.VELOCITIES.astype(float), lattice.WEIGHTS
+    delta = np.eye(3)
+    assert w.sum() == pytest.approx(1)
+    np.testing.assert_allclose(np.einsum("q,qa,qb->ab", w, c, c), delta / 3, atol=1e-15)
+    expected = sum(np.einsum(rule, delta, delta) for rule in ("ab,cd->abcd", "ac,bd->abcd", "ad,bc->abcd")) / 9
+    np.testing.assert_allclose(np.einsum("q,qa,qb,qc,qd->abcd", w, c, c, c, c), expected, atol=1e-15)
+    np.testing.assert_array_equal(c[lattice.OPPOSITE], -c)
+
+
+def test_a_collision_keeps_mass_and_momentum():
+    f = populations()
+    before, after = f[: -lattice.LANES].reshape(19, STRIDE), even_step(f)
+    np.testing.assert_allclose(after.sum(axis=0), before.sum(axis=0), atol=2e-7)
+    np.testing.assert_allclose(momentum(after), momentum(before), atol=2e-7)
+    assert np.abs(after - before).max() > 1e-3
+
+
+def test_a_collision_relaxes_the_stress_at_its_rate_and_nothing_is_left_but_stress():
+    f = populations(1)
+    before, after = f[: -lattice.LANES].reshape(19, STRIDE).astype(float), even_step(f).astype(float)
+    c, w = lattice.VELOCITIES.astype(float), lattice.WEIGHTS
+    u, density = momentum(before), before.sum(axis=0)
+    cu = c @ u.T
+    equilibrium = w[:, None] * (density + 3 * cu + 4.5 * cu**2 - 1.5 * (u**2).sum(axis=1))
+    traceless = np.einsum("qa,qb->qab", c, c) - np.eye(3) * (c**2).sum(axis=1)[:, None, None] / 3
+    stress = np.einsum("qab,qk->kab", traceless, before - equilibrium)
+    kept = np.einsum("qab,qk->kab", traceless, after - equilibrium)
+    np.testing.assert_allclose(kept, (1 - RATE) * stress, atol=1e-6)
+    even = 0.5 * (after + after[lattice.OPPOSITE])
+    wanted = 0.5 * (equilibrium + equilibrium[lattice.OPPOSITE])
+    wanted = wanted + (1 - RATE) * 4.5 * w[:, None] * np.einsum("qab,kab->qk", traceless, stress)
+    np.testing.assert_allclose(even, wanted, atol=1e-6)
+
+
+def screen_of(normal, along, across, quadratic=0.0):
+    """The same resistance in every cell of the segment."""
+    entry = np.array([*normal, along, across, quadratic], np.float32)
+    return np.array([0, STRIDE], np.int32), np.arange(STRIDE, dtype=np.int32), np.tile(entry, (STRIDE, 1))
+
+
+def test_a_screen_without_resistance_collides_as_none():
+    f = populations(2)
+    np.testing.assert_allclose(even_step(f, screen_of((0, 0, 1), 0, 0)), even_step(f), atol=3e-9)
+
+
+def test_a_screen_takes_the_momentum_of_its_law():
+    f = populations(3)
+    normal, along, across, quadratic = np.array([0.6, 0.0, 0.8]), 0.7, 0.3, 5.0
+    start = momentum(f[: -lattice.LANES].reshape(19, STRIDE))
+    force = momentum(even_step(f, screen_of(normal, along, across, quadratic))) - start
+    velocity = start + 0.5 * force
+    normal_speed = velocity @ normal
+    tangential = velocity - normal_speed[:, None] * normal
+    law = -across * tangential - ((along + quadratic * np.abs(normal_speed)) * normal_speed)[:, None] * normal
+    np.testing.assert_allclose(force, law, atol=1e-6)
+
+
+def test_voxels_count_the_volume_of_a_sphere_and_forgive_a_doubled_face():
+    ball = sphere(9.0)
+    corners = ball.corners_mm + 12.0 + np.array([0.13, 0.21, 0.17])
+    inside = voxels.fill(corners, (24, 25, 26))
+    assert inside.sum() == pytest.approx(ball.volume_mm3, rel=0.01)
+    grid = np.stack(np.meshgrid(*map(np.arange, inside.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    distance = ball.signed_distance(grid - 12.0 - np.array([0.13, 0.21, 0.17]))
+    np.testing.assert_array_equal(inside.ravel(), distance < 0)
+    np.testing.assert_array_equal(voxels.fill(np.concatenate([corners, corners[:40]]), inside.shape), inside)
+
+
+def test_interpolation_is_exact_for_linear_fields_inside():
+    index = np.arange(6 * 7 * 8, dtype=np.int32).reshape(6, 7, 8)
+    grid = np.argwhere(index >= 0).astype(float)
+    values = (grid @ [[1.0, 0.5], [-2.0, 0.1], [0.3, 4.0]]) + 1.0
+    points = np.random.default_rng(0).uniform(0, 4.9, (50, 3))
+    expected = (points @ [[1.0, 0.5], [-2.0, 0.1], [0.3, 4.0]]) + 1.0
+    for is_zero_outside in (True, False):
+        np.testing.assert_allclose(lattice_sampling.interpolate(index, values, points, is_zero_outside), expected)
+
+
+def test_streamlines_of_a_rotation_are_circles():
+    index = np.arange(40 * 40 * 3, dtype=np.int32).reshape(40, 40, 3)
+    x, y, _ = np.argwhere(index >= 0).T - 19.5
+    velocity = np.stack([-y, x, 0 * x], axis=1)
+    path, count = lattice_sampling.trace_all(index, velocity, np.array([[29.5, 19.5, 1.0]]), 0.4, 1e-9, 300)
+    radius = np.hypot(path[0, :, 0] - 19.5, path[0, :, 1] - 19.5)
+    assert count[0] == 300
+    np.testing.assert_allclose(radius, 10.0, atol=1e-3)
+    np.testing.assert_allclose(path[0, :, 3], 10.0, atol=1e-3)
