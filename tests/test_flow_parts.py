@@ -63,7 +63,7 @@ def test_the_screen_of_a_braid_resists_as_its_closed_form(degrees, expected):
     assert made.area_mm2.sum() == pytest.approx(np.pi * DIAMETER_MM * LENGTH_MM, rel=0.005)
 
 
-def test_thicker_wires_resist_more_and_none_of_it_is_lost_on_the_grid():
+def test_thicker_wires_resist_more_and_none_of_it_is_lost_inside_the_blood():
     thin, thick = (screen(braid(np.radians(65), um), Blood()) for um in (30.0, 50.0))
     assert (thick.normal_resistance_Pa_s_m > thin.normal_resistance_Pa_s_m).all()
     index = np.arange(31 * 31 * 61, dtype=np.int32).reshape(31, 31, 61)

@@ -150,7 +150,9 @@ class GridResistance:
 
 
 def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float) -> GridResistance:
-    """Share every sample's resistance among the blood cells around it, trilinearly; none is lost.
+    """Share every sample's resistance among the eight cells around it, trilinearly; what falls outside is void.
+
+    So a cell at the rim resists as its neighbours do, where the screen goes on over the wall beyond the neck.
 
     Parameters
     ----------
@@ -158,7 +160,6 @@ def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float)
     """
     cells, weights = lattice_sampling.stencils(index, (screen.points_mm - origin_mm) / cell_size_mm)
     share = np.where(cells >= 0, weights, 0.0)
-    share = share / np.maximum(share.sum(axis=1, keepdims=True), 1e-12)
     is_used = share > 0
     cell, owner = cells[is_used], np.broadcast_to(np.arange(len(cells))[:, None], cells.shape)[is_used]
     per_volume = share[is_used] * screen.area_mm2[owner] / (cell_size_mm**3 * M_PER_MM)

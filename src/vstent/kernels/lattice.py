@@ -435,8 +435,10 @@ def drive(f: Any, stride: int, openings: Any, start: Any, place: Any, direction:
     for k in range(len(openings)):
         first, last = start[k], start[k + 1]
         if openings[k, 0] == 1.0:
-            excess = _density(f, stride, place[first:last]) - openings[k, 2]
-            openings[k, 2] += openings[k, 3] * excess
+            density = _density(f, stride, place[first:last])
+            excess = density - openings[k, 2]
+            # Against a high resistance the flow itself waits for the mean: forget faster the higher the pressure.
+            openings[k, 2] += openings[k, 3] * (1.0 + abs(density / openings[k, 1]) / np.sqrt(3.0)) * excess
             speed = openings[k, 1] - excess / np.sqrt(3.0)
             for n in range(first, last):
                 source[n] = shape[n] * speed

@@ -249,7 +249,7 @@ def fraction_left(history: Floats) -> float:
     means = [history[len(history) - (k + 1) * window : len(history) - k * window].mean(axis=0) for k in range(3)]
     scale = np.maximum(np.abs(history[-1]), 1e-12)
     change, before = np.abs(means[0] - means[1]), np.abs(means[1] - means[2])
-    shrinking = np.clip(change / np.maximum(before, 1e-30), 0.5, 0.9)
+    shrinking = np.clip(change / np.maximum(before, 1e-30), 0.3, 0.9)
     return float((change / scale * shrinking / (1 - shrinking)).max())
 
 
