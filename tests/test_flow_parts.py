@@ -6,12 +6,13 @@ import pytest
 from tubes import line, tube
 from vstent import device
 from vstent.errors import FlowError
-from vstent.flow import Blood, FlowCase, FlowSettings, domain, sampling, screen
+from vstent.flow import Blood, FlowCase, FlowSettings, domain, screen
 from vstent.flow.engines import AbstractEngine, run
 from vstent.flow.engines.lattice_boltzmann import fraction_left
 from vstent.flow.profile import developed_profile
 from vstent.flow.screen import drag_per_length, inertial_loss, on_grid
 from vstent.flow.wall_stress import wall_stress
+from vstent.kernels import voxels
 from vstent.stent import Stent
 
 DIAMETER_MM, LENGTH_MM, N_WIRES = 4.0, 10.0, 48
@@ -90,7 +91,7 @@ def test_wall_stress_of_an_exact_poiseuille_flow_is_exact(cells_per_diameter):
     radius2 = (grid.centers_mm[:, :2] ** 2).sum(axis=1)
     velocity = np.stack([0 * radius2, 0 * radius2, 1 - radius2 / 4.0], axis=1)
     stress, pressure = wall_stress(
-        index=sampling.index_of(grid.cells),
+        index=voxels.index_of(grid.cells),
         origin_mm=grid.origin_mm,
         cell_size_mm=grid.cell_size_mm,
         velocity_m_s=velocity,

@@ -4,15 +4,8 @@ import numpy as np
 
 from vstent.flow.types import FlowField
 from vstent.kernels import lattice_sampling
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Floats
 from vstent.surface import Surface
-
-
-def index_of(cells: Ints) -> Ints:
-    """Number of the cell at every grid point (i, j, k), -1 outside, from coordinates (n, 3)."""
-    index = np.full(cells.max(axis=0) + 2, -1, dtype=np.int32)
-    index[tuple(cells.T)] = np.arange(len(cells), dtype=np.int32)
-    return index
 
 
 def values_at(field: FlowField, points_mm: Floats) -> tuple[Floats, Floats]:

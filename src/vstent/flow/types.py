@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from vstent.kernels import voxels
 from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.surface import Surface
 from vstent.vessel import Vessel
@@ -171,9 +172,7 @@ class FlowField:
     @cached_property
     def index(self) -> Ints:
         """(i, j, k) number of the cell at every grid point, -1 outside the blood."""
-        index = np.full(self.cells.max(axis=0) + 2, -1, dtype=np.int32)
-        index[tuple(self.cells.T)] = np.arange(len(self.cells), dtype=np.int32)
-        return index
+        return voxels.index_of(self.cells)
 
     @property
     def cell_volume_mm3(self) -> float:

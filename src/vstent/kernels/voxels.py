@@ -1,4 +1,4 @@
-"""Which grid cells lie inside a closed triangle mesh."""
+"""Which grid cells lie inside a closed triangle mesh, and where each one stands in a list."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vstent.kernels.arrays import Bools, Floats
+from vstent.kernels.arrays import Bools, Floats, Ints
 
 
 def fill(corners: Floats, shape: tuple[int, int, int]) -> Bools:
@@ -62,3 +62,10 @@ def dilate(mask: Bools, offsets: NDArray[Any]) -> Bools:
     for offset in offsets:
         result |= np.roll(mask, tuple(int(o) for o in offset), axis=(0, 1, 2))
     return result
+
+
+def index_of(cells: Ints) -> Ints:
+    """Number of the cell at every grid point (i, j, k), -1 outside, from coordinates (n, 3)."""
+    index = np.full(cells.max(axis=0) + 2, -1, dtype=np.int32)
+    index[tuple(cells.T)] = np.arange(len(cells), dtype=np.int32)
+    return index

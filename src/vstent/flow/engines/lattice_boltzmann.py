@@ -26,7 +26,7 @@ from vstent.flow.engines.lattice_setup import (
 )
 from vstent.flow.types import FlowCase, FlowField
 from vstent.flow.wall_stress import wall_stress
-from vstent.kernels import lattice, lattice_sampling
+from vstent.kernels import lattice, lattice_sampling, voxels
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
@@ -229,7 +229,7 @@ def _monitor(state: State) -> Floats:
     inlet = state.domain.link_cell[state.domain.link_patch == 1]
     values = [speed[state.probe.cells].mean(), density[inlet].mean(), speed.mean()]
     if len(state.probe.neck_points):
-        index = sampling.index_of(state.domain.cells)
+        index = voxels.index_of(state.domain.cells)
         through = lattice_sampling.interpolate(index, velocity, state.probe.neck_points, True)
         values.append(float(np.maximum(np.einsum("ij,ij->i", through, state.probe.neck_area_mm2), 0.0).sum()))
     return np.array(values)
@@ -258,7 +258,7 @@ def _field(state: State, outcome: Outcome) -> FlowField:
     scales, domain, vessel = state.scales, state.domain, state.case.vessel
     velocity_m_s, pressure_Pa = velocity * scales.speed_m_s, density * scales.pressure_Pa
     stress_Pa, wall_pressure_Pa = wall_stress(
-        index=sampling.index_of(domain.cells),
+        index=voxels.index_of(domain.cells),
         origin_mm=domain.origin_mm,
         cell_size_mm=domain.cell_size_mm,
         velocity_m_s=velocity_m_s,

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.flow import sampling
 from vstent.flow.domain import Domain
 from vstent.flow.profile import developed_profile
 from vstent.flow.screen import on_grid
@@ -341,7 +340,7 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
         return ScreenEntries(
             np.zeros(segments + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32), np.zeros(0, np.int32)
         )
-    spread = on_grid(case.screen, sampling.index_of(domain.cells), domain.origin_mm, domain.cell_size_mm)
+    spread = on_grid(case.screen, voxels.index_of(domain.cells), domain.origin_mm, domain.cell_size_mm)
     per_step = scales.step_s / case.blood.density_kg_m3
     entry = np.column_stack(
         [
