@@ -21,11 +21,10 @@ from vstent.trace import trace
 from vstent.trim import trim
 from vstent.vessel import Vessel
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from vessel_truth import NAMES, PHANTOMS, large_scan, reference_errors, trace_errors, traced, wall_errors
 
-DATA = ROOT.parent / "shared" / "data"
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 EDGES_MM = (0.5, 0.35, 0.25, 0.18)
 VOXELS_MM = (0.15, 0.25, 0.4)
 SIZES = {20_000: 0.27, 80_000: 0.135, 320_000: 0.0675}

@@ -120,18 +120,17 @@ def _is_flat(lumen: Surface, member: Bools) -> bool:
 
 def _with_open_arms(lumen: Surface) -> tuple[Surface, int]:
     """Cut open the slender arms that end blind."""
-    loops = np.array([lumen.vertices_mm[loop].mean(axis=0) for loop in lumen.boundary_loops]).reshape(-1, 3)
-    samples, normals = triangles.sample(lumen.vertices_mm, lumen.faces)
-    graph = medial.spheres(samples, normals, Vessel(lumen).closed.tree, loops)
-    graph = medial.keep(graph, graph.radius > ARM_RADIUS_MM)
-    roots = np.asarray(cKDTree(graph.points).query(loops)[1], dtype=np.int32)
-    cuts = [_cut_of(graph.points[path], graph.radius[path]) for path in medial.arms(graph, roots, ARM_SLENDERNESS)]
+    graph = lumen.medial
+    roots = np.asarray(cKDTree(graph.points).query(lumen.loop_centers_mm)[1], dtype=np.int32)
+    paths = medial.arms(graph, roots, ARM_SLENDERNESS, ARM_RADIUS_MM)
+    cuts = [_cut_of(graph.points[path], graph.radius[path]) for path in paths]
     n_cut = 0
     for cut in cuts:
         opened = None if cut is None else cut_square(lumen, *cut, ARM_SHARE)
-        if opened is not None:
+        # A cut makes one end more; one that takes an end off has run into another artery.
+        if opened is not None and len(opened.boundary_loops) > len(lumen.boundary_loops):
             lumen, n_cut = opened, n_cut + 1
-    return Surface(*triangles.largest_part(lumen.vertices_mm, lumen.faces)), n_cut
+    return (Surface(*triangles.largest_part(lumen.vertices_mm, lumen.faces)) if n_cut else lumen), n_cut
 
 
 def _cut_of(points_mm: Floats, radius_mm: Floats) -> tuple[Floats, Floats, float] | None:

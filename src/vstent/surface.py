@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from vstent.kernels import tree, triangles
+from vstent.kernels import medial, tree, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 
 
@@ -61,6 +61,23 @@ class Surface:
     def boundary_loops(self) -> tuple[Ints, ...]:
         """Vertex loops along the open edges, largest perimeter first; empty for a closed surface."""
         return triangles.boundary_loops(self.vertices_mm, self.faces)
+
+    @cached_property
+    def loop_centers_mm(self) -> Floats:
+        """(k, 3) centroids of the boundary loops."""
+        centers = [triangles.polygon_centroid(self.vertices_mm[loop]) for loop in self.boundary_loops]
+        return np.array(centers, dtype=np.float64).reshape(-1, 3)
+
+    @cached_property
+    def closed(self) -> "Surface":
+        """The surface with every boundary loop capped."""
+        return Surface(*triangles.cap(self.vertices_mm, self.faces, self.boundary_loops))
+
+    @cached_property
+    def medial(self) -> medial.Medial:
+        """Centres and radii of the maximum inscribed spheres, and which are neighbours."""
+        samples, normals = triangles.sample(self.vertices_mm, self.faces)
+        return medial.spheres(samples, normals, self.closed.tree, self.loop_centers_mm)
 
     def closest(self, points_mm: Floats) -> tuple[Floats, Floats, Ints]:
         """Return the closest point (n, 3), its distance (n,) in mm and its face (n,) for (n, 3) points."""

@@ -15,7 +15,7 @@ from scipy.ndimage import percentile_filter
 from scipy.spatial import cKDTree
 
 from vstent.errors import VesselError
-from vstent.kernels import curves, medial, triangles
+from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
 from vstent.openings import open_ends, with_inlet
 from vstent.surface import Surface
@@ -28,6 +28,8 @@ STEP_MM: Final = 0.1
 PARENT_WINDOW_MM: Final = 16.0
 """The parent radius is a low percentile of the inscribed radii within a window of this length: a neck is shorter."""
 PARENT_PERCENTILE: Final = 35.0
+SMOOTHED_DIAMETERS: Final = 0.75
+"""Waves of a centerline shorter than this many local diameters are smoothed away."""
 THIN: Final = 0.3
 """An outlet narrower than this fraction of the inlet may be left closed where the lumen to it is interrupted."""
 
@@ -52,7 +54,8 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
     vessel, graph = _reachable(vessel, graph)
     paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
     paths = _shortest(vessel, graph, _radius_cap(graph, paths))
-    return replace(vessel, centerlines=tuple(_centerline(vessel.lumen, graph.points[path]) for path in paths))
+    lines = tuple(_centerline(vessel.lumen, graph.points[path], graph.radius[path]) for path in paths)
+    return replace(vessel, centerlines=lines)
 
 
 def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
@@ -67,10 +70,9 @@ def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
 
 def _graph(vessel: Vessel) -> medial.Medial:
     """Build the medial graph; its last vertices are the openings, in their order."""
-    samples, normals = triangles.sample(vessel.lumen.vertices_mm, vessel.lumen.faces)
     ends = np.array([opening.center_mm for opening in vessel.openings])
     reach = np.array([0.25 * opening.diameter_mm for opening in vessel.openings])
-    return medial.with_terminals(medial.spheres(samples, normals, vessel.closed.tree, ends), ends, reach)
+    return medial.with_terminals(vessel.lumen.medial, ends, reach)
 
 
 def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Medial]:
@@ -120,12 +122,14 @@ def _unreachable(inlet: Opening, outlet: Opening) -> str:
     )
 
 
-def _centerline(wall: Surface, path_mm: Floats) -> Centerline:
+def _centerline(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Centerline:
     points = curves.resample(path_mm, STEP_MM)
-    radius = wall.closest(points)[1]
-    wavelength = 2.0 * float(np.median(radius))
-    # The smoothing passes waves longer than about one diameter: Voronoi vertices jitter on a finer scale.
-    points = curves.smooth(points, _held_ends(len(points)), (wavelength / (2 * np.pi * STEP_MM)) ** 4)
+    abscissa, along = curves.arc_length(path_mm), np.linspace(0.0, 1.0, len(points))
+    radius = np.maximum(np.interp(along * abscissa[-1], abscissa, radius_mm), STEP_MM)
+    # Voronoi vertices jitter on a scale finer than a diameter: longer waves pass. Third differences leave a bend as it
+    # is where second ones would pull it inwards.
+    waves = 2.0 * radius * SMOOTHED_DIAMETERS / (2 * np.pi * STEP_MM)
+    points = curves.smooth(points, _held_ends(len(points)), waves**6, order=3)
     return Centerline(points, wall.closest(points)[1])
 
 

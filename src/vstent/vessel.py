@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from vstent.kernels import curves, triangles
+from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats, freeze
 from vstent.surface import Surface
 
@@ -83,11 +83,10 @@ class Vessel:
     notes: tuple[str, ...] = ()
     """What was found, guessed or repaired on the way, one sentence each."""
 
-    @cached_property
+    @property
     def closed(self) -> Surface:
         """The lumen with every open loop capped: what is inside it is blood."""
-        vertices_mm, faces = triangles.cap(self.lumen.vertices_mm, self.lumen.faces, self.lumen.boundary_loops)
-        return Surface(vertices_mm, faces)
+        return self.lumen.closed
 
     @property
     def inlet(self) -> Opening:

@@ -1,6 +1,9 @@
 """Polylines: arc length, frames, interpolation, projection."""
 
+from typing import Any
+
 import numpy as np
+from numba import njit
 from scipy.sparse import csc_matrix, diags, eye
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
@@ -42,24 +45,27 @@ def parallel_frames(points: Floats) -> Floats:
     Double reflection (Wang, Juettler, Zheng and Liu 2008, ACM Trans. Graph. 27(1):2, table I).
     """
     tangent = tangents(points)
-    frames = np.zeros((len(points), 3, 3))
-    normal = any_perpendicular(tangent[0])
-    for i, t in enumerate(tangent):
-        if i > 0:
-            normal = _reflected(points[i] - points[i - 1], normal, tangent[i - 1], t)
-            normal = normal - (normal @ t) * t
-            normal = normal / np.linalg.norm(normal)
-        frames[i] = t, normal, np.cross(t, normal)
-    return frames
+    normal = _transported(np.ascontiguousarray(points, dtype=np.float64), tangent, any_perpendicular(tangent[0]))
+    return np.stack([tangent, normal, np.cross(tangent, normal)], axis=1)
 
 
-def _reflected(step: Floats, normal: Floats, tangent: Floats, next_tangent: Floats) -> Floats:
-    length2 = step @ step
-    normal_left = normal - (2 / length2) * (step @ normal) * step
-    tangent_left = tangent - (2 / length2) * (step @ tangent) * step
-    turn = next_tangent - tangent_left
-    turn2 = turn @ turn
-    return normal_left if turn2 < 1e-30 else normal_left - (2 / turn2) * (turn @ normal_left) * turn
+@njit(cache=True)
+def _transported(points: Any, tangent: Any, first: Any) -> Any:
+    """Normals (n, 3): each is the one before it, reflected in the middle planes of the points and of the tangents."""
+    normal = np.zeros_like(points)
+    normal[0] = first
+    for i in range(1, len(points)):
+        step = points[i] - points[i - 1]
+        step2 = (step * step).sum()
+        moved = normal[i - 1] - (2 / step2) * (step * normal[i - 1]).sum() * step
+        turned = tangent[i - 1] - (2 / step2) * (step * tangent[i - 1]).sum() * step
+        turn = tangent[i] - turned
+        turn2 = (turn * turn).sum()
+        if turn2 > 1e-30:
+            moved = moved - (2 / turn2) * (turn * moved).sum() * turn
+        moved = moved - (moved * tangent[i]).sum() * tangent[i]
+        normal[i] = moved / np.sqrt((moved * moved).sum())
+    return normal
 
 
 def any_perpendicular(direction: Floats) -> Floats:
@@ -89,22 +95,24 @@ def project(polyline: Floats, points: Floats) -> tuple[Floats, Floats]:
     return best_s, best_d
 
 
-def roughness(n: int, order: int) -> csc_matrix:
-    """Matrix (n, n) of the sum of squared differences of `order` along n samples."""
+def roughness(n: int, order: int, strength: Floats | float = 1.0) -> csc_matrix:
+    """Matrix (n, n) of the sum of squared differences of `order` along n samples, each times its strength (n,)."""
     difference = csc_matrix(eye(n))
     for k in range(order):
         difference = csc_matrix(diags([-1.0, 1.0], [0, 1], shape=(n - k - 1, n - k)) @ difference)
-    return csc_matrix(difference.T @ difference)
+    middle = np.broadcast_to(strength, n)[order // 2 : order // 2 + n - order]
+    return csc_matrix(difference.T @ diags(middle) @ difference)
 
 
-def smooth(values: Floats, weight: Floats, strength: float, order: int = 2) -> Floats:
+def smooth(values: Floats, weight: Floats, strength: Floats | float, order: int = 2) -> Floats:
     """Whittaker smoothing of samples (n,) or (n, d) with weights (n,).
 
-    Minimises sum w |x - v|^2 + strength |difference of `order` of x|^2 (Eilers 2003, Anal. Chem. 75:3631, eq. 5).
+    Minimises sum w |x - v|^2 + strength |difference of `order` of x|^2 (Eilers 2003, Anal. Chem. 75:3631, eq. 5);
+    `strength` may be given for every sample (n,).
     """
     n = len(values)
     if n <= order:
         return values
-    matrix = diags(weight) + strength * roughness(n, order)
+    matrix = diags(weight) + roughness(n, order, strength)
     right = values * (weight if values.ndim == 1 else weight[:, None])
     return np.asarray(spsolve(csc_matrix(matrix), right)).reshape(values.shape)

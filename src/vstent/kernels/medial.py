@@ -126,21 +126,25 @@ def _largest(medial: Medial) -> Medial:
     return keep(medial, label == np.argmax(np.bincount(label)))
 
 
-def arms(medial: Medial, roots: Ints, least_cost: float) -> list[Ints]:
+def arms(medial: Medial, roots: Ints, least_cost: float, least_radius: float) -> list[Ints]:
     """Paths from the tree of `roots` (without any: the widest sphere) to the tips further from it than `least_cost`.
 
     The cost length / radius counts radii travelled. The farthest tip comes first; its path joins the tree before the
-    next is sought.
+    next is sought. Spheres no wider than `least_radius` are passed on the way between roots, but make no arm.
     """
     graph = cost_graph(medial, np.full(len(medial.radius), np.inf))
     if len(roots):
         roots = np.unique(np.concatenate([_farthest(graph, roots[:1], int(root)) for root in roots]))
     else:
         roots = np.array([int(np.argmax(medial.radius))], dtype=np.int32)
+    wide = medial.radius > least_radius
+    wide[roots] = True
+    number, original = np.cumsum(wide) - 1, np.flatnonzero(wide)
+    graph, roots = graph[wide][:, wide], number[roots]
     found: list[Ints] = []
     while len(path := _farthest(graph, roots, least_cost=least_cost)):
-        found.append(path)
-        roots = np.union1d(roots, path).astype(np.int32)
+        found.append(original[path])
+        roots = np.union1d(roots, path)
     return found
 
 

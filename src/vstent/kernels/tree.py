@@ -42,17 +42,54 @@ def build(vertices: Floats, faces: Ints) -> Tree:
     return Tree(corners, order, low, high, pseudonormal)
 
 
-def _median_order(points: Floats) -> Ints:
+@njit(cache=True)
+def _median_order(points: Any) -> Any:
     """Order (m,) in which every node's triangles are one half of its parent's, split along the longer side."""
     n = len(points)
-    order, every = np.arange(n), np.arange(n)
-    block = LEAF << max(0, int(np.ceil(np.log2(max(1, -(-n // LEAF))))))
+    order = np.arange(n).astype(np.int32)
+    block = LEAF
+    while block < n:
+        block *= 2
     while block > LEAF:
-        node, starts, placed = every // block, np.arange(0, n, block), points[order]
-        side = np.maximum.reduceat(placed, starts) - np.minimum.reduceat(placed, starts)
-        order = order[np.lexsort((placed[every, side.argmax(axis=1)[node]], node))]
-        block //= 2
-    return order.astype(np.int32)
+        half = block // 2
+        for start in range(0, n - half, block):
+            end = min(start + block, n)
+            _part(points[:, _longest_side(points, order, start, end)], order, start, end - 1, start + half)
+        block = half
+    return order
+
+
+@njit(cache=True)
+def _longest_side(points: Any, order: Any, start: int, end: int) -> int:
+    best, longest = 0, -1.0
+    for k in range(3):
+        low, high = np.inf, -np.inf
+        for i in range(start, end):
+            low, high = min(low, points[order[i], k]), max(high, points[order[i], k])
+        if high - low > longest:
+            best, longest = k, high - low
+    return best
+
+
+@njit(cache=True)
+def _part(key: Any, order: Any, first: int, last: int, middle: int) -> None:
+    """Put the triangles of lesser key before `middle`, the others from it on (Hoare 1961, Algorithm 65: FIND)."""
+    while first < last:
+        pivot = key[order[(first + last) // 2]]
+        i, j = first, last
+        while i <= j:
+            while key[order[i]] < pivot:
+                i += 1
+            while key[order[j]] > pivot:
+                j -= 1
+            if i <= j:
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if j < middle:
+            first = i
+        if i > middle:
+            last = j
 
 
 def _boxes(corners: Floats, n_leaves: int) -> tuple[Floats, Floats]:
@@ -74,17 +111,41 @@ def _boxes(corners: Floats, n_leaves: int) -> tuple[Floats, Floats]:
 def _pseudonormals(vertices: Floats, faces: Ints) -> Floats:
     """Angle-weighted pseudonormals (Baerentzen and Aanaes 2005): their sign test is exact on closed surfaces."""
     corners = vertices[faces]
-    face = triangles.normals(corners)
     result = np.zeros((len(faces), 7, 3))
-    result[:, 0] = face
-    edges = np.sort(triangles.directed_edges(faces), axis=1).astype(np.int64)
-    _, edge_id = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True)
-    owner = np.tile(np.arange(len(faces)), 3)
-    for axis in range(3):
-        total = np.bincount(edge_id, face[owner, axis])
-        result[:, 1:4, axis] = total[edge_id].reshape(3, len(faces)).T
+    result[:, 0] = triangles.normals(corners)
     result[:, 4:7] = triangles.vertex_normals(vertices, faces)[faces]
+    _add_edge_normals(np.ascontiguousarray(faces), len(vertices), result)
     return result
+
+
+@njit(cache=True)
+def _add_edge_normals(faces: Any, n_vertices: int, result: Any) -> None:
+    """Write the sum of the normals of all faces at an edge into `result` (m, 7, 3), places 1 to 3.
+
+    The edges of a vertex to higher ones are kept in a list of its own, so that only a few are compared.
+    """
+    m = len(faces)
+    begin = np.zeros(n_vertices + 1, dtype=np.int64)
+    for f in range(m):
+        for k in range(3):
+            begin[min(faces[f, k], faces[f, (k + 1) % 3]) + 1] += 1
+    begin = np.cumsum(begin)
+    filled = begin[:-1].copy()
+    use = np.zeros(3 * m, dtype=np.int64)
+    for f in range(m):
+        for k in range(3):
+            low = min(faces[f, k], faces[f, (k + 1) % 3])
+            use[filled[low]] = 3 * f + k
+            filled[low] += 1
+    for low in range(n_vertices):
+        for i in range(begin[low], begin[low + 1]):
+            f, k = use[i] // 3, use[i] % 3
+            high = max(faces[f, k], faces[f, (k + 1) % 3])
+            for j in range(begin[low], begin[low + 1]):
+                g, n = use[j] // 3, use[j] % 3
+                if max(faces[g, n], faces[g, (n + 1) % 3]) == high:
+                    for axis in range(3):
+                        result[f, 1 + k, axis] += result[g, 0, axis]
 
 
 def closest_points(tree: Tree, points: Floats) -> tuple[Floats, Floats, Ints]:
@@ -219,14 +280,17 @@ def _closest_all(corners: Any, low: Any, high: Any, points: Any) -> tuple[Any, A
 
 
 @njit(cache=True)
-def _ray_enters_box(origin: Any, inverse: Any, low: Any, high: Any, limit: float) -> bool:
-    near, far = 0.0, limit
+def _entry(origin: Any, inverse: Any, low: Any, high: Any, node: int) -> tuple[float, float]:
+    """Parameters at which a line enters and leaves a node's box; it misses the box where it leaves before it enters."""
+    if low[node, 0] > high[node, 0]:  # leaves that pad the tree are empty
+        return np.inf, -np.inf
+    near, far = 0.0, np.inf
     for k in range(3):
-        t0 = (low[k] - origin[k]) * inverse[k]
-        t1 = (high[k] - origin[k]) * inverse[k]
+        t0 = (low[node, k] - origin[k]) * inverse[k]
+        t1 = (high[node, k] - origin[k]) * inverse[k]
         near = max(near, min(t0, t1))
         far = min(far, max(t0, t1))
-    return near <= far * (1.0 + 1e-12) + 1e-12
+    return near * (1.0 - 1e-12) - 1e-12, far * (1.0 + 1e-12) + 1e-12
 
 
 @njit(cache=True)
@@ -256,19 +320,31 @@ def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: An
     for k in range(3):
         inverse[k] = 1.0 / direction[k] if abs(direction[k]) > 1e-200 else 1e200
     stack = np.zeros(_STACK, dtype=np.int32)
+    entry = np.zeros(_STACK)
     size, best = 1, np.inf
     while size > 0:
         size -= 1
         node = stack[size]
-        if not _ray_enters_box(origin, inverse, low[node], high[node], min(best, limit)):
+        if entry[size] > min(best, limit):
             continue
         if node >= first_leaf:
             start = (node - first_leaf) * LEAF
             for i in range(start, min(start + LEAF, corners.shape[0])):
                 best = min(best, ray_meets_triangle(origin, direction, corners[i]))
             continue
-        stack[size], stack[size + 1] = 2 * node + 1, 2 * node + 2
-        size += 2
+        near, far = 2 * node + 1, 2 * node + 2
+        enter_near, leave_near = _entry(origin, inverse, low, high, near)
+        enter_far, leave_far = _entry(origin, inverse, low, high, far)
+        if enter_far < enter_near:
+            near, enter_near, leave_near, far, enter_far, leave_far = (
+                far, enter_far, leave_far, near, enter_near, leave_near,
+            )  # fmt: skip
+        if enter_far <= leave_far:
+            stack[size], entry[size] = far, enter_far
+            size += 1
+        if enter_near <= leave_near:
+            stack[size], entry[size] = near, enter_near
+            size += 1
     return best
 
 

@@ -34,9 +34,10 @@ def vertex_normals(vertices: Floats, faces: Ints) -> Floats:
     """Angle-weighted unit normals (n, 3) (Baerentzen and Aanaes 2005, IEEE TVCG 11(3), eq. 5)."""
     corners = vertices[faces]
     normal = normals(corners)
-    total = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(total, faces[:, k], corner_angles(corners, k)[:, None] * normal)
+    angle = np.stack([corner_angles(corners, k) for k in range(3)], axis=1)
+    total = np.zeros((len(vertices), 3))
+    for axis in range(3):
+        total[:, axis] = np.bincount(faces.ravel(), (angle * normal[:, axis, None]).ravel(), minlength=len(vertices))
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
