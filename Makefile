@@ -3,13 +3,16 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check lint benchmark clean
+.PHONY: demo test validation check lint benchmark clean
 
 demo: $(VENV)/.ready
 	$(BIN)/vstent demo --out demo
 
 test: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -m "not validation"
+
+validation: $(VENV)/.ready-dev
+	$(BIN)/python -m pytest -m validation -rP
 
 check: lint test
 

@@ -27,7 +27,7 @@ from vessel_truth import NAMES, PHANTOMS, large_scan, reference_errors, trace_er
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 EDGES_MM = (0.5, 0.35, 0.25, 0.18)
 VOXELS_MM = (0.15, 0.25, 0.4)
-SIZES = {20_000: 0.27, 80_000: 0.135, 320_000: 0.0675}
+SIZES = {20_000: 0.325, 80_000: 0.163, 320_000: 0.0814}
 """Triangles of the demo's artery, and the edge that makes about so many."""
 
 

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import Delaunay, cKDTree
 
 from vstent.kernels.arrays import Bools, Floats, Ints
-from vstent.kernels.tree import Tree, signed_distances
+from vstent.kernels.tree import Tree, sees_inside
 
 
 class Medial(NamedTuple):
@@ -113,7 +113,7 @@ def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Med
     unsure = kept & (every.radius > 2.0 * np.quantile(every.radius[kept], 0.9))
     if len(ends):
         unsure |= kept & (cKDTree(ends).query(every.points)[0] < 3.0 * every.radius)
-    kept[unsure] = signed_distances(closed, every.points[unsure]) < 0
+    kept[unsure] = sees_inside(closed, every.points[unsure], -offset[unsure, 0])
     return _largest(keep(every, kept))
 
 

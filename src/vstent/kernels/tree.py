@@ -92,19 +92,21 @@ def _part(key: Any, order: Any, first: int, last: int, middle: int) -> None:
             last = j
 
 
-def _boxes(corners: Floats, n_leaves: int) -> tuple[Floats, Floats]:
+@njit(cache=True)
+def _boxes(corners: Any, n_leaves: int) -> tuple[Any, Any]:
+    """Lower and upper corner (nodes, 3) of every node's box; leaves without triangles have theirs the wrong way round."""
     low = np.full((2 * n_leaves - 1, 3), np.inf)
     high = np.full((2 * n_leaves - 1, 3), -np.inf)
-    starts = np.arange(0, len(corners), LEAF)
-    leaves = slice(n_leaves - 1, n_leaves - 1 + len(starts))
-    low[leaves] = np.minimum.reduceat(corners.min(axis=1), starts)
-    high[leaves] = np.maximum.reduceat(corners.max(axis=1), starts)
-    first = n_leaves - 1
-    while first > 0:
-        parents = slice((first - 1) // 2, first)
-        low[parents] = low[first : 2 * first + 1].reshape(-1, 2, 3).min(axis=1)
-        high[parents] = high[first : 2 * first + 1].reshape(-1, 2, 3).max(axis=1)
-        first = (first - 1) // 2
+    for f in range(len(corners)):
+        leaf = n_leaves - 1 + f // LEAF
+        for k in range(3):
+            for corner in range(3):
+                low[leaf, k] = min(low[leaf, k], corners[f, corner, k])
+                high[leaf, k] = max(high[leaf, k], corners[f, corner, k])
+    for node in range(2 * n_leaves - 2, 0, -1):
+        for k in range(3):
+            low[(node - 1) // 2, k] = min(low[(node - 1) // 2, k], low[node, k])
+            high[(node - 1) // 2, k] = max(high[(node - 1) // 2, k], high[node, k])
     return low, high
 
 
@@ -167,14 +169,25 @@ def segments_cross(tree: Tree, starts: Floats, ends: Floats) -> Bools:
     """Tell for each segment, from starts (n, 3) to ends (n, 3), whether it meets a triangle."""
     starts = np.ascontiguousarray(starts, dtype=np.float64)
     ends = np.ascontiguousarray(ends, dtype=np.float64)
-    return _first_hit_all(tree.corners, tree.low, tree.high, starts, ends - starts, 1.0) <= 1.0
+    return _first_hit_all(tree.corners, tree.low, tree.high, starts, ends - starts, 1.0)[0] <= 1.0
 
 
 def first_hits(tree: Tree, origins: Floats, directions: Floats) -> Floats:
     """Distance (n,) from origins (n, 3) along unit directions (n, 3) to the first triangle; inf where none."""
     origins = np.ascontiguousarray(origins, dtype=np.float64)
     directions = np.ascontiguousarray(directions, dtype=np.float64)
-    return _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)
+    return _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)[0]
+
+
+def sees_inside(tree: Tree, origins: Floats, directions: Floats) -> Bools:
+    """Tell whether rays from origins (n, 3) along directions (n, 3) meet a closed surface from within.
+
+    Any ray of a point inside does. Where walls are all about as near, this is much faster than the nearest of them.
+    """
+    origins = np.ascontiguousarray(origins, dtype=np.float64)
+    directions = np.ascontiguousarray(directions, dtype=np.float64)
+    hit, triangle = _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)
+    return np.isfinite(hit) & (np.einsum("ij,ij->i", tree.pseudonormal[triangle, 0], directions) > 0)
 
 
 @njit(cache=True)
@@ -314,14 +327,14 @@ def ray_meets_triangle(o: Any, d: Any, t: Any) -> float:
 
 
 @njit(cache=True)
-def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: Any, limit: float) -> float:
+def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: Any, limit: float) -> tuple[float, int]:
     first_leaf = low.shape[0] // 2
     inverse = np.zeros(3)
     for k in range(3):
         inverse[k] = 1.0 / direction[k] if abs(direction[k]) > 1e-200 else 1e200
     stack = np.zeros(_STACK, dtype=np.int32)
     entry = np.zeros(_STACK)
-    size, best = 1, np.inf
+    size, best, hit = 1, np.inf, 0
     while size > 0:
         size -= 1
         node = stack[size]
@@ -330,7 +343,9 @@ def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: An
         if node >= first_leaf:
             start = (node - first_leaf) * LEAF
             for i in range(start, min(start + LEAF, corners.shape[0])):
-                best = min(best, ray_meets_triangle(origin, direction, corners[i]))
+                s = ray_meets_triangle(origin, direction, corners[i])
+                if s < best:
+                    best, hit = s, i
             continue
         near, far = 2 * node + 1, 2 * node + 2
         enter_near, leave_near = _entry(origin, inverse, low, high, near)
@@ -345,13 +360,14 @@ def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: An
         if enter_near <= leave_near:
             stack[size], entry[size] = near, enter_near
             size += 1
-    return best
+    return best, hit
 
 
 @njit(cache=True, parallel=True)
-def _first_hit_all(corners: Any, low: Any, high: Any, origins: Any, directions: Any, limit: float) -> Any:
+def _first_hit_all(corners: Any, low: Any, high: Any, origins: Any, directions: Any, limit: float) -> tuple[Any, Any]:
     n = origins.shape[0]
     hit = np.full(n, np.inf)
+    triangle = np.zeros(n, dtype=np.int32)
     for i in prange(n):
-        hit[i] = _first_hit_one(corners, low, high, origins[i], directions[i], limit)
-    return hit
+        hit[i], triangle[i] = _first_hit_one(corners, low, high, origins[i], directions[i], limit)
+    return hit, triangle

@@ -1,8 +1,10 @@
 """Triangle soups and meshes on bare arrays: areas, normals, volume, loops, caps."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numba import njit
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -21,7 +23,18 @@ def normals(corners: Floats) -> Floats:
 
 
 def _crosses(corners: Floats) -> Floats:
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return _cross_all(np.ascontiguousarray(corners, dtype=np.float64))
+
+
+@njit(cache=True)
+def _cross_all(corners: Any) -> Any:
+    cross = np.zeros((len(corners), 3))
+    for f in range(len(corners)):
+        a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            cross[f, k] = (b[i] - a[i]) * (c[j] - a[j]) - (b[j] - a[j]) * (c[i] - a[i])
+    return cross
 
 
 def volume(corners: Floats) -> float:
@@ -32,20 +45,24 @@ def volume(corners: Floats) -> float:
 
 def vertex_normals(vertices: Floats, faces: Ints) -> Floats:
     """Angle-weighted unit normals (n, 3) (Baerentzen and Aanaes 2005, IEEE TVCG 11(3), eq. 5)."""
-    corners = vertices[faces]
-    normal = normals(corners)
-    angle = np.stack([corner_angles(corners, k) for k in range(3)], axis=1)
-    total = np.zeros((len(vertices), 3))
-    for axis in range(3):
-        total[:, axis] = np.bincount(faces.ravel(), (angle * normal[:, axis, None]).ravel(), minlength=len(vertices))
+    corners = np.ascontiguousarray(vertices[faces], dtype=np.float64)
+    total = _angle_weighted(corners, np.ascontiguousarray(faces), normals(corners), len(vertices))
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
-def corner_angles(corners: Floats, k: int) -> Floats:
-    """Interior angle (m,) at corner `k` of triangles (m, 3, 3)."""
-    a = corners[:, (k + 1) % 3] - corners[:, k]
-    b = corners[:, (k + 2) % 3] - corners[:, k]
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ij,ij->i", a, b))
+@njit(cache=True)
+def _angle_weighted(corners: Any, faces: Any, normal: Any, n_vertices: int) -> Any:
+    total = np.zeros((n_vertices, 3))
+    for f in range(len(faces)):
+        for k in range(3):
+            o, p, q = corners[f, k], corners[f, (k + 1) % 3], corners[f, (k + 2) % 3]
+            a0, a1, a2 = p[0] - o[0], p[1] - o[1], p[2] - o[2]
+            b0, b1, b2 = q[0] - o[0], q[1] - o[1], q[2] - o[2]
+            c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+            angle = np.arctan2(np.sqrt(c0 * c0 + c1 * c1 + c2 * c2), a0 * b0 + a1 * b1 + a2 * b2)
+            for axis in range(3):
+                total[faces[f, k], axis] += angle * normal[f, axis]
+    return total
 
 
 def directed_edges(faces: Ints) -> Ints:
