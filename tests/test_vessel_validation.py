@@ -1,4 +1,4 @@
-"""Centerlines and walls against analytic axes, synthetic scans and another program's centerlines: the issue's tables."""
+"""Centerlines and walls against analytic axes, synthetic scans and another program's centerlines."""
 
 from pathlib import Path
 
@@ -14,11 +14,11 @@ pytestmark = pytest.mark.validation
 @pytest.mark.parametrize("phantom", PHANTOMS, ids=NAMES)
 def test_centerlines_converge_to_the_axes(phantom: Phantom) -> None:
     coarse, fine = (trace_errors(phantom, traced(phantom, edge_mm)) for edge_mm in (0.5, 0.25))
-    print(coarse, fine, sep="\n")
+    print(coarse, fine, sep="\n")  # noqa: T201  # `make validation` shows it
     assert fine.mean_mm < 0.02
     assert fine.max_mm < 0.1
     assert fine.radius_mm < 0.01
-    # A chord lies below its arc by the square of the edge; what the wall's unevenness adds takes a little off the order.
+    # A chord lies below its arc by the square of the edge; what uneven triangles add takes a little off the order.
     assert np.log2(coarse.radius_mm / fine.radius_mm) > 1.65
     assert fine.mean_mm < max(0.5 * coarse.mean_mm, 0.001)
 
@@ -28,7 +28,7 @@ def test_centerlines_converge_to_the_axes(phantom: Phantom) -> None:
 @pytest.mark.parametrize(("blur_voxels", "noise"), [(0.5, 0.03), (1.0, 0.08)])
 def test_scanned_walls_lie_where_they_are(phantom: Phantom, voxel_mm: float, blur_voxels: float, noise: float) -> None:
     found = wall_errors(phantom, Scanner(voxel_mm, blur_voxels * voxel_mm, noise))
-    print(found)
+    print(found)  # noqa: T201
     assert abs(found.diameter_bias) < 0.1
     assert found.p95 < 0.5
 
@@ -36,7 +36,7 @@ def test_scanned_walls_lie_where_they_are(phantom: Phantom, voxel_mm: float, blu
 @pytest.mark.parametrize("case", ["aneurisk_C0038", "aneurisk_beta"])
 def test_real_centerlines_agree_with_vmtk_outside_the_sac(case: str, shared_data: Path) -> None:
     found = reference_errors(shared_data, case)
-    print(found)
+    print(found)  # noqa: T201
     assert found.n_reached == found.n_reference
     assert found.mean_mm < 0.1
     assert found.radius_mm < 0.05

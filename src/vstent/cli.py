@@ -4,7 +4,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from vstent.errors import InputError, VstentError
 
@@ -45,13 +45,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_run(commands.add_parser("run", help="scan or surface -> stented artery, flow compared, report", epilog=EPILOG))
+    _add_trace(commands.add_parser("trace", help="scan or surface -> wall, openings, centerlines", epilog=EPILOG))
+    restore = commands.add_parser(
+        "restore", help="scan or surface -> parent artery, sac, neck, measures", epilog=EPILOG
+    )
+    _add_restore(restore)
     _add_demo(commands.add_parser("demo", help="the same on a synthetic scan, beside its known truth", epilog=EPILOG))
     devices = commands.add_parser("devices", help="list the catalogue", epilog=EPILOG)
     devices.set_defaults(command=_devices)
     return parser
 
 
-def _add_run(parser: argparse.ArgumentParser) -> None:
+def _add_geometry(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add the input, the folder, and what may be said of the vessel; return the group of the latter."""
     parser.add_argument(
         "input", type=Path, help="DICOM folder, NIfTI, NRRD, MHA, raw volume, STL, VTP, VTK, OBJ or PLY"
     )
@@ -63,7 +69,26 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     given.add_argument("--threshold", type=float, metavar="T", help="intensity of the lumen's wall in a scan")
     given.add_argument("--at", type=_point, metavar="X,Y,Z", help="a point near the sac, mm")
     given.add_argument("--inlet", type=_point, metavar="X,Y,Z", help="a point near the inlet, mm")
+    return given
+
+
+def _add_trace(parser: argparse.ArgumentParser) -> None:
+    _add_geometry(parser)
+    parser.set_defaults(command=_trace, outlet=None)
+
+
+def _add_restore(parser: argparse.ArgumentParser) -> None:
+    _add_outlet(_add_geometry(parser))
+    parser.set_defaults(command=_restore)
+
+
+def _add_outlet(given: "argparse._ArgumentGroup") -> None:
     given.add_argument("--outlet", type=_point, metavar="X,Y,Z", help="a point near the parent artery's outlet, mm")
+
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    given = _add_geometry(parser)
+    _add_outlet(given)
     given.add_argument("--diameter", type=float, metavar="MM", help="label diameter of the devices")
     given.add_argument("--length", type=float, metavar="MM", help="label length of the devices")
     given.add_argument("--center", type=float, metavar="MM", help="where on the parent axis the device's middle lies")
@@ -123,16 +148,23 @@ def _settings(arguments: argparse.Namespace, **given: object) -> "Settings":
     return Settings(devices=devices, flow=None if arguments.no_flow else flow, **given)  # type: ignore[arg-type]
 
 
+def _geometry(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Collect what was said of the vessel, under the names of the settings."""
+    return {
+        "units": arguments.units,
+        "spacing_mm": arguments.spacing,
+        "shape": arguments.shape,
+        "threshold": arguments.threshold,
+        "at_mm": arguments.at,
+        "inlet_mm": arguments.inlet,
+        "outlet_mm": arguments.outlet,
+    }
+
+
 def _run(arguments: argparse.Namespace) -> int:
     settings = _settings(
         arguments,
-        units=arguments.units,
-        spacing_mm=arguments.spacing,
-        shape=arguments.shape,
-        threshold=arguments.threshold,
-        at_mm=arguments.at,
-        inlet_mm=arguments.inlet,
-        outlet_mm=arguments.outlet,
+        **_geometry(arguments),
         diameter_mm=arguments.diameter,
         length_mm=arguments.length,
         center_mm=arguments.center,
@@ -158,6 +190,32 @@ def _study(path: Path, out: Path, settings: "Settings") -> "CaseResult":
     console.print(comparison_table(case.metrics))
     console.print(f"Results in {out}; open {out / 'report.html'}. Research use only.")
     return case
+
+
+def _trace(arguments: argparse.Namespace) -> int:
+    from vstent.console import Console, opening_table
+    from vstent.study import Settings, trace_vessel
+
+    console = Console()
+    settings = Settings(devices=(), flow=None, **_geometry(arguments))
+    with console.live():
+        vessel = trace_vessel(arguments.input, arguments.out, settings, console.progress)
+    console.print(opening_table(vessel.openings))
+    console.print(f"Results in {arguments.out}. Research use only.")
+    return 0
+
+
+def _restore(arguments: argparse.Namespace) -> int:
+    from vstent.console import Console, morphology_table
+    from vstent.study import Settings, restore_vessel
+
+    console = Console()
+    settings = Settings(devices=(), flow=None, **_geometry(arguments))
+    with console.live():
+        _, measures = restore_vessel(arguments.input, arguments.out, settings, console.progress)
+    console.print(morphology_table(measures))
+    console.print(f"Results in {arguments.out}. Research use only.")
+    return 0
 
 
 def _demo(arguments: argparse.Namespace) -> int:

@@ -1,7 +1,7 @@
 """What a terminal shows: a line per stage with its time, and the table of a comparison."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Final
 
@@ -10,6 +10,7 @@ from rich.status import Status
 from rich.table import Table
 
 from vstent.device import Design
+from vstent.vessel import Opening
 
 ROWS: Final = (
     ("Neck inflow", "neck_inflow_mL_s", "mL/s"),
@@ -81,6 +82,25 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
         if bare is None:
             continue
         table.add_row(title, unit, _cell(bare), *(_change(bare, stent["flow"][key]) for stent in stents.values()))
+    return table
+
+
+def opening_table(openings: Sequence[Opening]) -> Table:
+    """Table of the vessel's ends: role, diameter, area, where."""
+    table = Table("opening", "diameter, mm", "area, mm²", "center, mm (LPS)")
+    for opening in openings:
+        center = ", ".join(f"{x:.1f}" for x in opening.center_mm)
+        table.add_row(opening.role, f"{opening.diameter_mm:.2f}", f"{opening.area_mm2:.2f}", center)
+    return table
+
+
+def morphology_table(measures: Mapping[str, Any]) -> Table:
+    """Table of a vessel's measures: name, value with unit."""
+    from vstent.report.quantities import flatten
+
+    table = Table("morphology", "")
+    for quantity in flatten(measures):
+        table.add_row(quantity.name, quantity.text)
     return table
 
 

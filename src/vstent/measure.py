@@ -20,6 +20,10 @@ Measures = dict[str, float | str]
 
 NECK_TOLERANCE_MM: Final = 0.02
 """The neck's triangles lie on the landing surface to within this: they are other triangles than its own."""
+FEWEST_AXIS_POINTS: Final = 9
+"""A shorter axis is too short to tell how it bends."""
+BENT: Final = 0.1
+"""An axis is bent, and has a torsion, where its curvature exceeds this over the artery's diameter."""
 SAMPLES_PER_QUAD: Final = 8
 """Points per direction at which coverage is tried in every quad of the contour."""
 
@@ -175,12 +179,37 @@ def morphology(anatomy: Anatomy) -> Measures:
     Height, aspect ratio and size ratio as defined by Dhar et al. 2008 (Neurosurgery 63:185): the height is measured
     square to the neck plane; the size ratio takes the longest distance from the neck's center to the dome; the neck's
     diameter in the aspect ratio is twice the mean distance from its center to its rim. Volume and area are those of
-    the sac, closed across the neck.
+    the sac, closed across the neck. Curvature and torsion are those of the parent axis (Piccinelli et al. 2009, IEEE
+    Trans. Med. Imaging 28:1141), of a quartic through one diameter of it to both sides; that much is left out at its
+    ends.
     """
     proximal_mm, distal_mm = landing_diameters_mm(anatomy)
     found: Measures = {"parent_proximal_diameter_mm": proximal_mm, "parent_distal_diameter_mm": distal_mm}
+    found |= _course(anatomy)
     if anatomy.aneurysms:
         found |= _sac(anatomy.aneurysms[0], 0.5 * (proximal_mm + distal_mm))
+    return found
+
+
+def _course(anatomy: Anatomy) -> Measures:
+    """How the parent axis bends and twists; nothing for an axis of a few points."""
+    axis = anatomy.axis
+    diameter_mm = 2 * float(np.median(anatomy.section_radius_mm))
+    inner = (axis.abscissa_mm >= diameter_mm) & (axis.abscissa_mm <= axis.length_mm - diameter_mm)
+    if inner.sum() < FEWEST_AXIS_POINTS:
+        return {}
+    even_mm = curves.resample_evenly(axis.points_mm, len(axis.points_mm))
+    curvature, torsion = curves.curvature_and_torsion(even_mm, diameter_mm)
+    is_bent = inner & (curvature * diameter_mm > BENT)
+    found: Measures = {
+        "parent_mean_curvature_per_mm": float(curvature[inner].mean()),
+        "parent_max_curvature_per_mm": float(curvature[inner].max()),
+        "parent_mean_torsion_per_mm": float(np.abs(torsion[is_bent]).mean()) if is_bent.any() else 0.0,
+    }
+    if anatomy.aneurysms:
+        proximal_mm, distal_mm = neck_span_mm(anatomy)
+        at_neck = np.interp(np.linspace(proximal_mm, distal_mm, 51), axis.abscissa_mm, curvature)
+        found["neck_mean_curvature_per_mm"] = float(at_neck.mean())
     return found
 
 

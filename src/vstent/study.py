@@ -39,7 +39,7 @@ from vstent.stent import Deployment, Landing
 from vstent.struts import struts
 from vstent.trace import trace
 from vstent.trim import trim
-from vstent.vessel import Anatomy, Vessel
+from vstent.vessel import Anatomy, Centerline, Vessel
 
 PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
 CACHE: Final = ".vstent"
@@ -127,8 +127,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     designs = {name: find_design(name) for name in settings.devices}
     ledger = _Ledger(out / CACHE, progress)
     source = _hash_of(path)
-    geometry = replace(settings, devices=(), diameter_mm=None, length_mm=None, center_mm=None, flow=None)
-    anatomy_key = _key(source, geometry)
+    anatomy_key = _anatomy_key(source, settings)
     anatomy = ledger.recall("anatomy", anatomy_key, Anatomy) or _anatomy(path, settings, ledger)
     deployments = {}
     for name, design in designs.items():
@@ -148,6 +147,54 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     writers.write_json(out / "run.json", provenance)
     notes = (*anatomy.vessel.notes, *anatomy.notes)
     return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, provenance, notes)
+
+
+def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> Vessel:
+    """Find the vessel, its openings and its centerlines, untrimmed; write them into the folder `out`.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the folder.
+    settings : what is given; the rest is proposed.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    """
+    _refuse_missing(path)
+    vessel = _traced(path, settings, _Ledger(out / CACHE, progress))
+    _write_vessel(out, vessel)
+    return vessel
+
+
+def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Anatomy, dict[str, Any]]:
+    """Shrink the sac: find the parent artery and measure it; write it into the folder `out`.
+
+    A study begun in the same folder goes on from what is found here, and the other way round.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : what is given; the rest is proposed.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    """
+    ledger = _Ledger(out / CACHE, progress)
+    key = _anatomy_key(_hash_of(path), settings)
+    anatomy = ledger.recall("anatomy", key, Anatomy) or _anatomy(path, settings, ledger)
+    measures = morphology(anatomy)
+    ledger.keep("anatomy", key, anatomy)
+    _write_anatomy(out, anatomy)
+    writers.write_json(out / "morphology.json", measures)
+    return anatomy, measures
 
 
 class _Ledger:
@@ -203,17 +250,26 @@ class _Ledger:
 
 
 def _anatomy(path: Path, settings: Settings, ledger: _Ledger) -> Anatomy:
-    """Read, segment, repair, trace and restore."""
-    with ledger.stage("segment") as tell:
-        vessel = _vessel(path, settings)
-        tell(" ".join(vessel.notes))
-    with ledger.stage("trace") as tell:
-        traced = trim(trace(vessel, inlet_mm=_array(settings.inlet_mm)), at_mm=_array(settings.at_mm))
-        tell(f"{len(traced.outlets)} outlets; inlet {traced.inlet.diameter_mm:.1f} mm wide.")
+    """Read, segment, repair, trace, trim and restore."""
+    whole = _traced(path, settings, ledger)
+    with ledger.stage("trim") as tell:
+        traced = trim(whole, at_mm=_array(settings.at_mm))
+        tell(" ".join(traced.notes[len(whole.notes) :]))
     with ledger.stage("restore") as tell:
         anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=_array(settings.outlet_mm))
         tell(" ".join([*anatomy.notes, *(f"Sac of {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
     return anatomy
+
+
+def _traced(path: Path, settings: Settings, ledger: _Ledger) -> Vessel:
+    """Read, segment, repair and trace."""
+    with ledger.stage("segment") as tell:
+        vessel = _vessel(path, settings)
+        tell(" ".join(vessel.notes))
+    with ledger.stage("trace") as tell:
+        traced = trace(vessel, inlet_mm=_array(settings.inlet_mm))
+        tell(f"{len(traced.outlets)} outlets; inlet {traced.inlet.diameter_mm:.1f} mm wide.")
+    return traced
 
 
 def _vessel(path: Path, settings: Settings) -> Vessel:
@@ -285,13 +341,21 @@ def _metrics(
     return {"vessel": morphology(anatomy), "stents": stents} | ({BARE: flow[BARE]} if flow else {})
 
 
-def _write_anatomy(out: Path, anatomy: Anatomy) -> None:
+def _write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    writers.write_surface(out / "vessel.vtp", anatomy.vessel.lumen)
-    writers.write_centerlines(out / "centerlines.vtp", (*anatomy.vessel.centerlines, anatomy.axis))
+    writers.write_surface(out / "vessel.vtp", vessel.lumen)
+    writers.write_centerlines(out / "centerlines.vtp", (*vessel.centerlines, *axes))
+    openings = [asdict(opening) | {"diameter_mm": opening.diameter_mm} for opening in vessel.openings]
+    writers.write_json(out / "openings.json", {"openings": openings, "notes": vessel.notes})
+
+
+def _write_anatomy(out: Path, anatomy: Anatomy) -> None:
+    _write_vessel(out, anatomy.vessel, anatomy.axis)
     restored = {"is_restored": anatomy.is_restored.astype(np.uint8)}
     writers.write_surface(out / "landing_surface.vtp", anatomy.landing_surface, restored)
     if not anatomy.aneurysms:
+        for stale in (out / "sac.vtp", out / "neck.vtp"):  # of another input or of other settings
+            stale.unlink(missing_ok=True)
         return
     aneurysm = anatomy.aneurysms[0]
     writers.write_surface(out / "sac.vtp", aneurysm.sac)
@@ -329,10 +393,14 @@ def _provenance(path: Path, source: str, settings: Settings, ledger: _Ledger) ->
     }
 
 
-def _hash_of(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a folder in the order of their names."""
+def _refuse_missing(path: Path) -> None:
     if not path.exists():
         raise ReadError(f"{path} does not exist: give a scan (DICOM folder, NIfTI, NRRD, MHA, raw) or a surface")
+
+
+def _hash_of(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a folder in the order of their names."""
+    _refuse_missing(path)
     digest = hashlib.sha256()
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if file.is_file():
@@ -341,6 +409,11 @@ def _hash_of(path: Path) -> str:
                 while block := stream.read(1 << 20):
                     digest.update(block)
     return digest.hexdigest()
+
+
+def _anatomy_key(source: str, settings: Settings) -> str:
+    """Key of the geometry of an input: devices and flow do not change it."""
+    return _key(source, replace(settings, devices=(), diameter_mm=None, length_mm=None, center_mm=None, flow=None))
 
 
 def _key(*parts: Any) -> str:

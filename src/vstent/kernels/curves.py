@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from scipy.signal import savgol_filter
 from scipy.sparse import csc_matrix, diags, eye
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
@@ -66,6 +67,22 @@ def _transported(points: Any, tangent: Any, first: Any) -> Any:
         moved = moved - (moved * tangent[i]).sum() * tangent[i]
         normal[i] = moved / np.sqrt((moved * moved).sum())
     return normal
+
+
+def curvature_and_torsion(points: Floats, reach: float) -> tuple[Floats, Floats]:
+    """Curvature |a x b| / |a|^3 and torsion (a x b) . c / |a x b|^2, both (n,), of evenly spaced points (n, 3).
+
+    a, b and c are the first three derivatives of the quartic of least squares through the points within `reach` along
+    the curve (Savitzky and Golay 1964, Anal. Chem. 36:1627). The torsion of a straight piece is 0 here: it has none.
+    """
+    step = float(arc_length(points)[-1]) / (len(points) - 1)
+    window = min(2 * max(3, round(reach / step)) + 1, len(points) - 1 + len(points) % 2)
+    a, b, c = (savgol_filter(points, window, 4, deriv=k, delta=step, axis=0) for k in (1, 2, 3))
+    cross = np.cross(a, b)
+    size = np.linalg.norm(cross, axis=1)
+    is_bent = size > 1e-6
+    torsion = np.einsum("ij,ij->i", cross, c) / np.where(is_bent, size, 1.0) ** 2
+    return size / np.linalg.norm(a, axis=1) ** 3, np.where(is_bent, torsion, 0.0)
 
 
 def any_perpendicular(direction: Floats) -> Floats:

@@ -94,7 +94,7 @@ def _part(key: Any, order: Any, first: int, last: int, middle: int) -> None:
 
 @njit(cache=True)
 def _boxes(corners: Any, n_leaves: int) -> tuple[Any, Any]:
-    """Lower and upper corner (nodes, 3) of every node's box; leaves without triangles have theirs the wrong way round."""
+    """Lower and upper corner (nodes, 3) of every node's box; those without triangles are inside out."""
     low = np.full((2 * n_leaves - 1, 3), np.inf)
     high = np.full((2 * n_leaves - 1, 3), -np.inf)
     for f in range(len(corners)):

@@ -15,6 +15,7 @@ class Definition(NamedTuple):
 
 
 _DHAR: Final = "Dhar et al. 2008, Neurosurgery 63:185"
+_PICCINELLI: Final = "Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141"
 
 DEFINITIONS: Final[dict[str, Definition]] = {
     # the artery and the sac
@@ -39,6 +40,18 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "neck_max_diameter_mm": Definition("Neck width, largest", "Largest width of the neck curve in its mean plane."),
     "aspect_ratio": Definition("Aspect ratio", "Sac height divided by the mean diameter of the neck.", _DHAR),
     "size_ratio": Definition("Size ratio", "Longest sac height divided by the parent artery's diameter.", _DHAR),
+    "parent_mean_curvature_per_mm": Definition(
+        "Parent curvature, mean", "Mean curvature of the parent axis, its ends left out.", _PICCINELLI
+    ),
+    "parent_max_curvature_per_mm": Definition(
+        "Parent curvature, largest", "Largest curvature of the parent axis, its ends left out.", _PICCINELLI
+    ),
+    "parent_mean_torsion_per_mm": Definition(
+        "Parent torsion, mean", "Mean magnitude of the torsion of the parent axis where that is bent.", _PICCINELLI
+    ),
+    "neck_mean_curvature_per_mm": Definition(
+        "Parent curvature at the neck", "Mean curvature of the parent axis along the neck.", _PICCINELLI
+    ),
     # the device
     "label_diameter_mm": Definition("Diameter on the label", "Diameter the device is sold as."),
     "label_length_mm": Definition("Length on the label", "Length the device is sold as."),

@@ -10,6 +10,7 @@ from vstent.report.definitions import DEFINITIONS, Definition
 UNITS: dict[str, tuple[str, float]] = {
     "Pa_per_m_s": ("Pa/(m/s)", 1.0),
     "per_mm2": ("1/mm²", 1.0),
+    "per_mm": ("1/mm", 1.0),
     "kg_m3": ("kg/m³", 1.0),
     "mL_min": ("mL/min", 1.0),
     "mL_s": ("mL/s", 1.0),
