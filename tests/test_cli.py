@@ -1,5 +1,6 @@
 """The command line as a user meets it: help, errors, exit codes, resume."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -8,8 +9,10 @@ import numpy as np
 import pytest
 
 from shapes import sphere
+from vessel_truth import read_centerlines
 from vstent import phantoms
 from vstent.cli import main
+from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
 from vstent.surface import Surface
 
@@ -54,6 +57,74 @@ def test_bad_input_ends_in_one_sentence(name: str, tmp_path: Path, capsys: pytes
     assert not out.exists()
 
 
+@pytest.mark.parametrize("command", ["trace", "restore"])
+@pytest.mark.parametrize("name", [name for name in BAD if "device" not in name])
+def test_the_parts_refuse_bad_input_as_the_whole_does(
+    command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, content, options, said = BAD[name]
+    (tmp_path / file).write_bytes(content)
+    assert main([command, str(tmp_path / file), "--out", str(tmp_path / "out"), *options]) == 2
+    assert _complaint(capsys, said)
+    assert main([command, str(tmp_path / "none.stl"), "--out", str(tmp_path / "out")]) == 2
+    assert _complaint(capsys, "does not exist")
+    assert not (tmp_path / "out").exists()
+
+
+def test_trace_writes_wall_openings_and_centerlines(artery: Path, tmp_path: Path) -> None:
+    out, phantom = tmp_path / "out", phantoms.demo_phantom()
+    assert main(["trace", str(artery), "--out", str(out), "--units", "mm"]) == 0
+    assert sorted(file.name for file in out.iterdir()) == ["centerlines.vtp", "openings.json", "vessel.vtp"]
+    openings = json.loads((out / "openings.json").read_text())["openings"]
+    assert [o["role"] for o in openings] == ["inlet", "outlet_1", "outlet_2"]
+    for opening in openings:
+        center, normal, radius = min(phantom.ends, key=lambda end: np.linalg.norm(end[0] - opening["center_mm"]))
+        np.testing.assert_allclose(opening["center_mm"], center, atol=0.05)
+        assert np.dot(opening["normal"], normal) > 0.999
+        assert opening["diameter_mm"] == pytest.approx(2 * radius, rel=0.02)
+        assert opening["area_mm2"] == pytest.approx(np.pi * radius**2, rel=0.04)
+    lines = read_centerlines(out / "centerlines.vtp")
+    assert len(lines) == 2
+    wall, _ = read_surface(out / "vessel.vtp", units="mm")
+    for line, opening in zip(lines, openings[1:], strict=True):
+        np.testing.assert_allclose(line.points_mm[[0, -1]], [o["center_mm"] for o in (openings[0], opening)], atol=1e-3)
+        np.testing.assert_allclose(line.inscribed_radius_mm, wall.closest(line.points_mm)[1], atol=1e-5)
+
+
+def test_restore_writes_the_parent_artery_and_a_study_goes_on_from_it(
+    artery: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, phantom = tmp_path / "out", phantoms.demo_phantom()
+    assert main(["restore", str(artery), "--out", str(out), "--units", "mm"]) == 0
+    assert "Sac volume" in capsys.readouterr().out
+    found = json.loads((out / "morphology.json").read_text())
+    sac, _ = read_surface(out / "sac.vtp", units="mm")
+    assert found["sac_volume_mm3"] == pytest.approx(abs(sac.volume_mm3), rel=1e-4)
+    assert found["sac_volume_mm3"] == pytest.approx(phantom.sac_volume_mm3, rel=0.05)
+    landing, _ = read_surface(out / "landing_surface.vtp", units="mm")
+    assert landing.closest(phantom.sac.center_mm[None] + 3.0 * phantom.sac.direction)[1] > 5.0  # the dome is gone
+    written = {file.name: file.read_bytes() for file in out.glob("*.vtp")}
+    command = ["run", str(artery), "--out", str(out), "--units", "mm", "--device", "silk", "--no-flow"]
+    assert main(command) == 0
+    assert "already done" in capsys.readouterr().err
+    assert json.loads((out / "metrics.json").read_text())["vessel"] == found
+    assert {name: (out / name).read_bytes() for name in written} == written
+
+
+def test_without_a_sac_restore_says_so_and_leaves_none_of_another_case(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "sac.vtp").write_text("of another case")
+    write_stl(tmp_path / "healthy.stl", phantoms.phantom_surface(phantoms.siphon(), edge_mm=0.4))
+    assert main(["restore", str(tmp_path / "healthy.stl"), "--out", str(out), "--units", "mm"]) == 0
+    assert "No sac was found" in capsys.readouterr().err
+    names = {file.name for file in out.iterdir() if file.is_file()}
+    assert names == {"centerlines.vtp", "landing_surface.vtp", "morphology.json", "openings.json", "vessel.vtp"}
+    assert "sac_volume_mm3" not in json.loads((out / "morphology.json").read_text())
+
+
 def _complaint(capsys: pytest.CaptureFixture[str], said: str) -> bool:
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("vstent: ")]
     return said in line
@@ -81,10 +152,6 @@ def test_a_device_longer_than_the_artery_leaves_nothing_behind(
 
 
 def test_a_surface_in_metres_gives_the_same_case(artery: Path, tmp_path: Path) -> None:
-    import json
-
-    from vstent.io.surfaces import read_surface
-
     surface, _ = read_surface(artery, units="mm")
     in_metres = tmp_path / "metres.stl"
     write_stl(in_metres, Surface(surface.vertices_mm / 1000, surface.faces))

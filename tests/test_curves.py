@@ -1,6 +1,7 @@
 """Polylines against circles and helices."""
 
 import numpy as np
+import pytest
 
 from vstent.kernels import curves
 
@@ -56,3 +57,21 @@ def test_smoothing_damps_a_wave_as_its_transfer_function_says() -> None:
         found = curves.smooth(np.sin(k * x), np.ones(2000), 500.0, order=2)[900:1100]
         expected = np.sin(k * x[900:1100]) / (1 + 500.0 * (2 * np.sin(k / 2)) ** 4)
         np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("rise", [-2.0, 0.0, 1.5])
+def test_curvature_and_torsion_of_a_helix(rise: float) -> None:
+    radius = 5.0
+    turn = np.linspace(0, 4 * np.pi, 400)
+    helix = np.stack([radius * np.cos(turn), radius * np.sin(turn), rise * turn], axis=1)
+    curvature, torsion = curves.curvature_and_torsion(helix, 3.0)
+    # The quartic leaves out the fifth derivative: (reach / radius)^4 / 120 or so of the third.
+    np.testing.assert_allclose(curvature[30:-30], radius / (radius**2 + rise**2), rtol=2e-3)
+    np.testing.assert_allclose(torsion[30:-30], rise / (radius**2 + rise**2), rtol=0.02, atol=1e-6)
+
+
+def test_a_straight_line_neither_bends_nor_twists() -> None:
+    line = np.linspace(0, 1, 50)[:, None] * np.array([3.0, -7.0, 11.0])
+    curvature, torsion = curves.curvature_and_torsion(line, 2.0)
+    np.testing.assert_allclose(curvature, 0, atol=1e-9)
+    np.testing.assert_allclose(torsion, 0, atol=1e-9)

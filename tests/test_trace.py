@@ -10,9 +10,13 @@ from shapes import sphere
 from vstent import phantoms
 from vstent.errors import VesselError
 from vstent.kernels import curves, triangles
+from vstent.measure import morphology
 from vstent.openings import open_ends
+from vstent.restore import restore
+from vstent.segment import segment
 from vstent.surface import Surface
 from vstent.trace import trace
+from vstent.trim import trim
 from vstent.vessel import Vessel
 
 
@@ -147,3 +151,11 @@ def test_real_centerlines_agree_with_vmtk(shared_data) -> None:
     distance, nearest = cKDTree(reference).query(line.points_mm[healthy])
     assert distance.mean() < 0.1
     assert np.abs(line.inscribed_radius_mm[healthy] - radius[nearest]).mean() < 0.05
+
+
+def test_the_band_of_the_threshold_is_carried_to_the_measures() -> None:
+    image = phantoms.scan(phantoms.siphon(), np.random.default_rng(0), scanner=phantoms.Scanner(0.4, 0.3))
+    scanned = segment(image)
+    anatomy = restore(trim(trace(scanned)))
+    assert anatomy.vessel.threshold_band_mm == scanned.threshold_band_mm > 0.02
+    assert morphology(anatomy)["diameter_threshold_band_mm"] == scanned.threshold_band_mm

@@ -185,6 +185,8 @@ def morphology(anatomy: Anatomy) -> Measures:
     """
     proximal_mm, distal_mm = landing_diameters_mm(anatomy)
     found: Measures = {"parent_proximal_diameter_mm": proximal_mm, "parent_distal_diameter_mm": distal_mm}
+    if anatomy.vessel.threshold_band_mm > 0:
+        found["diameter_threshold_band_mm"] = anatomy.vessel.threshold_band_mm
     found |= _course(anatomy)
     if anatomy.aneurysms:
         found |= _sac(anatomy.aneurysms[0], 0.5 * (proximal_mm + distal_mm))

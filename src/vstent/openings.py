@@ -57,13 +57,14 @@ def open_ends(vessel: Vessel) -> Vessel:
         )
     found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
     widest = max(found, key=lambda opening: opening.area_mm2)
-    return Vessel(lumen, _named(widest, found), (), (*vessel.notes, *notes))
+    openings = _named(widest, found)
+    return replace(vessel, lumen=lumen, openings=openings, centerlines=(), notes=(*vessel.notes, *notes))
 
 
 def with_inlet(vessel: Vessel, inlet_mm: Floats) -> Vessel:
     """Return the vessel with the opening nearest to `inlet_mm` (3,) as its inlet."""
     nearest = min(vessel.openings, key=lambda opening: float(np.linalg.norm(opening.center_mm - inlet_mm)))
-    return Vessel(vessel.lumen, _named(nearest, list(vessel.openings)), (), vessel.notes)
+    return replace(vessel, openings=_named(nearest, list(vessel.openings)), centerlines=())
 
 
 def _opening(loop_mm: Floats) -> Opening:

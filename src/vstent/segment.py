@@ -52,12 +52,13 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
 
     Smoothing is that of Taubin 1995; what volume it takes is measured, said and given back.
     """
-    lumen, notes = propose(image, at_mm=at_mm) if threshold is None else _at(image, float(threshold), at_mm)
+    lumen, notes, band_mm = propose(image, at_mm=at_mm) if threshold is None else _at(image, float(threshold), at_mm)
     surface, mesh_notes = _smooth(_wall(lumen))
     size = " x ".join(f"{h:.3g}" for h in image.spacing_mm)
     share = lumen.n_voxels / lumen.n_above
     found = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all above the threshold."
-    return Vessel(surface, notes=(*image.notes, *notes, found, *mesh_notes))
+    band = f"Threshold +-5 % changes diameters by -+{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
+    return Vessel(surface, notes=(*image.notes, *notes, band, found, *mesh_notes), threshold_band_mm=band_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +82,8 @@ class Lumen:
         return float(np.abs(np.linalg.det(self.affine_mm[:3, :3])) ** (1 / 3))
 
 
-def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[str, ...]]:
-    """Propose a threshold.
+def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[str, ...], float]:
+    """Propose a threshold; return the lumen, how it was found, and what 5 % of it does to a diameter (mm).
 
     Vessels are far less than a tenth of the voxels, so the histogram of the scan does not show them. A first threshold
     is the mean intensity weighted with the squared gradient (Kittler, Illingworth and Foeglein 1985, Comput. Vis.
@@ -100,20 +101,19 @@ def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[
         f"Threshold {lumen.threshold:.4g} proposed: half way between tissue ({profile.tissue:.4g}) and lumen "
         f"({profile.lumen:.4g}), corrected for the wall's curvature and a blur of {profile.blur_mm:.2g} mm."
     )
-    return lumen, (note, _band(lumen, profile))
+    return lumen, (note,), _band_mm(lumen, profile)
 
 
-def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tuple[str, ...]]:
+def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tuple[str, ...], float]:
     lumen = _lumen(image, threshold, at_mm)
     profile = _profile(lumen)
     note = f"Threshold {threshold:.4g} as given; {profile.wall_level:.4g} would have been proposed."
-    return lumen, (note, _band(lumen, profile))
+    return lumen, (note,), _band_mm(lumen, profile)
 
 
-def _band(lumen: Lumen, profile: "Profile") -> str:
-    """Say what 5 % of the threshold does to a diameter."""
-    change_mm = 2 * 0.05 * abs(lumen.threshold) / profile.slope_per_mm
-    return f"Threshold +-5 % changes diameters by -+{change_mm:.3f} mm ({change_mm / lumen.voxel_mm:.2f} voxel)."
+def _band_mm(lumen: Lumen, profile: "Profile") -> float:
+    """What 5 % of the threshold does to a diameter."""
+    return 2 * 0.05 * abs(lumen.threshold) / profile.slope_per_mm
 
 
 # -- voxels ------------------------------------------------------------------------------------------------------------

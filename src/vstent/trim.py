@@ -4,6 +4,7 @@ A scan shows the whole tree; blood far from the sac costs time and tells nothing
 neighbourhood is cut square to its centerline where it has run the stated length, branches included.
 """
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -41,14 +42,15 @@ def trim(vessel: Vessel, *, at_mm: Floats | None = None) -> Vessel:
         center, ahead = line.at(np.array([abscissa_mm, abscissa_mm + sense * STRIDE_MM]))
         direction = (ahead - center) / np.linalg.norm(ahead - center)
         radius = float(np.interp(abscissa_mm, line.abscissa_mm, line.inscribed_radius_mm))
-        shorter = cut_square(lumen, center, direction, radius)
-        if shorter is not None:
-            lumen = Surface(*triangles.part_at(shorter.vertices_mm, shorter.faces, bulges[0].dome_mm))
+        cut = cut_square(lumen, center, direction, radius)
+        if cut is not None:
+            lumen = Surface(*triangles.part_at(cut.vertices_mm, cut.faces, bulges[0].dome_mm))
             inlet_mm = center if sense < 0 else inlet_mm
     if lumen is vessel.lumen:
         return vessel
     note = f"Trimmed to {UPSTREAM_MM:.0f} mm of vessel before the sac and {DOWNSTREAM_MM:.0f} mm beyond it, cut square."
-    return trace(Vessel(lumen, notes=(*vessel.notes, note)), inlet_mm=inlet_mm)
+    shorter = replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=(*vessel.notes, note))
+    return trace(shorter, inlet_mm=inlet_mm)
 
 
 def _cuts(vessel: Vessel, bulge: Bulge) -> list[tuple[Centerline, float, int]]:

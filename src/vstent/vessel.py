@@ -82,6 +82,9 @@ class Vessel:
     """One from the inlet to each outlet, in the order of the outlets; empty before tracing."""
     notes: tuple[str, ...] = ()
     """What was found, guessed or repaired on the way, one sentence each."""
+    threshold_band_mm: float = 0.0
+    """By how much a diameter grows where the scan's threshold is 5 % lower, and shrinks where it is 5 % higher; 0 for a
+    vessel that is no scan's."""
 
     @property
     def closed(self) -> Surface:
