@@ -1,17 +1,23 @@
 """Openings and centerlines on vessels with a known axis."""
 
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from shapes import sphere
 from vstent import phantoms
-from vstent.errors import VesselError
+from vstent.errors import InputError, VesselError
 from vstent.kernels import curves, triangles
 from vstent.measure import morphology
 from vstent.openings import open_ends
+from vstent.repair import repair
 from vstent.restore import restore
 from vstent.segment import segment
 from vstent.surface import Surface
@@ -159,3 +165,75 @@ def test_the_band_of_the_threshold_is_carried_to_the_measures() -> None:
     anatomy = restore(trim(trace(scanned)))
     assert anatomy.vessel.threshold_band_mm == scanned.threshold_band_mm > 0.02
     assert morphology(anatomy)["diameter_threshold_band_mm"] == scanned.threshold_band_mm
+
+
+def _differences(found: Vessel, expected: Vessel) -> tuple[float, float]:
+    """Largest distance and largest difference of radius between the lines of two vessels."""
+    far, wide = [], []
+    for line, other in zip(found.centerlines, expected.centerlines, strict=True):
+        place, distance = curves.project(other.points_mm, line.points_mm)
+        far.append(distance.max())
+        there = np.interp(place, other.abscissa_mm, other.inscribed_radius_mm)
+        wide.append(np.abs(there - line.inscribed_radius_mm).max())
+    return max(far), max(wide)
+
+
+@settings(max_examples=6, deadline=20_000)
+@given(seed=st.integers(0, 2**32 - 1), is_mirrored=st.booleans())
+def test_motion_mirror_and_order_of_the_triangles_do_not_matter(fork: Vessel, seed: int, is_mirrored: bool) -> None:
+    rng = np.random.default_rng(seed)
+    motion = Rotation.random(random_state=seed).as_matrix() * ([-1, 1, 1] if is_mirrored else [1, 1, 1])
+    shift = rng.normal(0, 50, 3)
+    order = rng.permutation(len(fork.lumen.vertices_mm))
+    faces = np.argsort(order)[rng.permutation(fork.lumen.faces)]
+    faces = np.take_along_axis(faces, (rng.integers(0, 3, (len(faces), 1)) + np.arange(3)) % 3, axis=1)
+    moved = Surface(fork.lumen.vertices_mm[order] @ motion.T + shift, faces[:, ::-1] if is_mirrored else faces)
+    outlets = [motion @ o.center_mm + shift for o in fork.outlets]
+    found = trace(Vessel(moved), inlet_mm=motion @ fork.inlet.center_mm + shift)
+    lines = sorted(found.centerlines, key=lambda line: np.linalg.norm(line.points_mm[-1] - outlets[0]))
+    back = [replace(line, points_mm=(line.points_mm - shift) @ motion) for line in lines]
+    far_mm, wide_mm = _differences(replace(found, centerlines=tuple(back)), fork)
+    assert far_mm < 0.02
+    assert wide_mm < 0.01
+
+
+def test_a_finer_mesh_gives_the_same_centerlines(fork: Vessel) -> None:
+    finer = trace(Vessel(phantoms.phantom_surface(phantoms.bifurcation(), edge_mm=0.15)), inlet_mm=fork.inlet.center_mm)
+    far_mm, wide_mm = _differences(finer, fork)
+    assert far_mm < 0.02
+    assert wide_mm < 0.02  # a chord of 0.25 mm lies 0.005 mm below its arc
+
+
+@settings(max_examples=40, deadline=10_000)
+@given(
+    seed=st.integers(0, 2**32 - 1), n=st.integers(4, 50), n_gone=st.integers(0, 6), squash=st.sampled_from([0.01, 1, 9])
+)
+def test_any_blob_is_traced_or_refused(seed: int, n: int, n_gone: int, squash: float) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(n, 3)) * [1, 1, squash]
+    faces = rng.permutation(ConvexHull(points).simplices)[n_gone:]
+    with suppress(InputError):
+        vessel = trace(Vessel(repair(Surface(points, faces))[0]))
+        assert len(vessel.centerlines) == len(vessel.outlets)
+
+
+def test_a_lens_of_two_flat_sides_is_no_vessel() -> None:
+    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    rim = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    lens = np.concatenate([rim, [[0, 0, 0.05], [0, 0, -0.05]]])
+    with pytest.raises(VesselError, match="flat sides"):
+        trace(Vessel(repair(Surface(lens, ConvexHull(lens).simplices))[0]))
+
+
+def test_a_branch_too_narrow_on_its_way_is_not_taken_for_a_blind_one() -> None:
+    """It used to be cut open before its narrow part, and its own end with it."""
+    direction = np.array([1.0, 0.0, 1.2])
+    trunk = phantoms.tube(length_mm=28.0)
+    branched = phantoms.with_branch(trunk, abscissa_mm=8.0, direction=direction, radius_mm=0.6, length_mm=22.0)
+    branch = branched.branches[0]
+    narrow = 0.6 - 0.25 * np.exp(-(((branch.abscissa_mm - 17.0) / 1.5) ** 2))
+    phantom = replace(branched, branches=(replace(branch, inscribed_radius_mm=narrow),))
+    vessel = traced(phantom)
+    assert [round(o.diameter_mm, 1) for o in vessel.outlets] == [4.0, 1.2]
+    np.testing.assert_allclose(vessel.outlets[1].center_mm, branch.points_mm[-1], atol=0.05)
+    assert vessel.centerlines[1].inscribed_radius_mm.min() == pytest.approx(0.35, abs=0.03)  # in chords of 0.25 mm

@@ -46,6 +46,8 @@ def open_ends(vessel: Vessel) -> Vessel:
     """
     lumen, n_caps = _without_caps(vessel.lumen)
     notes = [f"{n_caps} flat caps were taken off to open the vessel."] if n_caps else []
+    if not len(lumen.faces):
+        raise VesselError("the surface has flat sides only, and no round wall between them: it is not a vessel's")
     lumen, n_arms = _with_open_arms(lumen)
     if n_arms:
         notes.append(f"{n_arms} arms that end blind were cut open square to their axis.")

@@ -45,6 +45,8 @@ def repair(surface: Surface) -> tuple[Surface, tuple[str, ...]]:
     VesselError
         Nothing is left of the surface.
     """
+    if not len(surface.faces):
+        raise VesselError("The surface has no triangles; check the file.")
     mesh = _once(_Mesh(surface.vertices_mm, surface.faces, ()))
     if mesh.notes:  # filling a hole that a pinched vertex runs through leaves needles: a second pass finds them
         mesh = _Mesh(*_once(_Mesh(mesh.vertices, mesh.faces, ())).geometry, mesh.notes)
