@@ -90,7 +90,7 @@ def test_rigid_motion_moves_the_centerline(torus: Vessel) -> None:
 def test_flat_caps_are_taken_off() -> None:
     phantom = phantoms.tube(end_radius_mm=1.5)
     opened = Vessel(phantoms.phantom_surface(phantom))
-    capped = open_ends(Vessel(opened.closed))
+    capped = open_ends(Vessel(opened.closed))[0]
     assert [o.role for o in capped.openings] == ["inlet", "outlet_1"]
     np.testing.assert_allclose([o.diameter_mm for o in capped.openings], [4.0, 3.0], rtol=0.01)
 
@@ -101,7 +101,7 @@ def test_a_blind_arm_is_opened_and_a_sac_is_not() -> None:
     outlet = vessel.lumen.boundary_loops[1]
     dome = _domed(vessel, outlet)
     assert len(dome.boundary_loops) == 1
-    opened = open_ends(Vessel(dome))
+    opened, _ = open_ends(Vessel(dome))
     assert len(opened.openings) == 2
     np.testing.assert_allclose(opened.outlets[0].diameter_mm, 4.0, rtol=0.05)
 

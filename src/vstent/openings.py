@@ -36,8 +36,10 @@ ARM_RADIUS_MM: Final = 0.5
 """Thinner blind arms are left closed: no flow worth computing leaves through them."""
 
 
-def open_ends(vessel: Vessel) -> Vessel:
-    """Return the vessel with its ends cut open and listed: the widest as inlet, the outlets numbered by width.
+def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
+    """Return the vessel with its ends cut open and listed, and its inscribed spheres.
+
+    The widest end is the inlet; the outlets are numbered by width.
 
     Raises
     ------
@@ -48,8 +50,10 @@ def open_ends(vessel: Vessel) -> Vessel:
     notes = [f"{n_caps} flat caps were taken off to open the vessel."] if n_caps else []
     if not len(lumen.faces):
         raise VesselError("the surface has flat sides only, and no round wall between them: it is not a vessel's")
+    spheres = lumen.medial
     lumen, n_arms = _with_open_arms(lumen)
     if n_arms:
+        spheres = medial.within(spheres, lumen.closed.tree)
         notes.append(f"{n_arms} arms that end blind were cut open square to their axis.")
     loops = lumen.boundary_loops
     if len(loops) < 2:
@@ -60,7 +64,7 @@ def open_ends(vessel: Vessel) -> Vessel:
     found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
     widest = max(found, key=lambda opening: opening.area_mm2)
     openings = _named(widest, found)
-    return replace(vessel, lumen=lumen, openings=openings, centerlines=(), notes=(*vessel.notes, *notes))
+    return replace(vessel, lumen=lumen, openings=openings, centerlines=(), notes=(*vessel.notes, *notes)), spheres
 
 
 def with_inlet(vessel: Vessel, inlet_mm: Floats) -> Vessel:

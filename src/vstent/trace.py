@@ -47,10 +47,10 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
     VesselError
         When fewer than two ends are found, or an outlet cannot be reached from the inlet.
     """
-    vessel = vessel if vessel.openings else open_ends(vessel)
+    vessel, spheres = (vessel, vessel.lumen.medial) if vessel.openings else open_ends(vessel)
     if inlet_mm is not None:
         vessel = with_inlet(vessel, np.asarray(inlet_mm, dtype=np.float64))
-    graph = _graph(vessel)
+    graph = _graph(vessel, spheres)
     vessel, graph = _reachable(vessel, graph)
     paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
     paths = _shortest(vessel, graph, _radius_cap(graph, paths))
@@ -68,11 +68,11 @@ def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
     return np.asarray(percentile_filter(radius_mm, PARENT_PERCENTILE, size=size, mode="nearest"))
 
 
-def _graph(vessel: Vessel) -> medial.Medial:
-    """Build the medial graph; its last vertices are the openings, in their order."""
+def _graph(vessel: Vessel, spheres: medial.Medial) -> medial.Medial:
+    """Join the openings to the medial graph; they are its last vertices, in their order."""
     ends = np.array([opening.center_mm for opening in vessel.openings])
     reach = np.array([0.25 * opening.diameter_mm for opening in vessel.openings])
-    return medial.with_terminals(vessel.lumen.medial, ends, reach)
+    return medial.with_terminals(spheres, ends, reach)
 
 
 def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Medial]:

@@ -117,6 +117,13 @@ def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Med
     return _largest(keep(every, kept))
 
 
+def within(medial: Medial, closed: Tree) -> Medial:
+    """The connected part of most spheres whose centres lie inside a closed surface."""
+    askew = np.array([0.756, 0.539, 0.371])  # a ray along no axis grazes no row of triangles
+    inside = sees_inside(closed, medial.points, np.broadcast_to(askew, medial.points.shape))
+    return _largest(keep(medial, inside))
+
+
 def _largest(medial: Medial) -> Medial:
     """The connected part of most spheres: sampling leaves a few spheres by themselves."""
     n = len(medial.points)
@@ -134,7 +141,8 @@ def arms(medial: Medial, roots: Ints, least_cost: float, least_radius: float) ->
     """
     graph = cost_graph(medial, np.full(len(medial.radius), np.inf))
     if len(roots):
-        roots = np.unique(np.concatenate([_farthest(graph, roots[:1], int(root)) for root in roots]))
+        cost, before = shortest_paths(graph, int(roots[0]))
+        roots = np.unique(np.concatenate([path_to(before, int(root)) for root in roots if np.isfinite(cost[root])]))
     else:
         roots = np.array([int(np.argmax(medial.radius))], dtype=np.int32)
     wide = medial.radius > least_radius
@@ -142,17 +150,17 @@ def arms(medial: Medial, roots: Ints, least_cost: float, least_radius: float) ->
     number, original = np.cumsum(wide) - 1, np.flatnonzero(wide)
     graph, roots = graph[wide][:, wide], number[roots]
     found: list[Ints] = []
-    while len(path := _farthest(graph, roots, least_cost=least_cost)):
+    while len(path := _farthest(graph, roots, least_cost)):
         found.append(original[path])
         roots = np.union1d(roots, path)
     return found
 
 
-def _farthest(graph: csr_matrix, roots: Ints, end: int | None = None, least_cost: float = 0.0) -> Ints:
-    """Path from the nearest of `roots` to vertex `end`, or to the farthest; empty when that is nearer than asked."""
+def _farthest(graph: csr_matrix, roots: Ints, least_cost: float) -> Ints:
+    """Path from the nearest of `roots` to the vertex farthest from them; empty when that is nearer than asked."""
     cost, before, _ = dijkstra(graph, directed=False, indices=roots, return_predecessors=True, min_only=True)
     cost[~np.isfinite(cost)] = -1.0
-    tip = int(np.argmax(cost)) if end is None else end
+    tip = int(np.argmax(cost))
     return path_to(before, tip) if cost[tip] >= least_cost else np.zeros(0, dtype=np.int32)
 
 
