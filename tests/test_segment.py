@@ -5,11 +5,12 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
+from shapes import sphere
 from vstent.errors import VesselError
 from vstent.image import Image
 from vstent.io.images import read_image
-from vstent.kernels import topology, triangles
-from vstent.phantoms import Scanner, demo_phantom, scan, tube
+from vstent.kernels import curves, smoothing, topology, triangles
+from vstent.phantoms import Scanner, demo_phantom, phantom_surface, scan, tube, with_branch
 from vstent.segment import segment
 
 
@@ -142,7 +143,8 @@ def test_smoothing_keeps_the_volume(demo):
     assert abs(shrinkage) < 1.0
     from vstent.segment import _wall, propose
 
-    rough = _wall(propose(image)[0])
+    lumen = propose(image)[0]
+    rough, vessel = _wall(lumen), segment(image, threshold=lumen.threshold)
     assert capped_volume(vessel.lumen) == pytest.approx(capped_volume(rough), rel=1e-4)
     roughness = [
         np.abs(np.einsum("ij,ij->i", s.normals[f], s.normals[g])).mean()
@@ -236,3 +238,29 @@ def test_real_time_of_flight_angiogram(shared_data):
     vessel = segment(read_image(shared_data / "tof_mra_healthy.nii.gz"))
     widths = [triangles.perimeter(vessel.lumen.vertices_mm[loop]) / np.pi for loop in vessel.lumen.boundary_loops]
     np.testing.assert_allclose(widths, [4.9, 4.9], atol=0.4)  # both carotids leave through the lowest slice
+
+
+@pytest.mark.parametrize("voxel_mm", [0.25, 0.4])
+def test_a_thin_branch_has_its_diameter_though_the_threshold_is_the_arterys(voxel_mm):
+    phantom = with_branch(tube(), abscissa_mm=10.0, direction=np.array([1, 0, 0.8]), radius_mm=0.6, length_mm=14.0)
+    image = scan(phantom, np.random.default_rng(1), scanner=Scanner(voxel_mm, voxel_mm, 0.04))
+    branch = phantom.branches[0]
+
+    def bias_voxels(surface):
+        place, distance = curves.project(branch.points_mm, surface.vertices_mm)
+        on_branch = (place > 4) & (place < 13) & (distance < 1.0)
+        return 2 * phantom.implicit_mm(surface.vertices_mm[on_branch])[0].mean() / voxel_mm
+
+    vessel = segment(image)
+    assert abs(bias_voxels(vessel.lumen)) < 0.12
+    assert bias_voxels(segment(image, threshold=threshold_of(vessel)).lumen) < -0.25  # the plain iso-surface
+
+
+def test_mean_curvature_of_a_ball_and_of_a_tube():
+    ball = sphere(3.0, 60, 120)
+    curvature = smoothing.mean_curvature(ball.vertices_mm, ball.faces, rounds=0)
+    np.testing.assert_allclose(curvature, 1 / 3, rtol=0.01)
+    pipe = phantom_surface(tube(radius_mm=2.0), edge_mm=0.25)
+    inner = np.abs(pipe.vertices_mm[:, 2] - 10) < 9
+    curvature = smoothing.mean_curvature(pipe.vertices_mm, pipe.faces, rounds=3)
+    np.testing.assert_allclose(curvature[inner], 1 / 4, rtol=0.05)

@@ -26,6 +26,8 @@ MOST_FACES: Final = 120_000
 """Meshes of more triangles are decimated to this number."""
 SMOOTHING_STEPS: Final = 12
 PASS_BAND: Final = 0.1
+CURVATURE_ROUNDS: Final = 25
+"""The wall's curvature is averaged so many times with the neighbours': over some three voxels."""
 PROFILE_VOXELS: Final = 4.0
 """How far into the lumen and into the tissue the profiles across the wall reach."""
 PROFILES: Final = 8000
@@ -52,13 +54,18 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
 
     Smoothing is that of Taubin 1995; what volume it takes is measured, said and given back.
     """
-    lumen, notes, band_mm = propose(image, at_mm=at_mm) if threshold is None else _at(image, float(threshold), at_mm)
-    surface, mesh_notes = _smooth(_wall(lumen))
+    lumen, notes, profile = propose(image, at_mm=at_mm) if threshold is None else _at(image, float(threshold), at_mm)
+    surface, smooth_note = _smooth(_wall(lumen))
+    if threshold is None:
+        surface = _unblurred(surface, profile)
+    surface, decimation_notes = _decimated(surface)
     size = " x ".join(f"{h:.3g}" for h in image.spacing_mm)
     share = lumen.n_voxels / lumen.n_above
     found = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all above the threshold."
+    band_mm = 2 * 0.05 * abs(lumen.threshold) / profile.slope_per_mm
     band = f"Threshold +-5 % changes diameters by -+{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
-    return Vessel(surface, notes=(*image.notes, *notes, band, found, *mesh_notes), threshold_band_mm=band_mm)
+    all_notes = (*image.notes, *notes, band, found, smooth_note, *decimation_notes)
+    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +89,8 @@ class Lumen:
         return float(np.abs(np.linalg.det(self.affine_mm[:3, :3])) ** (1 / 3))
 
 
-def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[str, ...], float]:
-    """Propose a threshold; return the lumen, how it was found, and what 5 % of it does to a diameter (mm).
+def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[str, ...], "Profile"]:
+    """Propose a threshold; return the lumen, how it was found, and the profile across its wall.
 
     Vessels are far less than a tenth of the voxels, so the histogram of the scan does not show them. A first threshold
     is the mean intensity weighted with the squared gradient (Kittler, Illingworth and Foeglein 1985, Comput. Vis.
@@ -91,7 +98,7 @@ def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[
     the threshold set half way between the medians of tissue and lumen: full width at half maximum (Hoogeveen, Bakker
     and Viergever 1998, Magn. Reson. Med. 40:751). The wall of a cylinder of radius R, blurred with standard deviation
     s, does not lie at one half but at Phi(-s / (2 R)) of the step (mean curvature flow, to first order); s is taken
-    from the slope of the profile.
+    from the slope of the profile. R is the whole vessel's; `_unblurred` sees to branches and sacs.
     """
     first = _lumen(image, _edge_level(image.voxels), at_mm)
     second = replace(first, threshold=_profile(first).wall_level)
@@ -101,19 +108,14 @@ def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[
         f"Threshold {lumen.threshold:.4g} proposed: half way between tissue ({profile.tissue:.4g}) and lumen "
         f"({profile.lumen:.4g}), corrected for the wall's curvature and a blur of {profile.blur_mm:.2g} mm."
     )
-    return lumen, (note,), _band_mm(lumen, profile)
+    return lumen, (note,), profile
 
 
-def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tuple[str, ...], float]:
+def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tuple[str, ...], "Profile"]:
     lumen = _lumen(image, threshold, at_mm)
     profile = _profile(lumen)
     note = f"Threshold {threshold:.4g} as given; {profile.wall_level:.4g} would have been proposed."
-    return lumen, (note,), _band_mm(lumen, profile)
-
-
-def _band_mm(lumen: Lumen, profile: "Profile") -> float:
-    """What 5 % of the threshold does to a diameter."""
-    return 2 * 0.05 * abs(lumen.threshold) / profile.slope_per_mm
+    return lumen, (note,), profile
 
 
 # -- voxels ------------------------------------------------------------------------------------------------------------
@@ -268,28 +270,41 @@ def _taubin(surface: Surface) -> Surface:
     return Surface(vertices, surface.faces)
 
 
-def _smooth(rough: Surface) -> tuple[Surface, tuple[str, ...]]:
-    """Smooth, give back the volume that this takes, and decimate a very fine mesh."""
+def _smooth(rough: Surface) -> tuple[Surface, str]:
+    """Smooth, and give back the volume that this takes."""
     volume = _capped_volume_mm3(rough)
     smooth = _taubin(rough)
     lost = volume - _capped_volume_mm3(smooth)
     vertices = smooth.vertices_mm + (lost / smooth.area_mm2) * smooth.vertex_normals
-    note = f"Smoothing changed the volume by {-lost / volume:+.2%}, which was given back."
-    if len(rough.faces) <= MOST_FACES:
-        return Surface(vertices, smooth.faces), (note,)
-    coarse = _decimated(Surface(vertices, smooth.faces))
-    change = _capped_volume_mm3(coarse) / volume - 1
-    return coarse, (note, f"{len(rough.faces)} triangles decimated to {len(coarse.faces)} (volume {change:+.2%}).")
+    return Surface(
+        vertices, smooth.faces
+    ), f"Smoothing changed the volume by {-lost / volume:+.2%}, which was given back."
 
 
-def _decimated(surface: Surface) -> Surface:
-    """Collapse edges by the quadric error (Garland and Heckbert 1997, SIGGRAPH)."""
+def _unblurred(surface: Surface, profile: Profile) -> Surface:
+    """Move the wall to where it was before the blur: by s^2 times its mean curvature, less that of the whole vessel.
+
+    The threshold is right for the whole vessel's radius. A thin branch comes out too narrow with it and a sac too wide;
+    no shift is larger than half a voxel.
+    """
+    curvature = smoothing.mean_curvature(surface.vertices_mm, surface.faces, rounds=CURVATURE_ROUNDS)
+    shift_mm = profile.blur_mm**2 * (curvature - 0.5 / profile.radius_mm)
+    shift_mm = np.clip(shift_mm, -0.5 * profile.voxel_mm, 0.5 * profile.voxel_mm)
+    return Surface(surface.vertices_mm + shift_mm[:, None] * surface.vertex_normals, surface.faces)
+
+
+def _decimated(fine: Surface) -> tuple[Surface, tuple[str, ...]]:
+    """Decimate a very fine mesh: collapse edges by the quadric error (Garland and Heckbert 1997, SIGGRAPH)."""
+    if len(fine.faces) <= MOST_FACES:
+        return fine, ()
     import fast_simplification
 
     vertices, faces = fast_simplification.simplify(
-        np.array(surface.vertices_mm), np.array(surface.faces), target_count=MOST_FACES
+        np.array(fine.vertices_mm), np.array(fine.faces), target_count=MOST_FACES
     )
-    return Surface(vertices, faces)
+    coarse = Surface(vertices, faces)
+    change = _capped_volume_mm3(coarse) / _capped_volume_mm3(fine) - 1
+    return coarse, (f"{len(fine.faces)} triangles decimated to {len(faces)} (volume {change:+.2%}).",)
 
 
 def _capped_volume_mm3(surface: Surface) -> float:

@@ -38,3 +38,24 @@ def taubin(vertices: Floats, faces: Ints, *, iterations: int, pass_band: float) 
     for factor in (shrink, grow) * iterations:
         vertices = vertices + factor * np.where(has_neighbours, mean @ vertices - vertices, 0.0)
     return vertices
+
+
+def mean_curvature(vertices: Floats, faces: Ints, *, rounds: int) -> Floats:
+    """Mean curvature (n,), 1 / (2 R) on a cylinder seen from outside: half the divergence of the vertex normals.
+
+    On every face the normals are interpolated linearly; the curvature is averaged with the neighbours' `rounds` times.
+    """
+    corners, n = vertices[faces], len(vertices)
+    normal, double_area = triangles.normals(corners), np.maximum(2 * triangles.areas(corners), 1e-12)
+    at_corner = triangles.vertex_normals(vertices, faces)[faces]
+    divergence = np.zeros(len(faces))
+    for k in range(3):
+        opposite = corners[:, (k + 2) % 3] - corners[:, (k + 1) % 3]
+        divergence += np.einsum("fi,fi->f", np.cross(normal, opposite), at_corner[:, k]) / double_area
+    weight = np.bincount(faces.ravel(), np.repeat(double_area, 3), minlength=n)
+    total = np.bincount(faces.ravel(), np.repeat(0.5 * divergence * double_area, 3), minlength=n)
+    curvature = total / np.maximum(weight, 1e-12)
+    mean = averaging(n, faces)
+    for _ in range(rounds):
+        curvature = mean @ curvature
+    return curvature
