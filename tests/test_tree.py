@@ -78,3 +78,24 @@ def test_face_order_does_not_matter() -> None:
     shuffled = Surface(soup.vertices_mm, soup.faces[rng.permutation(100)])
     points = rng.uniform(-7, 7, (100, 3))
     np.testing.assert_array_equal(soup.closest(points)[1], shuffled.closest(points)[1])
+
+
+def test_any_ray_tells_inside_as_the_signed_distance_does() -> None:
+    rng = np.random.default_rng(5)
+    ball = sphere(3.0)
+    points = rng.uniform(-4, 4, (2000, 3))
+    directions = rng.normal(size=(2000, 3))
+    is_inside = ball.signed_distance(points) < 0
+    assert 0.1 < is_inside.mean() < 0.9
+    np.testing.assert_array_equal(tree.sees_inside(ball.tree, points, directions), is_inside)
+
+
+@pytest.mark.parametrize("n", [4, 9, 33, 257])
+def test_rays_miss_the_empty_leaves_that_pad_the_tree(n: int) -> None:
+    soup = random_soup(np.random.default_rng(n), n)
+    low, high = soup.tree.low, soup.tree.high
+    empty = np.flatnonzero((low > high).any(axis=1))
+    assert len(empty) > 0 or n == 4
+    for node in empty:
+        enter, leave = tree._entry.py_func(np.zeros(3), np.ones(3), low, high, node)
+        assert enter > leave
