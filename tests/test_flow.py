@@ -93,3 +93,16 @@ def test_a_screen_costs_the_pressure_of_its_law() -> None:
     gradient = 8 * 0.004 * slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 4)
     mean_speed = slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 2)
     assert before - after - gradient * 8e-3 == pytest.approx(resistance * mean_speed, rel=0.02)
+
+
+@pytest.mark.parametrize("outlets", ["murray", "zero_pressure"])
+def test_outlets_share_the_flow_as_murray_says_when_asked(outlets: str) -> None:
+    straight = phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM)
+    phantom = phantoms.with_branch(straight, abscissa_mm=6.0, direction=[1, 0, 1], radius_mm=1.2, length_mm=7.0)
+    vessel = trace(Vessel(phantoms.phantom_surface(phantom)))
+    settings = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.25, outlets=outlets, tolerance=0.005)
+    field = simulate_case(FlowCase(vessel, settings=settings))
+    cubes = np.array([outlet.diameter_mm**3 for outlet in vessel.outlets])
+    shares = field.outlets_mL_s / field.outlets_mL_s.sum()
+    assert field.outlets_mL_s.sum() == pytest.approx(2.0, rel=2e-3)
+    assert (np.abs(shares - cubes / cubes.sum()).max() < 0.005) == (outlets == "murray")

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
 from vstent.flow.engines import Progress, run
@@ -132,15 +131,9 @@ def _guess(
 
 
 def _run(case: FlowCase, cell_size_mm: float, start: FlowField | None, progress: OnProgress | None) -> FlowField:
-    """Run the engine; where it diverges, once more with thick blood in the openings' extensions."""
     from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 
-    engine = LatticeBoltzmann(cell_size_mm)
-    try:
-        return run(engine, case, start=start, progress=progress)
-    except FlowError:
-        thick = replace(case.settings, has_thick_ends=True)
-        return run(engine, replace(case, settings=thick), start=start, progress=progress)
+    return run(LatticeBoltzmann(cell_size_mm), case, start=start, progress=progress)
 
 
 def _stage(progress: OnProgress | None, begin: float, end: float) -> OnProgress | None:

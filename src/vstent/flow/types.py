@@ -45,10 +45,8 @@ class FlowSettings:
     """Converged when every monitored quantity has less than this fraction of itself left to go."""
     max_steps: int = 24_000
     """Most time steps on the fine grid."""
-    lattice_speed: float = 0.1
+    lattice_speed: float = 0.15
     """Peak speed in cells per time step: sets the time step."""
-    has_thick_ends: bool = False
-    """Make the blood thicker in the extensions of the openings: stable where fast blood leaves through few cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +132,8 @@ class FlowField:
     """(k,) mean pressure on each outlet's section."""
     blood: Blood
     """The fluid."""
+    thickened_fraction: float
+    """Part of the blood that is so fast for the grid that it was computed thicker than it is."""
     is_converged: bool
     """Whether every monitored quantity has settled to within the tolerance."""
     advice: str
