@@ -138,7 +138,6 @@ def field(strength):
         inlet_pressure_Pa=80.0,
         outlet_pressure_Pa=np.zeros(1),
         blood=Blood(),
-        thickened_fraction=0.0,
         is_converged=True,
         advice="Converged.",
         residual=np.array([0.1, 0.001]),

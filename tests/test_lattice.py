@@ -21,7 +21,7 @@ def even_step(f, screen=NO_SCREEN, limit=NO_LIMIT):
     """Collide all cells and bring the populations home: the even step leaves each at its opposite's place."""
     result = f.copy()
     address = (np.arange(19) * STRIDE)[None].astype(np.int32)
-    relaxation = np.float32([1 / RATE, limit, ODD_RATE])
+    relaxation = np.float32(1 / RATE), np.float32([limit]), np.float32(ODD_RATE)
     lattice.update(result, address, np.array([STRIDE], np.int32), *relaxation, *screen, 1)
     return result[: -lattice.LANES].reshape(19, STRIDE)[lattice.OPPOSITE]
 

@@ -24,8 +24,7 @@ def indices(field: FlowField, sac: Surface | None = None, neck: Surface | None =
     """Every index of a flow, its unit in its key.
 
     Of the vessel: ``inlet_flow_mL_s``, ``outlet_K_flow_mL_s``, ``inlet_pressure_Pa``, ``pressure_drop_Pa`` (inlet to
-    widest outlet), ``mean_wss_Pa``, ``thickened_blood_fraction`` (computed thicker than it is, for it is
-    fast for the grid). With a sac (closed) and its neck (normals into the sac), besides:
+    widest outlet), ``mean_wss_Pa``. With a sac (closed) and its neck (normals into the sac), besides:
 
     - ``neck_inflow_mL_s`` = integral over the neck of max(u.n, 0), ``neck_outflow_mL_s`` of max(-u.n, 0);
       ``turnover_time_s`` = sac volume / inflow;
@@ -57,7 +56,6 @@ def _of_vessel(field: FlowField) -> dict[str, float]:
         "inlet_pressure_Pa": field.inlet_pressure_Pa,
         "pressure_drop_Pa": field.inlet_pressure_Pa - float(field.outlet_pressure_Pa[0]),
         "mean_wss_Pa": float(np.average(stress_Pa, weights=_vertex_areas_mm2(field.wall))),
-        "thickened_blood_fraction": field.thickened_fraction,
     }
 
 

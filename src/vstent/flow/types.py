@@ -104,7 +104,7 @@ MEAN_INLET_SPEED_M_S = 0.27
 
 @dataclass(frozen=True, eq=False)
 class FlowField:
-    """A computed steady flow, and how it was reached."""
+    """A computed steady flow, or the mean of one that does not settle, and how it was reached."""
 
     cells: Ints
     """(n, 3) integer grid coordinates of the blood cells, sorted."""
@@ -132,8 +132,6 @@ class FlowField:
     """(k,) mean pressure on each outlet's section."""
     blood: Blood
     """The fluid."""
-    thickened_fraction: float
-    """Part of the blood that is so fast for the grid that it was computed thicker than it is."""
     is_converged: bool
     """Whether every monitored quantity has settled to within the tolerance."""
     advice: str

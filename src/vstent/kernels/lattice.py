@@ -275,7 +275,7 @@ def update(
     address: Any,
     length: Any,
     time: float,
-    limit: float,
+    limit: Any,
     odd_rate: float,
     screen_start: Any,
     screen_place: Any,
@@ -291,7 +291,7 @@ def update(
         neighbours' in an odd one.
     length : (segments,) int32 cells of each segment, at most SEGMENT.
     time : float32 relaxation time of the stress.
-    limit : float32 largest cell Reynolds number, speed over viscosity: faster blood is made as thick as that takes.
+    limit : (segments,) float32 largest cell Reynolds number, speed over viscosity: faster blood is made that thick.
     odd_rate : float32 relaxation rate of the odd part.
     screen_start : (segments + 1,) int32 first screen entry of every segment.
     screen_place, screen : (e,) int32 place within the segment and (e, 6) float32 resistance (see `_resist`).
@@ -306,10 +306,10 @@ def update(
             lanes = (length[s] + LANES - 1) // LANES * LANES
             begin, end = screen_start[s], screen_start[s + 1]
             if begin == end:
-                _collide(buffer, lanes, time, limit, odd_rate)
+                _collide(buffer, lanes, time, limit[s], odd_rate)
             else:
                 _collide_screened(
-                    buffer, extra, lanes, time, limit, odd_rate, screen_place[begin:end], screen[begin:end]
+                    buffer, extra, lanes, time, limit[s], odd_rate, screen_place[begin:end], screen[begin:end]
                 )
             _store(buffer, address[s], length[s], f)
 

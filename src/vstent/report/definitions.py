@@ -142,10 +142,6 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "Low shear area, relative",
         "Part of the sac's wall below a tenth of the parent artery's mean wall shear stress.",
     ),
-    "thickened_blood_fraction": Definition(
-        "Blood computed too thick",
-        "Part of the blood so fast for the grid that it was computed thicker than it is.",
-    ),
     "mean_wss_Pa": Definition("Wall shear stress, mean", "Area mean of its magnitude over the whole wall."),
     "inlet_pressure_Pa": Definition("Inlet pressure", "Mean over the inlet's section, above that of the outlets."),
     "pressure_drop_Pa": Definition("Pressure drop", "Inlet pressure less that of the widest outlet."),

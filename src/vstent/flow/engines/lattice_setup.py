@@ -10,14 +10,14 @@ from vstent.flow.profile import developed_profile
 from vstent.flow.screen import on_grid
 from vstent.flow.types import Blood, FlowCase
 from vstent.kernels import lattice, voxels
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import M3_PER_ML
 
 ODD_RATE = 0.7
 """Relaxation rate of the odd part: lower is more isotropic, higher is more stable and leaks less."""
-CELL_REYNOLDS = 25.0
-"""Largest speed x cell / viscosity: beyond it (30 to 50 were seen to fail) a jet through few cells is unstable, so the
-blood is made thicker just there."""
+CELL_REYNOLDS_AT_END = 25.0
+"""Largest speed x cell / viscosity in the openings' extensions, whose ends are where fast blood becomes unstable first
+(30 to 50 were seen to fail): faster blood is made thicker there. In the vessel there is no limit."""
 REFILL_BLOCK = 4
 """Edge, in cells, of the blocks within which the walls' losses are made up."""
 SOUND_MEMORY = 0.002
@@ -141,8 +141,20 @@ class ScreenEntries:
     """(e,) cell."""
 
 
-def address(domain: Domain) -> Addressing:
-    """Lay out the populations of a domain."""
+def in_extensions(case: FlowCase, domain: Domain) -> Bools:
+    """Whether every cell (n,) lies in the extension of an opening."""
+    result = np.zeros(len(domain.cells), dtype=bool)
+    for opening, section in zip(case.vessel.openings, domain.sections, strict=True):
+        offset = domain.centers_mm - opening.center_mm
+        ahead_mm = offset @ opening.normal
+        length_mm = float(((section - opening.center_mm) @ opening.normal).max())
+        beside_mm = np.linalg.norm(offset - ahead_mm[:, None] * opening.normal, axis=1)
+        result |= (ahead_mm > 0) & (ahead_mm < length_mm) & (beside_mm < opening.diameter_mm)
+    return result
+
+
+def address(domain: Domain, is_end: Bools) -> Addressing:
+    """Lay out the populations of a domain; no segment spans cells where `is_end` (n,) differs."""
     cells = domain.cells
     inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
     inside[tuple(cells.T)] = True
@@ -151,7 +163,7 @@ def address(domain: Domain) -> Addressing:
     stride = int(stored.sum())
     number[stored] = np.arange(stride, dtype=np.int32)
     place = number[tuple(cells.T)]
-    is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1)
+    is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(is_end) != 0)
     first: Ints = np.flatnonzero(np.r_[True, is_new])
     length = np.diff(np.r_[first, len(cells)])
     first, length = _cut(first, length)
