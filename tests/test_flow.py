@@ -8,6 +8,9 @@ import pytest
 
 from vstent import phantoms
 from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, sampling, simulate_case
+from vstent.flow.engines import Outcome
+from vstent.flow.engines.lattice_boltzmann import CHECKS_AVERAGED, LatticeBoltzmann
+from vstent.kernels import lattice
 from vstent.trace import trace
 from vstent.vessel import Vessel
 
@@ -66,6 +69,22 @@ def test_wall_shear_stress_is_poiseuilles() -> None:
     expected = 4 * 0.004 * INFLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 3)
     assert stress[:, 2].mean() == pytest.approx(expected, rel=0.02)
     assert np.abs(stress[:, 2] / expected - 1).max() < 0.08
+
+
+@pytest.mark.parametrize("is_converged", [True, False])
+def test_a_flow_that_does_not_settle_is_the_mean_of_its_last_checks(is_converged: bool) -> None:
+    engine = LatticeBoltzmann(0.4)
+    state = engine.init(FlowCase(tube(), settings=replace(SETTINGS, max_steps=480)), None)
+    seen = []
+    for _ in range(CHECKS_AVERAGED + 3):
+        state = engine.step(state)
+        moments = lattice.moments(state.populations, state.addressing.stride, state.addressing.place)
+        seen.append(moments[:, 1:] * state.scales.speed_m_s)
+    field = engine.result(state, Outcome(is_converged, (0.5,), 1.0, 1.0))
+    expected = seen[-1] if is_converged else np.mean(seen[-CHECKS_AVERAGED:], axis=0)
+    np.testing.assert_allclose(field.velocity_m_s, expected, atol=1e-6)
+    assert np.abs(seen[-1] - expected).max() > 0.001 or is_converged
+    assert ("settled in" in field.advice) == (not is_converged)
 
 
 def disc(resistance_Pa_s_m: float) -> Screen:
