@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_design, find_size
 from vstent.errors import ReadError
-from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, simulate_case
+from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, ostium, simulate_case
 from vstent.flow import Progress as FlowProgress
 from vstent.io import writers
 from vstent.io.archive import load_noun, save_noun
@@ -275,7 +275,7 @@ def _metrics(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]
 ) -> dict[str, Any]:
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
-    shapes = (sac.sac, sac.neck) if sac else ()
+    shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
     flow = {name: indices(field, *shapes) for name, field in fields.items()}
     stents: dict[str, dict[str, Any]] = {}
     for name, deployment in deployments.items():

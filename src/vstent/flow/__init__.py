@@ -7,6 +7,7 @@ from vstent.flow import sampling
 from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
 from vstent.flow.engines import Progress, run
 from vstent.flow.indices import compare, indices
+from vstent.flow.ostium import ostium
 from vstent.flow.screen import screen
 from vstent.flow.streamlines import Streamlines, streamlines
 from vstent.flow.types import Blood, FlowCase, FlowField, FlowSettings, Screen
@@ -24,6 +25,7 @@ __all__ = [
     "compare",
     "flow_case",
     "indices",
+    "ostium",
     "screen",
     "simulate",
     "simulate_case",
@@ -76,7 +78,7 @@ def flow_case(
     return FlowCase(
         vessel=anatomy.vessel,
         sac=None if largest is None else largest.sac,
-        neck=None if largest is None else largest.neck,
+        ostium=None if largest is None else ostium(largest, anatomy.vessel.lumen),
         screen=None if stent is None else screen(stent, blood),
         blood=blood,
         settings=settings or FlowSettings(),

@@ -81,8 +81,8 @@ class FlowCase:
     """What blood flows through."""
     sac: Surface | None = None
     """The closed sac, for its indices and for judging convergence."""
-    neck: Surface | None = None
-    """The surface that closes the sac, its normals into the sac."""
+    ostium: Surface | None = None
+    """What blood crosses between artery and sac, its normals into the sac."""
     screen: Screen | None = None
     """The stent, or None."""
     blood: Blood = field(default_factory=Blood)

@@ -51,9 +51,9 @@ class Probe:
 
     cells: Ints
     """Cells of the sac, or of the whole lumen where there is no sac."""
-    neck_points: Floats
-    """(p, 3) points on the neck, grid units."""
-    neck_area_mm2: Floats
+    ostium_points: Floats
+    """(p, 3) points on the ostium, grid units."""
+    ostium_area_mm2: Floats
     """(p, 3) area vectors there."""
 
 
@@ -178,10 +178,10 @@ def _steps_per_check(case: FlowCase, scales: Scales) -> int:
 
 
 def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
-    if case.sac is None or case.neck is None:
+    if case.sac is None or case.ostium is None:
         return Probe(np.arange(len(domain.cells), dtype=np.int32), np.zeros((0, 3)), np.zeros((0, 3)))
     cells = domains.cells_inside(case.sac, domain.centers_mm, domain.cell_size_mm)
-    points_mm, area_mm2 = sampling.surface_samples(case.neck, domain.cell_size_mm)
+    points_mm, area_mm2 = sampling.surface_samples(case.ostium, domain.cell_size_mm)
     return Probe(cells, (points_mm - domain.origin_mm) / domain.cell_size_mm, area_mm2)
 
 
@@ -255,10 +255,10 @@ def _monitor(state: State, now: Snapshot) -> Floats:
     speed = np.linalg.norm(now.velocity, axis=1)
     inlet = state.domain.link_cell[state.domain.link_patch == 1]
     values = [speed[state.probe.cells].mean(), now.density[inlet].mean(), speed.mean()]
-    if len(state.probe.neck_points):
+    if len(state.probe.ostium_points):
         index = voxels.index_of(state.domain.cells)
-        through = lattice_sampling.interpolate(index, now.velocity.astype(float), state.probe.neck_points, True)
-        values.append(float(np.maximum(np.einsum("ij,ij->i", through, state.probe.neck_area_mm2), 0.0).sum()))
+        through = lattice_sampling.interpolate(index, now.velocity.astype(float), state.probe.ostium_points, True)
+        values.append(float(np.maximum(np.einsum("ij,ij->i", through, state.probe.ostium_area_mm2), 0.0).sum()))
     return np.array(values, dtype=float)
 
 
