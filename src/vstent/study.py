@@ -316,6 +316,12 @@ def _write_field(folder: Path, field: FlowField) -> None:
     of_cell = {"velocity_m_s": field.velocity_m_s, "pressure_Pa": field.pressure_Pa}
     writers.write_cells(folder / "field.vtu", field.centers_mm, field.cell_size_mm, of_cell)
     of_vertex = {"wall_shear_stress_Pa": field.wall_shear_stress_Pa, "pressure_Pa": field.wall_pressure_Pa}
+    if field.phases:
+        of_vertex |= {
+            "time_averaged_wall_shear_stress_Pa": field.shear_Pa,
+            "oscillatory_shear_index": field.oscillatory_shear_index,
+            "relative_residence_time_per_Pa": field.relative_residence_time_per_Pa,
+        }
     writers.write_surface(folder / "wall.vtp", field.wall, of_vertex)
 
 

@@ -86,7 +86,7 @@ def flow_case(
 
 
 def simulate_case(case: FlowCase, *, start: FlowField | None = None, progress: OnProgress | None = None) -> FlowField:
-    """Compute one steady flow.
+    """Compute one flow: steady, or pulsatile where the settings have a waveform.
 
     Parameters
     ----------
@@ -99,7 +99,8 @@ def simulate_case(case: FlowCase, *, start: FlowField | None = None, progress: O
         When the vessel cannot be put on a grid, or the computation diverges.
     """
     cell_size_mm = default_cell_size_mm(case)
-    guess = _guess(case, start, COARSENING * cell_size_mm, progress)
+    steady = replace(case, settings=replace(case.settings, waveform=None))
+    guess = _guess(steady, start, COARSENING * cell_size_mm, progress)
     return _run(case, cell_size_mm, guess, _stage(progress, _coarse_runs(case, start) * COARSE_SHARE, 1.0))
 
 
@@ -134,8 +135,10 @@ def _guess(
 
 def _run(case: FlowCase, cell_size_mm: float, start: FlowField | None, progress: OnProgress | None) -> FlowField:
     from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
+    from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
 
-    return run(LatticeBoltzmann(cell_size_mm), case, start=start, progress=progress)
+    engine = LatticeBoltzmann if case.settings.waveform is None else PulsatileLatticeBoltzmann
+    return run(engine(cell_size_mm), case, start=start, progress=progress)
 
 
 def _stage(progress: OnProgress | None, begin: float, end: float) -> OnProgress | None:

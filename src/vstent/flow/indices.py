@@ -35,10 +35,16 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
       tenth of the parent's mean;
     - ``inflow_concentration_index`` = (inflow / inlet flow) / (inflow area / ostium area) (Cebral et al. 2011, AJNR 32,
       145).
+
+    Of a pulsatile flow, the means over its cycle; wall shear stress is then its magnitude's time average (TAWSS), and
+    ``mean_sac_oscillatory_shear_fraction`` (OSI) is given besides.
     """
+    moments = [field.at_phase(phase) for phase in field.phases] or [field]
     result = _of_vessel(field)
     if sac is not None and ostium is not None:
-        result |= _of_ostium(field, sac, ostium) | _of_sac(field, sac) | _of_sac_wall(field, sac, ostium)
+        of_moments = [_of_ostium(now, sac, ostium) | _of_sac(now, sac) for now in moments]
+        result |= {key: float(np.mean([one[key] for one in of_moments])) for key in of_moments[0]}
+        result |= _of_sac_wall(field, sac, ostium)
     return result
 
 
@@ -49,13 +55,12 @@ def compare(bare: dict[str, float], stented: dict[str, float]) -> dict[str, floa
 
 def _of_vessel(field: FlowField) -> dict[str, float]:
     outlets = {f"outlet_{k + 1}_flow_mL_s": float(flow) for k, flow in enumerate(field.outlets_mL_s)}
-    stress_Pa = np.linalg.norm(field.wall_shear_stress_Pa, axis=1)
     return {
         "inlet_flow_mL_s": field.inlet_mL_s,
         **outlets,
         "inlet_pressure_Pa": field.inlet_pressure_Pa,
         "pressure_drop_Pa": field.inlet_pressure_Pa - float(field.outlet_pressure_Pa[0]),
-        "mean_wss_Pa": float(np.average(stress_Pa, weights=_vertex_areas_mm2(field.wall))),
+        "mean_wss_Pa": float(np.average(field.shear_Pa, weights=_vertex_areas_mm2(field.wall))),
     }
 
 
@@ -91,12 +96,15 @@ def _of_sac(field: FlowField, sac: Surface) -> dict[str, float]:
 
 
 def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, float]:
-    stress_Pa = np.linalg.norm(field.wall_shear_stress_Pa, axis=1)
+    stress_Pa = field.shear_Pa
     area_mm2 = _vertex_areas_mm2(field.wall)
     is_sac = on_sac(field.wall, sac, 0.2 * field.cell_size_mm)
     is_near = np.linalg.norm(field.wall.vertices_mm - ostium.vertices_mm.mean(axis=0), axis=1) < NEAR_MM
     parent_Pa = _mean(stress_Pa, area_mm2, is_near & ~is_sac)
-    return {
+    pulse = {}
+    if field.phases:
+        pulse["mean_sac_oscillatory_shear_fraction"] = _mean(field.oscillatory_shear_index, area_mm2, is_sac)
+    return pulse | {
         "mean_sac_wss_Pa": _mean(stress_Pa, area_mm2, is_sac),
         "max_sac_wss_Pa": float(stress_Pa[is_sac].max()),
         "parent_wss_Pa": parent_Pa,

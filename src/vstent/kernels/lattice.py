@@ -476,10 +476,11 @@ def drive(
         density = openings[k, 1]
         if openings[k, 0] == INFLOW:
             density = _density(f, stride, place[first:last])
-            excess = density - openings[k, 2]
             # Against a high resistance the flow itself waits for the mean: forget faster the higher the pressure.
-            openings[k, 2] += openings[k, 3] * (1.0 + abs(density / openings[k, 1]) / np.sqrt(3.0)) * excess
-            speed = openings[k, 1] - excess / np.sqrt(3.0)
+            resistance = abs(density) / max(abs(openings[k, 1]), 1e-6)
+            rate = min(1.0, openings[k, 3] * (1.0 + resistance / np.sqrt(3.0)))
+            openings[k, 2] += rate * (density - openings[k, 2])
+            speed = openings[k, 1] - (density - openings[k, 2]) / np.sqrt(3.0)
             for n in range(first, last):
                 source[n] = shape[n] * speed
             continue
