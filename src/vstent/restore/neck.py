@@ -41,6 +41,9 @@ OUTSIDE_MM: Final = 0.05
 BRANCH_SHARE: Final = 0.15
 """A branch's own wall stands out of its tube by less than this many radii."""
 
+FACING: Final = 3.0
+"""A wall that looks straight at a branch counts as this many of its radii further away."""
+
 
 class Artery(NamedTuple):
     """What is not sac: the parent artery and the side branches beyond it."""
@@ -50,11 +53,20 @@ class Artery(NamedTuple):
     branches: Tubes
     """The side branches, where they have left the parent artery and the sac."""
 
-    def height_mm(self, points_mm: Floats) -> Floats:
-        """How far points (n, 3) stand out of the parent's and the branches' walls, negative inside."""
+    def height_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
+        """How far points (n, 3) stand out of the parent's and the branches' walls, negative inside.
+
+        With `normals` (n, 3) the points are the lumen's wall: a wall that looks at a branch belongs to a sac beside it.
+        """
         height, sphere = self.branches.height_mm(points_mm)
-        radius = self.branches.radius_mm[sphere] if len(self.branches.radius_mm) else np.ones(len(points_mm))
-        return np.minimum(self.landing.solid.signed_distance(points_mm), height - BRANCH_SHARE * radius)
+        if len(self.branches.radius_mm):
+            radius = self.branches.radius_mm[sphere]
+            height = height - BRANCH_SHARE * radius
+            if normals is not None:
+                toward = self.branches.centers_mm[sphere] - points_mm
+                facing = np.einsum("nd,nd->n", toward, normals) / np.maximum(np.linalg.norm(toward, axis=1), 1e-12)
+                height = height + FACING * radius * np.maximum(facing, 0.0)
+        return np.minimum(self.landing.solid.signed_distance(points_mm), height)
 
     def onto(self, points_mm: Floats) -> Floats:
         """Move points (n, 3) onto the parent artery; those at a branch stay."""

@@ -31,7 +31,7 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     """
     lumen = vessel.lumen
     artery = Artery(landing, _branch_tubes(side_lines, landing, bulge))
-    height_mm = artery.height_mm(lumen.vertices_mm)
+    height_mm = artery.height_mm(lumen.vertices_mm, lumen.vertex_normals)
     parent_mm = landing.section_radius_mm[landing.nearest_sections(lumen.vertices_mm)]
     core = bulge_at(lumen, height_mm, height_mm > FLANK * parent_mm, bulge.dome_mm)
     if core is None:
