@@ -17,7 +17,6 @@ from vstent.trace import trace
 from vstent.trim import trim
 from vstent.vessel import Anatomy, Vessel
 
-
 X = np.array([1.0, 0.0, 0.0])
 PHANTOMS: dict[str, Callable[[], Phantom]] = {
     "straight": lambda: with_sac(tube(length_mm=40), abscissa_mm=20),
