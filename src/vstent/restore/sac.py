@@ -18,6 +18,9 @@ ON_ARTERY_MM: Final = 0.5
 """A flank whose rim comes nearer than this to the height where it begins stands on the parent artery."""
 FLAT: Final = 0.2
 """Less volume than this fraction of neck area to the power 3/2 is an uneven wall (a half sphere has 0.38)."""
+ROUND: Final = 0.6
+"""A shape with more than 1 / 0.6 times the surface of the sphere of its volume is a scan's debris: sacs, lobed ones
+too, have 0.7 to 0.85."""
 N_RINGS: Final = 12
 """Rings of the neck's triangles."""
 N_SKIRT: Final = 4
@@ -44,10 +47,15 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     rings = skirt(flank, artery, vessel.closed, n_rings=N_SKIRT)
     neck = _neck(landing, rings[-1])
     sac = _closed_sac(flank, other_loops, rings, neck)
-    if sac.volume_mm3 < FLAT * neck.area_mm2**1.5:
+    if sac.volume_mm3 < FLAT * neck.area_mm2**1.5 or _roundness(sac) < ROUND:
         return None
     abscissa = curves.project(landing.points_mm, rings[-1])[0]
     return Aneurysm(sac, neck, rings[-1], float(abscissa.min()), float(abscissa.max()))
+
+
+def _roundness(sac: Surface) -> float:
+    """Surface of the sphere of the same volume over the sac's own (Wadell 1935, J. Geol. 43:250)."""
+    return float(np.cbrt(36 * np.pi * max(sac.volume_mm3, 0.0) ** 2)) / sac.area_mm2
 
 
 def _flank(lumen: Surface, height_mm: Floats, low_mm: float, dome_mm: Floats) -> tuple[Flank, list[Ints]]:
