@@ -29,6 +29,9 @@ PHANTOMS: dict[str, Callable[[], Phantom]] = {
     "beside a branch": lambda: with_branch(
         with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), abscissa_mm=24, direction=np.array([1.0, 0.3, 0.5])
     ),
+    "touching a branch": lambda: with_branch(
+        with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), abscissa_mm=24.5, direction=X
+    ),
     "neck of 2 diameters": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=10, neck_mm=8),
     "sac of 3 diameters": lambda: with_sac(tube(length_mm=44), abscissa_mm=22, width_mm=12, neck_mm=5),
     "half a sphere": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=5.6, neck_mm=5.5),
@@ -145,6 +148,15 @@ def test_the_neck_lies_on_the_landing_surface_in_the_lumen(demo) -> None:
     assert anatomy.vessel.closed.signed_distance(aneurysm.neck_mm).max() < 0.05
     # The true neck is where the sac's ellipsoid meets the artery.
     assert np.abs(phantom.sac.implicit_mm(aneurysm.neck_mm)[0]).max() < 0.05
+
+
+def test_a_branch_that_passes_close_to_the_sac_takes_nothing_of_its_wall() -> None:
+    phantom = PHANTOMS["touching a branch"]()
+    (aneurysm,) = anatomy_of(phantom).aneurysms
+    assert phantom.sac is not None
+    angle = np.linspace(-0.5, 0.5, 21)
+    facing_mm = phantom.sac.center_mm + 3.5 * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
+    assert aneurysm.sac.closest(facing_mm)[1].max() < 0.02
 
 
 def test_the_neck_does_not_depend_on_the_mesh(demo) -> None:
