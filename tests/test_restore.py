@@ -10,7 +10,9 @@ from vstent.errors import InputError
 from vstent.kernels import curves
 from vstent.measure import morphology
 from vstent.phantoms import Phantom, Scanner, torus_arc, tube, with_bleb, with_branch, with_sac
+from vstent.repair import repair
 from vstent.restore import restore
+from vstent.restore.sac import _is_island
 from vstent.segment import segment
 from vstent.surface import Surface
 from vstent.trace import trace
@@ -157,6 +159,31 @@ def test_a_branch_that_passes_close_to_the_sac_takes_nothing_of_its_wall() -> No
     angle = np.linspace(-0.5, 0.5, 21)
     facing_mm = phantom.sac.center_mm + 3.5 * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
     assert aneurysm.sac.closest(facing_mm)[1].max() < 0.02
+
+
+def test_low_wall_apart_from_every_opening_is_where_the_sac_touches_an_artery() -> None:
+    lumen = phantoms.phantom_surface(tube(length_mm=10))
+    x, _, z = lumen.vertices_mm.T
+    touching, artery = (np.abs(z - 6) < 1) & (x > 1), z < 3
+    np.testing.assert_array_equal(_is_island(lumen, touching | artery), touching)
+    bridge = (np.abs(z - 4) < 2.5) & (np.abs(x - 1.5) < 0.5)
+    assert not _is_island(lumen, touching | artery | bridge).any()
+
+
+def test_a_sac_on_a_coarse_mesh_is_cut_where_its_branches_leave(shared_data) -> None:
+    from vstent.io.surfaces import read_surface
+
+    lumen = repair(read_surface(shared_data / "bifurcation_coarse.vtp")[0])[0]
+    (aneurysm,) = restore(trim(trace(Vessel(lumen)))).aneurysms
+    # One daughter runs along the sac, less than a triangle away: the neck must not climb between them.
+    height_mm = np.ptp(aneurysm.neck_mm @ _mean_direction(aneurysm.neck))
+    assert height_mm < 0.7 * np.sqrt(4 * aneurysm.neck.area_mm2 / np.pi)
+    assert aneurysm.sac.boundary_loops == ()
+
+
+def _mean_direction(neck: Surface) -> np.ndarray:
+    total = (neck.areas_mm2[:, None] * neck.normals).sum(axis=0)
+    return total / np.linalg.norm(total)
 
 
 def test_the_neck_does_not_depend_on_the_mesh(demo) -> None:

@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from vstent.kernels import curves, triangles
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.restore.bulges import FLANK, Bulge, bulge_at
 from vstent.restore.landing import Landing
 from vstent.restore.neck import Artery, Flank, believed_from_mm, skirt
@@ -53,6 +55,19 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     return Aneurysm(sac, neck, rings[-1], float(abscissa.min()), float(abscissa.max()))
 
 
+def _is_island(lumen: Surface, is_low: Bools) -> Bools:
+    """Tell the vertices (n,) of low wall from which no low wall leads to an opening.
+
+    There the sac itself touches an artery that it does not hang on.
+    """
+    edges = triangles.directed_edges(lumen.faces)
+    edges = edges[is_low[edges].all(axis=1)]
+    graph = coo_matrix((np.ones(len(edges), dtype=bool), tuple(edges.T)), shape=(len(is_low), len(is_low)))
+    label = connected_components(graph, directed=False)[1]
+    ends = np.unique(triangles.open_edges(lumen.faces))
+    return is_low & ~np.isin(label, label[ends[is_low[ends]]])
+
+
 def _roundness(sac: Surface) -> float:
     """Surface of the sphere of the same volume over the sac's own (Wadell 1935, J. Geol. 43:250)."""
     return float(np.cbrt(36 * np.pi * max(sac.volume_mm3, 0.0) ** 2)) / sac.area_mm2
@@ -60,6 +75,8 @@ def _roundness(sac: Surface) -> float:
 
 def _flank(lumen: Surface, height_mm: Floats, low_mm: float, dome_mm: Floats) -> tuple[Flank, list[Ints]]:
     """The sac's wall above a height, and its edges apart from the rim."""
+    is_touching = _is_island(lumen, height_mm < low_mm)
+    height_mm = np.where(is_touching, 1.001 * low_mm, height_mm)
     vertices, faces, below = triangles.clip(lumen.vertices_mm, lumen.faces, low_mm - height_mm)
     faces = triangles.faces_at(vertices, faces, dome_mm)
     used = np.unique(faces)
