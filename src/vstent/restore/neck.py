@@ -19,14 +19,14 @@ from vstent.restore.tubes import Tubes
 from vstent.surface import Surface
 
 BLUR_MM: Final = 0.5
-"""Twice the standard deviation of the point spread of a clinical 3DRA scan (Hoogeveen et al. 1998): lower down the
-flank is not believed."""
+"""Lower down the flank is not believed: twice a standard deviation of 0.25 mm, which 3DRA scans are blurred by at
+least, voxel, reconstruction and smoothing of the mesh together."""
 BLUR_EDGES: Final = 2.2
 """The same in edges of the mesh: an iso-surface has edges of 0.9 voxel, and a scan is blurred by about a voxel."""
 BAND: Final = 3.0
 """The flank is followed up to this many times the height at which it is believed..."""
 BAND_OF_HEIGHT: Final = 0.6
-"""... and no further than this fraction of the sac's height: there a dome begins."""
+"""... and no further than this fraction of the way from there to the dome's top."""
 N_LEVELS: Final = 9
 """Heights at which the flank is followed."""
 DETAIL: Final = 4.0
@@ -37,10 +37,8 @@ N_STEPS: Final = 36
 """Steps in which the continuation of a flank is searched for the artery."""
 OUTSIDE_MM: Final = 0.05
 """A continuation that leaves the lumen by more than this ends there: blur adds to the lumen in a crevice."""
-
 BRANCH_SHARE: Final = 0.15
 """A branch's own wall stands out of its tube by less than this many radii."""
-
 FACING: Final = 3.0
 """A wall that looks straight at a branch counts as this many of its radii further away."""
 
@@ -140,7 +138,7 @@ def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floa
 
 def _rise(flank: Flank, starts_mm: Floats, low_mm: float) -> Floats:
     """Points (levels, n, 3) up the flank from its rim: each the nearest one on the next line of equal height."""
-    high_mm = max(min(BAND * low_mm, BAND_OF_HEIGHT * float(flank.height_mm.max())), 1.5 * low_mm)
+    high_mm = min(BAND * low_mm, low_mm + BAND_OF_HEIGHT * (float(flank.height_mm.max()) - low_mm))
     points = [starts_mm]
     for height_mm in np.linspace(low_mm, high_mm, N_LEVELS)[1:]:
         line_mm = flank.isoline(float(height_mm))

@@ -43,8 +43,8 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
         return None
     most_mm = FLANK * float(np.median(landing.section_radius_mm[landing.nearest_sections(core.foot_mm)]))
     low_mm = believed_from_mm(lumen, core.foot_mm, most_mm)
-    flank, other_loops = _flank(lumen, height_mm, low_mm, core.dome_mm)
-    if landing.surface.closest(flank.vertices_mm[flank.rim])[1].min() > low_mm + ON_ARTERY_MM:
+    flank, other_loops = _flank(lumen, height_mm, low_mm, core.dome_mm, landing)
+    if flank is None:
         return None
     rings = skirt(flank, artery, vessel.closed, n_rings=N_SKIRT)
     neck = _neck(landing, rings[-1])
@@ -73,16 +73,23 @@ def _roundness(sac: Surface) -> float:
     return float(np.cbrt(36 * np.pi * max(sac.volume_mm3, 0.0) ** 2)) / sac.area_mm2
 
 
-def _flank(lumen: Surface, height_mm: Floats, low_mm: float, dome_mm: Floats) -> tuple[Flank, list[Ints]]:
-    """The sac's wall above a height, and its edges apart from the rim."""
+def _flank(
+    lumen: Surface, height_mm: Floats, low_mm: float, dome_mm: Floats, landing: Landing
+) -> tuple[Flank | None, list[Ints]]:
+    """The sac's wall above a height, and its edges apart from the rim; None where it does not stand on the artery."""
     is_touching = _is_island(lumen, height_mm < low_mm)
     height_mm = np.where(is_touching, 1.001 * low_mm, height_mm)
     vertices, faces, below = triangles.clip(lumen.vertices_mm, lumen.faces, low_mm - height_mm)
     faces = triangles.faces_at(vertices, faces, dome_mm)
     used = np.unique(faces)
     vertices, faces = triangles.compact(vertices, faces)
-    rim, *others = triangles.boundary_loops(vertices, faces)
-    return Flank(vertices, faces, low_mm - below[used], rim), others
+    loops = triangles.boundary_loops(vertices, faces)
+    near = [landing.surface.closest(vertices[loop])[1].min() < low_mm + ON_ARTERY_MM for loop in loops]
+    if not any(near):
+        return None, []
+    # The longest edge at the artery is the rim; others are the mouths of branches that leave from the sac.
+    rim = near.index(True)
+    return Flank(vertices, faces, low_mm - below[used], loops[rim]), [*loops[:rim], *loops[rim + 1 :]]
 
 
 def _branch_tubes(lines: Sequence[Centerline], landing: Landing, bulge: Bulge) -> Tubes:
