@@ -78,3 +78,13 @@ def test_face_order_does_not_matter() -> None:
     shuffled = Surface(soup.vertices_mm, soup.faces[rng.permutation(100)])
     points = rng.uniform(-7, 7, (100, 3))
     np.testing.assert_array_equal(soup.closest(points)[1], shuffled.closest(points)[1])
+
+
+def test_rays_enter_no_empty_box() -> None:
+    # 33 triangles fill 9 of 16 leaves: the empty ones must cost a ray nothing.
+    ray_tree = tree.build(*(lambda s: (s.vertices_mm, s.faces))(random_soup(np.random.default_rng(2), 33)))
+    is_empty = np.isinf(ray_tree.low).any(axis=1)
+    assert is_empty.sum() == 7 + 3 + 1
+    inverse = np.array([0.3, -0.8, 1e200])
+    for node in np.flatnonzero(is_empty):
+        assert tree._entry(np.zeros(3), inverse, ray_tree.low, ray_tree.high, node) == np.inf

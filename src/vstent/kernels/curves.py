@@ -1,6 +1,9 @@
 """Polylines: arc length, frames, interpolation, projection."""
 
+from typing import Any
+
 import numpy as np
+from numba import njit
 from scipy.sparse import csc_matrix, diags, eye
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
@@ -42,24 +45,43 @@ def parallel_frames(points: Floats) -> Floats:
     Double reflection (Wang, Juettler, Zheng and Liu 2008, ACM Trans. Graph. 27(1):2, table I).
     """
     tangent = tangents(points)
-    frames = np.zeros((len(points), 3, 3))
-    normal = any_perpendicular(tangent[0])
-    for i, t in enumerate(tangent):
+    return np.asarray(_transported(points, tangent, any_perpendicular(tangent[0])))
+
+
+@njit(cache=True)
+def _transported(points: Any, tangent: Any, first: Any) -> Any:
+    n = len(points)
+    frames = np.zeros((n, 3, 3))
+    normal, step, turn = first.copy(), np.zeros(3), np.zeros(3)
+    for i in range(n):
         if i > 0:
-            normal = _reflected(points[i] - points[i - 1], normal, tangent[i - 1], t)
-            normal = normal - (normal @ t) * t
-            normal = normal / np.linalg.norm(normal)
-        frames[i] = t, normal, np.cross(t, normal)
+            length2, shift, ahead = 0.0, 0.0, 0.0
+            for k in range(3):
+                step[k] = points[i, k] - points[i - 1, k]
+                length2 += step[k] * step[k]
+                shift += step[k] * normal[k]
+                ahead += step[k] * tangent[i - 1, k]
+            turn2, slip = 0.0, 0.0
+            for k in range(3):
+                normal[k] -= 2.0 / length2 * shift * step[k]
+                turn[k] = tangent[i, k] - (tangent[i - 1, k] - 2.0 / length2 * ahead * step[k])
+                turn2 += turn[k] * turn[k]
+                slip += turn[k] * normal[k]
+            along, size2 = 0.0, 0.0
+            for k in range(3):
+                normal[k] -= 2.0 / turn2 * slip * turn[k] if turn2 >= 1e-30 else 0.0
+                along += normal[k] * tangent[i, k]
+            for k in range(3):
+                normal[k] -= along * tangent[i, k]
+                size2 += normal[k] * normal[k]
+            for k in range(3):
+                normal[k] /= np.sqrt(size2)
+        for k in range(3):
+            frames[i, 0, k], frames[i, 1, k] = tangent[i, k], normal[k]
+            frames[i, 2, k] = (
+                tangent[i, (k + 1) % 3] * normal[(k + 2) % 3] - tangent[i, (k + 2) % 3] * normal[(k + 1) % 3]
+            )
     return frames
-
-
-def _reflected(step: Floats, normal: Floats, tangent: Floats, next_tangent: Floats) -> Floats:
-    length2 = step @ step
-    normal_left = normal - (2 / length2) * (step @ normal) * step
-    tangent_left = tangent - (2 / length2) * (step @ tangent) * step
-    turn = next_tangent - tangent_left
-    turn2 = turn @ turn
-    return normal_left if turn2 < 1e-30 else normal_left - (2 / turn2) * (turn @ normal_left) * turn
 
 
 def any_perpendicular(direction: Floats) -> Floats:

@@ -68,6 +68,7 @@ def _boxes(corners: Floats, n_leaves: int) -> tuple[Floats, Floats]:
         low[parents] = low[first : 2 * first + 1].reshape(-1, 2, 3).min(axis=1)
         high[parents] = high[first : 2 * first + 1].reshape(-1, 2, 3).max(axis=1)
         first = (first - 1) // 2
+    high[np.isinf(low)] = np.inf  # an empty box from inf to -inf would be entered by every ray
     return low, high
 
 
@@ -219,14 +220,19 @@ def _closest_all(corners: Any, low: Any, high: Any, points: Any) -> tuple[Any, A
 
 
 @njit(cache=True)
-def _ray_enters_box(origin: Any, inverse: Any, low: Any, high: Any, limit: float) -> bool:
-    near, far = 0.0, limit
+def _entry(origin: Any, inverse: Any, low: Any, high: Any, node: int) -> float:
+    """Distance at which a ray enters a node's box, 0 from inside, inf where it misses."""
+    near, far = 0.0, np.inf
     for k in range(3):
-        t0 = (low[k] - origin[k]) * inverse[k]
-        t1 = (high[k] - origin[k]) * inverse[k]
-        near = max(near, min(t0, t1))
-        far = min(far, max(t0, t1))
-    return near <= far * (1.0 + 1e-12) + 1e-12
+        t0 = (low[node, k] - origin[k]) * inverse[k]
+        t1 = (high[node, k] - origin[k]) * inverse[k]
+        if t0 > t1:
+            t0, t1 = t1, t0
+        if t0 > near:
+            near = t0
+        if t1 < far:
+            far = t1
+    return near if near <= far * (1.0 + 1e-12) + 1e-12 else np.inf
 
 
 @njit(cache=True)
@@ -256,19 +262,30 @@ def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: An
     for k in range(3):
         inverse[k] = 1.0 / direction[k] if abs(direction[k]) > 1e-200 else 1e200
     stack = np.zeros(_STACK, dtype=np.int32)
+    entry = np.zeros(_STACK)
     size, best = 1, np.inf
     while size > 0:
         size -= 1
         node = stack[size]
-        if not _ray_enters_box(origin, inverse, low[node], high[node], min(best, limit)):
+        # A hit right at a box's face must not be lost to rounding: the boxes count as a hair nearer.
+        if entry[size] > min(best, limit) * (1.0 + 1e-12) + 1e-12:
             continue
         if node >= first_leaf:
             start = (node - first_leaf) * LEAF
             for i in range(start, min(start + LEAF, corners.shape[0])):
                 best = min(best, ray_meets_triangle(origin, direction, corners[i]))
             continue
-        stack[size], stack[size + 1] = 2 * node + 1, 2 * node + 2
-        size += 2
+        left, right = 2 * node + 1, 2 * node + 2
+        t_left = _entry(origin, inverse, low, high, left)
+        t_right = _entry(origin, inverse, low, high, right)
+        if t_left < t_right:
+            left, right, t_left, t_right = right, left, t_right, t_left
+        if t_left < np.inf:
+            stack[size], entry[size] = left, t_left
+            size += 1
+        if t_right < np.inf:
+            stack[size], entry[size] = right, t_right
+            size += 1
     return best
 
 
