@@ -11,7 +11,8 @@ import numpy as np
 
 from vstent import phantoms
 from vstent.flow import FlowCase, FlowField, FlowSettings, simulate_case
-from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann, _advance
+from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
+from vstent.flow.engines.lattice_state import advance
 from vstent.trace import trace
 from vstent.vessel import Vessel
 
@@ -46,11 +47,11 @@ def throughput(vessel: Vessel, cell_mm: float) -> None:
     case = FlowCase(vessel, settings=FlowSettings(inflow_mL_s=INFLOW_ML_S))
     state = LatticeBoltzmann(cell_mm).init(case, None)
     state.steps_per_check = 20
-    _advance(state)
+    advance(state)
     times = []
     for _ in range(5):
         began = time.perf_counter()
-        _advance(state)
+        advance(state)
         times.append(time.perf_counter() - began)
     rate = len(state.domain.cells) * state.steps_per_check / min(times)
     limit = bandwidth_GB_s(state.populations.nbytes) * 1e9 / BYTES_PER_UPDATE

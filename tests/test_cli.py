@@ -43,6 +43,13 @@ BAD = {
     "a volume without spacing": ("scan.raw", bytes(4096), ["--shape", "16,16,16"], "spacing"),
     "a volume without shape": ("scan.raw", bytes(4096), ["--spacing", "0.4"], "shape"),
     "a volume of zeros": ("scan.raw", bytes(4096), ["--shape", "16,16,16", "--spacing", "0.4"], "lumen"),
+    "a waveform of one column": ("pulse.csv", b"0\n1\n", ["--pulsatile", "FILE"], "line 1"),
+    "a pulse that runs back": (
+        "pulse.csv",
+        b"0,1\n2,1\n1,1\n3,1\n4,1",
+        ["--pulsatile", "FILE"],
+        "do not increase",
+    ),
     "a device that does not exist": ("text.stl", b"hello\n", ["--device", "slik"], "silk"),
 }
 
@@ -52,7 +59,8 @@ def test_bad_input_ends_in_one_sentence(name: str, tmp_path: Path, capsys: pytes
     file, content, options, said = BAD[name]
     (tmp_path / file).write_bytes(content)
     out = tmp_path / "out"
-    assert main(["run", str(tmp_path / file), "--out", str(out), *options]) == 2
+    given = [option.replace("FILE", str(tmp_path / file)) for option in options]
+    assert main(["run", str(tmp_path / file), "--out", str(out), *given]) == 2
     assert _complaint(capsys, said)
     assert not out.exists()
 

@@ -8,6 +8,9 @@ import pytest
 
 from vstent import phantoms
 from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, sampling, simulate_case
+from vstent.flow.engines import Outcome
+from vstent.flow.engines.lattice_boltzmann import CHECKS_AVERAGED, LatticeBoltzmann
+from vstent.kernels import lattice
 from vstent.trace import trace
 from vstent.vessel import Vessel
 
@@ -68,6 +71,22 @@ def test_wall_shear_stress_is_poiseuilles() -> None:
     assert np.abs(stress[:, 2] / expected - 1).max() < 0.08
 
 
+@pytest.mark.parametrize("is_converged", [True, False])
+def test_a_flow_that_does_not_settle_is_the_mean_of_its_last_checks(is_converged: bool) -> None:
+    engine = LatticeBoltzmann(0.4)
+    state = engine.init(FlowCase(tube(), settings=replace(SETTINGS, max_steps=480)), None)
+    seen = []
+    for _ in range(CHECKS_AVERAGED + 3):
+        state = engine.step(state)
+        moments = lattice.moments(state.populations, state.addressing.stride, state.addressing.place)
+        seen.append(moments[:, 1:] * state.scales.speed_m_s)
+    field = engine.result(state, Outcome(is_converged, (0.5,), 1.0, 1.0))
+    expected = seen[-1] if is_converged else np.mean(seen[-CHECKS_AVERAGED:], axis=0)
+    np.testing.assert_allclose(field.velocity_m_s, expected, atol=1e-6)
+    assert np.abs(seen[-1] - expected).max() > 0.001 or is_converged
+    assert ("settled in" in field.advice) == (not is_converged)
+
+
 def disc(resistance_Pa_s_m: float) -> Screen:
     """A screen across the tube at half its length."""
     ticks = np.arange(-RADIUS_MM - 0.5, RADIUS_MM + 0.5, 0.05)
@@ -93,3 +112,16 @@ def test_a_screen_costs_the_pressure_of_its_law() -> None:
     gradient = 8 * 0.004 * slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 4)
     mean_speed = slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 2)
     assert before - after - gradient * 8e-3 == pytest.approx(resistance * mean_speed, rel=0.02)
+
+
+@pytest.mark.parametrize("outlets", ["murray", "zero_pressure"])
+def test_outlets_share_the_flow_as_murray_says_when_asked(outlets: str) -> None:
+    straight = phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM)
+    phantom = phantoms.with_branch(straight, abscissa_mm=6.0, direction=[1, 0, 1], radius_mm=1.2, length_mm=7.0)
+    vessel = trace(Vessel(phantoms.phantom_surface(phantom)))
+    settings = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.25, outlets=outlets, tolerance=0.005)
+    field = simulate_case(FlowCase(vessel, settings=settings))
+    cubes = np.array([outlet.diameter_mm**3 for outlet in vessel.outlets])
+    shares = field.outlets_mL_s / field.outlets_mL_s.sum()
+    assert field.outlets_mL_s.sum() == pytest.approx(2.0, rel=2e-3)
+    assert (np.abs(shares - cubes / cubes.sum()).max() < 0.005) == (outlets == "murray")

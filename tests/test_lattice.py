@@ -7,7 +7,7 @@ from shapes import sphere
 from vstent.kernels import lattice, lattice_sampling, voxels
 
 STRIDE = 40
-RATE, ODD_RATE = np.float32(1.6), np.float32(0.7)
+RATE, ODD_RATE, NO_LIMIT = 1.6, 0.7, 1e9
 NO_SCREEN = (np.zeros(2, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
 
 
@@ -17,11 +17,12 @@ def populations(seed=0):
     return np.concatenate([small.ravel(), np.zeros(lattice.LANES, np.float32)])
 
 
-def even_step(f, screen=NO_SCREEN):
+def even_step(f, screen=NO_SCREEN, limit=NO_LIMIT):
     """Collide all cells and bring the populations home: the even step leaves each at its opposite's place."""
     result = f.copy()
     address = (np.arange(19) * STRIDE)[None].astype(np.int32)
-    lattice.update(result, address, np.array([STRIDE], np.int32), np.array([RATE]), ODD_RATE, *screen, 1)
+    relaxation = np.float32(1 / RATE), np.float32([limit]), np.float32(ODD_RATE)
+    lattice.update(result, address, np.array([STRIDE], np.int32), *relaxation, *screen, 1)
     return result[: -lattice.LANES].reshape(19, STRIDE)[lattice.OPPOSITE]
 
 
@@ -47,21 +48,41 @@ def test_a_collision_keeps_mass_and_momentum():
     assert np.abs(after - before).max() > 1e-3
 
 
+def equilibrium(f):
+    c, w = lattice.VELOCITIES.astype(float), lattice.WEIGHTS
+    u = momentum(f)
+    return w[:, None] * (f.sum(axis=0) + 3 * c @ u.T + 4.5 * (c @ u.T) ** 2 - 1.5 * (u**2).sum(axis=1))
+
+
+def stress(f):
+    """Traceless second moments (cells, 3, 3) of what departs from equilibrium."""
+    c = lattice.VELOCITIES.astype(float)
+    traceless = np.einsum("qa,qb->qab", c, c) - np.eye(3) * (c**2).sum(axis=1)[:, None, None] / 3
+    return np.einsum("qab,qk->kab", traceless, f - equilibrium(f))
+
+
 def test_a_collision_relaxes_the_stress_at_its_rate_and_nothing_is_left_but_stress():
     f = populations(1)
     before, after = f[: -lattice.LANES].reshape(19, STRIDE).astype(float), even_step(f).astype(float)
+    np.testing.assert_allclose(stress(after), (1 - RATE) * stress(before), atol=1e-6)
     c, w = lattice.VELOCITIES.astype(float), lattice.WEIGHTS
-    u, density = momentum(before), before.sum(axis=0)
-    cu = c @ u.T
-    equilibrium = w[:, None] * (density + 3 * cu + 4.5 * cu**2 - 1.5 * (u**2).sum(axis=1))
     traceless = np.einsum("qa,qb->qab", c, c) - np.eye(3) * (c**2).sum(axis=1)[:, None, None] / 3
-    stress = np.einsum("qab,qk->kab", traceless, before - equilibrium)
-    kept = np.einsum("qab,qk->kab", traceless, after - equilibrium)
-    np.testing.assert_allclose(kept, (1 - RATE) * stress, atol=1e-6)
     even = 0.5 * (after + after[lattice.OPPOSITE])
-    wanted = 0.5 * (equilibrium + equilibrium[lattice.OPPOSITE])
-    wanted = wanted + (1 - RATE) * 4.5 * w[:, None] * np.einsum("qab,kab->qk", traceless, stress)
+    wanted = 0.5 * (equilibrium(before) + equilibrium(before)[lattice.OPPOSITE])
+    wanted = wanted + (1 - RATE) * 4.5 * w[:, None] * np.einsum("qab,kab->qk", traceless, stress(before))
     np.testing.assert_allclose(even, wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("is_screened", [False, True])
+def test_fast_blood_is_as_thick_as_the_cell_reynolds_number_allows(is_screened):
+    f, limit = populations(4), 1.0
+    before = f[: -lattice.LANES].reshape(19, STRIDE).astype(float)
+    screen = screen_of((0, 0, 1), 0, 0) if is_screened else NO_SCREEN
+    after = even_step(f, screen, limit).astype(float)
+    viscosity = np.maximum((1 / RATE - 0.5) / 3, np.linalg.norm(momentum(before), axis=1) / limit)
+    assert 0.2 < (viscosity > (1 / RATE - 0.5) / 3).mean() < 0.8
+    kept = 1 - 1 / (3 * viscosity + 0.5)
+    np.testing.assert_allclose(stress(after), kept[:, None, None] * stress(before), atol=1e-6)
 
 
 def screen_of(normal, along, across, quadratic=0.0):

@@ -1,20 +1,70 @@
 """The parent artery under a sac of known shape."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from vstent import phantoms
 from vstent.errors import InputError
 from vstent.kernels import curves
+from vstent.measure import morphology
+from vstent.phantoms import Phantom, Scanner, torus_arc, tube, with_bleb, with_branch, with_sac
+from vstent.repair import repair
 from vstent.restore import restore
+from vstent.restore.sac import _is_island
+from vstent.segment import segment
 from vstent.surface import Surface
 from vstent.trace import trace
 from vstent.trim import trim
 from vstent.vessel import Anatomy, Vessel
 
+X = np.array([1.0, 0.0, 0.0])
+PHANTOMS: dict[str, Callable[[], Phantom]] = {
+    "straight": lambda: with_sac(tube(length_mm=40), abscissa_mm=20),
+    "tapered": lambda: with_sac(tube(length_mm=40, radius_mm=2.3, end_radius_mm=1.6), abscissa_mm=20),
+    "outside of a bend": lambda: with_sac(torus_arc(bend_radius_mm=9.0), abscissa_mm=14),
+    "inside of a bend": lambda: with_sac(torus_arc(bend_radius_mm=9.0), abscissa_mm=14, direction=_inside(14 / 9)),
+    "wide on the inside of a bend": lambda: with_sac(
+        torus_arc(bend_radius_mm=9.0), abscissa_mm=14, neck_mm=6.8, direction=_inside(14 / 9)
+    ),
+    "beside a branch": lambda: with_branch(
+        with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), abscissa_mm=24, direction=np.array([1.0, 0.3, 0.5])
+    ),
+    "touching a branch": lambda: with_branch(
+        with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), abscissa_mm=24.5, direction=X
+    ),
+    "neck of 2 diameters": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=10, neck_mm=8),
+    "sac of 3 diameters": lambda: with_sac(tube(length_mm=44), abscissa_mm=22, width_mm=12, neck_mm=5),
+    "half a sphere": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=5.6, neck_mm=5.5),
+    "tall": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=5, neck_mm=3, elongation=1.8),
+    "small": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=4, neck_mm=2.8),
+    "blebs": lambda: with_bleb(
+        with_bleb(with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), direction=np.array([0.2, 1.0, 0.3])),
+        direction=np.array([1.0, -0.3, 0.9]),
+        radius_mm=1.6,
+    ),
+    "demo": phantoms.demo_phantom,
+}
+"""The table of glued sacs."""
+IN_BRIEF = ("wide on the inside of a bend", "beside a branch")
+"""Those that the default suite tries."""
+SCANS_IN_BRIEF = (("demo", 0.28),)
+NECK_TOLERANCE = {0.15: 0.05, 0.28: 0.06, 0.4: 0.12}
+"""Of a scan by voxel edge (mm): its blur fills the crevice by a quarter of a voxel on the average."""
+
+
+def _rows(every: list, brief: tuple) -> list:
+    return [pytest.param(row, marks=() if row in brief else pytest.mark.validation, id=str(row)) for row in every]
+
 
 def anatomy_of(phantom: phantoms.Phantom) -> Anatomy:
     return restore(trace(Vessel(phantoms.phantom_surface(phantom))))
+
+
+def scanned_anatomy_of(phantom: phantoms.Phantom, voxel_mm: float) -> Anatomy:
+    scanner = Scanner(voxel_mm=voxel_mm, blur_mm=0.8 * voxel_mm)
+    return restore(trace(segment(phantoms.scan(phantom, np.random.default_rng(1), scanner=scanner))))
 
 
 def relative_errors(anatomy: Anatomy, phantom: phantoms.Phantom) -> tuple[np.ndarray, np.ndarray]:
@@ -63,15 +113,83 @@ def test_neck_and_sac_share_their_rim(demo) -> None:
     np.testing.assert_allclose(flux, others[~on_neck].sum(axis=0), atol=1e-6)
 
 
-@pytest.mark.parametrize("neck_mm", [4.0, 6.8])
-def test_a_sac_on_the_inside_of_a_bend(neck_mm: float) -> None:
-    phantom = phantoms.with_sac(
-        phantoms.torus_arc(bend_radius_mm=9.0), abscissa_mm=14.0, neck_mm=neck_mm, direction=_inside(14.0 / 9.0)
-    )
-    radius_error, distance_mm = relative_errors(anatomy := anatomy_of(phantom), phantom)
+@pytest.mark.parametrize("name", _rows(list(PHANTOMS), IN_BRIEF))
+def test_artery_neck_and_sac_of_an_exact_wall(name: str) -> None:
+    phantom = PHANTOMS[name]()
+    anatomy = anatomy_of(phantom)
+    radius_error, distance_mm = relative_errors(anatomy, phantom)
+    assert np.abs(radius_error).mean() < 0.005
+    assert distance_mm.max() < 0.03
+    (aneurysm,) = anatomy.aneurysms
+    # What 0.25 mm triangles cut off a crevice is not known to the method; of a neck of 2.8 mm it is 2 %.
+    np.testing.assert_allclose(aneurysm.neck.area_mm2, phantom.neck_area_mm2, rtol=0.025)
+    np.testing.assert_allclose(aneurysm.sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.005)
+    assert aneurysm.sac.boundary_loops == ()
+
+
+@pytest.mark.parametrize("row", _rows([(name, h) for name in PHANTOMS for h in NECK_TOLERANCE], SCANS_IN_BRIEF))
+def test_artery_neck_and_sac_of_a_noisy_scan(row: tuple[str, float]) -> None:
+    name, voxel_mm = row
+    phantom = PHANTOMS[name]()
+    anatomy = scanned_anatomy_of(phantom, voxel_mm)
+    radius_error, distance_mm = relative_errors(anatomy, phantom)
     assert np.abs(radius_error).mean() < 0.02
     assert np.quantile(distance_mm, 0.95) < 0.15
-    np.testing.assert_allclose(anatomy.aneurysms[0].sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.05)
+    assert distance_mm.max() < 0.3
+    (aneurysm,) = anatomy.aneurysms
+    if (name, voxel_mm) != ("small", 0.4):  # a neck of 2.8 by 1.9 mm is 7 by 5 voxels: it comes out a fifth too large
+        np.testing.assert_allclose(aneurysm.neck.area_mm2, phantom.neck_area_mm2, rtol=NECK_TOLERANCE[voxel_mm])
+    # A wall of constant convexity is blurred inwards: a shallow sac loses more of its volume.
+    np.testing.assert_allclose(aneurysm.sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.03 if voxel_mm < 0.3 else 0.05)
+
+
+def test_the_neck_lies_on_the_landing_surface_in_the_lumen(demo) -> None:
+    anatomy, phantom = demo
+    (aneurysm,) = anatomy.aneurysms
+    assert anatomy.landing_surface.closest(aneurysm.neck_mm)[1].max() < 1e-6
+    assert anatomy.vessel.closed.signed_distance(aneurysm.neck_mm).max() < 0.05
+    # The true neck is where the sac's ellipsoid meets the artery.
+    assert np.abs(phantom.sac.implicit_mm(aneurysm.neck_mm)[0]).max() < 0.05
+
+
+def test_a_branch_that_passes_close_to_the_sac_takes_nothing_of_its_wall() -> None:
+    phantom = PHANTOMS["touching a branch"]()
+    (aneurysm,) = anatomy_of(phantom).aneurysms
+    assert phantom.sac is not None
+    angle = np.linspace(-0.5, 0.5, 21)
+    facing_mm = phantom.sac.center_mm + 3.5 * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
+    assert aneurysm.sac.closest(facing_mm)[1].max() < 0.02
+
+
+def test_low_wall_apart_from_every_opening_is_where_the_sac_touches_an_artery() -> None:
+    lumen = phantoms.phantom_surface(tube(length_mm=10))
+    x, _, z = lumen.vertices_mm.T
+    touching, artery = (np.abs(z - 6) < 1) & (x > 1), z < 3
+    np.testing.assert_array_equal(_is_island(lumen, touching | artery), touching)
+    bridge = (np.abs(z - 4) < 2.5) & (np.abs(x - 1.5) < 0.5)
+    assert not _is_island(lumen, touching | artery | bridge).any()
+
+
+def test_a_sac_on_a_coarse_mesh_is_cut_where_its_branches_leave(shared_data) -> None:
+    from vstent.io.surfaces import read_surface
+
+    lumen = repair(read_surface(shared_data / "bifurcation_coarse.vtp")[0])[0]
+    (aneurysm,) = restore(trim(trace(Vessel(lumen)))).aneurysms
+    # One daughter runs along the sac, less than a triangle away: the neck must not climb between them.
+    height_mm = np.ptp(aneurysm.neck_mm @ _mean_direction(aneurysm.neck))
+    assert height_mm < 0.7 * np.sqrt(4 * aneurysm.neck.area_mm2 / np.pi)
+    assert aneurysm.sac.boundary_loops == ()
+
+
+def _mean_direction(neck: Surface) -> np.ndarray:
+    total = (neck.areas_mm2[:, None] * neck.normals).sum(axis=0)
+    return total / np.linalg.norm(total)
+
+
+def test_the_neck_does_not_depend_on_the_mesh(demo) -> None:
+    anatomy, phantom = demo
+    coarse = restore(trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.35))))
+    np.testing.assert_allclose(coarse.aneurysms[0].neck.area_mm2, anatomy.aneurysms[0].neck.area_mm2, rtol=0.02)
 
 
 def _inside(angle_rad: float) -> np.ndarray:
@@ -115,9 +233,48 @@ def test_trimming_cuts_a_long_artery_square_and_keeps_the_sac() -> None:
     assert restore(vessel).aneurysms[0].sac.volume_mm3 == pytest.approx(phantom.sac_volume_mm3, rel=0.03)
 
 
-def test_the_real_sac_has_the_published_volume(shared_data) -> None:
+def test_the_real_sac_is_that_of_aneurisk_web(shared_data) -> None:
     from vstent.io.surfaces import read_surface
 
     anatomy = restore(trim(trace(Vessel(read_surface(shared_data / "aneurisk_C0038.vtp")[0]))))
-    # AneuriskWeb cuts the neck by a plane further out: its sac is 344 mm3 with the artery's share of the neck.
-    assert anatomy.aneurysms[0].sac.volume_mm3 == pytest.approx(344.4, rel=0.15)
+    (aneurysm,) = anatomy.aneurysms
+    found = morphology(anatomy)
+    # AneuriskWeb closes the sac by a plane: its 344.4 mm3 leave out what hangs down both sides of the artery, which the
+    # neck embraces by more than half a turn, and its 38.5 mm2 lie between our curved neck and that neck's projection.
+    assert aneurysm.sac.volume_mm3 == pytest.approx(344.4, rel=0.15)
+    assert aneurysm.sac.volume_mm3 > 344.4
+    assert found["neck_area_mm2"] < 38.5 < found["neck_surface_area_mm2"]
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_idealised_bifurcation_is_restored_to_the_one_without_its_sac(shared_data, side: float) -> None:
+    from vstent.io.surfaces import read_surface
+
+    sick, healthy = (
+        restore(
+            trace(Vessel(read_surface(shared_data / f"bifurcation_{name}_sac.stl")[0])),
+            outlet_mm=np.array([7.5 * side, 0.0, 10.0]),
+        )
+        for name in ("with", "without")
+    )
+    assert len(sick.aneurysms) == 1
+    assert healthy.aneurysms == ()
+    axis = sick.axis
+    inner = (axis.abscissa_mm > 1.5) & (axis.abscissa_mm < axis.length_mm - 1.5)
+    place = curves.project(healthy.axis.points_mm, axis.points_mm[inner])[0]
+    radius = np.interp(place, healthy.axis.abscissa_mm, healthy.section_radius_mm)
+    assert np.abs(sick.section_radius_mm[inner] / radius - 1).mean() < 0.01
+    rings = sick.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
+    distance_mm = healthy.landing_surface.closest(rings)[1]
+    assert np.quantile(distance_mm, 0.95) < 0.1
+    assert distance_mm.max() < 0.2
+
+
+@pytest.mark.parametrize("name", ["aneurisk_C0015_no_sac.vtp", "healthy_siphon.vtk"])
+def test_a_real_healthy_artery_stays_as_it_is(shared_data, name: str) -> None:
+    from vstent.io.surfaces import read_surface
+
+    anatomy = restore(trace(Vessel(read_surface(shared_data / name)[0])))
+    assert anatomy.aneurysms == ()
+    own = anatomy.landing_surface.vertices_mm[~anatomy.is_restored]
+    assert anatomy.vessel.lumen.closest(own)[1].max() < 0.05

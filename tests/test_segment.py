@@ -1,4 +1,5 @@
 import re
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -215,7 +216,7 @@ def test_a_threshold_above_everything_is_refused(demo):
 
 def test_fine_meshes_are_decimated_without_losing_volume(demo, monkeypatch):
     phantom, image, whole = demo
-    monkeypatch.setattr("vstent.segment.MOST_FACES", 12_000)
+    monkeypatch.setattr(import_module("vstent.segment"), "MOST_FACES", 12_000)
     vessel = segment(image)
     assert len(vessel.lumen.faces) <= 12_000 < len(whole.lumen.faces)
     assert f"{len(whole.lumen.faces)} triangles decimated to {len(vessel.lumen.faces)} (volume" in vessel.notes[-1]

@@ -1,9 +1,12 @@
 """vstent: virtual stenting of intracranial aneurysms, from a scan to a deployed device and the blood flow.
 
-The verbs are loaded when they are first used: importing vstent costs nothing.
+The verbs are loaded when they are first used: importing vstent costs nothing. A stage's module and its verb share a
+name: `vstent.trace` is the verb, also once the module is loaded, and `from vstent.trace import ...` reaches the module.
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 _HOMES = {
@@ -32,3 +35,14 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'vstent' has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)
+
+
+class _Package(ModuleType):
+    """A package that a submodule, when it is loaded, does not enter under the name of a verb."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _HOMES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Any, Final
 from vstent.errors import InputError, VstentError
 
 if TYPE_CHECKING:
+    from vstent.flow.types import Waveform
     from vstent.study import CaseResult, Settings
 
 BAD_INPUT: Final = 2
 FAILED: Final = 1
 INTERRUPTED: Final = 130
 
+PUBLISHED: Final = "published"
+"""The waveform where none is given."""
 EPILOG = "Research use only: not cleared for diagnosis or treatment. Lengths in mm, flow in SI; coordinates are LPS."
 
 
@@ -110,6 +113,13 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
     flow.add_argument("--no-flow", action="store_true", help="stop after the deployment")
     flow.add_argument("--flow-rate", type=float, metavar="ML_S", help="mean inflow (0.27 m/s times the inlet's area)")
     flow.add_argument("--cell-size", type=float, metavar="MM", help="edge of a flow cell")
+    flow.add_argument(
+        "--pulsatile",
+        nargs="?",
+        const=PUBLISHED,
+        metavar="CSV",
+        help="follow a pulse: columns time in s and flow in any unit (the published one of the internal carotid)",
+    )
     flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
 
 
@@ -143,7 +153,12 @@ def _settings(arguments: argparse.Namespace, **given: object) -> "Settings":
     from vstent.flow import FlowSettings
     from vstent.study import Settings
 
-    flow = FlowSettings(inflow_mL_s=arguments.flow_rate, outlets=arguments.outlets, cell_size_mm=arguments.cell_size)
+    flow = FlowSettings(
+        inflow_mL_s=arguments.flow_rate,
+        waveform=_waveform(arguments.pulsatile),
+        outlets=arguments.outlets,
+        cell_size_mm=arguments.cell_size,
+    )
     devices = tuple(dict.fromkeys(arguments.device or ("silk", "enterprise")))
     return Settings(devices=devices, flow=None if arguments.no_flow else flow, **given)  # type: ignore[arg-type]
 
@@ -159,6 +174,16 @@ def _geometry(arguments: argparse.Namespace) -> dict[str, Any]:
         "inlet_mm": arguments.inlet,
         "outlet_mm": arguments.outlet,
     }
+
+
+def _waveform(source: str | None) -> "Waveform | None":
+    from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
+    from vstent.io.tables import read_columns
+
+    if source is None or source == PUBLISHED:
+        return OLDER_ADULT_ICA if source else None
+    time_s, flow = read_columns(Path(source), 2).T
+    return waveform_of(time_s, flow)
 
 
 def _run(arguments: argparse.Namespace) -> int:

@@ -41,6 +41,11 @@ class Sac:
         freeze(self, "center_mm", np.float64, (3,))
         freeze(self, "direction", np.float64, (3,))
 
+    @property
+    def reach_mm(self) -> float:
+        """The larger semi-axis."""
+        return max(self.width_radius_mm, self.height_radius_mm)
+
     def implicit_mm(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Signed distance (n,) of (n, 3) points, negative inside, and its unit gradient (n, 3).
 
@@ -69,6 +74,13 @@ class Phantom:
     """Other tubes; the first point of each lies on the parent's axis, the last is an outlet."""
     sac: Sac | None = None
     """The aneurysm."""
+    blebs: tuple[Sac, ...] = ()
+    """Daughter sacs on the sac."""
+
+    @property
+    def sacs(self) -> tuple[Sac, ...]:
+        """The sac and its blebs."""
+        return self.blebs if self.sac is None else (self.sac, *self.blebs)
 
     @property
     def tubes(self) -> tuple[Centerline, ...]:
@@ -82,7 +94,7 @@ class Phantom:
         """
         value, gradient = tube_implicit_mm(self.parent, points_mm)
         parts = [tube_implicit_mm(branch, points_mm) for branch in self.branches]
-        for part_value, part_gradient in parts if self.sac is None else [*parts, self.sac.implicit_mm(points_mm)]:
+        for part_value, part_gradient in [*parts, *(sac.implicit_mm(points_mm) for sac in self.sacs)]:
             nearer = part_value < value
             value, gradient = np.where(nearer, part_value, value), np.where(nearer[:, None], part_gradient, gradient)
         return value, gradient
@@ -102,12 +114,12 @@ class Phantom:
 
     @cached_property
     def sac_volume_mm3(self) -> float:
-        """True volume of the sac: the ellipsoid outside the parent artery (0 without a sac)."""
+        """True volume of the sac: the ellipsoids outside the parent artery (0 without a sac)."""
         return self._sac_layers[0]
 
     @cached_property
     def neck_area_mm2(self) -> float:
-        """True area of the parent artery's wall that lies inside the ellipsoid (0 without a sac)."""
+        """True area of the parent artery's wall that lies inside the ellipsoids (0 without a sac)."""
         return self._sac_layers[1]
 
     @property
@@ -123,14 +135,15 @@ class Phantom:
 
     @cached_property
     def _sac_layers(self) -> tuple[float, float]:
-        """Volume outside the wall and area of the wall, both within the ellipsoid, on a grid of 1/80 of its size."""
+        """Volume outside the wall and area of the wall, both within the ellipsoids, on a grid of 1/80 of the sac."""
         if self.sac is None:
             return 0.0, 0.0
-        reach = max(self.sac.width_radius_mm, self.sac.height_radius_mm)
-        step = reach / 40
-        ticks = np.arange(-reach - step, reach + 2 * step, step)
-        points = self.sac.center_mm + np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-        inside = np.clip(0.5 - self.sac.implicit_mm(points)[0] / step, 0.0, 1.0)
+        step = self.sac.reach_mm / 40
+        low = np.min([sac.center_mm - sac.reach_mm for sac in self.sacs], axis=0) - step
+        high = np.max([sac.center_mm + sac.reach_mm for sac in self.sacs], axis=0) + 2 * step
+        points = _points([np.arange(a, b, step) for a, b in zip(low, high, strict=True)])
+        depth = np.min([sac.implicit_mm(points)[0] for sac in self.sacs], axis=0)
+        inside = np.clip(0.5 - depth / step, 0.0, 1.0)
         beyond = tube_implicit_mm(self.parent, points)[0]
         volume = float((inside * np.clip(0.5 + beyond / step, 0.0, 1.0)).sum() * step**3)
         layer = inside * np.clip(1.0 - np.abs(beyond) / step, 0.0, 1.0) / step  # a hat of unit area across the wall
@@ -226,6 +239,16 @@ def with_sac(
     lift = height * np.sqrt(1.0 - (neck_mm / width_mm) ** 2)
     center = parent.points_mm[i] + (parent.inscribed_radius_mm[i] + lift) * across
     return replace(phantom, name=f"{phantom.name} with sac", sac=Sac(center, across, 0.5 * width_mm, height))
+
+
+def with_bleb(phantom: Phantom, *, direction: Floats, radius_mm: float = 1.2) -> Phantom:
+    """Let a round daughter sac stand half out of the sac in a direction (3,) from its centre."""
+    if phantom.sac is None:
+        raise ValueError(f"phantom {phantom.name} has no sac")
+    unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
+    level, _ = phantom.sac.implicit_mm(phantom.sac.center_mm + unit[None] * phantom.sac.reach_mm)
+    center = phantom.sac.center_mm + (phantom.sac.reach_mm - level[0]) * unit
+    return replace(phantom, blebs=(*phantom.blebs, Sac(center, unit, radius_mm, radius_mm)))
 
 
 def with_branch(
@@ -351,9 +374,9 @@ def _box(phantom: Phantom, *, margin_mm: float) -> tuple[Floats, Floats]:
         reach = t.inscribed_radius_mm[:, None] + margin_mm
         low = np.minimum(low, (t.points_mm - reach).min(axis=0))
         high = np.maximum(high, (t.points_mm + reach).max(axis=0))
-    if phantom.sac is not None:
-        radius = max(phantom.sac.width_radius_mm, phantom.sac.height_radius_mm) + margin_mm
-        low, high = np.minimum(low, phantom.sac.center_mm - radius), np.maximum(high, phantom.sac.center_mm + radius)
+    for sac in phantom.sacs:
+        radius = sac.reach_mm + margin_mm
+        low, high = np.minimum(low, sac.center_mm - radius), np.maximum(high, sac.center_mm + radius)
     return low, high
 
 

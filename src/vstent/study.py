@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_design, find_size
 from vstent.errors import ReadError
-from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, simulate_case
+from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, ostium, simulate_case
 from vstent.flow import Progress as FlowProgress
 from vstent.io import writers
 from vstent.io.archive import load_noun, save_noun
@@ -331,7 +331,7 @@ def _metrics(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]
 ) -> dict[str, Any]:
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
-    shapes = (sac.sac, sac.neck) if sac else ()
+    shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
     flow = {name: indices(field, *shapes) for name, field in fields.items()}
     stents: dict[str, dict[str, Any]] = {}
     for name, deployment in deployments.items():
@@ -380,6 +380,12 @@ def _write_field(folder: Path, field: FlowField) -> None:
     of_cell = {"velocity_m_s": field.velocity_m_s, "pressure_Pa": field.pressure_Pa}
     writers.write_cells(folder / "field.vtu", field.centers_mm, field.cell_size_mm, of_cell)
     of_vertex = {"wall_shear_stress_Pa": field.wall_shear_stress_Pa, "pressure_Pa": field.wall_pressure_Pa}
+    if field.phases:
+        of_vertex |= {
+            "time_averaged_wall_shear_stress_Pa": field.shear_Pa,
+            "oscillatory_shear_index": field.oscillatory_shear_index,
+            "relative_residence_time_per_Pa": field.relative_residence_time_per_Pa,
+        }
     writers.write_surface(folder / "wall.vtp", field.wall, of_vertex)
 
 

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
 from vstent.flow.engines import Progress, run
 from vstent.flow.indices import compare, indices
+from vstent.flow.ostium import ostium
 from vstent.flow.screen import screen
 from vstent.flow.streamlines import Streamlines, streamlines
 from vstent.flow.types import Blood, FlowCase, FlowField, FlowSettings, Screen
@@ -25,6 +25,7 @@ __all__ = [
     "compare",
     "flow_case",
     "indices",
+    "ostium",
     "screen",
     "simulate",
     "simulate_case",
@@ -77,7 +78,7 @@ def flow_case(
     return FlowCase(
         vessel=anatomy.vessel,
         sac=None if largest is None else largest.sac,
-        neck=None if largest is None else largest.neck,
+        ostium=None if largest is None else ostium(largest, anatomy.vessel.lumen),
         screen=None if stent is None else screen(stent, blood),
         blood=blood,
         settings=settings or FlowSettings(),
@@ -85,7 +86,7 @@ def flow_case(
 
 
 def simulate_case(case: FlowCase, *, start: FlowField | None = None, progress: OnProgress | None = None) -> FlowField:
-    """Compute one steady flow.
+    """Compute one flow: steady, or pulsatile where the settings have a waveform.
 
     Parameters
     ----------
@@ -98,7 +99,8 @@ def simulate_case(case: FlowCase, *, start: FlowField | None = None, progress: O
         When the vessel cannot be put on a grid, or the computation diverges.
     """
     cell_size_mm = default_cell_size_mm(case)
-    guess = _guess(case, start, COARSENING * cell_size_mm, progress)
+    steady = replace(case, settings=replace(case.settings, waveform=None))
+    guess = _guess(steady, start, COARSENING * cell_size_mm, progress)
     return _run(case, cell_size_mm, guess, _stage(progress, _coarse_runs(case, start) * COARSE_SHARE, 1.0))
 
 
@@ -132,15 +134,11 @@ def _guess(
 
 
 def _run(case: FlowCase, cell_size_mm: float, start: FlowField | None, progress: OnProgress | None) -> FlowField:
-    """Run the engine; where it diverges, once more with thick blood in the openings' extensions."""
     from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
+    from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
 
-    engine = LatticeBoltzmann(cell_size_mm)
-    try:
-        return run(engine, case, start=start, progress=progress)
-    except FlowError:
-        thick = replace(case.settings, has_thick_ends=True)
-        return run(engine, replace(case, settings=thick), start=start, progress=progress)
+    engine = LatticeBoltzmann if case.settings.waveform is None else PulsatileLatticeBoltzmann
+    return run(engine(cell_size_mm), case, start=start, progress=progress)
 
 
 def _stage(progress: OnProgress | None, begin: float, end: float) -> OnProgress | None:

@@ -20,25 +20,31 @@ NEAR_MM = 10.0
 """The parent wall is the wall within this distance of the neck (Cebral et al. 2011, AJNR 32, 145)."""
 
 
-def indices(field: FlowField, sac: Surface | None = None, neck: Surface | None = None) -> dict[str, float]:
+def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None = None) -> dict[str, float]:
     """Every index of a flow, its unit in its key.
 
     Of the vessel: ``inlet_flow_mL_s``, ``outlet_K_flow_mL_s``, ``inlet_pressure_Pa``, ``pressure_drop_Pa`` (inlet to
-    widest outlet), ``mean_wss_Pa``. With a sac (closed) and its neck (normals into the sac), besides:
+    widest outlet), ``mean_wss_Pa``. With a sac (closed) and its ostium (normals into the sac), besides:
 
-    - ``neck_inflow_mL_s`` = integral over the neck of max(u.n, 0), ``neck_outflow_mL_s`` of max(-u.n, 0);
+    - ``neck_inflow_mL_s`` = integral over the ostium of max(u.n, 0), ``neck_outflow_mL_s`` of max(-u.n, 0);
       ``turnover_time_s`` = sac volume / inflow;
     - ``mean_sac_velocity_m_s``, ``max_sac_velocity_m_s``, ``mean_sac_pressure_Pa`` over the sac's cells;
       ``sac_kinetic_energy_J`` = integral of rho u^2 / 2; ``fast_sac_volume_mm3`` where u > 0.08 m/s;
     - ``mean_sac_wss_Pa``, ``max_sac_wss_Pa`` over the sac's wall; ``parent_wss_Pa`` over the other wall within 10 mm of
       the neck; ``low_shear_area_fraction`` of the sac's wall below 0.4 Pa, ``relative_low_shear_area_fraction`` below a
       tenth of the parent's mean;
-    - ``inflow_concentration_index`` = (inflow / inlet flow) / (inflow area / neck area) (Cebral et al. 2011, AJNR 32,
+    - ``inflow_concentration_index`` = (inflow / inlet flow) / (inflow area / ostium area) (Cebral et al. 2011, AJNR 32,
       145).
+
+    Of a pulsatile flow, the means over its cycle; wall shear stress is then its magnitude's time average (TAWSS), and
+    ``mean_sac_oscillatory_shear_fraction`` (OSI) is given besides.
     """
+    moments = [field.at_phase(phase) for phase in field.phases] or [field]
     result = _of_vessel(field)
-    if sac is not None and neck is not None:
-        result |= _of_neck(field, sac, neck) | _of_sac(field, sac) | _of_sac_wall(field, sac, neck)
+    if sac is not None and ostium is not None:
+        of_moments = [_of_ostium(now, sac, ostium) | _of_sac(now, sac) for now in moments]
+        result |= {key: float(np.mean([one[key] for one in of_moments])) for key in of_moments[0]}
+        result |= _of_sac_wall(field, sac, ostium)
     return result
 
 
@@ -49,18 +55,17 @@ def compare(bare: dict[str, float], stented: dict[str, float]) -> dict[str, floa
 
 def _of_vessel(field: FlowField) -> dict[str, float]:
     outlets = {f"outlet_{k + 1}_flow_mL_s": float(flow) for k, flow in enumerate(field.outlets_mL_s)}
-    stress_Pa = np.linalg.norm(field.wall_shear_stress_Pa, axis=1)
     return {
         "inlet_flow_mL_s": field.inlet_mL_s,
         **outlets,
         "inlet_pressure_Pa": field.inlet_pressure_Pa,
         "pressure_drop_Pa": field.inlet_pressure_Pa - float(field.outlet_pressure_Pa[0]),
-        "mean_wss_Pa": float(np.average(stress_Pa, weights=_vertex_areas_mm2(field.wall))),
+        "mean_wss_Pa": float(np.average(field.shear_Pa, weights=_vertex_areas_mm2(field.wall))),
     }
 
 
-def _of_neck(field: FlowField, sac: Surface, neck: Surface) -> dict[str, float]:
-    points_mm, area_mm2 = sampling.surface_samples(neck, field.cell_size_mm)
+def _of_ostium(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, float]:
+    points_mm, area_mm2 = sampling.surface_samples(ostium, field.cell_size_mm)
     points = (points_mm - field.origin_mm) / field.cell_size_mm
     velocity_m_s = lattice_sampling.interpolate(field.index, field.velocity_m_s, points, False)
     through_mL_s = np.einsum("ij,ij->i", velocity_m_s, area_mm2)  # m/s times mm^2 is mL/s
@@ -90,13 +95,16 @@ def _of_sac(field: FlowField, sac: Surface) -> dict[str, float]:
     }
 
 
-def _of_sac_wall(field: FlowField, sac: Surface, neck: Surface) -> dict[str, float]:
-    stress_Pa = np.linalg.norm(field.wall_shear_stress_Pa, axis=1)
+def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, float]:
+    stress_Pa = field.shear_Pa
     area_mm2 = _vertex_areas_mm2(field.wall)
     is_sac = on_sac(field.wall, sac, 0.2 * field.cell_size_mm)
-    is_near = np.linalg.norm(field.wall.vertices_mm - neck.vertices_mm.mean(axis=0), axis=1) < NEAR_MM
+    is_near = np.linalg.norm(field.wall.vertices_mm - ostium.vertices_mm.mean(axis=0), axis=1) < NEAR_MM
     parent_Pa = _mean(stress_Pa, area_mm2, is_near & ~is_sac)
-    return {
+    pulse = {}
+    if field.phases:
+        pulse["mean_sac_oscillatory_shear_fraction"] = _mean(field.oscillatory_shear_index, area_mm2, is_sac)
+    return pulse | {
         "mean_sac_wss_Pa": _mean(stress_Pa, area_mm2, is_sac),
         "max_sac_wss_Pa": float(stress_Pa[is_sac].max()),
         "parent_wss_Pa": parent_Pa,

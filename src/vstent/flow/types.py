@@ -1,6 +1,6 @@
 """The nouns of blood flow: Blood, FlowSettings, Screen, FlowCase, FlowField."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -27,12 +27,40 @@ class Blood:
         return self.viscosity_Pa_s / self.density_kg_m3
 
 
+@dataclass(frozen=True)
+class Waveform:
+    """A periodic flow, as multiples of its mean: 1 + sum of a_k cos(k w t) + b_k sin(k w t), w = 2 pi / period."""
+
+    period_s: float
+    """Length of a cycle."""
+    cosine: tuple[float, ...]
+    """a_k, from k = 1."""
+    sine: tuple[float, ...]
+    """b_k, from k = 1."""
+
+    def factor(self, time_s: Floats) -> Floats:
+        """Flow over mean flow at times (t,)."""
+        angle = 2 * np.pi / self.period_s * np.multiply.outer(time_s, np.arange(1, len(self.cosine) + 1))
+        return 1 + np.cos(angle) @ np.array(self.cosine) + np.sin(angle) @ np.array(self.sine)
+
+    @property
+    def peak_factor(self) -> float:
+        """Largest flow of the cycle, either way, over mean flow."""
+        return float(np.abs(self.factor(np.linspace(0.0, self.period_s, 1001))).max())
+
+
 @dataclass(frozen=True, eq=False)
 class FlowSettings:
     """How the flow is to be computed."""
 
     inflow_mL_s: float | None = None
     """Mean flow through the inlet; None: 0.27 m/s times the inlet's area."""
+    waveform: Waveform | None = None
+    """The pulse; None: steady flow at the mean."""
+    max_cycles: int = 4
+    """Most cycles of pulsatile flow."""
+    cycle_tolerance: float = 0.02
+    """Pulsatile flow has converged when a cycle differs by less than this from the one before."""
     outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
     """Zero pressure at every outlet, or the flow split as radius cubed (Murray 1926, PNAS 12, 207)."""
     cell_size_mm: float | None = None
@@ -45,10 +73,12 @@ class FlowSettings:
     """Converged when every monitored quantity has less than this fraction of itself left to go."""
     max_steps: int = 24_000
     """Most time steps on the fine grid."""
-    lattice_speed: float = 0.1
+    lattice_speed: float = 0.15
     """Peak speed in cells per time step: sets the time step."""
-    has_thick_ends: bool = False
-    """Make the blood thicker in the extensions of the openings: stable where fast blood leaves through few cells."""
+
+    def inflow_factor(self, time_s: Floats) -> Floats:
+        """Inflow over mean inflow at times (t,)."""
+        return np.ones(len(time_s)) if self.waveform is None else self.waveform.factor(time_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +113,8 @@ class FlowCase:
     """What blood flows through."""
     sac: Surface | None = None
     """The closed sac, for its indices and for judging convergence."""
-    neck: Surface | None = None
-    """The surface that closes the sac, its normals into the sac."""
+    ostium: Surface | None = None
+    """What blood crosses between artery and sac, its normals into the sac."""
     screen: Screen | None = None
     """The stent, or None."""
     blood: Blood = field(default_factory=Blood)
@@ -105,8 +135,29 @@ MEAN_INLET_SPEED_M_S = 0.27
 
 
 @dataclass(frozen=True, eq=False)
+class Phase:
+    """A moment of a pulsatile flow."""
+
+    time_s: float
+    """Time since the waveform's beginning."""
+    inlet_mL_s: float
+    """Flow in through the inlet."""
+    velocity_m_s: Floats
+    """(n, 3) velocity at the cell centres."""
+    pressure_Pa: Floats
+    """(n,) pressure at the cell centres."""
+    wall_shear_stress_Pa: Floats
+    """(v, 3) at the lumen's vertices."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "velocity_m_s", np.float32, (-1, 3))
+        freeze(self, "pressure_Pa", np.float32, (len(self.velocity_m_s),))
+        freeze(self, "wall_shear_stress_Pa", np.float32, (-1, 3))
+
+
+@dataclass(frozen=True, eq=False)
 class FlowField:
-    """A computed steady flow, and how it was reached."""
+    """A computed flow and how it was reached: steady, or the mean of one that swings or pulses."""
 
     cells: Ints
     """(n, 3) integer grid coordinates of the blood cells, sorted."""
@@ -146,6 +197,8 @@ class FlowField:
     """Wall time."""
     updates_per_s: float
     """Cell updates per second, the finest grid's loop alone."""
+    phases: tuple[Phase, ...] = ()
+    """The last cycle of a pulsatile flow, at equal times; empty for a steady one."""
 
     def __post_init__(self) -> None:
         freeze(self, "cells", np.int32, (-1, 3))
@@ -173,6 +226,34 @@ class FlowField:
     def index(self) -> Ints:
         """(i, j, k) number of the cell at every grid point, -1 outside the blood."""
         return voxels.index_of(self.cells)
+
+    @cached_property
+    def shear_Pa(self) -> Floats:
+        """(v,) magnitude of the wall shear stress; its time average (TAWSS) where the flow pulses."""
+        moments = self.phases or (self,)
+        return np.mean([np.linalg.norm(now.wall_shear_stress_Pa, axis=1) for now in moments], axis=0, dtype=float)
+
+    @cached_property
+    def oscillatory_shear_index(self) -> Floats:
+        """(v,) (1 - |mean stress| / mean |stress|) / 2 (He and Ku 1996, J. Biomech. Eng. 118, 74); 0 in steady flow."""
+        # The stress is linear in the velocity: that of the mean flow is the mean stress.
+        return 0.5 * (1 - np.linalg.norm(self.wall_shear_stress_Pa, axis=1) / np.maximum(self.shear_Pa, 1e-12))
+
+    @cached_property
+    def relative_residence_time_per_Pa(self) -> Floats:
+        """(v,) 1 / ((1 - 2 OSI) TAWSS) (Himburg et al. 2004, Am. J. Physiol. Heart 286, H1916)."""
+        return 1 / np.maximum((1 - 2 * self.oscillatory_shear_index) * self.shear_Pa, 1e-12)
+
+    def at_phase(self, phase: Phase) -> "FlowField":
+        """The flow at a moment of the cycle."""
+        return replace(
+            self,
+            velocity_m_s=phase.velocity_m_s,
+            pressure_Pa=phase.pressure_Pa,
+            wall_shear_stress_Pa=phase.wall_shear_stress_Pa,
+            inlet_mL_s=phase.inlet_mL_s,
+            phases=(),
+        )
 
     @property
     def cell_volume_mm3(self) -> float:

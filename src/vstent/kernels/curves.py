@@ -46,27 +46,43 @@ def parallel_frames(points: Floats) -> Floats:
     Double reflection (Wang, Juettler, Zheng and Liu 2008, ACM Trans. Graph. 27(1):2, table I).
     """
     tangent = tangents(points)
-    normal = _transported(np.ascontiguousarray(points, dtype=np.float64), tangent, any_perpendicular(tangent[0]))
-    return np.stack([tangent, normal, np.cross(tangent, normal)], axis=1)
+    return np.asarray(_transported(points, tangent, any_perpendicular(tangent[0])))
 
 
 @njit(cache=True)
 def _transported(points: Any, tangent: Any, first: Any) -> Any:
-    """Normals (n, 3): each is the one before it, reflected in the middle planes of the points and of the tangents."""
-    normal = np.zeros_like(points)
-    normal[0] = first
-    for i in range(1, len(points)):
-        step = points[i] - points[i - 1]
-        step2 = (step * step).sum()
-        moved = normal[i - 1] - (2 / step2) * (step * normal[i - 1]).sum() * step
-        turned = tangent[i - 1] - (2 / step2) * (step * tangent[i - 1]).sum() * step
-        turn = tangent[i] - turned
-        turn2 = (turn * turn).sum()
-        if turn2 > 1e-30:
-            moved = moved - (2 / turn2) * (turn * moved).sum() * turn
-        moved = moved - (moved * tangent[i]).sum() * tangent[i]
-        normal[i] = moved / np.sqrt((moved * moved).sum())
-    return normal
+    n = len(points)
+    frames = np.zeros((n, 3, 3))
+    normal, step, turn = first.copy(), np.zeros(3), np.zeros(3)
+    for i in range(n):
+        if i > 0:
+            length2, shift, ahead = 0.0, 0.0, 0.0
+            for k in range(3):
+                step[k] = points[i, k] - points[i - 1, k]
+                length2 += step[k] * step[k]
+                shift += step[k] * normal[k]
+                ahead += step[k] * tangent[i - 1, k]
+            turn2, slip = 0.0, 0.0
+            for k in range(3):
+                normal[k] -= 2.0 / length2 * shift * step[k]
+                turn[k] = tangent[i, k] - (tangent[i - 1, k] - 2.0 / length2 * ahead * step[k])
+                turn2 += turn[k] * turn[k]
+                slip += turn[k] * normal[k]
+            along, size2 = 0.0, 0.0
+            for k in range(3):
+                normal[k] -= 2.0 / turn2 * slip * turn[k] if turn2 >= 1e-30 else 0.0
+                along += normal[k] * tangent[i, k]
+            for k in range(3):
+                normal[k] -= along * tangent[i, k]
+                size2 += normal[k] * normal[k]
+            for k in range(3):
+                normal[k] /= np.sqrt(size2)
+        for k in range(3):
+            frames[i, 0, k], frames[i, 1, k] = tangent[i, k], normal[k]
+            frames[i, 2, k] = (
+                tangent[i, (k + 1) % 3] * normal[(k + 2) % 3] - tangent[i, (k + 2) % 3] * normal[(k + 1) % 3]
+            )
+    return frames
 
 
 def curvature_and_torsion(points: Floats, reach: float) -> tuple[Floats, Floats]:

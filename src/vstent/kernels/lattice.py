@@ -39,6 +39,10 @@ OPPOSITE: Final = np.array([0] + [q + 1 if q % 2 else q - 1 for q in range(1, 19
 """(19,) number of the opposite velocity."""
 LANES: Final = 8
 """Cells worked on at once: segments are read in whole multiples, so the array ends in that many spare places."""
+PRESSURE, INFLOW, OUTFLOW = 0.0, 1.0, 2.0
+"""What can be imposed at an opening (see `drive`)."""
+SLOWLY: Final = 0.1
+"""Part of the way that an outlet's pressure goes in a step pair; at once, it would chase its own answer."""
 SEGMENT: Final = 128
 """Longest segment, in cells; a literal, so that the compiler sees the stride of the buffer."""
 
@@ -130,8 +134,14 @@ def _relax(
     _relax_pair(f, 17, 18, k, isotropic_diagonal + d2 * (yy + zz - yz - yz), d1 * (ay - az), kept)
 
 
-@njit(cache=True, fastmath=True)
-def _collide(f: Any, n: int, rate: float, odd_rate: float) -> None:
+@njit(cache=True, inline="always", error_model="numpy")
+def _kept(ux: float, uy: float, uz: float, time: float, limit: float) -> float:
+    """Part of the stress kept: by the blood's relaxation time, or that of blood at the largest cell Reynolds number."""
+    return _ONE - _ONE / max(time, _HALF + _THREE / limit * np.sqrt(ux * ux + uy * uy + uz * uz))
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _collide(f: Any, n: int, time: float, limit: float, odd_rate: float) -> None:
     """Collide n cells of the buffer f (19 * SEGMENT) and swap opposite populations.
 
     Regularised: of the even part only the stress survives (Latt and Chopard 2006, Math. Comput. Simul. 72:165, eq 12),
@@ -139,9 +149,10 @@ def _collide(f: Any, n: int, rate: float, odd_rate: float) -> None:
     Commun. Comput. Phys. 3, 427). Equilibrium of incompressible flow (He and Luo 1997, J. Stat. Phys. 88, 927, eq. 20):
     the steady state is free of divergence, whatever the lattice speed.
     """
-    keep, kept_odd, zero = _ONE - rate, _ONE - odd_rate, np.float32(0.0)
+    kept_odd, zero = _ONE - odd_rate, np.float32(0.0)
     for k in range(n):
         density, ux, uy, uz, pxx, pyy, pzz, pxy, pxz, pyz = _sums(f, k)
+        keep = _kept(ux, uy, uz, time, limit)
         qxx, qyy, qzz = pxx - ux * ux, pyy - uy * uy, pzz - uz * uz
         trace = (qxx + qyy + qzz) * _REST
         _relax(
@@ -181,14 +192,15 @@ def _resist(entry: Any, ux: float, uy: float, uz: float) -> tuple[float, float, 
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _collide_screened(f: Any, g: Any, n: int, rate: float, odd_rate: float, place: Any, entries: Any) -> None:
+def _collide_screened(
+    f: Any, g: Any, n: int, time: float, limit: float, odd_rate: float, place: Any, entries: Any
+) -> None:
     """As `_collide`, where the cells `place` of the segment carry the resistances `entries` (see `_resist`).
 
     The force of Guo, Zheng and Shi 2002 (Phys. Rev. E 65, 046308, eq. 19 and 20): velocity with half the force, and the
     force's first and second moment with the factors 1 - rate / 2. `g` is a buffer (6 * SEGMENT) for velocity and force.
     """
-    keep, kept_odd = _ONE - rate, _ONE - odd_rate
-    half, half_odd = _ONE - _HALF * rate, (_ONE - _HALF * odd_rate) / odd_rate
+    kept_odd, half_odd = _ONE - odd_rate, (_ONE - _HALF * odd_rate) / odd_rate
     for k in range(n):
         _, ux, uy, uz, _, _, _, _, _, _ = _sums(f, k)
         g[k], g[SEGMENT + k], g[2 * SEGMENT + k] = ux, uy, uz
@@ -207,6 +219,8 @@ def _collide_screened(f: Any, g: Any, n: int, rate: float, odd_rate: float, plac
         density, _, _, _, pxx, pyy, pzz, pxy, pxz, pyz = _sums(f, k)
         ux, uy, uz = g[k], g[SEGMENT + k], g[2 * SEGMENT + k]
         fx, fy, fz = g[3 * SEGMENT + k], g[4 * SEGMENT + k], g[5 * SEGMENT + k]
+        keep = _kept(ux, uy, uz, time, limit)
+        half = _HALF + _HALF * keep
         qxx, qyy, qzz = pxx - ux * ux, pyy - uy * uy, pzz - uz * uz
         trace = (qxx + qyy + qzz) * _REST
         _relax(
@@ -260,7 +274,8 @@ def update(
     f: Any,
     address: Any,
     length: Any,
-    rate: Any,
+    time: float,
+    limit: Any,
     odd_rate: float,
     screen_start: Any,
     screen_place: Any,
@@ -275,8 +290,9 @@ def update(
     address : (segments, 19) int32, where the populations of each segment begin: its own in an even step, its
         neighbours' in an odd one.
     length : (segments,) int32 cells of each segment, at most SEGMENT.
-    rate : (segments,) float32 relaxation rate of the stress in every segment.
-    odd_rate : float32 that of the odd part.
+    time : float32 relaxation time of the stress.
+    limit : (segments,) float32 largest cell Reynolds number, speed over viscosity: faster blood is made that thick.
+    odd_rate : float32 relaxation rate of the odd part.
     screen_start : (segments + 1,) int32 first screen entry of every segment.
     screen_place, screen : (e,) int32 place within the segment and (e, 6) float32 resistance (see `_resist`).
     threads : number of chunks.
@@ -290,9 +306,11 @@ def update(
             lanes = (length[s] + LANES - 1) // LANES * LANES
             begin, end = screen_start[s], screen_start[s + 1]
             if begin == end:
-                _collide(buffer, lanes, rate[s], odd_rate)
+                _collide(buffer, lanes, time, limit[s], odd_rate)
             else:
-                _collide_screened(buffer, extra, lanes, rate[s], odd_rate, screen_place[begin:end], screen[begin:end])
+                _collide_screened(
+                    buffer, extra, lanes, time, limit[s], odd_rate, screen_place[begin:end], screen[begin:end]
+                )
             _store(buffer, address[s], length[s], f)
 
 
@@ -416,46 +434,65 @@ def _density(f: Any, stride: int, places: Any) -> float:
 
 
 @njit(cache=True)
-def drive(f: Any, stride: int, openings: Any, start: Any, place: Any, direction: Any, shape: Any, source: Any) -> None:
+def outflow(f: Any, address: Any) -> float:
+    """Flow out through the links `address` (l, 6), all populations being at home."""
+    total = 0.0
+    for k in range(len(address)):
+        total += float(f[address[k, 3]]) - float(f[address[k, 0]])
+    return total
+
+
+@njit(cache=True)
+def drive(
+    f: Any,
+    stride: int,
+    openings: Any,
+    start: Any,
+    address: Any,
+    place: Any,
+    direction: Any,
+    shape: Any,
+    source: Any,
+) -> None:
     """Set what every opening sends back during the next two steps (all populations being at home).
 
     Parameters
     ----------
-    openings : (k, 7) whether flow is imposed (1) or pressure (0), the inflow speed or density deviation wanted, the
-        remembered mean density, its rate of forgetting, the outward normal (3).
-    start : (k + 1,) first link of every opening in `place`, `direction`, `shape` and `source` (l,).
+    openings : (k, 9) what is imposed (`PRESSURE`, `INFLOW` or `OUTFLOW`), the density deviation or speed wanted, the
+        remembered mean density, its rate of change, the outward normal (3), the area in cells, the density imposed.
+    start : (k + 1,) first link of every opening in what follows.
+    address : (l, 6) as in `reflect`; place : (l,) storage place of each link's cell; direction, source : (l,).
     shape : what unit inflow speed sends back through each link.
 
-    Imposed flow: half-way reflection off a moving wall (Ladd 1994, J. Fluid Mech. 271, 285), so the flow is exact. It
+    Inflow: half-way reflection off a moving wall (Ladd 1994, J. Fluid Mech. 271, 285), so the flow is exact. It
     lets sound out: a density above the remembered mean is answered by the wave that leaves (Poinsot and Lele 1992,
-    J. Comput. Phys. 101, 104). Imposed pressure: anti-reflection (Ginzburg, Verhaeghe and d'Humieres 2008, Commun.
+    J. Comput. Phys. 101, 104). Pressure: anti-reflection (Ginzburg, Verhaeghe and d'Humieres 2008, Commun.
     Comput. Phys. 3, 427, sec. 5.2). Where blood comes back through an outlet it is the total pressure that is
-    imposed, which bounds the energy that enters.
+    imposed, which bounds the energy that enters. Outflow: the pressure that answers the excess of speed as the wave
+    that leaves would, about a mean that moves until no excess is left.
     """
     for k in range(len(openings)):
         first, last = start[k], start[k + 1]
-        if openings[k, 0] == 1.0:
+        density = openings[k, 1]
+        if openings[k, 0] == INFLOW:
             density = _density(f, stride, place[first:last])
-            excess = density - openings[k, 2]
             # Against a high resistance the flow itself waits for the mean: forget faster the higher the pressure.
-            openings[k, 2] += openings[k, 3] * (1.0 + abs(density / openings[k, 1]) / np.sqrt(3.0)) * excess
-            speed = openings[k, 1] - excess / np.sqrt(3.0)
+            resistance = abs(density) / max(abs(openings[k, 1]), 1e-6)
+            rate = min(1.0, openings[k, 3] * (1.0 + resistance / np.sqrt(3.0)))
+            openings[k, 2] += rate * (density - openings[k, 2])
+            speed = openings[k, 1] - (density - openings[k, 2]) / np.sqrt(3.0)
             for n in range(first, last):
                 source[n] = shape[n] * speed
             continue
+        if openings[k, 0] == OUTFLOW:
+            excess = outflow(f, address[first:last]) / openings[k, 7] - openings[k, 1]
+            openings[k, 2] += openings[k, 3] * excess
+            openings[k, 8] += SLOWLY * (openings[k, 2] + np.sqrt(3.0) * excess - openings[k, 8])
+            density = openings[k, 8]
         for n in range(first, last):
             q = direction[n]
             ux, uy, uz = _velocity(f, stride, place[n])
             along = VELOCITIES[q, 0] * ux + VELOCITIES[q, 1] * uy + VELOCITIES[q, 2] * uz
             inward = max(0.0, -(ux * openings[k, 4] + uy * openings[k, 5] + uz * openings[k, 6]))
-            density = openings[k, 1] - 1.5 * inward * inward
-            source[n] = 2.0 * WEIGHTS[q] * (density + 4.5 * along * along - 1.5 * (ux * ux + uy * uy + uz * uz))
-
-
-@njit(cache=True)
-def outflow(f: Any, address: Any) -> float:
-    """Flow out through the links `address` (l, 4), all populations being at home."""
-    total = 0.0
-    for k in range(len(address)):
-        total += float(f[address[k, 3]]) - float(f[address[k, 0]])
-    return total
+            even = density - 1.5 * inward * inward + 4.5 * along * along - 1.5 * (ux * ux + uy * uy + uz * uz)
+            source[n] = 2.0 * WEIGHTS[q] * even

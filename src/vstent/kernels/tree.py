@@ -94,7 +94,7 @@ def _part(key: Any, order: Any, first: int, last: int, middle: int) -> None:
 
 @njit(cache=True)
 def _boxes(corners: Any, n_leaves: int) -> tuple[Any, Any]:
-    """Lower and upper corner (nodes, 3) of every node's box; those without triangles are inside out."""
+    """Lower and upper corner (nodes, 3) of every node's box; without triangles it lies at infinity."""
     low = np.full((2 * n_leaves - 1, 3), np.inf)
     high = np.full((2 * n_leaves - 1, 3), -np.inf)
     for f in range(len(corners)):
@@ -107,6 +107,10 @@ def _boxes(corners: Any, n_leaves: int) -> tuple[Any, Any]:
         for k in range(3):
             low[(node - 1) // 2, k] = min(low[(node - 1) // 2, k], low[node, k])
             high[(node - 1) // 2, k] = max(high[(node - 1) // 2, k], high[node, k])
+    for node in range(2 * n_leaves - 1):
+        for k in range(3):
+            if low[node, k] == np.inf:  # a box from inf to -inf would be entered by every ray
+                high[node, k] = np.inf
     return low, high
 
 
@@ -293,17 +297,19 @@ def _closest_all(corners: Any, low: Any, high: Any, points: Any) -> tuple[Any, A
 
 
 @njit(cache=True)
-def _entry(origin: Any, inverse: Any, low: Any, high: Any, node: int) -> tuple[float, float]:
-    """Parameters at which a line enters and leaves a node's box; it misses the box where it leaves before it enters."""
-    if low[node, 0] > high[node, 0]:  # leaves that pad the tree are empty
-        return np.inf, -np.inf
+def _entry(origin: Any, inverse: Any, low: Any, high: Any, node: int) -> float:
+    """Distance at which a ray enters a node's box, 0 from inside, inf where it misses."""
     near, far = 0.0, np.inf
     for k in range(3):
         t0 = (low[node, k] - origin[k]) * inverse[k]
         t1 = (high[node, k] - origin[k]) * inverse[k]
-        near = max(near, min(t0, t1))
-        far = min(far, max(t0, t1))
-    return near * (1.0 - 1e-12) - 1e-12, far * (1.0 + 1e-12) + 1e-12
+        if t0 > t1:
+            t0, t1 = t1, t0
+        if t0 > near:
+            near = t0
+        if t1 < far:
+            far = t1
+    return near if near <= far * (1.0 + 1e-12) + 1e-12 else np.inf
 
 
 @njit(cache=True)
@@ -338,7 +344,8 @@ def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: An
     while size > 0:
         size -= 1
         node = stack[size]
-        if entry[size] > min(best, limit):
+        # A hit right at a box's face must not be lost to rounding: the boxes count as a hair nearer.
+        if entry[size] > min(best, limit) * (1.0 + 1e-12) + 1e-12:
             continue
         if node >= first_leaf:
             start = (node - first_leaf) * LEAF
@@ -347,18 +354,16 @@ def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: An
                 if s < best:
                     best, hit = s, i
             continue
-        near, far = 2 * node + 1, 2 * node + 2
-        enter_near, leave_near = _entry(origin, inverse, low, high, near)
-        enter_far, leave_far = _entry(origin, inverse, low, high, far)
-        if enter_far < enter_near:
-            near, enter_near, leave_near, far, enter_far, leave_far = (
-                far, enter_far, leave_far, near, enter_near, leave_near,
-            )  # fmt: skip
-        if enter_far <= leave_far:
-            stack[size], entry[size] = far, enter_far
+        left, right = 2 * node + 1, 2 * node + 2
+        t_left = _entry(origin, inverse, low, high, left)
+        t_right = _entry(origin, inverse, low, high, right)
+        if t_left < t_right:
+            left, right, t_left, t_right = right, left, t_right, t_left
+        if t_left < np.inf:
+            stack[size], entry[size] = left, t_left
             size += 1
-        if enter_near <= leave_near:
-            stack[size], entry[size] = near, enter_near
+        if t_right < np.inf:
+            stack[size], entry[size] = right, t_right
             size += 1
     return best, hit
 

@@ -231,9 +231,14 @@ def sample(vertices: Floats, faces: Ints, most: int = 30_000, coarsest: float = 
 
 def part_at(vertices: Floats, faces: Ints, point: Floats) -> tuple[Floats, Ints]:
     """Vertices and faces of the connected part whose faces come nearest to `point` (3,)."""
+    return compact(vertices, faces_at(vertices, faces, point))
+
+
+def faces_at(vertices: Floats, faces: Ints, point: Floats) -> Ints:
+    """Faces (k, 3) of the connected part whose faces come nearest to `point` (3,)."""
     nearest = np.argmin(np.linalg.norm(vertices[faces].mean(axis=1) - point, axis=1))
     label = components(faces, len(vertices))
-    return compact(vertices, faces[label == label[nearest]])
+    return faces[label == label[nearest]]
 
 
 def largest_part(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:

@@ -132,6 +132,9 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "Mean sac velocity",
         "Mean magnitude of the velocity over the sac; a reduction by 35 % or more has been associated with occlusion.",
     ),
+    "mean_sac_oscillatory_shear_fraction": Definition(
+        "Sac oscillatory shear index", "Area mean over the sac's wall of (1 - |mean stress| / mean |stress|) / 2."
+    ),
     "mean_sac_wss_Pa": Definition(
         "Wall shear stress on the sac, mean", "Area mean over the sac's wall of the magnitude of the wall shear stress."
     ),

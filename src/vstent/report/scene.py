@@ -220,7 +220,7 @@ def _flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLaye
         pane=name,
         colour=_WALL,
         scale="shear",
-        values=np.linalg.norm(field.wall_shear_stress_Pa, axis=-1)[origin],
+        values=field.shear_Pa[origin],
         surface=wall,
     )
     lines = streamlines(field, _seeds_mm(field, anatomy))

@@ -59,7 +59,7 @@ def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> li
         bulge = _bulge(lumen, height, member)
         found.append(bulge)
         typical = float(np.median(parent[member]))
-        width_mm = max(float(np.quantile(thickness[member], 0.9)), 1e-6)
+        width_mm = max(float(np.median(thickness[member])), 1e-6)
         is_high = bulge.height_mm > max(HEIGHT * typical, HEIGHT_MM)
         if is_high and width_mm > WIDTH * typical and bulge.height_mm < LENGTH * width_mm:
             sacs.append(bulge)

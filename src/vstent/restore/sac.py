@@ -4,27 +4,29 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from vstent.kernels import curves, triangles
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.restore.bulges import FLANK, Bulge, bulge_at
 from vstent.restore.landing import Landing
+from vstent.restore.neck import Artery, Flank, believed_from_mm, skirt
 from vstent.restore.tubes import Tubes, tubes_of
 from vstent.surface import Surface
 from vstent.vessel import Aneurysm, Centerline, Vessel
 
-DEPARTURE: Final = 0.05
-"""The neck is where the wall has left the landing surface by this many parent radii: a tenth of a millimetre."""
-FLANK_LENGTH: Final = 0.8
-"""From the bulge down to the neck the sac's flank is at most this many parent radii long."""
 ON_ARTERY_MM: Final = 0.5
-"""A rim that comes nearer than this to the landing surface is a neck on the parent artery."""
-BRANCH_SHARE: Final = 0.15
-"""A branch's own wall stands out of its tube by less than this many radii."""
+"""A flank whose rim comes nearer than this to the height where it begins stands on the parent artery."""
 FLAT: Final = 0.2
 """Less volume than this fraction of neck area to the power 3/2 is an uneven wall (a half sphere has 0.38)."""
+ROUND: Final = 0.6
+"""A shape with more than 1 / 0.6 times the surface of the sphere of its volume is a scan's debris: sacs, lobed ones
+too, have 0.7 to 0.85."""
 N_RINGS: Final = 12
 """Rings of the neck's triangles."""
+N_SKIRT: Final = 4
+"""Strips of triangles between the flank and the neck."""
 
 
 def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], bulge: Bulge) -> Aneurysm | None:
@@ -33,32 +35,61 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     Side branches that leave from the sac or beside it are cut off along their own tubes.
     """
     lumen = vessel.lumen
-    level = _height_mm(lumen.vertices_mm, landing, _branch_tubes(side_lines, landing, bulge))
-    parent = landing.section_radius_mm[landing.nearest_sections(lumen.vertices_mm)]
-    core = bulge_at(lumen, level, level > FLANK * parent, bulge.dome_mm)
+    artery = Artery(landing, _branch_tubes(side_lines, landing, bulge))
+    height_mm = artery.height_mm(lumen.vertices_mm, lumen.vertex_normals)
+    parent_mm = landing.section_radius_mm[landing.nearest_sections(lumen.vertices_mm)]
+    core = bulge_at(lumen, height_mm, height_mm > FLANK * parent_mm, bulge.dome_mm)
     if core is None:
         return None
-    level = np.minimum(level - DEPARTURE * parent, FLANK_LENGTH * parent - core.distances_mm(lumen.vertices_mm))
-    vertices, faces, _ = triangles.clip(lumen.vertices_mm, lumen.faces, -level)
-    vertices, faces = triangles.part_at(vertices, faces, bulge.dome_mm)
+    most_mm = FLANK * float(np.median(landing.section_radius_mm[landing.nearest_sections(core.foot_mm)]))
+    low_mm = believed_from_mm(lumen, core.foot_mm, most_mm)
+    flank, other_loops = _flank(lumen, height_mm, low_mm, core.dome_mm, landing)
+    if flank is None:
+        return None
+    rings = skirt(flank, artery, vessel.closed, n_rings=N_SKIRT)
+    neck = _neck(landing, rings[-1])
+    sac = _closed_sac(flank, other_loops, rings, neck)
+    if sac.volume_mm3 < FLAT * neck.area_mm2**1.5 or _roundness(sac) < ROUND:
+        return None
+    abscissa = curves.project(landing.points_mm, rings[-1])[0]
+    return Aneurysm(sac, neck, rings[-1], float(abscissa.min()), float(abscissa.max()))
+
+
+def _is_island(lumen: Surface, is_low: Bools) -> Bools:
+    """Tell the vertices (n,) of low wall from which no low wall leads to an opening.
+
+    There the sac itself touches an artery that it does not hang on.
+    """
+    edges = triangles.directed_edges(lumen.faces)
+    edges = edges[is_low[edges].all(axis=1)]
+    graph = coo_matrix((np.ones(len(edges), dtype=bool), tuple(edges.T)), shape=(len(is_low), len(is_low)))
+    label = connected_components(graph, directed=False)[1]
+    ends = np.unique(triangles.open_edges(lumen.faces))
+    return is_low & ~np.isin(label, label[ends[is_low[ends]]])
+
+
+def _roundness(sac: Surface) -> float:
+    """Surface of the sphere of the same volume over the sac's own (Wadell 1935, J. Geol. 43:250)."""
+    return float(np.cbrt(36 * np.pi * max(sac.volume_mm3, 0.0) ** 2)) / sac.area_mm2
+
+
+def _flank(
+    lumen: Surface, height_mm: Floats, low_mm: float, dome_mm: Floats, landing: Landing
+) -> tuple[Flank | None, list[Ints]]:
+    """The sac's wall above a height, and its edges apart from the rim; None where it does not stand on the artery."""
+    is_touching = _is_island(lumen, height_mm < low_mm)
+    height_mm = np.where(is_touching, 1.001 * low_mm, height_mm)
+    vertices, faces, below = triangles.clip(lumen.vertices_mm, lumen.faces, low_mm - height_mm)
+    faces = triangles.faces_at(vertices, faces, dome_mm)
+    used = np.unique(faces)
+    vertices, faces = triangles.compact(vertices, faces)
     loops = triangles.boundary_loops(vertices, faces)
-    rims = [loop for loop in loops if landing.surface.closest(vertices[loop])[1].min() < ON_ARTERY_MM]
-    if not rims:
-        return None
-    rim = rims[0]
-    neck = _neck(landing, vertices[rim])
-    sac = _closed_sac(vertices, faces, [loop for loop in loops if loop is not rim], rim, neck)
-    if sac.volume_mm3 < FLAT * neck.area_mm2**1.5:
-        return None
-    abscissa = curves.project(landing.points_mm, vertices[rim])[0]
-    return Aneurysm(sac, neck, vertices[rim], float(abscissa.min()), float(abscissa.max()))
-
-
-def _height_mm(points_mm: Floats, landing: Landing, branches: Tubes) -> Floats:
-    """How far points (n, 3) of the wall stand out of the landing surface and of the side branches' own walls."""
-    height, sphere = branches.height_mm(points_mm)
-    radius = branches.radius_mm[sphere] if len(branches.radius_mm) else np.ones(len(points_mm))
-    return np.minimum(landing.solid.signed_distance(points_mm), height - BRANCH_SHARE * radius)
+    near = [landing.surface.closest(vertices[loop])[1].min() < low_mm + ON_ARTERY_MM for loop in loops]
+    if not any(near):
+        return None, []
+    # The longest edge at the artery is the rim; others are the mouths of branches that leave from the sac.
+    rim = near.index(True)
+    return Flank(vertices, faces, low_mm - below[used], loops[rim]), [*loops[:rim], *loops[rim + 1 :]]
 
 
 def _branch_tubes(lines: Sequence[Centerline], landing: Landing, bulge: Bulge) -> Tubes:
@@ -97,10 +128,20 @@ def _neck(landing: Landing, rim_mm: Floats) -> Surface:
     return Surface(vertices, np.concatenate(faces))
 
 
-def _closed_sac(vertices: Floats, faces: Ints, other_loops: list[Ints], rim: Ints, neck: Surface) -> Surface:
-    """The sac's wall, its branches' mouths and its neck as one closed surface."""
-    points, wall = triangles.cap(vertices, faces, other_loops)
-    # The neck's first ring is the rim: those vertices are shared, the others appended.
-    number = np.concatenate([rim, len(points) + np.arange(len(neck.vertices_mm) - len(rim))])
-    closed = np.concatenate([wall, number[neck.faces[:, ::-1]]])
-    return Surface(np.concatenate([points, neck.vertices_mm[len(rim) :]]), closed)
+def _closed_sac(flank: Flank, other_loops: list[Ints], rings: Floats, neck: Surface) -> Surface:
+    """The sac's wall, its branches' mouths, its continuation to the artery and its neck as one closed surface."""
+    points, wall = triangles.cap(flank.vertices_mm, flank.faces, other_loops)
+    n_below, k = len(rings) - 1, len(flank.rim)
+    # The skirt's first ring is the rim, the neck's first ring is the skirt's last: those vertices are shared.
+    number = np.concatenate([flank.rim, len(points) + np.arange(n_below * k)]).reshape(-1, k)
+    strips = [_strip(number[i], number[i + 1]) for i in range(n_below)]
+    first = len(points) + n_below * k
+    on_neck = np.concatenate([number[-1], first + np.arange(len(neck.vertices_mm) - k)])
+    vertices = np.concatenate([points, rings[1:].reshape(-1, 3), neck.vertices_mm[k:]])
+    return Surface(vertices, np.concatenate([wall, *strips, on_neck[neck.faces[:, ::-1]]]))
+
+
+def _strip(upper: Ints, lower: Ints) -> Ints:
+    """Triangles between two rings of vertices (k,), seen from outside; the rings run with the wall above them."""
+    ahead_up, ahead_low = np.roll(upper, -1), np.roll(lower, -1)
+    return np.concatenate([np.stack([ahead_up, upper, lower], 1), np.stack([ahead_up, lower, ahead_low], 1)])

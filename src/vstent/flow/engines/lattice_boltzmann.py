@@ -1,33 +1,14 @@
-"""The embedded engine: sparse lattice-Boltzmann, D3Q19, single precision, regularised, interpolated walls."""
+"""The embedded engine for steady flow: sparse lattice-Boltzmann, D3Q19, single precision, interpolated walls."""
 
-from dataclasses import dataclass, field
-from time import perf_counter
+from dataclasses import dataclass
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from vstent.flow import domain as domains
-from vstent.flow import sampling
 from vstent.flow.engines import AbstractEngine, Outcome
-from vstent.flow.engines.lattice_setup import (
-    ODD_RATE,
-    Addressing,
-    Links,
-    Refill,
-    Scales,
-    ScreenEntries,
-    address,
-    build_links,
-    build_refill,
-    build_screen,
-    relaxation_rates,
-    sponge,
-)
+from vstent.flow.engines.lattice_setup import Scales
+from vstent.flow.engines.lattice_state import State, build, check, field_of, peak_speed_m_s, read
 from vstent.flow.types import FlowCase, FlowField
-from vstent.flow.wall_stress import wall_stress
-from vstent.kernels import lattice, lattice_sampling, voxels
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
 CHECK_DIAMETERS = 0.5
@@ -36,56 +17,8 @@ LEAST_CHECKS = 24
 """The limit of time steps leaves room for at least this many checks: fewer cannot tell whether the flow has settled."""
 CHECKS_AGREEING = 3
 """Checks that must agree: a quantity that swings passes its end by chance."""
-DEFER_PAIRS = 8
-"""Step pairs between updates of what is deferred."""
-DEFER_PART = 0.15
-"""Part of the way that each update goes."""
-
-
-@dataclass(frozen=True, eq=False)
-class Probe:
-    """Where the monitored quantities are read."""
-
-    cells: Ints
-    """Cells of the sac, or of the whole lumen where there is no sac."""
-    neck_points: Floats
-    """(p, 3) points on the neck, grid units."""
-    neck_area_mm2: Floats
-    """(p, 3) area vectors there."""
-
-
-@dataclass(eq=False)
-class State:
-    """A run under way; the populations change in place."""
-
-    case: FlowCase
-    """What is computed."""
-    domain: domains.Domain
-    """The grid."""
-    addressing: Addressing
-    """The storage."""
-    scales: Scales
-    """Lattice units."""
-    links: Links
-    """What walls and openings send back."""
-    screen: ScreenEntries
-    """Resistance of the stent by segment."""
-    probe: Probe
-    """Monitored quantities."""
-    refill: Refill
-    """What the walls lose."""
-    rate: NDArray[np.float32]
-    """(s,) relaxation rate of the stress in every segment."""
-    populations: NDArray[np.float32]
-    """(19 * stride + LANES,) shifted populations."""
-    steps_per_check: int
-    """Time steps between checks, even."""
-    steps: int = 0
-    """Time steps made."""
-    history: list[Floats] = field(default_factory=list)
-    """Monitored quantities at every check."""
-    loop_seconds: float = 0.0
-    """Time spent in the time steps."""
+CHECKS_AVERAGED = 8
+"""Checks whose mean is the result where the flow does not settle."""
 
 
 @dataclass(frozen=True)
@@ -96,35 +29,14 @@ class LatticeBoltzmann(AbstractEngine[State]):
     """Edge of a cell."""
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
-        """Build grid, storage and coefficients; begin at rest or from a field on any grid."""
-        domain = domains.build(case.vessel, self.cell_size_mm)
-        level = sponge(case, domain)
-        addressing = address(domain, level)
-        scales = _scales(case, self.cell_size_mm, start)
-        populations = np.zeros(19 * addressing.stride + lattice.LANES, dtype=np.float32)
-        state = State(
-            case,
-            domain,
-            addressing,
-            scales,
-            build_links(case, domain, addressing, scales),
-            build_screen(case, domain, addressing, scales),
-            _probe(case, domain),
-            build_refill(domain, addressing),
-            relaxation_rates(addressing, level, scales),
-            populations,
-            _steps_per_check(case, scales),
-        )
-        if start is not None:
-            _begin_from(state, start)
-        return state
+        """Choose the time step so that the fastest blood moves `lattice_speed` cells a step."""
+        cell_m = self.cell_size_mm * M_PER_MM
+        scales = Scales(cell_m, case.settings.lattice_speed * cell_m / peak_speed_m_s(case, start), case.blood)
+        return build(case, scales, _steps_per_check(case, scales), start=start, kept=CHECKS_AVERAGED)
 
     def step(self, state: State) -> State:
-        """Make the time steps to the next check and read the monitored quantities."""
-        began = perf_counter()
-        _advance(state)
-        state.loop_seconds += perf_counter() - began
-        state.history.append(_monitor(state))
+        """Advance to the next check."""
+        check(state)
         return state
 
     def terminate(self, state: State) -> float:
@@ -137,19 +49,9 @@ class LatticeBoltzmann(AbstractEngine[State]):
         return max(4, state.case.settings.max_steps // state.steps_per_check)
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
-        """Return to SI units and find the wall stress."""
-        return _field(state, outcome)
-
-
-def _scales(case: FlowCase, cell_size_mm: float, start: FlowField | None) -> Scales:
-    """Choose the time step so that the fastest blood moves `lattice_speed` cells a step."""
-    if start is not None:
-        peak_m_s = 1.1 * float(start.speed_m_s.max())
-    else:
-        narrowest_mm2 = min(case.vessel.inlet.area_mm2, sum(outlet.area_mm2 for outlet in case.vessel.outlets))
-        peak_m_s = 3.0 * case.inflow_mL_s / narrowest_mm2
-    cell_m = cell_size_mm * M_PER_MM
-    return Scales(cell_m, case.settings.lattice_speed * cell_m / peak_m_s, case.blood)
+        """Return the last check, or the mean of the last ones where the flow has not settled."""
+        kept = [state.snapshots[-1]] if outcome.is_converged else list(state.snapshots)
+        return field_of(state, read(state, kept), outcome, _advice(state, outcome))
 
 
 def _steps_per_check(case: FlowCase, scales: Scales) -> int:
@@ -157,82 +59,6 @@ def _steps_per_check(case: FlowCase, scales: Scales) -> int:
     speed_m_s = case.inflow_mL_s / inlet.area_mm2
     steps = CHECK_DIAMETERS * inlet.diameter_mm * M_PER_MM / speed_m_s / scales.step_s
     return 2 * max(1, round(0.5 * min(steps, case.settings.max_steps / LEAST_CHECKS)))
-
-
-def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
-    if case.sac is None or case.neck is None:
-        return Probe(np.arange(len(domain.cells), dtype=np.int32), np.zeros((0, 3)), np.zeros((0, 3)))
-    cells = domains.cells_inside(case.sac, domain.centers_mm, domain.cell_size_mm)
-    points_mm, area_mm2 = sampling.surface_samples(case.neck, domain.cell_size_mm)
-    return Probe(cells, (points_mm - domain.origin_mm) / domain.cell_size_mm, area_mm2)
-
-
-def _begin_from(state: State, start: FlowField) -> None:
-    velocity, pressure = sampling.values_at(start, state.domain.centers_mm)
-    lattice.set_equilibrium(
-        state.populations,
-        state.addressing.stride,
-        state.addressing.place,
-        pressure / state.scales.pressure_Pa,
-        velocity / state.scales.speed_m_s,
-    )
-    inlet = state.links
-    inlet.openings[0, 2] = lattice.moments(
-        state.populations, state.addressing.stride, inlet.place[inlet.start[0] : inlet.start[1]]
-    )[:, 0].mean()
-
-
-def _advance(state: State) -> None:
-    """Make the time steps to the next check, in pairs."""
-    f, links, refill = state.populations, state.links, state.refill
-    a, screen = state.addressing, state.screen
-    threads = numba.get_num_threads()
-    opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
-    for pair in range(state.steps_per_check // 2):
-        lattice.drive(
-            f, a.stride, links.openings, links.start, links.place, links.direction, links.shape, opening_source
-        )
-        for address_of, is_even in ((a.even_address, True), (a.odd_address, False)):
-            lattice.update(
-                f,
-                address_of,
-                a.length,
-                state.rate,
-                np.float32(ODD_RATE),
-                screen.start,
-                screen.place,
-                screen.entry,
-                threads,
-            )
-            lattice.reflect(f, links.address, links.weight, links.source, refill.place, refill.refill, is_even)
-            lattice.swap(f, *a.swap_address)
-        if pair % DEFER_PAIRS == 0:
-            part = np.float32(DEFER_PART)
-            lattice.defer(f, links.address[wall], links.correction[wall], links.source[wall], part)
-            lattice.balance(f, links.address[wall], refill.link_group, refill.count, refill.member, refill.refill, part)
-    state.steps += state.steps_per_check
-
-
-def _macroscopic(state: State) -> tuple[Floats, Floats]:
-    """Velocity (n, 3) in cells per step and density deviation (n,) of every cell."""
-    moment = lattice.moments(state.populations, state.addressing.stride, state.addressing.place)
-    velocity = np.ascontiguousarray(moment[:, 1:])
-    if len(state.screen.cell):
-        velocity[state.screen.cell] = lattice.resisted(velocity[state.screen.cell], state.screen.entry)
-    return velocity, moment[:, 0]
-
-
-def _monitor(state: State) -> Floats:
-    """Mean speed of the sac, neck inflow, pressure and mean speed of the vessel: what convergence is judged by."""
-    velocity, density = _macroscopic(state)
-    speed = np.linalg.norm(velocity, axis=1)
-    inlet = state.domain.link_cell[state.domain.link_patch == 1]
-    values = [speed[state.probe.cells].mean(), density[inlet].mean(), speed.mean()]
-    if len(state.probe.neck_points):
-        index = voxels.index_of(state.domain.cells)
-        through = lattice_sampling.interpolate(index, velocity, state.probe.neck_points, True)
-        values.append(float(np.maximum(np.einsum("ij,ij->i", through, state.probe.neck_area_mm2), 0.0).sum()))
-    return np.array(values)
 
 
 def fraction_left(history: Floats) -> float:
@@ -253,61 +79,13 @@ def fraction_left(history: Floats) -> float:
     return float((change / scale * shrinking / (1 - shrinking)).max())
 
 
-def _field(state: State, outcome: Outcome) -> FlowField:
-    velocity, density = _macroscopic(state)
-    scales, domain, vessel = state.scales, state.domain, state.case.vessel
-    velocity_m_s, pressure_Pa = velocity * scales.speed_m_s, density * scales.pressure_Pa
-    stress_Pa, wall_pressure_Pa = wall_stress(
-        index=voxels.index_of(domain.cells),
-        origin_mm=domain.origin_mm,
-        cell_size_mm=domain.cell_size_mm,
-        velocity_m_s=velocity_m_s,
-        pressure_Pa=pressure_Pa,
-        lumen=vessel.lumen,
-        closed=domain.surface,
-        blood=state.case.blood,
+def _advice(state: State, outcome: Outcome) -> str:
+    if outcome.is_converged:
+        return "The flow has settled."
+    last = np.array(state.history[-CHECKS_AVERAGED:])
+    swing = float((np.ptp(last, axis=0) / np.maximum(np.abs(last.mean(axis=0)), 1e-12)).max())
+    span_ms = 1e3 * len(last) * state.steps_per_check * state.scales.step_s
+    return (
+        f"The flow has not settled in {state.steps} time steps and may be unsteady by nature: these are means over its "
+        f"last {span_ms:.0f} ms, in which what is monitored ranged over up to {100 * swing:.0f} % of its mean."
     )
-    links = state.links
-    out_mL_s = np.array(
-        [
-            lattice.outflow(state.populations, links.address[links.start[k] : links.start[k + 1]]) * scales.flow_mL_s
-            for k in range(len(vessel.openings))
-        ]
-    )
-    section_Pa = np.array([_section_pressure_Pa(state, pressure_Pa, k) for k in range(len(vessel.openings))])
-    advice = (
-        "The flow has settled."
-        if outcome.is_converged
-        else f"The flow still changes by about {100 * outcome.residual[-1]:.1f} %: allow more steps, "
-        "or compute it as pulsatile, for it may be unsteady."
-    )
-    return FlowField(
-        cells=domain.cells,
-        origin_mm=domain.origin_mm,
-        cell_size_mm=domain.cell_size_mm,
-        velocity_m_s=velocity_m_s,
-        pressure_Pa=pressure_Pa,
-        wall=vessel.lumen,
-        wall_shear_stress_Pa=stress_Pa,
-        wall_pressure_Pa=wall_pressure_Pa,
-        inlet_mL_s=-out_mL_s[0],
-        outlets_mL_s=out_mL_s[1:],
-        inlet_pressure_Pa=section_Pa[0],
-        outlet_pressure_Pa=section_Pa[1:],
-        blood=state.case.blood,
-        is_converged=outcome.is_converged,
-        advice=advice,
-        residual=np.array(outcome.residual),
-        steps=state.steps,
-        seconds=outcome.seconds,
-        updates_per_s=len(domain.cells) * state.steps / state.loop_seconds,
-    )
-
-
-def _section_pressure_Pa(state: State, pressure_Pa: Floats, k: int) -> float:
-    """Mean pressure of the cells on the plane of opening k itself, not of its extension's end."""
-    opening = state.case.vessel.openings[k]
-    offset = state.domain.centers_mm - opening.center_mm
-    along = offset @ opening.normal
-    near = (np.abs(along) < state.domain.cell_size_mm) & (np.linalg.norm(offset, axis=1) < 0.75 * opening.diameter_mm)
-    return float(pressure_Pa[near].mean()) if near.any() else float("nan")

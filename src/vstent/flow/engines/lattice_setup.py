@@ -10,15 +10,14 @@ from vstent.flow.profile import developed_profile
 from vstent.flow.screen import on_grid
 from vstent.flow.types import Blood, FlowCase
 from vstent.kernels import lattice, voxels
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import M3_PER_ML
 
 ODD_RATE = 0.7
 """Relaxation rate of the odd part: lower is more isotropic, higher is more stable and leaks less."""
-SPONGE_VISCOSITY = 0.04
-"""Viscosity at the end of the extensions, in lattice units: fast blood through few cells is unstable at an end."""
-SPONGE_LEVELS = 4
-"""Steps in which the viscosity rises along an extension."""
+CELL_REYNOLDS_AT_END = 25.0
+"""Largest speed x cell / viscosity in the openings' extensions, whose ends are where fast blood becomes unstable first
+(30 to 50 were seen to fail): faster blood is made thicker there. In the vessel there is no limit."""
 REFILL_BLOCK = 4
 """Edge, in cells, of the blocks within which the walls' losses are made up."""
 SOUND_MEMORY = 0.002
@@ -82,6 +81,11 @@ class Scales:
         """Kinematic viscosity, in squared cells per time step."""
         return self.blood.kinematic_viscosity_m2_s * self.step_s / self.cell_m**2
 
+    @property
+    def relaxation_steps(self) -> float:
+        """Relaxation time of the stress, in time steps."""
+        return 3 * self.viscosity + 0.5
+
 
 @dataclass(frozen=True, eq=False)
 class Links:
@@ -96,7 +100,7 @@ class Links:
     source: NDArray[np.float32]
     """(l,)."""
     openings: Floats
-    """(k, 7) see `lattice.drive`."""
+    """(k, 9) see `lattice.drive`."""
     start: Ints
     """(k + 1,) first link of every opening, and of the wall."""
     place: Ints
@@ -137,31 +141,20 @@ class ScreenEntries:
     """(e,) cell."""
 
 
-def sponge(case: FlowCase, domain: Domain) -> Ints:
-    """Level (n,) of every cell: 0 in the vessel, rising to `SPONGE_LEVELS` at the end of an opening's extension."""
-    level = np.zeros(len(domain.cells), dtype=np.int32)
-    if not case.settings.has_thick_ends:
-        return level
+def in_extensions(case: FlowCase, domain: Domain) -> Bools:
+    """Whether every cell (n,) lies in the extension of an opening."""
+    result = np.zeros(len(domain.cells), dtype=bool)
     for opening, section in zip(case.vessel.openings, domain.sections, strict=True):
         offset = domain.centers_mm - opening.center_mm
         ahead_mm = offset @ opening.normal
-        length_mm = float(((section - opening.center_mm) @ opening.normal).mean())
+        length_mm = float(((section - opening.center_mm) @ opening.normal).max())
         beside_mm = np.linalg.norm(offset - ahead_mm[:, None] * opening.normal, axis=1)
-        own = (ahead_mm > 0) & (ahead_mm < 1.5 * length_mm) & (beside_mm < opening.diameter_mm)
-        rise = np.ceil(SPONGE_LEVELS * np.clip(ahead_mm[own] / length_mm, 0.0, 1.0))
-        level[own] = np.maximum(level[own], rise.astype(np.int32))
-    return level
+        result |= (ahead_mm > 0) & (ahead_mm < length_mm) & (beside_mm < opening.diameter_mm)
+    return result
 
 
-def relaxation_rates(addressing: Addressing, level: Ints, scales: Scales) -> NDArray[np.float32]:
-    """Rate (s,) of the stress in every segment: the blood's own, slower where the sponge makes it thicker."""
-    share = level[addressing.first_cell] / SPONGE_LEVELS
-    viscosity = scales.viscosity + share * max(0.0, SPONGE_VISCOSITY - scales.viscosity)
-    return (1 / (3 * viscosity + 0.5)).astype(np.float32)
-
-
-def address(domain: Domain, level: Ints) -> Addressing:
-    """Lay out the populations of a domain; no segment spans two levels (n,) of the sponge."""
+def address(domain: Domain, is_end: Bools) -> Addressing:
+    """Lay out the populations of a domain; no segment spans cells where `is_end` (n,) differs."""
     cells = domain.cells
     inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
     inside[tuple(cells.T)] = True
@@ -170,7 +163,7 @@ def address(domain: Domain, level: Ints) -> Addressing:
     stride = int(stored.sum())
     number[stored] = np.arange(stride, dtype=np.int32)
     place = number[tuple(cells.T)]
-    is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(level) != 0)
+    is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(is_end) != 0)
     first: Ints = np.flatnonzero(np.r_[True, is_new])
     length = np.diff(np.r_[first, len(cells)])
     first, length = _cut(first, length)
@@ -243,16 +236,11 @@ def build_links(case: FlowCase, domain: Domain, addressing: Addressing, scales: 
     correction[:, :3] -= weight
     correction[~addressing.link_has_two[order]] = 0.0
     shape = np.zeros(start[-1])
-    openings = np.zeros((len(domain.sections), 7))
-    for k, flow_mL_s in enumerate(_imposed_flows_mL_s(case)):
-        links = slice(start[k], start[k + 1])
-        openings[k, 4:] = case.vessel.openings[k].normal
-        weight[links], correction[links] = (-1.0, 0.0, 0.0), 0.0
-        if flow_mL_s is not None:
-            weight[links] = (1.0, 0.0, 0.0)
-            area_mm2 = case.vessel.openings[k].area_mm2
-            openings[k, :4] = 1.0, flow_mL_s / area_mm2 / scales.speed_m_s, 0.0, SOUND_MEMORY
-            shape[links] = _unit_inflow(case, domain, k, order[links]) * area_mm2 / domain.cell_size_mm**2
+    openings = np.array([_imposed(case, domain, scales, k) for k in range(len(domain.sections))])
+    is_inlet = slice(start[0], start[1])
+    weight[: start[-1]], correction[: start[-1]] = (-1.0, 0.0, 0.0), 0.0
+    weight[is_inlet] = (1.0, 0.0, 0.0)
+    shape[is_inlet] = _unit_inflow(case, domain, order[is_inlet]) * openings[0, 7]
     opening_links = order[: start[-1]]
     return Links(
         addressing.link_address[order],
@@ -293,24 +281,31 @@ def _quadratic_weights(fraction: Floats) -> Floats:
     return np.where(x[:, None] < 0.5, near, far)
 
 
-def _imposed_flows_mL_s(case: FlowCase) -> list[float | None]:
-    """Inflow through every opening, None where pressure is imposed; the widest outlet takes the rest."""
-    outlets = case.vessel.outlets
-    if case.settings.outlets == "zero_pressure" or len(outlets) < 2:
-        return [case.inflow_mL_s, *[None] * len(outlets)]
-    share = np.array([outlet.diameter_mm**3 for outlet in outlets])
-    widest = int(np.argmax(share))
-    return [case.inflow_mL_s] + [
-        None if k == widest else -case.inflow_mL_s * float(share[k] / share.sum()) for k in range(len(outlets))
-    ]
+def _imposed(case: FlowCase, domain: Domain, scales: Scales, k: int) -> Floats:
+    """Row (9,) of `lattice.drive` for opening k."""
+    opening = case.vessel.openings[k]
+    outflow_mL_s = _outflow_mL_s(case, k)
+    kind = lattice.INFLOW if k == 0 else lattice.PRESSURE if outflow_mL_s is None else lattice.OUTFLOW
+    speed = (case.inflow_mL_s if k == 0 else outflow_mL_s or 0.0) / opening.area_mm2 / scales.speed_m_s
+    # Critically damped: the blood that the pressure moves is a column about as long as the grid.
+    rate = SOUND_MEMORY if k == 0 else 0.25 / float(np.ptp(domain.cells, axis=0).max())
+    return np.array([kind, speed, 0.0, rate, *opening.normal, opening.area_mm2 / domain.cell_size_mm**2, 0.0])
 
 
-def _unit_inflow(case: FlowCase, domain: Domain, k: int, links: Ints) -> Floats:
-    """What each link of opening k sends back so that the whole flow is one cell volume per time step."""
-    normal = case.vessel.openings[k].normal
+def _outflow_mL_s(case: FlowCase, k: int) -> float | None:
+    """Murray's share of the inflow for opening k; None where pressure is imposed: the widest outlet takes the rest."""
+    cubes = np.array([outlet.diameter_mm**3 for outlet in case.vessel.outlets])
+    if case.settings.outlets == "zero_pressure" or k in (0, 1 + int(np.argmax(cubes))):
+        return None
+    return float(case.inflow_mL_s * cubes[k - 1] / cubes.sum())
+
+
+def _unit_inflow(case: FlowCase, domain: Domain, links: Ints) -> Floats:
+    """What each link of the inlet sends back so that the whole flow is one cell volume per time step."""
+    normal = case.vessel.inlet.normal
     c = lattice.VELOCITIES[domain.link_direction[links]]
     halfway_mm = domain.origin_mm + (domain.cells[domain.link_cell[links]] + 0.5 * c) * domain.cell_size_mm
-    speed = developed_profile(domain.sections[k], normal, halfway_mm)
+    speed = developed_profile(domain.sections[0], normal, halfway_mm)
     sent = lattice.WEIGHTS[domain.link_direction[links]] * speed * (c @ normal)
     return sent / sent.sum()
 

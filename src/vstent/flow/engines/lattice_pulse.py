@@ -1,0 +1,87 @@
+"""The embedded engine for pulsatile flow: the same steps, the inflow following a waveform until cycles repeat."""
+
+from dataclasses import dataclass
+from math import ceil
+
+import numpy as np
+
+from vstent.errors import FlowError
+from vstent.flow.engines import AbstractEngine, Outcome
+from vstent.flow.engines.lattice_setup import Scales
+from vstent.flow.engines.lattice_state import State, build, check, field_of, peak_speed_m_s, read
+from vstent.flow.types import FlowCase, FlowField, Phase
+from vstent.kernels.arrays import Floats
+from vstent.units import M_PER_MM
+
+PHASES = 20
+"""Times at which a cycle is kept."""
+INLET_RATE = 1.0
+"""The inlet takes every new pressure for the mean at once: the flow is the waveform's, whatever answers it."""
+
+
+@dataclass(frozen=True)
+class PulsatileLatticeBoltzmann(AbstractEngine[State]):
+    """The sparse D3Q19 engine with a waveform at the inlet."""
+
+    cell_size_mm: float
+    """Edge of a cell."""
+
+    def init(self, case: FlowCase, start: FlowField | None) -> State:
+        """Choose a time step that divides the cycle and keeps the fastest blood below `lattice_speed` cells a step."""
+        waveform = case.settings.waveform
+        if waveform is None:
+            raise FlowError("pulsatile flow needs a waveform: set one, or compute the steady flow")
+        cell_m = self.cell_size_mm * M_PER_MM
+        peak_m_s = peak_speed_m_s(case, start) * waveform.peak_factor
+        phase_s = waveform.period_s / PHASES
+        steps = 2 * ceil(0.5 * phase_s * peak_m_s / (case.settings.lattice_speed * cell_m))
+        state = build(case, Scales(cell_m, phase_s / steps, case.blood), steps, start=start, kept=PHASES)
+        state.links.openings[0, 3] = INLET_RATE
+        return state
+
+    def step(self, state: State) -> State:
+        """Advance to the next phase."""
+        check(state)
+        return state
+
+    def terminate(self, state: State) -> float:
+        """Relative change of the monitored quantities from the last cycle but one to the last; inf within a cycle."""
+        return cycle_change(np.array(state.history))
+
+    def max_checks(self, state: State) -> int:
+        """Phases of all cycles allowed."""
+        return PHASES * state.case.settings.max_cycles
+
+    def result(self, state: State, outcome: Outcome) -> FlowField:
+        """Return the mean of the last cycle, with its phases."""
+        phases = []
+        for k, snapshot in enumerate(state.snapshots):
+            flow = read(state, [snapshot])
+            time_s = (k + 1) * state.steps_per_check * state.scales.step_s
+            inlet_mL_s = -float(flow.outflow_mL_s[0])
+            phases.append(Phase(time_s, inlet_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa))
+        return field_of(state, read(state, list(state.snapshots)), outcome, _advice(state, outcome), tuple(phases))
+
+
+def cycle_change(history: Floats) -> float:
+    """Largest root-mean-square change of any column of a history (phases, quantities) between its last two cycles.
+
+    Relative to the quantity's root mean square; inf where no cycle ends or no two are complete; nan where the history
+    is not finite.
+    """
+    if not np.isfinite(history[-1]).all():
+        return float("nan")
+    cycles, rest = divmod(len(history), PHASES)
+    if rest or cycles < 2:
+        return float("inf")
+    before, last = history[-2 * PHASES : -PHASES], history[-PHASES:]
+    scale = np.maximum(np.sqrt((last**2).mean(axis=0)), 1e-12)
+    return float((np.sqrt(((last - before) ** 2).mean(axis=0)) / scale).max())
+
+
+def _advice(state: State, outcome: Outcome) -> str:
+    cycles, change = len(state.history) // PHASES, 100 * outcome.residual[-1]
+    said = f"Cycle {cycles} repeats the one before to within {change:.1f} %"
+    if outcome.is_converged:
+        return f"{said}: the flow is periodic."
+    return f"{said}, which is more than was asked for: allow more cycles, or take it as it is."

@@ -1,0 +1,303 @@
+"""The lattice-Boltzmann run itself: built from a case, advanced from check to check, read out in SI units."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.flow import domain as domains
+from vstent.flow import sampling
+from vstent.flow.engines import Outcome
+from vstent.flow.engines.lattice_setup import (
+    CELL_REYNOLDS_AT_END,
+    ODD_RATE,
+    Addressing,
+    Links,
+    Refill,
+    Scales,
+    ScreenEntries,
+    address,
+    build_links,
+    build_refill,
+    build_screen,
+    in_extensions,
+)
+from vstent.flow.types import FlowCase, FlowField, Phase
+from vstent.flow.wall_stress import wall_stress
+from vstent.kernels import lattice, lattice_sampling, voxels
+from vstent.kernels.arrays import Floats, Ints
+from vstent.units import M_PER_MM
+
+DEFER_PAIRS = 8
+"""Step pairs between updates of what is deferred."""
+DEFER_PART = 0.15
+"""Part of the way that each update goes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """Where the monitored quantities are read."""
+
+    cells: Ints
+    """Cells of the sac, or of the whole lumen where there is no sac."""
+    ostium_points: Floats
+    """(p, 3) points on the ostium, grid units."""
+    ostium_area_mm2: Floats
+    """(p, 3) area vectors there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The flow at a check, in lattice units."""
+
+    velocity: NDArray[np.float32]
+    """(n, 3) of every cell."""
+    density: NDArray[np.float32]
+    """(n,) deviation of every cell."""
+    outflow: Floats
+    """(k,) through every opening."""
+
+
+@dataclass(eq=False)
+class State:
+    """A run under way; the populations and the links' sources change in place."""
+
+    case: FlowCase
+    """What is computed."""
+    domain: domains.Domain
+    """The grid."""
+    addressing: Addressing
+    """The storage."""
+    scales: Scales
+    """Lattice units."""
+    links: Links
+    """What walls and openings send back."""
+    screen: ScreenEntries
+    """Resistance of the stent by segment."""
+    probe: Probe
+    """Monitored quantities."""
+    refill: Refill
+    """What the walls lose."""
+    limit: NDArray[np.float32]
+    """(s,) largest cell Reynolds number in every segment."""
+    populations: NDArray[np.float32]
+    """(19 * stride + LANES,) shifted populations."""
+    wanted: Floats
+    """(k,) speed wanted at every opening at mean flow (see `lattice.drive`)."""
+    steps_per_check: int
+    """Time steps between checks, even."""
+    snapshots: deque[Snapshot]
+    """The flow at the last checks."""
+    steps: int = 0
+    """Time steps made."""
+    history: list[Floats] = field(default_factory=list)
+    """Monitored quantities at every check."""
+    loop_seconds: float = 0.0
+    """Time spent in the time steps."""
+
+
+def build(case: FlowCase, scales: Scales, steps_per_check: int, *, start: FlowField | None, kept: int) -> State:
+    """Build grid, storage and coefficients; begin at rest or from a field on any grid; `kept` checks are remembered."""
+    domain = domains.build(case.vessel, scales.cell_m / M_PER_MM)
+    is_end = in_extensions(case, domain)
+    addressing = address(domain, is_end)
+    links = build_links(case, domain, addressing, scales)
+    state = State(
+        case,
+        domain,
+        addressing,
+        scales,
+        links,
+        build_screen(case, domain, addressing, scales),
+        _probe(case, domain),
+        build_refill(domain, addressing),
+        np.where(is_end, CELL_REYNOLDS_AT_END, np.inf)[addressing.first_cell].astype(np.float32),
+        np.zeros(19 * addressing.stride + lattice.LANES, dtype=np.float32),
+        links.openings[:, 1].copy(),
+        steps_per_check,
+        deque(maxlen=kept),
+    )
+    if start is not None:
+        _begin_from(state, start)
+    return state
+
+
+def peak_speed_m_s(case: FlowCase, start: FlowField | None) -> float:
+    """Estimate the fastest blood at mean flow."""
+    if start is not None:
+        return 1.1 * float(start.speed_m_s.max())
+    narrowest_mm2 = min(case.vessel.inlet.area_mm2, sum(outlet.area_mm2 for outlet in case.vessel.outlets))
+    return 3.0 * case.inflow_mL_s / narrowest_mm2
+
+
+def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
+    if case.sac is None or case.ostium is None:
+        return Probe(np.arange(len(domain.cells), dtype=np.int32), np.zeros((0, 3)), np.zeros((0, 3)))
+    cells = domains.cells_inside(case.sac, domain.centers_mm, domain.cell_size_mm)
+    points_mm, area_mm2 = sampling.surface_samples(case.ostium, domain.cell_size_mm)
+    return Probe(cells, (points_mm - domain.origin_mm) / domain.cell_size_mm, area_mm2)
+
+
+def _begin_from(state: State, start: FlowField) -> None:
+    velocity, pressure = sampling.values_at(start, state.domain.centers_mm)
+    lattice.set_equilibrium(
+        state.populations,
+        state.addressing.stride,
+        state.addressing.place,
+        pressure / state.scales.pressure_Pa,
+        velocity / state.scales.speed_m_s,
+    )
+    inlet = state.links
+    inlet.openings[0, 2] = lattice.moments(
+        state.populations, state.addressing.stride, inlet.place[inlet.start[0] : inlet.start[1]]
+    )[:, 0].mean()
+
+
+def check(state: State) -> None:
+    """Make the time steps to the next check and read the monitored quantities."""
+    began = perf_counter()
+    advance(state)
+    state.loop_seconds += perf_counter() - began
+    state.snapshots.append(_snapshot(state))
+    state.history.append(_monitor(state, state.snapshots[-1]))
+
+
+def advance(state: State) -> None:
+    """Make the time steps to the next check, in pairs."""
+    f, links, refill = state.populations, state.links, state.refill
+    a, screen = state.addressing, state.screen
+    threads = numba.get_num_threads()
+    relaxation = np.float32(state.scales.relaxation_steps), state.limit, np.float32(ODD_RATE)
+    opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
+    middle = state.steps + 1 + np.arange(0, state.steps_per_check, 2)
+    factor = state.case.settings.inflow_factor(np.float64(state.scales.step_s) * middle)
+    for pair in range(len(factor)):
+        links.openings[:, 1] = state.wanted * factor[pair]
+        lattice.drive(
+            f,
+            a.stride,
+            links.openings,
+            links.start,
+            links.address,
+            links.place,
+            links.direction,
+            links.shape,
+            opening_source,
+        )
+        for address_of, is_even in ((a.even_address, True), (a.odd_address, False)):
+            lattice.update(
+                f,
+                address_of,
+                a.length,
+                *relaxation,
+                screen.start,
+                screen.place,
+                screen.entry,
+                threads,
+            )
+            lattice.reflect(f, links.address, links.weight, links.source, refill.place, refill.refill, is_even)
+            lattice.swap(f, *a.swap_address)
+        if pair % DEFER_PAIRS == 0:
+            part = np.float32(DEFER_PART)
+            lattice.defer(f, links.address[wall], links.correction[wall], links.source[wall], part)
+            lattice.balance(f, links.address[wall], refill.link_group, refill.count, refill.member, refill.refill, part)
+    state.steps += state.steps_per_check
+
+
+def _snapshot(state: State) -> Snapshot:
+    moment = lattice.moments(state.populations, state.addressing.stride, state.addressing.place).astype(np.float32)
+    velocity = np.ascontiguousarray(moment[:, 1:])
+    if len(state.screen.cell):
+        velocity[state.screen.cell] = lattice.resisted(velocity[state.screen.cell], state.screen.entry)
+    links = state.links
+    ends = range(len(links.start) - 1)
+    outflow = [lattice.outflow(state.populations, links.address[links.start[k] : links.start[k + 1]]) for k in ends]
+    return Snapshot(velocity, moment[:, 0], np.array(outflow))
+
+
+def _monitor(state: State, now: Snapshot) -> Floats:
+    """Mean speed of the sac, pressure and mean speed of the vessel, neck inflow: what convergence is judged by."""
+    speed = np.linalg.norm(now.velocity, axis=1)
+    inlet = state.domain.link_cell[state.domain.link_patch == 1]
+    values = [speed[state.probe.cells].mean(), now.density[inlet].mean(), speed.mean()]
+    if len(state.probe.ostium_points):
+        index = voxels.index_of(state.domain.cells)
+        through = lattice_sampling.interpolate(index, now.velocity.astype(float), state.probe.ostium_points, True)
+        values.append(float(np.maximum(np.einsum("ij,ij->i", through, state.probe.ostium_area_mm2), 0.0).sum()))
+    return np.array(values, dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A flow in SI units."""
+
+    velocity_m_s: Floats
+    """(n, 3)."""
+    pressure_Pa: Floats
+    """(n,)."""
+    wall_shear_stress_Pa: Floats
+    """(v, 3)."""
+    wall_pressure_Pa: Floats
+    """(v,)."""
+    outflow_mL_s: Floats
+    """(k,) through every opening."""
+
+
+def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
+    """Return the mean of some snapshots in SI units, with the stress on the wall."""
+    scales, domain = state.scales, state.domain
+    velocity_m_s = np.mean([one.velocity for one in snapshots], axis=0, dtype=float) * scales.speed_m_s
+    pressure_Pa = np.mean([one.density for one in snapshots], axis=0, dtype=float) * scales.pressure_Pa
+    stress_Pa, wall_pressure_Pa = wall_stress(
+        index=voxels.index_of(domain.cells),
+        origin_mm=domain.origin_mm,
+        cell_size_mm=domain.cell_size_mm,
+        velocity_m_s=velocity_m_s,
+        pressure_Pa=pressure_Pa,
+        lumen=state.case.vessel.lumen,
+        closed=domain.surface,
+        blood=state.case.blood,
+    )
+    outflow_mL_s = np.mean([one.outflow for one in snapshots], axis=0) * scales.flow_mL_s
+    return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, outflow_mL_s)
+
+
+def field_of(state: State, flow: Reading, outcome: Outcome, advice: str, phases: tuple[Phase, ...] = ()) -> FlowField:
+    """Put a flow together with how it was reached."""
+    domain, vessel = state.domain, state.case.vessel
+    section_Pa = np.array([_section_pressure_Pa(state, flow.pressure_Pa, k) for k in range(len(vessel.openings))])
+    return FlowField(
+        cells=domain.cells,
+        origin_mm=domain.origin_mm,
+        cell_size_mm=domain.cell_size_mm,
+        velocity_m_s=flow.velocity_m_s,
+        pressure_Pa=flow.pressure_Pa,
+        wall=vessel.lumen,
+        wall_shear_stress_Pa=flow.wall_shear_stress_Pa,
+        wall_pressure_Pa=flow.wall_pressure_Pa,
+        inlet_mL_s=-flow.outflow_mL_s[0],
+        outlets_mL_s=flow.outflow_mL_s[1:],
+        inlet_pressure_Pa=section_Pa[0],
+        outlet_pressure_Pa=section_Pa[1:],
+        blood=state.case.blood,
+        is_converged=outcome.is_converged,
+        advice=advice,
+        residual=np.array(outcome.residual),
+        steps=state.steps,
+        seconds=outcome.seconds,
+        updates_per_s=len(domain.cells) * state.steps / state.loop_seconds,
+        phases=phases,
+    )
+
+
+def _section_pressure_Pa(state: State, pressure_Pa: Floats, k: int) -> float:
+    """Mean pressure of the cells on the plane of opening k itself, not of its extension's end."""
+    opening = state.case.vessel.openings[k]
+    offset = state.domain.centers_mm - opening.center_mm
+    along = offset @ opening.normal
+    near = (np.abs(along) < state.domain.cell_size_mm) & (np.linalg.norm(offset, axis=1) < 0.75 * opening.diameter_mm)
+    return float(pressure_Pa[near].mean()) if near.any() else float("nan")

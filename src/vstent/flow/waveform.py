@@ -1,0 +1,90 @@
+"""Waveforms: the published pulse of the internal carotid artery, or one of the patient's own."""
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from vstent.errors import InputError
+from vstent.flow.types import Waveform
+from vstent.kernels.arrays import Floats
+
+OLDER_ADULT_ICA = Waveform(
+    period_s=0.951,
+    cosine=(
+        0.04806,
+        -0.18538,
+        -0.19723,
+        -0.04749,
+        -0.14767,
+        -0.06541,
+        -0.00401,
+        0.00251,
+        0.02782,
+        0.01079,
+        -0.00106,
+        -0.00165,
+        -0.0071,
+        -0.00319,
+        -0.00202,
+        -0.00101,
+        0.00131,
+        0.00064,
+        0.00099,
+        -0.00014,
+    ),
+    sine=(
+        0.57555,
+        0.25049,
+        0.0427,
+        0.03531,
+        0.02599,
+        -0.07995,
+        -0.04022,
+        -0.03336,
+        -0.01215,
+        0.01444,
+        0.00647,
+        0.00751,
+        0.00287,
+        -0.00182,
+        -0.00064,
+        -0.0025,
+        -0.00101,
+        -5e-05,
+        0.0004,
+        0.00123,
+    ),
+)
+"""Internal carotid artery of older adults (Hoi et al. 2010, Physiol. Meas. 31, 291): 20 harmonics."""
+HARMONICS = 20
+"""Harmonics kept of a measured waveform."""
+RESAMPLED = 512
+"""Equal times at which a measured waveform is read from its spline."""
+
+
+def waveform_of(time_s: Floats, flow: Floats) -> Waveform:
+    """Fit a waveform to a measured cycle.
+
+    Parameters
+    ----------
+    time_s, flow : (n,) times, increasing, and flow in any unit; the last sample is the first of the next cycle, and
+        takes its value.
+
+    Raises
+    ------
+    InputError
+        When there are fewer than 5 samples, the times do not increase, or the mean flow is not positive.
+    """
+    time_s, flow = np.asarray(time_s, dtype=np.float64), np.array(flow, dtype=np.float64)
+    if len(time_s) < 5 or len(time_s) != len(flow):
+        raise InputError(f"a waveform of {len(time_s)} samples is no cycle: give 5 or more times, each with its flow")
+    if not (np.isfinite(time_s).all() and np.isfinite(flow).all() and (np.diff(time_s) > 0).all()):
+        raise InputError("the waveform's times do not increase, or a number is missing: mend the file")
+    flow[-1] = flow[0]
+    period_s = float(time_s[-1] - time_s[0])
+    times = time_s[0] + period_s * np.arange(RESAMPLED) / RESAMPLED
+    spectrum = np.fft.rfft(CubicSpline(time_s, flow, bc_type="periodic")(times)) / RESAMPLED
+    mean = float(spectrum[0].real)
+    if mean <= 0:
+        raise InputError(f"the waveform's mean flow is {mean:.3g}: turn its sign, for blood must enter")
+    kept = 2 * spectrum[1 : 1 + HARMONICS] / mean
+    return Waveform(period_s, tuple(map(float, kept.real)), tuple(map(float, -kept.imag)))

@@ -1,0 +1,194 @@
+"""The neck: where the sac's flank, freed of the blur that rounds its edge, meets the parent artery.
+
+A scan's point spread fills the crevice between sac and artery: at its bottom the tissue is thinner than the blur, so
+the wall seen there lies outside of both, the more so the sharper the crevice. From a height of twice the blur's
+standard deviation on, the artery's share in the flank's intensity is below 3 % and the flank is where it is. So the
+flank is followed up from there along lines of steepest ascent, each line is continued downwards with its own slope
+and curvature (a parabola over its length), and the neck is where those parabolas meet the artery.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.kernels import curves
+from vstent.kernels.arrays import Floats, Ints
+from vstent.restore.landing import Landing
+from vstent.restore.tubes import Tubes
+from vstent.surface import Surface
+
+BLUR_MM: Final = 0.5
+"""Lower down the flank is not believed: twice a standard deviation of 0.25 mm, which 3DRA scans are blurred by at
+least, voxel, reconstruction and smoothing of the mesh together."""
+BLUR_EDGES: Final = 2.2
+"""The same in edges of the mesh: an iso-surface has edges of 0.9 voxel, and a scan is blurred by about a voxel."""
+BAND: Final = 3.0
+"""The flank is followed up to this many times the height at which it is believed..."""
+BAND_OF_HEIGHT: Final = 0.6
+"""... and no further than this fraction of the way from there to the dome's top."""
+N_LEVELS: Final = 9
+"""Heights at which the flank is followed."""
+DETAIL: Final = 4.0
+"""The neck follows waves along its rim longer than this many times the height from which it is extrapolated."""
+REACH: Final = 3.0
+"""A flank that has not met the artery within this many times that height lies along it."""
+N_STEPS: Final = 36
+"""Steps in which the continuation of a flank is searched for the artery."""
+OUTSIDE_MM: Final = 0.05
+"""A continuation that leaves the lumen by more than this ends there: blur adds to the lumen in a crevice."""
+BRANCH_SHARE: Final = 0.15
+"""A branch's own wall stands out of its tube by less than this many radii."""
+FACING: Final = 3.0
+"""A wall that looks straight at a branch counts as this many of its radii further away."""
+
+
+class Artery(NamedTuple):
+    """What is not sac: the parent artery and the side branches beyond it."""
+
+    landing: Landing
+    """The parent artery."""
+    branches: Tubes
+    """The side branches, where they have left the parent artery and the sac."""
+
+    def height_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
+        """How far points (n, 3) stand out of the parent's and the branches' walls, negative inside.
+
+        With `normals` (n, 3) the points are the lumen's wall: a wall that looks at a branch belongs to a sac beside it.
+        """
+        height, sphere = self.branches.height_mm(points_mm)
+        if len(self.branches.radius_mm):
+            radius = self.branches.radius_mm[sphere]
+            height = height - BRANCH_SHARE * radius
+            if normals is not None:
+                toward = self.branches.centers_mm[sphere] - points_mm
+                facing = np.einsum("nd,nd->n", toward, normals) / np.maximum(np.linalg.norm(toward, axis=1), 1e-12)
+                height = height + FACING * radius * np.maximum(facing, 0.0)
+        return np.minimum(self.landing.solid.signed_distance(points_mm), height)
+
+    def onto(self, points_mm: Floats) -> Floats:
+        """Move points (n, 3) onto the parent artery; those at a branch stay."""
+        foot_mm, distance_mm, _ = self.landing.surface.closest(points_mm)
+        return np.where((self.branches.height_mm(points_mm)[0] > distance_mm)[:, None], foot_mm, points_mm)
+
+
+class Flank(NamedTuple):
+    """The sac's wall above its rim."""
+
+    vertices_mm: Floats
+    """(n, 3) vertices of the sac's wall."""
+    faces: Ints
+    """(m, 3) its faces."""
+    height_mm: Floats
+    """(n,) how far the vertices stand out of the artery."""
+    rim: Ints
+    """(k,) closed loop of vertices on the artery's side, at the lowest height that is believed."""
+
+    def isoline(self, height_mm: float) -> Floats:
+        """Points (j, 3) close together along the line of one height."""
+        points = self.vertices_mm
+        level = np.where(np.abs(self.height_mm - height_mm) < 1e-12, 1e-12, self.height_mm - height_mm)
+        is_above = level[self.faces] > 0
+        cut = np.flatnonzero((is_above.sum(axis=1) % 3) != 0)
+        is_lone = np.where((is_above[cut].sum(axis=1) == 1)[:, None], is_above[cut], ~is_above[cut])
+        lone = (is_lone.argmax(axis=1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(self.faces[cut], lone, axis=1).T
+        ends = [
+            points[a] + (level[a] / (level[a] - level[other]))[:, None] * (points[other] - points[a])
+            for other in (b, c)
+        ]
+        share = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None, None]
+        return np.asarray((ends[0] + share * (ends[1] - ends[0])).reshape(-1, 3))
+
+
+def believed_from_mm(lumen: Surface, foot_mm: Floats, most_mm: float) -> float:
+    """Height from which on the flank around a bulge's foot (k, 3) is free of blur; no more than `most_mm`."""
+    near = np.asarray(cKDTree(foot_mm).query(lumen.vertices_mm, distance_upper_bound=most_mm)[0]) < most_mm
+    corners = lumen.corners_mm[near[lumen.faces].any(axis=1)]
+    edge_mm = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+    return min(max(BLUR_MM, BLUR_EDGES * edge_mm), most_mm)
+
+
+def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floats:
+    """Continue the flank to the artery: rings (n_rings + 1, k, 3) from the rim's vertices down to the neck.
+
+    Parameters
+    ----------
+    flank : the wall above the rim.
+    artery : what the flank stands on.
+    lumen : the closed lumen, which the continuation does not leave.
+    n_rings : strips of triangles between rim and neck.
+    """
+    rim_mm = flank.vertices_mm[flank.rim]
+    place = curves.arc_length(np.concatenate([rim_mm, rim_mm[:1]]))
+    low_mm = float(np.median(flank.height_mm[flank.rim]))
+    n = max(32, round(8 * place[-1] / low_mm))
+    even = curves.interpolate(place, np.concatenate([rim_mm, rim_mm[:1]]), place[-1] * np.arange(n) / n)
+    n_waves = place[-1] / (DETAIL * low_mm)
+    bend = _convex(_lowpass(_parabolas(_rise(flank, even, low_mm)), n_waves))
+    length = _lowpass(_length_to_neck(bend, REACH * low_mm, artery, lumen), n_waves)
+    where = place[:-1] * n / place[-1]
+    bend, length = _between(bend.reshape(n, -1), where).reshape(-1, 3, 3), _between(length[:, None], where)
+    share = np.linspace(0.0, 1.0, n_rings + 1)[:, None, None]
+    down = -share * length
+    # The rings begin at the rim itself and forget its distance from the parabola on the way.
+    rings = bend[:, 0] + down * bend[:, 1] + down**2 * bend[:, 2] + (1 - share) * (rim_mm - bend[:, 0])
+    return np.asarray(rings + share * (artery.onto(rings[-1]) - rings[-1]))
+
+
+def _rise(flank: Flank, starts_mm: Floats, low_mm: float) -> Floats:
+    """Points (levels, n, 3) up the flank from its rim: each the nearest one on the next line of equal height."""
+    high_mm = min(BAND * low_mm, low_mm + BAND_OF_HEIGHT * (float(flank.height_mm.max()) - low_mm))
+    points = [starts_mm]
+    for height_mm in np.linspace(low_mm, high_mm, N_LEVELS)[1:]:
+        line_mm = flank.isoline(float(height_mm))
+        points.append(line_mm[cKDTree(line_mm).query(points[-1])[1]])
+    return np.stack(points)
+
+
+def _parabolas(points_mm: Floats) -> Floats:
+    """Coefficients (n, 3, 3) of 1, t, t^2 of lines of points (levels, n, 3), t their length, by least squares."""
+    steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=2)
+    length = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)]).T
+    return np.asarray(np.linalg.pinv(length[..., None] ** np.arange(3)) @ points_mm.transpose(1, 0, 2))
+
+
+def _lowpass(values: Floats, n_waves: float) -> Floats:
+    """Values (n, ...) around a ring, without waves of which more than `n_waves` fit into it."""
+    wave = np.arange(len(values) // 2 + 1)
+    gain = 1.0 / (1.0 + (wave / n_waves) ** 4)
+    return np.fft.irfft(np.fft.rfft(values, axis=0) * gain.reshape(-1, *[1] * (values.ndim - 1)), n=len(values), axis=0)
+
+
+def _convex(bend: Floats) -> Floats:
+    """Parabolas (n, 3, 3) around a ring, straightened where they are hollow: a sac is convex, its flare is not sac."""
+    along = np.roll(bend[:, 0], -1, axis=0) - np.roll(bend[:, 0], 1, axis=0)
+    outward = np.cross(along, bend[:, 1])
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
+    hollow = np.maximum(np.einsum("nd,nd->n", bend[:, 2], outward), 0.0)
+    straight = bend.copy()
+    straight[:, 2] -= hollow[:, None] * outward
+    return straight
+
+
+def _length_to_neck(bend: Floats, reach_mm: float, artery: Artery, lumen: Surface) -> Floats:
+    """Length (n,) of the continuation of parabolas (n, 3, 3) down to where they enter the artery.
+
+    One that misses it ends at its lowest point in the lumen.
+    """
+    t = np.linspace(0.0, reach_mm, N_STEPS + 1)
+    points = np.einsum("td,nde->nte", (-t[:, None]) ** np.arange(3), bend).reshape(-1, 3)
+    height = artery.height_mm(points).reshape(len(bend), -1)
+    has_left = np.logical_or.accumulate(lumen.signed_distance(points).reshape(height.shape) > OUTSIDE_MM, axis=1)
+    height[:, 1:][has_left[:, 1:]] = np.inf
+    has_entered = (height[:, 1:] <= 0).any(axis=1)
+    after = 1 + np.where(has_entered, (height[:, 1:] <= 0).argmax(axis=1), height[:, 1:].argmin(axis=1))
+    rows = np.arange(len(bend))
+    above, below = np.maximum(height[rows, after - 1], 0.0), np.minimum(height[rows, after], 0.0)
+    share = np.where(has_entered, above / np.maximum(above - below, 1e-12), 1.0)
+    return np.asarray(t[after - 1] + share * (t[after] - t[after - 1]))
+
+
+def _between(values: Floats, where: Floats) -> Floats:
+    """Values (k, d) at fractional places (k,) on a ring of values (n, d)."""
+    return curves.interpolate(np.arange(len(values) + 1.0), np.concatenate([values, values[:1]]), where)

@@ -1,0 +1,135 @@
+"""Pulsatile flow against Womersley's, and the waveforms that drive it."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.special import jv
+
+from vstent import phantoms
+from vstent.errors import InputError
+from vstent.flow import FlowCase, FlowField, FlowSettings, sampling, simulate_case
+from vstent.flow.engines.lattice_pulse import PHASES, cycle_change
+from vstent.flow.types import Waveform
+from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
+from vstent.trace import trace
+from vstent.vessel import Vessel
+
+RADIUS_M, MEAN_MEAN_M_S, SWING = 2e-3, 0.03, 0.8
+VISCOSITY_PA_S, DENSITY_KG_M3 = 0.004, 1060.0
+PULSE = Waveform(0.951, (SWING,), (0.0,))
+OMEGA = 2 * np.pi / PULSE.period_s
+BETA = RADIUS_M * np.sqrt(OMEGA * DENSITY_KG_M3 / VISCOSITY_PA_S) * 1j**1.5
+SHAPE = 1 - 2 * jv(1, BETA) / (BETA * jv(0, BETA))
+
+
+def womersley_m_s(r_m: np.ndarray, time_s: float) -> np.ndarray:
+    """Womersley 1955 (J. Physiol. 127, 553) for a given flow: mean parabola and one harmonic."""
+    swinging = (1 - jv(0, BETA * r_m / RADIUS_M) / jv(0, BETA)) / SHAPE * np.exp(1j * OMEGA * time_s)
+    return MEAN_MEAN_M_S * (2 * (1 - (r_m / RADIUS_M) ** 2) + SWING * swinging.real)
+
+
+def womersley_wss_Pa() -> tuple[float, complex]:
+    """Mean and complex amplitude of the wall shear stress."""
+    slope = BETA / RADIUS_M * jv(1, BETA) / jv(0, BETA) / SHAPE
+    return VISCOSITY_PA_S * MEAN_MEAN_M_S * 4 / RADIUS_M, -VISCOSITY_PA_S * MEAN_MEAN_M_S * SWING * slope
+
+
+@cache
+def pulsing() -> FlowField:
+    vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=14.0, radius_mm=2.0))))
+    inflow_mL_s = MEAN_MEAN_M_S * np.pi * RADIUS_M**2 * 1e6
+    settings = FlowSettings(inflow_mL_s=inflow_mL_s, cell_size_mm=0.25, waveform=PULSE, lattice_speed=0.05)
+    return simulate_case(FlowCase(vessel, settings=settings))
+
+
+def along(field: FlowField) -> float:
+    return np.sign(field.velocity_m_s[:, 2].mean())
+
+
+def test_velocity_is_womersleys_at_every_phase() -> None:
+    field = pulsing()
+    assert field.is_converged
+    r_mm = np.linspace(0, 1.8, 10)
+    points = np.stack([r_mm, 0 * r_mm, np.full(10, 7.0)], axis=1)
+    error = []
+    for phase in field.phases:
+        found = along(field) * sampling.values_at(field.at_phase(phase), points)[0][:, 2]
+        error.append(np.abs(found - womersley_m_s(r_mm * 1e-3, phase.time_s)).max())
+    assert max(error) < 0.015 * womersley_m_s(np.zeros(1), 0.0).max()
+
+
+def test_inflow_is_the_waveforms() -> None:
+    field = pulsing()
+    time_s = np.array([phase.time_s for phase in field.phases])
+    found = np.array([phase.inlet_mL_s for phase in field.phases])
+    np.testing.assert_allclose(time_s, PULSE.period_s * np.arange(1, PHASES + 1) / PHASES)
+    np.testing.assert_allclose(found / found.mean(), PULSE.factor(time_s), atol=0.002)
+
+
+def test_wall_shear_stress_has_womersleys_amplitude_and_phase() -> None:
+    field = pulsing()
+    z = field.wall.vertices_mm[:, 2]
+    time_s = np.array([phase.time_s for phase in field.phases])
+    stress = along(field) * np.array([p.wall_shear_stress_Pa[(z > 5) & (z < 9), 2].mean() for p in field.phases])
+    mean_Pa, amplitude_Pa = womersley_wss_Pa()
+    found = 2 * (stress * np.exp(-1j * OMEGA * time_s)).mean()
+    assert stress.mean() == pytest.approx(mean_Pa, rel=0.02)
+    assert abs(found) == pytest.approx(abs(amplitude_Pa), rel=0.02)
+    assert np.degrees(np.angle(found / amplitude_Pa)) == pytest.approx(0.0, abs=4.0)
+
+
+def test_time_averaged_stress_and_its_oscillation_are_those_of_the_phases() -> None:
+    field = pulsing()
+    stress = np.array([phase.wall_shear_stress_Pa for phase in field.phases], float)
+    np.testing.assert_allclose(field.shear_Pa, np.linalg.norm(stress, axis=2).mean(axis=0), rtol=1e-5)
+    mean = np.linalg.norm(stress.mean(axis=0), axis=1)
+    np.testing.assert_allclose(field.wall_shear_stress_Pa, stress.mean(axis=0), atol=1e-4 * mean.max())
+    expected = 0.5 * (1 - mean / field.shear_Pa)
+    np.testing.assert_allclose(field.oscillatory_shear_index, expected, atol=1e-4)
+    np.testing.assert_allclose(field.relative_residence_time_per_Pa, 1 / mean, rtol=1e-2)
+
+
+def test_a_measured_waveform_is_recovered() -> None:
+    time_s = np.linspace(0.2, 0.2 + OLDER_ADULT_ICA.period_s, 401)
+    found = waveform_of(time_s, 7.0 * OLDER_ADULT_ICA.factor(time_s - 0.2))
+    dense = np.linspace(0, 2 * OLDER_ADULT_ICA.period_s, 333)
+    assert found.period_s == pytest.approx(OLDER_ADULT_ICA.period_s)
+    np.testing.assert_allclose(found.factor(dense), OLDER_ADULT_ICA.factor(dense), atol=2e-4)
+
+
+def test_the_published_waveform_has_its_published_range() -> None:
+    factor = OLDER_ADULT_ICA.factor(np.linspace(0, OLDER_ADULT_ICA.period_s, 2001))
+    assert (factor.min(), factor.max()) == pytest.approx((0.403, 2.189), abs=0.002)
+    assert OLDER_ADULT_ICA.peak_factor == pytest.approx(2.189, abs=0.002)
+
+
+@pytest.mark.parametrize(
+    ("time_s", "flow", "why"),
+    [
+        ([0, 1, 2], [1, 1, 1], "5 or more"),
+        ([0, 1, 2, 2, 4], [1, 2, 3, 2, 1], "do not increase"),
+        ([0, 1, 2, 3, 4], [1, np.nan, 3, 2, 1], "number is missing"),
+        ([0, 1, 2, 3, 4], [-1, -2, -3, -2, -1], "turn its sign"),
+    ],
+)
+def test_a_bad_waveform_is_refused(time_s: list, flow: list, why: str) -> None:
+    with pytest.raises(InputError, match=why):
+        waveform_of(np.array(time_s, float), np.array(flow, float))
+
+
+def test_cycles_are_compared_phase_by_phase() -> None:
+    cycle = 2.0 + np.sin(np.linspace(0, 2 * np.pi, PHASES, endpoint=False))[:, None] * [1.0, 0.5]
+    assert cycle_change(np.concatenate([cycle, cycle])) == 0.0
+    assert cycle_change(np.concatenate([cycle, 1.1 * cycle])) == pytest.approx(0.1 / 1.1)
+    assert cycle_change(np.concatenate([cycle, cycle])[:-1]) == np.inf
+    assert np.isnan(cycle_change(np.concatenate([cycle, np.nan * cycle])))
+
+
+def test_pulsatile_flow_without_swing_is_steady_flow() -> None:
+    case = FlowCase(pulsing().wall and trace(Vessel(pulsing().wall)), settings=FlowSettings(inflow_mL_s=0.4))
+    coarse = replace(case.settings, cell_size_mm=0.4)
+    steady = simulate_case(replace(case, settings=replace(coarse, tolerance=0.001)))
+    pulsed = simulate_case(replace(case, settings=replace(coarse, waveform=Waveform(0.5, (0.0,), (0.0,)))))
+    np.testing.assert_allclose(pulsed.velocity_m_s, steady.velocity_m_s, atol=0.01 * steady.speed_m_s.max())
