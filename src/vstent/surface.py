@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from vstent.errors import VesselError
 from vstent.kernels import medial, tree, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 
@@ -75,9 +76,20 @@ class Surface:
 
     @cached_property
     def medial(self) -> medial.Medial:
-        """Centres and radii of the maximum inscribed spheres, and which are neighbours."""
+        """Centres and radii of the maximum inscribed spheres, and which are neighbours.
+
+        Raises
+        ------
+        VesselError
+            When none fits inside.
+        """
         samples, normals = triangles.sample(self.vertices_mm, self.faces)
-        return medial.spheres(samples, normals, self.closed.tree, self.loop_centers_mm)
+        found = medial.spheres(samples, normals, self.closed.tree, self.loop_centers_mm)
+        if not len(found.points):
+            raise VesselError(
+                "the surface encloses no room for blood: it is flat, or a splinter; give the vessel's wall"
+            )
+        return found
 
     def closest(self, points_mm: Floats) -> tuple[Floats, Floats, Ints]:
         """Return the closest point (n, 3), its distance (n,) in mm and its face (n,) for (n, 3) points."""

@@ -110,6 +110,8 @@ def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Med
     offset = every.points[:, None] - samples[touched]
     behind = np.einsum("tkd,tkd->tk", offset, normals[touched]) < 0
     kept = (every.radius < extent) & np.isfinite(every.points).all(axis=1) & behind.all(axis=1)
+    if not kept.any():
+        return keep(every, kept)
     unsure = kept & (every.radius > 2.0 * np.quantile(every.radius[kept], 0.9))
     if len(ends):
         unsure |= kept & (cKDTree(ends).query(every.points)[0] < 3.0 * every.radius)
@@ -127,6 +129,8 @@ def within(medial: Medial, closed: Tree) -> Medial:
 def _largest(medial: Medial) -> Medial:
     """The connected part of most spheres: sampling leaves a few spheres by themselves."""
     n = len(medial.points)
+    if not n:
+        return medial
     ones = np.ones(len(medial.edges), dtype=bool)
     graph = coo_matrix((ones, (medial.edges[:, 0], medial.edges[:, 1])), shape=(n, n))
     label = connected_components(graph, directed=False)[1]
