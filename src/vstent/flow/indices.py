@@ -67,7 +67,7 @@ def _of_vessel(field: FlowField) -> dict[str, float]:
 def _of_ostium(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, float]:
     points_mm, area_mm2 = sampling.surface_samples(ostium, field.cell_size_mm)
     points = (points_mm - field.origin_mm) / field.cell_size_mm
-    velocity_m_s = lattice_sampling.interpolate(field.index, field.velocity_m_s, points, False)
+    velocity_m_s = lattice_sampling.interpolate(field.index, field.velocity_m_s, points, True)
     through_mL_s = np.einsum("ij,ij->i", velocity_m_s, area_mm2)  # m/s times mm^2 is mL/s
     inflow_mL_s = float(through_mL_s[through_mL_s > 0].sum())
     sizes_mm2 = np.linalg.norm(area_mm2, axis=1)
