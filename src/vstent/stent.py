@@ -86,11 +86,14 @@ class Deployment:
     """(rows, columns) clearance between the device's outer face and the landing surface."""
     history_mm: Floats
     """(iterations + 1, rows, columns, 3) contour before the first and after every iteration."""
+    energy_mm2: Floats
+    """(iterations + 1,) energy of the contour (Zhong et al. 2016, eq. 1) before the first and after every iteration."""
 
     def __post_init__(self) -> None:
         freeze(self, "terminated_fraction", np.float64, (-1,))
         freeze(self, "wall_gap_mm", np.float64, self.stent.nodes_mm.shape[:2])
         freeze(self, "history_mm", np.float64, (-1, *self.stent.nodes_mm.shape))
+        freeze(self, "energy_mm2", np.float64, (len(self.history_mm),))
 
 
 def tube_faces(rows: int, columns: int) -> Ints:

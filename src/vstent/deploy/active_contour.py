@@ -1,28 +1,15 @@
 """The active contour of Zhong et al. 2016: a closed tube of nodes that grows until it meets the wall (eq. 1-7)."""
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, Protocol, final
+from typing import final
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from vstent.deploy.contour import normals
 from vstent.deploy.wall import ON_WALL_MM, AbstractWall, Contact
-from vstent.errors import InputError
 from vstent.kernels.arrays import Bools, Floats
-
-Progress = Callable[[int, float], None]
-"""Called after every iteration with its number and the fraction of nodes terminated."""
-
-
-class Limit(Protocol):
-    """What stops a contour besides the wall, for instance the device's free diameter."""
-
-    def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
-        """Return the contour allowed between two contours (rows, columns, 3), and which nodes (rows, columns) stop."""
 
 
 @final
@@ -86,11 +73,11 @@ class State:
     nodes_mm: Floats
     """(rows, columns, 3) nodes."""
     centers_mm: Floats
-    """(rows, 3) fiducial point inside the lumen for every row, the paper's "center"."""
+    """(rows, columns, 3) fiducial point inside the lumen for every node: its row's center, the paper's "center"."""
     is_terminated: Bools
     """(rows, columns) nodes that no longer move."""
     contact: Contact
-    """The nearest wall of every node, flattened to (rows * columns,)."""
+    """The nearest wall of every node, flattened to (rows * columns,); of a terminated one before it was relocated."""
     stiffness: Stiffness
     """I + tau K, factored."""
 
@@ -107,7 +94,8 @@ class ActiveContour:
 
     The elastic weights act on differences between neighbouring nodes, without units; forces are displacements in mm
     per unit of tau. The weights are small against k1: elasticity smooths what the balloon inflates and does not hold
-    it back. See `relax` for the loop.
+    it back (``benchmarks/contour_weights.py`` shows where other weights work and where they fail). See
+    `vstent.deploy.method` for the loop.
     """
 
     a1: float = 0.01
@@ -138,6 +126,7 @@ class ActiveContour:
         rows, columns = nodes_mm.shape[:2]
         stiffness = Stiffness.of(self, rows, columns)
         moving = np.zeros((rows, columns), dtype=bool)
+        centers_mm = np.broadcast_to(centers_mm[:, None], nodes_mm.shape)
         return State(nodes_mm, centers_mm, moving, wall.contact(nodes_mm.reshape(-1, 3)), stiffness)
 
     def step(self, state: State, wall: AbstractWall) -> State:
@@ -154,6 +143,27 @@ class ActiveContour:
         to_wall = -state.contact.inward(state.nodes_mm.reshape(-1, 3)).reshape(shape)
         return self.k1 * distance_mm * normals(state.nodes_mm) + self.k2 * to_wall
 
+    def energy_mm2(self, state: State) -> float:
+        """Energy of the contour, eq. (1): the internal energy of eq. (2) and the potential of the forces.
+
+        Along the way to the wall, where the contour's normal points to it, eq. (4, 5) have the potential
+        k1 d^2 + 2 k2 d (an iteration descends half of eq. 2, whose variation is 2 K v). A terminated node has d = dd.
+        """
+        v = state.nodes_mm
+        along, around = np.diff(v, axis=0), np.roll(v, -1, axis=1) - v
+        bent = around - np.roll(around, 1, axis=1)
+        twisted = np.roll(along, -1, axis=1) - along
+        terms = (
+            (self.a1, along),
+            (self.a2, np.diff(along, axis=0)),
+            (self.a3, around),
+            (self.a4, bent),
+            (2 * self.a5, twisted),
+        )
+        internal = sum(weight * float(np.vdot(d, d)) for weight, d in terms)
+        distance_mm = np.where(state.is_terminated.ravel(), self.dd_mm, state.contact.distance_mm)
+        return internal + float((self.k1 * distance_mm**2 + 2 * self.k2 * distance_mm).sum())
+
     def classify(self, state: State, is_asked: Bools, wall: AbstractWall) -> State:
         """Sort the nodes asked about (rows, columns) into the paper's three states and relocate those that terminate.
 
@@ -162,13 +172,13 @@ class ActiveContour:
         """
         asked = is_asked.ravel()
         points_mm = state.nodes_mm.reshape(-1, 3).copy()
-        centers_mm = np.repeat(state.centers_mm, state.nodes_mm.shape[1], axis=0)
+        centers_mm = state.centers_mm.reshape(-1, 3)
         found = wall.contact(points_mm[asked])
         is_outside = wall.crosses(centers_mm[asked], points_mm[asked])
         is_done = is_outside | (found.distance_mm <= self.dd_mm)
         relocated = self.relocated_mm(points_mm[asked], is_outside, found)
         points_mm[asked] = np.where(is_done[:, None], relocated, points_mm[asked])
-        contact = Contact(*(_replaced(old, asked, new) for old, new in zip(state.contact, found, strict=True)))
+        contact = state.contact.replaced(asked, found)
         is_terminated = state.is_terminated.copy()
         is_terminated[is_asked] |= is_done
         nodes_mm = points_mm.reshape(state.nodes_mm.shape)
@@ -183,66 +193,3 @@ class ActiveContour:
     def terminate(self, state: State) -> bool:
         """Tell whether enough nodes have terminated."""
         return state.terminated_fraction >= self.terminated_goal
-
-
-def _replaced(values: Floats, where: Bools, new: Floats) -> Floats:
-    values = values.copy()
-    values[where] = new
-    return values
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Relaxation:
-    """What `relax` did."""
-
-    state: State
-    """The last state."""
-    outcome: Literal["terminated", "iteration_limit"]
-    """Whether enough nodes terminated."""
-    terminated_fraction: tuple[float, ...]
-    """After every iteration."""
-    history_mm: tuple[Floats, ...]
-    """Contour (rows, columns, 3) after every iteration."""
-    seconds: float
-    """Wall time."""
-
-
-def relax(
-    method: ActiveContour,
-    state: State,
-    wall: AbstractWall,
-    *,
-    limit: Limit | None = None,
-    progress: Progress | None = None,
-) -> Relaxation:
-    """Iterate `method` until enough nodes terminate or its iteration limit.
-
-    Raises
-    ------
-    InputError
-        When the weights make the contour run away.
-    """
-    began = time.perf_counter()
-    fractions: list[float] = []
-    history: list[Floats] = []
-    while not method.terminate(state) and len(fractions) < method.iteration_limit:
-        following = method.step(state, wall)
-        if limit is not None:
-            nodes_mm, is_stopped = limit(state.nodes_mm, following.nodes_mm)
-            following = replace(following, nodes_mm=nodes_mm, is_terminated=following.is_terminated | is_stopped)
-        state = following
-        _check_finite(state, len(fractions) + 1)
-        fractions.append(state.terminated_fraction)
-        history.append(state.nodes_mm)
-        if progress is not None:
-            progress(len(fractions), state.terminated_fraction)
-    outcome: Literal["terminated", "iteration_limit"] = "terminated" if method.terminate(state) else "iteration_limit"
-    return Relaxation(state, outcome, tuple(fractions), tuple(history), time.perf_counter() - began)
-
-
-def _check_finite(state: State, iteration: int) -> None:
-    if not np.isfinite(state.nodes_mm).all():
-        raise InputError(
-            f"The active contour ran away in iteration {iteration}: its weights are too large. Use a smaller tau."
-        )

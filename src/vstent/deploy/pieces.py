@@ -1,0 +1,211 @@
+"""Pieces: crossings slide along the wall until every piece of wire between two of them is as long as it was made.
+
+In a bend, rows that lie in planes across the axis stretch the wires outside and press them together inside. Wires do
+not stretch: columns come closer together outside, where rows are farther apart, and spread inside, and rows tilt. The
+crossings x (coordinates on the contour, mm) are those of least
+
+    sum over pieces of (length - length as made)^2  +  (RESISTANCE |x - x of the plane rows|)^2
+
+by Gauss-Newton steps, each a damped least-squares problem (LSMR: Fong and Saunders 2011). The second term picks the
+nearest among the many nets that wires of fixed length allow, and the compromise where none exists: outside a bend so
+tight that the straightened wire is still too short. Rows may tilt and bend but stay where they are in the mean: where
+they lie is the business of `vstent.deploy.braid.march`.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final, NamedTuple, Self, final
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import lsmr
+
+from vstent.device import Design, Grid, Size, grid, piece_length_mm
+from vstent.kernels.arrays import Floats, Ints
+
+RESISTANCE: Final = 0.04
+"""How much a crossing that slides weighs against a piece of wire that stretches by as much."""
+STEPS: Final = 6
+"""Gauss-Newton steps at most."""
+GAIN: Final = 0.01
+"""Less gained by a step, relative, ends them."""
+TOLERANCE: Final = 3e-3
+"""Of every least-squares problem."""
+SHORTEST_STEP: Final = 0.1
+"""A step that does not help is halved down to this."""
+
+
+class Slid(NamedTuple):
+    """A contour whose crossings have slid."""
+
+    nodes_mm: Floats
+    """(rows, columns, 3) nodes."""
+    row: Floats
+    """(rows, columns) where on the old contour every node lies, in rows."""
+
+
+def slide(design: Design, size: Size, nodes_mm: Floats) -> Slid:
+    """Let the crossings of a device slide on its contour (rows, columns, 3); nodes between them go along."""
+    shape = grid(design, size)
+    net = _Net.on(nodes_mm, shape, piece_length_mm(design, size))
+    net = _relaxed(net)
+    row = np.arange(shape.rows)[:, None] + _spread(net.shift_rows, net, shape)
+    column = np.arange(shape.columns) + _spread(net.shift_columns, net, shape)
+    return Slid(_bilinear(nodes_mm, row, column)[0], row)
+
+
+def extrapolated(known: Floats | Ints, values: Floats, wanted: Floats) -> Floats:
+    """Linear interpolation of values (n,) at increasing places (n,), going on in a straight line beyond the ends."""
+    i = np.clip(np.searchsorted(known, wanted, side="right") - 1, 0, len(known) - 2)
+    share = (wanted - known[i]) / (known[i + 1] - known[i])
+    return (1 - share) * values[i] + share * values[i + 1]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Net:
+    """Crossings on a contour, and the pieces of wire between them."""
+
+    contour_mm: Floats
+    """(rows, columns, 3) the contour they slide on."""
+    line: Ints
+    """(c,) lattice row of every crossing."""
+    row: Ints
+    """(c,) node row of every crossing before it slid."""
+    column: Ints
+    """(c,) node column."""
+    ends: Ints
+    """(2, p) crossings at the two ends of every piece."""
+    length_mm: float
+    """Length of a piece as made."""
+    spacing_mm: tuple[float, float]
+    """Median distance of neighbouring node rows and node columns."""
+    slid_mm: Floats
+    """(2 c,) how far every crossing has slid, along rows first, then along columns."""
+
+    @classmethod
+    def on(cls, nodes_mm: Floats, shape: Grid, length_mm: float) -> Self:
+        """Put the crossings where lattice rows and columns of one parity meet."""
+        rows, columns = shape.lattice_rows, shape.lattice_columns
+        i, j = np.nonzero(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)
+        number = np.full((rows, columns), -1)
+        number[i, j] = np.arange(len(i))
+        first = np.flatnonzero(i < rows - 1)
+        ends = [[first, number[i[first] + 1, (j[first] + hand) % columns]] for hand in (1, -1)]
+        row, column = i * shape.row_split, j * shape.column_split
+        along_mm = float(np.median(np.linalg.norm(np.diff(nodes_mm, axis=0), axis=2)))
+        around_mm = float(np.median(np.linalg.norm(np.roll(nodes_mm, -1, axis=1) - nodes_mm, axis=2)))
+        spacing_mm = along_mm, around_mm
+        return cls(nodes_mm, i, row, column, np.concatenate(ends, axis=1), length_mm, spacing_mm, np.zeros(2 * len(i)))
+
+    @property
+    def shift_rows(self) -> Floats:
+        """(c,) how far every crossing has slid along the device, in node rows."""
+        return self.slid_mm[: len(self.row)] / self.spacing_mm[0]
+
+    @property
+    def shift_columns(self) -> Floats:
+        """(c,) how far every crossing has slid round the device, in node columns."""
+        return self.slid_mm[len(self.row) :] / self.spacing_mm[1]
+
+    @cached_property
+    def _places(self) -> tuple[Floats, Floats, Floats]:
+        """Points (c, 3) of the crossings and their derivatives by how far they slide along rows and columns."""
+        points, along, around = _bilinear(self.contour_mm, self.row + self.shift_rows, self.column + self.shift_columns)
+        return points, along / self.spacing_mm[0], around / self.spacing_mm[1]
+
+    @cached_property
+    def _pieces(self) -> tuple[Floats, Floats]:
+        """Unit directions (p, 3) of the pieces and by how much they are too long (p,)."""
+        first, last = self.ends
+        vector = self._places[0][last] - self._places[0][first]
+        length = np.linalg.norm(vector, axis=1)
+        return vector / length[:, None], length - self.length_mm
+
+    @property
+    def excess_mm(self) -> Floats:
+        """(p,) by how much every piece is longer than it was made."""
+        return self._pieces[1]
+
+    @cached_property
+    def cost_mm2(self) -> float:
+        """What the crossings minimise."""
+        return float(np.vdot(self.excess_mm, self.excess_mm) + RESISTANCE**2 * np.vdot(self.slid_mm, self.slid_mm))
+
+    def jacobian(self) -> csr_array:
+        """Derivatives (p + rows, 2 c) of the lengths of the pieces, then of the mean of every row, by the sliding."""
+        (first, last), (direction, _) = self.ends, self._pieces
+        crossings, each = len(self.row), np.arange(self.ends.shape[1])
+        values = [
+            sign * np.einsum("pk,pk->p", direction, tangent[end])
+            for sign, end in ((1, last), (-1, first))
+            for tangent in self._places[1:]
+        ]
+        where = [end + half for end in (last, first) for half in (0, crossings)]
+        count = np.bincount(self.line)
+        entries = np.concatenate([*values, 1 / np.sqrt(count[self.line])])
+        rows = np.concatenate([np.tile(each, 4), len(each) + self.line])
+        columns = np.concatenate([*where, np.arange(crossings)])
+        return csr_array((entries, (rows, columns)), shape=(len(each) + len(count), 2 * crossings))
+
+    def moved(self, slid_mm: Floats) -> Self:
+        """Return the net slid so far (2 c,), its rows kept where they are in the mean."""
+        along = slid_mm[: len(self.row)]
+        mean_mm = np.bincount(self.line, along) / np.bincount(self.line)
+        return replace(self, slid_mm=np.concatenate([along - mean_mm[self.line], slid_mm[len(self.row) :]]))
+
+
+def _relaxed(net: _Net) -> _Net:
+    for _ in range(STEPS):
+        jacobian = net.jacobian()
+        target = jacobian @ net.slid_mm
+        target[: len(net.excess_mm)] -= net.excess_mm
+        wanted_mm = lsmr(jacobian, target, damp=RESISTANCE, atol=TOLERANCE, btol=TOLERANCE, maxiter=60)[0]
+        better = _better(net, wanted_mm)
+        if better is None:
+            break
+        gain = 1 - better.cost_mm2 / max(net.cost_mm2, 1e-300)
+        net = better
+        if gain < GAIN:
+            break
+    return net
+
+
+def _better(net: _Net, wanted_mm: Floats) -> _Net | None:
+    """Go towards the place wanted, half as far as long as that does not help; None where nothing helps."""
+    share = 1.0
+    while share > SHORTEST_STEP:
+        tried = net.moved(net.slid_mm + share * (wanted_mm - net.slid_mm))
+        if tried.cost_mm2 < net.cost_mm2:
+            return tried
+        share *= 0.5
+    return None
+
+
+def _spread(values: Floats, net: _Net, shape: Grid) -> Floats:
+    """Values (rows, columns) at every node from those at the crossings (c,).
+
+    A pore's middle gets the mean of the crossings round it; nodes between rows and columns of the lattice get what is
+    linear between them.
+    """
+    known = np.zeros((2, shape.lattice_rows, shape.lattice_columns))
+    known[:, net.line, net.column // shape.column_split] = values, np.ones_like(values)
+    beside = np.roll(known, 1, axis=2) + np.roll(known, -1, axis=2)
+    beside[:, 1:] += known[:, :-1]
+    beside[:, :-1] += known[:, 1:]
+    lattice = np.where(known[1] > 0, known[0], beside[0] / np.maximum(beside[1], 1.0))
+    row = np.arange(shape.rows)[:, None] / shape.row_split
+    column = np.arange(shape.columns)[None] / shape.column_split
+    return _bilinear(lattice[..., None], *np.broadcast_arrays(row, column))[0][..., 0]
+
+
+def _bilinear(grid_values: Floats, row: Floats, column: Floats) -> tuple[Floats, Floats, Floats]:
+    """Values (..., d) of a grid (n, m, d), periodic in its columns, and their derivatives by row and by column."""
+    n, m = grid_values.shape[:2]
+    i = np.clip(np.floor(row).astype(int), 0, n - 2)
+    j = np.floor(column).astype(int)
+    down, right = (row - i)[..., None], (column - j)[..., None]
+    j, beyond = j % m, (j + 1) % m
+    a, b, c, d = grid_values[i, j], grid_values[i, beyond], grid_values[i + 1, j], grid_values[i + 1, beyond]
+    above, below = a + right * (b - a), c + right * (d - c)
+    return above + down * (below - above), below - above, (1 - down) * (b - a) + down * (d - c)
