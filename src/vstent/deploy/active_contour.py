@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
+from typing import Final, final
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -10,6 +10,9 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from vstent.deploy.contour import normals
 from vstent.deploy.wall import ON_WALL_MM, AbstractWall, Contact
 from vstent.kernels.arrays import Bools, Floats
+
+SAFELY: Final = 1 - 1e-9
+"""Balls without a wall in them are taken smaller by this, so that rounding cannot hide a crossing."""
 
 
 @final
@@ -74,12 +77,20 @@ class State:
     """(rows, columns, 3) nodes."""
     centers_mm: Floats
     """(rows, columns, 3) fiducial point inside the lumen for every node: its row's center, the paper's "center"."""
+    clearance_mm: Floats
+    """(rows, columns) no wall is nearer to the fiducial point than this."""
     is_terminated: Bools
     """(rows, columns) nodes that no longer move."""
     contact: Contact
-    """The nearest wall of every node, flattened to (rows * columns,); of a terminated one before it was relocated."""
+    """The nearest wall of every node, flattened to (rows * columns,)."""
     stiffness: Stiffness
     """I + tau K, factored."""
+
+    def about(self, centers_mm: Floats, wall: AbstractWall) -> "State":
+        """Return the contour with a fiducial point for every row (rows, 3)."""
+        shape = self.nodes_mm.shape
+        clearance_mm = np.broadcast_to(wall.contact(centers_mm).distance_mm[:, None], shape[:2])
+        return replace(self, centers_mm=np.broadcast_to(centers_mm[:, None], shape), clearance_mm=clearance_mm)
 
     @cached_property
     def terminated_fraction(self) -> float:
@@ -126,8 +137,10 @@ class ActiveContour:
         rows, columns = nodes_mm.shape[:2]
         stiffness = Stiffness.of(self, rows, columns)
         moving = np.zeros((rows, columns), dtype=bool)
-        centers_mm = np.broadcast_to(centers_mm[:, None], nodes_mm.shape)
-        return State(nodes_mm, centers_mm, moving, wall.contact(nodes_mm.reshape(-1, 3)), stiffness)
+        state = State(
+            nodes_mm, nodes_mm, np.zeros((rows, columns)), moving, wall.contact(nodes_mm.reshape(-1, 3)), stiffness
+        )
+        return state.about(centers_mm, wall)
 
     def step(self, state: State, wall: AbstractWall) -> State:
         """Move the nodes that continue, then terminate those that reach the wall or cross it."""
@@ -147,7 +160,7 @@ class ActiveContour:
         """Energy of the contour, eq. (1): the internal energy of eq. (2) and the potential of the forces.
 
         Along the way to the wall, where the contour's normal points to it, eq. (4, 5) have the potential
-        k1 d^2 + 2 k2 d (an iteration descends half of eq. 2, whose variation is 2 K v). A terminated node has d = dd.
+        k1 d^2 + 2 k2 d (an iteration descends half of eq. 2, whose variation is 2 K v).
         """
         v = state.nodes_mm
         along, around = np.diff(v, axis=0), np.roll(v, -1, axis=1) - v
@@ -161,7 +174,7 @@ class ActiveContour:
             (2 * self.a5, twisted),
         )
         internal = sum(weight * float(np.vdot(d, d)) for weight, d in terms)
-        distance_mm = np.where(state.is_terminated.ravel(), self.dd_mm, state.contact.distance_mm)
+        distance_mm = state.contact.distance_mm
         return internal + float((self.k1 * distance_mm**2 + 2 * self.k2 * distance_mm).sum())
 
     def classify(self, state: State, is_asked: Bools, wall: AbstractWall) -> State:
@@ -172,12 +185,12 @@ class ActiveContour:
         """
         asked = is_asked.ravel()
         points_mm = state.nodes_mm.reshape(-1, 3).copy()
-        centers_mm = state.centers_mm.reshape(-1, 3)
         found = wall.contact(points_mm[asked])
-        is_outside = wall.crosses(centers_mm[asked], points_mm[asked])
+        is_outside = _is_outside(state, asked, found.distance_mm, wall)
         is_done = is_outside | (found.distance_mm <= self.dd_mm)
         relocated = self.relocated_mm(points_mm[asked], is_outside, found)
         points_mm[asked] = np.where(is_done[:, None], relocated, points_mm[asked])
+        found = found._replace(distance_mm=np.where(is_done, self.dd_mm, found.distance_mm))
         contact = state.contact.replaced(asked, found)
         is_terminated = state.is_terminated.copy()
         is_terminated[is_asked] |= is_done
@@ -193,3 +206,22 @@ class ActiveContour:
     def terminate(self, state: State) -> bool:
         """Tell whether enough nodes have terminated."""
         return state.terminated_fraction >= self.terminated_goal
+
+
+def _is_outside(state: State, asked: Bools, distance_mm: Floats, wall: AbstractWall) -> Bools:
+    """Tell of the nodes asked about, (n,) of all, whether the segment from their center crosses the wall.
+
+    No wall lies within the clearance of the center nor within the distance of the node: only what is left of the
+    segment between these two balls is tested, if anything is.
+    """
+    centers_mm, points_mm = state.centers_mm.reshape(-1, 3)[asked], state.nodes_mm.reshape(-1, 3)[asked]
+    clearance_mm = SAFELY * state.clearance_mm.ravel()[asked]
+    way_mm = points_mm - centers_mm
+    length_mm = np.linalg.norm(way_mm, axis=1)
+    is_open = clearance_mm + SAFELY * distance_mm < length_mm
+    along = (way_mm / np.maximum(length_mm, ON_WALL_MM)[:, None])[is_open]
+    starts_mm = centers_mm[is_open] + clearance_mm[is_open, None] * along
+    ends_mm = points_mm[is_open] - SAFELY * distance_mm[is_open, None] * along
+    is_outside = np.zeros(len(points_mm), dtype=bool)
+    is_outside[is_open] = wall.crosses(starts_mm, ends_mm)
+    return is_outside

@@ -17,9 +17,10 @@ from vstent.vessel import Anatomy
 
 ROUNDS = 8
 """Rows are marched anew at most so often."""
-SETTLED_MM = 0.005
+SETTLED_MM = 0.01
 """Rows have settled when none moves further than this from one round to the next."""
-
+LAST_STEPS = 5
+"""Steps at most for the last nodes, once 99 % have terminated."""
 TABLE_ROWS = 2001
 """Samples of the row spacing along the artery."""
 BEYOND_MM = 500.0
@@ -120,22 +121,32 @@ class ConstantWire(AbstractMethod):
 
     def step(self, placement: Placement, opened: Opened) -> Opened:
         """Let the contour grow, no row wider than the free device; once it lies, march the rows anew."""
-        following = self.contour.step(opened.contour, placement.wall)
-        nodes_mm, is_stopped = FreeDiameter(placement.size.free_diameter_mm)(
-            opened.contour.nodes_mm, following.nodes_mm
-        )
-        following = replace(following, nodes_mm=nodes_mm, is_terminated=following.is_terminated | is_stopped)
-        opened = replace(opened, contour=following)
+        opened = self._grown(placement, opened)
         return self._marched(placement, opened) if self.terminate(opened) else opened
 
     def result(self, placement: Placement, opened: Opened) -> Opened:
         """Let crossings slide until pieces of wire have their length, and put every node back to the wall."""
+        for _ in range(LAST_STEPS):
+            if opened.contour.is_terminated.all():
+                break
+            opened = self._grown(placement, opened)
         slid = pieces.slide(placement.design, placement.size, opened.contour.nodes_mm)
         rows = np.arange(len(opened.abscissa_mm))
         where_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row)
         centers_mm = placement.across.at(where_mm.ravel())[0].reshape(slid.nodes_mm.shape)
-        state = replace(opened.contour, nodes_mm=slid.nodes_mm, centers_mm=centers_mm)
+        # The clearance falls off from a row's center no faster than one moves away from it.
+        off_mm = np.linalg.norm(centers_mm - opened.contour.centers_mm, axis=2)
+        clearance_mm = np.maximum(opened.contour.clearance_mm - off_mm, 0.0)
+        state = replace(opened.contour, nodes_mm=slid.nodes_mm, centers_mm=centers_mm, clearance_mm=clearance_mm)
         return Opened(self._laid(placement, state), opened.abscissa_mm)
+
+    def _grown(self, placement: Placement, opened: Opened) -> Opened:
+        """One step of the contour; a row that reaches the free diameter stops there."""
+        before, after = opened.contour, self.contour.step(opened.contour, placement.wall)
+        free = FreeDiameter(placement.size.free_diameter_mm)
+        nodes_mm, is_stopped = free(before.nodes_mm, after.nodes_mm)
+        after = replace(after, nodes_mm=nodes_mm, is_terminated=after.is_terminated | is_stopped)
+        return replace(opened, contour=after)
 
     def _marched(self, placement: Placement, opened: Opened) -> Opened:
         """March the rows by their measured diameters until they stay where they are.
@@ -147,14 +158,13 @@ class ConstantWire(AbstractMethod):
         """
         design, size, axis = placement.design, placement.size, placement.anatomy.axis
         profile = expected_profile(design, placement.anatomy)
-        for _ in range(ROUNDS):
+        for done in range(ROUNDS):
             profile = profile.corrected(opened.abscissa_mm, perimeters(opened.contour.nodes_mm) / np.pi)
             rows_mm = march(design, size, placement.landing, profile)
             check_inside(design, size, rows_mm, axis.length_mm)
-            shift_mm = float(np.abs(rows_mm - opened.abscissa_mm).max())
-            opened = self._moved(placement, opened, rows_mm)
-            if shift_mm < SETTLED_MM:
+            if done and np.abs(rows_mm - opened.abscissa_mm).max() < SETTLED_MM:
                 break
+            opened = self._moved(placement, opened, rows_mm)
         return opened
 
     def _moved(self, placement: Placement, opened: Opened, rows_mm: Floats) -> Opened:
@@ -162,8 +172,8 @@ class ConstantWire(AbstractMethod):
         across, state = placement.across, opened.contour
         in_plane_mm = evenly_spaced(across.coordinates(opened.abscissa_mm, state.nodes_mm))
         nodes_mm = across.place(rows_mm, _interpolated(opened.abscissa_mm, in_plane_mm, rows_mm))
-        centers_mm = np.broadcast_to(across.at(rows_mm)[0][:, None], nodes_mm.shape)
-        return Opened(self._laid(placement, replace(state, nodes_mm=nodes_mm, centers_mm=centers_mm)), rows_mm)
+        state = replace(state, nodes_mm=nodes_mm).about(across.at(rows_mm)[0], placement.wall)
+        return Opened(self._laid(placement, state), rows_mm)
 
     def _laid(self, placement: Placement, state: State) -> State:
         """Put moved nodes to the wall.

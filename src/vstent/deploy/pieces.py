@@ -23,11 +23,11 @@ from scipy.sparse.linalg import lsmr
 from vstent.device import Design, Grid, Size, grid, piece_length_mm
 from vstent.kernels.arrays import Floats, Ints
 
-RESISTANCE: Final = 0.04
+RESISTANCE: Final = 0.03
 """How much a crossing that slides weighs against a piece of wire that stretches by as much."""
-STEPS: Final = 6
+STEPS: Final = 5
 """Gauss-Newton steps at most."""
-GAIN: Final = 0.01
+GAIN: Final = 0.02
 """Less gained by a step, relative, ends them."""
 TOLERANCE: Final = 3e-3
 """Of every least-squares problem."""
