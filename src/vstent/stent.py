@@ -1,6 +1,7 @@
 """The device's nouns once it is in an artery: Landing, Stent, Deployment."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -51,6 +52,22 @@ class Stent:
         """The contour as triangles, normals outward; vertex (row, column) is number row * columns + column."""
         rows, columns = self.nodes_mm.shape[:2]
         return Surface(self.nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
+
+    @cached_property
+    def row_diameter_mm(self) -> Floats:
+        """(rows,) diameter of the circle of every row's perimeter, seen along the device: a row may be tilted."""
+        around_mm = np.roll(self.nodes_mm, -1, axis=1) - self.nodes_mm
+        columns = self.nodes_mm.shape[1]
+        center_mm = self.nodes_mm.mean(axis=1)
+        # The direction of the device is taken over about one diameter: centers of rows wobble.
+        radius_mm = np.linalg.norm(around_mm, axis=2).sum(axis=1).mean() / (2 * np.pi)
+        step_mm = np.linalg.norm(np.diff(center_mm, axis=0), axis=1).mean()
+        reach, row = max(1, round(radius_mm / step_mm)), np.arange(len(center_mm))
+        ahead = center_mm[np.minimum(row + reach, row[-1])] - center_mm[np.maximum(row - reach, 0)]
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+        across_mm = around_mm - np.einsum("ijk,ik->ij", around_mm, ahead)[..., None] * ahead[:, None]
+        # A regular polygon is shorter than its circle by (pi/n) / sin(pi/n).
+        return np.linalg.norm(across_mm, axis=2).sum(axis=1) / (columns * np.sin(np.pi / columns))
 
     @property
     def proximal_abscissa_mm(self) -> float:
