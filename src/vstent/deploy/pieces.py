@@ -51,7 +51,7 @@ def slide(design: Design, size: Size, nodes_mm: Floats) -> Slid:
     net = _relaxed(net)
     row = np.arange(shape.rows)[:, None] + _spread(net.shift_rows, net, shape)
     column = np.arange(shape.columns) + _spread(net.shift_columns, net, shape)
-    return Slid(_bilinear(nodes_mm, row, column)[0], row)
+    return Slid(_bilinear(nodes_mm, row, column), row)
 
 
 def extrapolated(known: Floats | Ints, values: Floats, wanted: Floats) -> Floats:
@@ -66,8 +66,8 @@ def extrapolated(known: Floats | Ints, values: Floats, wanted: Floats) -> Floats
 class _Net:
     """Crossings on a contour, and the pieces of wire between them."""
 
-    contour_mm: Floats
-    """(rows, columns, 3) the contour they slide on."""
+    chart: Floats
+    """(rows, columns, 9) the contour they slide on: its nodes and their derivatives by row and by column."""
     line: Ints
     """(c,) lattice row of every crossing."""
     row: Ints
@@ -78,7 +78,7 @@ class _Net:
     """(2, p) crossings at the two ends of every piece."""
     length_mm: float
     """Length of a piece as made."""
-    spacing_mm: tuple[float, float]
+    spacing_mm: tuple[float, ...]
     """Median distance of neighbouring node rows and node columns."""
     slid_mm: Floats
     """(2 c,) how far every crossing has slid, along rows first, then along columns."""
@@ -93,10 +93,11 @@ class _Net:
         first = np.flatnonzero(i < rows - 1)
         ends = [[first, number[i[first] + 1, (j[first] + hand) % columns]] for hand in (1, -1)]
         row, column = i * shape.row_split, j * shape.column_split
-        along_mm = float(np.median(np.linalg.norm(np.diff(nodes_mm, axis=0), axis=2)))
-        around_mm = float(np.median(np.linalg.norm(np.roll(nodes_mm, -1, axis=1) - nodes_mm, axis=2)))
-        spacing_mm = along_mm, around_mm
-        return cls(nodes_mm, i, row, column, np.concatenate(ends, axis=1), length_mm, spacing_mm, np.zeros(2 * len(i)))
+        along_mm = np.gradient(nodes_mm, axis=0)
+        around_mm = 0.5 * (np.roll(nodes_mm, -1, axis=1) - np.roll(nodes_mm, 1, axis=1))
+        spacing_mm = tuple(float(np.median(np.linalg.norm(side, axis=2))) for side in (along_mm, around_mm))
+        chart = np.concatenate([nodes_mm, along_mm / spacing_mm[0], around_mm / spacing_mm[1]], axis=2)
+        return cls(chart, i, row, column, np.concatenate(ends, axis=1), length_mm, spacing_mm, np.zeros(2 * len(i)))
 
     @property
     def shift_rows(self) -> Floats:
@@ -109,10 +110,10 @@ class _Net:
         return self.slid_mm[len(self.row) :] / self.spacing_mm[1]
 
     @cached_property
-    def _places(self) -> tuple[Floats, Floats, Floats]:
-        """Points (c, 3) of the crossings and their derivatives by how far they slide along rows and columns."""
-        points, along, around = _bilinear(self.contour_mm, self.row + self.shift_rows, self.column + self.shift_columns)
-        return points, along / self.spacing_mm[0], around / self.spacing_mm[1]
+    def _places(self) -> Floats:
+        """Points of the crossings and their derivatives by how far they slide along rows and columns, (3, c, 3)."""
+        found = _bilinear(self.chart, self.row + self.shift_rows, self.column + self.shift_columns)
+        return found.reshape(-1, 3, 3).transpose(1, 0, 2)
 
     @cached_property
     def _pieces(self) -> tuple[Floats, Floats]:
@@ -196,16 +197,16 @@ def _spread(values: Floats, net: _Net, shape: Grid) -> Floats:
     lattice = np.where(known[1] > 0, known[0], beside[0] / np.maximum(beside[1], 1.0))
     row = np.arange(shape.rows)[:, None] / shape.row_split
     column = np.arange(shape.columns)[None] / shape.column_split
-    return _bilinear(lattice[..., None], *np.broadcast_arrays(row, column))[0][..., 0]
+    return _bilinear(lattice[..., None], *np.broadcast_arrays(row, column))[..., 0]
 
 
-def _bilinear(grid_values: Floats, row: Floats, column: Floats) -> tuple[Floats, Floats, Floats]:
-    """Values (..., d) of a grid (n, m, d), periodic in its columns, and their derivatives by row and by column."""
+def _bilinear(grid_values: Floats, row: Floats, column: Floats) -> Floats:
+    """Values (..., d) of a grid (n, m, d), periodic in its columns; beyond the rows it goes on in straight lines."""
     n, m = grid_values.shape[:2]
     i = np.clip(np.floor(row).astype(int), 0, n - 2)
     j = np.floor(column).astype(int)
     down, right = (row - i)[..., None], (column - j)[..., None]
     j, beyond = j % m, (j + 1) % m
-    a, b, c, d = grid_values[i, j], grid_values[i, beyond], grid_values[i + 1, j], grid_values[i + 1, beyond]
-    above, below = a + right * (b - a), c + right * (d - c)
-    return above + down * (below - above), below - above, (1 - down) * (b - a) + down * (d - c)
+    above = (1 - right) * grid_values[i, j] + right * grid_values[i, beyond]
+    below = (1 - right) * grid_values[i + 1, j] + right * grid_values[i + 1, beyond]
+    return (1 - down) * above + down * below
