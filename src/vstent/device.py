@@ -7,9 +7,11 @@ column, pi D / n, and the row spacing is what is left: h(D) = sqrt((l/n)^2 - (pi
 """
 
 import difflib
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -267,18 +269,62 @@ def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> floa
 
 @cache
 def catalogue() -> dict[str, Design]:
-    """Return every device of the catalogue by its key.
+    """Return every device by its key: those of the catalogue, then those that the user has added.
 
     Raises
     ------
     DeviceError
-        When the catalogue breaks its schema.
+        When a catalogue breaks its schema or names a device that another one names.
     """
     from importlib.resources import files
 
     from vstent.device_schema import parse  # pydantic is loaded only when the catalogue is
 
-    return parse(files("vstent").joinpath("devices.toml").read_text(encoding="utf-8"))
+    designs = parse(files("vstent").joinpath("devices.toml").read_text(encoding="utf-8"))
+    for path in sorted(user_folder().glob("*.toml")):
+        added = parse(path.read_text(encoding="utf-8"), str(path))
+        _check_new(added, designs, path)
+        designs |= added
+    return designs
+
+
+def user_folder() -> Path:
+    """Return where the user's own device files are kept: ``$XDG_CONFIG_HOME/vstent/devices``, or in ``~/.config``."""
+    home = os.environ.get("XDG_CONFIG_HOME") or os.environ.get("APPDATA") or "~/.config"
+    return Path(home).expanduser() / "vstent" / "devices"
+
+
+def add_devices(path: Path) -> dict[str, Design]:
+    """Check a device file (TOML, as ``vstent/devices.toml``) and keep a copy of it: its devices join the catalogue.
+
+    A file of the same name that was added before is replaced.
+
+    Raises
+    ------
+    DeviceError
+        When it is no readable text, breaks the schema or names a device that the catalogue has already.
+    """
+    from vstent.device_schema import parse
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DeviceError(f"{path} cannot be read as text: give a TOML file of devices.") from error
+    added, kept = parse(text, str(path)), user_folder() / f"{path.stem}.toml"
+    others = parse(kept.read_text(encoding="utf-8"), str(kept)) if kept.exists() else {}
+    _check_new(added, {key: design for key, design in catalogue().items() if key not in others}, path)
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    partial = kept.with_suffix(".partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(kept)
+    catalogue.cache_clear()
+    return added
+
+
+def _check_new(added: Iterable[str], known: Iterable[str], path: Path) -> None:
+    twice = sorted(set(added) & set(known))
+    if twice:
+        raise DeviceError(f"{path} names a device that the catalogue has already, {twice[0]}: give it another key.")
 
 
 def find_design(name: str) -> Design:

@@ -19,6 +19,8 @@ ROUNDS = 8
 """Rows are marched anew at most so often."""
 SETTLED_MM = 0.01
 """Rows have settled when none moves further than this from one round to the next."""
+FREE_SLACK = 1e-3
+"""A row this near to the free perimeter, relative, has reached it."""
 LAST_STEPS = 5
 """Steps at most for the last nodes, once 99 % have terminated."""
 TABLE_ROWS = 2001
@@ -80,6 +82,10 @@ class FreeDiameter:
     diameter_mm: float
     """The free diameter."""
 
+    def is_reached(self, nodes_mm: Floats) -> Bools:
+        """Tell which rows (rows,) are as wide as the free device."""
+        return perimeters(nodes_mm) > (1 - FREE_SLACK) * np.pi * self.diameter_mm
+
     def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
         """Let every row go from `before_mm` towards `after_mm` only as far as its perimeter may grow."""
         allowed = np.pi * self.diameter_mm
@@ -138,7 +144,10 @@ class ConstantWire(AbstractMethod):
         off_mm = np.linalg.norm(centers_mm - opened.contour.centers_mm, axis=2)
         clearance_mm = np.maximum(opened.contour.clearance_mm - off_mm, 0.0)
         state = replace(opened.contour, nodes_mm=slid.nodes_mm, centers_mm=centers_mm, clearance_mm=clearance_mm)
-        return Opened(self._laid(placement, state), opened.abscissa_mm)
+        state, laid_mm = self._laid(placement, state)
+        is_free = FreeDiameter(placement.size.free_diameter_mm).is_reached(opened.contour.nodes_mm)
+        nodes_mm = np.where(is_free[:, None, None], state.nodes_mm, laid_mm)
+        return replace(opened, contour=replace(state, nodes_mm=nodes_mm))
 
     def _grown(self, placement: Placement, opened: Opened) -> Opened:
         """One step of the contour; a row that reaches the free diameter stops there."""
@@ -173,22 +182,22 @@ class ConstantWire(AbstractMethod):
         in_plane_mm = evenly_spaced(across.coordinates(opened.abscissa_mm, state.nodes_mm))
         nodes_mm = across.place(rows_mm, _interpolated(opened.abscissa_mm, in_plane_mm, rows_mm))
         state = replace(state, nodes_mm=nodes_mm).about(across.at(rows_mm)[0], placement.wall)
-        return Opened(self._laid(placement, state), rows_mm)
+        state, laid_mm = self._laid(placement, state)
+        free = FreeDiameter(placement.size.free_diameter_mm)
+        return Opened(replace(state, nodes_mm=free(state.nodes_mm, laid_mm)[0]), rows_mm)
 
-    def _laid(self, placement: Placement, state: State) -> State:
-        """Put moved nodes to the wall.
+    def _laid(self, placement: Placement, state: State) -> tuple[State, Floats]:
+        """Put nodes that were moved out of the wall's way; return also where (rows, columns, 3) they lie against it.
 
-        A node that had terminated goes back to the wall by eq. (6, 7) as far as its row's free perimeter allows; one
-        that still moves does so only where it would be outside or nearer than dd.
+        A node that had terminated goes back to the wall by eq. (6, 7); one that still moves does so only where it
+        would be outside or nearer than dd.
         """
         held = state.is_terminated
         state = self.contour.classify(state, np.ones_like(held), placement.wall)
         points_mm = state.nodes_mm.reshape(-1, 3)
         is_off = held.ravel() & (state.contact.distance_mm > self.contour.dd_mm)
         back_mm = self.contour.relocated_mm(points_mm, np.zeros_like(is_off), state.contact)
-        back_mm = np.where(is_off[:, None], back_mm, points_mm).reshape(state.nodes_mm.shape)
-        free = FreeDiameter(placement.size.free_diameter_mm)
-        return replace(state, nodes_mm=free(state.nodes_mm, back_mm)[0])
+        return state, np.where(is_off[:, None], back_mm, points_mm).reshape(state.nodes_mm.shape)
 
 
 def _interpolated(old_mm: Floats, values: Floats, new_mm: Floats) -> Floats:

@@ -47,11 +47,19 @@ class Slid(NamedTuple):
 def slide(design: Design, size: Size, nodes_mm: Floats) -> Slid:
     """Let the crossings of a device slide on its contour (rows, columns, 3); nodes between them go along."""
     shape = grid(design, size)
-    net = _Net.on(nodes_mm, shape, piece_length_mm(design, size))
-    net = _relaxed(net)
+    continued_mm = _continued(nodes_mm)
+    net = _relaxed(_Net.on(continued_mm, shape, piece_length_mm(design, size)))
     row = np.arange(shape.rows)[:, None] + _spread(net.shift_rows, net, shape)
     column = np.arange(shape.columns) + _spread(net.shift_columns, net, shape)
-    return Slid(_bilinear(nodes_mm, row, column), row)
+    return Slid(_bilinear(continued_mm, row + 1, column), row)
+
+
+def _continued(nodes_mm: Floats) -> Floats:
+    """Put one more row before and behind a contour, shaped as its end: a tilted end reaches a little beyond it."""
+    middle_mm = nodes_mm.mean(axis=1)
+    before = nodes_mm[:1] - (middle_mm[1] - middle_mm[0])
+    behind = nodes_mm[-1:] + (middle_mm[-1] - middle_mm[-2])
+    return np.concatenate([before, nodes_mm, behind])
 
 
 def extrapolated(known: Floats | Ints, values: Floats, wanted: Floats) -> Floats:
@@ -67,11 +75,11 @@ class _Net:
     """Crossings on a contour, and the pieces of wire between them."""
 
     chart: Floats
-    """(rows, columns, 9) the contour they slide on: its nodes and their derivatives by row and by column."""
+    """(rows + 2, columns, 9) the continued contour they slide on: nodes, derivatives by row and by column."""
     line: Ints
     """(c,) lattice row of every crossing."""
     row: Ints
-    """(c,) node row of every crossing before it slid."""
+    """(c,) row of the continued contour on which every crossing lay before it slid."""
     column: Ints
     """(c,) node column."""
     ends: Ints
@@ -85,14 +93,14 @@ class _Net:
 
     @classmethod
     def on(cls, nodes_mm: Floats, shape: Grid, length_mm: float) -> Self:
-        """Put the crossings where lattice rows and columns of one parity meet."""
+        """Put the crossings of a continued contour where lattice rows and columns of one parity meet."""
         rows, columns = shape.lattice_rows, shape.lattice_columns
         i, j = np.nonzero(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)
         number = np.full((rows, columns), -1)
         number[i, j] = np.arange(len(i))
         first = np.flatnonzero(i < rows - 1)
         ends = [[first, number[i[first] + 1, (j[first] + hand) % columns]] for hand in (1, -1)]
-        row, column = i * shape.row_split, j * shape.column_split
+        row, column = i * shape.row_split + 1, j * shape.column_split
         along_mm = np.gradient(nodes_mm, axis=0)
         around_mm = 0.5 * (np.roll(nodes_mm, -1, axis=1) - np.roll(nodes_mm, 1, axis=1))
         spacing_mm = tuple(float(np.median(np.linalg.norm(side, axis=2))) for side in (along_mm, around_mm))
