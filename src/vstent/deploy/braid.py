@@ -17,7 +17,7 @@ from vstent.vessel import Anatomy
 
 ROUNDS = 8
 """Rows are marched anew at most so often."""
-SETTLED_MM = 0.01
+SETTLED_MM = 0.02
 """Rows have settled when none moves further than this from one round to the next."""
 FREE_SLACK = 1e-3
 """A row this near to the free perimeter, relative, has reached it."""

@@ -52,24 +52,37 @@ def _gather(first: Any, row: int, column: int, rows: int, columns: int, found: A
 @njit(cache=True)
 def _plane(corners: Any, frame: Any) -> float:
     """Write the middle of a quad (4, 3) and two unit vectors in its plane (3, 3); return its half-diagonal."""
-    reach = 0.0
     for k in range(3):
         frame[0, k] = 0.25 * (corners[0, k] + corners[1, k] + corners[2, k] + corners[3, k])
+        frame[1, k], frame[2, k] = corners[3, k] - corners[0, k], corners[2, k] - corners[1, k]
+    reach2 = 0.0
     for corner in range(4):
-        reach = max(reach, np.sqrt(np.sum((corners[corner] - frame[0]) ** 2)))
-    frame[1] = corners[3] - corners[0]
-    frame[1] /= np.sqrt(np.sum(frame[1] ** 2))
-    frame[2] = corners[2] - corners[1]
-    frame[2] -= np.sum(frame[2] * frame[1]) * frame[1]
-    frame[2] /= np.sqrt(np.sum(frame[2] ** 2))
-    return reach
+        away2 = 0.0
+        for k in range(3):
+            away2 += (corners[corner, k] - frame[0, k]) ** 2
+        reach2 = max(reach2, away2)
+    _scale(frame[1])
+    share = frame[2, 0] * frame[1, 0] + frame[2, 1] * frame[1, 1] + frame[2, 2] * frame[1, 2]
+    for k in range(3):
+        frame[2, k] -= share * frame[1, k]
+    _scale(frame[2])
+    return np.sqrt(reach2)
+
+
+@njit(cache=True)
+def _scale(vector: Any) -> None:
+    """Give a vector (3,) the length 1."""
+    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    for k in range(3):
+        vector[k] /= length
 
 
 @njit(cache=True)
 def _flatten(frame: Any, reach: float, starts: Any, ends: Any, radius: Any, near: Any, flat: Any) -> int:
     """Write the nearby segments that reach the quad, seen square to it: start, vector, 1 / length^2, radius^2."""
     n = 0
-    for k in near:
+    for i in range(len(near)):
+        k = near[i]
         ax, ay, bx, by = 0.0, 0.0, 0.0, 0.0
         for axis in range(3):
             a, b = starts[k, axis] - frame[0, axis], ends[k, axis] - starts[k, axis]
@@ -101,8 +114,10 @@ def _share_under(quad: int, corners: Any, frame: Any, flat: Any, samples: int) -
     hits = 0
     at = np.zeros((4, 2))
     for corner in range(4):
-        at[corner, 0] = np.sum((corners[corner] - frame[0]) * frame[1])
-        at[corner, 1] = np.sum((corners[corner] - frame[0]) * frame[2])
+        for k in range(3):
+            off = corners[corner, k] - frame[0, k]
+            at[corner, 0] += off * frame[1, k]
+            at[corner, 1] += off * frame[2, k]
     for sample in range(samples * samples):
         # R2 sequence (Roberts 2018), its start moved from quad to quad by the same kind of numbers.
         u = (0.5 + 0.7548776662466927 * sample + 0.5698402909980532 * quad) % 1.0
@@ -114,18 +129,26 @@ def _share_under(quad: int, corners: Any, frame: Any, flat: Any, samples: int) -
     return hits / (samples * samples)
 
 
+@njit(cache=True)
+def _row_fractions(
+    row: int, nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int, result: Any
+) -> None:
+    rows, columns = nodes.shape[0], nodes.shape[1]
+    near, flat = np.zeros(4096, dtype=np.int32), np.zeros((4096, 6))
+    corners, frame = np.zeros((4, 3)), np.zeros((3, 3))
+    for column in range(columns):
+        for k in range(3):
+            corners[0, k], corners[1, k] = nodes[row, column, k], nodes[row, (column + 1) % columns, k]
+            corners[2, k], corners[3, k] = nodes[row + 1, column, k], nodes[row + 1, (column + 1) % columns, k]
+        reach = _plane(corners, frame)
+        n_near = _gather(first, row, column, rows, columns, near)
+        n_flat = _flatten(frame, reach, starts, ends, radius, near[:n_near], flat)
+        result[row, column] = _share_under(row * columns + column, corners, frame, flat[:n_flat], samples)
+
+
 @njit(cache=True, parallel=True)
 def _fractions(nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int) -> Any:
-    rows, columns = nodes.shape[0], nodes.shape[1]
-    result = np.zeros((rows - 1, columns))
-    for i in prange(rows - 1):
-        near, flat = np.zeros(4096, dtype=np.int32), np.zeros((4096, 6))
-        corners, frame = np.zeros((4, 3)), np.zeros((3, 3))
-        for j in range(columns):
-            corners[0], corners[1] = nodes[i, j], nodes[i, (j + 1) % columns]
-            corners[2], corners[3] = nodes[i + 1, j], nodes[i + 1, (j + 1) % columns]
-            reach = _plane(corners, frame)
-            n_near = _gather(first, i, j, rows, columns, near)
-            n_flat = _flatten(frame, reach, starts, ends, radius, near[:n_near], flat)
-            result[i, j] = _share_under(i * columns + j, corners, frame, flat[:n_flat], samples)
+    result = np.zeros((nodes.shape[0] - 1, nodes.shape[1]))
+    for row in prange(len(result)):
+        _row_fractions(row, nodes, starts, ends, radius, first, samples, result)
     return result
