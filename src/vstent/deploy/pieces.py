@@ -4,12 +4,13 @@ In a bend, rows that lie in planes across the axis stretch the wires outside and
 not stretch: columns come closer together outside, where rows are farther apart, and spread inside, and rows tilt. The
 crossings x (coordinates on the contour, mm) are those of least
 
-    sum over pieces of (length - length as made)^2  +  (RESISTANCE |x - x of the plane rows|)^2
+    sum over pieces of (length - length as made)^2  +  sum over crossings of (RESISTANCE |x - x of the plane rows|)^2
+    +  sum over neighbours in a row of (CROWDING times how much nearer together or further apart they come)^2
 
 by Gauss-Newton steps, each a damped least-squares problem (LSMR: Fong and Saunders 2011). The second term picks the
-nearest among the many nets that wires of fixed length allow, and the compromise where none exists: outside a bend so
-tight that the straightened wire is still too short. Rows may tilt and bend but stay where they are in the mean: where
-they lie is the business of `vstent.deploy.braid.march`.
+nearest among the many nets that wires of fixed length allow; the third keeps cells open where none exists: outside a
+bend so tight that the straightened wire is still too short. Rows may tilt and bend but stay where they are in the
+mean: where they lie is the business of `vstent.deploy.braid.march`.
 """
 
 from dataclasses import dataclass, replace
@@ -25,6 +26,11 @@ from vstent.kernels.arrays import Floats, Ints
 
 RESISTANCE: Final = 0.03
 """How much a crossing that slides weighs against a piece of wire that stretches by as much."""
+CROWDING: Final = {"braid": 0.1, "laser_cut": 0.5}
+"""How much neighbours in a row that come nearer together weigh against a piece of wire that stretches by as much.
+
+The least that keeps every cell open in tight siphons; cells whose struts are joined resist more than wires that cross.
+"""
 STEPS: Final = 5
 """Gauss-Newton steps at most."""
 GAIN: Final = 0.02
@@ -48,7 +54,7 @@ def slide(design: Design, size: Size, nodes_mm: Floats) -> Slid:
     """Let the crossings of a device slide on its contour (rows, columns, 3); nodes between them go along."""
     shape = grid(design, size)
     continued_mm = _continued(nodes_mm)
-    net = _relaxed(_Net.on(continued_mm, shape, piece_length_mm(design, size)))
+    net = _relaxed(_Net.on(continued_mm, shape, piece_length_mm(design, size), CROWDING[design.kind]))
     row = np.arange(shape.rows)[:, None] + _spread(net.shift_rows, net, shape)
     column = np.arange(shape.columns) + _spread(net.shift_columns, net, shape)
     return Slid(_bilinear(continued_mm, row + 1, column), row)
@@ -78,6 +84,8 @@ class _Net:
     """(rows + 2, columns, 9) the continued contour they slide on: nodes, derivatives by row and by column."""
     line: Ints
     """(c,) lattice row of every crossing."""
+    beside: Ints
+    """(c,) next crossing in the same row."""
     row: Ints
     """(c,) row of the continued contour on which every crossing lay before it slid."""
     column: Ints
@@ -86,26 +94,39 @@ class _Net:
     """(2, p) crossings at the two ends of every piece."""
     length_mm: float
     """Length of a piece as made."""
+    crowding: float
+    """The device's weight of CROWDING."""
     spacing_mm: tuple[float, ...]
     """Median distance of neighbouring node rows and node columns."""
     slid_mm: Floats
     """(2 c,) how far every crossing has slid, along rows first, then along columns."""
 
     @classmethod
-    def on(cls, nodes_mm: Floats, shape: Grid, length_mm: float) -> Self:
+    def on(cls, nodes_mm: Floats, shape: Grid, length_mm: float, crowding: float) -> Self:
         """Put the crossings of a continued contour where lattice rows and columns of one parity meet."""
         rows, columns = shape.lattice_rows, shape.lattice_columns
         i, j = np.nonzero(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)
         number = np.full((rows, columns), -1)
         number[i, j] = np.arange(len(i))
-        first = np.flatnonzero(i < rows - 1)
+        first, beside = np.flatnonzero(i < rows - 1), number[i, (j + 2) % columns]
         ends = [[first, number[i[first] + 1, (j[first] + hand) % columns]] for hand in (1, -1)]
         row, column = i * shape.row_split + 1, j * shape.column_split
         along_mm = np.gradient(nodes_mm, axis=0)
         around_mm = 0.5 * (np.roll(nodes_mm, -1, axis=1) - np.roll(nodes_mm, 1, axis=1))
         spacing_mm = tuple(float(np.median(np.linalg.norm(side, axis=2))) for side in (along_mm, around_mm))
         chart = np.concatenate([nodes_mm, along_mm / spacing_mm[0], around_mm / spacing_mm[1]], axis=2)
-        return cls(chart, i, row, column, np.concatenate(ends, axis=1), length_mm, spacing_mm, np.zeros(2 * len(i)))
+        return cls(
+            chart,
+            i,
+            beside,
+            row,
+            column,
+            np.concatenate(ends, axis=1),
+            length_mm,
+            crowding,
+            spacing_mm,
+            np.zeros(2 * len(i)),
+        )
 
     @property
     def shift_rows(self) -> Floats:
@@ -139,10 +160,13 @@ class _Net:
     @cached_property
     def cost_mm2(self) -> float:
         """What the crossings minimise."""
-        return float(np.vdot(self.excess_mm, self.excess_mm) + RESISTANCE**2 * np.vdot(self.slid_mm, self.slid_mm))
+        around_mm = self.slid_mm[len(self.row) :]
+        nearer_mm = around_mm[self.beside] - around_mm
+        terms = (1.0, self.excess_mm), (RESISTANCE, self.slid_mm), (self.crowding, nearer_mm)
+        return float(sum(weight**2 * np.vdot(values, values) for weight, values in terms))
 
     def jacobian(self) -> csr_array:
-        """Derivatives (p + rows, 2 c) of the lengths of the pieces, then of the mean of every row, by the sliding."""
+        """Derivatives by the sliding (p + rows + c, 2 c): lengths of pieces, means of rows, how neighbours part."""
         (first, last), (direction, _) = self.ends, self._pieces
         crossings, each = len(self.row), np.arange(self.ends.shape[1])
         values = [
@@ -151,11 +175,14 @@ class _Net:
             for tangent in self._places[1:]
         ]
         where = [end + half for end in (last, first) for half in (0, crossings)]
-        count = np.bincount(self.line)
-        entries = np.concatenate([*values, 1 / np.sqrt(count[self.line])])
-        rows = np.concatenate([np.tile(each, 4), len(each) + self.line])
-        columns = np.concatenate([*where, np.arange(crossings)])
-        return csr_array((entries, (rows, columns)), shape=(len(each) + len(count), 2 * crossings))
+        count, number = np.bincount(self.line), np.arange(crossings)
+        crowded = np.full(crossings, self.crowding)
+        entries = np.concatenate([*values, 1 / np.sqrt(count[self.line]), crowded, -crowded])
+        means = len(each) + self.line
+        neighbours = len(each) + len(count) + number
+        rows = np.concatenate([np.tile(each, 4), means, neighbours, neighbours])
+        columns = np.concatenate([*where, number, crossings + self.beside, crossings + number])
+        return csr_array((entries, (rows, columns)), shape=(neighbours[-1] + 1, 2 * crossings))
 
     def moved(self, slid_mm: Floats) -> Self:
         """Return the net slid so far (2 c,), its rows kept where they are in the mean."""
@@ -167,8 +194,9 @@ class _Net:
 def _relaxed(net: _Net) -> _Net:
     for _ in range(STEPS):
         jacobian = net.jacobian()
-        target = jacobian @ net.slid_mm
-        target[: len(net.excess_mm)] -= net.excess_mm
+        target = np.zeros(jacobian.shape[0])
+        pieces = slice(len(net.excess_mm))
+        target[pieces] = (jacobian @ net.slid_mm)[pieces] - net.excess_mm
         wanted_mm = lsmr(jacobian, target, damp=RESISTANCE, atol=TOLERANCE, btol=TOLERANCE, maxiter=60)[0]
         better = _better(net, wanted_mm)
         if better is None:
