@@ -36,6 +36,7 @@ $(VENV)/.ready: pyproject.toml
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m vstent.kernels.warm
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready

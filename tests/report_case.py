@@ -101,8 +101,9 @@ def deployment(key, hands, rows=60, columns=36):
         wire_diameter_um=np.where(np.arange(len(wires)) % 6 == 0, 50.0, 30.0),
     )
     gap = 0.03 + 0.25 * np.exp(-(((grid[0] - 1.2) / 0.15) ** 2)) * (1 + np.cos(grid[1])) / 2
+    energy = np.linspace(8, 1, len(history))
     return Deployment(
-        stent, "terminated", "It spans the neck and lies well.", np.linspace(0.1, 1, 7), 0.41, gap, history
+        stent, "terminated", "It spans the neck and lies well.", np.linspace(0.1, 1, 7), 0.41, gap, history, energy
     )
 
 

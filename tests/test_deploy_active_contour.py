@@ -5,10 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from brute import BruteWall
 from tubes import arc, line, tube
 from vstent.deploy import contour
-from vstent.deploy.active_contour import ActiveContour, Stiffness, relax
-from vstent.deploy.wall import AbstractWall, Contact, TreeWall
+from vstent.deploy.active_contour import ActiveContour, Stiffness
+from vstent.deploy.method import AbstractMethod, Opened, run
+from vstent.deploy.wall import TreeWall
 from vstent.errors import InputError
 from vstent.kernels import triangles
 
@@ -16,53 +18,31 @@ ROWS, COLUMNS = 14, 16
 METHOD = ActiveContour(a1=0.05, a2=0.02, a3=0.03, a4=0.04, a5=0.015, tau=1.7)
 
 
-class BruteWall(AbstractWall):
-    """Every point against every triangle."""
+class Bare(AbstractMethod):
+    """The contour alone, from a given state."""
 
-    def __init__(self, surface):
-        self.surface = surface
+    def __init__(self, contour, state, wall):
+        self.contour, self.state, self.wall = contour, state, wall
 
-    def contact(self, points_mm):
-        corners, normals = self.surface.corners_mm, self.surface.normals
-        every = np.arange(len(corners))
-        found = []
-        for p in points_mm:
-            candidates = [_on_edge(corners[:, k], corners[:, (k + 1) % 3], p) for k in range(3)]
-            height = np.einsum("ij,ij->i", p - corners[:, 0], normals)
-            foot = p - height[:, None] * normals
-            candidates.append(np.where(_is_in_triangle(corners, normals, foot)[:, None], foot, corners[:, 0]))
-            candidates = np.array(candidates)
-            distance = np.linalg.norm(candidates - p, axis=2)
-            which = distance.argmin(axis=0)
-            best = distance[which, every].argmin()
-            found.append((candidates[which[best], best], distance[which[best], best], normals[best]))
-        closest, distance, normal = zip(*found, strict=True)
-        return Contact(np.array(closest), np.array(distance), np.array(normal))
+    @property
+    def weights(self):
+        return self.contour
 
-    def crosses(self, starts_mm, ends_mm):
-        """Signed volumes of tetrahedra: start and end on two sides, and the line inside the triangle."""
-        a, b, c = self.surface.corners_mm.transpose(1, 0, 2)
+    def beside(self, dd_mm):
+        return self
 
-        def volume(p, q, r, s):
-            return np.einsum("...i,...i->...", np.cross(q - p, r - p), s - p)
+    def init(self, placement):
+        return Opened(self.state, np.arange(len(self.state.nodes_mm)))
 
-        hits = []
-        for p, q in zip(starts_mm, ends_mm, strict=True):
-            sides = volume(a, b, c, p) * volume(a, b, c, q) <= 0
-            u, v, w = volume(p, q, a, b), volume(p, q, b, c), volume(p, q, c, a)
-            same = ((u >= 0) & (v >= 0) & (w >= 0)) | ((u <= 0) & (v <= 0) & (w <= 0))
-            hits.append(bool((sides & same).any()))
-        return np.array(hits)
+    def step(self, placement, opened):
+        return dataclasses.replace(opened, contour=self.contour.step(opened.contour, self.wall))
+
+    def result(self, placement, opened):
+        return opened
 
 
-def _on_edge(a, b, p):
-    t = np.einsum("ij,ij->i", p - a, b - a) / np.einsum("ij,ij->i", b - a, b - a)
-    return a + np.clip(t, 0, 1)[:, None] * (b - a)
-
-
-def _is_in_triangle(corners, normals, foot):
-    turns = [np.cross(np.roll(corners, -k - 1, axis=1)[:, 0] - corners[:, k], foot - corners[:, k]) for k in range(3)]
-    return np.all([np.einsum("ij,ij->i", turn, normals) >= 0 for turn in turns], axis=0)
+def relax(contour, state, wall, progress=None):
+    return run(Bare(contour, state, wall), None, progress)
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +108,7 @@ def test_forces_are_those_of_equations_4_and_5(artery):
     brute = BruteWall(artery.landing_surface).contact(state.nodes_mm.reshape(-1, 3))
     d2 = brute.closest_mm.reshape(state.nodes_mm.shape) - state.nodes_mm
     d1 = np.linalg.norm(d2, axis=2, keepdims=True)
-    radial = state.nodes_mm - state.centers_mm[:, None]
+    radial = state.nodes_mm - state.centers_mm
     n = radial / np.linalg.norm(radial, axis=2, keepdims=True)
     assert np.allclose(method.force_mm(state), 0.7 * d1 * n + 0.13 * d2 / d1, atol=1e-12)
 
@@ -138,14 +118,14 @@ def test_each_node_is_put_into_its_state_and_relocated_by_equations_6_and_7(arte
     method = ActiveContour(dd_mm=0.15)
     before = start(artery, method, 1.0)
     scale = rng.uniform(0.8, 2.2, size=(ROWS, COLUMNS, 1))
-    centers = before.centers_mm[:, None]
+    centers = before.centers_mm
     moved = dataclasses.replace(before, nodes_mm=centers + scale * (before.nodes_mm - centers))
     after = method.classify(moved, np.ones((ROWS, COLUMNS), dtype=bool), TreeWall(artery.landing_surface))
 
     wall = BruteWall(artery.landing_surface)
     p = moved.nodes_mm.reshape(-1, 3)
     found = wall.contact(p)
-    crosses = wall.crosses(np.repeat(before.centers_mm, COLUMNS, axis=0), p)
+    crosses = wall.crosses(before.centers_mm.reshape(-1, 3), p)
     near = ~crosses & (found.distance_mm <= 0.15)
     assert min(crosses.sum(), near.sum(), (~crosses & ~near).sum()) > 10
     unit = (p - found.closest_mm) / found.distance_mm[:, None]
@@ -182,7 +162,7 @@ def test_the_fraction_of_terminated_nodes_never_falls_and_terminated_nodes_stay(
     assert np.all(np.diff(done.terminated_fraction) >= 0)
     assert [f for _, f in seen] == list(done.terminated_fraction)
     assert [i for i, _ in seen] == list(range(1, len(seen) + 1))
-    assert np.array_equal(done.history_mm[-1], done.state.nodes_mm)
+    assert np.array_equal(done.history_mm[-1], done.opened.contour.nodes_mm)
     assert done.terminated_fraction[-1] >= 0.99 > done.terminated_fraction[-2]
 
 
@@ -202,7 +182,7 @@ def test_too_few_iterations_are_a_result_not_an_error(artery):
     method = ActiveContour(k1=0.01, k2=0.0, iteration_limit=3)
     done = relax(method, start(artery, method, 0.8), TreeWall(artery.landing_surface))
     assert done.outcome == "iteration_limit"
-    assert len(done.history_mm) == 3
+    assert len(done.history_mm) == len(done.energy_mm2) == 4
 
 
 def test_weights_that_blow_up_are_refused(artery):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from vstent import device, device_schema
+from vstent.cli import main
 from vstent.device import Braid, LaserCut, Size
 from vstent.errors import DeviceError
 
@@ -135,3 +136,66 @@ def test_one_key_for_two_devices_is_refused():
 def test_importing_devices_does_not_load_pydantic():
     code = "import sys, vstent.device; sys.exit('pydantic' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+OWN = """
+[[device]]
+key = "own"
+name = "Own"
+maker = "me"
+kind = "braid"
+wires = [{ count = 64, diameter_um = 25, source = "drawing 7", confidence = "cited" }]
+braid_angle_rad = { value = 1.2, source = "measured on a bench", confidence = "derived" }
+free_diameter_margin_mm = { value = 0.1, source = "drawing 7", confidence = "cited" }
+sizes = [{ diameters_mm = [3.0], lengths_mm = [10, 20], source = "drawing 7", confidence = "cited" }]
+"""
+
+
+@pytest.fixture
+def own_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    device.catalogue.cache_clear()
+    yield tmp_path / "config" / "vstent" / "devices"
+    device.catalogue.cache_clear()
+
+
+def test_a_device_of_ones_own_joins_the_catalogue_and_can_be_replaced(own_folder, tmp_path, capsys):
+    before = set(device.catalogue())
+    file = tmp_path / "mine.toml"
+    file.write_text(OWN)
+    assert main(["devices", "add", str(file)]) == 0
+    assert "Own" in capsys.readouterr().out
+    assert set(device.catalogue()) - before == {"own"}
+    assert device.find_design("Own").wires == ((64, 25.0),)
+    assert {fact.source for fact in device.find_design("own").facts} == {"drawing 7", "measured on a bench"}
+    file.write_text(OWN.replace("diameter_um = 25", "diameter_um = 26"))
+    assert main(["devices", "add", str(file)]) == 0
+    assert device.find_design("own").wires == ((64, 26.0),)
+    assert [path.name for path in own_folder.iterdir()] == ["mine.toml"]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (OWN.replace('"own"', '"silk"'), "names a device that the catalogue has already, silk"),
+        (OWN.replace(', confidence = "derived"', ""), "is wrong at device.0.braid.braid_angle_rad.confidence"),
+        (OWN.replace("value = 1.2", "value = 2.0"), "has an angle of 2.000 rad"),
+        (OWN.replace("]]", "]"), "is not valid TOML"),
+        (None, "cannot be read"),
+    ],
+    ids=["taken", "no confidence", "angle", "no TOML", "no file"],
+)
+def test_a_bad_device_file_is_refused_and_not_kept(own_folder, tmp_path, capsys, text, complaint):
+    file = tmp_path / "mine.toml"
+    if text is not None:
+        file.write_text(text)
+    assert main(["devices", "add", str(file)]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not own_folder.exists()
+
+
+def test_an_own_file_spoiled_later_is_named(own_folder):
+    own_folder.mkdir(parents=True)
+    (own_folder / "mine.toml").write_text("spoiled")
+    with pytest.raises(DeviceError, match=r"mine\.toml is not valid TOML"):
+        device.catalogue()

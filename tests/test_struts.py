@@ -10,7 +10,9 @@ from scipy.spatial import cKDTree
 from tubes import arc, line, tube
 from vstent import device
 from vstent.deploy import deploy, wires
-from vstent.struts import struts
+from vstent.errors import DeviceError
+from vstent.struts import blood, struts, united
+from vstent.surface import Surface
 
 SILK, ENTERPRISE = device.find_design("silk"), device.find_design("enterprise")
 SIZES = {
@@ -155,3 +157,22 @@ def test_struts_are_closed_outward_solids_of_the_wires_volume(design, artery):
 def test_no_solid_reaches_through_the_wall(design):
     vertices_mm = struts(stent(straight(), design)).vertices_mm
     assert np.linalg.norm(vertices_mm[:, :2], axis=1).max() < 1.9 + 0.003
+
+
+def test_struts_and_blood_together_fill_the_lumen():
+    pytest.importorskip("manifold3d")
+    solid = struts(stent(bent(), ENTERPRISE))
+    metal, left = united(solid), blood(bent(), solid)
+    assert 0.9 * solid.volume_mm3 < metal.volume_mm3 < solid.volume_mm3  # crowns of neighbouring rings overlap
+    # Edges of the struts, which lie flat against a round wall, stick out of it by a hair.
+    outside_mm3 = metal.volume_mm3 + left.volume_mm3 - bent().vessel.closed.volume_mm3
+    assert 0 <= outside_mm3 < 0.002 * metal.volume_mm3
+    for body in (metal, left):
+        assert body.boundary_loops == ()
+
+
+def test_an_open_solid_is_refused():
+    pytest.importorskip("manifold3d")
+    solid = struts(stent(straight(), ENTERPRISE))
+    with pytest.raises(DeviceError, match="is not closed"):
+        united(Surface(solid.vertices_mm, solid.faces[1:]))

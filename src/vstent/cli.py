@@ -56,6 +56,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_demo(commands.add_parser("demo", help="the same on a synthetic scan, beside its known truth", epilog=EPILOG))
     devices = commands.add_parser("devices", help="list the catalogue", epilog=EPILOG)
     devices.set_defaults(command=_devices)
+    add = devices.add_subparsers(metavar="COMMAND").add_parser("add", help="add devices of your own", epilog=EPILOG)
+    add.add_argument("file", type=Path, help="TOML, written like vstent's devices.toml: every number with its source")
+    add.set_defaults(command=_devices_add)
     return parser
 
 
@@ -257,4 +260,12 @@ def _devices(arguments: argparse.Namespace) -> int:
     from vstent.device import catalogue
 
     Console().print(device_table(catalogue()))
+    return 0
+
+
+def _devices_add(arguments: argparse.Namespace) -> int:
+    from vstent.console import Console, device_table
+    from vstent.device import add_devices
+
+    Console().print(device_table(add_devices(arguments.file)))
     return 0

@@ -7,9 +7,11 @@ column, pi D / n, and the row spacing is what is left: h(D) = sqrt((l/n)^2 - (pi
 """
 
 import difflib
+import os
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,6 +21,8 @@ from vstent.units import MM_PER_UM
 
 Confidence = Literal["cited", "derived", "estimated"]
 
+STEEP_RAD = 0.1, 1.5
+"""Angles between wire and axis that a device may have at its free diameter."""
 NODE_SPACING_LIMIT_MM = 0.35
 """A contour's nodes are never further apart than this at the label diameter."""
 
@@ -45,6 +49,8 @@ class Size:
     """Label length: the length at the label diameter."""
     free_diameter_mm: float
     """Diameter without an artery around it; the device never gets wider."""
+    compaction_fraction: float = 0.0
+    """Part by which pushing has shortened a braid at its label diameter; below zero where it was pulled."""
 
     @property
     def label(self) -> str:
@@ -147,7 +153,7 @@ def _check_columns(name: str, n_columns: int) -> None:
 
 
 def _check_angle(name: str, angle_rad: float) -> None:
-    if not 0.1 < angle_rad < 1.5:
+    if not STEEP_RAD[0] < angle_rad < STEEP_RAD[1]:
         raise DeviceError(f"{name} has an angle of {angle_rad:.3f} rad to the axis: give 0.1 to 1.5 rad.")
 
 
@@ -177,20 +183,52 @@ class Grid(NamedTuple):
 def grid(design: Design, size: Size) -> Grid:
     """Return the contour's grid: one node per junction column and row, finer where cells are large."""
     spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
-    rows = max(2, round(size.length_mm / spacing_mm) + 1)
+    rows = max(2, round(size.length_mm * (1 - size.compaction_fraction) / spacing_mm) + 1)
     row_split = int(np.ceil(spacing_mm / NODE_SPACING_LIMIT_MM))
     column_split = int(np.ceil(np.pi * size.diameter_mm / design.n_columns / NODE_SPACING_LIMIT_MM))
     return Grid((rows - 1) * row_split + 1, design.n_columns * column_split, row_split, column_split)
 
 
 def piece_length_mm(design: Design, size: Size) -> float:
-    """Length l/n of the wire or strut between junctions: it never changes."""
-    return float(np.pi * size.free_diameter_mm / (design.n_columns * np.sin(design.angle_rad)))
+    """Length l/n of the wire or strut between junctions: an artery cannot change it."""
+    return float(np.pi * size.free_diameter_mm / (design.n_columns * _free_sine(design, size)))
+
+
+def compacted(design: Design, size: Size, fraction: float) -> Size:
+    """Return a size of a braid pushed together (pulled apart: below zero) by a part of its length.
+
+    The wires' ends are free: pushed, wires wind more often round the device and cross more often. A wire of the same
+    length over the fraction (1 - q) of the axis has cos(alpha) = (1 - q) cos(alpha of the label).
+
+    Raises
+    ------
+    DeviceError
+        When the wires of such a device would stand too steep, or the device has none.
+    """
+    if fraction == 0.0:
+        return size
+    changed = replace(size, compaction_fraction=fraction)
+    if not (isinstance(design, Braid) and np.sin(STEEP_RAD[0]) < _free_sine(design, changed) < np.sin(STEEP_RAD[1])):
+        raise DeviceError(
+            f"{design.name} {size.label} cannot be compacted by {fraction:g} of its length: "
+            f"{'its wires would stand too steep' if isinstance(design, Braid) else 'its cells are joined'}. "
+            f"Give {'a smaller part' if isinstance(design, Braid) else '0, or another device'}."
+        )
+    return changed
+
+
+def _free_sine(design: Design, size: Size) -> float:
+    """Sine of the angle between wire and axis at the free diameter; a compacted braid's may exceed 1: it is none."""
+    if size.compaction_fraction == 0.0:
+        return float(np.sin(design.angle_rad))
+    cosine = np.sqrt(1 - (np.sin(design.angle_rad) * size.diameter_mm / size.free_diameter_mm) ** 2)
+    left = min(1.0, (1 - size.compaction_fraction) * cosine)
+    return float(np.sqrt(1 - left**2) * size.free_diameter_mm / size.diameter_mm)
 
 
 def angle_rad(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np.ndarray:
     """Angle between wire and axis at a local diameter: sin(alpha) = sin(alpha_free) D / D_free."""
-    return np.arcsin(np.sin(design.angle_rad) * np.minimum(diameter_mm, size.free_diameter_mm) / size.free_diameter_mm)
+    return np.arcsin(_free_sine(design, size) * np.minimum(diameter_mm, size.free_diameter_mm) / size.free_diameter_mm)
 
 
 def row_spacing_mm(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np.ndarray:
@@ -205,9 +243,9 @@ def deployed_length_mm(design: Design, size: Size, diameter_mm: float) -> float:
 
 
 def foreshortening_fraction(design: Design, size: Size, diameter_mm: float) -> float:
-    """Shortening at a local diameter against the label: 1 - L(D)/L_label = 1 - cos(alpha)/cos(alpha_label)."""
+    """Shortening at a local diameter against the label: 1 - L(D)/L_label = 1 - (1 - q) cos(alpha)/cos(alpha_label)."""
     here, label = angle_rad(design, size, np.array([diameter_mm, size.diameter_mm]))
-    return float(1 - np.cos(here) / np.cos(label))
+    return float(1 - (1 - size.compaction_fraction) * np.cos(here) / np.cos(label))
 
 
 def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
@@ -231,18 +269,62 @@ def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> floa
 
 @cache
 def catalogue() -> dict[str, Design]:
-    """Return every device of the catalogue by its key.
+    """Return every device by its key: those of the catalogue, then those that the user has added.
 
     Raises
     ------
     DeviceError
-        When the catalogue breaks its schema.
+        When a catalogue breaks its schema or names a device that another one names.
     """
     from importlib.resources import files
 
     from vstent.device_schema import parse  # pydantic is loaded only when the catalogue is
 
-    return parse(files("vstent").joinpath("devices.toml").read_text(encoding="utf-8"))
+    designs = parse(files("vstent").joinpath("devices.toml").read_text(encoding="utf-8"))
+    for path in sorted(user_folder().glob("*.toml")):
+        added = parse(path.read_text(encoding="utf-8"), str(path))
+        _check_new(added, designs, path)
+        designs |= added
+    return designs
+
+
+def user_folder() -> Path:
+    """Return where the user's own device files are kept: ``$XDG_CONFIG_HOME/vstent/devices``, or in ``~/.config``."""
+    home = os.environ.get("XDG_CONFIG_HOME") or os.environ.get("APPDATA") or "~/.config"
+    return Path(home).expanduser() / "vstent" / "devices"
+
+
+def add_devices(path: Path) -> dict[str, Design]:
+    """Check a device file (TOML, as ``vstent/devices.toml``) and keep a copy of it: its devices join the catalogue.
+
+    A file of the same name that was added before is replaced.
+
+    Raises
+    ------
+    DeviceError
+        When it is no readable text, breaks the schema or names a device that the catalogue has already.
+    """
+    from vstent.device_schema import parse
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DeviceError(f"{path} cannot be read as text: give a TOML file of devices.") from error
+    added, kept = parse(text, str(path)), user_folder() / f"{path.stem}.toml"
+    others = parse(kept.read_text(encoding="utf-8"), str(kept)) if kept.exists() else {}
+    _check_new(added, {key: design for key, design in catalogue().items() if key not in others}, path)
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    partial = kept.with_suffix(".partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(kept)
+    catalogue.cache_clear()
+    return added
+
+
+def _check_new(added: Iterable[str], known: Iterable[str], path: Path) -> None:
+    twice = sorted(set(added) & set(known))
+    if twice:
+        raise DeviceError(f"{path} names a device that the catalogue has already, {twice[0]}: give it another key.")
 
 
 def find_design(name: str) -> Design:

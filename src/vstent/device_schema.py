@@ -109,8 +109,8 @@ def _fact(name: str, sourced: _Sourced) -> Fact:
     return Fact(name, sourced.source, sourced.confidence)
 
 
-def parse(text: str) -> dict[str, Design]:
-    """Read a catalogue (TOML): its devices by key.
+def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:
+    """Read a catalogue (TOML) called `name`: its devices by key.
 
     Raises
     ------
@@ -120,12 +120,12 @@ def parse(text: str) -> dict[str, Design]:
     try:
         found = _Catalogue.model_validate(tomllib.loads(text)).device
     except tomllib.TOMLDecodeError as error:
-        raise DeviceError(f"The device catalogue is not valid TOML: {error}. Correct that line.") from error
+        raise DeviceError(f"{name} is not valid TOML: {error}. Correct that line.") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise DeviceError(f"The device catalogue is wrong at {where}: {first['msg']}. Correct that entry.") from error
+        raise DeviceError(f"{name} is wrong at {where}: {first['msg']}. Correct that entry.") from error
     designs = {entry.key: entry.design() for entry in found}
     if len(designs) < len(found):
-        raise DeviceError("The device catalogue uses one key for two devices: give each its own.")
+        raise DeviceError(f"{name} uses one key for two devices: give each its own.")
     return designs

@@ -6,9 +6,8 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from vstent.deploy import APPOSED_GAP_MM
-from vstent.deploy.contour import perimeters
 from vstent.deploy.sizing import landing_diameters_mm, neck_span_mm
-from vstent.device import coverage_fraction, grid, pore_density_per_mm2
+from vstent.device import coverage_fraction, grid, piece_length_mm, pore_density_per_mm2
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats
 from vstent.stent import Deployment, Stent
@@ -38,10 +37,11 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
         _position(anatomy, deployment.stent)
         | _apposition(anatomy, deployment)
         | _density(anatomy, deployment.stent)
+        | _stretch(deployment.stent)
+        | _branches(anatomy, deployment.stent)
         | {
             "iterations_count": float(len(deployment.terminated_fraction)),
             "terminated_fraction": float(deployment.terminated_fraction[-1]),
-            "jailed_branches_count": float(_jailed_branches(anatomy, deployment.stent)),
         }
     )
 
@@ -49,7 +49,7 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
 def _position(anatomy: Anatomy, stent: Stent) -> Measures:
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     before_mm, after_mm = proximal_mm - stent.proximal_abscissa_mm, stent.distal_abscissa_mm - distal_mm
-    diameter_mm = perimeters(stent.nodes_mm) / np.pi
+    diameter_mm = stent.row_diameter_mm
     artery_mm = 2 * np.interp(stent.row_abscissa_mm, anatomy.axis.abscissa_mm, anatomy.section_radius_mm)
     found: Measures = {
         "device": stent.design.name,
@@ -136,7 +136,7 @@ def _density(anatomy: Anatomy, stent: Stent) -> Measures:
     quads_mm = (quads_mm + np.roll(quads_mm, -1, axis=1)).reshape(-1, 3)
     hidden, area_mm2 = coverage_fractions(stent).ravel(), quad_areas_mm2(stent).ravel()
     pore_mm2, pores_mm = pore_areas_mm2(stent)
-    diameter_mm = float(perimeters(stent.nodes_mm).mean() / np.pi)
+    diameter_mm = float(stent.row_diameter_mm.mean())
     found: Measures = {
         "metal_coverage_fraction": float(np.average(hidden, weights=area_mm2)),
         "metal_coverage_formula_fraction": coverage_fraction(stent.design, stent.size, diameter_mm),
@@ -159,18 +159,46 @@ def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
     return to_neck_mm <= anatomy.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM
 
 
-def _jailed_branches(anatomy: Anatomy, stent: Stent) -> int:
-    """Count the outlets whose centerline leaves the parent artery between the ends of the device."""
-    axis = anatomy.axis
-    count = 0
+def wire_stretches(stent: Stent) -> Floats:
+    """By how much every piece of wire (strut) between junctions is longer than it was made, (p,) fractions."""
+    shape = grid(stent.design, stent.size)
+    junctions_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
+    row, column = np.meshgrid(np.arange(shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
+    row, column = row[(row + column) % 2 == 0], column[(row + column) % 2 == 0]
+    ends_mm = [junctions_mm[row + 1, (column + hand) % shape.lattice_columns] for hand in (1, -1)]
+    length_mm = np.linalg.norm(np.stack(ends_mm) - junctions_mm[row, column], axis=2).ravel()
+    return length_mm / piece_length_mm(stent.design, stent.size) - 1
+
+
+def _stretch(stent: Stent) -> Measures:
+    stretch = wire_stretches(stent)
+    return {
+        "mean_wire_stretch_fraction": float(stretch.mean()),
+        "p95_wire_stretch_fraction": float(np.quantile(np.abs(stretch), 0.95)),
+    }
+
+
+def branch_abscissas_mm(anatomy: Anatomy) -> Floats:
+    """Where on the parent axis (b,) the centerlines of other outlets leave the parent artery."""
+    axis, left_mm = anatomy.axis, []
     for line in anatomy.vessel.centerlines:
         foot_mm, distance_mm = curves.project(axis.points_mm, line.points_mm)
         is_away = distance_mm > np.interp(foot_mm, axis.abscissa_mm, anatomy.section_radius_mm)
         is_gone = np.logical_and.accumulate(is_away[::-1])[::-1]
         if is_gone[-1]:
-            left_mm = foot_mm[np.argmax(is_gone)]
-            count += bool(stent.proximal_abscissa_mm <= left_mm <= stent.distal_abscissa_mm)
-    return count
+            left_mm.append(foot_mm[np.argmax(is_gone)])
+    return np.array(left_mm)
+
+
+def _branches(anatomy: Anatomy, stent: Stent) -> Measures:
+    """Branches between the ends of the device, and how far the nearest branch is from each end."""
+    left_mm = branch_abscissas_mm(anatomy)
+    first_mm, last_mm = stent.proximal_abscissa_mm, stent.distal_abscissa_mm
+    found: Measures = {"jailed_branches_count": float(((left_mm >= first_mm) & (left_mm <= last_mm)).sum())}
+    if len(left_mm):
+        found["proximal_end_to_branch_mm"] = float(np.abs(left_mm - first_mm).min())
+        found["distal_end_to_branch_mm"] = float(np.abs(left_mm - last_mm).min())
+    return found
 
 
 def morphology(anatomy: Anatomy) -> Measures:

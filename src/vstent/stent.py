@@ -1,6 +1,7 @@
 """The device's nouns once it is in an artery: Landing, Stent, Deployment."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -52,6 +53,22 @@ class Stent:
         rows, columns = self.nodes_mm.shape[:2]
         return Surface(self.nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
 
+    @cached_property
+    def row_diameter_mm(self) -> Floats:
+        """(rows,) diameter of the circle of every row's perimeter, seen along the device: a row may be tilted."""
+        around_mm = np.roll(self.nodes_mm, -1, axis=1) - self.nodes_mm
+        columns = self.nodes_mm.shape[1]
+        center_mm = self.nodes_mm.mean(axis=1)
+        # The direction of the device is taken over about one diameter: centers of rows wobble.
+        radius_mm = np.linalg.norm(around_mm, axis=2).sum(axis=1).mean() / (2 * np.pi)
+        step_mm = np.linalg.norm(np.diff(center_mm, axis=0), axis=1).mean()
+        reach, row = max(1, round(radius_mm / step_mm)), np.arange(len(center_mm))
+        ahead = center_mm[np.minimum(row + reach, row[-1])] - center_mm[np.maximum(row - reach, 0)]
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+        across_mm = around_mm - np.einsum("ijk,ik->ij", around_mm, ahead)[..., None] * ahead[:, None]
+        # A regular polygon is shorter than its circle by (pi/n) / sin(pi/n).
+        return np.linalg.norm(across_mm, axis=2).sum(axis=1) / (columns * np.sin(np.pi / columns))
+
     @property
     def proximal_abscissa_mm(self) -> float:
         """Where the device begins on the parent axis."""
@@ -86,11 +103,14 @@ class Deployment:
     """(rows, columns) clearance between the device's outer face and the landing surface."""
     history_mm: Floats
     """(iterations + 1, rows, columns, 3) contour before the first and after every iteration."""
+    energy_mm2: Floats
+    """(iterations + 1,) energy of the contour (Zhong et al. 2016, eq. 1) before the first and after every iteration."""
 
     def __post_init__(self) -> None:
         freeze(self, "terminated_fraction", np.float64, (-1,))
         freeze(self, "wall_gap_mm", np.float64, self.stent.nodes_mm.shape[:2])
         freeze(self, "history_mm", np.float64, (-1, *self.stent.nodes_mm.shape))
+        freeze(self, "energy_mm2", np.float64, (len(self.history_mm),))
 
 
 def tube_faces(rows: int, columns: int) -> Ints:

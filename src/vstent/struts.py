@@ -1,16 +1,18 @@
 """Struts: the wires of a deployed device as closed solids."""
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from vstent.deploy.contour import normals
 from vstent.device import LaserCut
+from vstent.errors import DeviceError
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.stent import Stent
 from vstent.surface import Surface
 from vstent.units import MM_PER_UM
+from vstent.vessel import Anatomy
 
 SIDES: Final = 6
 """Sides of a round wire's section; a flat side faces the wall."""
@@ -32,6 +34,51 @@ def struts(stent: Stent) -> Surface:
     sides = section.shape[1]
     faces = [_side_faces(stent.wire_starts, is_joined, is_last, sides), _cap_faces(stent.wire_starts, is_joined, sides)]
     return _compacted(vertices.reshape(-1, 3), np.concatenate(faces))
+
+
+def united(solid: Surface) -> Surface:
+    """Return the struts as one solid, where wires touch or run into each other included (exact boolean union).
+
+    Raises
+    ------
+    DeviceError
+        When the solid is not closed, or the library manifold3d is missing.
+    """
+    return _surface(_union(solid))
+
+
+def blood(anatomy: Anatomy, solid: Surface) -> Surface:
+    """Return what blood fills in the patient's own lumen with the struts in it: lumen, sac and branches, less metal.
+
+    Raises
+    ------
+    DeviceError
+        When lumen or struts are not closed, or the library manifold3d is missing.
+    """
+    return _surface(_manifold(anatomy.vessel.closed) - _union(solid))
+
+
+def _union(solid: Surface) -> Any:
+    body = _manifold(solid)
+    import manifold3d
+
+    return manifold3d.Manifold.batch_boolean(body.decompose(), manifold3d.OpType.Add)
+
+
+def _manifold(surface: Surface) -> Any:
+    try:
+        import manifold3d
+    except ImportError as error:
+        raise DeviceError("Joining solids needs the library manifold3d: run pip install 'vstent[solids]'.") from error
+    body = manifold3d.Manifold(manifold3d.Mesh64(surface.vertices_mm.copy(), surface.faces.astype(np.uint64)))
+    if body.status() != manifold3d.Error.NoError or body.is_empty():
+        raise DeviceError(f"A surface of {len(surface.faces)} triangles is not closed: it cannot be joined or cut.")
+    return body
+
+
+def _surface(body: Any) -> Surface:
+    mesh = body.to_mesh64()
+    return Surface(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts, dtype=np.int32))
 
 
 def _ring_ends(stent: Stent) -> tuple[Bools, Bools]:

@@ -1,20 +1,36 @@
 """Deploy: an active contour grows to the wall, rows of a braid that cannot stretch follow it, wires are drawn on it."""
 
 import time
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 
-from vstent.deploy import braid, sizing, wires
-from vstent.deploy.active_contour import ActiveContour, Progress
-from vstent.deploy.wall import TreeWall
-from vstent.device import Design, Size
+from vstent.deploy import sizing, wires
+from vstent.deploy.active_contour import ActiveContour
+from vstent.deploy.braid import ConstantWire
+from vstent.deploy.method import AbstractMethod, Course, Placement, Progress, run
+from vstent.deploy.wall import landing_wall
+from vstent.deploy.zhong2016 import Zhong2016
+from vstent.device import Design, Size, compacted
+from vstent.errors import InputError
 from vstent.kernels.arrays import Floats
 from vstent.stent import Deployment, Landing, Stent
 from vstent.units import MM_PER_UM
 from vstent.vessel import Anatomy
 
-__all__ = ["APPOSED_GAP_MM", "ActiveContour", "deploy", "propose_landing", "propose_size"]
+__all__ = [
+    "APPOSED_GAP_MM",
+    "METHODS",
+    "ActiveContour",
+    "ConstantWire",
+    "Zhong2016",
+    "deploy",
+    "propose_landing",
+    "propose_size",
+]
+
+METHODS: dict[str, type[ConstantWire] | type[Zhong2016]] = {"constant_wire": ConstantWire, "zhong2016": Zhong2016}
+"""Ways to deploy, by name."""
 
 APPOSED_GAP_MM = 0.1
 """A node is apposed when the device's outer face is nearer to the wall than this."""
@@ -31,7 +47,9 @@ def deploy(
     *,
     size: Size | None = None,
     landing: Landing | None = None,
-    method: ActiveContour | None = None,
+    method: AbstractMethod | str = "constant_wire",
+    compaction_fraction: float = 0.0,
+    inside: Sequence[Stent] = (),
     progress: Progress | None = None,
 ) -> Deployment:
     """Deploy a device in the parent artery.
@@ -41,14 +59,20 @@ def deploy(
     design : the device; see `vstent.device.catalogue`.
     anatomy : the artery, restored.
     size : the size; None proposes one.
-    landing : where it is to lie; None centers it on the neck of the largest aneurysm.
-    method : weights of the active contour (Zhong et al. 2016, eq. 1-7); its dd becomes the device's wire width.
+    landing : where its center, proximal or distal end is to lie; None centers it on the neck of the largest aneurysm.
+    method : ``constant_wire``, ``zhong2016`` (the paper's contour and nothing else), or one with its own weights.
+    compaction_fraction : part by which pushing shortens a braid against its natural length (pulling: below zero).
+    inside : devices that lie in the artery already, in which this one opens where they overlap (telescoping).
     progress : called after every iteration with its number and the fraction of nodes terminated.
 
     Raises
     ------
     LandingError
         When the device does not fit the artery there.
+    DeviceError
+        When the device cannot be compacted so much.
+    InputError
+        When there is no such method, or its weights make the contour run away.
 
     Notes
     -----
@@ -56,35 +80,44 @@ def deploy(
     artery is wider than the free device, the device stays at its free diameter and the gap is in ``wall_gap_mm``.
     """
     began = time.perf_counter()
-    size = size or propose_size(design, anatomy)
+    chosen = _method(method).beside(design.wall_offset_um * MM_PER_UM)
+    size = compacted(design, size or propose_size(design, anatomy), compaction_fraction)
     landing = landing or propose_landing(design, anatomy, size)
-    method = replace(method or ActiveContour(), dd_mm=design.wall_offset_um * MM_PER_UM)
-    wall = TreeWall(anatomy.landing_surface)
-    settled = braid.settle(braid.Expansion(design, size, landing, anatomy, method, wall), progress)
-    drawn = wires.draw(design, size, settled.nodes_mm, wall)
-    stent = Stent(design, size, settled.nodes_mm, settled.abscissa_mm, drawn.points_mm, drawn.starts, drawn.diameter_um)
-    _, distance_mm, face = anatomy.landing_surface.closest(settled.nodes_mm.reshape(-1, 3))
-    gap_mm = np.maximum(distance_mm - method.dd_mm, 0.0).reshape(settled.nodes_mm.shape[:2])
-    is_wall = ~anatomy.is_restored[anatomy.landing_surface.faces[face]].all(axis=1)
+    wall, is_patient = landing_wall(anatomy, inside)
+    course = run(chosen, Placement(design, size, landing, anatomy, wall), progress)
+    nodes_mm = course.opened.contour.nodes_mm
+    drawn = wires.draw(design, size, nodes_mm, wall)
+    stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, drawn.points_mm, drawn.starts, drawn.diameter_um)
+    contact = wall.contact(nodes_mm.reshape(-1, 3))
+    gap_mm = np.maximum(contact.distance_mm - chosen.weights.dd_mm, 0.0)
     return Deployment(
         stent=stent,
-        outcome=settled.outcome,
-        advice=_advice(stent, settled, gap_mm.ravel()[is_wall]),
-        terminated_fraction=np.array(settled.terminated_fraction),
+        outcome=course.outcome,
+        advice=_advice(stent, course, gap_mm[is_patient[contact.face]]),
+        terminated_fraction=np.array(course.terminated_fraction),
         seconds=time.perf_counter() - began,
-        wall_gap_mm=gap_mm,
-        history_mm=np.array(settled.history_mm),
+        wall_gap_mm=gap_mm.reshape(nodes_mm.shape[:2]),
+        history_mm=np.array(course.history_mm),
+        energy_mm2=np.array(course.energy_mm2),
     )
 
 
-def _advice(stent: Stent, settled: braid.Settled, gap_mm: Floats) -> str:
+def _method(method: AbstractMethod | str) -> AbstractMethod:
+    if isinstance(method, AbstractMethod):
+        return method
+    if method not in METHODS:
+        raise InputError(f"There is no way to deploy called {method!r}: choose one of {', '.join(METHODS)}.")
+    return METHODS[method]()
+
+
+def _advice(stent: Stent, course: Course, gap_mm: Floats) -> str:
     """One sentence: where the device lies, and what to do when it does not fit; gaps (n,) at the patient's own wall."""
     lies = (
         f"{stent.design.name} {stent.size.label} lies from {stent.proximal_abscissa_mm:.1f} to "
         f"{stent.distal_abscissa_mm:.1f} mm of the parent artery, {stent.deployed_length_mm:.1f} mm long"
     )
-    if settled.outcome == "iteration_limit":
-        done = settled.terminated_fraction[-1]
+    if course.outcome == "iteration_limit":
+        done = course.terminated_fraction[-1]
         return f"{lies}, but only {done:.0%} of its contour reached the wall: raise the iteration limit or tau."
     loose = float((gap_mm > APPOSED_GAP_MM).mean()) if gap_mm.size else 0.0
     if loose <= LOOSE_FRACTION:

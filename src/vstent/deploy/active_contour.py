@@ -1,28 +1,18 @@
 """The active contour of Zhong et al. 2016: a closed tube of nodes that grows until it meets the wall (eq. 1-7)."""
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, Protocol, final
+from typing import Final, final
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from vstent.deploy.contour import normals
 from vstent.deploy.wall import ON_WALL_MM, AbstractWall, Contact
-from vstent.errors import InputError
 from vstent.kernels.arrays import Bools, Floats
 
-Progress = Callable[[int, float], None]
-"""Called after every iteration with its number and the fraction of nodes terminated."""
-
-
-class Limit(Protocol):
-    """What stops a contour besides the wall, for instance the device's free diameter."""
-
-    def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
-        """Return the contour allowed between two contours (rows, columns, 3), and which nodes (rows, columns) stop."""
+SAFELY: Final = 1 - 1e-9
+"""Balls without a wall in them are taken smaller by this, so that rounding cannot hide a crossing."""
 
 
 @final
@@ -86,13 +76,21 @@ class State:
     nodes_mm: Floats
     """(rows, columns, 3) nodes."""
     centers_mm: Floats
-    """(rows, 3) fiducial point inside the lumen for every row, the paper's "center"."""
+    """(rows, columns, 3) fiducial point inside the lumen for every node: its row's center, the paper's "center"."""
+    clearance_mm: Floats
+    """(rows, columns) no wall is nearer to the fiducial point than this."""
     is_terminated: Bools
     """(rows, columns) nodes that no longer move."""
     contact: Contact
     """The nearest wall of every node, flattened to (rows * columns,)."""
     stiffness: Stiffness
     """I + tau K, factored."""
+
+    def about(self, centers_mm: Floats, wall: AbstractWall) -> "State":
+        """Return the contour with a fiducial point for every row (rows, 3)."""
+        shape = self.nodes_mm.shape
+        clearance_mm = np.broadcast_to(wall.contact(centers_mm).distance_mm[:, None], shape[:2])
+        return replace(self, centers_mm=np.broadcast_to(centers_mm[:, None], shape), clearance_mm=clearance_mm)
 
     @cached_property
     def terminated_fraction(self) -> float:
@@ -106,8 +104,12 @@ class ActiveContour:
     """The paper's contour: eq. (1-7), one explicit force step and one implicit elastic step per iteration.
 
     The elastic weights act on differences between neighbouring nodes, without units; forces are displacements in mm
-    per unit of tau. The weights are small against k1: elasticity smooths what the balloon inflates and does not hold
-    it back. See `relax` for the loop.
+    per unit of tau. The defaults are argued from a study (``benchmarks/contour_weights.py``, an artery of lobed
+    sections): from no elasticity at all to ten times this much the contour ends on the same wall; at a hundred times
+    (tension 1, bending 20) it hangs in front of it, for the tension pulls a tube shut. So the weights are a tenth of
+    what changes nothing. k1 below 1 aims short of the wall, so that eq. (7) is for accidents; far below, it creeps (8
+    iterations at 0.05) and nodes drift together. k2 only matters close to the wall; from 0.2 on it crowds the nodes.
+    See `vstent.deploy.method` for the loop.
     """
 
     a1: float = 0.01
@@ -138,7 +140,10 @@ class ActiveContour:
         rows, columns = nodes_mm.shape[:2]
         stiffness = Stiffness.of(self, rows, columns)
         moving = np.zeros((rows, columns), dtype=bool)
-        return State(nodes_mm, centers_mm, moving, wall.contact(nodes_mm.reshape(-1, 3)), stiffness)
+        state = State(
+            nodes_mm, nodes_mm, np.zeros((rows, columns)), moving, wall.contact(nodes_mm.reshape(-1, 3)), stiffness
+        )
+        return state.about(centers_mm, wall)
 
     def step(self, state: State, wall: AbstractWall) -> State:
         """Move the nodes that continue, then terminate those that reach the wall or cross it."""
@@ -154,6 +159,27 @@ class ActiveContour:
         to_wall = -state.contact.inward(state.nodes_mm.reshape(-1, 3)).reshape(shape)
         return self.k1 * distance_mm * normals(state.nodes_mm) + self.k2 * to_wall
 
+    def energy_mm2(self, state: State) -> float:
+        """Energy of the contour, eq. (1): the internal energy of eq. (2) and the potential of the forces.
+
+        Along the way to the wall, where the contour's normal points to it, eq. (4, 5) have the potential
+        k1 d^2 + 2 k2 d (an iteration descends half of eq. 2, whose variation is 2 K v).
+        """
+        v = state.nodes_mm
+        along, around = np.diff(v, axis=0), np.roll(v, -1, axis=1) - v
+        bent = around - np.roll(around, 1, axis=1)
+        twisted = np.roll(along, -1, axis=1) - along
+        terms = (
+            (self.a1, along),
+            (self.a2, np.diff(along, axis=0)),
+            (self.a3, around),
+            (self.a4, bent),
+            (2 * self.a5, twisted),
+        )
+        internal = sum(weight * float(np.vdot(d, d)) for weight, d in terms)
+        distance_mm = state.contact.distance_mm
+        return internal + float((self.k1 * distance_mm**2 + 2 * self.k2 * distance_mm).sum())
+
     def classify(self, state: State, is_asked: Bools, wall: AbstractWall) -> State:
         """Sort the nodes asked about (rows, columns) into the paper's three states and relocate those that terminate.
 
@@ -162,13 +188,13 @@ class ActiveContour:
         """
         asked = is_asked.ravel()
         points_mm = state.nodes_mm.reshape(-1, 3).copy()
-        centers_mm = np.repeat(state.centers_mm, state.nodes_mm.shape[1], axis=0)
         found = wall.contact(points_mm[asked])
-        is_outside = wall.crosses(centers_mm[asked], points_mm[asked])
+        is_outside = _is_outside(state, asked, found.distance_mm, wall)
         is_done = is_outside | (found.distance_mm <= self.dd_mm)
         relocated = self.relocated_mm(points_mm[asked], is_outside, found)
         points_mm[asked] = np.where(is_done[:, None], relocated, points_mm[asked])
-        contact = Contact(*(_replaced(old, asked, new) for old, new in zip(state.contact, found, strict=True)))
+        found = found._replace(distance_mm=np.where(is_done, self.dd_mm, found.distance_mm))
+        contact = state.contact.replaced(asked, found)
         is_terminated = state.is_terminated.copy()
         is_terminated[is_asked] |= is_done
         nodes_mm = points_mm.reshape(state.nodes_mm.shape)
@@ -185,64 +211,20 @@ class ActiveContour:
         return state.terminated_fraction >= self.terminated_goal
 
 
-def _replaced(values: Floats, where: Bools, new: Floats) -> Floats:
-    values = values.copy()
-    values[where] = new
-    return values
+def _is_outside(state: State, asked: Bools, distance_mm: Floats, wall: AbstractWall) -> Bools:
+    """Tell of the nodes asked about, (n,) of all, whether the segment from their center crosses the wall.
 
-
-@final
-@dataclass(frozen=True, eq=False)
-class Relaxation:
-    """What `relax` did."""
-
-    state: State
-    """The last state."""
-    outcome: Literal["terminated", "iteration_limit"]
-    """Whether enough nodes terminated."""
-    terminated_fraction: tuple[float, ...]
-    """After every iteration."""
-    history_mm: tuple[Floats, ...]
-    """Contour (rows, columns, 3) after every iteration."""
-    seconds: float
-    """Wall time."""
-
-
-def relax(
-    method: ActiveContour,
-    state: State,
-    wall: AbstractWall,
-    *,
-    limit: Limit | None = None,
-    progress: Progress | None = None,
-) -> Relaxation:
-    """Iterate `method` until enough nodes terminate or its iteration limit.
-
-    Raises
-    ------
-    InputError
-        When the weights make the contour run away.
+    No wall lies within the clearance of the center nor within the distance of the node: only what is left of the
+    segment between these two balls is tested, if anything is.
     """
-    began = time.perf_counter()
-    fractions: list[float] = []
-    history: list[Floats] = []
-    while not method.terminate(state) and len(fractions) < method.iteration_limit:
-        following = method.step(state, wall)
-        if limit is not None:
-            nodes_mm, is_stopped = limit(state.nodes_mm, following.nodes_mm)
-            following = replace(following, nodes_mm=nodes_mm, is_terminated=following.is_terminated | is_stopped)
-        state = following
-        _check_finite(state, len(fractions) + 1)
-        fractions.append(state.terminated_fraction)
-        history.append(state.nodes_mm)
-        if progress is not None:
-            progress(len(fractions), state.terminated_fraction)
-    outcome: Literal["terminated", "iteration_limit"] = "terminated" if method.terminate(state) else "iteration_limit"
-    return Relaxation(state, outcome, tuple(fractions), tuple(history), time.perf_counter() - began)
-
-
-def _check_finite(state: State, iteration: int) -> None:
-    if not np.isfinite(state.nodes_mm).all():
-        raise InputError(
-            f"The active contour ran away in iteration {iteration}: its weights are too large. Use a smaller tau."
-        )
+    centers_mm, points_mm = state.centers_mm.reshape(-1, 3)[asked], state.nodes_mm.reshape(-1, 3)[asked]
+    clearance_mm = SAFELY * state.clearance_mm.ravel()[asked]
+    way_mm = points_mm - centers_mm
+    length_mm = np.linalg.norm(way_mm, axis=1)
+    is_open = clearance_mm + SAFELY * distance_mm < length_mm
+    along = (way_mm / np.maximum(length_mm, ON_WALL_MM)[:, None])[is_open]
+    starts_mm = centers_mm[is_open] + clearance_mm[is_open, None] * along
+    ends_mm = points_mm[is_open] - SAFELY * distance_mm[is_open, None] * along
+    is_outside = np.zeros(len(points_mm), dtype=bool)
+    is_outside[is_open] = wall.crosses(starts_mm, ends_mm)
+    return is_outside

@@ -1,26 +1,28 @@
-"""Braid: rows of a device whose wires cannot stretch, marched along the parent axis from the landing point."""
+"""Constant wire, the default method: rows marched along the parent axis by wires that cannot stretch."""
 
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Literal, final
+from dataclasses import dataclass, field, replace
+from typing import Self, final
 
 import numpy as np
 
-from vstent.deploy.active_contour import ActiveContour, Progress, State, relax
-from vstent.deploy.contour import Planes, circles, evenly_spaced, perimeters, planes
-from vstent.deploy.wall import AbstractWall
+from vstent.deploy import pieces
+from vstent.deploy.active_contour import ActiveContour, State
+from vstent.deploy.contour import evenly_spaced, perimeters
+from vstent.deploy.method import AbstractMethod, Opened, Placement, check_inside
 from vstent.device import Design, Size, grid, row_spacing_mm
-from vstent.errors import LandingError
 from vstent.kernels.arrays import Bools, Floats
 from vstent.stent import Landing
 from vstent.units import MM_PER_UM
 from vstent.vessel import Anatomy
 
 ROUNDS = 8
-"""Expansion and marching alternate at most so often."""
-SETTLED_MM = 0.005
+"""Rows are marched anew at most so often."""
+SETTLED_MM = 0.02
 """Rows have settled when none moves further than this from one round to the next."""
-
+FREE_SLACK = 1e-3
+"""A row this near to the free perimeter, relative, has reached it."""
+LAST_STEPS = 5
+"""Steps at most for the last nodes, once 99 % have terminated."""
 TABLE_ROWS = 2001
 """Samples of the row spacing along the artery."""
 BEYOND_MM = 500.0
@@ -60,7 +62,7 @@ def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Flo
     """Arc lengths (rows,) of the rows: from each to the next it is h(D), so rows are counted by the integral of ds/h.
 
     The landing point is the middle row, the first (proximal) or the last (distal). Rows may leave the artery, where
-    the diameter is that of its end: ask `check_inside`.
+    the diameter is that of its end.
     """
     shape = grid(design, size)
     start = {"proximal": 0, "center": (shape.rows - 1) // 2, "distal": shape.rows - 1}[landing.anchor]
@@ -72,34 +74,6 @@ def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Flo
     return np.interp(wanted, count, table_mm)
 
 
-def check_inside(design: Design, size: Size, abscissa_mm: Floats, artery_mm: float) -> None:
-    """See that the rows (rows,) lie on an artery of length `artery_mm`.
-
-    Raises
-    ------
-    LandingError
-        When they do not; the sentence says where the device would lie and what to do.
-    """
-    first, last = float(abscissa_mm[0]), float(abscissa_mm[-1])
-    if first >= 0 and last <= artery_mm:
-        return
-    length_mm = last - first
-    lies = (
-        f"{design.name} {size.label} would lie from {first:.1f} to {last:.1f} mm of a parent artery that runs "
-        f"from 0 to {artery_mm:.1f} mm"
-    )
-    if length_mm > artery_mm:
-        raise LandingError(
-            f"{lies}: deployed it is {length_mm:.1f} mm long, longer than the artery. Choose a shorter size."
-        )
-    end, by_mm = ("proximal", -first) if first < 0 else ("distal", last - artery_mm)
-    move = "distally" if first < 0 else "proximally"
-    raise LandingError(
-        f"{lies}: it leaves the artery by {by_mm:.1f} mm at the {end} end. "
-        f"Land it at least {by_mm:.1f} mm more {move} or choose a shorter size."
-    )
-
-
 @final
 @dataclass(frozen=True)
 class FreeDiameter:
@@ -107,6 +81,10 @@ class FreeDiameter:
 
     diameter_mm: float
     """The free diameter."""
+
+    def is_reached(self, nodes_mm: Floats) -> Bools:
+        """Tell which rows (rows,) are as wide as the free device."""
+        return perimeters(nodes_mm) > (1 - FREE_SLACK) * np.pi * self.diameter_mm
 
     def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
         """Let every row go from `before_mm` towards `after_mm` only as far as its perimeter may grow."""
@@ -121,105 +99,105 @@ class FreeDiameter:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Settled:
-    """A contour whose rows lie where its wires put them."""
+class ConstantWire(AbstractMethod):
+    """The device's own mechanics round the paper's contour: wires keep their length, rows their free diameter.
 
-    nodes_mm: Floats
-    """(rows, columns, 3) nodes."""
-    abscissa_mm: Floats
-    """(rows,) arc lengths of the rows."""
-    outcome: Literal["terminated", "iteration_limit"]
-    """Whether enough nodes terminated."""
-    terminated_fraction: tuple[float, ...]
-    """After every iteration."""
-    history_mm: tuple[Floats, ...]
-    """The contour before the first and after every iteration."""
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Expansion:
-    """One device opening at one place of one artery."""
-
-    design: Design
-    """The device."""
-    size: Size
-    """Its size."""
-    landing: Landing
-    """Where it is to lie."""
-    anatomy: Anatomy
-    """The artery."""
-    method: ActiveContour
-    """The contour's weights."""
-    wall: AbstractWall
-    """The artery's wall."""
-
-    @cached_property
-    def across(self) -> Planes:
-        """Planes on which rows lie."""
-        return planes(self.anatomy.axis)
-
-    @cached_property
-    def free(self) -> FreeDiameter:
-        """The device's own limit."""
-        return FreeDiameter(self.size.free_diameter_mm)
-
-    def rows_mm(self, profile: Profile) -> Floats:
-        """Arc lengths (rows,) of the rows where the contour has this profile, all of them in the artery."""
-        rows_mm = march(self.design, self.size, self.landing, profile)
-        check_inside(self.design, self.size, rows_mm, self.anatomy.axis.length_mm)
-        return rows_mm
-
-    def initial(self, rows_mm: Floats) -> State:
-        """Start with circles of the maximum inscribed spheres, no wider than the free device."""
-        axis = self.anatomy.axis
-        radius_mm = np.interp(rows_mm, axis.abscissa_mm, axis.inscribed_radius_mm)
-        radius_mm = np.minimum(radius_mm, 0.5 * self.size.free_diameter_mm)
-        nodes_mm = self.across.place(rows_mm, circles(radius_mm, grid(self.design, self.size).columns))
-        return self.method.init(nodes_mm, self.across.at(rows_mm)[0], self.wall)
-
-    def moved(self, state: State, old_mm: Floats, new_mm: Floats) -> State:
-        """Move the rows along the axis, keeping the contour's shape, space nodes evenly and put them to the wall.
-
-        A node that had terminated goes back to the wall by eq. (6, 7) as far as its row's free perimeter allows; one
-        that still moves does so only where it would be outside or nearer than dd.
-        """
-        in_plane_mm = evenly_spaced(self.across.coordinates(old_mm, state.nodes_mm))
-        nodes_mm = self.across.place(new_mm, _interpolated(old_mm, in_plane_mm, new_mm))
-        held = state.is_terminated
-        state = replace(state, nodes_mm=nodes_mm, centers_mm=self.across.at(new_mm)[0])
-        state = self.method.classify(state, np.ones_like(held), self.wall)
-        points_mm = state.nodes_mm.reshape(-1, 3)
-        is_off = held.ravel() & (state.contact.distance_mm > self.method.dd_mm)
-        back_mm = self.method.relocated_mm(points_mm, np.zeros_like(is_off), state.contact)
-        back_mm = np.where(is_off[:, None], back_mm, points_mm).reshape(nodes_mm.shape)
-        return replace(state, nodes_mm=self.free(state.nodes_mm, back_mm)[0])
-
-
-def settle(expansion: Expansion, progress: Progress | None = None) -> Settled:
-    """Expand the contour and march its rows in turn until the rows stay where they are.
-
-    Raises
-    ------
-    LandingError
-        When the device does not fit the artery.
+    Rows are as far apart as the wires put them (`march`), so length and ends are predictions; a row stops growing at
+    the free diameter; where the artery bends, crossings slide along the wall until the single pieces of wire are as
+    long as they were made, as far as that goes (`pieces`).
     """
-    profile = expected_profile(expansion.design, expansion.anatomy)
-    rows_mm = expansion.rows_mm(profile)
-    state = expansion.initial(rows_mm)
-    fractions: list[float] = []
-    history = [state.nodes_mm]
-    for _ in range(ROUNDS):
-        relaxed = relax(expansion.method, state, expansion.wall, limit=expansion.free, progress=progress)
-        fractions.extend(relaxed.terminated_fraction)
-        history.extend(relaxed.history_mm)
-        profile = profile.corrected(rows_mm, perimeters(relaxed.state.nodes_mm) / np.pi)
-        old_mm, rows_mm = rows_mm, expansion.rows_mm(profile)
-        state = expansion.moved(relaxed.state, old_mm, rows_mm)
-        if np.abs(rows_mm - old_mm).max() < SETTLED_MM:
-            break
-    history[-1] = state.nodes_mm
-    return Settled(state.nodes_mm, rows_mm, relaxed.outcome, tuple(fractions), tuple(history))
+
+    contour: ActiveContour = field(default_factory=ActiveContour)
+    """Weights of the active contour, eq. (1-7)."""
+
+    @property
+    def weights(self) -> ActiveContour:
+        """The active contour that carries the device to the wall."""
+        return self.contour
+
+    def beside(self, dd_mm: float) -> Self:
+        """Return the method for a device whose contour keeps `dd_mm` from the wall."""
+        return replace(self, contour=replace(self.contour, dd_mm=dd_mm))
+
+    def init(self, placement: Placement) -> Opened:
+        """Put rows where they would lie if the device filled the artery."""
+        profile = expected_profile(placement.design, placement.anatomy)
+        rows_mm = march(placement.design, placement.size, placement.landing, profile)
+        return Opened(placement.start(self.contour, rows_mm, placement.size.free_diameter_mm), rows_mm)
+
+    def step(self, placement: Placement, opened: Opened) -> Opened:
+        """Let the contour grow, no row wider than the free device; once it lies, march the rows anew."""
+        opened = self._grown(placement, opened)
+        return self._marched(placement, opened) if self.terminate(opened) else opened
+
+    def result(self, placement: Placement, opened: Opened) -> Opened:
+        """Let crossings slide until pieces of wire have their length, and put every node back to the wall."""
+        for _ in range(LAST_STEPS):
+            if opened.contour.is_terminated.all():
+                break
+            opened = self._grown(placement, opened)
+        slid = pieces.slide(placement.design, placement.size, opened.contour.nodes_mm)
+        rows = np.arange(len(opened.abscissa_mm))
+        where_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row)
+        centers_mm = placement.across.at(where_mm.ravel())[0].reshape(slid.nodes_mm.shape)
+        # The clearance falls off from a row's center no faster than one moves away from it.
+        off_mm = np.linalg.norm(centers_mm - opened.contour.centers_mm, axis=2)
+        clearance_mm = np.maximum(opened.contour.clearance_mm - off_mm, 0.0)
+        state = replace(opened.contour, nodes_mm=slid.nodes_mm, centers_mm=centers_mm, clearance_mm=clearance_mm)
+        state, laid_mm = self._laid(placement, state)
+        is_free = FreeDiameter(placement.size.free_diameter_mm).is_reached(opened.contour.nodes_mm)
+        nodes_mm = np.where(is_free[:, None, None], state.nodes_mm, laid_mm)
+        return replace(opened, contour=replace(state, nodes_mm=nodes_mm))
+
+    def _grown(self, placement: Placement, opened: Opened) -> Opened:
+        """One step of the contour; a row that reaches the free diameter stops there."""
+        before, after = opened.contour, self.contour.step(opened.contour, placement.wall)
+        free = FreeDiameter(placement.size.free_diameter_mm)
+        nodes_mm, is_stopped = free(before.nodes_mm, after.nodes_mm)
+        after = replace(after, nodes_mm=nodes_mm, is_terminated=after.is_terminated | is_stopped)
+        return replace(opened, contour=after)
+
+    def _marched(self, placement: Placement, opened: Opened) -> Opened:
+        """March the rows by their measured diameters until they stay where they are.
+
+        Raises
+        ------
+        LandingError
+            When a row leaves the artery.
+        """
+        design, size, axis = placement.design, placement.size, placement.anatomy.axis
+        profile = expected_profile(design, placement.anatomy)
+        for done in range(ROUNDS):
+            profile = profile.corrected(opened.abscissa_mm, perimeters(opened.contour.nodes_mm) / np.pi)
+            rows_mm = march(design, size, placement.landing, profile)
+            check_inside(design, size, rows_mm, axis.length_mm)
+            if done and np.abs(rows_mm - opened.abscissa_mm).max() < SETTLED_MM:
+                break
+            opened = self._moved(placement, opened, rows_mm)
+        return opened
+
+    def _moved(self, placement: Placement, opened: Opened, rows_mm: Floats) -> Opened:
+        """Move the rows along the axis, keeping the contour's shape; space nodes evenly and put them to the wall."""
+        across, state = placement.across, opened.contour
+        in_plane_mm = evenly_spaced(across.coordinates(opened.abscissa_mm, state.nodes_mm))
+        nodes_mm = across.place(rows_mm, _interpolated(opened.abscissa_mm, in_plane_mm, rows_mm))
+        state = replace(state, nodes_mm=nodes_mm).about(across.at(rows_mm)[0], placement.wall)
+        state, laid_mm = self._laid(placement, state)
+        free = FreeDiameter(placement.size.free_diameter_mm)
+        return Opened(replace(state, nodes_mm=free(state.nodes_mm, laid_mm)[0]), rows_mm)
+
+    def _laid(self, placement: Placement, state: State) -> tuple[State, Floats]:
+        """Put nodes that were moved out of the wall's way; return also where (rows, columns, 3) they lie against it.
+
+        A node that had terminated goes back to the wall by eq. (6, 7); one that still moves does so only where it
+        would be outside or nearer than dd.
+        """
+        held = state.is_terminated
+        state = self.contour.classify(state, np.ones_like(held), placement.wall)
+        points_mm = state.nodes_mm.reshape(-1, 3)
+        is_off = held.ravel() & (state.contact.distance_mm > self.contour.dd_mm)
+        back_mm = self.contour.relocated_mm(points_mm, np.zeros_like(is_off), state.contact)
+        return state, np.where(is_off[:, None], back_mm, points_mm).reshape(state.nodes_mm.shape)
 
 
 def _interpolated(old_mm: Floats, values: Floats, new_mm: Floats) -> Floats:

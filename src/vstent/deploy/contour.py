@@ -123,11 +123,12 @@ def evenly_spaced(nodes: Floats) -> Floats:
     np.cumsum(np.linalg.norm(np.diff(closed, axis=1), axis=2), axis=1, out=arc[:, 1:])
     arc *= m / arc[:, -1:]
     wanted = (np.arange(m) + (arc[:, :m] - np.arange(m)).mean(axis=1, keepdims=True)) % m
-    result = np.zeros_like(nodes)
-    for i in range(n):
-        left = np.clip(np.searchsorted(arc[i], wanted[i], side="right") - 1, 0, m - 1)
-        share = ((wanted[i] - arc[i, left]) / (arc[i, left + 1] - arc[i, left]))[:, None]
-        result[i] = (1 - share) * closed[i, left] + share * closed[i, left + 1]
+    row = np.arange(n)[:, None]
+    apart = (m + 1.0) * row  # rows one after another on one line, so that one search serves all
+    left = np.searchsorted((arc + apart).ravel(), (wanted + apart).ravel(), side="right").reshape(n, m)
+    left = np.clip(left - 1 - (m + 1) * row, 0, m - 1)
+    share = ((wanted - arc[row, left]) / (arc[row, left + 1] - arc[row, left]))[..., None]
+    result = (1 - share) * closed[row, left] + share * closed[row, left + 1]
     # Nodes slide along chords, which cuts corners: the row's length is put back.
     middle = result.mean(axis=1, keepdims=True)
     return middle + (perimeters(nodes) / perimeters(result))[:, None, None] * (result - middle)

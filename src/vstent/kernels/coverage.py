@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 from scipy.spatial import cKDTree
 
 from vstent.kernels.arrays import Floats
@@ -50,58 +50,105 @@ def _gather(first: Any, row: int, column: int, rows: int, columns: int, found: A
 
 
 @njit(cache=True)
-def _unit_normal(corners: Any, normal: Any) -> None:
-    """Write the unit normal of a quad (4, 3) from its diagonals."""
+def _plane(corners: Any, frame: Any) -> float:
+    """Write the middle of a quad (4, 3) and two unit vectors in its plane (3, 3); return its half-diagonal."""
     for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        normal[k] = (corners[3, i] - corners[0, i]) * (corners[2, j] - corners[1, j]) - (
-            corners[3, j] - corners[0, j]
-        ) * (corners[2, i] - corners[1, i])
-    length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+        frame[0, k] = 0.25 * (corners[0, k] + corners[1, k] + corners[2, k] + corners[3, k])
+        frame[1, k], frame[2, k] = corners[3, k] - corners[0, k], corners[2, k] - corners[1, k]
+    reach2 = 0.0
+    for corner in range(4):
+        away2 = 0.0
+        for k in range(3):
+            away2 += (corners[corner, k] - frame[0, k]) ** 2
+        reach2 = max(reach2, away2)
+    _scale(frame[1])
+    share = frame[2, 0] * frame[1, 0] + frame[2, 1] * frame[1, 1] + frame[2, 2] * frame[1, 2]
     for k in range(3):
-        normal[k] /= length
+        frame[2, k] -= share * frame[1, k]
+    _scale(frame[2])
+    return np.sqrt(reach2)
 
 
 @njit(cache=True)
-def _is_under(point: Any, normal: Any, starts: Any, ends: Any, radius: Any, near: Any, n_near: int) -> bool:
-    for i in range(n_near):
+def _scale(vector: Any) -> None:
+    """Give a vector (3,) the length 1."""
+    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    for k in range(3):
+        vector[k] /= length
+
+
+@njit(cache=True)
+def _flatten(frame: Any, reach: float, starts: Any, ends: Any, radius: Any, near: Any, flat: Any) -> int:
+    """Write the nearby segments that reach the quad, seen square to it: start, vector, 1 / length^2, radius^2."""
+    n = 0
+    for i in range(len(near)):
         k = near[i]
-        ax, ay, az = point[0] - starts[k, 0], point[1] - starts[k, 1], point[2] - starts[k, 2]
-        bx, by, bz = ends[k, 0] - starts[k, 0], ends[k, 1] - starts[k, 1], ends[k, 2] - starts[k, 2]
-        an = ax * normal[0] + ay * normal[1] + az * normal[2]
-        bn = bx * normal[0] + by * normal[1] + bz * normal[2]
-        ax, ay, az = ax - an * normal[0], ay - an * normal[1], az - an * normal[2]
-        bx, by, bz = bx - bn * normal[0], by - bn * normal[1], bz - bn * normal[2]
-        t = (ax * bx + ay * by + az * bz) / max(bx * bx + by * by + bz * bz, 1e-300)
-        t = min(max(t, 0.0), 1.0)
-        dx, dy, dz = ax - t * bx, ay - t * by, az - t * bz
-        if dx * dx + dy * dy + dz * dz < radius[k] * radius[k]:
+        ax, ay, bx, by = 0.0, 0.0, 0.0, 0.0
+        for axis in range(3):
+            a, b = starts[k, axis] - frame[0, axis], ends[k, axis] - starts[k, axis]
+            ax, ay = ax + a * frame[1, axis], ay + a * frame[2, axis]
+            bx, by = bx + b * frame[1, axis], by + b * frame[2, axis]
+        length2 = max(bx * bx + by * by, 1e-300)
+        t = min(max(-(ax * bx + ay * by) / length2, 0.0), 1.0)
+        if np.sqrt((ax + t * bx) ** 2 + (ay + t * by) ** 2) > reach + radius[k]:
+            continue
+        flat[n, 0], flat[n, 1], flat[n, 2], flat[n, 3] = ax, ay, bx, by
+        flat[n, 4], flat[n, 5] = 1.0 / length2, radius[k] * radius[k]
+        n += 1
+    return n
+
+
+@njit(cache=True)
+def _is_under(x: float, y: float, flat: Any) -> bool:
+    for i in range(len(flat)):
+        px, py, bx, by = x - flat[i, 0], y - flat[i, 1], flat[i, 2], flat[i, 3]
+        t = min(max((px * bx + py * by) * flat[i, 4], 0.0), 1.0)
+        dx, dy = px - t * bx, py - t * by
+        if dx * dx + dy * dy < flat[i, 5]:
             return True
     return False
 
 
 @njit(cache=True)
-def _fractions(nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int) -> Any:
-    rows, columns = nodes.shape[0], nodes.shape[1]
-    result = np.zeros((rows - 1, columns))
-    near = np.zeros(4096, dtype=np.int32)
-    corners, normal, point = np.zeros((4, 3)), np.zeros(3), np.zeros(3)
-    for quad in range((rows - 1) * columns):
-        i, j = quad // columns, quad % columns
+def _share_under(quad: int, corners: Any, frame: Any, flat: Any, samples: int) -> float:
+    hits = 0
+    at = np.zeros((4, 2))
+    for corner in range(4):
         for k in range(3):
-            corners[0, k], corners[1, k] = nodes[i, j, k], nodes[i, (j + 1) % columns, k]
-            corners[2, k], corners[3, k] = nodes[i + 1, j, k], nodes[i + 1, (j + 1) % columns, k]
-        _unit_normal(corners, normal)
-        n_near = _gather(first, i, j, rows, columns, near)
-        hits = 0
-        for sample in range(samples * samples):
-            # R2 sequence (Roberts 2018), its start moved from quad to quad by the same kind of numbers.
-            u = (0.5 + 0.7548776662466927 * sample + 0.5698402909980532 * quad) % 1.0
-            v = (0.5 + 0.5698402909980532 * sample + 0.3247179572447460 * quad) % 1.0
-            for k in range(3):
-                low = (1 - v) * corners[0, k] + v * corners[1, k]
-                point[k] = (1 - u) * low + u * ((1 - v) * corners[2, k] + v * corners[3, k])
-            if _is_under(point, normal, starts, ends, radius, near, n_near):
-                hits += 1
-        result[i, j] = hits / (samples * samples)
+            off = corners[corner, k] - frame[0, k]
+            at[corner, 0] += off * frame[1, k]
+            at[corner, 1] += off * frame[2, k]
+    for sample in range(samples * samples):
+        # R2 sequence (Roberts 2018), its start moved from quad to quad by the same kind of numbers.
+        u = (0.5 + 0.7548776662466927 * sample + 0.5698402909980532 * quad) % 1.0
+        v = (0.5 + 0.5698402909980532 * sample + 0.3247179572447460 * quad) % 1.0
+        a, b, c, d = (1 - u) * (1 - v), (1 - u) * v, u * (1 - v), u * v
+        x = a * at[0, 0] + b * at[1, 0] + c * at[2, 0] + d * at[3, 0]
+        y = a * at[0, 1] + b * at[1, 1] + c * at[2, 1] + d * at[3, 1]
+        hits += _is_under(x, y, flat)
+    return hits / (samples * samples)
+
+
+@njit(cache=True)
+def _row_fractions(
+    row: int, nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int, result: Any
+) -> None:
+    rows, columns = nodes.shape[0], nodes.shape[1]
+    near, flat = np.zeros(4096, dtype=np.int32), np.zeros((4096, 6))
+    corners, frame = np.zeros((4, 3)), np.zeros((3, 3))
+    for column in range(columns):
+        for k in range(3):
+            corners[0, k], corners[1, k] = nodes[row, column, k], nodes[row, (column + 1) % columns, k]
+            corners[2, k], corners[3, k] = nodes[row + 1, column, k], nodes[row + 1, (column + 1) % columns, k]
+        reach = _plane(corners, frame)
+        n_near = _gather(first, row, column, rows, columns, near)
+        n_flat = _flatten(frame, reach, starts, ends, radius, near[:n_near], flat)
+        result[row, column] = _share_under(row * columns + column, corners, frame, flat[:n_flat], samples)
+
+
+@njit(cache=True, parallel=True)
+def _fractions(nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int) -> Any:
+    result = np.zeros((nodes.shape[0] - 1, nodes.shape[1]))
+    for row in prange(len(result)):
+        _row_fractions(row, nodes, starts, ends, radius, first, samples, result)
     return result

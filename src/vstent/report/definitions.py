@@ -121,6 +121,18 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "Nodes terminated", "Part of the nodes that reached the wall or the free diameter; the contour stops at 99 %."
     ),
     "jailed_branches_count": Definition("Jailed branches", "Branches that leave the artery between the device's ends."),
+    "proximal_end_to_branch_mm": Definition(
+        "Proximal end to branch", "Along the artery, from the proximal end of the device to the nearest branch."
+    ),
+    "distal_end_to_branch_mm": Definition(
+        "Distal end to branch", "Along the artery, from the distal end of the device to the nearest branch."
+    ),
+    "mean_wire_stretch_fraction": Definition(
+        "Wire stretch, mean", "By how much pieces of wire between crossings are longer than made: 0 is right."
+    ),
+    "p95_wire_stretch_fraction": Definition(
+        "Wire stretch, 95 %", "95 % of the pieces of wire between crossings stretch or shorten by less than this."
+    ),
     # the flow
     "inlet_flow_mL_s": Definition("Inlet flow", "Blood that enters through the inlet."),
     "outlet_flow_mL_s": Definition("Outlet flow", "Blood that leaves through the outlet."),

@@ -1,0 +1,55 @@
+"""The paper's own method (Zhong et al. 2016): an active contour on evenly spaced rows, and nothing else."""
+
+from dataclasses import dataclass, field, replace
+from typing import Self, final
+
+import numpy as np
+
+from vstent.deploy.active_contour import ActiveContour
+from vstent.deploy.method import AbstractMethod, Opened, Placement
+from vstent.device import grid
+from vstent.kernels.arrays import Floats
+from vstent.stent import Landing
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Zhong2016(AbstractMethod):
+    """Eq. (1-7) of the paper to the letter.
+
+    The device is as long as its label says, its rows evenly spaced, their first diameters those of the maximum
+    inscribed spheres. It opens until 99 % of its nodes have met the wall, however wide the artery is: wires stretch,
+    and no gap can show. `vstent.deploy.braid.ConstantWire` mends that.
+    """
+
+    contour: ActiveContour = field(default_factory=ActiveContour)
+    """Weights a1..a5, k1, k2, dd of the active contour."""
+
+    @property
+    def weights(self) -> ActiveContour:
+        """The active contour that carries the device to the wall."""
+        return self.contour
+
+    def beside(self, dd_mm: float) -> Self:
+        """Return the method for a device whose contour keeps `dd_mm` from the wall."""
+        return replace(self, contour=replace(self.contour, dd_mm=dd_mm))
+
+    def init(self, placement: Placement) -> Opened:
+        """Put evenly spaced rows of inscribed circles over the label's length."""
+        rows = grid(placement.design, placement.size).rows
+        rows_mm = evenly_spaced_rows(placement.landing, placement.size.length_mm, rows)
+        return Opened(placement.start(self.contour, rows_mm), rows_mm)
+
+    def step(self, placement: Placement, opened: Opened) -> Opened:
+        """One force step, one elastic step, and the three states of every node."""
+        return replace(opened, contour=self.contour.step(opened.contour, placement.wall))
+
+    def result(self, placement: Placement, opened: Opened) -> Opened:
+        """Return the contour as the iterations left it."""
+        return opened
+
+
+def evenly_spaced_rows(landing: Landing, length_mm: float, rows: int) -> Floats:
+    """Arc lengths (rows,) of rows of a device of a length, its landing point where it is to lie."""
+    before_mm = {"proximal": 0.0, "center": 0.5 * length_mm, "distal": length_mm}[landing.anchor]
+    return landing.abscissa_mm - before_mm + np.linspace(0.0, length_mm, rows)
