@@ -1,6 +1,7 @@
 """Command line. The only place that prints, and that knows of files' names on a shell."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +24,8 @@ EPILOG = "Research use only: not cleared for diagnosis or treatment. Lengths in 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code (0 done, 1 failed, 2 bad input, 130 interrupted)."""
+    # Many small systems are solved, none large: threads of the linear algebra only wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = _parser().parse_args(argv)
     try:
         return int(arguments.command(arguments))
