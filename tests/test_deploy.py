@@ -160,6 +160,23 @@ def test_pieces_of_wire_keep_their_length(artery):
     assert np.quantile(np.abs(found), 0.95) < (0.031 if in_bend else 0.002)
 
 
+def test_on_a_regular_lattice_nothing_slides():
+    nodes_mm = deployed(straight()).stent.nodes_mm
+    slid = pieces.slide(SILK, SILK_SIZE, nodes_mm)
+    assert slid.nodes_mm == pytest.approx(nodes_mm, abs=1e-3)
+    assert slid.row == pytest.approx(np.broadcast_to(np.arange(len(nodes_mm))[:, None], slid.row.shape), abs=0.01)
+
+
+def test_rows_tilt_but_stay_where_they_are_in_the_mean():
+    n = len(deployed(bent()).stent.nodes_mm)
+    s = deployed(bent()).stent.row_abscissa_mm
+    across = contour.planes(bent().axis)
+    flat_mm = across.place(s, contour.circles(np.full(n, 1.85), 48))
+    row = pieces.slide(SILK, SILK_SIZE, flat_mm).row
+    assert np.ptp(row - np.arange(n)[:, None]) > 0.5
+    assert row.mean(axis=1) == pytest.approx(np.arange(n), abs=0.02)
+
+
 def test_without_sliding_pieces_of_wire_in_the_bend_would_stretch(monkeypatch):
     monkeypatch.setattr(pieces, "slide", lambda design, size, nodes_mm: _unslid(nodes_mm))
     found = stretch(deploy(SILK, bent(), size=SILK_SIZE).stent)

@@ -166,16 +166,39 @@ def test_gaps_over_the_neck_do_not_count_as_malapposed():
     )
 
 
-def test_branches_that_leave_between_the_ends_are_jailed():
+def with_branches(*places):
+    """The artery with centerlines that leave it at arc lengths."""
+
     def leaving_at(z):
         up = np.stack([np.zeros(40), np.zeros(40), np.linspace(0, z, 40)], axis=1)
         out = np.stack([np.linspace(0.1, 8, 40), np.zeros(40), np.full(40, z)], axis=1)
         return Centerline(np.concatenate([up, out]), np.full(80, 0.5))
 
+    lines = (artery().axis, *(leaving_at(z) for z in places))
+    return replace(artery(), vessel=replace(artery().vessel, centerlines=lines))
+
+
+def test_the_nearest_branch_is_told_from_each_end():
+    stent = deployed(SILK).stent
+    found = measure(with_branches(3.0, 12.0, 30.0), deployed(SILK))
+    assert found["proximal_end_to_branch_mm"] == pytest.approx(abs(stent.proximal_abscissa_mm - 3.0), abs=1e-6)
+    assert found["distal_end_to_branch_mm"] == pytest.approx(30.0 - stent.distal_abscissa_mm, abs=1e-6)
+    assert "distal_end_to_branch_mm" not in measure(with_branches(), deployed(SILK))
+
+
+def test_a_tilted_row_is_as_wide_as_its_tube():
+    rows, columns = 60, 12
+    angle = 2 * np.pi * np.arange(columns) / columns
+    z = 0.2 * np.arange(rows)[:, None] + 0.8 * np.cos(angle)
+    ring = np.broadcast_to(np.stack([1.5 * np.cos(angle), 1.5 * np.sin(angle)], axis=1), (rows, columns, 2))
+    nodes_mm = np.concatenate([ring, z[..., None]], axis=2)
+    tilted = replace(deployed(SILK).stent, nodes_mm=nodes_mm, row_abscissa_mm=np.arange(rows))
+    assert tilted.row_diameter_mm == pytest.approx(np.full(rows, 3.0), rel=1e-9)
+
+
+def test_branches_that_leave_between_the_ends_are_jailed():
     def jailed(*places):
-        lines = (artery().axis, *(leaving_at(z) for z in places))
-        anatomy = replace(artery(), vessel=replace(artery().vessel, centerlines=lines))
-        return measure(anatomy, deployed(SILK))["jailed_branches_count"]
+        return measure(with_branches(*places), deployed(SILK))["jailed_branches_count"]
 
     assert jailed() == 0
     assert jailed(16.0) == 1
