@@ -28,7 +28,7 @@ def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     anatomy = names["anatomy"]
     sac, ostium = anatomy.aneurysms[0].sac, flow.ostium(anatomy.aneurysms[0], anatomy.vessel.lumen)
     before, after = (flow.indices(names[k], sac, ostium) for k in ("before", "after"))
-    assert before["neck_outflow_mL_s"] == pytest.approx(before["neck_inflow_mL_s"], rel=0.05)
+    assert before["neck_outflow_mL_s"] == pytest.approx(before["neck_inflow_mL_s"], rel=0.1)
     assert after["mean_sac_velocity_m_s"] < before["mean_sac_velocity_m_s"]
 
 
