@@ -8,7 +8,7 @@ import pytest
 from brute import BruteWall
 from tubes import arc, line, tube
 from vstent.deploy import contour
-from vstent.deploy.active_contour import ActiveContour, Stiffness
+from vstent.deploy.active_contour import ActiveContour, State, Stiffness
 from vstent.deploy.method import AbstractMethod, Opened, run
 from vstent.deploy.wall import TreeWall
 from vstent.errors import InputError
@@ -18,18 +18,12 @@ ROWS, COLUMNS = 14, 16
 METHOD = ActiveContour(a1=0.05, a2=0.02, a3=0.03, a4=0.04, a5=0.015, tau=1.7)
 
 
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Bare(AbstractMethod):
     """The contour alone, from a given state."""
 
-    def __init__(self, contour, state, wall):
-        self.contour, self.state, self.wall = contour, state, wall
-
-    @property
-    def weights(self):
-        return self.contour
-
-    def beside(self, dd_mm):
-        return self
+    state: State
+    wall: TreeWall
 
     def init(self, placement):
         return Opened(self.state, np.arange(len(self.state.nodes_mm)))
@@ -42,7 +36,7 @@ class Bare(AbstractMethod):
 
 
 def relax(contour, state, wall, progress=None):
-    return run(Bare(contour, state, wall), None, progress)
+    return run(Bare(contour=contour, state=state, wall=wall), None, progress)
 
 
 @pytest.fixture(scope="module")

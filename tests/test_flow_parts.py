@@ -12,7 +12,6 @@ from vstent.flow.engines.lattice_boltzmann import fraction_left
 from vstent.flow.profile import developed_profile
 from vstent.flow.screen import drag_per_length, inertial_loss, on_grid
 from vstent.flow.wall_stress import wall_stress
-from vstent.kernels import voxels
 from vstent.stent import Stent
 
 DIAMETER_MM, LENGTH_MM, N_WIRES = 4.0, 10.0, 48
@@ -90,16 +89,8 @@ def test_wall_stress_of_an_exact_poiseuille_flow_is_exact(cells_per_diameter):
     grid = domain.build(vessel, 4.0 / cells_per_diameter)
     radius2 = (grid.centers_mm[:, :2] ** 2).sum(axis=1)
     velocity = np.stack([0 * radius2, 0 * radius2, 1 - radius2 / 4.0], axis=1)
-    stress, pressure = wall_stress(
-        index=voxels.index_of(grid.cells),
-        origin_mm=grid.origin_mm,
-        cell_size_mm=grid.cell_size_mm,
-        velocity_m_s=velocity,
-        pressure_Pa=3.0 - 2.0 * grid.centers_mm[:, 2],
-        lumen=vessel.lumen,
-        closed=grid.surface,
-        blood=Blood(),
-    )
+    pressure_Pa = 3.0 - 2.0 * grid.centers_mm[:, 2]
+    stress, pressure = wall_stress(grid, velocity, pressure_Pa, lumen=vessel.lumen, blood=Blood())
     z = vessel.lumen.vertices_mm[:, 2]
     middle = (z > 2) & (z < 6)
     np.testing.assert_allclose(stress[middle, 2], 0.004 * 1.0 / 2e-3 * 2, rtol=0.003)

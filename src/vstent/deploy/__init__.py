@@ -89,7 +89,7 @@ def deploy(
     drawn = wires.draw(design, size, nodes_mm, wall)
     stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, drawn.points_mm, drawn.starts, drawn.diameter_um)
     contact = wall.contact(nodes_mm.reshape(-1, 3))
-    gap_mm = np.maximum(contact.distance_mm - chosen.weights.dd_mm, 0.0)
+    gap_mm = np.maximum(contact.distance_mm - chosen.contour.dd_mm, 0.0)
     return Deployment(
         stent=stent,
         outcome=course.outcome,

@@ -1,12 +1,12 @@
 """Constant wire, the default method: rows marched along the parent axis by wires that cannot stretch."""
 
-from dataclasses import dataclass, field, replace
-from typing import Self, final
+from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 
 from vstent.deploy import pieces
-from vstent.deploy.active_contour import ActiveContour, State
+from vstent.deploy.active_contour import State
 from vstent.deploy.contour import evenly_spaced, perimeters
 from vstent.deploy.method import AbstractMethod, Opened, Placement, check_inside
 from vstent.device import Design, Size, grid, row_spacing_mm
@@ -106,18 +106,6 @@ class ConstantWire(AbstractMethod):
     the free diameter; where the artery bends, crossings slide along the wall until the single pieces of wire are as
     long as they were made, as far as that goes (`pieces`).
     """
-
-    contour: ActiveContour = field(default_factory=ActiveContour)
-    """Weights of the active contour, eq. (1-7)."""
-
-    @property
-    def weights(self) -> ActiveContour:
-        """The active contour that carries the device to the wall."""
-        return self.contour
-
-    def beside(self, dd_mm: float) -> Self:
-        """Return the method for a device whose contour keeps `dd_mm` from the wall."""
-        return replace(self, contour=replace(self.contour, dd_mm=dd_mm))
 
     def init(self, placement: Placement) -> Opened:
         """Put rows where they would lie if the device filled the artery."""

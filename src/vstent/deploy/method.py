@@ -3,7 +3,7 @@
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, Self, final
 
@@ -71,17 +71,16 @@ class Opened:
     """(rows,) arc length of every row on the parent axis."""
 
 
+@dataclass(frozen=True, eq=False)
 class AbstractMethod(ABC):
     """A way to deploy. Final classes answer; `run` owns the loop, its limit, the checks, the records and the time."""
 
-    @property
-    @abstractmethod
-    def weights(self) -> ActiveContour:
-        """The active contour that carries the device to the wall."""
+    contour: ActiveContour = field(default_factory=ActiveContour)
+    """The active contour, eq. (1-7) of the paper, that carries the device to the wall: a1..a5, k1, k2, dd."""
 
-    @abstractmethod
     def beside(self, dd_mm: float) -> Self:
         """Return the method for a device whose contour keeps `dd_mm` from the wall."""
+        return replace(self, contour=replace(self.contour, dd_mm=dd_mm))
 
     @abstractmethod
     def init(self, placement: Placement) -> Opened:
@@ -93,7 +92,7 @@ class AbstractMethod(ABC):
 
     def terminate(self, opened: Opened) -> bool:
         """Tell whether enough nodes have reached the wall."""
-        return self.weights.terminate(opened.contour)
+        return self.contour.terminate(opened.contour)
 
     @abstractmethod
     def result(self, placement: Placement, opened: Opened) -> Opened:
@@ -132,18 +131,18 @@ def run(method: AbstractMethod, placement: Placement, progress: Progress | None 
     began = time.perf_counter()
     opened = method.init(placement)
     fractions: list[float] = []
-    history, energies = [opened.contour.nodes_mm], [method.weights.energy_mm2(opened.contour)]
-    while not method.terminate(opened) and len(fractions) < method.weights.iteration_limit:
+    history, energies = [opened.contour.nodes_mm], [method.contour.energy_mm2(opened.contour)]
+    while not method.terminate(opened) and len(fractions) < method.contour.iteration_limit:
         opened = method.step(placement, opened)
         _check_finite(opened.contour, len(fractions) + 1)
         fractions.append(opened.contour.terminated_fraction)
         history.append(opened.contour.nodes_mm)
-        energies.append(method.weights.energy_mm2(opened.contour))
+        energies.append(method.contour.energy_mm2(opened.contour))
         if progress is not None:
             progress(len(fractions), fractions[-1])
     outcome: Literal["terminated", "iteration_limit"] = "terminated" if method.terminate(opened) else "iteration_limit"
     opened = method.result(placement, opened)
-    history[-1], energies[-1] = opened.contour.nodes_mm, method.weights.energy_mm2(opened.contour)
+    history[-1], energies[-1] = opened.contour.nodes_mm, method.contour.energy_mm2(opened.contour)
     seconds = time.perf_counter() - began
     return Course(opened, outcome, tuple(fractions), tuple(energies), tuple(history), seconds)
 

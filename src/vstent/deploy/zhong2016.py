@@ -1,11 +1,10 @@
 """The paper's own method (Zhong et al. 2016): an active contour on evenly spaced rows, and nothing else."""
 
-from dataclasses import dataclass, field, replace
-from typing import Self, final
+from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 
-from vstent.deploy.active_contour import ActiveContour
 from vstent.deploy.method import AbstractMethod, Opened, Placement
 from vstent.device import grid
 from vstent.kernels.arrays import Floats
@@ -21,18 +20,6 @@ class Zhong2016(AbstractMethod):
     inscribed spheres. It opens until 99 % of its nodes have met the wall, however wide the artery is: wires stretch,
     and no gap can show. `vstent.deploy.braid.ConstantWire` mends that.
     """
-
-    contour: ActiveContour = field(default_factory=ActiveContour)
-    """Weights a1..a5, k1, k2, dd of the active contour."""
-
-    @property
-    def weights(self) -> ActiveContour:
-        """The active contour that carries the device to the wall."""
-        return self.contour
-
-    def beside(self, dd_mm: float) -> Self:
-        """Return the method for a device whose contour keeps `dd_mm` from the wall."""
-        return replace(self, contour=replace(self.contour, dd_mm=dd_mm))
 
     def init(self, placement: Placement) -> Opened:
         """Put evenly spaced rows of inscribed circles over the label's length."""

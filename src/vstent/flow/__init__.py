@@ -48,7 +48,7 @@ def simulate(
     blood: Blood | None = None,
     progress: OnProgress | None = None,
 ) -> tuple[FlowField, ...]:
-    """Compute the steady flow at mean inflow for every stent, None standing for the bare vessel.
+    """Compute the flow, steady or pulsatile, for every stent, None standing for the bare vessel.
 
     Returns
     -------

@@ -1,6 +1,7 @@
 """The blood's domain: the lumen with straight extensions on a regular grid, and every link that leaves it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
@@ -60,10 +61,20 @@ class Domain:
         freeze(self, "septum_cell", np.int32, (-1,))
         freeze(self, "septum_direction", np.int32, self.septum_cell.shape)
 
-    @property
+    @cached_property
     def centers_mm(self) -> Floats:
         """(n, 3) cell centres."""
         return self.origin_mm + self.cells * self.cell_size_mm
+
+    @cached_property
+    def index(self) -> Ints:
+        """(i, j, k) number of the cell at every grid point, -1 outside the blood."""
+        return voxels.index_of(self.cells)
+
+    @cached_property
+    def depth_mm(self) -> Floats:
+        """(n,) distance of every cell from the surface."""
+        return self.surface.closest(self.centers_mm)[1]
 
 
 def default_cell_size_mm(case: FlowCase) -> float:

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from vstent.flow.domain import Domain
 from vstent.flow.types import Blood
 from vstent.kernels import lattice_sampling
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Floats
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
 
@@ -13,15 +14,7 @@ REACH = 4
 
 
 def wall_stress(
-    *,
-    index: Ints,
-    origin_mm: Floats,
-    cell_size_mm: float,
-    velocity_m_s: Floats,
-    pressure_Pa: Floats,
-    lumen: Surface,
-    closed: Surface,
-    blood: Blood,
+    domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, *, lumen: Surface, blood: Blood
 ) -> tuple[Floats, Floats]:
     """Wall shear stress (v, 3) in Pa and pressure (v,) in Pa at the vertices of the lumen.
 
@@ -30,24 +23,20 @@ def wall_stress(
 
     Parameters
     ----------
-    index : (i, j, k) cell number at every grid point, -1 outside.
-    origin_mm : centre (3,) of grid point (0, 0, 0).
+    domain : the cells, and how far they are from the wall.
     velocity_m_s, pressure_Pa : (n, 3), (n,) of the cells.
     lumen : the wall, open at its ends; its faces are outward.
-    closed : the wall with extensions and ends, to which cells measure their distance.
     """
-    centers_mm = origin_mm + np.argwhere(index >= 0) * cell_size_mm
-    _, distance_mm, _ = closed.closest(centers_mm)
     fit = lattice_sampling.fit_wall(
-        index,
-        distance_mm / cell_size_mm,
+        domain.index,
+        domain.depth_mm / domain.cell_size_mm,
         velocity_m_s,
         pressure_Pa,
-        (lumen.vertices_mm - origin_mm) / cell_size_mm,
+        (lumen.vertices_mm - domain.origin_mm) / domain.cell_size_mm,
         -lumen.vertex_normals,
         REACH,
     )
-    traction_Pa = blood.viscosity_Pa_s * fit[:, :3] / (cell_size_mm * M_PER_MM)
+    traction_Pa = blood.viscosity_Pa_s * fit[:, :3] / (domain.cell_size_mm * M_PER_MM)
     normal = lumen.vertex_normals
     along = np.einsum("ij,ij->i", traction_Pa, normal)
     return traction_Pa - along[:, None] * normal, fit[:, 3]

@@ -15,8 +15,6 @@ from vstent.units import M_PER_MM
 
 PHASES = 20
 """Times at which a cycle is kept."""
-INLET_RATE = 1.0
-"""The inlet takes every new pressure for the mean at once: the flow is the waveform's, whatever answers it."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +33,7 @@ class PulsatileLatticeBoltzmann(AbstractEngine[State]):
         peak_m_s = peak_speed_m_s(case, start) * waveform.peak_factor
         phase_s = waveform.period_s / PHASES
         steps = 2 * ceil(0.5 * phase_s * peak_m_s / (case.settings.lattice_speed * cell_m))
-        state = build(case, Scales(cell_m, phase_s / steps, case.blood), steps, start=start, kept=PHASES)
-        state.links.openings[0, 3] = INLET_RATE
-        return state
+        return build(case, Scales(cell_m, phase_s / steps, case.blood), steps, start=start, kept=PHASES)
 
     def step(self, state: State) -> State:
         """Advance to the next phase."""

@@ -21,7 +21,8 @@ CELL_REYNOLDS_AT_END = 25.0
 REFILL_BLOCK = 4
 """Edge, in cells, of the blocks within which the walls' losses are made up."""
 SOUND_MEMORY = 0.002
-"""Rate per step pair at which the inlet forgets the pressure that it takes for the mean."""
+"""Rate per step pair at which the inlet forgets the pressure that it takes for the mean, in steady flow. In pulsatile
+flow it takes every new pressure for the mean at once (1): the flow is the waveform's, whatever answers it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,8 +288,10 @@ def _imposed(case: FlowCase, domain: Domain, scales: Scales, k: int) -> Floats:
     outflow_mL_s = _outflow_mL_s(case, k)
     kind = lattice.INFLOW if k == 0 else lattice.PRESSURE if outflow_mL_s is None else lattice.OUTFLOW
     speed = (case.inflow_mL_s if k == 0 else outflow_mL_s or 0.0) / opening.area_mm2 / scales.speed_m_s
-    # Critically damped: the blood that the pressure moves is a column about as long as the grid.
-    rate = SOUND_MEMORY if k == 0 else 0.25 / float(np.ptp(domain.cells, axis=0).max())
+    # Outlets, critically damped: the blood that the pressure moves is a column about as long as the grid.
+    outlet_rate = 0.25 / float(np.ptp(domain.cells, axis=0).max())
+    inlet_rate = SOUND_MEMORY if case.settings.waveform is None else 1.0
+    rate = inlet_rate if k == 0 else outlet_rate
     return np.array([kind, speed, 0.0, rate, *opening.normal, opening.area_mm2 / domain.cell_size_mm**2, 0.0])
 
 
@@ -335,7 +338,7 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
         return ScreenEntries(
             np.zeros(segments + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32), np.zeros(0, np.int32)
         )
-    spread = on_grid(case.screen, voxels.index_of(domain.cells), domain.origin_mm, domain.cell_size_mm)
+    spread = on_grid(case.screen, domain.index, domain.origin_mm, domain.cell_size_mm)
     per_step = scales.step_s / case.blood.density_kg_m3
     entry = np.column_stack(
         [

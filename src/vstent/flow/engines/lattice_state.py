@@ -28,7 +28,7 @@ from vstent.flow.engines.lattice_setup import (
 )
 from vstent.flow.types import FlowCase, FlowField, Phase
 from vstent.flow.wall_stress import wall_stress
-from vstent.kernels import lattice, lattice_sampling, voxels
+from vstent.kernels import lattice, lattice_sampling
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
@@ -151,10 +151,9 @@ def _begin_from(state: State, start: FlowField) -> None:
         pressure / state.scales.pressure_Pa,
         velocity / state.scales.speed_m_s,
     )
-    inlet = state.links
-    inlet.openings[0, 2] = lattice.moments(
-        state.populations, state.addressing.stride, inlet.place[inlet.start[0] : inlet.start[1]]
-    )[:, 0].mean()
+    links = state.links
+    at_inlet = links.place[links.start[0] : links.start[1]]
+    links.openings[0, 2] = lattice.moments(state.populations, state.addressing.stride, at_inlet)[:, 0].mean()
 
 
 def check(state: State) -> None:
@@ -225,7 +224,7 @@ def _monitor(state: State, now: Snapshot) -> Floats:
     inlet = state.domain.link_cell[state.domain.link_patch == 1]
     values = [speed[state.probe.cells].mean(), now.density[inlet].mean(), speed.mean()]
     if len(state.probe.ostium_points):
-        index = voxels.index_of(state.domain.cells)
+        index = state.domain.index
         through = lattice_sampling.interpolate(index, now.velocity.astype(float), state.probe.ostium_points, True)
         values.append(float(np.maximum(np.einsum("ij,ij->i", through, state.probe.ostium_area_mm2), 0.0).sum()))
     return np.array(values, dtype=float)
@@ -253,14 +252,7 @@ def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     velocity_m_s = np.mean([one.velocity for one in snapshots], axis=0, dtype=float) * scales.speed_m_s
     pressure_Pa = np.mean([one.density for one in snapshots], axis=0, dtype=float) * scales.pressure_Pa
     stress_Pa, wall_pressure_Pa = wall_stress(
-        index=voxels.index_of(domain.cells),
-        origin_mm=domain.origin_mm,
-        cell_size_mm=domain.cell_size_mm,
-        velocity_m_s=velocity_m_s,
-        pressure_Pa=pressure_Pa,
-        lumen=state.case.vessel.lumen,
-        closed=domain.surface,
-        blood=state.case.blood,
+        domain, velocity_m_s, pressure_Pa, lumen=state.case.vessel.lumen, blood=state.case.blood
     )
     outflow_mL_s = np.mean([one.outflow for one in snapshots], axis=0) * scales.flow_mL_s
     return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, outflow_mL_s)
