@@ -119,7 +119,7 @@ def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
         uid = next(key for key, files in found.items() if any(file == path for file, _ in files))
     if (n_voxels := sum(_n_voxels(dataset) for _, dataset in found[uid])) > MOST_VOXELS:
         raise ReadError(
-            f"{path} announces {n_voxels / 1e9:.3g} billion voxels, more than any scan of a head; export the series again."
+            f"{path} announces {n_voxels / 1e9:.3g} billion voxels, more than any scan of a head; export it again."
         )
     note = f"{len(found)} DICOM series found; the one of {len(found[uid])} files taken." if len(found) > 1 else ""
     return found[uid], (note,) if note else ()

@@ -161,7 +161,9 @@ def _reason(error: Exception) -> str:
     """Return the last plain sentence of an ITK exception in brackets, where it says more than that it failed."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     last = lines[-1].split("): ", 1)[-1].rstrip(".") if lines else ""
-    says_little = not last or "sitk::ERROR" in last or last.startswith("Reason:") or " " not in last.strip("0123456789 ")
+    says_little = (
+        not last or "sitk::ERROR" in last or last.startswith("Reason:") or " " not in last.strip("0123456789 ")
+    )
     return "" if says_little else f" ({last[:150]})"
 
 
@@ -181,9 +183,10 @@ def _states_spacing(path: Path, kind: str) -> bool:
 
 
 def _may_be_spacing(line: bytes) -> bool:
-    """Tell whether a line of a header holds no number that is none, and is no spacing below zero (ITK drops the sign)."""
-    words = line.lower().replace(b"=", b":").partition(b":")[2].split()
-    return b"nan" not in line.lower() and not (b"direction" not in line.lower() and any(w[:1] == b"-" for w in words))
+    """Tell whether a line of a header holds numbers, and no edge below zero: ITK drops the sign."""
+    key, _, values = line.lower().replace(b"=", b":").partition(b":")
+    is_edges = b"directions" not in key
+    return b"nan" not in values and not (is_edges and any(word.startswith(b"-") for word in values.split()))
 
 
 NIFTI_2: Final = 540

@@ -90,7 +90,9 @@ def _refuse_mislabelled(path: Path, kind: str) -> None:
             f"is room for {(path.stat().st_size - 84) // 50}; copy it again."
         )
     if wrong:
-        raise ReadError(f"{path.name} is not a {kind} file, whatever its name says: it begins with {head[:16]!r}; export it again.")
+        raise ReadError(
+            f"{path.name} is not a {kind} file, whatever its name says: it begins with {head[:16]!r}; export it again."
+        )
 
 
 def _is_ascii_stl(head: bytes) -> bool:
@@ -108,7 +110,9 @@ def _n_stl(head: bytes) -> int:
 
 def _checked(surface: Surface, path: Path) -> Surface:
     if len(surface.faces) < 4:
-        raise ReadError(f"{path.name} holds {len(surface.faces)} triangles, which is no vessel; give the wall of the vessel.")
+        raise ReadError(
+            f"{path.name} holds {len(surface.faces)} triangles, which is no vessel; give the wall of the vessel."
+        )
     bad = ~np.isfinite(surface.vertices_mm).all(axis=1)
     if bad.any():
         raise ReadError(

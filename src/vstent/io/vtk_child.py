@@ -93,8 +93,9 @@ def _faults() -> list[str]:
         if event == "ErrorEvent" or "Error reading" in text:  # binary data that end early are only warned of
             faults.append(text)
 
+    window: Any = vtkOutputWindow.GetInstance()
     for event in ("ErrorEvent", "WarningEvent"):
-        vtkOutputWindow.GetInstance().AddObserver(event, note)
+        window.AddObserver(event, note)
     return faults
 
 
