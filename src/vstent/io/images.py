@@ -90,6 +90,10 @@ def _plausible(image: Image, path: Path) -> Image:
         )
     if image.voxels.dtype.kind == "f" and not np.isfinite(image.voxels).all():
         raise ReadError(f"{path.name} has voxels that are not numbers; export it again with integers.")
+    if image.voxels.dtype.kind in "iu" and image.voxels.dtype.itemsize == 2:
+        middle = np.ravel(image.voxels[:, :, image.voxels.shape[2] // 2], order="F")
+        if SWAPPED_ROUGHNESS * _roughness(middle.byteswap()) < _roughness(middle):
+            raise ReadError(f"{path.name} has voxels whose bytes are in the other order; export it again.")
     return image
 
 
@@ -236,6 +240,8 @@ def _read_raw(
     return _plausible(Image(voxels.astype(kind.newbyteorder("="), copy=False), affine, notes=note), path)
 
 
+SWAPPED_ROUGHNESS: Final = 2.0
+"""Voxels so many times as rough as with their bytes swapped are in the wrong order; in the right one they are less."""
 LARGEST_VOXEL: Final = 8
 """Bytes of the largest kind of voxel."""
 
