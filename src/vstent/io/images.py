@@ -19,6 +19,8 @@ VOXEL_MM: Final = (0.01, 5.0)
 """Voxel edges that a scan of the head can have."""
 MOST_BYTES: Final = 1 << 32
 """A scan of more bytes is refused: it is none of a head, or its header lies."""
+LONGEST_LINE: Final = 1000
+"""Characters of a line of a header."""
 MOST_PACKED: Final = 1032
 """No packer of these formats makes one byte of more."""
 
@@ -103,6 +105,8 @@ def _plausible(image: Image, path: Path) -> Image:
 def _read_itk(path: Path, kind: str, *, has_spacing: bool) -> Image:
     import SimpleITK
 
+    if kind in (".mha", ".mhd"):
+        _refuse_odd_meta(path)
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
     try:
@@ -127,6 +131,19 @@ def _read_itk(path: Path, kind: str, *, has_spacing: bool) -> Image:
     affine[:3, :3] = np.reshape(scan.GetDirection(), (3, 3)) * scan.GetSpacing()
     affine[:3, 3] = scan.GetOrigin()
     return Image(SimpleITK.GetArrayViewFromImage(scan).transpose(), affine)
+
+
+def _refuse_odd_meta(path: Path) -> None:
+    """Refuse a MetaImage header whose counts contradict each other: ITK crashes on those."""
+    with path.open("rb") as file:
+        head = file.read(65536).partition(b"ElementDataFile")[0]
+    pairs = [line.partition(b"=") for line in head.splitlines()]
+    values = {key.strip().lower(): value.split() for key, _, value in pairs}
+    n_axes = {b"2": 2, b"3": 3, b"4": 4}.get(b" ".join(values.get(b"ndims", [])), 0)
+    counts = {b"dimsize": n_axes, b"elementspacing": n_axes, b"transformmatrix": n_axes**2, b"offset": n_axes}
+    wrong = [key for key, n in counts.items() if key in values and len(values[key]) != n]
+    if len(values) < len(pairs) or n_axes == 0 or wrong or any(len(line) > LONGEST_LINE for line in head.splitlines()):
+        raise ReadError(f"{path.name} is damaged: its header contradicts itself; copy it again or export it anew.")
 
 
 def _refuse_untrue(path: Path, kind: str, reader: Any) -> None:
