@@ -69,7 +69,7 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     band_mm = 2 * 0.05 * abs(lumen.threshold) / profile.slope_per_mm
     band = f"Threshold +-5 % changes diameters by -+{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
     all_notes = (*image.notes, *notes, band, found, smooth_note, *decimation_notes)
-    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm)
+    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm, blur_mm=profile.blur_mm)
 
 
 @dataclass(frozen=True, eq=False)
