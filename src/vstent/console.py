@@ -10,6 +10,7 @@ from rich.status import Status
 from rich.table import Table
 
 from vstent.device import Design
+from vstent.rank import Ranking
 from vstent.vessel import Opening
 
 ROWS: Final = (
@@ -82,6 +83,28 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
         if bare is None:
             continue
         table.add_row(title, unit, _cell(bare), *(_change(bare, stent["flow"][key]) for stent in stents.values()))
+    return table
+
+
+RANKING_COLUMNS: Final = (
+    ("length, mm", "deployed_length_mm", "{:.1f}"),
+    ("apposed", "apposed_fraction", "{:.0%}"),
+    ("beyond neck, mm", "landing_length_mm", "{:.1f}"),
+    ("metal at neck", "neck_metal_coverage_fraction", "{:.0%}"),
+)
+"""Columns of the ranking: title, key of the measure, its form."""
+
+
+def ranking_table(ranking: Ranking, shown: int) -> Table:
+    """Table of the best candidates, and how many there are beyond."""
+    titles = [title for title, _, _ in RANKING_COLUMNS]
+    table = Table("", "device and size", "shift, mm", "score", *titles, "why")
+    for number, candidate in enumerate(ranking.candidates[:shown], start=1):
+        values = [(candidate.measures.get(key), form) for _, key, form in RANKING_COLUMNS]
+        cells = ["" if value is None else form.format(value) for value, form in values]
+        score = f"{candidate.score:.2f}" if candidate.is_suitable else "out"
+        table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells, candidate.reason)
+    table.caption = f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable"
     return table
 
 
