@@ -29,6 +29,11 @@ def add_geometry(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         "input", type=Path, help="DICOM folder, NIfTI, NRRD, MHA, raw volume, STL, VTP, VTK, OBJ or PLY"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="case folder to write, or to go on with")
+    return add_given(parser)
+
+
+def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add what may be said of the vessel; return the group."""
     given = parser.add_argument_group("instead of what is guessed or proposed")
     given.add_argument("--units", choices=("m", "cm", "mm"), help="length unit of a surface file")
     given.add_argument("--spacing", type=_spacing, metavar="S|X,Y,Z", help="voxel edges of a raw volume, mm")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vstent.errors import ReadError
-from vstent.io.files import existing
+from vstent.io.files import atomic, existing
 from vstent.io.writers import SIGNIFICANT_DIGITS, write_text
 from vstent.kernels.arrays import Floats
 
@@ -53,6 +53,17 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the names of all columns, in the order of first use."""
     return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Write rows of named values as Parquet; False, and nothing written, where pyarrow is not installed."""
+    try:
+        from pyarrow import parquet, table
+    except ImportError:
+        return False
+    with atomic(path) as partial:
+        parquet.write_table(table({name: [row.get(name) for row in rows] for name in columns_of(rows)}), partial)
+    return True
 
 
 def _plain(value: Any) -> Any:
