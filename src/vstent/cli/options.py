@@ -1,6 +1,7 @@
 """Options that several commands share, and what they say to a study."""
 
 import argparse
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -28,6 +29,11 @@ def add_geometry(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         "input", type=Path, help="DICOM folder, NIfTI, NRRD, MHA, raw volume, STL, VTP, VTK, OBJ or PLY"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="case folder to write, or to go on with")
+    return add_given(parser)
+
+
+def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add what may be said of the vessel; return the group."""
     given = parser.add_argument_group("instead of what is guessed or proposed")
     given.add_argument("--units", choices=("m", "cm", "mm"), help="length unit of a surface file")
     given.add_argument("--spacing", type=_spacing, metavar="S|X,Y,Z", help="voxel edges of a raw volume, mm")
@@ -64,6 +70,26 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
     )
     flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
     return flow
+
+
+def add_jobs(group: "argparse._ArgumentGroup") -> None:
+    """Add how many processes work at once."""
+    group.add_argument("--jobs", type=_jobs, default=_cores(), metavar="N", help="processes at once (one a core)")
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _jobs(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of processes such as 2")
+    return int(text)
+
+
+def numbers(text: str) -> list[float]:
+    """Read numbers parted by commas."""
+    return _numbers(text, float)
 
 
 def _numbers(text: str, kind: type) -> list[float]:

@@ -15,12 +15,12 @@ from vstent.device import find_design
 from vstent.io import writers
 from vstent.measure import morphology
 from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
-from vstent.study.outputs import write_anatomy, write_stent, write_vessel
+from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
 from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all
 from vstent.study.types import CaseResult, Progress, Settings
 from vstent.vessel import Anatomy, Vessel
 
-__all__ = ["CaseResult", "Progress", "Settings", "restore_vessel", "run", "trace_vessel"]
+__all__ = ["CaseResult", "Progress", "Settings", "restore_vessel", "run", "trace_vessel", "write_ranking"]
 
 PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
 CACHE: Final = ".vstent"
