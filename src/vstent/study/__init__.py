@@ -14,6 +14,7 @@ from typing import Any, Final
 from vstent.device import find_design
 from vstent.io import writers
 from vstent.measure import morphology
+from vstent.study.folder import CACHE, claiming
 from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
 from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
 from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all
@@ -23,10 +24,9 @@ from vstent.vessel import Anatomy, Vessel
 __all__ = ["CaseResult", "Progress", "Settings", "restore_vessel", "run", "trace_vessel", "write_ranking"]
 
 PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
-CACHE: Final = ".vstent"
-"""Folder inside the case folder that holds finished stages."""
 
 
+@claiming
 def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseResult:
     """Run one study and write its folder; a study already begun there goes on where it stopped.
 
@@ -43,6 +43,8 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
         Something given cannot be used; nothing has been written.
     FlowError
         A flow could not be computed; everything before it is kept.
+    FolderError
+        Another process works in the folder, or it cannot be written to.
     """
     designs = {name: find_design(name) for name in settings.devices}
     ledger = Ledger(out / CACHE, progress)
@@ -64,6 +66,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, provenance, notes)
 
 
+@claiming
 def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> Vessel:
     """Find the vessel, its openings and its centerlines, untrimmed; write them into the folder `out`.
 
@@ -85,6 +88,7 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) 
     return vessel
 
 
+@claiming
 def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Anatomy, dict[str, Any]]:
     """Shrink the sac: find the parent artery and measure it; write it into the folder `out`.
 
