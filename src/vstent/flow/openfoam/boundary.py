@@ -94,7 +94,7 @@ def _outlet_velocity(case: FlowCase, k: int) -> dict[str, Any]:
 def inlet_profile(case: FlowCase, section_mm: Floats) -> dict[str, str]:
     """Files of constant/boundaryData/inlet: points in m, and there the developed profile whose mean is the mean flow's.
 
-    The mean that OpenFOAM holds the patch to stands before the values (`setAverage`).
+    The mean that OpenFOAM holds the patch to stands behind the values (`setAverage`).
     """
     inward = -case.vessel.inlet.normal
     points_mm = _section_points_mm(section_mm, inward)
@@ -103,7 +103,7 @@ def inlet_profile(case: FlowCase, section_mm: Floats) -> dict[str, str]:
     speed_m_s = shape * mean_m_s / max(float(shape[shape > 0].mean()), 1e-300)
     return {
         "points": _vectors(points_mm * M_PER_MM),
-        "0/U": f"{_vector(mean_m_s * inward)}\n{_vectors(speed_m_s[:, None] * inward)}",
+        "0/U": f"{_vectors(speed_m_s[:, None] * inward)}{_vector(mean_m_s * inward)}\n",
     }
 
 

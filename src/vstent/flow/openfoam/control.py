@@ -20,10 +20,10 @@ def schemes(*, is_steady: bool) -> str:
     bounded = "bounded Gauss" if is_steady else "Gauss"
     entries = {
         "ddtSchemes": {"default": "steadyState" if is_steady else "backward"},
-        "gradSchemes": {"default": "Gauss linear", "grad(U)": "cellLimited Gauss linear 1"},
+        "gradSchemes": {"default": "Gauss linear", "grad(U)": "Gauss linear"},
         "divSchemes": {
             "default": "none",
-            "div(phi,U)": f"{bounded} linearUpwind grad(U)",
+            "div(phi,U)": f"{bounded} LUST grad(U)",
             "div((nuEff*dev2(T(grad(U)))))": "Gauss linear",
         },
         "laplacianSchemes": {"default": "Gauss linear limited 0.5"},
@@ -48,7 +48,7 @@ def solution() -> str:
         "SIMPLE": {
             "consistent": True,
             "nNonOrthogonalCorrectors": 1,
-            "residualControl": {"p": 1e-6, "U": 1e-6},
+            "residualControl": {"p": 1e-5, "U": 1e-5},
         },
         "PIMPLE": {"nOuterCorrectors": 1, "nCorrectors": 2, "nNonOrthogonalCorrectors": 1},
         "potentialFlow": {"nNonOrthogonalCorrectors": 5},
