@@ -17,14 +17,16 @@ from vstent.measure import morphology
 from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
 from vstent.study.outputs import write_anatomy, write_stent, write_vessel
 from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all
-from vstent.study.types import CaseResult, Progress, Settings
+from vstent.study.types import CaseResult, Placing, Progress, Settings
 from vstent.vessel import Anatomy, Vessel
 
-__all__ = ["CaseResult", "Progress", "Settings", "restore_vessel", "run", "trace_vessel"]
+__all__ = ["CACHE", "INPUT", "CaseResult", "Placing", "Progress", "Settings", "restore_vessel", "run", "trace_vessel"]
 
 PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
 CACHE: Final = ".vstent"
 """Folder inside the case folder that holds finished stages."""
+INPUT: Final = "input.json"
+"""File in it that says where the input lies: not for handing on, for its path may name the patient."""
 
 
 def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseResult:
@@ -51,6 +53,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     deployments = deploy_all(designs, anatomy, settings, ledger)
     ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
     write_anatomy(out, anatomy)
+    writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve())})
     for name, deployment in deployments.items():
         with ledger.stage(f"struts {name}") as tell:
             tell(write_stent(out / "stents" / name, deployment))
