@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vstent.app.choices import Choices
 from vstent.errors import InputError, ReadError
-from vstent.io.writers import write_text
+from vstent.io.files import atomic
 
 STATE: Final = "app.json"
 """File of a case folder that remembers the page's state."""
@@ -149,7 +149,8 @@ class Case:
         """Change the state, write it down, and tell all who look."""
         with self._lock:
             self._state = self._state.model_copy(update=changes)
-            write_text(self.folder / STATE, self._state.model_dump_json(indent=1))
+            with atomic(self.folder / STATE) as partial:
+                partial.write_text(self._state.model_dump_json(indent=1), encoding="utf-8")
         self.tell()
         return self._state
 

@@ -1,12 +1,12 @@
 """What a user has chosen, as the page and the REST interface say it, and as a study understands it."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from vstent.flow import FlowSettings
-from vstent.flow.waveform import OLDER_ADULT_ICA
-from vstent.study import Placing, Settings
+if TYPE_CHECKING:  # a study's modules are loaded when it is to be told something: the page must be there at once
+    from vstent.flow import FlowSettings
+    from vstent.study import Placing, Settings
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
 Length = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
@@ -37,8 +37,11 @@ class FlowChoice(Strict):
     is_pulsatile: bool = False
     outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
 
-    def settings(self) -> FlowSettings | None:
+    def settings(self) -> "FlowSettings | None":
         """Return what a study is told of the flow."""
+        from vstent.flow import FlowSettings
+        from vstent.flow.waveform import OLDER_ADULT_ICA
+
         if not self.is_wanted:
             return None
         return FlowSettings(
@@ -71,8 +74,10 @@ class Choices(Strict):
             raise ValueError("a device can be chosen once")
         return devices
 
-    def settings(self) -> Settings:
+    def settings(self) -> "Settings":
         """Return what a study is told."""
+        from vstent.study import Placing, Settings
+
         return Settings(
             devices=tuple(device.name for device in self.devices),
             units=self.units,
@@ -87,6 +92,8 @@ class Choices(Strict):
         )
 
 
-def placing_of(device: DeviceChoice) -> Placing:
+def placing_of(device: DeviceChoice) -> "Placing":
     """Return what a study is told of a device's size and place."""
+    from vstent.study import Placing
+
     return Placing(device.diameter_mm, device.length_mm, device.center_mm)

@@ -4,18 +4,15 @@ import json
 import tempfile
 import threading
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
-from vstent.app import intake, sheets
+from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Conflict, Store, dependencies, statuses
 from vstent.app.choices import DeviceChoice
-from vstent.app.jobs import KINDS, Jobs
+from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.app.reopening import RUN, reopened, stem
 from vstent.errors import InputError, ReadError
 from vstent.io.files import existing
-
-RANKING: Final = "ranking.json"
-"""File of a case folder that holds the sizes ranked."""
 
 
 class Desk:
@@ -179,6 +176,8 @@ class Desk:
 
     def numbers(self, case: Case) -> dict[str, Any]:
         """Return every number found so far: anatomy, and flow before and after."""
+        from vstent.app import sheets
+
         found: dict[str, Any] = {"anatomy": [], "flow": []}
         if case.state.anatomy:
             found["anatomy"] = self.live(case).anatomy_sheet()
@@ -217,7 +216,7 @@ def begin_upload(case: Case, name: str) -> Path:
     intake.checked_name(name)
     folder = case.folder / intake.FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    handle = tempfile.NamedTemporaryFile(prefix=".part-", dir=folder, delete=False)  # noqa: SIM115
+    handle = tempfile.NamedTemporaryFile(prefix=".part-", dir=folder, delete=False)
     handle.close()
     return Path(handle.name)
 

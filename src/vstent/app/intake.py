@@ -1,8 +1,8 @@
 """Files that come in through the door: their names, their sizes, what is packed in them, and no patient's record.
 
-A file lies in the case's folder `input` as soon as it is whole. DICOM slices are written anew without the patient's record
-and under numbers for names, for names too can be a patient's; archives are unpacked under a limit, whatever paths are
-in them.
+A file lies in the case's folder `input` as soon as it is whole. DICOM slices are written anew without the patient's
+record and under numbers for names, for names too can be a patient's; archives are unpacked under a limit, whatever
+paths are in them.
 """
 
 import gzip
@@ -28,6 +28,7 @@ MOST_FILES: Final = 5000
 """Files of a case, and entries of an archive."""
 LONGEST_NAME: Final = 120
 _BLOCK: Final = 1 << 20
+_TOO_MUCH: Final = f"The archive holds more than {UNPACKED_LIMIT >> 30} GB or {MOST_FILES} files: too much."
 
 
 def checked_name(name: str) -> str:
@@ -106,7 +107,7 @@ def _take_archive(path: Path, folder: Path) -> None:
         with zipfile.ZipFile(path) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
             if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > UNPACKED_LIMIT:
-                raise ReadError(f"The archive holds more than {UNPACKED_LIMIT >> 30} GB or {MOST_FILES} files: too much.")
+                raise ReadError(_TOO_MUCH)
             left = UNPACKED_LIMIT
             for number, entry in enumerate(entries):
                 left = _take_entry(archive, entry, folder / f".entry-{number}", folder, left)

@@ -1,12 +1,15 @@
-"""Jobs: the long stages of a case, in a process of their own, so that the page stays quick and can stop them at once."""
+"""Jobs: the long stages of a case, in a process of their own, so that the page stays quick and can stop them."""
 
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from typing import Any, Final
 
 from vstent.app.cases import Case, State, dependencies
@@ -36,6 +39,8 @@ SETTLING: Final = re.compile(r"([\d.]+)% left to settle, (?:.*?)(\d+) s left")
 """How a ledger tells of a flow (`vstent.study.ledger.Ledger.teller`)."""
 STOPPED: Final = "Stopped. What was finished is kept."
 POINTS_KEPT: Final = 600
+RANKING: Final = "ranking.json"
+"""File of a case folder that holds the sizes ranked."""
 
 
 class Job:
@@ -51,7 +56,13 @@ class Job:
         self._is_stopped = False
         command = [sys.executable, "-m", "vstent.app.worker", kind, str(case.folder)]
         self._process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, bufsize=1
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            bufsize=1,
+            start_new_session=True,  # a job's own processes end with it
         )
         self._thread = threading.Thread(target=self._follow, daemon=True)
         self._thread.start()
@@ -83,13 +94,20 @@ class Job:
     def stop(self) -> None:
         """Stop at once; what was finished is kept."""
         self._is_stopped = True
-        self._process.kill()
+        self._kill()
         self._thread.join(5.0)
 
     def abandon(self) -> None:
         """Stop because the server ends; the case remembers that there was something to do."""
         self.case = _Deaf(self.case)  # type: ignore[assignment]
-        self._process.kill()
+        self._kill()
+
+    def _kill(self) -> None:
+        with suppress(ProcessLookupError):
+            if hasattr(os, "killpg"):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            else:
+                self._process.kill()
 
     def _follow(self) -> None:
         assert self._process.stdout is not None
@@ -118,7 +136,15 @@ class Job:
             self.residual.append((fraction, float(settling[1]) / 100))
         if fraction >= 1.0:
             self.finished.append({"stage": stage, "detail": detail})
+        self._pass()
         self.case.tell()
+
+    def _pass(self) -> None:
+        """Steps before the one at work are done."""
+        steps, keys, done = KINDS[self.kind], dependencies(self._given), self.case.state.done
+        passed = steps[: steps.index(self.step)] if self.step in steps else ()
+        if any(done.get(step) != keys[step] for step in passed):
+            self.case.update(done=done | {step: keys[step] for step in passed})
 
     def _close(self, failure: str) -> None:
         state = self.case.state

@@ -25,11 +25,13 @@ from vstent.report.packing import message
 from vstent.report.scene import (
     LineLayer,
     MeshLayer,
+    View,
     anatomy_layers,
     device_layers,
     device_title,
     flow_layers,
     scales_of,
+    view_of,
     views_of,
 )
 from vstent.stent import Deployment, Landing, Stent
@@ -48,9 +50,17 @@ KEPT: Final = 40
 """Results remembered per case."""
 SECTION_REACH_MM: Final = 9.0
 """A section shows what is this near to the axis."""
+BESIDE_MM: Final = 8.0
+"""The profile shows so much of the artery beside the neck."""
 NEIGHBOURS: Final = 3
 """Every so many points of a wire are coloured after the nearest node, those between like them."""
-OPENING_COLOURS: Final = ((0.00, 0.45, 0.70), (0.90, 0.62, 0.00), (0.00, 0.62, 0.45), (0.80, 0.47, 0.65), (0.34, 0.71, 0.91))
+OPENING_COLOURS: Final = (
+    (0.00, 0.45, 0.70),
+    (0.90, 0.62, 0.00),
+    (0.00, 0.62, 0.45),
+    (0.80, 0.47, 0.65),
+    (0.34, 0.71, 0.91),
+)
 """Okabe and Ito's colours, told apart by the colour-blind; the inlet has the first."""
 
 
@@ -121,9 +131,7 @@ class Live:
     def deployment(self, choice: DeviceChoice) -> Deployment:
         """Return the deployed device."""
         key = ("deployment", self.case.state.anatomy, *choice.model_dump().values())
-        return self.remembered(
-            key, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice))
-        )
+        return self.remembered(key, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice)))
 
     def flows(self) -> dict[str, Path]:
         """Return where the flows computed last are kept, ``bare`` first."""
@@ -144,9 +152,9 @@ class Live:
         layers = [*anatomy_layers(anatomy), *(_disc(k, opening) for k, opening in enumerate(openings))]
         return message(
             layers,
-            views=views_of(anatomy, {}),
+            views=_views(anatomy),
             fade=1.2 * float(np.median(anatomy.section_radius_mm)),
-            axis={"points": anatomy.axis.points_mm.ravel().tolist(), "abscissa": anatomy.axis.abscissa_mm.tolist()},
+            axis=_axis(anatomy),
             openings=[_said(opening) for opening in openings],
             notes=[*anatomy.vessel.notes, *anatomy.notes],
             neck=_neck_span(anatomy),
@@ -214,6 +222,26 @@ class Live:
                 return shown
             deployment = self.deployment(self.choice(name))
             return shown | _row(deployment, at_mm, center, frame)
+
+
+def _views(anatomy: Anatomy) -> list[View]:
+    """The report's directions, the profile as wide as where a device will lie, and the whole vessel from there."""
+    profile, *others = views_of(anatomy, {})
+    axis, span = anatomy.axis, _neck_span(anatomy) or [0.0, anatomy.axis.length_mm]
+    is_near = (axis.abscissa_mm > span[0] - BESIDE_MM) & (axis.abscissa_mm < span[1] + BESIDE_MM)
+    sacs = [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
+    treated = np.concatenate([axis.points_mm[is_near], *sacs])
+    whole = view_of("whole", profile.axes, anatomy.vessel.lumen.vertices_mm)
+    return [view_of("profile", profile.axes, treated, 1.15), whole, *others]
+
+
+def _axis(anatomy: Anatomy) -> dict[str, list[float]]:
+    axis = anatomy.axis
+    return {
+        "points": np.round(axis.points_mm, 3).ravel().tolist(),
+        "abscissa": np.round(axis.abscissa_mm, 3).tolist(),
+        "diameter": np.round(2 * anatomy.section_radius_mm, 3).tolist(),
+    }
 
 
 def _kept(folder: Path, stage: str) -> Path | None:
@@ -312,6 +340,7 @@ def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
         "center_mm": _center_mm(stent),
         "ends_mm": ends,
         "ends_band_mm": bands,
+        "profile": np.round(np.stack([stent.row_abscissa_mm, stent.row_diameter_mm], axis=1), 3).tolist(),
         "length_mm": stent.deployed_length_mm,
         "length_band_mm": [length + shift for length in lengths],
     }

@@ -10,7 +10,6 @@ from vstent.app.cases import STEPS, Case, State, Store, dependencies
 from vstent.app.choices import Choices, DeviceChoice, FlowChoice
 from vstent.errors import ReadError
 from vstent.io.files import suffix
-from vstent.study import CACHE, INPUT
 
 RUN: Final = "run.json"
 """What a study says of itself."""
@@ -31,6 +30,8 @@ def reopened(store: Store, folder: Path) -> Case:
     ReadError
         The folder does not say how it was made, or not in a way that this version understands.
     """
+    from vstent.study import CACHE, INPUT
+
     try:
         told = json.loads((folder / RUN).read_text(encoding="utf-8"))
         choices = _choices(told["settings"])

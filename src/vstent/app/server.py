@@ -182,7 +182,7 @@ async def _stream(desk: Desk, case: Any) -> AsyncIterator[str]:
 
 
 def _add_input(app: FastAPI, desk: Desk) -> None:
-    @app.put("/api/cases/{case_id}/input", summary="Bring a file in: a volume, a surface, a DICOM slice, or a ZIP of them")
+    @app.put("/api/cases/{case_id}/input", summary="Bring in a volume, a surface, a DICOM slice, or a ZIP of them")
     async def bring(case_id: str, request: Request, name: Annotated[str, Query(max_length=300)]) -> dict[str, Any]:
         found = await asyncio.to_thread(desk.store.get, case_id)
         partial = await asyncio.to_thread(desks.begin_upload, found, name)

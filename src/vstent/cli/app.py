@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def add(commands: options.Commands) -> None:
     """Add the command."""
     parser = options.add_command(commands, "app", "plan a stent on a page in the browser")
-    parser.add_argument("input", type=Path, nargs="?", help="scan, surface, or case folder (drop one on the page if none)")
+    parser.add_argument("input", type=Path, nargs="?", help="scan, surface or case folder (else drop one on the page)")
     parser.add_argument("--cases", type=Path, default=Path("vstent-cases"), metavar="DIR", help="folder of the cases")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
     parser.add_argument("--port", type=int, default=0, help="port to listen at (default: a free one)")

@@ -1,8 +1,8 @@
 """Sketch: where a device will lie, fast enough to follow a hand that drags it; `deploy` answers in full.
 
 The wall as the device will find it does not depend on where the device lies: it is measured once, on rays across the
-parent axis, no wider than the free device (`Bed`). A sketch marches the rows over it and draws the wires. What it leaves
-out is that crossings slide along the wall in a bend.
+parent axis, no wider than the free device (`Bed`). A sketch marches the rows over it and draws the wires. What it
+leaves out is that crossings slide along the wall in a bend.
 """
 
 from dataclasses import dataclass

@@ -290,18 +290,18 @@ def views_of(anatomy: Anatomy, deployments: dict[str, Deployment]) -> tuple[View
     treated = np.concatenate(points or [anatomy.axis.points_mm])
     whole = anatomy.vessel.lumen.vertices_mm
     right, up, toward = _profile(anatomy)
-    profile = _view("profile", np.stack([right, up, toward]), treated)
-    opposite = _view("profile", np.stack([-right, up, -toward]), treated)
+    profile = view_of("profile", np.stack([right, up, toward]), treated)
+    opposite = view_of("profile", np.stack([-right, up, -toward]), treated)
     views = [profile if _hidden(whole, profile) <= _hidden(whole, opposite) else opposite]
     if anatomy.aneurysms:
         right, up, toward = views[0].axes
-        views.append(_view("neck", np.stack([right, -toward, up]), anatomy.aneurysms[0].neck_mm, 1.3))
-    views.append(_view("frontal", np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), whole))
-    views.append(_view("lateral", np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), whole))
+        views.append(view_of("neck", np.stack([right, -toward, up]), anatomy.aneurysms[0].neck_mm, 1.3))
+    views.append(view_of("frontal", np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), whole))
+    views.append(view_of("lateral", np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), whole))
     return tuple(views)
 
 
-def _view(name: str, axes: Floats, points_mm: Floats, room: float = 1.0) -> View:
+def view_of(name: str, axes: Floats, points_mm: Floats, room: float = 1.0) -> View:
     """Frame points (n, 3) as they show from there, with some room."""
     seen = points_mm @ axes.T
     middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
