@@ -540,7 +540,7 @@ const LAYERS = {
   flow: (page) => {
     const mode = page.memory.mode || "streamlines";
     const shear = mode === "shear";
-    return [{ id: "lumen", title: "Lumen", on: true }, { id: "streamlines", title: "Streamlines", on: !shear }, { id: "shear", title: "Wall shear stress", on: shear }, { id: "wires", title: "Wires", on: false }, NECK];
+    return [{ id: "lumen", title: "Lumen", on: !shear }, { id: "streamlines", on: !shear }, { id: "shear", on: shear }, { id: "wires", title: "Wires", on: false }, NECK];
   },
   report: (page) => LAYERS.flow(page),
 };

@@ -4,7 +4,7 @@ import { make } from "../src/dom.js";
 import { annotate, annotations, colourBar } from "../src/furniture.js";
 import { Stage } from "../src/stage.js";
 
-const VIEWS = { whole: "Whole", profile: "Profile", neck: "From the sac", frontal: "Frontal", lateral: "From the left" };
+const VIEWS = { profile: ["Profile", "The neck in profile"], whole: ["Whole", "The whole vessel"], neck: ["Neck", "From the sac onto the neck"], frontal: ["Front", "From the front"], lateral: ["Left", "From the left"] };
 const EMPTY = { scales: [], layers: [], views: [], fade: 2 };
 
 export class Picture {
@@ -107,7 +107,7 @@ export class Picture {
         return button;
       });
     const views = this.views.map(({ id }, i) =>
-      make("button", { type: "button", className: "chip view", title: `Key ${i + 1}`, onClick: () => this.look(id) }, [VIEWS[id]]),
+      make("button", { type: "button", className: "chip view", title: `${VIEWS[id][1]} (key ${i + 1})`, onClick: () => this.look(id) }, [VIEWS[id][0]]),
     );
     this.toolbar.replaceChildren(make("div", { className: "chips" }, layers), make("div", { className: "chips" }, views));
   }

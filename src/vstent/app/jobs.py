@@ -20,6 +20,8 @@ KINDS: Final = {
     "flow": ("device", "deploy", "flow", "report"),
 }
 """Kind of a job -> the steps that are done when it is."""
+FIRST: Final = {"anatomy": "image", "rank": "device", "flow": "flow"}
+"""Kind of a job -> the step that it is said to be at before it has said a word."""
 STAGES: Final = {
     "scan": "image",
     "segment": "image",
@@ -72,7 +74,7 @@ class Job:
         """The step that is at work; empty once all is done."""
         if self._process.poll() is not None and not self._thread.is_alive():
             return ""
-        return STAGES.get(self.stage.partition(" ")[0], KINDS[self.kind][0])
+        return STAGES.get(self.stage.partition(" ")[0], FIRST[self.kind])
 
     @property
     def is_alive(self) -> bool:

@@ -6,6 +6,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Final
 from urllib.parse import parse_qs
 
+from starlette.exceptions import HTTPException
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -32,8 +33,11 @@ _HEADERS: Final = (
 )
 
 
-class TooLarge(Exception):
+class TooLarge(HTTPException):
     """A body exceeds what is allowed."""
+
+    def __init__(self) -> None:
+        super().__init__(413, "Too large.")
 
 
 class Guard:
@@ -57,10 +61,7 @@ class Guard:
         if refusal is None and _length(headers) > limit:
             refusal = PlainTextResponse(f"More than {limit >> 20} MB: too large.", 413)
         sender = _with_headers(send)
-        try:
-            await (refusal or self.app)(scope, _counted(receive, limit), sender)
-        except TooLarge:
-            await PlainTextResponse(f"More than {limit >> 20} MB: too large.", 413)(scope, receive, sender)
+        await (refusal or self.app)(scope, _counted(receive, limit), sender)
 
     def _refusal(self, scope: Scope, headers: dict[str, str]) -> Response | None:
         if headers.get("host", "") not in self.hosts:
