@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -42,6 +43,11 @@ def add_geometry(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         "input", type=Path, help="DICOM folder, NIfTI, NRRD, MHA, raw volume, STL, VTP, VTK, OBJ or PLY"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="case folder to write, or to go on with")
+    return add_given(parser)
+
+
+def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add what may be said of the vessel; return the group."""
     given = parser.add_argument_group("instead of what is guessed or proposed")
     given.add_argument("--units", choices=("m", "cm", "mm"), help="length unit of a surface file")
     given.add_argument("--spacing", type=_spacing, metavar="S|X,Y,Z", help="voxel edges of a raw volume, mm")
@@ -82,12 +88,33 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
     return flow
 
 
-def _numbers(text: str, kind: type, count: int) -> list[float]:
+def add_jobs(group: "argparse._ArgumentGroup") -> None:
+    """Add how many processes work at once."""
+    group.add_argument("--jobs", type=_jobs, default=_cores(), metavar="N", help="processes at once (one a core)")
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _jobs(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of processes such as 2")
+    return int(text)
+
+
+def numbers(text: str) -> list[float]:
+    """Read numbers parted by commas."""
+    return _numbers(text, float)
+
+
+def _numbers(text: str, kind: type, count: int | None = None) -> list[float]:
+    """Read numbers parted by commas, `count` of them where that is said."""
     try:
         numbers = [kind(part) for part in text.replace("x", ",").split(",")]
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not {'a number' if count == 1 else 'like 1,2,3'}") from None
-    if len(numbers) != count:
+    if count is not None and len(numbers) != count:
         raise argparse.ArgumentTypeError(f"{text!r} has {len(numbers)} numbers, not {count}")
     if not all(math.isfinite(value) for value in numbers):
         raise argparse.ArgumentTypeError(f"{text!r} is not finite")

@@ -73,7 +73,7 @@ def read_dicom(path: Path) -> Image:
     UnitError
         The size of the pixels is not stated.
     """
-    with _quiet():
+    with quiet():
         series, note = _choose(path)
         slices = [plane for file, dataset in series for plane in _planes(file, dataset)]
         slices, affine = _arrange(slices)
@@ -83,7 +83,7 @@ def read_dicom(path: Path) -> Image:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keep pydicom's remarks on small faults to itself: what matters is raised."""
     logger = logging.getLogger("pydicom")
     level = logger.level
@@ -96,7 +96,7 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _damage() -> tuple[type[Exception], ...]:
+def damage() -> tuple[type[Exception], ...]:
     """Give all that pydicom raises for files and pixels that it cannot decode."""
     from pydicom.errors import BytesLengthException, InvalidDicomError
 
@@ -150,7 +150,7 @@ def _header(file: Path) -> Any:
             return None
         _ = dataset.SeriesInstanceUID, _n_voxels(dataset)  # values are decoded, and faults met, on first use
         return dataset
-    except _damage():
+    except damage():
         raise ReadError(
             f"{file.name} is damaged; copy it again, or remove it if it is not part of the series."
         ) from None
@@ -181,7 +181,7 @@ def _planes(file: Path, dataset: Any) -> list[_Slice]:
     """Slices of one file: itself, or its frames."""
     try:
         return _frames(file, dataset)
-    except _damage():
+    except damage():
         raise ReadError(f"{file.name} is damaged: its position, orientation or pixel size cannot be read.") from None
 
 
@@ -340,7 +340,7 @@ def _decoded(plane: _Slice) -> NDArray[Any]:
         if "PixelData" not in plane.dataset:
             _load_pixels(plane)
         array = plane.dataset.pixel_array
-    except _damage():
+    except damage():
         array = _decoded_by_gdcm(plane)
     return array if plane.frame is None or array.ndim == 2 else array[plane.frame]
 

@@ -16,14 +16,27 @@ from vstent.io import writers
 from vstent.measure import morphology
 from vstent.study.folder import CACHE, claiming
 from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
-from vstent.study.outputs import write_anatomy, write_stent, write_vessel
+from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
 from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all
-from vstent.study.types import CaseResult, Progress, Settings
+from vstent.study.types import CaseResult, Placing, Progress, Settings
 from vstent.vessel import Anatomy, Vessel
 
-__all__ = ["CaseResult", "Progress", "Settings", "restore_vessel", "run", "trace_vessel"]
+__all__ = [
+    "CACHE",
+    "INPUT",
+    "CaseResult",
+    "Placing",
+    "Progress",
+    "Settings",
+    "restore_vessel",
+    "run",
+    "trace_vessel",
+    "write_ranking",
+]
 
 PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
+INPUT: Final = "input.json"
+"""File in the case folder that says where the input lies: not for handing on, for its path may name the patient."""
 
 
 @claiming
@@ -53,6 +66,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     deployments = deploy_all(designs, anatomy, settings, ledger)
     ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
     write_anatomy(out, anatomy)
+    writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve())})
     for name, deployment in deployments.items():
         with ledger.stage(f"struts {name}") as tell:
             tell(write_stent(out / "stents" / name, deployment))
