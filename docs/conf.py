@@ -9,7 +9,7 @@ sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]
 
 project = "vstent"
 author = "The vstent developers"
-copyright = "The vstent developers. Research use only: not cleared for diagnosis or treatment."  # noqa: A001
+copyright = "The vstent developers. Research use only: not cleared for diagnosis or treatment."
 version = release = version_of("vstent")
 
 extensions = [

@@ -2,8 +2,8 @@
 How long a braid gets
 =====================
 
-Wires do not stretch, so a braid gets longer where the artery is narrower. In straight tubes the deployed length must follow
-from the closed formula :math:`L(D)/L_0 = \\cos\\alpha(D)/\\cos\\alpha_0`.
+Wires do not stretch, so a braid gets longer where the artery is narrower. In straight tubes the deployed length
+follows the closed formula :math:`L(D)/L_0 = \\cos\\alpha(D)/\\cos\\alpha_0`.
 """
 
 import matplotlib.pyplot as plt
