@@ -1,6 +1,5 @@
 """The parent artery under a sac of known shape."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -8,49 +7,21 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
+from sac_truth import GLUED, X, anatomy_of, relative_errors, scanned_anatomy_of
 from vstent import phantoms
 from vstent.errors import InputError
 from vstent.kernels import curves
 from vstent.measure import morphology
-from vstent.phantoms import Phantom, Scanner, torus_arc, tube, with_bleb, with_branch, with_sac
+from vstent.phantoms import tube, with_sac
 from vstent.repair import repair
 from vstent.restore import restore
 from vstent.restore.neck import Flank, unblurred
 from vstent.restore.sac import _is_island
-from vstent.segment import segment
 from vstent.surface import Surface
 from vstent.trace import trace
 from vstent.trim import trim
 from vstent.vessel import Anatomy, Vessel
 
-X = np.array([1.0, 0.0, 0.0])
-PHANTOMS: dict[str, Callable[[], Phantom]] = {
-    "straight": lambda: with_sac(tube(length_mm=40), abscissa_mm=20),
-    "tapered": lambda: with_sac(tube(length_mm=40, radius_mm=2.3, end_radius_mm=1.6), abscissa_mm=20),
-    "outside of a bend": lambda: with_sac(torus_arc(bend_radius_mm=9.0), abscissa_mm=14),
-    "inside of a bend": lambda: with_sac(torus_arc(bend_radius_mm=9.0), abscissa_mm=14, direction=_inside(14 / 9)),
-    "wide on the inside of a bend": lambda: with_sac(
-        torus_arc(bend_radius_mm=9.0), abscissa_mm=14, neck_mm=6.8, direction=_inside(14 / 9)
-    ),
-    "beside a branch": lambda: with_branch(
-        with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), abscissa_mm=24, direction=np.array([1.0, 0.3, 0.5])
-    ),
-    "touching a branch": lambda: with_branch(
-        with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), abscissa_mm=24.5, direction=X
-    ),
-    "neck of 2 diameters": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=10, neck_mm=8),
-    "sac of 3 diameters": lambda: with_sac(tube(length_mm=44), abscissa_mm=22, width_mm=12, neck_mm=5),
-    "half a sphere": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=5.6, neck_mm=5.5),
-    "tall": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=5, neck_mm=3, elongation=1.8),
-    "small": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=4, neck_mm=2.8),
-    "blebs": lambda: with_bleb(
-        with_bleb(with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), direction=np.array([0.2, 1.0, 0.3])),
-        direction=np.array([1.0, -0.3, 0.9]),
-        radius_mm=1.6,
-    ),
-    "demo": phantoms.demo_phantom,
-}
-"""The table of glued sacs."""
 IN_BRIEF = ("wide on the inside of a bend", "beside a branch")
 """Those that the default suite tries."""
 SCANS_IN_BRIEF = (("demo", 0.28),)
@@ -60,26 +31,6 @@ NECK_TOLERANCE = {0.15: 0.05, 0.28: 0.05, 0.4: 0.08}
 
 def _rows(every: list, brief: tuple) -> list:
     return [pytest.param(row, marks=() if row in brief else pytest.mark.validation, id=str(row)) for row in every]
-
-
-def anatomy_of(phantom: phantoms.Phantom) -> Anatomy:
-    return restore(trace(Vessel(phantoms.phantom_surface(phantom))))
-
-
-def scanned_anatomy_of(phantom: phantoms.Phantom, voxel_mm: float) -> Anatomy:
-    scanner = Scanner(voxel_mm=voxel_mm, blur_mm=0.8 * voxel_mm)
-    return restore(trace(segment(phantoms.scan(phantom, np.random.default_rng(1), scanner=scanner))))
-
-
-def relative_errors(anatomy: Anatomy, phantom: phantoms.Phantom) -> tuple[np.ndarray, np.ndarray]:
-    """Radius error (fraction) of the landing surface's sections, and distance (mm) of its vertices to the true wall."""
-    axis = anatomy.axis
-    inner = (axis.abscissa_mm > 3) & (axis.abscissa_mm < axis.length_mm - 3)
-    place = curves.project(phantom.parent.points_mm, axis.points_mm[inner])[0]
-    true_mm = np.interp(place, phantom.parent.abscissa_mm, phantom.parent.inscribed_radius_mm)
-    rings = anatomy.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
-    wall = phantoms.tube_implicit_mm(phantom.parent, rings)[0]
-    return anatomy.section_radius_mm[inner] / true_mm - 1, np.abs(wall)
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +68,9 @@ def test_neck_and_sac_share_their_rim(demo) -> None:
     np.testing.assert_allclose(flux, others[~on_neck].sum(axis=0), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", _rows(list(PHANTOMS), IN_BRIEF))
+@pytest.mark.parametrize("name", _rows(list(GLUED), IN_BRIEF))
 def test_artery_neck_and_sac_of_an_exact_wall(name: str) -> None:
-    phantom = PHANTOMS[name]()
+    phantom = GLUED[name]()
     anatomy = anatomy_of(phantom)
     radius_error, distance_mm = relative_errors(anatomy, phantom)
     assert np.abs(radius_error).mean() < 0.005
@@ -131,10 +82,10 @@ def test_artery_neck_and_sac_of_an_exact_wall(name: str) -> None:
     assert aneurysm.sac.boundary_loops == ()
 
 
-@pytest.mark.parametrize("row", _rows([(name, h) for name in PHANTOMS for h in NECK_TOLERANCE], SCANS_IN_BRIEF))
+@pytest.mark.parametrize("row", _rows([(name, h) for name in GLUED for h in NECK_TOLERANCE], SCANS_IN_BRIEF))
 def test_artery_neck_and_sac_of_a_noisy_scan(row: tuple[str, float]) -> None:
     name, voxel_mm = row
-    phantom = PHANTOMS[name]()
+    phantom = GLUED[name]()
     anatomy = scanned_anatomy_of(phantom, voxel_mm)
     radius_error, distance_mm = relative_errors(anatomy, phantom)
     assert np.abs(radius_error).mean() < 0.02
@@ -193,7 +144,7 @@ def test_the_neck_lies_on_the_landing_surface_in_the_lumen(demo) -> None:
 
 
 def test_a_branch_that_passes_close_to_the_sac_takes_nothing_of_its_wall() -> None:
-    phantom = PHANTOMS["touching a branch"]()
+    phantom = GLUED["touching a branch"]()
     (aneurysm,) = anatomy_of(phantom).aneurysms
     assert phantom.sac is not None
     angle = np.linspace(-0.5, 0.5, 21)
@@ -230,10 +181,6 @@ def test_the_neck_does_not_depend_on_the_mesh(demo) -> None:
     anatomy, phantom = demo
     coarse = restore(trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.35))))
     np.testing.assert_allclose(coarse.aneurysms[0].neck.area_mm2, anatomy.aneurysms[0].neck.area_mm2, rtol=0.02)
-
-
-def _inside(angle_rad: float) -> np.ndarray:
-    return -np.array([np.cos(angle_rad), 0.0, np.sin(angle_rad)])
 
 
 def test_without_a_sac_the_landing_surface_is_the_wall() -> None:
