@@ -222,6 +222,18 @@ def test_trimming_cuts_a_long_artery_square_and_keeps_the_sac() -> None:
     assert restore(vessel).aneurysms[0].sac.volume_mm3 == pytest.approx(phantom.sac_volume_mm3, rel=0.03)
 
 
+def test_a_sac_that_trimming_takes_off_is_told() -> None:
+    long = phantoms.tube(length_mm=100)
+    near, far = (with_sac(long, abscissa_mm=s, width_mm=w, neck_mm=4.0) for s, w in ((20, 7.0), (85, 6.0)))
+    assert far.sac is not None
+    wall = phantoms.phantom_surface(replace(near, blebs=(far.sac,)), edge_mm=0.4)
+    vessel = trim(trace(Vessel(wall), inlet_mm=np.zeros(3)))
+    assert "Another sac, 5." in vessel.notes[-1]
+    place_mm = [float(x) for x in vessel.notes[-1].split(" at ")[1].split(" mm")[0].split(", ")]
+    assert far.sac.implicit_mm(np.array([place_mm]))[0] == pytest.approx(0.0, abs=0.1)
+    assert len(restore(vessel).aneurysms) == 1
+
+
 def test_the_real_sac_is_that_of_aneurisk_web(shared_data) -> None:
     from vstent.io.surfaces import read_surface
 
