@@ -2,8 +2,10 @@
 
 Crossings x (c, 2), moves along and around in mm, are those of least
 
-    sum over pieces of (length - length as made)^2  +  sum over crossings of (resistance |x - mean of x along its row|)^2
+    sum over pieces of (length - length as made)^2
+    +  sum over crossings of (resistance times how far they move otherwise than their row)^2
     +  sum over neighbours in a row of (crowding times how much nearer together or further apart they come)^2
+    +  sum over neighbours on a wire of (stiffness times the second difference of their moves)^2
 
 with the mean of one row held where it is. Gauss-Newton steps; every one solves its normal equations by conjugate
 gradients, preconditioned by the diagonal and by one coarse problem: whole rows moved, tilted, turned and bunched.
@@ -44,7 +46,9 @@ class Net(NamedTuple):
     spacing: Floats
     """(2,) mm per row and per column of the grid."""
     bulge: Floats
-    """(l,) mm2 by which the squared length of a piece that begins in a row exceeds its chord's: wires follow the wall."""
+    """(l,) mm2: wires follow the wall, so much more than its chord's is the squared length of a piece behind a row."""
+    bends: Ints
+    """(3, b) every three crossings that follow on each other on a wire."""
 
 
 class Weights(NamedTuple):
@@ -56,6 +60,8 @@ class Weights(NamedTuple):
     """Weight of a crossing that moves otherwise than its row against a piece that stretches by as much."""
     crowding: float
     """Weight of neighbours in a row that come nearer together."""
+    stiffness: float
+    """Weight of wires that bend otherwise."""
     held: int
     """The row of crossings that stays where it is in the mean."""
 
@@ -83,9 +89,11 @@ def _put(chart: Any, row: Any, column: Any, spacing: Any, x: Any, places: Any) -
 
 
 @njit(cache=True, nogil=True)
-def _cost(places: Any, line: Any, beside: Any, ends: Any, bulge: Any, weights: Any, x: Any, excess: Any) -> float:
+def _cost(
+    places: Any, line: Any, beside: Any, ends: Any, bulge: Any, bends: Any, weights: Any, x: Any, excess: Any
+) -> float:
     """Write by how much every piece (p,) is too long; return what the crossings minimise."""
-    length, resistance, crowding, held = weights
+    length, resistance, crowding, stiffness, held = weights
     total = 0.0
     for p in range(ends.shape[1]):
         a, b = ends[0, p], ends[1, p]
@@ -99,6 +107,9 @@ def _cost(places: Any, line: Any, beside: Any, ends: Any, bulge: Any, weights: A
         off = x[c, 0] - mean[line[c]]
         total += resistance**2 * (off * off + x[c, 1] ** 2)
         total += (crowding * (x[beside[c], 1] - x[c, 1])) ** 2
+    for b in range(bends.shape[1]):
+        for k in range(2):
+            total += (stiffness * (x[bends[0, b], k] - 2 * x[bends[1, b], k] + x[bends[2, b], k])) ** 2
     return total + count[held] * mean[held] ** 2
 
 
@@ -126,11 +137,11 @@ def _slopes(places: Any, ends: Any, slopes: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, x: Any, result: Any) -> None:
+def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, bends: Any, weights: Any, x: Any, result: Any) -> None:
     """Write the normal matrix times x (c, 2)."""
-    _, resistance, crowding, held = weights
+    _, resistance, crowding, stiffness, held = weights
     mean, _ = _row_means(line, x)
-    damp, crowd = resistance**2, crowding**2
+    damp, crowd, stiff = resistance**2, crowding**2, stiffness**2
     for c in range(len(line)):
         result[c, 0] = damp * (x[c, 0] - mean[line[c]])
         result[c, 1] = damp * x[c, 1]
@@ -140,6 +151,13 @@ def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, x: A
         nearer = crowd * (x[beside[c], 1] - x[c, 1])
         result[beside[c], 1] += nearer
         result[c, 1] -= nearer
+    for b in range(bends.shape[1]):
+        before, here, after = bends[0, b], bends[1, b], bends[2, b]
+        for k in range(2):
+            bent = stiff * (x[before, k] - 2 * x[here, k] + x[after, k])
+            result[before, k] += bent
+            result[here, k] -= 2 * bent
+            result[after, k] += bent
     for p in range(ends.shape[1]):
         a, b = ends[0, p], ends[1, p]
         longer = slopes[p, 0] * x[a, 0] + slopes[p, 1] * x[a, 1] + slopes[p, 2] * x[b, 0] + slopes[p, 3] * x[b, 1]
@@ -152,8 +170,8 @@ def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, x: A
 @njit(cache=True, nogil=True)
 def _diagonal(slopes: Any, ends: Any, weights: Any, n: int) -> Any:
     """Inverse of the normal matrix's diagonal (c, 2)."""
-    _, resistance, crowding, _ = weights
-    diagonal = np.full((n, 2), resistance**2)
+    _, resistance, crowding, stiffness, _ = weights
+    diagonal = np.full((n, 2), resistance**2 + 12 * stiffness**2)  # two wires, (1, -2, 1) thrice on each
     diagonal[:, 1] += 2 * crowding**2
     for p in range(ends.shape[1]):
         for k in range(2):
@@ -165,7 +183,7 @@ def _diagonal(slopes: Any, ends: Any, weights: Any, n: int) -> Any:
 @njit(cache=True, nogil=True)
 def _coarse(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, waves: Any) -> Any:
     """Banded Cholesky factor (n, BAND), lower form, of the normal matrix on moves of whole rows."""
-    _, resistance, crowding, held = weights
+    _, resistance, crowding, stiffness, held = weights
     band = np.zeros(((line[-1] + 1) * _WAVES, _BAND))
     g = np.zeros(_BAND)
     for p in range(ends.shape[1]):
@@ -245,13 +263,21 @@ def _dot(a: Any, b: Any) -> float:
 
 @njit(cache=True, nogil=True)
 def _step(
-    slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, waves: Any, x: Any, excess: Any, tolerance: float
+    slopes: Any,
+    line: Any,
+    beside: Any,
+    ends: Any,
+    bends: Any,
+    weights: Any,
+    waves: Any,
+    x: Any,
+    excess: Any,
+    tolerance: float,
 ) -> Any:
     """Moves (c, 2) of a Gauss-Newton step from x, by conjugate gradients."""
     inverse, factor = _diagonal(slopes, ends, weights, len(line)), _coarse(slopes, line, beside, ends, weights, waves)
     residual, image = np.zeros_like(x), np.zeros_like(x)
-    heeded = (weights[0], weights[1], weights[2], weights[3])
-    _multiply(np.zeros_like(slopes), line, beside, ends, heeded, x, image)
+    _multiply(np.zeros_like(slopes), line, beside, ends, bends, weights, x, image)
     for c in range(len(line)):
         residual[c, 0], residual[c, 1] = -image[c, 0], -image[c, 1]
     for p in range(ends.shape[1]):
@@ -266,7 +292,7 @@ def _step(
     for _ in range(200):
         if size <= goal:
             break
-        _multiply(slopes, line, beside, ends, weights, way, image)
+        _multiply(slopes, line, beside, ends, bends, weights, way, image)
         share = size / _dot(way, image)
         for c in range(len(line)):
             for k in range(2):
@@ -290,23 +316,25 @@ def _slide(
     ends: Any,
     spacing: Any,
     bulge: Any,
+    bends: Any,
     length: float,
     resistance: float,
     crowding: float,
+    stiffness: float,
     held: int,
     waves: Any,
     steps: int,
     gain: float,
     tolerance: float,
 ) -> Any:
-    weights = (length, resistance, crowding, held)
+    weights = (length, resistance, crowding, stiffness, held)
     x, tried = np.zeros((len(row), 2)), np.zeros((len(row), 2))
     places, excess, slopes = np.zeros((len(row), 9)), np.zeros(ends.shape[1]), np.zeros((ends.shape[1], 4))
     _put(chart, row, column, spacing, x, places)
-    cost = _cost(places, line, beside, ends, bulge, weights, x, excess)
+    cost = _cost(places, line, beside, ends, bulge, bends, weights, x, excess)
     for _ in range(steps):
         _slopes(places, ends, slopes)
-        move = _step(slopes, line, beside, ends, weights, waves, x, excess, tolerance)
+        move = _step(slopes, line, beside, ends, bends, weights, waves, x, excess, tolerance)
         for c in range(len(row)):
             for k in range(2):
                 move[c, k] = min(max(move[c, k], -REACH), REACH)
@@ -314,7 +342,7 @@ def _slide(
         while share > 0.05:  # a step that does not help is halved
             tried[:] = x + share * move
             _put(chart, row, column, spacing, tried, places)
-            cost = _cost(places, line, beside, ends, bulge, weights, tried, excess)
+            cost = _cost(places, line, beside, ends, bulge, bends, weights, tried, excess)
             if cost < before:
                 break
             share *= 0.5
