@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from vstent import phantoms, study
+from vstent import phantoms
 from vstent.cli import main
 from vstent.flow import FlowCase, FlowField
 from vstent.io.writers import write_stl
+from vstent.study import stages
 
 
 def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
@@ -17,7 +18,7 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     artery, out = tmp_path / "artery.stl", tmp_path / "out"
     write_stl(artery, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
     command = ["run", str(artery), "--out", str(out), "--device", "silk", "--cell-size", "0.25"]
-    real, computed = study.simulate_case, []
+    real, computed = stages.simulate_case, []
 
     def stopped_with_a_stent(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
         if case.screen is not None and not computed.count("silk"):
@@ -26,7 +27,7 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
         computed.append("silk" if case.screen else "bare")
         return start if start is not None else real(case, start=start, **given)
 
-    monkeypatch.setattr(study, "simulate_case", stopped_with_a_stent)
+    monkeypatch.setattr(stages, "simulate_case", stopped_with_a_stent)
     assert main(command) == 130
     assert "give the same command again" in capsys.readouterr().err
     assert (out / "flow" / "bare" / "field.vtu").stat().st_size > 100_000

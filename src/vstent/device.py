@@ -308,7 +308,7 @@ def catalogue() -> dict[str, Design]:
 
     designs = parse(files("vstent").joinpath("devices.toml").read_text(encoding="utf-8"))
     for path in sorted(user_folder().glob("*.toml")):
-        added = parse(path.read_text(encoding="utf-8"), str(path))
+        added = parse(_text(path), str(path))
         _check_new(added, designs, path)
         designs |= added
     return designs
@@ -332,12 +332,9 @@ def add_devices(path: Path) -> dict[str, Design]:
     """
     from vstent.device_schema import parse
 
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DeviceError(f"{path} cannot be read as text: give a TOML file of devices.") from error
+    text = _text(path)
     added, kept = parse(text, str(path)), user_folder() / f"{path.stem}.toml"
-    others = parse(kept.read_text(encoding="utf-8"), str(kept)) if kept.exists() else {}
+    others = parse(_text(kept), str(kept)) if kept.exists() else {}
     _check_new(added, {key: design for key, design in catalogue().items() if key not in others}, path)
     kept.parent.mkdir(parents=True, exist_ok=True)
     partial = kept.with_suffix(".partial")
@@ -345,6 +342,13 @@ def add_devices(path: Path) -> dict[str, Design]:
     partial.replace(kept)
     catalogue.cache_clear()
     return added
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DeviceError(f"{path} cannot be read as text: give a TOML file of devices, or remove it.") from error
 
 
 def _check_new(added: Iterable[str], known: Iterable[str], path: Path) -> None:

@@ -1,0 +1,23 @@
+"""`vstent demo`: the whole job on a synthetic scan, beside its known truth."""
+
+import argparse
+from pathlib import Path
+
+from vstent.cli import options, run
+
+
+def add(commands: options.Commands) -> None:
+    """Add the command."""
+    parser = options.add_command(commands, "demo", "the same on a synthetic scan, beside its known truth")
+    parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="case folder (default: demo)")
+    run.add_study(parser)
+    parser.set_defaults(command=_demo)
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from vstent.console import Console, truth_table
+    from vstent.demo import truth, write_scan
+
+    case = run.study(write_scan(arguments.out / "scan"), arguments.out, run.given_study(arguments))
+    Console().print(truth_table(truth(case)))
+    return 0

@@ -1,0 +1,178 @@
+"""Options that several commands share, and what they say to a study."""
+
+import argparse
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+if TYPE_CHECKING:
+    from vstent.flow.types import FlowSettings, Waveform
+
+EPILOG: Final = (
+    "Research use only: not cleared for diagnosis or treatment. Lengths in mm, flow in SI; coordinates are LPS."
+)
+PUBLISHED: Final = "published"
+"""The waveform where none is given."""
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+"""What a command adds itself to."""
+
+
+def number(text: str) -> float:
+    """Read a number; argparse makes a sentence of the complaint."""
+    return _numbers(text, float, 1)[0]
+
+
+def positive(text: str) -> float:
+    """Read a number above zero."""
+    value = number(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above zero")
+    return value
+
+
+def add_command(commands: Commands, name: str, text: str) -> argparse.ArgumentParser:
+    """Add a command with its line of help."""
+    return commands.add_parser(name, help=text, description=text, epilog=EPILOG)
+
+
+def add_geometry(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add the input, the folder, and what may be said of the vessel; return the group of the latter."""
+    parser.add_argument(
+        "input", type=Path, help="DICOM folder, NIfTI, NRRD, MHA, raw volume, STL, VTP, VTK, OBJ or PLY"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="case folder to write, or to go on with")
+    return add_given(parser)
+
+
+def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add what may be said of the vessel; return the group."""
+    given = parser.add_argument_group("instead of what is guessed or proposed")
+    given.add_argument("--units", choices=("m", "cm", "mm"), help="length unit of a surface file")
+    given.add_argument("--spacing", type=_spacing, metavar="S|X,Y,Z", help="voxel edges of a raw volume, mm")
+    given.add_argument("--shape", type=_shape, metavar="I,J,K", help="voxel counts of a raw volume")
+    given.add_argument("--threshold", type=number, metavar="T", help="intensity of the lumen's wall in a scan")
+    given.add_argument("--at", type=_point, metavar="X,Y,Z", help="a point near the sac, mm")
+    given.add_argument("--inlet", type=_point, metavar="X,Y,Z", help="a point near the inlet, mm")
+    return given
+
+
+def add_outlet(given: "argparse._ArgumentGroup") -> None:
+    """Add the point that picks the parent artery's outlet."""
+    given.add_argument("--outlet", type=_point, metavar="X,Y,Z", help="a point near the parent artery's outlet, mm")
+
+
+def add_devices(parser: argparse.ArgumentParser) -> None:
+    """Add the choice of devices."""
+    parser.add_argument(
+        "--device", action="append", metavar="NAME", help="a device of the catalogue; repeatable (silk, enterprise)"
+    )
+
+
+def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add how the flow is computed; return the group."""
+    flow = parser.add_argument_group("flow")
+    flow.add_argument(
+        "--flow-rate", type=positive, metavar="ML_S", help="mean inflow (0.27 m/s times the inlet's area)"
+    )
+    flow.add_argument("--cell-size", type=positive, metavar="MM", help="edge of a flow cell")
+    flow.add_argument(
+        "--pulsatile",
+        nargs="?",
+        const=PUBLISHED,
+        metavar="CSV",
+        help="follow a pulse: columns time in s and flow in any unit (the published one of the internal carotid)",
+    )
+    flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
+    return flow
+
+
+def add_jobs(group: "argparse._ArgumentGroup") -> None:
+    """Add how many processes work at once."""
+    group.add_argument("--jobs", type=_jobs, default=_cores(), metavar="N", help="processes at once (one a core)")
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _jobs(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of processes such as 2")
+    return int(text)
+
+
+def numbers(text: str) -> list[float]:
+    """Read numbers parted by commas."""
+    return _numbers(text, float)
+
+
+def _numbers(text: str, kind: type, count: int | None = None) -> list[float]:
+    """Read numbers parted by commas, `count` of them where that is said."""
+    try:
+        numbers = [kind(part) for part in text.replace("x", ",").split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {'a number' if count == 1 else 'like 1,2,3'}") from None
+    if count is not None and len(numbers) != count:
+        raise argparse.ArgumentTypeError(f"{text!r} has {len(numbers)} numbers, not {count}")
+    if not all(math.isfinite(value) for value in numbers):
+        raise argparse.ArgumentTypeError(f"{text!r} is not finite")
+    return numbers
+
+
+def _three(text: str, kind: type) -> tuple[float, float, float]:
+    first, second, third = _numbers(text, kind, 3)
+    return first, second, third
+
+
+def _point(text: str) -> tuple[float, float, float]:
+    return _three(text, float)
+
+
+def _shape(text: str) -> tuple[float, float, float]:
+    return _three(text, int)
+
+
+def _spacing(text: str) -> tuple[float, float, float]:
+    return _three(text if "," in text else ",".join([text] * 3), float)
+
+
+def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Collect what was said of the vessel, under the names of the settings."""
+    return {
+        "units": arguments.units,
+        "spacing_mm": arguments.spacing,
+        "shape": arguments.shape,
+        "threshold": arguments.threshold,
+        "at_mm": arguments.at,
+        "inlet_mm": arguments.inlet,
+        "outlet_mm": getattr(arguments, "outlet", None),
+    }
+
+
+def given_devices(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Names of the devices, each once; the paper's two where none is given."""
+    return tuple(dict.fromkeys(arguments.device or ("silk", "enterprise")))
+
+
+def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
+    """Collect what was said of the flow."""
+    from vstent.flow import FlowSettings
+
+    return FlowSettings(
+        inflow_mL_s=arguments.flow_rate,
+        waveform=_waveform(arguments.pulsatile),
+        outlets=arguments.outlets,
+        cell_size_mm=arguments.cell_size,
+    )
+
+
+def _waveform(source: str | None) -> "Waveform | None":
+    from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
+    from vstent.io.tables import read_columns
+
+    if source is None or source == PUBLISHED:
+        return OLDER_ADULT_ICA if source else None
+    time_s, flow = read_columns(Path(source), 2).T
+    return waveform_of(time_s, flow)

@@ -1,0 +1,25 @@
+"""`vstent restore`: the sac shrunk, the parent artery found and measured."""
+
+import argparse
+
+from vstent.cli import options
+
+
+def add(commands: options.Commands) -> None:
+    """Add the command."""
+    parser = options.add_command(commands, "restore", "scan or surface -> parent artery, sac, neck, measures")
+    options.add_outlet(options.add_geometry(parser))
+    parser.set_defaults(command=_restore)
+
+
+def _restore(arguments: argparse.Namespace) -> int:
+    from vstent.console import Console, morphology_table
+    from vstent.study import Settings, restore_vessel
+
+    console = Console()
+    settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
+    with console.live():
+        _, measures = restore_vessel(arguments.input, arguments.out, settings, console.progress)
+    console.print(morphology_table(measures))
+    console.print(f"Results in {arguments.out}. Research use only.")
+    return 0

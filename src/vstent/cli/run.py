@@ -1,0 +1,70 @@
+"""`vstent run`: a patient's scan or surface, whole."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vstent.cli import options
+
+if TYPE_CHECKING:
+    from vstent.study import CaseResult, Settings
+
+
+def add(commands: options.Commands) -> None:
+    """Add the command."""
+    parser = options.add_command(commands, "run", "scan or surface -> stented artery, flow compared, report")
+    given = options.add_geometry(parser)
+    options.add_outlet(given)
+    given.add_argument("--diameter", type=options.positive, metavar="MM", help="label diameter of the devices")
+    given.add_argument("--length", type=options.positive, metavar="MM", help="label length of the devices")
+    given.add_argument(
+        "--center", type=options.number, metavar="MM", help="where on the parent axis the device's middle lies"
+    )
+    add_study(parser)
+    parser.set_defaults(command=_run)
+
+
+def add_study(parser: argparse.ArgumentParser) -> None:
+    """Add what every study may be told: the devices, and how to compute the flow, if at all."""
+    options.add_devices(parser)
+    flow = options.add_flow(parser)
+    flow.add_argument("--no-flow", action="store_true", help="stop after the deployment")
+
+
+def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
+    """Collect what a study is told; `given` are further settings."""
+    from vstent.study import Settings
+
+    flow = None if arguments.no_flow else options.given_flow(arguments)
+    return Settings(devices=options.given_devices(arguments), flow=flow, **given)  # type: ignore[arg-type]
+
+
+def study(path: Path, out: Path, settings: "Settings") -> "CaseResult":
+    """Run a study with its progress shown; write the report and print the table."""
+    from vstent.console import Console, comparison_table
+    from vstent.study import run
+
+    console = Console()
+    with console.live():
+        case = run(path, out, settings, console.progress)
+        console.progress("report", 0.0, "")
+        from vstent.io.writers import write_text
+        from vstent.report import report
+
+        write_text(out / "report.html", report(case))
+        console.progress("report", 1.0, str(out / "report.html"))
+    console.print(comparison_table(case.metrics))
+    console.print(f"Results in {out}; open {out / 'report.html'}. Research use only.")
+    return case
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    settings = given_study(
+        arguments,
+        **options.given_geometry(arguments),
+        diameter_mm=arguments.diameter,
+        length_mm=arguments.length,
+        center_mm=arguments.center,
+    )
+    study(arguments.input, arguments.out, settings)
+    return 0

@@ -1,0 +1,25 @@
+"""`vstent trace`: the vessel and its centerlines alone."""
+
+import argparse
+
+from vstent.cli import options
+
+
+def add(commands: options.Commands) -> None:
+    """Add the command."""
+    parser = options.add_command(commands, "trace", "scan or surface -> wall, openings, centerlines")
+    options.add_geometry(parser)
+    parser.set_defaults(command=_trace)
+
+
+def _trace(arguments: argparse.Namespace) -> int:
+    from vstent.console import Console, opening_table
+    from vstent.study import Settings, trace_vessel
+
+    console = Console()
+    settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
+    with console.live():
+        vessel = trace_vessel(arguments.input, arguments.out, settings, console.progress)
+    console.print(opening_table(vessel.openings))
+    console.print(f"Results in {arguments.out}. Research use only.")
+    return 0

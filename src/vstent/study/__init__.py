@@ -1,0 +1,140 @@
+"""Study: one patient, from a file to the flow before and after, with its files, its provenance and its resume.
+
+The stages follow each other as in design.md section 1. Geometry is computed first and nothing is written until every
+device is deployed, so that a wrong input leaves nothing behind. From then on each finished stage lies in the folder
+under a key that names everything it depends on; running the same study again reads it back instead of computing it.
+"""
+
+import platform
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.device import find_design
+from vstent.io import writers
+from vstent.measure import morphology
+from vstent.study.folder import CACHE, claiming
+from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
+from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
+from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all
+from vstent.study.types import CaseResult, Placing, Progress, Settings
+from vstent.vessel import Anatomy, Vessel
+
+__all__ = [
+    "CACHE",
+    "INPUT",
+    "CaseResult",
+    "Placing",
+    "Progress",
+    "Settings",
+    "restore_vessel",
+    "run",
+    "trace_vessel",
+    "write_ranking",
+]
+
+PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
+INPUT: Final = "input.json"
+"""File in the case folder that says where the input lies: not for handing on, for its path may name the patient."""
+
+
+@claiming
+def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseResult:
+    """Run one study and write its folder; a study already begun there goes on where it stopped.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : what is given; the rest is proposed.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    FlowError
+        A flow could not be computed; everything before it is kept.
+    FolderError
+        Another process works in the folder, or it cannot be written to.
+    """
+    designs = {name: find_design(name) for name in settings.devices}
+    ledger = Ledger(out / CACHE, progress)
+    source = hash_of(path)
+    anatomy = find_anatomy(path, source, settings, ledger)
+    deployments = deploy_all(designs, anatomy, settings, ledger)
+    ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
+    write_anatomy(out, anatomy)
+    writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve())})
+    for name, deployment in deployments.items():
+        with ledger.stage(f"struts {name}") as tell:
+            tell(write_stent(out / "stents" / name, deployment))
+    fields = compute_flows(out, anatomy, deployments, settings, ledger, source)
+    with ledger.stage("measure"):
+        metrics = measure_all(anatomy, deployments, fields)
+        writers.write_json(out / "metrics.json", metrics)
+    provenance = _provenance(path, source, settings, ledger)
+    writers.write_json(out / "run.json", provenance)
+    notes = (*anatomy.vessel.notes, *anatomy.notes)
+    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, provenance, notes)
+
+
+@claiming
+def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> Vessel:
+    """Find the vessel, its openings and its centerlines, untrimmed; write them into the folder `out`.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the folder.
+    settings : what is given; the rest is proposed.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    """
+    refuse_missing(path)
+    vessel = find_vessel(path, settings, Ledger(out / CACHE, progress))
+    write_vessel(out, vessel)
+    return vessel
+
+
+@claiming
+def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Anatomy, dict[str, Any]]:
+    """Shrink the sac: find the parent artery and measure it; write it into the folder `out`.
+
+    A study begun in the same folder goes on from what is found here, and the other way round.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : what is given; the rest is proposed.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    """
+    ledger = Ledger(out / CACHE, progress)
+    source = hash_of(path)
+    anatomy = find_anatomy(path, source, settings, ledger)
+    measures = morphology(anatomy)
+    ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
+    write_anatomy(out, anatomy)
+    writers.write_json(out / "morphology.json", measures)
+    return anatomy, measures
+
+
+def _provenance(path: Path, source: str, settings: Settings, ledger: Ledger) -> dict[str, Any]:
+    return {
+        "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
+        "input": {"name": "DICOM folder" if path.is_dir() else path.name, "sha256": source},
+        "settings": asdict(settings),
+        "seconds": ledger.seconds,
+        "research_use_only": True,
+    }

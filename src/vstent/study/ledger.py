@@ -1,0 +1,102 @@
+"""Ledger: what a study has finished, how long it took, and the keys under which it is kept and found again."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass, replace
+from importlib.metadata import version
+from math import isfinite
+from pathlib import Path
+from typing import Any, TypeVar
+
+from vstent.errors import ReadError
+from vstent.flow import Progress as FlowProgress
+from vstent.io.archive import load_noun, save_noun
+from vstent.study.types import Progress, Settings
+
+Noun = TypeVar("Noun")
+
+
+class Ledger:
+    """Times the stages, tells of them, and keeps what they found under keys of what they depend on."""
+
+    def __init__(self, folder: Path, progress: Progress) -> None:
+        self.folder, self.progress = folder, progress
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Callable[[str], None]]:
+        """Announce a stage, time it, and say what it found (the yielded function takes the sentence)."""
+        found: list[str] = []
+        self.progress(name, 0.0, "")
+        began = time.perf_counter()
+        yield found.append
+        self.seconds[name] = time.perf_counter() - began
+        self.progress(name, 1.0, " ".join(found))
+
+    def teller(self, name: str) -> Callable[[FlowProgress], None]:
+        """Return what a flow engine tells its progress to."""
+
+        def tell(progress: FlowProgress) -> None:
+            fraction = min(progress.fraction, 0.99)
+            settling = f"{progress.residual:.1%} left to settle, " if isfinite(progress.residual) else ""
+            self.progress(name, fraction, f"{settling}{progress.seconds_left:.0f} s left")
+
+        return tell
+
+    def recall(self, name: str, key: str, noun_type: type[Noun]) -> Noun | None:
+        """Return what was kept under this key; None where it is missing or damaged."""
+        path = self.folder / f"{name}-{key}.npz"
+        if not path.exists():
+            return None
+        try:
+            with self.stage(name) as tell:
+                noun = load_noun(path, noun_type)
+                tell("already done")
+        except ReadError:
+            return None
+        return noun
+
+    def keep(self, name: str, key: str, noun: Any) -> None:
+        """Keep a noun under a key; what was kept under the same name before is dropped."""
+        path = self.folder / f"{name}-{key}.npz"
+        if path.exists():
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        stale = list(self.folder.glob(f"{name}-*.npz"))
+        save_noun(path, noun)
+        for old in stale:
+            old.unlink()
+
+
+def refuse_missing(path: Path) -> None:
+    """Raise ReadError where there is nothing to read."""
+    if not path.exists():
+        raise ReadError(f"{path} does not exist: give a scan (DICOM folder, NIfTI, NRRD, MHA, raw) or a surface")
+
+
+def hash_of(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a folder in the order of their names."""
+    refuse_missing(path)
+    digest = hashlib.sha256()
+    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        if file.is_file():
+            digest.update(file.name.encode() + b"\0")
+            with file.open("rb") as stream:
+                while block := stream.read(1 << 20):
+                    digest.update(block)
+    return digest.hexdigest()
+
+
+def anatomy_key(source: str, settings: Settings) -> str:
+    """Key of the geometry of an input: devices and flow do not change it."""
+    geometry = replace(settings, devices=(), diameter_mm=None, length_mm=None, center_mm=None, flow=None, placings={})
+    return key_of(source, geometry)
+
+
+def key_of(*parts: Any) -> str:
+    """Short name of everything that a result depends on, this version of the code included."""
+    plain = [asdict(part) if is_dataclass(part) and not isinstance(part, type) else part for part in parts]
+    return hashlib.sha256(json.dumps([version("vstent"), plain], sort_keys=True).encode()).hexdigest()[:16]

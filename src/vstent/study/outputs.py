@@ -1,0 +1,78 @@
+"""The files of a case folder."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.flow import FlowField
+from vstent.io import writers
+from vstent.io.tables import write_rows
+from vstent.rank import Ranking
+from vstent.stent import Deployment
+from vstent.struts import struts
+from vstent.vessel import Anatomy, Centerline, Vessel
+
+
+def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
+    """Write the wall, the centerlines (and other axes beside them) and the openings."""
+    out.mkdir(parents=True, exist_ok=True)
+    writers.write_surface(out / "vessel.vtp", vessel.lumen)
+    writers.write_centerlines(out / "centerlines.vtp", (*vessel.centerlines, *axes))
+    openings = [asdict(opening) | {"diameter_mm": opening.diameter_mm} for opening in vessel.openings]
+    writers.write_json(out / "openings.json", {"openings": openings, "notes": vessel.notes})
+
+
+def write_anatomy(out: Path, anatomy: Anatomy) -> None:
+    """Write the vessel, the parent artery and the sacs; those of an earlier input are taken away."""
+    write_vessel(out, anatomy.vessel, anatomy.axis)
+    restored = {"is_restored": anatomy.is_restored.astype(np.uint8)}
+    writers.write_surface(out / "landing_surface.vtp", anatomy.landing_surface, restored)
+    written = set()
+    for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
+        sac, neck = (f"{noun}.vtp" if number == 1 else f"{noun}_{number}.vtp" for noun in ("sac", "neck"))
+        writers.write_surface(out / sac, aneurysm.sac)
+        closed = np.concatenate([aneurysm.neck_mm, aneurysm.neck_mm[:1]])
+        writers.write_lines(out / neck, closed, np.array([0, len(closed)], dtype=np.int32))
+        written |= {sac, neck}
+    for pattern in ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp"):
+        for stale in {file.name for file in out.glob(pattern)} - written:  # of another input or of other settings
+            (out / stale).unlink()
+
+
+def write_stent(folder: Path, deployment: Deployment) -> str:
+    """Write contour, wires and struts; say how many."""
+    stent = deployment.stent
+    folder.mkdir(parents=True, exist_ok=True)
+    writers.write_surface(folder / "contour.vtp", stent.contour, {"wall_gap_mm": deployment.wall_gap_mm.ravel()})
+    wire_id = np.arange(len(stent.wire_diameter_um), dtype=np.int32)
+    of_wire: dict[str, NDArray[Any]] = {"wire_id": wire_id, "diameter_um": stent.wire_diameter_um}
+    writers.write_lines(folder / "wires.vtp", stent.wire_points_mm, stent.wire_starts, cell_data=of_wire)
+    solid = struts(stent)
+    writers.write_stl(folder / "struts.stl", solid)
+    return f"{len(wire_id)} wires, {len(solid.faces)} triangles."
+
+
+def write_field(folder: Path, field: FlowField) -> None:
+    """Write the flow in the cells and on the wall."""
+    folder.mkdir(parents=True, exist_ok=True)
+    of_cell = {"velocity_m_s": field.velocity_m_s, "pressure_Pa": field.pressure_Pa}
+    writers.write_cells(folder / "field.vtu", field.centers_mm, field.cell_size_mm, of_cell)
+    of_vertex = {"wall_shear_stress_Pa": field.wall_shear_stress_Pa, "pressure_Pa": field.wall_pressure_Pa}
+    if field.phases:
+        of_vertex |= {
+            "time_averaged_wall_shear_stress_Pa": field.shear_Pa,
+            "oscillatory_shear_index": field.oscillatory_shear_index,
+            "relative_residence_time_per_Pa": field.relative_residence_time_per_Pa,
+        }
+    writers.write_surface(folder / "wall.vtp", field.wall, of_vertex)
+
+
+def write_ranking(out: Path, ranking: Ranking) -> None:
+    """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``."""
+    rows = ranking.rows()
+    write_rows(out / "ranking.csv", rows)
+    criteria = [item.model_dump(exclude_none=True) for item in ranking.criteria.items]
+    writers.write_json(out / "ranking.json", {"criteria": criteria, "candidates": rows, "research_use_only": True})

@@ -1,0 +1,156 @@
+"""Stages of a study: each timed and told of by the ledger."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from vstent.deploy import deploy, propose_size
+from vstent.device import Design, Size, find_size
+from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, ostium, simulate_case
+from vstent.flow.cost import estimate, refuse_too_large
+from vstent.io.files import is_surface_file
+from vstent.io.images import read_image
+from vstent.io.surfaces import read_surface
+from vstent.kernels.arrays import Floats
+from vstent.measure import measure, morphology
+from vstent.repair import repair
+from vstent.restore import restore
+from vstent.segment import segment
+from vstent.stent import Deployment, Landing
+from vstent.study.checkpoint import FlowCheckpoint
+from vstent.study.ledger import Ledger, anatomy_key, key_of
+from vstent.study.outputs import write_field
+from vstent.study.types import Placing, Point, Settings
+from vstent.trace import trace
+from vstent.trim import trim
+from vstent.vessel import Anatomy, Vessel
+
+BARE: Final = "bare"
+"""Name of the flow without a device."""
+
+
+def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) -> Anatomy:
+    """Read, segment, repair, trace, trim and restore; what was kept of this `source` (hash) is taken as it is."""
+    kept = ledger.recall("anatomy", anatomy_key(source, settings), Anatomy)
+    if kept is not None:
+        return kept
+    whole = find_vessel(path, settings, ledger)
+    with ledger.stage("trim") as tell:
+        traced = trim(whole, at_mm=_array(settings.at_mm))
+        tell(" ".join(traced.notes[len(whole.notes) :]))
+    with ledger.stage("restore") as tell:
+        anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=_array(settings.outlet_mm))
+        tell(" ".join([*anatomy.notes, *(f"Sac of {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
+    return anatomy
+
+
+def find_vessel(path: Path, settings: Settings, ledger: Ledger) -> Vessel:
+    """Read, segment, repair and trace."""
+    with ledger.stage("segment") as tell:
+        vessel = _vessel(path, settings)
+        tell(" ".join(vessel.notes))
+    with ledger.stage("trace") as tell:
+        traced = trace(vessel, inlet_mm=_array(settings.inlet_mm))
+        tell(f"{len(traced.outlets)} outlets; inlet {traced.inlet.diameter_mm:.1f} mm wide.")
+    return traced
+
+
+def _vessel(path: Path, settings: Settings) -> Vessel:
+    if path.is_file() and is_surface_file(path):
+        surface, notes = read_surface(path, units=settings.units)
+        vessel = Vessel(surface, notes=notes)
+    else:
+        image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape)
+        vessel = segment(image, threshold=settings.threshold, at_mm=_array(settings.at_mm))
+    lumen, repairs = repair(vessel.lumen)
+    return replace(vessel, lumen=lumen, notes=(*vessel.notes, *repairs))
+
+
+def deploy_all(
+    designs: Mapping[str, Design], anatomy: Anatomy, settings: Settings, ledger: Ledger
+) -> dict[str, Deployment]:
+    """Deploy every device, each in the given or the proposed size."""
+    deployments = {}
+    for name, design in designs.items():
+        with ledger.stage(f"deploy {name}") as tell:
+            deployments[name] = deploy_one(design, anatomy, settings.placing(name))
+            tell(deployments[name].advice)
+    return deployments
+
+
+def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
+    """Deploy a device in the size and at the place that are given, or proposed where they are not."""
+    landing = None if placing.center_mm is None else Landing(placing.center_mm)
+    return deploy(design, anatomy, size=size_of(design, anatomy, placing), landing=landing)
+
+
+def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
+    """Return the size given; what of it is not given is as proposed."""
+    proposed = propose_size(design, anatomy)
+    if placing.diameter_mm is None and placing.length_mm is None:
+        return proposed
+    return find_size(
+        design,
+        diameter_mm=placing.diameter_mm or proposed.diameter_mm,
+        length_mm=placing.length_mm or proposed.length_mm,
+    )
+
+
+def compute_flows(
+    out: Path,
+    anatomy: Anatomy,
+    deployments: Mapping[str, Deployment],
+    settings: Settings,
+    ledger: Ledger,
+    source: str,
+) -> dict[str, FlowField]:
+    """Compute the flow without and with each device; each is kept as soon as it is done."""
+    if settings.flow is None:
+        return {}
+    fields: dict[str, FlowField] = {}
+    _plan(anatomy, settings.flow, ledger)
+    for name in (BARE, *deployments):
+        stent = deployments[name].stent if name in deployments else None
+        placing = settings.placing(name) if stent else None
+        stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, placing)
+        field = ledger.recall(stage, key, FlowField)
+        if field is None:
+            with ledger.stage(stage) as tell:
+                case = flow_case(anatomy, stent, settings.flow)
+                begun = FlowCheckpoint(ledger.folder, stage, key)
+                field = simulate_case(case, start=fields.get(BARE), progress=ledger.teller(stage), checkpoint=begun)
+                tell(field.advice)
+            ledger.keep(stage, key, field)
+        fields[name] = field
+        write_field(out / "flow" / name, field)
+    return fields
+
+
+def _plan(anatomy: Anatomy, settings: FlowSettings, ledger: Ledger) -> None:
+    """Say what a flow will cost; refuse one that does not fit in the memory."""
+    with ledger.stage("plan flow") as tell:
+        case = flow_case(anatomy, None, settings)
+        refuse_too_large(case)
+        tell(str(estimate(case)))
+
+
+def measure_all(
+    anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]
+) -> dict[str, Any]:
+    """Measure the vessel, every deployment and every flow, and compare the latter with the bare one."""
+    sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
+    shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
+    flow = {name: indices(field, *shapes) for name, field in fields.items()}
+    stents: dict[str, dict[str, Any]] = {}
+    for name, deployment in deployments.items():
+        stents[name] = {"deployment": measure(anatomy, deployment)}
+        if name in flow:
+            stents[name] |= {"flow": flow[name], "ratios": compare(flow[BARE], flow[name])}
+    return {"vessel": morphology(anatomy), "stents": stents} | ({BARE: flow[BARE]} if flow else {})
+
+
+def _array(point_mm: Point | None) -> Floats | None:
+    return None if point_mm is None else np.array(point_mm, dtype=np.float64)

@@ -1,0 +1,85 @@
+"""What a study is told, and what it finds."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from vstent.flow import FlowField, FlowSettings
+from vstent.stent import Deployment
+from vstent.vessel import Anatomy
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Size and place of one device; None means that it is proposed."""
+
+    diameter_mm: float | None = None
+    """Label diameter."""
+    length_mm: float | None = None
+    """Label length."""
+    center_mm: float | None = None
+    """Abscissa on the parent axis where the middle of the device is to lie."""
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """Everything that a study may be told; None means that it is proposed."""
+
+    devices: tuple[str, ...] = ("silk", "enterprise")
+    """Names in the catalogue."""
+    units: Literal["m", "cm", "mm"] | None = None
+    """Length unit of a surface file."""
+    spacing_mm: Point | None = None
+    """Voxel edges of a raw volume."""
+    shape: tuple[int, int, int] | None = None
+    """Voxel counts of a raw volume."""
+    threshold: float | None = None
+    """Intensity of the lumen's wall in a scan."""
+    at_mm: Point | None = None
+    """A point near the sac."""
+    inlet_mm: Point | None = None
+    """A point near the inlet."""
+    outlet_mm: Point | None = None
+    """A point near the outlet that the parent artery leads to."""
+    diameter_mm: float | None = None
+    """Label diameter of the devices."""
+    length_mm: float | None = None
+    """Label length of the devices."""
+    center_mm: float | None = None
+    """Abscissa on the parent axis where the middle of the device is to lie."""
+    flow: FlowSettings | None = field(default_factory=FlowSettings)
+    """How to compute the flow; None: not at all."""
+    placings: dict[str, Placing] = field(default_factory=dict)
+    """Sizes and places of single devices, by name, instead of those above that hold for all."""
+
+    def placing(self, device: str) -> Placing:
+        """Return what is given of the size and the place of a device."""
+        return self.placings.get(device) or Placing(self.diameter_mm, self.length_mm, self.center_mm)
+
+
+class Progress(Protocol):
+    """Told what a study does."""
+
+    def __call__(self, stage: str, fraction: float, detail: str) -> None:
+        """`stage` has come to `fraction` (1: done); `detail` says what was found, or how long is left."""
+
+
+@dataclass(frozen=True, eq=False)
+class CaseResult:
+    """All that a study found."""
+
+    name: str
+    """The case folder's name (a scan's own name may be the patient's)."""
+    anatomy: Anatomy
+    """Vessel, parent artery, sacs."""
+    deployments: dict[str, Deployment]
+    """By device name."""
+    fields: dict[str, FlowField]
+    """``bare``, then by device name; empty where flow was not asked for."""
+    metrics: dict[str, Any]
+    """``vessel``, ``bare``, ``stents.NAME.{deployment,flow,ratios}``; every number's key ends in its unit."""
+    provenance: dict[str, Any]
+    """Versions, inputs with hashes, settings, seconds per stage."""
+    notes: tuple[str, ...]
+    """What was found, guessed or repaired, one sentence each."""
