@@ -60,7 +60,6 @@ def _turned_back(rods_mm, ours_mm, case, anatomy):
 @pytest.mark.parametrize("name", ["tube", "taper", "bend"])
 def test_elastic_rods_come_to_lie_where_the_braid_is_drawn(name):
     rods_mm, ours_mm, apart_mm = compared(name)
-    print(f"{name}: rods {rods_mm:.3f} mm, vstent {ours_mm:.3f} mm, nodes {apart_mm.mean():.3f} mm apart")
     assert ours_mm == pytest.approx(rods_mm, rel=0.01)
     assert apart_mm.mean() < 0.06
     assert apart_mm.max() < 0.15

@@ -183,7 +183,7 @@ def _diagonal(slopes: Any, ends: Any, weights: Any, n: int) -> Any:
 @njit(cache=True, nogil=True)
 def _coarse(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, waves: Any) -> Any:
     """Banded Cholesky factor (n, BAND), lower form, of the normal matrix on moves of whole rows."""
-    _, resistance, crowding, stiffness, held = weights
+    _, resistance, crowding, _stiffness, held = weights
     band = np.zeros(((line[-1] + 1) * _WAVES, _BAND))
     g = np.zeros(_BAND)
     for p in range(ends.shape[1]):
