@@ -26,6 +26,10 @@ _BAND: Final = 2 * _WAVES
 
 REACH: Final = 0.3
 """A crossing moves no further in a step, mm."""
+SHORTEST: Final = 0.05
+"""A step that does not help is halved down to this."""
+ROUNDS: Final = 200
+"""Of conjugate gradients, at most."""
 
 
 class Net(NamedTuple):
@@ -120,7 +124,9 @@ def _row_means(line: Any, x: Any) -> tuple[Any, Any]:
     for c in range(len(line)):
         mean[line[c]] += x[c, 0]
         count[line[c]] += 1.0
-    return mean / count, count
+    for row in range(len(mean)):
+        mean[row] /= count[row]
+    return mean, count
 
 
 @njit(cache=True, nogil=True)
@@ -171,13 +177,15 @@ def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, bends: Any, weight
 def _diagonal(slopes: Any, ends: Any, weights: Any, n: int) -> Any:
     """Inverse of the normal matrix's diagonal (c, 2)."""
     _, resistance, crowding, stiffness, _ = weights
-    diagonal = np.full((n, 2), resistance**2 + 12 * stiffness**2)  # two wires, (1, -2, 1) thrice on each
-    diagonal[:, 1] += 2 * crowding**2
+    inverse = np.zeros((n, 2))
     for p in range(ends.shape[1]):
         for k in range(2):
-            diagonal[ends[0, p], k] += slopes[p, k] ** 2
-            diagonal[ends[1, p], k] += slopes[p, 2 + k] ** 2
-    return 1 / diagonal
+            inverse[ends[0, p], k] += slopes[p, k] ** 2
+            inverse[ends[1, p], k] += slopes[p, 2 + k] ** 2
+    for c in range(n):
+        for k in range(2):  # on two wires (1, -2, 1) comes thrice
+            inverse[c, k] = 1 / (inverse[c, k] + resistance**2 + 12 * stiffness**2 + 2 * k * crowding**2)
+    return inverse
 
 
 @njit(cache=True, nogil=True)
@@ -204,8 +212,8 @@ def _coarse(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, waves:
                 if w > 0:
                     band[first + w, w - v] += resistance**2 * both
                 band[first + 3 + w, w - v] += resistance**2 * both + crowding**2 * apart
-    band[held * _WAVES, 0] += (line == held).sum()
-    band[:, 0] *= 1 + 1e-9
+        if line[c] == held:
+            band[held * _WAVES, 0] += 1.0
     return _cholesky(band)
 
 
@@ -219,7 +227,10 @@ def _cholesky(band: Any) -> Any:
             total = band[i, k]
             for m in range(max(0, i - width + 1, j - width + 1), j):
                 total -= band[i, i - m] * band[j, j - m]
-            band[i, k] = np.sqrt(max(total, 1e-30)) if k == 0 else total / band[j, 0]
+            if k == 0:
+                band[i, 0] = np.sqrt(max(total, 1e-30))
+            else:
+                band[i, k] = total / band[j, 0]
     return band
 
 
@@ -276,33 +287,32 @@ def _step(
 ) -> Any:
     """Moves (c, 2) of a Gauss-Newton step from x, by conjugate gradients."""
     inverse, factor = _diagonal(slopes, ends, weights, len(line)), _coarse(slopes, line, beside, ends, weights, waves)
-    residual, image = np.zeros_like(x), np.zeros_like(x)
-    _multiply(np.zeros_like(slopes), line, beside, ends, bends, weights, x, image)
+    n = len(line)
+    residual, image = np.zeros((n, 2)), np.zeros((n, 2))
+    _multiply(np.zeros((len(slopes), 4)), line, beside, ends, bends, weights, x, image)
     for c in range(len(line)):
         residual[c, 0], residual[c, 1] = -image[c, 0], -image[c, 1]
     for p in range(ends.shape[1]):
         for k in range(2):
             residual[ends[0, p], k] -= slopes[p, k] * excess[p]
             residual[ends[1, p], k] -= slopes[p, 2 + k] * excess[p]
-    move, way, ready = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x)
-    _precondition(inverse, factor, line, waves, residual, ready)
-    way[:] = ready
-    size = _dot(residual, ready)
-    goal = tolerance**2 * size
-    for _ in range(200):
+    move, way, ready = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2))
+    goal, before = 0.0, np.inf
+    for _ in range(ROUNDS):
+        _precondition(inverse, factor, line, waves, residual, ready)
+        size = _dot(residual, ready)
+        goal = max(goal, tolerance**2 * size)
         if size <= goal:
             break
+        for c in range(n):
+            for k in range(2):
+                way[c, k] = ready[c, k] + size / before * way[c, k]
         _multiply(slopes, line, beside, ends, bends, weights, way, image)
-        share = size / _dot(way, image)
-        for c in range(len(line)):
+        share, before = size / _dot(way, image), size
+        for c in range(n):
             for k in range(2):
                 move[c, k] += share * way[c, k]
                 residual[c, k] -= share * image[c, k]
-        _precondition(inverse, factor, line, waves, residual, ready)
-        before, size = size, _dot(residual, ready)
-        for c in range(len(line)):
-            for k in range(2):
-                way[c, k] = ready[c, k] + size / before * way[c, k]
     return move
 
 
@@ -327,28 +337,27 @@ def _slide(
     gain: float,
     tolerance: float,
 ) -> Any:
-    weights = (length, resistance, crowding, stiffness, held)
-    x, tried = np.zeros((len(row), 2)), np.zeros((len(row), 2))
-    places, excess, slopes = np.zeros((len(row), 9)), np.zeros(ends.shape[1]), np.zeros((ends.shape[1], 4))
+    weights, n = (length, resistance, crowding, stiffness, held), len(row)
+    x, tried = np.zeros((n, 2)), np.zeros((n, 2))
+    places, excess, slopes = np.zeros((n, 9)), np.zeros(ends.shape[1]), np.zeros((ends.shape[1], 4))
     _put(chart, row, column, spacing, x, places)
     cost = _cost(places, line, beside, ends, bulge, bends, weights, x, excess)
     for _ in range(steps):
         _slopes(places, ends, slopes)
         move = _step(slopes, line, beside, ends, bends, weights, waves, x, excess, tolerance)
-        for c in range(len(row)):
-            for k in range(2):
-                move[c, k] = min(max(move[c, k], -REACH), REACH)
         share, before = 1.0, cost
-        while share > 0.05:  # a step that does not help is halved
-            tried[:] = x + share * move
+        while True:  # a step that does not help is halved
+            for c in range(n):
+                for k in range(2):
+                    tried[c, k] = x[c, k] + share * min(max(move[c, k], -REACH), REACH)
             _put(chart, row, column, spacing, tried, places)
             cost = _cost(places, line, beside, ends, bulge, bends, weights, tried, excess)
             if cost < before:
                 break
             share *= 0.5
-        if cost >= before:
-            break
-        x[:] = tried
+            if share < SHORTEST:
+                return x
+        x, tried = tried, x
         if 1 - cost / before < gain:
             break
     return x
