@@ -6,11 +6,11 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from vstent.cli import demo, devices, restore, run, trace
+from vstent.cli import demo, devices, export, restore, run, trace
 from vstent.cli.options import EPILOG
 from vstent.errors import InputError, VstentError
 
-COMMANDS: Final = (run, trace, restore, demo, devices)
+COMMANDS: Final = (run, trace, restore, export, demo, devices)
 """In the order of the help."""
 BAD_INPUT: Final = 2
 FAILED: Final = 1

@@ -122,7 +122,7 @@ def _inside_mm(case: FlowCase, sections: tuple[Floats, ...]) -> Floats:
 
 
 def struts_near(struts: Surface, ostium: Surface, reach_mm: float) -> Surface:
-    """Return the solids that come nearer than `reach_mm` to the ostium, each whole: only they change what enters the sac.
+    """Return the solids that come nearer to the ostium than `reach_mm`, each whole: only they change what enters.
 
     Parameters
     ----------
