@@ -57,7 +57,9 @@ def test_every_dictionary_is_one(flavour: str, is_pulse: bool, outlets: str) -> 
     assert set(regions) | {"struts"} == patches
     assert all(meshed["castellatedMeshControls"]["refinementSurfaces"]["lumen"]["regions"][name] for name in regions)
     assert set(meshed["addLayersControls"]["layers"]) == {"wall"}
-    assert parsed["system/decomposeParDict"]["numberOfSubdomains"] == ["4"]
+    parts = parsed["system/decomposeParDict"]
+    assert parts["numberOfSubdomains"] == ["4"]
+    assert parts["hierarchicalCoeffs"]["n"] == ["(", "1", "1", "4", ")"]  # the tube is longest along z
     viscosity = parsed["constant/" + ("physicalProperties" if flavour == "org" else "transportProperties")]["nu"]
     assert float(viscosity[-1]) == pytest.approx(0.004 / 1060)
 
@@ -139,22 +141,30 @@ def test_the_inlet_carries_the_flow_that_was_asked_for() -> None:
     np.testing.assert_allclose(shape, expected, atol=0.05)
 
 
-def pairs(entry: dict[str, list[str]]) -> np.ndarray:
-    return np.array([x for x in entry["values"] if x not in "()"], dtype=float).reshape(-1, 2)
+def pairs(text: str) -> np.ndarray:
+    """A table (t, 2) of time and value."""
+    return np.array(text.replace("(", " ").replace(")", " ").split(), dtype=float).reshape(-1, 2)
 
 
 def test_a_pulse_repeats_and_keeps_its_mean() -> None:
-    com = parse(foam_case(case("murray", is_pulse=True), SETUP).files["0/U"])["boundaryField"]
+    foam = foam_case(case("murray", is_pulse=True), SETUP).files
+    com = parse(foam["0/U"])["boundaryField"]
     org = parse(foam_case(case("murray", is_pulse=True), replace(SETUP, flavour="org")).files["0/U"])["boundaryField"]
-    scale, flow, out = com["inlet"]["scale"], org["inlet"]["volumetricFlowRate"], com["outlet_2"]["volumetricFlowRate"]
-    assert [one["outOfBounds"] for one in (scale, flow, out)] == [["repeat"]] * 3
-    time_s, factor = pairs(scale).T
+    for patch, key in (("inlet", "scale"), ("outlet_2", "volumetricFlowRate")):
+        assert com[patch][key] == ["tableFile"]
+        assert com[patch][f"{key}Coeffs"] == {"file": [f'"<constant>/flow_{patch}"'], "outOfBounds": ["repeat"]}
+    time_s, factor = pairs(foam["constant/flow_inlet"]).T
     assert (time_s[0], time_s[-1]) == (0.0, OLDER_ADULT_ICA.period_s)
     np.testing.assert_allclose(factor, OLDER_ADULT_ICA.factor(time_s), rtol=1e-8)
-    assert factor[:-1].mean() == pytest.approx(1.0, abs=1e-9)
-    np.testing.assert_allclose(pairs(flow)[:, 1], FLOW_ML_S * 1e-6 * factor, rtol=1e-8)
+    assert factor[:-1].mean() == pytest.approx(1.0, abs=1e-8)
+    flow = org["inlet"]["volumetricFlowRate"]
+    assert (flow["type"], flow["outOfBounds"]) == (["table"], ["repeat"])
+    np.testing.assert_allclose(pairs(" ".join(flow["values"]))[:, 1], FLOW_ML_S * 1e-6 * factor, rtol=1e-8)
     cubes = np.array([outlet.diameter_mm**3 for outlet in case().vessel.outlets])
-    np.testing.assert_allclose(pairs(out)[:, 1], FLOW_ML_S * 1e-6 * factor * cubes[1] / cubes.sum(), rtol=1e-8)
+    out = pairs(foam["constant/flow_outlet_2"])[:, 1]
+    np.testing.assert_allclose(out, FLOW_ML_S * 1e-6 * factor * cubes[1] / cubes.sum(), rtol=1e-8)
+    steady = parse(foam_case(case("murray"), SETUP).files["0/U"])["boundaryField"]["outlet_2"]["volumetricFlowRate"]
+    assert float(steady[1]) == pytest.approx(FLOW_ML_S * 1e-6 * cubes[1] / cubes.sum())
     control = parse(foam_case(case("murray", is_pulse=True), SETUP).files["system/controlDict"])
     assert float(control["endTime"][0]) == pytest.approx(4 * OLDER_ADULT_ICA.period_s)
 
@@ -162,7 +172,7 @@ def test_a_pulse_repeats_and_keeps_its_mean() -> None:
 def test_only_wires_at_the_neck_are_meshed_each_whole() -> None:
     near, far = sphere(0.5), sphere(0.5)
     both = Surface(
-        np.concatenate([near.vertices_mm + [0, 0, 1.2], far.vertices_mm + [0, 0, 9.0]]),
+        np.concatenate([near.vertices_mm + 1.2 * np.eye(3)[2], far.vertices_mm + 9.0 * np.eye(3)[2]]),
         np.concatenate([near.faces, far.faces + len(near.vertices_mm)]),
     )
     kept = struts_near(both, sphere(0.4), 0.5)

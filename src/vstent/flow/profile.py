@@ -74,7 +74,7 @@ def _poisson(depth: Floats) -> Floats:
         part = depth[inside] / (depth[inside] - np.minimum(depth[beside], 0.0))
         diagonal += np.where(number[beside] >= 0, 1.0, 1 / np.maximum(part, 1e-3))
     speed = np.zeros(inside.shape)
-    speed[inside] = spsolve((sparse.diags([diagonal], [0]) - links).tocsc(), np.ones(count))
+    speed[inside] = spsolve((sparse.diags(diagonal) - links).tocsc(), np.ones(count))
     return speed
 
 
