@@ -132,6 +132,7 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
     return anatomy, measures
 
 
+@claiming
 def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Refinement, Refinement]:
     """Compute the flow without a device on three grids and with three time steps; write ``convergence.json``.
 
