@@ -91,6 +91,8 @@ class DaskCluster(AbstractCrew):
 
     address: str
     """Of the scheduler, such as tcp://head:8786."""
+    work: Callable[[Task], None] = work
+    """What each worker does."""
 
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
         """Yield every task when its future has ended; a worker's death makes Dask give its task to another.
@@ -103,7 +105,7 @@ class DaskCluster(AbstractCrew):
             When the scheduler is lost: what was finished is kept.
         """
         with _client(self.address) as client:
-            futures = {client.submit(work, task, pure=False): number for number, task in enumerate(tasks)}
+            futures = {client.submit(self.work, task, pure=False): number for number, task in enumerate(tasks)}
             while futures:
                 _see_alive(client)
                 for future in [future for future in futures if future.done()]:
