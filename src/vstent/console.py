@@ -158,6 +158,18 @@ def morphology_table(measures: Mapping[str, Any]) -> Table:
     return table
 
 
+def flow_table(metrics: Mapping[str, Any]) -> Table:
+    """Table of every index of the flow: bare, and with each device with its change."""
+    from vstent.report.quantities import flatten
+
+    stents = metrics["stents"]
+    table = Table("flow", "bare", *stents)
+    for quantity in flatten(metrics["bare"]):
+        changes = (_change(quantity.value, stent["flow"][quantity.key]) for stent in stents.values())
+        table.add_row(quantity.name, quantity.text, *changes)
+    return table
+
+
 def _cell(value: float | str | None) -> str:
     return "" if value is None else value if isinstance(value, str) else f"{value:.3g}"
 

@@ -26,18 +26,20 @@ def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
 
 
 def write_anatomy(out: Path, anatomy: Anatomy) -> None:
-    """Write the vessel, the parent artery and the sac; a sac of an earlier input is taken away."""
+    """Write the vessel, the parent artery and the sacs; those of an earlier input are taken away."""
     write_vessel(out, anatomy.vessel, anatomy.axis)
     restored = {"is_restored": anatomy.is_restored.astype(np.uint8)}
     writers.write_surface(out / "landing_surface.vtp", anatomy.landing_surface, restored)
-    if not anatomy.aneurysms:
-        for stale in (out / "sac.vtp", out / "neck.vtp"):  # of another input or of other settings
-            stale.unlink(missing_ok=True)
-        return
-    aneurysm = anatomy.aneurysms[0]
-    writers.write_surface(out / "sac.vtp", aneurysm.sac)
-    closed = np.concatenate([aneurysm.neck_mm, aneurysm.neck_mm[:1]])
-    writers.write_lines(out / "neck.vtp", closed, np.array([0, len(closed)], dtype=np.int32))
+    written = set()
+    for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
+        sac, neck = (f"{noun}.vtp" if number == 1 else f"{noun}_{number}.vtp" for noun in ("sac", "neck"))
+        writers.write_surface(out / sac, aneurysm.sac)
+        closed = np.concatenate([aneurysm.neck_mm, aneurysm.neck_mm[:1]])
+        writers.write_lines(out / neck, closed, np.array([0, len(closed)], dtype=np.int32))
+        written |= {sac, neck}
+    for pattern in ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp"):
+        for stale in {file.name for file in out.glob(pattern)} - written:  # of another input or of other settings
+            (out / stale).unlink()
 
 
 def write_stent(folder: Path, deployment: Deployment) -> str:

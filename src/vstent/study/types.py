@@ -10,6 +10,18 @@ from vstent.vessel import Anatomy
 Point = tuple[float, float, float]
 
 
+@dataclass(frozen=True)
+class Placing:
+    """Size and place of one device; None means that it is proposed."""
+
+    diameter_mm: float | None = None
+    """Label diameter."""
+    length_mm: float | None = None
+    """Label length."""
+    center_mm: float | None = None
+    """Abscissa on the parent axis where the middle of the device is to lie."""
+
+
 @dataclass(frozen=True, eq=False)
 class Settings:
     """Everything that a study may be told; None means that it is proposed."""
@@ -38,6 +50,12 @@ class Settings:
     """Abscissa on the parent axis where the middle of the device is to lie."""
     flow: FlowSettings | None = field(default_factory=FlowSettings)
     """How to compute the flow; None: not at all."""
+    placings: dict[str, Placing] = field(default_factory=dict)
+    """Sizes and places of single devices, by name, instead of those above that hold for all."""
+
+    def placing(self, device: str) -> Placing:
+        """Return what is given of the size and the place of a device."""
+        return self.placings.get(device) or Placing(self.diameter_mm, self.length_mm, self.center_mm)
 
 
 class Progress(Protocol):

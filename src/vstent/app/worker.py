@@ -1,0 +1,76 @@
+"""Worker: `python -m vstent.app.worker KIND FOLDER` does one job of a case and tells of it, a line of JSON each time.
+
+When the server that started it is gone, its next word falls on a closed pipe, which ends it.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.app.cases import Case, load
+from vstent.errors import VstentError
+from vstent.study import run
+from vstent.study.ledger import anatomy_key, hash_of
+
+
+def tell(**told: Any) -> None:
+    """Say a line to the server."""
+    sys.stdout.write(json.dumps(told) + "\n")
+    sys.stdout.flush()
+
+
+def progress(stage: str, fraction: float, detail: str) -> None:
+    """Tell of a study's stage."""
+    tell(stage=stage, fraction=fraction, detail=detail)
+
+
+def find_anatomy(case: Case) -> None:
+    """Find vessel, sac, neck and parent artery."""
+    from vstent.study import restore_vessel
+
+    _tell_anatomy(case, restore_vessel(case.input, case.folder, case.state.choices.settings(), progress))
+
+
+def _tell_anatomy(case: Case, _: Any) -> None:
+    tell(anatomy=anatomy_key(hash_of(case.input), case.state.choices.settings()))
+
+
+def compute(case: Case) -> None:
+    """Deploy, compute the flow where it is wanted, and write the report: what `vstent run` does."""
+    from vstent.io.writers import write_text
+    from vstent.report import report
+
+    result = run(case.input, case.folder, case.state.choices.settings(), progress)
+    _tell_anatomy(case, result)
+    progress("report", 0.0, "")
+    write_text(case.folder / "report.html", report(result))
+    progress("report", 1.0, "")
+
+
+def rank(case: Case) -> None:
+    """Deploy all sizes of the devices chosen and rank them."""
+    from vstent.app.ranking import rank_sizes
+
+    rank_sizes(case, progress)
+
+
+JOBS: Final[dict[str, Callable[[Case], None]]] = {"anatomy": find_anatomy, "rank": rank, "flow": compute}
+
+
+def main(kind: str, folder: Path) -> int:
+    """Do a job; return the exit code."""
+    try:
+        JOBS[kind](load(folder.name, folder))
+    except VstentError as error:
+        tell(error=str(error))
+        return 1
+    except OSError as error:
+        tell(error=f"{error.strerror or error}: what was finished is kept.")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1], Path(sys.argv[2])))
