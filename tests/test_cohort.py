@@ -291,11 +291,11 @@ def test_no_scheduler_is_told_in_a_sentence(scans, tmp_path, monkeypatch):
         list(DaskCluster("tcp://127.0.0.1:9").do(left_to_do(find_cases(scans, SETTINGS), tmp_path)))
 
 
-def test_a_slurm_job_asks_for_the_memory_foreseen_and_holds_one_case():
+def test_a_slurm_job_asks_for_twice_the_memory_foreseen_and_holds_one_case():
     pytest.importorskip("dask_jobqueue")
     with Slurm(3, 412.4).cluster() as cluster:
         script = cluster.job_script()
-    assert "#SBATCH --mem=412M" in script or "#SBATCH --mem=394M" in script
+    assert float(re.search(r"--mem=(\d+)M", script)[1]) == pytest.approx(2 * 412.4e6 / 2**20, abs=1)
     assert "#SBATCH --cpus-per-task=1" in script
     assert "--nthreads 1" in script
 

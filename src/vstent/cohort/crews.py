@@ -15,6 +15,8 @@ from vstent.errors import InputError, VstentError
 
 ATTEMPTS: Final = 2
 """A case whose process dies is tried so often."""
+SPARE: Final = 2.0
+"""A job of a queue asks for so many times the memory foreseen: beyond it, it is killed."""
 SCHEDULER_S: Final = 20.0
 """A scheduler that does not answer for so long is lost."""
 
@@ -121,7 +123,7 @@ class Slurm(AbstractCrew):
     jobs: int
     """How many at once."""
     memory_MB: float
-    """What one needs."""
+    """What one case is foreseen to need."""
 
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
         """Yield every task when it has ended.
@@ -141,7 +143,7 @@ class Slurm(AbstractCrew):
             from dask_jobqueue import SLURMCluster
         except ImportError:
             raise _missing("dask-jobqueue") from None
-        return SLURMCluster(cores=1, processes=1, memory=f"{self.memory_MB:.0f}MB", job_name="vstent")
+        return SLURMCluster(cores=1, processes=1, memory=f"{SPARE * self.memory_MB:.0f}MB", job_name="vstent")
 
 
 def _missing(package: str) -> InputError:
