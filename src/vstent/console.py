@@ -140,6 +140,18 @@ def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
+def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
+    """Table of intervals: each result of each device, and the causes of its spread."""
+    from vstent.report.uncertainty import intervals
+
+    table = Table("device", "result", "mean", "95 % between", "and", "because of", title="what is not sure, varied")
+    for name, stent in metrics["stents"].items():
+        for row in intervals(stent):
+            causes = ", ".join(f"{cause} {share:.0%}" for cause, share in row.shares if share >= 0.005)
+            table.add_row(name, row.name, row.mean, row.low, row.high, causes)
+    return table
+
+
 def opening_table(openings: Sequence[Opening]) -> Table:
     """Table of the vessel's ends: role, diameter, area, where."""
     table = Table("opening", "diameter, mm", "area, mm²", "center, mm (LPS)")

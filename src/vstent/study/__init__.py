@@ -18,7 +18,7 @@ from vstent.measure import morphology
 from vstent.study.folder import CACHE, claiming
 from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
 from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
-from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all, refine
+from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all, refine, vary_all
 from vstent.study.types import CaseResult, Placing, Progress, Settings
 from vstent.vessel import Anatomy, Vessel
 
@@ -73,8 +73,11 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
         with ledger.stage(f"struts {name}") as tell:
             tell(write_stent(out / "stents" / name, deployment))
     fields = compute_flows(out, anatomy, deployments, settings, ledger, source)
+    varied = vary_all(anatomy, deployments, settings, ledger, source)
     with ledger.stage("measure"):
         metrics = measure_all(anatomy, deployments, fields)
+        for name, spread in varied.items():
+            metrics["stents"][name]["uncertainty"] = spread
         writers.write_json(out / "metrics.json", metrics)
     provenance = _provenance(path, source, settings, ledger)
     writers.write_json(out / "run.json", provenance)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,6 +28,7 @@ from vstent.study.outputs import write_field
 from vstent.study.types import Placing, Point, Settings
 from vstent.trace import trace
 from vstent.trim import trim
+from vstent.uncertainty import Uncertainty, vary
 from vstent.vessel import Anatomy, Vessel
 
 BARE: Final = "bare"
@@ -152,6 +154,32 @@ def _plan(anatomy: Anatomy, settings: FlowSettings, ledger: Ledger) -> None:
         case = flow_case(anatomy, None, settings)
         refuse_too_large(case)
         tell(str(estimate(case)))
+
+
+def vary_all(
+    anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
+) -> dict[str, dict[str, Any]]:
+    """Vary what is not sure about every deployment; return the metrics of each, none where it was not asked for."""
+    if settings.uncertainty is None:
+        return {}
+    flow = settings.flow if settings.uncertainty.flow_samples else None
+    found = {}
+    for name, deployment in deployments.items():
+        stage = f"vary {name}"
+        key = key_of(anatomy_key(source, settings), settings.uncertainty, flow, name, settings.placing(name))
+        varied = ledger.recall(stage, key, Uncertainty)
+        if varied is None:
+            with ledger.stage(stage) as tell:
+                told = partial(_tell_count, ledger, stage)
+                varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told)
+                tell(f"{len(varied.points)} deployments, {varied.n_failed} of them did not fit.")
+            ledger.keep(stage, key, varied)
+        found[name] = varied.metrics()
+    return found
+
+
+def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
+    ledger.progress(stage, 0.99 * done / total, f"{done} of {total}")
 
 
 def measure_all(
