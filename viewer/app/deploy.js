@@ -13,6 +13,7 @@ export class Deploying {
     this.sketches = new Newest((answer) => this.sketched(answer), host.failed);
     this.whole = new Newest((answer) => this.deployed(answer), host.failed);
     this.sections = new Newest((answer) => host.section.show(answer), () => {});
+    this.cursorMark = { element: make("i", { className: "cursor-mark" }), point: () => this.cursor !== undefined && this.at(this.cursor) };
     this.handles = ["proximal", "distal"].map((end, i) => this.handle(end, i));
   }
 
@@ -131,6 +132,7 @@ export class Deploying {
     if (mm === null || !this.axis) return;
     this.cursor = mm;
     this.host.along.set({ cursor: mm });
+    this.host.picture.stage?.redraw();
     const device = this.name && !this.isDragging ? `&device=${encodeURIComponent(this.name)}` : "";
     this.sections.ask(() => get(`${this.host.path()}/section?abscissa_mm=${mm.toFixed(3)}${device}`));
   }

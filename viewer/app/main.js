@@ -342,7 +342,7 @@ class Page {
   renderDeploy() {
     const name = this.device;
     if (!name) return;
-    this.picture.setMarks(this.deploying.handles);
+    this.picture.setMarks([...this.deploying.handles, this.deploying.cursorMark]);
     this.picture.moved = (event) => this.deploying.look(this.deploying.under(event, null));
     const key = JSON.stringify([this.deploying.host.choice(name), this.colour, this.view.anatomy]);
     if (this.shownDevice !== key || this.deploying.name !== name || !this.measures[name]) {
@@ -400,7 +400,7 @@ class Page {
       const sheets = this.view.choices.devices.map(({ name }) => this.measures[name]).filter(Boolean);
       if (sheets.length) parts.push(head("Deployed"), plainSheet(sheets, this.isWhole));
     }
-    if (this.sheets?.anatomy?.length && !["flow", "report"].includes(this.step)) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));
+    if (this.sheets?.anatomy?.length && !(flow && ["flow", "report"].includes(this.step))) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));
     if (!parts.length) parts.push(make("h2", {}, ["Numbers"]), make("p", { className: "hint" }, ["They appear here as the steps are done, each with its unit and definition."]));
     else parts.push(make("p", { className: "hint" }, ["Rest the pointer on a name for its definition."]));
     this.numbers.replaceChildren(...parts);

@@ -122,6 +122,7 @@ class Job:
                 self.case.update(anatomy=told["anatomy"])
             else:
                 self._take(told["stage"], told["fraction"], told["detail"])
+        self._process.stdout.close()
         code = self._process.wait()
         if self._is_stopped:
             failure = STOPPED
