@@ -317,9 +317,12 @@ class Page {
 
   panes() {
     const names = this.flowPanes?.length ? this.flowPanes : ["bare"];
-    const rows = this.sheets?.flow?.[0]?.rows?.find(({ key }) => key === "neck_inflow_mL_s");
-    return names.map((name, i) => {
-      const note = rows ? `${rows.name} ${rows.cells[i ? 2 * i - 1 : 0]}${i ? ` (${rows.cells[2 * i]})` : ""}` : "";
+    const sheet = this.sheets?.flow?.[0];
+    const row = sheet?.rows.find(({ key }) => key === "neck_inflow_mL_s");
+    return names.map((name) => {
+      const i = sheet?.names.indexOf(name) ?? -1;
+      const said = i < 0 ? row?.cells[0] : `${row?.cells[1 + 2 * i]} (${row?.cells[2 + 2 * i]})`;
+      const note = row && (i >= 0 || name === "bare") ? `${row.name} ${said}` : "";
       return { id: name, title: name === "bare" ? "Before (no device)" : this.deviceTitle(name), note };
     });
   }
@@ -364,11 +367,7 @@ class Page {
 
   flowStrip() {
     const { job } = this.view;
-    const parts = [];
-    if (job?.kind === "flow") parts.push(residualChart(job.residual));
-    if (this.pulse) parts.push(pulseChart(this.pulse, this.view.choices.flow.is_pulsatile));
-    else get("/api/waveform").then((pulse) => ((this.pulse = pulse), this.renderStrip()));
-    return parts;
+    return job?.kind === "flow" ? [residualChart(job.residual)] : [];
   }
 
   renderWork() {
@@ -394,7 +393,7 @@ class Page {
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
       const stale = this.view.steps.flow !== "done" ? [make("p", { className: "note stale" }, ["Of an earlier choice: run the step Flow again."])] : [];
-      parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole));
+      parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole, (name) => this.deviceTitle(name)));
     }
     if (["device", "deploy"].includes(this.step)) {
       const sheets = this.view.choices.devices.map(({ name }) => this.measures[name]).filter(Boolean);
@@ -418,6 +417,15 @@ class Page {
     }
     const place = this.panel.querySelector(".place");
     if (place) place.replaceChildren(...placeWords(manifest));
+  }
+
+  /** The inlet's pulse, for the left side. */
+  pulseChart() {
+    const box = make("div", { className: "pulse" });
+    const draw = () => box.replaceChildren(pulseChart(this.pulse, this.view.choices.flow.is_pulsatile));
+    if (this.pulse) draw();
+    else get("/api/waveform").then((pulse) => ((this.pulse = pulse), draw())).catch((problem) => this.complain(problem));
+    return box;
   }
 
   // -- what a user does ---------------------------------------------------------------------------------------------
