@@ -9,7 +9,8 @@ The tree::
     │   ├── VesselError         a surface without a lumen to work in: no openings, no volume, no path
     │   ├── DeviceError         a device, size or wire that does not exist
     │   └── LandingError        a landing zone that does not fit the artery
-    └── FlowError               a flow computation that cannot start or has diverged
+    ├── FlowError               a flow computation that cannot start or has diverged
+    └── FolderError             a case folder that another process works in, or that cannot be written to
 
 Each message says what, where (mm), why, and one thing to do.
 """
@@ -45,3 +46,7 @@ class LandingError(InputError):
 
 class FlowError(VstentError):
     """A flow computation that cannot start or has diverged."""
+
+
+class FolderError(VstentError):
+    """A case folder that another process works in, or that cannot be written to."""

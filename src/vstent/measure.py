@@ -1,5 +1,6 @@
 """Measure: the aneurysm's morphology, and how a deployed device lies on the wall."""
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,8 @@ from vstent.vessel import Anatomy, Aneurysm
 
 Measures = dict[str, float | str]
 """Numbers by names that end in their unit; a few names hold words."""
+Morphology = dict[str, float | str | Measures]
+"""The same, with the measures of each further sac under a name of their own: ``sac_2``, ``sac_3``, ..."""
 
 NECK_TOLERANCE_MM: Final = 0.02
 """The neck's triangles lie on the landing surface to within this: they are other triangles than its own."""
@@ -201,8 +204,8 @@ def _branches(anatomy: Anatomy, stent: Stent) -> Measures:
     return found
 
 
-def morphology(anatomy: Anatomy) -> Measures:
-    """Measure the largest aneurysm and its parent artery.
+def morphology(anatomy: Anatomy) -> Morphology:
+    """Measure the parent artery and its aneurysms: the largest first, others under ``sac_2``, ``sac_3`` and so on.
 
     Height, aspect ratio and size ratio as defined by Dhar et al. 2008 (Neurosurgery 63:185): the height is measured
     square to the neck plane; the size ratio takes the longest distance from the neck's center to the dome; the neck's
@@ -211,14 +214,21 @@ def morphology(anatomy: Anatomy) -> Measures:
     Trans. Med. Imaging 28:1141), of a quartic through one diameter of it to both sides; that much is left out at its
     ends.
     """
-    proximal_mm, distal_mm = landing_diameters_mm(anatomy)
-    found: Measures = {"parent_proximal_diameter_mm": proximal_mm, "parent_distal_diameter_mm": distal_mm}
+    found: Morphology = {**_parent(anatomy)}
     if anatomy.vessel.threshold_band_mm > 0:
         found["diameter_threshold_band_mm"] = anatomy.vessel.threshold_band_mm
     found |= _course(anatomy)
-    if anatomy.aneurysms:
-        found |= _sac(anatomy.aneurysms[0], 0.5 * (proximal_mm + distal_mm))
+    for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
+        beside = _parent(replace(anatomy, aneurysms=(aneurysm,)))
+        measures = _sac(aneurysm, 0.5 * sum(beside.values()))
+        found |= measures if number == 1 else {f"sac_{number}": {**beside, **measures}}
     return found
+
+
+def _parent(anatomy: Anatomy) -> dict[str, float]:
+    """Diameters of the parent artery beside the neck of the largest aneurysm."""
+    proximal_mm, distal_mm = landing_diameters_mm(anatomy)
+    return {"parent_proximal_diameter_mm": proximal_mm, "parent_distal_diameter_mm": distal_mm}
 
 
 def _course(anatomy: Anatomy) -> Measures:

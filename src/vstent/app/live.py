@@ -266,7 +266,8 @@ def _axis(anatomy: Anatomy) -> dict[str, list[float]]:
 
 
 def _kept(folder: Path, stage: str) -> Path | None:
-    return next(iter(sorted(folder.glob(f"{stage}-*.npz"))), None)
+    found = (path for path in sorted(folder.glob(f"{stage}-*.npz")) if not path.name.endswith(".running.npz"))
+    return next(found, None)
 
 
 def _said(opening: Opening) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 """Options that several commands share, and what they say to a study."""
 
 import argparse
+import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -17,6 +19,19 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """What a command adds itself to."""
 
 
+def number(text: str) -> float:
+    """Read a number; argparse makes a sentence of the complaint."""
+    return _numbers(text, float, 1)[0]
+
+
+def positive(text: str) -> float:
+    """Read a number above zero."""
+    value = number(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above zero")
+    return value
+
+
 def add_command(commands: Commands, name: str, text: str) -> argparse.ArgumentParser:
     """Add a command with its line of help."""
     return commands.add_parser(name, help=text, description=text, epilog=EPILOG)
@@ -28,11 +43,16 @@ def add_geometry(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         "input", type=Path, help="DICOM folder, NIfTI, NRRD, MHA, raw volume, STL, VTP, VTK, OBJ or PLY"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="case folder to write, or to go on with")
+    return add_given(parser)
+
+
+def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add what may be said of the vessel; return the group."""
     given = parser.add_argument_group("instead of what is guessed or proposed")
     given.add_argument("--units", choices=("m", "cm", "mm"), help="length unit of a surface file")
     given.add_argument("--spacing", type=_spacing, metavar="S|X,Y,Z", help="voxel edges of a raw volume, mm")
     given.add_argument("--shape", type=_shape, metavar="I,J,K", help="voxel counts of a raw volume")
-    given.add_argument("--threshold", type=float, metavar="T", help="intensity of the lumen's wall in a scan")
+    given.add_argument("--threshold", type=number, metavar="T", help="intensity of the lumen's wall in a scan")
     given.add_argument("--at", type=_point, metavar="X,Y,Z", help="a point near the sac, mm")
     given.add_argument("--inlet", type=_point, metavar="X,Y,Z", help="a point near the inlet, mm")
     return given
@@ -53,8 +73,10 @@ def add_devices(parser: argparse.ArgumentParser) -> None:
 def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
     """Add how the flow is computed; return the group."""
     flow = parser.add_argument_group("flow")
-    flow.add_argument("--flow-rate", type=float, metavar="ML_S", help="mean inflow (0.27 m/s times the inlet's area)")
-    flow.add_argument("--cell-size", type=float, metavar="MM", help="edge of a flow cell")
+    flow.add_argument(
+        "--flow-rate", type=positive, metavar="ML_S", help="mean inflow (0.27 m/s times the inlet's area)"
+    )
+    flow.add_argument("--cell-size", type=positive, metavar="MM", help="edge of a flow cell")
     flow.add_argument(
         "--pulsatile",
         nargs="?",
@@ -66,18 +88,42 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
     return flow
 
 
-def _numbers(text: str, kind: type) -> list[float]:
+def add_jobs(group: "argparse._ArgumentGroup") -> None:
+    """Add how many processes work at once."""
+    group.add_argument("--jobs", type=_jobs, default=_cores(), metavar="N", help="processes at once (one a core)")
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _jobs(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of processes such as 2")
+    return int(text)
+
+
+def numbers(text: str) -> list[float]:
+    """Read numbers parted by commas."""
+    return _numbers(text, float)
+
+
+def _numbers(text: str, kind: type, count: int | None = None) -> list[float]:
+    """Read numbers parted by commas, `count` of them where that is said."""
     try:
-        return [kind(part) for part in text.replace("x", ",").split(",")]
+        numbers = [kind(part) for part in text.replace("x", ",").split(",")]
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers such as 1,2,3") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not {'a number' if count == 1 else 'like 1,2,3'}") from None
+    if count is not None and len(numbers) != count:
+        raise argparse.ArgumentTypeError(f"{text!r} has {len(numbers)} numbers, not {count}")
+    if not all(math.isfinite(value) for value in numbers):
+        raise argparse.ArgumentTypeError(f"{text!r} is not finite")
+    return numbers
 
 
 def _three(text: str, kind: type) -> tuple[float, float, float]:
-    numbers = _numbers(text, kind)
-    if len(numbers) != 3:
-        raise argparse.ArgumentTypeError(f"{text!r} has {len(numbers)} numbers, not 3")
-    return numbers[0], numbers[1], numbers[2]
+    first, second, third = _numbers(text, kind, 3)
+    return first, second, third
 
 
 def _point(text: str) -> tuple[float, float, float]:

@@ -15,9 +15,11 @@ def add(commands: options.Commands) -> None:
     parser = options.add_command(commands, "run", "scan or surface -> stented artery, flow compared, report")
     given = options.add_geometry(parser)
     options.add_outlet(given)
-    given.add_argument("--diameter", type=float, metavar="MM", help="label diameter of the devices")
-    given.add_argument("--length", type=float, metavar="MM", help="label length of the devices")
-    given.add_argument("--center", type=float, metavar="MM", help="where on the parent axis the device's middle lies")
+    given.add_argument("--diameter", type=options.positive, metavar="MM", help="label diameter of the devices")
+    given.add_argument("--length", type=options.positive, metavar="MM", help="label length of the devices")
+    given.add_argument(
+        "--center", type=options.number, metavar="MM", help="where on the parent axis the device's middle lies"
+    )
     add_study(parser)
     parser.set_defaults(command=_run)
 

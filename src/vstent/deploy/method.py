@@ -4,7 +4,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Literal, Self, final
 
 import numpy as np
@@ -38,7 +37,7 @@ class Placement:
     wall: AbstractWall
     """What the device opens against."""
 
-    @cached_property
+    @property
     def across(self) -> Planes:
         """Planes on which rows lie."""
         return planes(self.anatomy.axis)

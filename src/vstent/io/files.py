@@ -11,6 +11,8 @@ from vstent.errors import ReadError
 
 SURFACE_SUFFIXES: Final = (".stl", ".vtp", ".vtk", ".obj", ".ply")
 IMAGE_SUFFIXES: Final = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".raw", ".raw.gz", ".dcm")
+PARTIAL: Final = ".partial-"
+"""How the name of a file begins while it is being written; the process follows."""
 
 
 def is_surface_file(path: Path) -> bool:
@@ -43,7 +45,7 @@ def atomic(path: Path) -> Iterator[Path]:
     """Give a path in the same folder to write to; it becomes `path` when the block ends well, and vanishes if not."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=f"{PARTIAL}{os.getpid()}-", suffix=path.suffix, dir=path.parent)
     os.close(handle)
     try:
         yield Path(name)
@@ -52,6 +54,26 @@ def atomic(path: Path) -> Iterator[Path]:
     finally:
         with suppress(FileNotFoundError):
             os.unlink(name)
+
+
+def sweep(folder: Path) -> None:
+    """Take away what processes that were killed have left half-written in a folder and the two floors below it."""
+    for depth in ("", "*/", "*/*/"):
+        for partial in folder.glob(f"{depth}{PARTIAL}*"):
+            if partial.is_file() and not _is_running(partial.name[len(PARTIAL) :].partition("-")[0]):
+                partial.unlink(missing_ok=True)
+
+
+def _is_running(process: str) -> bool:
+    if not process.isdigit():
+        return False
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def _umask() -> int:

@@ -22,6 +22,8 @@ SECONDS: Final = 8.0
 SECONDS_PER_BYTE: Final = 1e-6
 MEMORY_BYTES: Final = 2_000_000_000
 MEMORY_PER_BYTE: Final = 40
+LEAST_USED: Final = 0.9
+"""Part of the points of an OBJ file that belong to triangles; they come first, so a file that breaks off has more."""
 
 
 def read_apart(path: Path) -> tuple[Floats, Ints] | None:
@@ -79,6 +81,34 @@ def _reader(kind: str) -> Any:
     return vtkSTLReader() if kind == ".stl" else vtkOBJReader()
 
 
+def _faults() -> list[str]:
+    """Return a list that fills with whatever VTK complains of: after that it hands over what it has, zeros included."""
+    from vtkmodules.util.misc import calldata_type
+    from vtkmodules.vtkCommonCore import VTK_STRING, vtkOutputWindow
+
+    faults: list[str] = []
+
+    @calldata_type(VTK_STRING)
+    def note(_: Any, event: str, text: str) -> None:
+        if event == "ErrorEvent" or "Error reading" in text:  # binary data that end early are only warned of
+            faults.append(text)
+
+    window: Any = vtkOutputWindow.GetInstance()
+    for event in ("ErrorEvent", "WarningEvent"):
+        window.AddObserver(event, note)
+    return faults
+
+
+def _announced(path: Path) -> int:
+    """Return how many polygons the header of a PLY file announces; VTK is content with fewer."""
+    if suffix(path) != ".ply":
+        return 0
+    with path.open("rb") as file:
+        head = file.read(1 << 16).partition(b"end_header")[0]
+    counts = [line.split()[2] for line in head.splitlines() if line.startswith(b"element face")]
+    return int(counts[0]) if counts else 0
+
+
 def _polygons(data: Any) -> Any:
     """Return polygons as they are, the outer faces of a volume mesh, and None for anything else."""
     if data is None or data.IsA("vtkPolyData"):
@@ -98,11 +128,16 @@ def main(path: Path, result: Path) -> int:
     _limit_memory(path.stat().st_size)
     reader = _reader(suffix(path))
     reader.SetFileName(str(path))
+    faults = _faults()
     reader.Update()
     data = _polygons(reader.GetOutput())
-    if data is None:
+    if data is None or faults:
         return 1
     vertices, faces = triangles_of(data)
+    if len(faces) < _announced(path):
+        return 1
+    if suffix(path) == ".obj" and len(np.unique(faces)) < LEAST_USED * len(vertices):
+        return 1
     np.savez(result, vertices=vertices.astype(np.float64), faces=faces.astype(np.int32))
     return 0
 

@@ -48,7 +48,7 @@ def report(case: "CaseResult") -> str:
         name=case.name,
         sections=_sections(case),
         script_hashes=Markup(" ".join(_hash(script) for script in scripts.values())),
-        style=Markup(_asset("report.css") + _asset("viewer.css")),
+        style=Markup(asset("report.css") + asset("viewer.css")),
         **{name: Markup(script) for name, script in scripts.items()},
         devices=devices,
         change=format_change,
@@ -68,12 +68,13 @@ def report(case: "CaseResult") -> str:
     )
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Return the text of a file that pages are made of."""
     return files("vstent.report").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _script(name: str) -> str:
-    return _asset(name).replace("</script", "<\\/script")
+    return asset(name).replace("</script", "<\\/script")
 
 
 def _hash(script: str) -> str:

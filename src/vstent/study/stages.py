@@ -9,7 +9,8 @@ import numpy as np
 
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_size
-from vstent.flow import FlowField, compare, flow_case, indices, ostium, simulate_case
+from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, ostium, simulate_case
+from vstent.flow.cost import estimate, refuse_too_large
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
@@ -19,6 +20,7 @@ from vstent.repair import repair
 from vstent.restore import restore
 from vstent.segment import segment
 from vstent.stent import Deployment, Landing
+from vstent.study.checkpoint import FlowCheckpoint
 from vstent.study.ledger import Ledger, anatomy_key, key_of
 from vstent.study.outputs import write_field
 from vstent.study.types import Placing, Point, Settings
@@ -109,6 +111,7 @@ def compute_flows(
     if settings.flow is None:
         return {}
     fields: dict[str, FlowField] = {}
+    _plan(anatomy, settings.flow, ledger)
     for name in (BARE, *deployments):
         stent = deployments[name].stent if name in deployments else None
         placing = settings.placing(name) if stent else None
@@ -117,12 +120,21 @@ def compute_flows(
         if field is None:
             with ledger.stage(stage) as tell:
                 case = flow_case(anatomy, stent, settings.flow)
-                field = simulate_case(case, start=fields.get(BARE), progress=ledger.teller(stage))
+                begun = FlowCheckpoint(ledger.folder, stage, key)
+                field = simulate_case(case, start=fields.get(BARE), progress=ledger.teller(stage), checkpoint=begun)
                 tell(field.advice)
             ledger.keep(stage, key, field)
         fields[name] = field
         write_field(out / "flow" / name, field)
     return fields
+
+
+def _plan(anatomy: Anatomy, settings: FlowSettings, ledger: Ledger) -> None:
+    """Say what a flow will cost; refuse one that does not fit in the memory."""
+    with ledger.stage("plan flow") as tell:
+        case = flow_case(anatomy, None, settings)
+        refuse_too_large(case)
+        tell(str(estimate(case)))
 
 
 def measure_all(
