@@ -113,7 +113,8 @@ class Job:
                 self._process.kill()
 
     def _follow(self) -> None:
-        assert self._process.stdout is not None and self._process.stdin is not None
+        assert self._process.stdout is not None
+        assert self._process.stdin is not None
         failure = ""
         for line in self._process.stdout:
             told = json.loads(line)

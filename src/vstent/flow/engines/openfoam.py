@@ -131,7 +131,9 @@ class OpenFoam(AbstractEngine[State]):
                 "take the embedded engine"
             )
         found = program.find()
-        setup = FoamSetup(self.cell_size_mm, found.flavour, self.layers, processes=self.processes, struts=self.struts)
+        setup = FoamSetup(
+            self.cell_size_mm, found.flavour, self.layers, processes=self.processes, struts=self.struts
+        )
         foam = foam_case(case, setup)
         _prepare(self.folder, foam)
         _mesh(found, self.folder, setup)
@@ -146,7 +148,9 @@ class OpenFoam(AbstractEngine[State]):
         bridge = _bridge(case, domain, centers, samples_mm)
         kept = PHASES if case.settings.waveform else CHECKS_AVERAGED
         count = len(centers.inside)
-        return State(case, setup, foam, found, self.folder, domain, bridge, sac, area_mm2, count, deque(maxlen=kept))
+        return State(
+            case, setup, foam, found, self.folder, domain, bridge, sac, area_mm2, count, deque(maxlen=kept)
+        )
 
     def step(self, state: State) -> State:
         """Run the solver to the next check and read what it wrote."""
@@ -234,9 +238,7 @@ def _begin_from(folder: Path, start: FlowField) -> None:
             rows = "\n".join(("(%.7g %.7g %.7g)" if kind == "vector" else "%.7g") % tuple(row) for row in values)
             listed = f"internalField nonuniform List<{kind}>\n{len(values)}\n(\n{rows}\n)\n;"
             path = part / "0" / name
-            path.write_text(
-                re.sub(r"internalField\s+uniform [^;]*;", lambda _, text=listed: text, path.read_text(), count=1)
-            )
+            path.write_text(re.sub(r"internalField\s+uniform [^;]*;", lambda _, text=listed: text, path.read_text(), count=1))
 
 
 def _bridge(case: FlowCase, domain: domains.Domain, centers: results.VolumeField, ostium_mm: Floats) -> Bridge:
@@ -310,9 +312,7 @@ def _read(state: State, time: str) -> Snapshot:
 
 def _flow_mL_s(folder: Path, name: str) -> float:
     """Last flow out through a patch that the function objects noted."""
-    files = sorted(
-        (folder / "postProcessing" / f"flow_{name}").glob("*/*.dat"), key=lambda path: path.stat().st_mtime_ns
-    )
+    files = sorted((folder / "postProcessing" / f"flow_{name}").glob("*/*.dat"), key=lambda path: path.stat().st_mtime_ns)
     last = files[-1].read_text().splitlines()[-1].split()
     return float(last[1]) / M3_PER_ML
 

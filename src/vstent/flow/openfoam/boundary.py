@@ -64,7 +64,9 @@ def _function(value: str) -> Any:
     """A function of time as an entry: ``constant q``, or a sub-dictionary with its table."""
     if not value.startswith("table"):
         return value
-    return {"type": value.partition(";")[0]} | dict(part.strip().split(" ", 1) for part in value.split(";")[1:])
+    return {"type": value.partition(";")[0]} | dict(
+        part.strip().split(" ", 1) for part in value.split(";")[1:]
+    )
 
 
 def _inlet(case: FlowCase, setup: FoamSetup) -> dict[str, Any]:

@@ -146,7 +146,9 @@ def fluid(blood: Blood, setup: FoamSetup) -> dict[str, str]:
     note = f"Blood: {blood.viscosity_Pa_s:.6g} Pa s at {blood.density_kg_m3:.6g} kg/m3; p is pressure over density."
     if setup.flavour == "org":
         return {
-            "physicalProperties": foam_file("physicalProperties", {"viscosityModel": "constant", "nu": nu}, note=note),
+            "physicalProperties": foam_file(
+                "physicalProperties", {"viscosityModel": "constant", "nu": nu}, note=note
+            ),
             "momentumTransport": foam_file("momentumTransport", {"simulationType": "laminar"}),
         }
     return {

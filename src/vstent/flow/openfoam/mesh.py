@@ -85,7 +85,9 @@ def _geometry(setup: FoamSetup, patches: dict[str, str], has_neck: bool) -> dict
     return result
 
 
-def _castellated(setup: FoamSetup, patches: dict[str, str], inside_mm: Floats, has_neck: bool) -> dict[str, Any]:
+def _castellated(
+    setup: FoamSetup, patches: dict[str, str], inside_mm: Floats, has_neck: bool
+) -> dict[str, Any]:
     level = (BASE_LEVEL, BASE_LEVEL)
     regions = {name: {"level": level, "patchInfo": {"type": kind}} for name, kind in patches.items()}
     surfaces: dict[str, Any] = {LUMEN: {"level": level, "regions": regions}}

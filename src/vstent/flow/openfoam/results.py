@@ -45,11 +45,7 @@ def _parsed(path: Path) -> VolumeField:
     try:
         text = path.read_text()
         inside, _, boundary = text.partition("boundaryField")
-        patches = {
-            name: _values(body[entry.end() :])
-            for name, body in _PATCH.findall(boundary)
-            if (entry := _ENTRY.search(body))
-        }
+        patches = {name: _values(body[entry.end() :]) for name, body in _PATCH.findall(boundary) if (entry := _ENTRY.search(body))}
         return VolumeField(_values(inside[inside.index("internalField") :]), patches)
     except (OSError, ValueError) as error:
         raise ReadError(f"OpenFOAM's field {path} is missing or damaged ({error}): delete its folder's run") from error
