@@ -79,6 +79,7 @@ class Page {
     this.anatomy = null;
     this.slices = null;
     this.measures = {};
+    this.moment = this.times = this.flowPanes = this.sheets = undefined;
   }
 
   async openCase(id, step) {
@@ -128,6 +129,10 @@ class Page {
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.surfaces = new Newest(
       (answer) => this.picture.put(answer),
+      (problem) => this.complain(problem),
+    );
+    this.moments = new Newest(
+      () => {},
       (problem) => this.complain(problem),
     );
     this.stepper = make("nav", { className: "stepper", ariaLabel: "Steps" });
@@ -206,14 +211,20 @@ class Page {
     try {
       const scan = await get(`${this.path}/image`);
       this.scan = scan;
-      this.slices = new Slices(this.path, (point) => this.setSeed(point), (problem) => this.complain(problem));
+      this.slices = new Slices(this.path, (point, isLumen) => (isLumen ? this.setSeed(point) : this.tell("There is no lumen at that point: click a bright one.")), (problem) => this.complain(problem));
       this.sliceBox.replaceChildren(...this.slices.elements);
-      this.slices.show(scan);
+      this.slices.show(scan, this.neckPoint());
       this.showThreshold(this.view.choices.threshold ?? scan.proposed_threshold);
       this.render();
     } catch (problem) {
       this.complain(problem);
     }
+  }
+
+  /** The middle of the neck on the parent axis, where one is known. */
+  neckPoint() {
+    const neck = this.anatomy?.neck;
+    return neck?.length ? this.deploying.at((neck[0] + neck[1]) / 2) : null;
   }
 
   /** The live surface and the outline at a threshold. */
@@ -243,9 +254,10 @@ class Page {
 
   async loadFlow() {
     try {
-      const [answer, sheets] = await Promise.all([getBinary(`${this.path}/flow`), get(`${this.path}/numbers`)]);
+      const [answer, sheets] = await Promise.all([getBinary(`${this.path}/flow${this.moment === undefined ? "" : `?moment=${this.moment}`}`), get(`${this.path}/numbers`)]);
       this.sheets = sheets;
       this.flowPanes = answer.manifest.panes;
+      this.times = answer.manifest.times_s;
       this.picture.put(answer);
       this.render();
     } catch (problem) {
@@ -422,7 +434,12 @@ class Page {
   /** The inlet's pulse, for the left side. */
   pulseChart() {
     const box = make("div", { className: "pulse" });
-    const draw = () => box.replaceChildren(pulseChart(this.pulse, this.view.choices.flow.is_pulsatile));
+    const shown = (moment) => {
+      this.moment = moment;
+      draw();
+      this.moments.ask(() => this.loadFlow());
+    };
+    const draw = () => box.replaceChildren(pulseChart(this.pulse, this.view.choices.flow.is_pulsatile, this.times || [], this.moment, shown));
     if (this.pulse) draw();
     else get("/api/waveform").then((pulse) => ((this.pulse = pulse), draw())).catch((problem) => this.complain(problem));
     return box;
@@ -548,7 +565,7 @@ const LAYERS = {
   flow: (page) => {
     const mode = page.memory.mode || "streamlines";
     const shear = mode === "shear";
-    return [{ id: "lumen", title: "Lumen", on: !shear }, { id: "streamlines", on: !shear }, { id: "shear", on: shear }, { id: "wires", title: "Wires", on: false }, NECK];
+    return [{ id: "lumen", title: "Lumen", on: !shear }, { id: "streamlines", on: mode === "streamlines" }, { id: "slice", on: mode === "slice" }, { id: "shear", on: shear }, { id: "wires", title: "Wires", on: false }, NECK];
   },
   report: (page) => LAYERS.flow(page),
 };

@@ -264,7 +264,7 @@ function expansion(page) {
 }
 
 function modes(page) {
-  const options = [["streamlines", "Streamlines"], ["shear", "Wall shear stress"]].map(([id, words]) => {
+  const options = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall stress"]].map(([id, words]) => {
     const button = make("button", { type: "button", ariaPressed: String((page.memory.mode || "streamlines") === id) }, [words]);
     button.addEventListener("click", () => {
       page.memory.mode = id;
