@@ -245,11 +245,11 @@ def row_spacing_mm(
 
     Where the axis bends, rows are h (1 + k cos(theta)) apart at the angle theta round it, k = curvature D / 2. Pieces
     of wire keep their length l, so that cos(alpha) = h (1 + k cos(theta)) / l and n columns fill the circumference
-    when the mean of 1 / sin(alpha) round it is n l / (pi D): h is less than in a straight artery, and less than what
-    lets the wires outside the bend reach from row to row.
+    when the mean of 1 / sin(alpha) round it is n l / (pi D): h is less than in a straight artery. The joined cells of
+    a laser-cut device do not crowd outside a bend: its axis keeps its length.
     """
     piece_mm, angle = piece_length_mm(design, size), angle_rad(design, size, diameter_mm)
-    if not np.any(curvature_per_mm):
+    if isinstance(design, LaserCut) or not np.any(curvature_per_mm):
         return piece_mm * np.cos(angle)
     bend = np.minimum(0.5 * np.abs(curvature_per_mm) * diameter_mm, STEEPEST_BEND)
     apart = 1 + np.multiply.outer(bend, np.cos(2 * np.pi * (np.arange(BEND_SAMPLES) + 0.5) / BEND_SAMPLES))
