@@ -240,7 +240,7 @@ class FlowField:
 
     @cached_property
     def oscillatory_shear_index(self) -> Floats:
-        """(v,) (1 - norm(mean stress) / mean(norm(stress))) / 2 (He and Ku 1996, J. Biomech. Eng. 118, 74); 0 in steady flow."""
+        """(v,) (1 - norm(mean stress) / mean norm) / 2 (He and Ku 1996, J. Biomech. Eng. 118, 74); 0 in steady flow."""
         # The stress is linear in the velocity: that of the mean flow is the mean stress.
         return 0.5 * (1 - np.linalg.norm(self.wall_shear_stress_Pa, axis=1) / np.maximum(self.shear_Pa, 1e-12))
 
