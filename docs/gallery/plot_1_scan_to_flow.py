@@ -39,15 +39,20 @@ assert abs(sac.sac.volume_mm3 / phantom.sac_volume_mm3 - 1) < 0.1
 deployment = vstent.deploy(vstent.find_design("silk"), anatomy)
 print(deployment.advice)
 
-nodes_mm = deployment.stent.nodes_mm
-figure = plt.figure(figsize=(6, 5))
-axes = figure.add_subplot(projection="3d")
-for first, last in zip(deployment.stent.wire_starts[:-1], deployment.stent.wire_starts[1:], strict=True):
-    axes.plot(*deployment.stent.wire_points_mm[first:last].T, color="0.3", linewidth=0.4)
-axes.plot(*np.vstack([sac.neck_mm, sac.neck_mm[:1]]).T, color="tab:red", label="neck")
-axes.plot(*anatomy.axis.points_mm.T, color="tab:blue", linewidth=1, label="axis of the parent artery")
-axes.set_box_aspect(np.ptp(anatomy.axis.points_mm, axis=0) + 2)
-axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
+stent, across, along = deployment.stent, 1, 2  # the artery bends in the plane of y and z
+figure, axes = plt.subplots(figsize=(6, 6))
+for first, last in zip(stent.wire_starts[:-1], stent.wire_starts[1:], strict=True):
+    wire_mm = stent.wire_points_mm[first:last]
+    axes.plot(wire_mm[:, across], wire_mm[:, along], color="0.4", linewidth=0.4)
+for line_mm, color, label in (
+    (np.vstack([sac.neck_mm, sac.neck_mm[:1]]), "tab:red", "neck"),
+    (anatomy.axis.points_mm, "tab:blue", "axis of the parent artery"),
+):
+    axes.plot(line_mm[:, across], line_mm[:, along], color=color, label=label)
+axes.plot(
+    sac.sac.vertices_mm[:, across], sac.sac.vertices_mm[:, along], ".", color="tab:red", markersize=1, label="sac"
+)
+axes.set(xlabel="y, mm", ylabel="z, mm", aspect="equal")
 axes.legend()
 
 # %%
