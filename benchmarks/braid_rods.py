@@ -1,4 +1,4 @@
-"""An independent model of a braid in an artery: elastic Cosserat rods, pushed apart by nothing but their own springiness.
+"""An independent model of a braid in an artery: elastic Cosserat rods, pushed apart by their own springiness alone.
 
 Run from the repository, offline, some minutes a case: ``pip install pyelastica``, then
 ``python benchmarks/braid_rods.py``. What comes out is kept in ``tests/data/braid_rods.json`` and compared with
@@ -23,6 +23,7 @@ import time
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import elastica
 import numpy as np
@@ -102,8 +103,8 @@ class Lattice:
 
 
 @njit(cache=True)
-def foot(x, y, z, curvature, half_mm):
-    """Arc length, point and tangent of the axis nearest to a point; the bend's plane is y = 0, its middle the origin."""
+def foot(x: float, y: float, z: float, curvature: float, half_mm: float) -> tuple:
+    """Arc length, point and tangent of the axis nearest to a point; a bend lies in y = 0, its middle at the origin."""
     if curvature == 0.0:
         return z, 0.0, z, 0.0, 1.0
     bend_mm = 1.0 / curvature
@@ -118,7 +119,7 @@ def foot(x, y, z, curvature, half_mm):
 
 
 @njit(cache=True)
-def push(x, force, is_wire, artery, stiffness, middle, hold):
+def push(x: Any, force: Any, is_wire: Any, artery: Any, stiffness: float, middle: Any, hold: float) -> None:
     """Add the wall's push and the weak spring on the arc length of the middle row to the forces (3, n) on nodes."""
     radius_mm, slope, curvature, half_mm = artery
     drift = 0.0
@@ -140,7 +141,7 @@ def push(x, force, is_wire, artery, stiffness, middle, hold):
 
 
 @njit(cache=True)
-def tie(x, force, base, place, last, stiffness, is_sliding):
+def tie(x: Any, force: Any, base: Any, place: Any, last: float, stiffness: float, is_sliding: bool) -> None:
     """Hold wires together: crossing j is at node `place[:, j]`, not whole, of the wires that begin at `base[:, j]`."""
     for j in range(base.shape[1]):
         i = np.zeros(2, dtype=np.int64)

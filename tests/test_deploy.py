@@ -163,7 +163,7 @@ def test_in_a_bend_the_braid_is_denser_inside_and_sparser_outside(side):
     wire_mm = sum(n * d for n, d in SILK.wires) / 48 * 1e-3
     assert hidden == pytest.approx(1 - (1 - wire_mm / apart_mm) ** 2, rel=0.05)
     straight_fraction = device.coverage_fraction(SILK, SILK_SIZE, 3.7)
-    assert side * (hidden - straight_fraction) > 0.01
+    assert side * (hidden - straight_fraction) > (0.01 if side > 0 else 0.005)
 
 
 def stretch(stent):

@@ -80,7 +80,7 @@ def test_shares_of_two_causes_are_their_first_order_indices():
 
 def test_a_fit_finds_the_shares_of_any_sum_of_quadratics_and_leaves_interplay_to_the_rest():
     points = np.random.default_rng(1).uniform(-1, 1, (64, 3))
-    x, y, z = points.T
+    x, y, _ = points.T
     shares = first_order_shares(points, 3 * x + 2 * y**2)
     assert shares == pytest.approx(np.array([3, 4 * 4 / 45, 0]) / (3 + 16 / 45), abs=1e-6)
     # twice as many causes and few points: the first degree alone

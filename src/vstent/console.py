@@ -11,6 +11,7 @@ from rich.status import Status
 from rich.table import Table
 
 from vstent.device import Design
+from vstent.flow.convergence import Refinement
 from vstent.rank import Ranking
 from vstent.vessel import Opening
 
@@ -179,6 +180,20 @@ def flow_table(metrics: Mapping[str, Any]) -> Table:
     for quantity in flatten(metrics["bare"]):
         changes = (_change(quantity.value, stent["flow"][quantity.key]) for stent in stents.values())
         table.add_row(quantity.name, quantity.text, *changes)
+    return table
+
+
+def convergence_table(found: Refinement) -> Table:
+    """Table of one refinement: every quantity at three sizes, its observed order, its value at size zero."""
+    from vstent.report.quantities import flatten
+
+    columns = (f"{size:.3g}" for size in found.sizes)
+    table = Table(found.name.replace("_", " "), *columns, "order", "limit", "±")
+    for key, one in found.quantities.items():
+        order = "not one way" if one.order is None else f"{one.order:.1f}"
+        values = [quantity.text for value in one.values for quantity in flatten({key: value})]
+        name = flatten({key: 0.0})[0].name
+        table.add_row(name, *values, order, _cell(one.extrapolated), f"{one.uncertainty_fraction:.1%}")
     return table
 
 

@@ -85,6 +85,7 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         metavar="CSV",
         help="follow a pulse: columns time in s and flow in any unit (the published one of the internal carotid)",
     )
+    flow.add_argument("--engine", default="lattice_boltzmann", metavar="NAME", help="a plug-in that computes the flow")
     flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
     return flow
 
@@ -214,6 +215,7 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
         waveform=_waveform(arguments.pulsatile),
         outlets=arguments.outlets,
         cell_size_mm=arguments.cell_size,
+        engine=arguments.engine,
     )
 
 

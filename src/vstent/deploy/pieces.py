@@ -16,16 +16,18 @@ from vstent.device import Design, Grid, Size, grid, piece_length_mm
 from vstent.kernels import net
 from vstent.kernels.arrays import Floats, Ints
 
-RESISTANCE: Final = 0.03
+RESISTANCE: Final = 0.01
 """How much a crossing that slides out of its row weighs against a piece of wire that stretches by as much."""
-CROWDING: Final = {"braid": 0.1, "laser_cut": 0.2}
+CROWDING: Final = {"braid": 0.1, "laser_cut": 0.5}
 """How much neighbours in a row that come nearer together weigh against a piece of wire that stretches by as much.
 
 The least that keeps every cell open in tight siphons; cells whose struts are joined resist more than wires that cross.
 """
+STIFFNESS: Final = 0.1
+"""How much a wire that bends otherwise weighs against a piece of wire that stretches by as much."""
 STEPS: Final = 8
 """Gauss-Newton steps at most."""
-GAIN: Final = 0.01
+GAIN: Final = 0.05
 """Less gained by a step, relative, ends them."""
 TOLERANCE: Final = 0.1
 """Of every least-squares problem, relative."""
@@ -61,9 +63,10 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int) -> Slid:
         lattice.ends,
         spacing_mm,
         _bulge_mm2(nodes_mm[:: shape.row_split, :: shape.column_split]),
+        lattice.bends,
     )
     weights = net.Weights(
-        piece_length_mm(design, size), RESISTANCE, CROWDING[design.kind], round(held / shape.row_split)
+        piece_length_mm(design, size), RESISTANCE, CROWDING[design.kind], STIFFNESS, round(held / shape.row_split)
     )
     slid = net.slide(pieces, weights, STEPS, GAIN, TOLERANCE) / spacing_mm
     rows, columns = (_spread(moves, lattice, shape) for moves in slid.T)
@@ -94,6 +97,8 @@ class _Lattice(NamedTuple):
     """(c,) next crossing in the same row."""
     ends: Ints
     """(2, p) crossings at the two ends of every piece."""
+    bends: Ints
+    """(3, b) every three crossings that follow on each other on a wire."""
 
 
 @cache
@@ -107,7 +112,13 @@ def _lattice(shape: Grid) -> _Lattice:
     ends = [[first, number[line[first] + 1, (column[first] + hand) % columns]] for hand in (1, -1)]
     # Pieces of one row after the other: what a loop over them reads lies close together.
     both = np.array(ends).transpose(1, 2, 0).reshape(2, -1)
-    return _Lattice(line, line * shape.row_split, column * shape.column_split, beside, np.ascontiguousarray(both))
+    inner = np.flatnonzero((line > 0) & (line < rows - 1))
+    ways = [
+        [number[line[inner] + way, (column[inner] + way * hand) % columns] for way in (-1, 0, 1)] for hand in (1, -1)
+    ]
+    bends = np.array(ways).transpose(1, 2, 0).reshape(3, -1)
+    row, column = line * shape.row_split, column * shape.column_split
+    return _Lattice(line, row, column, beside, np.ascontiguousarray(both), np.ascontiguousarray(bends))
 
 
 def _continued(nodes_mm: Floats) -> Floats:

@@ -2,8 +2,10 @@
 
 Crossings x (c, 2), moves along and around in mm, are those of least
 
-    sum over pieces of (length - length as made)^2  +  sum over crossings of (resistance |x - mean of x along its row|)^2
+    sum over pieces of (length - length as made)^2
+    +  sum over crossings of (resistance times how far they move otherwise than their row)^2
     +  sum over neighbours in a row of (crowding times how much nearer together or further apart they come)^2
+    +  sum over neighbours on a wire of (stiffness times the second difference of their moves)^2
 
 with the mean of one row held where it is. Gauss-Newton steps; every one solves its normal equations by conjugate
 gradients, preconditioned by the diagonal and by one coarse problem: whole rows moved, tilted, turned and bunched.
@@ -24,6 +26,10 @@ _BAND: Final = 2 * _WAVES
 
 REACH: Final = 0.3
 """A crossing moves no further in a step, mm."""
+SHORTEST: Final = 0.05
+"""A step that does not help is halved down to this."""
+ROUNDS: Final = 200
+"""Of conjugate gradients, at most."""
 
 
 class Net(NamedTuple):
@@ -44,7 +50,9 @@ class Net(NamedTuple):
     spacing: Floats
     """(2,) mm per row and per column of the grid."""
     bulge: Floats
-    """(l,) mm2 by which the squared length of a piece that begins in a row exceeds its chord's: wires follow the wall."""
+    """(l,) mm2: wires follow the wall, so much more than its chord's is the squared length of a piece behind a row."""
+    bends: Ints
+    """(3, b) every three crossings that follow on each other on a wire."""
 
 
 class Weights(NamedTuple):
@@ -56,6 +64,8 @@ class Weights(NamedTuple):
     """Weight of a crossing that moves otherwise than its row against a piece that stretches by as much."""
     crowding: float
     """Weight of neighbours in a row that come nearer together."""
+    stiffness: float
+    """Weight of wires that bend otherwise."""
     held: int
     """The row of crossings that stays where it is in the mean."""
 
@@ -83,9 +93,11 @@ def _put(chart: Any, row: Any, column: Any, spacing: Any, x: Any, places: Any) -
 
 
 @njit(cache=True, nogil=True)
-def _cost(places: Any, line: Any, beside: Any, ends: Any, bulge: Any, weights: Any, x: Any, excess: Any) -> float:
+def _cost(
+    places: Any, line: Any, beside: Any, ends: Any, bulge: Any, bends: Any, weights: Any, x: Any, excess: Any
+) -> float:
     """Write by how much every piece (p,) is too long; return what the crossings minimise."""
-    length, resistance, crowding, held = weights
+    length, resistance, crowding, stiffness, held = weights
     total = 0.0
     for p in range(ends.shape[1]):
         a, b = ends[0, p], ends[1, p]
@@ -99,6 +111,9 @@ def _cost(places: Any, line: Any, beside: Any, ends: Any, bulge: Any, weights: A
         off = x[c, 0] - mean[line[c]]
         total += resistance**2 * (off * off + x[c, 1] ** 2)
         total += (crowding * (x[beside[c], 1] - x[c, 1])) ** 2
+    for b in range(bends.shape[1]):
+        for k in range(2):
+            total += (stiffness * (x[bends[0, b], k] - 2 * x[bends[1, b], k] + x[bends[2, b], k])) ** 2
     return total + count[held] * mean[held] ** 2
 
 
@@ -109,7 +124,9 @@ def _row_means(line: Any, x: Any) -> tuple[Any, Any]:
     for c in range(len(line)):
         mean[line[c]] += x[c, 0]
         count[line[c]] += 1.0
-    return mean / count, count
+    for row in range(len(mean)):
+        mean[row] /= count[row]
+    return mean, count
 
 
 @njit(cache=True, nogil=True)
@@ -126,11 +143,11 @@ def _slopes(places: Any, ends: Any, slopes: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, x: Any, result: Any) -> None:
+def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, bends: Any, weights: Any, x: Any, result: Any) -> None:
     """Write the normal matrix times x (c, 2)."""
-    _, resistance, crowding, held = weights
+    _, resistance, crowding, stiffness, held = weights
     mean, _ = _row_means(line, x)
-    damp, crowd = resistance**2, crowding**2
+    damp, crowd, stiff = resistance**2, crowding**2, stiffness**2
     for c in range(len(line)):
         result[c, 0] = damp * (x[c, 0] - mean[line[c]])
         result[c, 1] = damp * x[c, 1]
@@ -140,6 +157,13 @@ def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, x: A
         nearer = crowd * (x[beside[c], 1] - x[c, 1])
         result[beside[c], 1] += nearer
         result[c, 1] -= nearer
+    for b in range(bends.shape[1]):
+        before, here, after = bends[0, b], bends[1, b], bends[2, b]
+        for k in range(2):
+            bent = stiff * (x[before, k] - 2 * x[here, k] + x[after, k])
+            result[before, k] += bent
+            result[here, k] -= 2 * bent
+            result[after, k] += bent
     for p in range(ends.shape[1]):
         a, b = ends[0, p], ends[1, p]
         longer = slopes[p, 0] * x[a, 0] + slopes[p, 1] * x[a, 1] + slopes[p, 2] * x[b, 0] + slopes[p, 3] * x[b, 1]
@@ -152,20 +176,22 @@ def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, x: A
 @njit(cache=True, nogil=True)
 def _diagonal(slopes: Any, ends: Any, weights: Any, n: int) -> Any:
     """Inverse of the normal matrix's diagonal (c, 2)."""
-    _, resistance, crowding, _ = weights
-    diagonal = np.full((n, 2), resistance**2)
-    diagonal[:, 1] += 2 * crowding**2
+    _, resistance, crowding, stiffness, _ = weights
+    inverse = np.zeros((n, 2))
     for p in range(ends.shape[1]):
         for k in range(2):
-            diagonal[ends[0, p], k] += slopes[p, k] ** 2
-            diagonal[ends[1, p], k] += slopes[p, 2 + k] ** 2
-    return 1 / diagonal
+            inverse[ends[0, p], k] += slopes[p, k] ** 2
+            inverse[ends[1, p], k] += slopes[p, 2 + k] ** 2
+    for c in range(n):
+        for k in range(2):  # on two wires (1, -2, 1) comes thrice
+            inverse[c, k] = 1 / (inverse[c, k] + resistance**2 + 12 * stiffness**2 + 2 * k * crowding**2)
+    return inverse
 
 
 @njit(cache=True, nogil=True)
 def _coarse(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, waves: Any) -> Any:
     """Banded Cholesky factor (n, BAND), lower form, of the normal matrix on moves of whole rows."""
-    _, resistance, crowding, held = weights
+    _, resistance, crowding, _stiffness, held = weights
     band = np.zeros(((line[-1] + 1) * _WAVES, _BAND))
     g = np.zeros(_BAND)
     for p in range(ends.shape[1]):
@@ -186,8 +212,8 @@ def _coarse(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, waves:
                 if w > 0:
                     band[first + w, w - v] += resistance**2 * both
                 band[first + 3 + w, w - v] += resistance**2 * both + crowding**2 * apart
-    band[held * _WAVES, 0] += (line == held).sum()
-    band[:, 0] *= 1 + 1e-9
+        if line[c] == held:
+            band[held * _WAVES, 0] += 1.0
     return _cholesky(band)
 
 
@@ -201,7 +227,10 @@ def _cholesky(band: Any) -> Any:
             total = band[i, k]
             for m in range(max(0, i - width + 1, j - width + 1), j):
                 total -= band[i, i - m] * band[j, j - m]
-            band[i, k] = np.sqrt(max(total, 1e-30)) if k == 0 else total / band[j, 0]
+            if k == 0:
+                band[i, 0] = np.sqrt(max(total, 1e-30))
+            else:
+                band[i, k] = total / band[j, 0]
     return band
 
 
@@ -245,38 +274,45 @@ def _dot(a: Any, b: Any) -> float:
 
 @njit(cache=True, nogil=True)
 def _step(
-    slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, waves: Any, x: Any, excess: Any, tolerance: float
+    slopes: Any,
+    line: Any,
+    beside: Any,
+    ends: Any,
+    bends: Any,
+    weights: Any,
+    waves: Any,
+    x: Any,
+    excess: Any,
+    tolerance: float,
 ) -> Any:
     """Moves (c, 2) of a Gauss-Newton step from x, by conjugate gradients."""
     inverse, factor = _diagonal(slopes, ends, weights, len(line)), _coarse(slopes, line, beside, ends, weights, waves)
-    residual, image = np.zeros_like(x), np.zeros_like(x)
-    heeded = (weights[0], weights[1], weights[2], weights[3])
-    _multiply(np.zeros_like(slopes), line, beside, ends, heeded, x, image)
+    n = len(line)
+    residual, image = np.zeros((n, 2)), np.zeros((n, 2))
+    _multiply(np.zeros((len(slopes), 4)), line, beside, ends, bends, weights, x, image)
     for c in range(len(line)):
         residual[c, 0], residual[c, 1] = -image[c, 0], -image[c, 1]
     for p in range(ends.shape[1]):
         for k in range(2):
             residual[ends[0, p], k] -= slopes[p, k] * excess[p]
             residual[ends[1, p], k] -= slopes[p, 2 + k] * excess[p]
-    move, way, ready = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x)
-    _precondition(inverse, factor, line, waves, residual, ready)
-    way[:] = ready
-    size = _dot(residual, ready)
-    goal = tolerance**2 * size
-    for _ in range(200):
+    move, way, ready = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2))
+    goal, before = 0.0, np.inf
+    for _ in range(ROUNDS):
+        _precondition(inverse, factor, line, waves, residual, ready)
+        size = _dot(residual, ready)
+        goal = max(goal, tolerance**2 * size)
         if size <= goal:
             break
-        _multiply(slopes, line, beside, ends, weights, way, image)
-        share = size / _dot(way, image)
-        for c in range(len(line)):
+        for c in range(n):
+            for k in range(2):
+                way[c, k] = ready[c, k] + size / before * way[c, k]
+        _multiply(slopes, line, beside, ends, bends, weights, way, image)
+        share, before = size / _dot(way, image), size
+        for c in range(n):
             for k in range(2):
                 move[c, k] += share * way[c, k]
                 residual[c, k] -= share * image[c, k]
-        _precondition(inverse, factor, line, waves, residual, ready)
-        before, size = size, _dot(residual, ready)
-        for c in range(len(line)):
-            for k in range(2):
-                way[c, k] = ready[c, k] + size / before * way[c, k]
     return move
 
 
@@ -290,37 +326,38 @@ def _slide(
     ends: Any,
     spacing: Any,
     bulge: Any,
+    bends: Any,
     length: float,
     resistance: float,
     crowding: float,
+    stiffness: float,
     held: int,
     waves: Any,
     steps: int,
     gain: float,
     tolerance: float,
 ) -> Any:
-    weights = (length, resistance, crowding, held)
-    x, tried = np.zeros((len(row), 2)), np.zeros((len(row), 2))
-    places, excess, slopes = np.zeros((len(row), 9)), np.zeros(ends.shape[1]), np.zeros((ends.shape[1], 4))
+    weights, n = (length, resistance, crowding, stiffness, held), len(row)
+    x, tried = np.zeros((n, 2)), np.zeros((n, 2))
+    places, excess, slopes = np.zeros((n, 9)), np.zeros(ends.shape[1]), np.zeros((ends.shape[1], 4))
     _put(chart, row, column, spacing, x, places)
-    cost = _cost(places, line, beside, ends, bulge, weights, x, excess)
+    cost = _cost(places, line, beside, ends, bulge, bends, weights, x, excess)
     for _ in range(steps):
         _slopes(places, ends, slopes)
-        move = _step(slopes, line, beside, ends, weights, waves, x, excess, tolerance)
-        for c in range(len(row)):
-            for k in range(2):
-                move[c, k] = min(max(move[c, k], -REACH), REACH)
+        move = _step(slopes, line, beside, ends, bends, weights, waves, x, excess, tolerance)
         share, before = 1.0, cost
-        while share > 0.05:  # a step that does not help is halved
-            tried[:] = x + share * move
+        while True:  # a step that does not help is halved
+            for c in range(n):
+                for k in range(2):
+                    tried[c, k] = x[c, k] + share * min(max(move[c, k], -REACH), REACH)
             _put(chart, row, column, spacing, tried, places)
-            cost = _cost(places, line, beside, ends, bulge, weights, tried, excess)
+            cost = _cost(places, line, beside, ends, bulge, bends, weights, tried, excess)
             if cost < before:
                 break
             share *= 0.5
-        if cost >= before:
-            break
-        x[:] = tried
+            if share < SHORTEST:
+                return x
+        x, tried = tried, x
         if 1 - cost / before < gain:
             break
     return x

@@ -5,10 +5,12 @@ device is deployed, so that a wrong input leaves nothing behind. From then on ea
 under a key that names everything it depends on; running the same study again reads it back instead of computing it.
 """
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from vstent.device import find_design
+from vstent.flow.convergence import Refinement
 from vstent.io import writers
 from vstent.measure import morphology
 from vstent.study.crate import write_crate
@@ -17,7 +19,7 @@ from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
 from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
 from vstent.study.provenance import INPUT, METRICS, provenance
 from vstent.study.repeat import Record, agreement, read_record
-from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all, vary_all
+from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all, refine, vary_all
 from vstent.study.types import CaseResult, Placing, Progress, Settings
 from vstent.vessel import Anatomy, Vessel
 
@@ -31,6 +33,7 @@ __all__ = [
     "Settings",
     "agreement",
     "read_record",
+    "refine_flow",
     "restore_vessel",
     "run",
     "trace_vessel",
@@ -131,3 +134,30 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
     write_anatomy(out, anatomy)
     writers.write_json(out / "morphology.json", measures)
     return anatomy, measures
+
+
+@claiming
+def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Refinement, Refinement]:
+    """Compute the flow without a device on three grids and with three time steps; write ``convergence.json``.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : what is given; the cell size, given or proposed, is the finest.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    FlowError
+        A flow could not be computed.
+    """
+    ledger = Ledger(out / CACHE, progress)
+    source = hash_of(path)
+    anatomy = find_anatomy(path, source, settings, ledger)
+    ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
+    found = refine(anatomy, settings, ledger)
+    writers.write_json(out / "convergence.json", {one.name: asdict(one) for one in found})
+    return found

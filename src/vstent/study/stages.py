@@ -11,6 +11,7 @@ import numpy as np
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_size
 from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, ostium, simulate_case
+from vstent.flow.convergence import Refinement, convergence
 from vstent.flow.cost import estimate, refuse_too_large
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
@@ -129,6 +130,22 @@ def compute_flows(
         fields[name] = field
         write_field(out / "flow" / name, field)
     return fields
+
+
+def refine(anatomy: Anatomy, settings: Settings, ledger: Ledger) -> tuple[Refinement, Refinement]:
+    """Compute the flow without a device on three grids and with three time steps."""
+    flow = settings.flow or FlowSettings()
+    _plan(anatomy, flow, ledger)
+    with ledger.stage("convergence") as tell:
+        done: list[str] = []
+
+        def told(sentence: str) -> None:
+            done.append(sentence)
+            ledger.progress("convergence", len(done) / 6, sentence)
+
+        found = convergence(flow_case(anatomy, None, flow), told=told)
+        tell(" ".join(done))
+    return found
 
 
 def _plan(anatomy: Anatomy, settings: FlowSettings, ledger: Ledger) -> None:

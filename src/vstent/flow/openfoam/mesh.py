@@ -47,7 +47,7 @@ def feature_extract(setup: FoamSetup) -> tuple[str, str]:
 
 
 def snappy(setup: FoamSetup, patches: dict[str, str], inside_mm: Floats, *, has_neck: bool) -> str:
-    """snappyHexMeshDict.
+    """SnappyHexMeshDict.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def _geometry(setup: FoamSetup, patches: dict[str, str], has_neck: bool) -> dict
     if has_neck:
         result[NECK] = surface(NECK)
     if setup.struts is not None:
-        result[STRUTS] = surface(STRUTS)
+        result[STRUTS] = surface(STRUTS) | {"regions": {STRUTS: {"name": STRUTS}}}
     return result
 
 
