@@ -1,4 +1,4 @@
-"""An independent model of a braid in an artery: elastic Cosserat rods, pushed apart by nothing but their own springiness.
+"""An independent model of a braid in an artery: elastic Cosserat rods, pushed apart by their own springiness alone.
 
 Run from the repository, offline, some minutes a case: ``pip install pyelastica``, then
 ``python benchmarks/braid_rods.py``. What comes out is kept in ``tests/data/braid_rods.json`` and compared with
@@ -104,7 +104,7 @@ class Lattice:
 
 @njit(cache=True)
 def foot(x: float, y: float, z: float, curvature: float, half_mm: float) -> tuple:
-    """Arc length, point and tangent of the axis nearest to a point; the bend's plane is y = 0, its middle the origin."""
+    """Arc length, point and tangent of the axis nearest to a point; a bend lies in y = 0, its middle at the origin."""
     if curvature == 0.0:
         return z, 0.0, z, 0.0, 1.0
     bend_mm = 1.0 / curvature

@@ -95,7 +95,8 @@ def test_every_answer_forbids_what_the_page_does_not_need(client):
 
 
 @pytest.mark.parametrize(
-    "name", ["../evil.stl", "..\\evil.stl", "/etc/passwd", ".hidden.stl", "a\0b.stl", "x" * 200 + ".stl", "virus.exe", ""]
+    "name",
+    ["../evil.stl", "..\\evil.stl", "/etc/passwd", ".hidden.stl", "a\0b.stl", "x" * 200 + ".stl", "virus.exe", ""],
 )
 def test_names_that_are_paths_hidden_or_of_another_kind_are_refused(client, case, workspace, name):
     before = sorted(workspace.parent.rglob("*.stl"))
@@ -135,7 +136,9 @@ def packed(entries):
 
 
 def test_archives_cannot_write_beside_their_folder(client, case, folder, workspace):
-    evil = packed([("../../escaped.stl", b"solid a"), ("/tmp/vstent-absolute.stl", b"solid b"), ("x/.hid.stl", b"solid")])
+    evil = packed(
+        [("../../escaped.stl", b"solid a"), ("/tmp/vstent-absolute.stl", b"solid b"), ("x/.hid.stl", b"solid")]
+    )
     answer = client.put(f"/api/cases/{case}/input", params={"name": "scan.zip"}, content=evil)
     assert answer.status_code == 422  # the hidden one is refused; the others lie where they should
     assert sorted(path.name for path in folder.iterdir()) == ["escaped.stl", "vstent-absolute.stl"]

@@ -11,6 +11,7 @@ from rich.status import Status
 from rich.table import Table
 
 from vstent.device import Design
+from vstent.flow.convergence import Refinement
 from vstent.rank import Ranking
 from vstent.vessel import Opening
 
@@ -139,6 +140,18 @@ def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
+def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
+    """Table of intervals: each result of each device, and the causes of its spread."""
+    from vstent.report.uncertainty import intervals
+
+    table = Table("device", "result", "mean", "95 % between", "and", "because of", title="what is not sure, varied")
+    for name, stent in metrics["stents"].items():
+        for row in intervals(stent):
+            causes = ", ".join(f"{cause} {share:.0%}" for cause, share in row.shares if share >= 0.005)
+            table.add_row(name, row.name, row.mean, row.low, row.high, causes)
+    return table
+
+
 def opening_table(openings: Sequence[Opening]) -> Table:
     """Table of the vessel's ends: role, diameter, area, where."""
     table = Table("opening", "diameter, mm", "area, mm²", "center, mm (LPS)")
@@ -167,6 +180,20 @@ def flow_table(metrics: Mapping[str, Any]) -> Table:
     for quantity in flatten(metrics["bare"]):
         changes = (_change(quantity.value, stent["flow"][quantity.key]) for stent in stents.values())
         table.add_row(quantity.name, quantity.text, *changes)
+    return table
+
+
+def convergence_table(found: Refinement) -> Table:
+    """Table of one refinement: every quantity at three sizes, its observed order, its value at size zero."""
+    from vstent.report.quantities import flatten
+
+    columns = (f"{size:.3g}" for size in found.sizes)
+    table = Table(found.name.replace("_", " "), *columns, "order", "limit", "±")
+    for key, one in found.quantities.items():
+        order = "not one way" if one.order is None else f"{one.order:.1f}"
+        values = [quantity.text for value in one.values for quantity in flatten({key: value})]
+        name = flatten({key: 0.0})[0].name
+        table.add_row(name, *values, order, _cell(one.extrapolated), f"{one.uncertainty_fraction:.1%}")
     return table
 
 

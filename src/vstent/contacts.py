@@ -111,7 +111,7 @@ def _goes_on(spheres: Medial, artery: Artery) -> bool:
 
 
 def _artery(points: Floats, radius: Floats) -> Artery | None:
-    """The artery that a path (n, 3) comes to from a waist, its direction towards the waist; None where there is none."""
+    """The artery that a path (n, 3) comes to from a waist, directed towards the waist; None where there is none."""
     widest = np.maximum.accumulate(radius)
     shrinks = np.flatnonzero(radius < 0.9 * widest)
     end = int(shrinks[0]) if len(shrinks) else len(radius)
@@ -126,7 +126,7 @@ def _artery(points: Floats, radius: Floats) -> Artery | None:
 
 def _angle(one: Floats, other: Floats) -> float:
     """Angle between two lines along vectors (3,), from 0 to a right angle."""
-    cosine = abs(one @ other) / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-12)
+    cosine = abs(float(one @ other)) / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-12)
     return float(np.arccos(min(cosine, 1.0)))
 
 

@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from vstent import plugins
 from vstent.errors import DeviceError
 from vstent.units import MM_PER_UM
 
@@ -295,18 +296,25 @@ def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> floa
 
 @cache
 def catalogue() -> dict[str, Design]:
-    """Return every device by its key: those of the catalogue, then those that the user has added.
+    """Return every device by its key: those of the catalogue, of plug-ins, then those that the user has added.
 
     Raises
     ------
     DeviceError
         When a catalogue breaks its schema or names a device that another one names.
+    PluginError
+        When a plug-in cannot be loaded.
     """
     from importlib.resources import files
 
     from vstent.device_schema import parse  # pydantic is loaded only when the catalogue is
 
     designs = parse(files("vstent").joinpath("devices.toml").read_text(encoding="utf-8"))
+    for name, entry in plugins.plugins("vstent.devices").items():
+        text = plugins.load("vstent.devices", name, built_in="vstent")()
+        added = parse(text, f"The plug-in {name} ({entry.value})")
+        _check_new(added, designs, f"The plug-in {name}")
+        designs |= added
     for path in sorted(user_folder().glob("*.toml")):
         added = parse(_text(path), str(path))
         _check_new(added, designs, path)
@@ -351,10 +359,10 @@ def _text(path: Path) -> str:
         raise DeviceError(f"{path} cannot be read as text: give a TOML file of devices, or remove it.") from error
 
 
-def _check_new(added: Iterable[str], known: Iterable[str], path: Path) -> None:
+def _check_new(added: Iterable[str], known: Iterable[str], source: object) -> None:
     twice = sorted(set(added) & set(known))
     if twice:
-        raise DeviceError(f"{path} names a device that the catalogue has already, {twice[0]}: give it another key.")
+        raise DeviceError(f"{source} names a device that the catalogue has already, {twice[0]}: give it another key.")
 
 
 def find_design(name: str) -> Design:

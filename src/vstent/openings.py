@@ -154,12 +154,16 @@ def _with_open_arms(lumen: Surface) -> tuple[Surface, int]:
 
 
 def _is_blind(graph: medial.Medial, path: Ints) -> bool:
-    """Tell whether an arm's tip is reached along its path (k,) only: a loop of an artery has two ways to its middle."""
-    abscissa = curves.arc_length(graph.points[path])
-    behind = path[np.searchsorted(abscissa, abscissa[-1] - 3.0 * np.median(graph.radius[path]))]
-    near = np.linalg.norm(graph.points - graph.points[behind], axis=1) < 1.25 * graph.radius[behind]
-    near[path[[0, -1]]] = False
-    label = _joined(graph.edges[~near[graph.edges].any(axis=1)], len(near))
+    """Tell whether an arm's tip is reached along its path (k,) only: a loop of an artery has two ways to its middle.
+
+    Ways less than half as wide as the arm, or too thin for an arm, are no way for blood.
+    """
+    abscissa, typical = curves.arc_length(graph.points[path]), float(np.median(graph.radius[path]))
+    behind = graph.points[path[np.searchsorted(abscissa, abscissa[-1] - 3.0 * typical)]]
+    passable = graph.radius > max(0.5 * typical, ARM_RADIUS_MM)
+    passable &= np.linalg.norm(graph.points - behind, axis=1) > 1.25 * typical
+    passable[path[[0, -1]]] = True
+    label = _joined(graph.edges[passable[graph.edges].all(axis=1)], len(passable))
     return bool(label[path[0]] != label[path[-1]])
 
 

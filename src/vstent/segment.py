@@ -28,7 +28,7 @@ SMOOTHING_STEPS: Final = 12
 PASS_BAND: Final = 0.1
 CURVATURE_ROUNDS: Final = 25
 """The wall's curvature is averaged so many times with the neighbours': over some three voxels."""
-CREVICE_ROUNDS: Final = 2
+CREVICE_ROUNDS: Final = 4
 """Where the curvature averaged so many times is hollow, there is a crevice between two parts of the vessel..."""
 CREVICE_RINGS: Final = 3
 """... which reaches this many rings of vertices further."""

@@ -151,8 +151,8 @@ export function residualChart(points, tolerance = 0.01) {
   return svg("svg", { class: "chart small", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": "Residual" }, parts);
 }
 
-/** The pulse at the inlet, and the time or the mean that is shown. */
-export function pulseChart({ time_s, factor }, isPulsatile) {
+/** The pulse at the inlet, and the time that is shown: a click on a moment shows it, one beside the curve the mean. */
+export function pulseChart({ time_s, factor }, isPulsatile, times, moment, chosen) {
   const [width, height, left, bottom, top] = [360, 150, 44, 26, 22];
   const high = 1.1 * Math.max(...factor);
   const x = (t) => left + ((width - left - 8) * t) / time_s.at(-1);
@@ -161,9 +161,17 @@ export function pulseChart({ time_s, factor }, isPulsatile) {
     svg("line", { x1: left, x2: width - 8, y1: y(v), y2: y(v), class: v ? "goal" : "grid" }),
     text(left - 6, y(v) + 4, String(v), { class: "tick end" }),
   ]);
-  parts.push(text(4, 13, "Inflow / mean", { class: "axis-title" }));
-  parts.push(text(width - 8, 13, isPulsatile ? "shown: mean over the cycle" : "shown: steady flow at the mean", { class: "axis-title end" }));
+  const shown = moment !== undefined && times.length ? `shown: ${times[moment].toFixed(2)} s` : times.length ? "shown: mean of the cycle" : isPulsatile ? "the pulse" : "shown: steady, at the mean";
+  parts.push(text(4, 13, "Inflow / mean", { class: "axis-title" }), text(width - 8, 13, shown, { class: "axis-title end" }));
   for (const t of ticks(0, time_s.at(-1), 4)) parts.push(text(x(t), height - 8, `${t} s`, { class: "tick middle" }));
   parts.push(svg("path", { d: path(time_s.map((t, i) => [x(t), y(factor[i])])), class: isPulsatile ? "line device" : "line artery" }));
-  return svg("svg", { class: "chart small", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": "Inlet waveform" }, parts);
+  const at = (t) => factor[Math.round((t / time_s.at(-1)) * (factor.length - 1))];
+  times.forEach((t, k) => {
+    const dot = svg("circle", { cx: x(t), cy: y(at(t)), r: k === moment ? 6 : 4, class: k === moment ? "dot moment now" : "dot moment", tabindex: 0, role: "button", "aria-label": `Show ${t.toFixed(2)} s` });
+    dot.addEventListener("click", () => chosen(k === moment ? undefined : k));
+    dot.addEventListener("keydown", (event) => event.key === "Enter" && chosen(k === moment ? undefined : k));
+    parts.push(dot);
+  });
+  if (moment !== undefined && times.length) parts.push(svg("line", { x1: x(times[moment]), x2: x(times[moment]), y1: top, y2: height - bottom, class: "cursor" }));
+  return svg("svg", { class: "chart small", viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "Inlet waveform" }, parts);
 }

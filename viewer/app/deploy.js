@@ -13,6 +13,7 @@ export class Deploying {
     this.sketches = new Newest((answer) => this.sketched(answer), host.failed);
     this.whole = new Newest((answer) => this.deployed(answer), host.failed);
     this.sections = new Newest((answer) => host.section.show(answer), () => {});
+    this.cursorMark = { element: make("i", { className: "cursor-mark" }), point: () => this.cursor !== undefined && this.at(this.cursor) };
     this.handles = ["proximal", "distal"].map((end, i) => this.handle(end, i));
   }
 
@@ -46,22 +47,22 @@ export class Deploying {
       event.stopPropagation();
       this.slide(end, this.under(event, this.place.ends_mm[i]));
     });
-    element.addEventListener("pointerup", (event) => {
-      event.stopPropagation();
+    // However it ends: let go, cancelled by the system, or taken away.
+    element.addEventListener("lostpointercapture", () => {
       grabbed = false;
       element.classList.remove("grabbed");
       this.release();
     });
     element.addEventListener("keydown", (event) => {
       const step = { ArrowLeft: -0.2, ArrowDown: -0.2, ArrowRight: 0.2, ArrowUp: 0.2, PageUp: 2, PageDown: -2 }[event.key];
-      if (!step || !this.place) return;
+      if (!step || !this.isHere) return;
       event.preventDefault();
       event.stopPropagation();
       this.slide(end, (this.wanted ?? this.place.ends_mm[i]) + step);
       clearTimeout(this.timer);
       this.timer = setTimeout(() => this.release(), 350);
     });
-    return { end, element, point: () => this.place && this.at(this.place.ends_mm[i]) };
+    return { end, element, point: () => this.isHere && this.at(this.place.ends_mm[i]) };
   }
 
   /** Abscissa whose picture is nearest to a pointer; nothing far along the artery, which may lie behind. */
@@ -96,8 +97,14 @@ export class Deploying {
     settle();
   }
 
+  /** Whether the device in view is the one whose place is known. */
+  get isHere() {
+    return this.place?.device === this.name;
+  }
+
   /** Show a device as it is chosen: deployed, with its numbers. */
   show(name) {
+    if (name !== this.name) this.host.along.set({ device: null });
     this.name = name;
     const [device, colour] = [this.host.choice(name), this.host.colour()];
     if (!device) return;
@@ -131,6 +138,7 @@ export class Deploying {
     if (mm === null || !this.axis) return;
     this.cursor = mm;
     this.host.along.set({ cursor: mm });
+    this.host.picture.stage?.redraw();
     const device = this.name && !this.isDragging ? `&device=${encodeURIComponent(this.name)}` : "";
     this.sections.ask(() => get(`${this.host.path()}/section?abscissa_mm=${mm.toFixed(3)}${device}`));
   }

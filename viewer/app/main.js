@@ -79,6 +79,7 @@ class Page {
     this.anatomy = null;
     this.slices = null;
     this.measures = {};
+    this.moment = this.times = this.flowPanes = this.sheets = undefined;
   }
 
   async openCase(id, step) {
@@ -128,6 +129,10 @@ class Page {
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.surfaces = new Newest(
       (answer) => this.picture.put(answer),
+      (problem) => this.complain(problem),
+    );
+    this.moments = new Newest(
+      () => {},
       (problem) => this.complain(problem),
     );
     this.stepper = make("nav", { className: "stepper", ariaLabel: "Steps" });
@@ -206,14 +211,20 @@ class Page {
     try {
       const scan = await get(`${this.path}/image`);
       this.scan = scan;
-      this.slices = new Slices(this.path, (point) => this.setSeed(point), (problem) => this.complain(problem));
+      this.slices = new Slices(this.path, (point, isLumen) => (isLumen ? this.setSeed(point) : this.tell("There is no lumen at that point: click a bright one.")), (problem) => this.complain(problem));
       this.sliceBox.replaceChildren(...this.slices.elements);
-      this.slices.show(scan);
+      this.slices.show(scan, this.neckPoint());
       this.showThreshold(this.view.choices.threshold ?? scan.proposed_threshold);
       this.render();
     } catch (problem) {
       this.complain(problem);
     }
+  }
+
+  /** The middle of the neck on the parent axis, where one is known. */
+  neckPoint() {
+    const neck = this.anatomy?.neck;
+    return neck?.length ? this.deploying.at((neck[0] + neck[1]) / 2) : null;
   }
 
   /** The live surface and the outline at a threshold. */
@@ -243,9 +254,10 @@ class Page {
 
   async loadFlow() {
     try {
-      const [answer, sheets] = await Promise.all([getBinary(`${this.path}/flow`), get(`${this.path}/numbers`)]);
+      const [answer, sheets] = await Promise.all([getBinary(`${this.path}/flow${this.moment === undefined ? "" : `?moment=${this.moment}`}`), get(`${this.path}/numbers`)]);
       this.sheets = sheets;
       this.flowPanes = answer.manifest.panes;
+      this.times = answer.manifest.times_s;
       this.picture.put(answer);
       this.render();
     } catch (problem) {
@@ -317,9 +329,12 @@ class Page {
 
   panes() {
     const names = this.flowPanes?.length ? this.flowPanes : ["bare"];
-    const rows = this.sheets?.flow?.[0]?.rows?.find(({ key }) => key === "neck_inflow_mL_s");
-    return names.map((name, i) => {
-      const note = rows ? `${rows.name} ${rows.cells[i ? 2 * i - 1 : 0]}${i ? ` (${rows.cells[2 * i]})` : ""}` : "";
+    const sheet = this.sheets?.flow?.[0];
+    const row = sheet?.rows.find(({ key }) => key === "neck_inflow_mL_s");
+    return names.map((name) => {
+      const i = sheet?.names.indexOf(name) ?? -1;
+      const said = i < 0 ? row?.cells[0] : `${row?.cells[1 + 2 * i]} (${row?.cells[2 + 2 * i]})`;
+      const note = row && (i >= 0 || name === "bare") ? `${row.name} ${said}` : "";
       return { id: name, title: name === "bare" ? "Before (no device)" : this.deviceTitle(name), note };
     });
   }
@@ -342,7 +357,7 @@ class Page {
   renderDeploy() {
     const name = this.device;
     if (!name) return;
-    this.picture.setMarks(this.deploying.handles);
+    this.picture.setMarks([...this.deploying.handles, this.deploying.cursorMark]);
     this.picture.moved = (event) => this.deploying.look(this.deploying.under(event, null));
     const key = JSON.stringify([this.deploying.host.choice(name), this.colour, this.view.anatomy]);
     if (this.shownDevice !== key || this.deploying.name !== name || !this.measures[name]) {
@@ -364,11 +379,7 @@ class Page {
 
   flowStrip() {
     const { job } = this.view;
-    const parts = [];
-    if (job?.kind === "flow") parts.push(residualChart(job.residual));
-    if (this.pulse) parts.push(pulseChart(this.pulse, this.view.choices.flow.is_pulsatile));
-    else get("/api/waveform").then((pulse) => ((this.pulse = pulse), this.renderStrip()));
-    return parts;
+    return job?.kind === "flow" ? [residualChart(job.residual)] : [];
   }
 
   renderWork() {
@@ -394,13 +405,13 @@ class Page {
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
       const stale = this.view.steps.flow !== "done" ? [make("p", { className: "note stale" }, ["Of an earlier choice: run the step Flow again."])] : [];
-      parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole));
+      parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole, (name) => this.deviceTitle(name)));
     }
     if (["device", "deploy"].includes(this.step)) {
       const sheets = this.view.choices.devices.map(({ name }) => this.measures[name]).filter(Boolean);
       if (sheets.length) parts.push(head("Deployed"), plainSheet(sheets, this.isWhole));
     }
-    if (this.sheets?.anatomy?.length && !["flow", "report"].includes(this.step)) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));
+    if (this.sheets?.anatomy?.length && !(flow && ["flow", "report"].includes(this.step))) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));
     if (!parts.length) parts.push(make("h2", {}, ["Numbers"]), make("p", { className: "hint" }, ["They appear here as the steps are done, each with its unit and definition."]));
     else parts.push(make("p", { className: "hint" }, ["Rest the pointer on a name for its definition."]));
     this.numbers.replaceChildren(...parts);
@@ -418,6 +429,20 @@ class Page {
     }
     const place = this.panel.querySelector(".place");
     if (place) place.replaceChildren(...placeWords(manifest));
+  }
+
+  /** The inlet's pulse, for the left side. */
+  pulseChart() {
+    const box = make("div", { className: "pulse" });
+    const shown = (moment) => {
+      this.moment = moment;
+      draw();
+      this.moments.ask(() => this.loadFlow());
+    };
+    const draw = () => box.replaceChildren(pulseChart(this.pulse, this.view.choices.flow.is_pulsatile, this.times || [], this.moment, shown));
+    if (this.pulse) draw();
+    else get("/api/waveform").then((pulse) => ((this.pulse = pulse), draw())).catch((problem) => this.complain(problem));
+    return box;
   }
 
   // -- what a user does ---------------------------------------------------------------------------------------------
@@ -540,7 +565,7 @@ const LAYERS = {
   flow: (page) => {
     const mode = page.memory.mode || "streamlines";
     const shear = mode === "shear";
-    return [{ id: "lumen", title: "Lumen", on: !shear }, { id: "streamlines", on: !shear }, { id: "shear", on: shear }, { id: "wires", title: "Wires", on: false }, NECK];
+    return [{ id: "lumen", title: "Lumen", on: !shear }, { id: "streamlines", on: mode === "streamlines" }, { id: "slice", on: mode === "slice" }, { id: "shear", on: shear }, { id: "wires", title: "Wires", on: false }, NECK];
   },
   report: (page) => LAYERS.flow(page),
 };

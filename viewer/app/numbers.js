@@ -18,21 +18,21 @@ export function plainSheet(sheets, isWhole) {
 }
 
 /** Numbers before, after and change: a card each. */
-export function changeSheet(sheet, isWhole) {
+export function changeSheet(sheet, isWhole, named) {
   const rows = sheet.rows.filter((row) => isWhole || row.is_first);
   return make(
     "div",
     { className: "cards" },
     rows.map((row) => {
-      const columns = [cell("Before", row.cells[0], "")];
-      sheet.devices.forEach((title, i) => columns.push(cell(title, row.cells[1 + 2 * i], row.cells[2 + 2 * i])));
+      const columns = [cell("Before", "without a device", row.cells[0], "")];
+      sheet.names.forEach((name, i) => columns.push(cell(named(name), sheet.devices[i], row.cells[1 + 2 * i], row.cells[2 + 2 * i])));
       return make("div", { className: "card" }, [term(row), make("div", { className: "card-cells" }, columns)]);
     }),
   );
 }
 
-function cell(title, value, change) {
-  const parts = [make("small", { title }, [title]), make("b", {}, [value])];
+function cell(words, title, value, change) {
+  const parts = [make("small", { title }, [words]), make("b", {}, [value])];
   if (change) parts.push(make("em", { className: change.startsWith("−") ? "down" : "up" }, [change]));
   return make("div", {}, parts);
 }

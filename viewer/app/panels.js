@@ -133,8 +133,8 @@ export const panels = {
       select("pulse", "Inlet", flow.is_pulsatile ? "1" : "", [["", "steady, at the mean"], ["1", "pulse of the carotid"]], (value) => page.chooseFlow({ is_pulsatile: Boolean(value) })),
       select("outlets", "Outlets", flow.outlets, [["zero_pressure", "zero pressure"], ["murray", "split by r³ (Murray)"]], (value) => page.chooseFlow({ outlets: value })),
     );
-    parts.push(...failure(page), ...staleness(page));
-    if (!job) parts.push(main(page, steps.flow === "done" ? "Run again" : page.view.failed.flow || steps.flow === "stale" ? "Run the flow" : "Run the flow", () => page.start("flow"), !page.view.has_anatomy || !page.device));
+    parts.push(page.pulseChart(), ...failure(page), ...staleness(page));
+    if (!job) parts.push(main(page, steps.flow === "done" ? "Run again" : "Run the flow", () => page.start("flow"), !page.view.has_anatomy || !page.device));
     if (page.flowPanes?.length) parts.push(modes(page));
     if (page.view.has_report && steps.report === "done") parts.push(next(page, "report", "Report →"));
     return parts;
@@ -264,7 +264,7 @@ function expansion(page) {
 }
 
 function modes(page) {
-  const options = [["streamlines", "Streamlines"], ["shear", "Wall shear stress"]].map(([id, words]) => {
+  const options = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall stress"]].map(([id, words]) => {
     const button = make("button", { type: "button", ariaPressed: String((page.memory.mode || "streamlines") === id) }, [words]);
     button.addEventListener("click", () => {
       page.memory.mode = id;

@@ -36,6 +36,8 @@ export class Picture {
       return;
     }
     this.stage.orbit.listen(this.area, () => this.paneSize()[1]);
+    for (const name of ["pointerdown", "wheel", "keydown"])
+      this.area.addEventListener(name, (event) => event.target.closest("button") || (this.lastLook = null), { passive: true });
     this.stage.drawn = () => this.afterDrawing();
     this.area.addEventListener("keydown", (event) => this.key(event));
     this.area.addEventListener("pointermove", (event) => event.buttons === 0 && this.moved?.(event));
@@ -130,6 +132,7 @@ export class Picture {
     const view = this.views.find((one) => one.id === id);
     if (!view || !this.stage) return;
     const [width, height] = this.paneSize();
+    this.lastLook = id;
     this.stage.orbit.look(view.axes, view.center, view.radius, width / height, glide);
   }
 
@@ -149,6 +152,8 @@ export class Picture {
       height: element.offsetHeight,
     }));
     this.stage.arrange(places, width, height);
+    // Until somebody turns it, the picture fits the room it has.
+    if (this.lastLook) this.look(this.lastLook, false);
   }
 
   key(event) {

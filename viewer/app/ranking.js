@@ -48,7 +48,7 @@ function line(page, row, names) {
     make("td", {}, [`${row.label_diameter_mm.toFixed(2)} × ${row.label_length_mm}`]),
     make("td", { className: "score-cell", title: `${(100 * row.score).toFixed(0)} of 100` }, [score, make("span", {}, [row.is_suitable ? (100 * row.score).toFixed(0) : "–"])]),
     ...COLUMNS.map(([key, , format]) => make("td", {}, [row[key] === undefined ? "–" : format(row[key])])),
-    make("td", { className: "reason", title: row.reason }, [row.reason]),
+    make("td", { className: "reason", title: row.reason }, [row.reason.replace("Costs it most: ", "")]),
   ];
   const choose = () => page.changeDevice(row.device, { diameter_mm: row.label_diameter_mm, length_mm: row.label_length_mm, center_mm: null }).then(() => page.goTo(row.device));
   const element = make("tr", { className: `${row.is_suitable ? "" : "unsuitable"} ${isChosen ? "chosen" : ""}`, tabIndex: 0, ariaSelected: String(Boolean(isChosen)) }, cells);

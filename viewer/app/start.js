@@ -7,6 +7,10 @@ const KINDS = "DICOM folder or ZIP · NIfTI · NRRD · MHA · STL · VTP · VTK 
 export function startPage(open, complain) {
   const said = make("p", { className: "drop-said", role: "status" });
   const bring = (files) => upload(files, said).then(open).catch(complain);
+  const tryDemo = () => {
+    said.textContent = "Making the demo's scan …";
+    post("/api/demo").then(({ id }) => open(id)).catch(complain);
+  };
   const file = make("input", { type: "file", multiple: true, hidden: true, onChange: () => bring([...file.files]) });
   const folder = make("input", { type: "file", hidden: true, onChange: () => bring([...folder.files]) });
   folder.webkitdirectory = true;
@@ -17,7 +21,7 @@ export function startPage(open, complain) {
     make("div", { className: "drop-buttons" }, [
       make("button", { type: "button", className: "primary", onClick: () => file.click() }, ["Choose files"]),
       make("button", { type: "button", onClick: () => folder.click() }, ["Choose a DICOM folder"]),
-      make("button", { type: "button", onClick: () => post("/api/demo").then(({ id }) => open(id)).catch(complain) }, ["Try the demo"]),
+      make("button", { type: "button", onClick: tryDemo }, ["Try the demo"]),
     ]),
     said,
     file,

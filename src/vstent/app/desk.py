@@ -184,7 +184,7 @@ class Desk:
         path = case.folder / "metrics.json"
         if path.is_file():
             metrics = json.loads(path.read_text(encoding="utf-8"))
-            found["flow"] = sheets.flow(metrics, _titles(metrics))
+            found["flow"] = sheets.flow(metrics, _titles(metrics, case))
         return found
 
     def warm(self) -> None:
@@ -272,10 +272,12 @@ def pulse() -> dict[str, Any]:
     return {"time_s": time_s.tolist(), "factor": OLDER_ADULT_ICA.factor(time_s).tolist()}
 
 
-def _titles(metrics: dict[str, Any]) -> dict[str, str]:
-    """Names of the devices with their sizes."""
+def _titles(metrics: dict[str, Any], case: Case) -> dict[str, str]:
+    """Names of the devices with their sizes, in the order in which they were chosen."""
+    order = [device.name for device in case.state.choices.devices]
     found = {name: stent["deployment"] for name, stent in metrics.get("stents", {}).items()}
-    return {name: f"{measured['device']} {measured['size']}" for name, measured in found.items()}
+    names = sorted(found, key=lambda name: order.index(name) if name in order else len(order))
+    return {name: f"{found[name]['device']} {found[name]['size']}" for name in names}
 
 
 def _is_surface(case: Case) -> bool:

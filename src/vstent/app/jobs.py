@@ -32,6 +32,7 @@ STAGES: Final = {
     "rank": "device",
     "deploy": "deploy",
     "struts": "deploy",
+    "plan": "flow",
     "flow": "flow",
     "measure": "flow",
     "report": "report",
@@ -59,7 +60,7 @@ class Job:
         command = [sys.executable, "-m", "vstent.app.worker", kind, str(case.folder)]
         self._process = subprocess.Popen(
             command,
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,  # closes when the server is gone, however it went: then the job ends too
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
@@ -113,6 +114,7 @@ class Job:
 
     def _follow(self) -> None:
         assert self._process.stdout is not None
+        assert self._process.stdin is not None
         failure = ""
         for line in self._process.stdout:
             told = json.loads(line)
@@ -122,6 +124,8 @@ class Job:
                 self.case.update(anatomy=told["anatomy"])
             else:
                 self._take(told["stage"], told["fraction"], told["detail"])
+        self._process.stdout.close()
+        self._process.stdin.close()
         code = self._process.wait()
         if self._is_stopped:
             failure = STOPPED

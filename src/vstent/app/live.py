@@ -1,7 +1,8 @@
 """Live: what a hand on the page asks is answered here, at once, from what the case has found so far."""
 
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -11,6 +12,7 @@ from scipy.spatial import cKDTree
 from vstent.app import sheets
 from vstent.app.cases import Case
 from vstent.app.choices import DeviceChoice, placing_of
+from vstent.app.cuts import at_phase, cut
 from vstent.deploy import propose_landing
 from vstent.deploy.contour import planes
 from vstent.deploy.sketch import Bed, Sketch, bed, sketch
@@ -25,11 +27,13 @@ from vstent.report.packing import message
 from vstent.report.scene import (
     LineLayer,
     MeshLayer,
+    Scale,
     View,
     anatomy_layers,
     device_layers,
     device_title,
     flow_layers,
+    round_up,
     scales_of,
     view_of,
     views_of,
@@ -50,6 +54,8 @@ KEPT: Final = 40
 """Results remembered per case."""
 SECTION_REACH_MM: Final = 9.0
 """A section shows what is this near to the axis."""
+BESIDE_SAC_MM: Final = 1.0
+"""What is this near to the sac says how wide the scales of the flow are."""
 BESIDE_MM: Final = 8.0
 """The profile shows so much of the artery beside the neck."""
 NEIGHBOURS: Final = 3
@@ -139,9 +145,19 @@ class Live:
         paths = {name: _kept(self.case.folder / CACHE, f"flow {name}") for name in names}
         return {name: path for name, path in paths.items() if path is not None}
 
-    def _flow_layers(self, name: str, path: Path) -> list[MeshLayer | LineLayer]:
-        key = ("flow layers", path, path.stat().st_mtime_ns, self.case.state.anatomy)
-        return self.remembered(key, lambda: flow_layers(name, load_noun(path, FlowField), self.anatomy))
+    def _field(self, path: Path, moment: int | None) -> FlowField:
+        """A flow: its mean, or a moment of its last cycle."""
+        field = self.remembered(("flow", path, path.stat().st_mtime_ns), lambda: load_noun(path, FlowField))
+        return field if moment is None or not field.phases else at_phase(field, moment % len(field.phases))
+
+    def _flow_layers(self, name: str, path: Path, moment: int | None) -> list[MeshLayer | LineLayer]:
+        key = ("flow layers", path, path.stat().st_mtime_ns, self.case.state.anatomy, moment)
+
+        def find() -> list[MeshLayer | LineLayer]:
+            field = self._field(path, moment)
+            return [*flow_layers(name, field, self.anatomy), cut(name, field, self.anatomy)]
+
+        return self.remembered(key, find)
 
     # -- messages for the page -----------------------------------------------------------------------------------------
 
@@ -194,15 +210,19 @@ class Live:
                 measures=sheets.device(device_title(deployment), measures),
             )
 
-    def flow_message(self) -> bytes:
-        """Return the wall's shear stress and the streamlines of every flow, on one scale."""
+    def flow_message(self, moment: int | None) -> bytes:
+        """Return wall shear stress, streamlines and a cut of every flow, on one scale: the mean, or one moment."""
         with LOCK:
-            layers: list[MeshLayer | LineLayer] = []
-            for name, path in self.flows().items():
-                layers += self._flow_layers(name, path)
-            if not layers:
+            paths = self.flows()
+            if not paths:
                 raise ReadError("No flow has been computed yet: run the step Flow.")
-            return message(layers, scales_of(layers), panes=list(self.flows()))
+            layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]
+            bare = self._field(next(iter(paths.values())), None)
+            most = _peak(bare)
+            of_scales = layers if moment is None or most is None else self._flow_layers(BARE, paths[BARE], most)
+            return message(
+                layers, _scales_about_the_sac(of_scales, self.anatomy), **_moments(bare, moment), panes=list(paths)
+            )
 
     def section(self, name: str | None, abscissa_mm: float) -> dict[str, Any]:
         """Return what a plane across the parent axis cuts: curves in the plane and diameters."""
@@ -235,6 +255,22 @@ def _views(anatomy: Anatomy) -> list[View]:
     return [view_of("profile", profile.axes, treated, 1.15), whole, *others]
 
 
+def _scales_about_the_sac(layers: Sequence[MeshLayer | LineLayer], anatomy: Anatomy) -> list[Scale]:
+    """The scales of the layers, as wide as what the flow without a device has about the sac, which it is all about."""
+    scales = list(scales_of(list(layers)))
+    if not anatomy.aneurysms:
+        return scales
+    tree = cKDTree(anatomy.aneurysms[0].sac.vertices_mm)
+    found = []
+    for scale in scales:
+        layer = next(layer for layer in layers if layer.scale == scale.id)
+        points_mm = layer.points_mm if isinstance(layer, LineLayer) else layer.surface.vertices_mm
+        near = layer.values[tree.query(points_mm, distance_upper_bound=BESIDE_SAC_MM)[0] < BESIDE_SAC_MM]
+        high = round_up(float(np.percentile(near, 98))) if len(near) and near.max() > 0 else scale.high
+        found.append(replace(scale, high=high))
+    return found
+
+
 def _axis(anatomy: Anatomy) -> dict[str, list[float]]:
     axis = anatomy.axis
     return {
@@ -244,8 +280,19 @@ def _axis(anatomy: Anatomy) -> dict[str, list[float]]:
     }
 
 
+def _peak(field: FlowField) -> int | None:
+    """The moment of the largest inflow; None for a steady flow."""
+    return max(range(len(field.phases)), key=lambda k: field.phases[k].inlet_mL_s) if field.phases else None
+
+
+def _moments(field: FlowField, moment: int | None) -> dict[str, Any]:
+    """Times of the moments there are, and the one shown."""
+    return {"times_s": [phase.time_s for phase in field.phases], "moment": moment if field.phases else None}
+
+
 def _kept(folder: Path, stage: str) -> Path | None:
-    return next(iter(sorted(folder.glob(f"{stage}-*.npz"))), None)
+    found = (path for path in sorted(folder.glob(f"{stage}-*.npz")) if not path.name.endswith(".running.npz"))
+    return next(found, None)
 
 
 def _said(opening: Opening) -> dict[str, Any]:

@@ -13,6 +13,8 @@ from vstent.study.ledger import Ledger
 from vstent.study.stages import find_anatomy
 
 MOST_PROCESSES: Final = 4
+WORTH_A_PROCESS: Final = 12
+"""So many sizes take longer than another process takes to start."""
 
 
 def rank_sizes(case: Case, progress: Progress) -> None:
@@ -32,7 +34,9 @@ def rank_sizes(case: Case, progress: Progress) -> None:
 
     progress("rank", 0.0, "")
     designs = [find_design(name) for name in settings.devices]
-    found = rank(anatomy, designs, jobs=min(os.cpu_count() or 1, MOST_PROCESSES), progress=told)
+    n_sizes = sum(len(design.sizes) for design in designs)
+    jobs = min(os.cpu_count() or 1, MOST_PROCESSES, 1 + n_sizes // WORTH_A_PROCESS)
+    found = rank(anatomy, designs, jobs=jobs, progress=told)
     rows = found.rows()
     content: dict[str, Any] = {
         "anatomy": case.state.anatomy,

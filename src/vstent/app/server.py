@@ -266,9 +266,9 @@ def _add_scenes(app: FastAPI, desk: Desk) -> None:
     def section(case_id: str, abscissa_mm: float, device: str | None = None) -> dict[str, Any]:
         return desk.live(desk.store.get(case_id)).section(device, abscissa_mm)
 
-    @app.get("/api/cases/{case_id}/flow", summary="Wall shear stress and streamlines, all on one scale (binary)")
-    def flow(case_id: str) -> Response:
-        return Response(desk.live(desk.store.get(case_id)).flow_message(), media_type=BINARY)
+    @app.get("/api/cases/{case_id}/flow", summary="Wall shear stress, streamlines and a cut, on one scale (binary)")
+    def flow(case_id: str, moment: Annotated[int | None, Query(ge=0)] = None) -> Response:
+        return Response(desk.live(desk.store.get(case_id)).flow_message(moment), media_type=BINARY)
 
     @app.get("/api/waveform", summary="The pulse of the internal carotid: flow over mean flow")
     def waveform() -> dict[str, Any]:

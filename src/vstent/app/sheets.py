@@ -54,13 +54,14 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
             cells += [after.text, format_change(change.before.value, after.value)] if after else ["–", "–"]
         rows.append(_row(change.before, cells, is_first=change.before.key in HEADLINES))
     rows.sort(key=lambda row: HEADLINES.index(row["key"]) if row["key"] in HEADLINES else len(HEADLINES))
-    return [{"title": "Blood flow", "devices": list(titles.values()), "rows": rows}] if rows else []
+    words = {"title": "Blood flow", "names": list(titles), "devices": list(titles.values())}
+    return [words | {"rows": rows}] if rows else []
 
 
 def _plain(title: str, quantities: list[Quantity], first: tuple[str, ...]) -> Sheet:
     rows = [_row(quantity, [quantity.text], is_first=quantity.key in first) for quantity in quantities]
     rows.sort(key=lambda row: first.index(row["key"]) if row["key"] in first else len(first))
-    return {"title": title, "devices": [], "rows": rows}
+    return {"title": title, "names": [], "devices": [], "rows": rows}
 
 
 def _row(quantity: Quantity, cells: list[str], *, is_first: bool) -> dict[str, Any]:

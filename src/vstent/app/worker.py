@@ -1,10 +1,14 @@
 """Worker: `python -m vstent.app.worker KIND FOLDER` does one job of a case and tells of it, a line of JSON each time.
 
-When the server that started it is gone, its next word falls on a closed pipe, which ends it.
+Its standard input closes when the server that started it is gone, however it went; it then ends with all its processes,
+so that the case folder is free when the server starts again.
 """
 
 import json
+import os
+import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +17,14 @@ from vstent.app.cases import Case, load
 from vstent.errors import VstentError
 from vstent.study import run
 from vstent.study.ledger import anatomy_key, hash_of
+
+
+def end_with_the_server() -> None:
+    """Wait until the server is gone, and end."""
+    sys.stdin.read()
+    if hasattr(os, "killpg"):
+        os.killpg(0, signal.SIGKILL)
+    os._exit(1)
 
 
 def tell(**told: Any) -> None:
@@ -61,6 +73,7 @@ JOBS: Final[dict[str, Callable[[Case], None]]] = {"anatomy": find_anatomy, "rank
 
 def main(kind: str, folder: Path) -> int:
     """Do a job; return the exit code."""
+    threading.Thread(target=end_with_the_server, daemon=True).start()
     try:
         JOBS[kind](load(folder.name, folder))
     except VstentError as error:

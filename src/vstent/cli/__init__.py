@@ -7,11 +7,11 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from vstent.cli import app, batch, demo, devices, flow, rank, restore, run, trace
+from vstent.cli import app, batch, demo, devices, export, flow, rank, restore, run, trace
 from vstent.cli.options import EPILOG
 from vstent.errors import InputError, VstentError
 
-COMMANDS: Final = (run, app, trace, restore, rank, batch, flow, demo, devices)
+COMMANDS: Final = (run, app, trace, restore, rank, batch, flow, export, demo, devices)
 """In the order of the help."""
 BAD_INPUT: Final = 2
 FAILED: Final = 1

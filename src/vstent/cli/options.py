@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 if TYPE_CHECKING:
     from vstent.flow.types import FlowSettings, Waveform
+    from vstent.uncertainty import Ranges
 
 EPILOG: Final = (
     "Research use only: not cleared for diagnosis or treatment. Lengths in mm, flow in SI; coordinates are LPS."
@@ -84,6 +85,7 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         metavar="CSV",
         help="follow a pulse: columns time in s and flow in any unit (the published one of the internal carotid)",
     )
+    flow.add_argument("--engine", default="lattice_boltzmann", metavar="NAME", help="a plug-in that computes the flow")
     flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
     return flow
 
@@ -106,6 +108,54 @@ def _jobs(text: str) -> int:
 def numbers(text: str) -> list[float]:
     """Read numbers parted by commas."""
     return _numbers(text, float)
+
+
+def add_uncertainty(parser: argparse.ArgumentParser) -> None:
+    """Add what is varied to tell how sure the results are."""
+    group = parser.add_argument_group("uncertainty")
+    group.add_argument("--uncertainty", type=int, metavar="N", help="deploy N times with what is not sure varied")
+    group.add_argument(
+        "--uncertain-flows",
+        type=int,
+        default=0,
+        metavar="M",
+        help="compute the flows of M of them too, before and after",
+    )
+    group.add_argument(
+        "--vary",
+        type=_cause,
+        action="append",
+        default=[],
+        metavar="CAUSE=RANGE",
+        help="how far to either side: threshold=MM (of all diameters; the scan's own band), landing=MM (1), "
+        "device=MM (0.1), inflow=FRACTION (0.2)",
+    )
+
+
+RANGES: Final = {
+    "threshold": "threshold_mm",
+    "landing": "landing_mm",
+    "device": "device_mm",
+    "inflow": "inflow_fraction",
+}
+"""Causes of uncertainty on the command line, and the fields that hold their ranges."""
+
+
+def _cause(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return RANGES[name], float(value)
+    except (KeyError, ValueError):
+        raise argparse.ArgumentTypeError(f"{text!r} is none of {'=, '.join(RANGES)}= with a number") from None
+
+
+def given_ranges(arguments: argparse.Namespace) -> "Ranges | None":
+    """Collect what is to be varied, and how far."""
+    if arguments.uncertainty is None:
+        return None
+    from vstent.uncertainty import Ranges
+
+    return Ranges(arguments.uncertainty, arguments.uncertain_flows, **dict(arguments.vary))
 
 
 def _numbers(text: str, kind: type, count: int | None = None) -> list[float]:
@@ -165,6 +215,7 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
         waveform=_waveform(arguments.pulsatile),
         outlets=arguments.outlets,
         cell_size_mm=arguments.cell_size,
+        engine=arguments.engine,
     )
 
 

@@ -15,6 +15,8 @@ from vstent.errors import InputError, VstentError
 
 ATTEMPTS: Final = 2
 """A case whose process dies is tried so often."""
+SPARE: Final = 2.0
+"""A job of a queue asks for so many times the memory foreseen: beyond it, it is killed."""
 SCHEDULER_S: Final = 20.0
 """A scheduler that does not answer for so long is lost."""
 
@@ -91,6 +93,8 @@ class DaskCluster(AbstractCrew):
 
     address: str
     """Of the scheduler, such as tcp://head:8786."""
+    work: Callable[[Task], None] = work
+    """What each worker does."""
 
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
         """Yield every task when its future has ended; a worker's death makes Dask give its task to another.
@@ -103,7 +107,7 @@ class DaskCluster(AbstractCrew):
             When the scheduler is lost: what was finished is kept.
         """
         with _client(self.address) as client:
-            futures = {client.submit(work, task, pure=False): number for number, task in enumerate(tasks)}
+            futures = {client.submit(self.work, task, pure=False): number for number, task in enumerate(tasks)}
             while futures:
                 _see_alive(client)
                 for future in [future for future in futures if future.done()]:
@@ -119,7 +123,7 @@ class Slurm(AbstractCrew):
     jobs: int
     """How many at once."""
     memory_MB: float
-    """What one needs."""
+    """What one case is foreseen to need."""
 
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
         """Yield every task when it has ended.
@@ -139,7 +143,7 @@ class Slurm(AbstractCrew):
             from dask_jobqueue import SLURMCluster
         except ImportError:
             raise _missing("dask-jobqueue") from None
-        return SLURMCluster(cores=1, processes=1, memory=f"{self.memory_MB:.0f}MB", job_name="vstent")
+        return SLURMCluster(cores=1, processes=1, memory=f"{SPARE * self.memory_MB:.0f}MB", job_name="vstent")
 
 
 def _missing(package: str) -> InputError:

@@ -65,8 +65,9 @@ def load_noun(path: Path, noun_type: type[Noun]) -> Noun:
         AttributeError,
         ImportError,
         EOFError,
+        NotImplementedError,
+        RuntimeError,
         MemoryError,
-        RecursionError,
         zipfile.BadZipFile,
         zlib.error,
     ):

@@ -21,7 +21,7 @@ from vstent.kernels.arrays import Floats
 
 MOST_VOXELS: Final = 1 << 31
 """A series of more voxels is none of a head, or its headers lie."""
-MOST_UNPACKED: Final = 1 << 30
+MOST_UNPACKED: Final = 1 << 29
 """Bytes that a packed (deflated) file may hold."""
 SPACING_TOLERANCE: Final = 0.02
 """Slices may lie this fraction of their distance off the regular grid."""

@@ -19,6 +19,8 @@ VOXEL_MM: Final = (0.01, 5.0)
 """Voxel edges that a scan of the head can have."""
 MOST_BYTES: Final = 1 << 32
 """A scan of more bytes is refused: it is none of a head, or its header lies."""
+LONGEST_LINE: Final = 1000
+"""Characters of a line of a header."""
 MOST_PACKED: Final = 1032
 """No packer of these formats makes one byte of more."""
 
@@ -90,6 +92,10 @@ def _plausible(image: Image, path: Path) -> Image:
         )
     if image.voxels.dtype.kind == "f" and not np.isfinite(image.voxels).all():
         raise ReadError(f"{path.name} has voxels that are not numbers; export it again with integers.")
+    if image.voxels.dtype.kind in "iu" and image.voxels.dtype.itemsize == 2:
+        middle = np.ravel(image.voxels[:, :, image.voxels.shape[2] // 2], order="F")
+        if SWAPPED_ROUGHNESS * _roughness(middle.byteswap()) < _roughness(middle):
+            raise ReadError(f"{path.name} has voxels whose bytes are in the other order; export it again.")
     return image
 
 
@@ -99,6 +105,8 @@ def _plausible(image: Image, path: Path) -> Image:
 def _read_itk(path: Path, kind: str, *, has_spacing: bool) -> Image:
     import SimpleITK
 
+    if kind in (".mha", ".mhd"):
+        _refuse_odd_meta(path)
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
     try:
@@ -123,6 +131,19 @@ def _read_itk(path: Path, kind: str, *, has_spacing: bool) -> Image:
     affine[:3, :3] = np.reshape(scan.GetDirection(), (3, 3)) * scan.GetSpacing()
     affine[:3, 3] = scan.GetOrigin()
     return Image(SimpleITK.GetArrayViewFromImage(scan).transpose(), affine)
+
+
+def _refuse_odd_meta(path: Path) -> None:
+    """Refuse a MetaImage header whose counts contradict each other: ITK crashes on those."""
+    with path.open("rb") as file:
+        head = file.read(65536).partition(b"ElementDataFile")[0]
+    pairs = [line.partition(b"=") for line in head.splitlines()]
+    values = {key.strip().lower(): value.split() for key, _, value in pairs}
+    n_axes = {b"2": 2, b"3": 3, b"4": 4}.get(b" ".join(values.get(b"ndims", [])), 0)
+    counts = {b"dimsize": n_axes, b"elementspacing": n_axes, b"transformmatrix": n_axes**2, b"offset": n_axes}
+    wrong = [key for key, n in counts.items() if key in values and len(values[key]) != n]
+    if len(values) < len(pairs) or n_axes == 0 or wrong or any(len(line) > LONGEST_LINE for line in head.splitlines()):
+        raise ReadError(f"{path.name} is damaged: its header contradicts itself; copy it again or export it anew.")
 
 
 def _refuse_untrue(path: Path, kind: str, reader: Any) -> None:
@@ -236,6 +257,8 @@ def _read_raw(
     return _plausible(Image(voxels.astype(kind.newbyteorder("="), copy=False), affine, notes=note), path)
 
 
+SWAPPED_ROUGHNESS: Final = 2.0
+"""Voxels so many times as rough as with their bytes swapped are in the wrong order; in the right one they are less."""
 LARGEST_VOXEL: Final = 8
 """Bytes of the largest kind of voxel."""
 

@@ -130,8 +130,11 @@ def _diagonal(surface: Surface) -> float:
 
 def hydraulic_diameter(surface: Surface) -> float:
     """Return 4 V / A of the capped surface in its own unit: the diameter, if it were one long tube."""
-    faces, _ = topology.oriented(surface.faces)
-    vertices, closed = triangles.cap(surface.vertices_mm, faces, triangles.boundary_loops(surface.vertices_mm, faces))
+    kept, same = topology.first_equals(surface.vertices_mm)
+    welded = same[surface.faces].astype(np.int32)
+    faces, _ = topology.oriented(welded[topology.sound_faces(welded)])
+    points = surface.vertices_mm[kept]
+    vertices, closed = triangles.cap(points, faces, triangles.boundary_loops(points, faces))
     return float(4 * abs(triangles.volume(vertices[closed])) / surface.area_mm2)
 
 

@@ -4,6 +4,7 @@ They are fast and know every dialect, but a damaged file can crash them, and us 
 memory there is. So a child reads the file and hands over bare arrays; when it dies, the file was damaged.
 """
 
+import errno
 import os
 import subprocess
 import sys
@@ -22,6 +23,8 @@ SECONDS: Final = 8.0
 SECONDS_PER_BYTE: Final = 1e-6
 MEMORY_BYTES: Final = 2_000_000_000
 MEMORY_PER_BYTE: Final = 40
+DISK_FULL: Final = 28
+"""Exit code where the arrays could not be written."""
 LEAST_USED: Final = 0.9
 """Part of the points of an OBJ file that belong to triangles; they come first, so a file that breaks off has more."""
 
@@ -41,7 +44,11 @@ def read_apart(path: Path) -> tuple[Floats, Ints] | None:
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
             )
-        except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
+        except subprocess.CalledProcessError as died:
+            if died.returncode == DISK_FULL:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), folder) from None
+            return None
+        except subprocess.TimeoutExpired:
             return None
         with np.load(result) as arrays:
             return arrays["vertices"], arrays["faces"]
@@ -138,7 +145,10 @@ def main(path: Path, result: Path) -> int:
         return 1
     if suffix(path) == ".obj" and len(np.unique(faces)) < LEAST_USED * len(vertices):
         return 1
-    np.savez(result, vertices=vertices.astype(np.float64), faces=faces.astype(np.int32))
+    try:
+        np.savez(result, vertices=vertices.astype(np.float64), faces=faces.astype(np.int32))
+    except OSError:
+        return DISK_FULL
     return 0
 
 

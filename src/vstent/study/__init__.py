@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from vstent.device import find_design
+from vstent.flow.convergence import Refinement
 from vstent.io import writers
 from vstent.measure import morphology
 from vstent.study.folder import CACHE, claiming
 from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
 from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
-from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all
+from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all, refine, vary_all
 from vstent.study.types import CaseResult, Placing, Progress, Settings
 from vstent.vessel import Anatomy, Vessel
 
@@ -28,6 +29,7 @@ __all__ = [
     "Placing",
     "Progress",
     "Settings",
+    "refine_flow",
     "restore_vessel",
     "run",
     "trace_vessel",
@@ -71,8 +73,11 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
         with ledger.stage(f"struts {name}") as tell:
             tell(write_stent(out / "stents" / name, deployment))
     fields = compute_flows(out, anatomy, deployments, settings, ledger, source)
+    varied = vary_all(anatomy, deployments, settings, ledger, source)
     with ledger.stage("measure"):
         metrics = measure_all(anatomy, deployments, fields)
+        for name, spread in varied.items():
+            metrics["stents"][name]["uncertainty"] = spread
         writers.write_json(out / "metrics.json", metrics)
     provenance = _provenance(path, source, settings, ledger)
     writers.write_json(out / "run.json", provenance)
@@ -128,6 +133,33 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
     write_anatomy(out, anatomy)
     writers.write_json(out / "morphology.json", measures)
     return anatomy, measures
+
+
+@claiming
+def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Refinement, Refinement]:
+    """Compute the flow without a device on three grids and with three time steps; write ``convergence.json``.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : what is given; the cell size, given or proposed, is the finest.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    FlowError
+        A flow could not be computed.
+    """
+    ledger = Ledger(out / CACHE, progress)
+    source = hash_of(path)
+    anatomy = find_anatomy(path, source, settings, ledger)
+    ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
+    found = refine(anatomy, settings, ledger)
+    writers.write_json(out / "convergence.json", {one.name: asdict(one) for one in found})
+    return found
 
 
 def _provenance(path: Path, source: str, settings: Settings, ledger: Ledger) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,6 +11,7 @@ import numpy as np
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_size
 from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, ostium, simulate_case
+from vstent.flow.convergence import Refinement, convergence
 from vstent.flow.cost import estimate, refuse_too_large
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
@@ -26,6 +28,7 @@ from vstent.study.outputs import write_field
 from vstent.study.types import Placing, Point, Settings
 from vstent.trace import trace
 from vstent.trim import trim
+from vstent.uncertainty import Uncertainty, vary
 from vstent.vessel import Anatomy, Vessel
 
 BARE: Final = "bare"
@@ -129,12 +132,54 @@ def compute_flows(
     return fields
 
 
+def refine(anatomy: Anatomy, settings: Settings, ledger: Ledger) -> tuple[Refinement, Refinement]:
+    """Compute the flow without a device on three grids and with three time steps."""
+    flow = settings.flow or FlowSettings()
+    _plan(anatomy, flow, ledger)
+    with ledger.stage("convergence") as tell:
+        done: list[str] = []
+
+        def told(sentence: str) -> None:
+            done.append(sentence)
+            ledger.progress("convergence", len(done) / 6, sentence)
+
+        found = convergence(flow_case(anatomy, None, flow), told=told)
+        tell(" ".join(done))
+    return found
+
+
 def _plan(anatomy: Anatomy, settings: FlowSettings, ledger: Ledger) -> None:
     """Say what a flow will cost; refuse one that does not fit in the memory."""
     with ledger.stage("plan flow") as tell:
         case = flow_case(anatomy, None, settings)
         refuse_too_large(case)
         tell(str(estimate(case)))
+
+
+def vary_all(
+    anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
+) -> dict[str, dict[str, Any]]:
+    """Vary what is not sure about every deployment; return the metrics of each, none where it was not asked for."""
+    if settings.uncertainty is None:
+        return {}
+    flow = settings.flow if settings.uncertainty.flow_samples else None
+    found = {}
+    for name, deployment in deployments.items():
+        stage = f"vary {name}"
+        key = key_of(anatomy_key(source, settings), settings.uncertainty, flow, name, settings.placing(name))
+        varied = ledger.recall(stage, key, Uncertainty)
+        if varied is None:
+            with ledger.stage(stage) as tell:
+                told = partial(_tell_count, ledger, stage)
+                varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told)
+                tell(f"{len(varied.points)} deployments, {varied.n_failed} of them did not fit.")
+            ledger.keep(stage, key, varied)
+        found[name] = varied.metrics()
+    return found
+
+
+def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
+    ledger.progress(stage, 0.99 * done / total, f"{done} of {total}")
 
 
 def measure_all(

@@ -5,6 +5,7 @@ from typing import Any, Literal, Protocol
 
 from vstent.flow import FlowField, FlowSettings
 from vstent.stent import Deployment
+from vstent.uncertainty import Ranges
 from vstent.vessel import Anatomy
 
 Point = tuple[float, float, float]
@@ -52,6 +53,9 @@ class Settings:
     """How to compute the flow; None: not at all."""
     placings: dict[str, Placing] = field(default_factory=dict)
     """Sizes and places of single devices, by name, instead of those above that hold for all."""
+
+    uncertainty: Ranges | None = None
+    """What of the deployment is varied, and how far; None: nothing."""
 
     def placing(self, device: str) -> Placing:
         """Return what is given of the size and the place of a device."""

@@ -1,7 +1,7 @@
 """OpenFOAM: a flow as a case folder that its users know, and its results read back.
 
-`foam_case` states a `FlowCase` as text files in OpenFOAM's own syntax; nothing here touches the disk but `program` (which
-runs OpenFOAM) and `results` (which reads what it wrote).
+`foam_case` states a `FlowCase` as text files in OpenFOAM's own syntax. Only `folder` writes them, `program` runs
+OpenFOAM there, and `results` and `bridge` read what it wrote.
 """
 
 from vstent.flow.openfoam.case import FoamCase, foam_case

@@ -12,7 +12,7 @@ from vstent.kernels import curves
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
 
-PROFILE_POINTS: Final = 41
+PROFILE_POINTS: Final = 81
 """Points across the inlet at which its profile is written."""
 TABLE_POINTS: Final = 100
 """Times of a cycle in a table of flow."""
@@ -23,7 +23,7 @@ def velocity(case: FlowCase, setup: FoamSetup, walls: list[str]) -> str:
     patches: dict[str, Any] = {name: {"type": "noSlip"} for name in walls}
     patches["inlet"] = _inlet(case, setup)
     for k, outlet in enumerate(case.vessel.outlets):
-        patches[outlet.role] = _outlet_velocity(case, k)
+        patches[outlet.role] = _outlet_velocity(case, setup, k)
     return _field("U", "volVectorField", "[0 1 -1 0 0 0 0]", "(0 0 0)", patches)
 
 
@@ -31,8 +31,8 @@ def pressure(case: FlowCase, walls: list[str]) -> str:
     """0/p."""
     patches: dict[str, Any] = {name: {"type": "zeroGradient"} for name in (*walls, "inlet")}
     for k, outlet in enumerate(case.vessel.outlets):
-        is_free = case.settings.outlets == "zero_pressure" or k == 0
-        patches[outlet.role] = {"type": "fixedValue", "value": "uniform 0"} if is_free else {"type": "zeroGradient"}
+        is_held = k in _held_shares(case)
+        patches[outlet.role] = {"type": "zeroGradient"} if is_held else {"type": "fixedValue", "value": "uniform 0"}
     return _field("p", "volScalarField", "[0 2 -2 0 0 0 0]", "0", patches)
 
 
@@ -41,54 +41,61 @@ def _field(name: str, kind: str, dimensions: str, inside: str, patches: dict[str
     return foam_file(name, entries, kind=kind)
 
 
-def flow_table(case: FlowCase, share: float = 1.0) -> str:
-    """Flow in m3/s, a share of the inlet's, as OpenFOAM's function of time: constant, or one cycle repeated."""
-    flow_m3_s = share * case.inflow_mL_s * M3_PER_ML
+def tables(case: FlowCase) -> dict[str, str]:
+    """Files of functions of time that the boundary conditions name: one cycle, time in s."""
+    if case.settings.waveform is None:
+        return {}
+    shares = {"inlet": 1.0 / case.inflow_mL_s / M3_PER_ML}  # the inlet's profile is that of the mean flow
+    shares |= {case.vessel.outlets[k].role: share for k, share in _held_shares(case).items()}
+    return {f"flow_{name}": _cycle(case, share) for name, share in shares.items()}
+
+
+def _held_shares(case: FlowCase) -> dict[int, float]:
+    """Part of the flow that is set at an outlet, by its number; the first always takes what is left."""
+    if case.settings.outlets == "zero_pressure":
+        return {}
+    cubes = np.array([outlet.diameter_mm**3 for outlet in case.vessel.outlets])
+    return {k: float(cubes[k] / cubes.sum()) for k in range(1, len(cubes))}
+
+
+def _cycle(case: FlowCase, share: float) -> str:
+    """A share of the flow in m3/s over one cycle, as a list of pairs."""
     waveform = case.settings.waveform
-    if waveform is None:
-        return f"constant {flow_m3_s:.9g}"
-    return _cycle(waveform.period_s, flow_m3_s * waveform.factor(_table_times(waveform.period_s)))
+    assert waveform is not None
+    time_s = np.linspace(0.0, waveform.period_s, TABLE_POINTS + 1)
+    flow_m3_s = share * case.inflow_mL_s * M3_PER_ML * waveform.factor(time_s)
+    return "(" + " ".join(f"({t:.9g} {q:.9g})" for t, q in zip(time_s, flow_m3_s, strict=True)) + ")\n"
 
 
-def _table_times(period_s: float) -> Floats:
-    return np.linspace(0.0, period_s, TABLE_POINTS + 1)
-
-
-def _cycle(period_s: float, values: Floats) -> str:
-    pairs = zip(_table_times(period_s), values, strict=True)
-    listed = "(" + " ".join(f"({t:.9g} {value:.9g})" for t, value in pairs) + ")"
-    return f"table; outOfBounds repeat; values {listed}"
-
-
-def _function(value: str) -> Any:
-    """A function of time as an entry: ``constant q``, or a sub-dictionary with its table."""
-    if not value.startswith("table"):
-        return value
-    return {"type": value.partition(";")[0]} | dict(
-        part.strip().split(" ", 1) for part in value.split(";")[1:]
-    )
+def _over_time(case: FlowCase, setup: FoamSetup, key: str, patch: str, share: float) -> dict[str, Any]:
+    """Entry of a share of the flow in m3/s: constant, or a cycle that repeats."""
+    if case.settings.waveform is None:
+        return {key: f"constant {share * case.inflow_mL_s * M3_PER_ML:.9g}"}
+    if setup.flavour == "org":
+        return {key: {"type": "table", "values": _cycle(case, share).strip(), "outOfBounds": "repeat"}}
+    # 1912 takes a table apart from its options only from a file.
+    return {key: "tableFile", f"{key}Coeffs": {"file": f'"<constant>/flow_{patch}"', "outOfBounds": "repeat"}}
 
 
 def _inlet(case: FlowCase, setup: FoamSetup) -> dict[str, Any]:
     """The developed profile of the inlet's own shape (.com), or of its distance to the wall (.org), times the flow."""
     start = {"value": "uniform (0 0 0)"}
     if setup.flavour == "org":
-        flow = {"volumetricFlowRate": _function(flow_table(case)), "profile": "laminarBL"}
-        return {"type": "flowRateInletVelocity"} | flow | start
-    mapped = {"type": "timeVaryingMappedFixedValue", "setAverage": True, "offset": "(0 0 0)"} | start
-    waveform = case.settings.waveform
-    if waveform is None:
+        flow = _over_time(case, setup, "volumetricFlowRate", "inlet", 1.0)
+        return {"type": "flowRateInletVelocity", **flow, "profile": "laminarBL"} | start
+    # By the nearest point: OpenFOAM's own interpolation in the plane fails on sections of a few millimetres.
+    mapped = {"type": "timeVaryingMappedFixedValue", "mapMethod": "nearest", "setAverage": True} | start
+    if case.settings.waveform is None:
         return mapped
-    scale = _function(_cycle(waveform.period_s, waveform.factor(_table_times(waveform.period_s))))
-    return {"type": "scaledFixedValue", "scale": scale, "refValue": mapped} | start
+    return {"type": "scaledFixedValue", **_over_time(case, setup, "scale", "inlet", 1.0), "refValue": mapped} | start
 
 
-def _outlet_velocity(case: FlowCase, k: int) -> dict[str, Any]:
-    if case.settings.outlets == "zero_pressure" or k == 0:
+def _outlet_velocity(case: FlowCase, setup: FoamSetup, k: int) -> dict[str, Any]:
+    share = _held_shares(case).get(k)
+    if share is None:
         return {"type": "inletOutlet", "inletValue": "uniform (0 0 0)", "value": "uniform (0 0 0)"}
-    cubes = np.array([outlet.diameter_mm**3 for outlet in case.vessel.outlets])
-    flow = _function(flow_table(case, float(cubes[k] / cubes.sum())))
-    return {"type": "flowRateOutletVelocity", "volumetricFlowRate": flow, "value": "uniform (0 0 0)"}
+    flow = _over_time(case, setup, "volumetricFlowRate", case.vessel.outlets[k].role, share)
+    return {"type": "flowRateOutletVelocity", **flow, "value": "uniform (0 0 0)"}
 
 
 def inlet_profile(case: FlowCase, section_mm: Floats) -> dict[str, str]:

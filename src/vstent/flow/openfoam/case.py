@@ -78,6 +78,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
     folder = "constant/geometry" if setup.flavour == "org" else "constant/triSurface"
     files |= {f"{folder}/{name}.stl": text for name, text in _surfaces(case, setup, patches).items()}
     if setup.flavour == "com":
+        files |= {f"constant/{name}": text for name, text in boundary.tables(case).items()}
         profile = boundary.inlet_profile(case, sections[0])
         files |= {f"constant/boundaryData/inlet/{name}": text for name, text in profile.items()}
     return FoamCase(files, ("Allrun", "Allclean", "submit.slurm"), application)
@@ -99,7 +100,7 @@ def _system(
         "system/controlDict": control.control(case, setup, step_s, walls=walls, has_neck=case.ostium is not None),
         "system/fvSchemes": control.schemes(is_steady=is_steady),
         "system/fvSolution": control.solution(),
-        "system/decomposeParDict": control.decomposition(setup),
+        "system/decomposeParDict": control.decomposition(setup, np.ptp(patches[0].surface.vertices_mm, axis=0)),
         "system/blockMeshDict": mesh.block_mesh(patches[0].surface.vertices_mm, setup.cell_size_mm),
     }
 
@@ -122,7 +123,7 @@ def _inside_mm(case: FlowCase, sections: tuple[Floats, ...]) -> Floats:
 
 
 def struts_near(struts: Surface, ostium: Surface, reach_mm: float) -> Surface:
-    """Return the solids that come nearer than `reach_mm` to the ostium, each whole: only they change what enters the sac.
+    """Return the solids that come nearer to the ostium than `reach_mm`, each whole: only they change what enters.
 
     Parameters
     ----------

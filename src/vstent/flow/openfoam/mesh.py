@@ -47,7 +47,7 @@ def feature_extract(setup: FoamSetup) -> tuple[str, str]:
 
 
 def snappy(setup: FoamSetup, patches: dict[str, str], inside_mm: Floats, *, has_neck: bool) -> str:
-    """snappyHexMeshDict.
+    """SnappyHexMeshDict.
 
     Parameters
     ----------
@@ -81,13 +81,11 @@ def _geometry(setup: FoamSetup, patches: dict[str, str], has_neck: bool) -> dict
     if has_neck:
         result[NECK] = surface(NECK)
     if setup.struts is not None:
-        result[STRUTS] = surface(STRUTS)
+        result[STRUTS] = surface(STRUTS) | {"regions": {STRUTS: {"name": STRUTS}}}
     return result
 
 
-def _castellated(
-    setup: FoamSetup, patches: dict[str, str], inside_mm: Floats, has_neck: bool
-) -> dict[str, Any]:
+def _castellated(setup: FoamSetup, patches: dict[str, str], inside_mm: Floats, has_neck: bool) -> dict[str, Any]:
     level = (BASE_LEVEL, BASE_LEVEL)
     regions = {name: {"level": level, "patchInfo": {"type": kind}} for name, kind in patches.items()}
     surfaces: dict[str, Any] = {LUMEN: {"level": level, "regions": regions}}

@@ -64,7 +64,7 @@ def named_patches(case: FlowCase) -> tuple[tuple[Patch, ...], tuple[Floats, ...]
 
 
 def stl_text(solids: dict[str, Floats], scale: float) -> str:
-    """Return named solids, each the corners (f, 3, 3) of its faces, as one ASCII STL; lengths are multiplied by `scale`."""
+    """Return named solids, each the corners (f, 3, 3) of its faces, as one ASCII STL; lengths times `scale`."""
     return "".join(_solid(name, corners * scale) for name, corners in solids.items())
 
 

@@ -124,6 +124,6 @@ def _divergence(said: str) -> str:
         return f"the time step is too long (Courant number {courant[-1]:.0f}); shorten it or take a smaller cell size"
     times = re.findall(r"^Time = (\S+)", said, re.MULTILINE)
     return (
-        f"at {times[-1] if times else 'the start'}: a cell of the mesh is too flat or blood rushes back through an outlet; "
-        "change the cell size a little, take fewer layers, or lengthen the outlets"
+        f"at {times[-1] if times else 'the start'}: a cell of the mesh is too flat or blood rushes back through an "
+        "outlet; change the cell size a little, take fewer layers, or lengthen the outlets"
     )

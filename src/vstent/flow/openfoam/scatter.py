@@ -17,16 +17,16 @@ BLOCK: Final = 50_000
 def linear_fits(sources: Floats, targets: Floats) -> csr_matrix:
     """Matrix (t, s) that takes values at sources (s, 3) to targets (t, 3): exact for linear functions.
 
-    Moving least squares (Lancaster and Salkauskas 1981, Math. Comput. 37, 141) over the nearest sources. Where these lie
-    on a plane, the slope across it is taken for zero.
+    Moving least squares (Lancaster and Salkauskas 1981, Math. Comput. 37, 141) over the nearest sources. Where these
+    lie on a plane, the slope across it is taken for zero.
     """
     count = min(NEIGHBOURS, len(sources))
     tree = cKDTree(sources)
     weights, columns = [], []
-    for start in range(0, len(targets), BLOCK):
+    for start in range(0, max(len(targets), 1), BLOCK):
         block = targets[start : start + BLOCK]
         distance, near = tree.query(block, k=count)
-        weights.append(_fit(sources[near] - block[:, None], distance))
+        weights.append(_fit(sources[near] - block[:, None], np.asarray(distance)))
         columns.append(near)
     weight, column = np.concatenate(weights), np.concatenate(columns)
     starts = np.arange(len(targets) + 1) * count
@@ -50,7 +50,7 @@ def near_means(sources: Floats, targets: Floats, reach: float) -> csr_matrix:
     """Matrix (t, s) of inverse-distance means over the four nearest sources; points (.., d) of any dimension."""
     count = min(4, len(sources))
     distance, near = cKDTree(sources).query(targets, k=count)
-    weight = 1 / (distance.reshape(-1, count) ** 2 + (0.1 * reach) ** 2)
+    weight = 1 / (np.asarray(distance).reshape(-1, count) ** 2 + (0.1 * reach) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
     starts = np.arange(len(targets) + 1) * count
     return csr_matrix((weight.ravel(), near.ravel(), starts), shape=(len(targets), len(sources)))
