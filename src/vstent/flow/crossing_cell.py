@@ -1,8 +1,8 @@
 """Flow through a periodic cell of resolved wires: what the screen's law is calibrated on.
 
 The cell repeats in all three directions. Its wires are straight cylinders, solid grid cells with the exact place of
-their wall on every link; a body force drives the blood through them, as a pressure gradient would. What the wires take is
-known without looking at their surface: in steady flow it is the gradient times the cell's volume.
+their wall on every link; a body force drives the blood through them, as a pressure gradient would. What the wires take
+of it is known without looking at their surface: in steady flow it is the gradient times the cell's volume.
 """
 
 from dataclasses import dataclass
