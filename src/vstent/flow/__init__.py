@@ -2,16 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
+from vstent import plugins
 from vstent.flow import sampling
 from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
-from vstent.flow.engines import Bookmark, Progress, Saved, run
+from vstent.flow.engines import AbstractEngine, Bookmark, Progress, Saved, run
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
 from vstent.flow.screen import screen
 from vstent.flow.streamlines import Streamlines, streamlines
-from vstent.flow.types import Blood, FlowCase, FlowField, FlowSettings, Screen
+from vstent.flow.types import LATTICE, Blood, FlowCase, FlowField, FlowSettings, Screen
 from vstent.stent import Stent
 from vstent.vessel import Anatomy
 
@@ -173,11 +174,20 @@ def _run(
     progress: OnProgress | None,
     bookmark: Bookmark | None,
 ) -> FlowField:
+    engine = _engine(case.settings)
+    return run(engine(cell_size_mm), case, start=start, progress=progress, bookmark=bookmark)
+
+
+def _engine(settings: FlowSettings) -> Callable[[float], AbstractEngine[Any]]:
     from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
     from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
 
-    engine = LatticeBoltzmann if case.settings.waveform is None else PulsatileLatticeBoltzmann
-    return run(engine(cell_size_mm), case, start=start, progress=progress, bookmark=bookmark)
+    if settings.engine != LATTICE:
+        found: Callable[[float], AbstractEngine[Any]] = plugins.load(
+            "vstent.engines", settings.engine, built_in=LATTICE
+        )
+        return found
+    return LatticeBoltzmann if settings.waveform is None else PulsatileLatticeBoltzmann
 
 
 def _stage(progress: OnProgress | None, begin: float, end: float) -> OnProgress | None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,9 +25,10 @@ from vstent.stent import Deployment, Landing
 from vstent.study.checkpoint import FlowCheckpoint
 from vstent.study.ledger import Ledger, anatomy_key, key_of
 from vstent.study.outputs import write_field
-from vstent.study.types import Point, Settings
+from vstent.study.types import Placing, Point, Settings
 from vstent.trace import trace
 from vstent.trim import trim
+from vstent.uncertainty import Uncertainty, vary
 from vstent.vessel import Anatomy, Vessel
 
 BARE: Final = "bare"
@@ -77,24 +79,26 @@ def deploy_all(
     deployments = {}
     for name, design in designs.items():
         with ledger.stage(f"deploy {name}") as tell:
-            deployments[name] = _deploy(design, anatomy, settings)
+            deployments[name] = deploy_one(design, anatomy, settings.placing(name))
             tell(deployments[name].advice)
     return deployments
 
 
-def _deploy(design: Design, anatomy: Anatomy, settings: Settings) -> Deployment:
-    landing = None if settings.center_mm is None else Landing(settings.center_mm)
-    return deploy(design, anatomy, size=_size(design, anatomy, settings), landing=landing)
+def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
+    """Deploy a device in the size and at the place that are given, or proposed where they are not."""
+    landing = None if placing.center_mm is None else Landing(placing.center_mm)
+    return deploy(design, anatomy, size=size_of(design, anatomy, placing), landing=landing)
 
 
-def _size(design: Design, anatomy: Anatomy, settings: Settings) -> Size:
-    if settings.diameter_mm is None and settings.length_mm is None:
-        return propose_size(design, anatomy)
+def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
+    """Return the size given; what of it is not given is as proposed."""
     proposed = propose_size(design, anatomy)
+    if placing.diameter_mm is None and placing.length_mm is None:
+        return proposed
     return find_size(
         design,
-        diameter_mm=settings.diameter_mm or proposed.diameter_mm,
-        length_mm=settings.length_mm or proposed.length_mm,
+        diameter_mm=placing.diameter_mm or proposed.diameter_mm,
+        length_mm=placing.length_mm or proposed.length_mm,
     )
 
 
@@ -113,8 +117,8 @@ def compute_flows(
     _plan(anatomy, settings.flow, ledger)
     for name in (BARE, *deployments):
         stent = deployments[name].stent if name in deployments else None
-        placing = (name, settings.diameter_mm, settings.length_mm, settings.center_mm) if stent else BARE
-        stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, placing)
+        placing = settings.placing(name) if stent else None
+        stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, placing)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
             with ledger.stage(stage) as tell:
@@ -150,6 +154,32 @@ def _plan(anatomy: Anatomy, settings: FlowSettings, ledger: Ledger) -> None:
         case = flow_case(anatomy, None, settings)
         refuse_too_large(case)
         tell(str(estimate(case)))
+
+
+def vary_all(
+    anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
+) -> dict[str, dict[str, Any]]:
+    """Vary what is not sure about every deployment; return the metrics of each, none where it was not asked for."""
+    if settings.uncertainty is None:
+        return {}
+    flow = settings.flow if settings.uncertainty.flow_samples else None
+    found = {}
+    for name, deployment in deployments.items():
+        stage = f"vary {name}"
+        key = key_of(anatomy_key(source, settings), settings.uncertainty, flow, name, settings.placing(name))
+        varied = ledger.recall(stage, key, Uncertainty)
+        if varied is None:
+            with ledger.stage(stage) as tell:
+                told = partial(_tell_count, ledger, stage)
+                varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told)
+                tell(f"{len(varied.points)} deployments, {varied.n_failed} of them did not fit.")
+            ledger.keep(stage, key, varied)
+        found[name] = varied.metrics()
+    return found
+
+
+def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
+    ledger.progress(stage, 0.99 * done / total, f"{done} of {total}")
 
 
 def measure_all(
