@@ -201,7 +201,7 @@ class _Grid:
         nothing: tuple[NDArray[np.int32], NDArray[np.float32]] = np.zeros(0, np.int32), np.zeros(0, np.float32)
         no_screen = np.zeros(len(self._length) + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
         limit = np.full(len(self._length), np.inf, np.float32)
-        relaxation = np.float32(RELAXATION_STEPS), limit, np.float32(ODD_RATE)
+        relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
             for address, is_even in ((self._even, True), (self._odd, False)):
