@@ -13,6 +13,7 @@ from vstent.device import Design, Size, find_size
 from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, ostium, simulate_case
 from vstent.flow.convergence import Refinement, convergence
 from vstent.flow.cost import estimate, refuse_too_large
+from vstent.flow.types import LATTICE
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
@@ -114,13 +115,14 @@ def compute_flows(
     if settings.flow is None:
         return {}
     fields: dict[str, FlowField] = {}
-    _plan(anatomy, settings.flow, ledger)
     for name in (BARE, *deployments):
         stent = deployments[name].stent if name in deployments else None
         placing = settings.placing(name) if stent else None
         stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, placing)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
+            if name == BARE and settings.flow.engine == LATTICE:
+                _plan(anatomy, settings.flow, ledger)
             with ledger.stage(stage) as tell:
                 case = flow_case(anatomy, stent, settings.flow)
                 begun = FlowCheckpoint(ledger.folder, stage, key)
