@@ -16,7 +16,7 @@ from vstent.flow.openfoam.case import struts_near
 from vstent.flow.openfoam.folder import write
 from vstent.io import writers
 from vstent.io.archive import load_noun
-from vstent.io.surfaces import read_surface
+from vstent.io.vtk_child import read_apart
 from vstent.stent import Deployment
 from vstent.struts import struts
 from vstent.study.ledger import Ledger, hash_of
@@ -125,8 +125,9 @@ def _struts(path: Path, case: FlowCase, anatomy: Anatomy, settings: Settings, le
         raise InputError("struts are meshed over the neck, and this vessel has no sac: leave --device away")
     name = settings.devices[0]
     file = path / "stents" / name / "struts.stl"
-    if file.exists():
-        return struts_near(read_surface(file, units="mm")[0], case.ostium, STRUT_REACH_MM)
+    solids = read_apart(file) if file.exists() else None
+    if solids is not None:
+        return struts_near(Surface(*solids), case.ostium, STRUT_REACH_MM)
     deployments: dict[str, Deployment] = deploy_all({name: find_design(name)}, anatomy, settings, ledger)
     return struts_near(struts(deployments[name].stent), case.ostium, STRUT_REACH_MM)
 

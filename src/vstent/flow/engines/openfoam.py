@@ -27,7 +27,7 @@ from vstent.flow.types import FlowCase, FlowField, Phase
 from vstent.kernels.arrays import Floats, Ints
 from vstent.surface import Surface
 
-CHECK_ITERATIONS: Final = 20
+CHECK_ITERATIONS: Final = 50
 """Iterations of a steady flow between checks."""
 CHECKS_HELD: Final = 3
 """Checks at which the inflow is corrected for the inlet's meshed area."""
