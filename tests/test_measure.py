@@ -68,6 +68,8 @@ def test_the_morphology_of_a_cut_sphere():
         "sac_height_mm": r + h,
         "sac_max_height_mm": r + h,
         "sac_max_diameter_mm": 2 * r,
+        "sac_plane_volume_mm3": np.pi * (r + h) ** 2 * (3 * r - (r + h)) / 3,
+        "neck_plane_area_mm2": np.pi * neck_mm**2,
         "neck_area_mm2": np.pi * neck_mm**2,
         "neck_surface_area_mm2": np.pi * neck_mm**2,
         "neck_perimeter_mm": 2 * np.pi * neck_mm,
@@ -82,6 +84,30 @@ def test_the_morphology_of_a_cut_sphere():
     }
     assert found.keys() == expected.keys()
     assert found == pytest.approx(expected, rel=2e-3, abs=1e-9)
+
+
+def test_a_plane_cuts_off_what_hangs_below_the_neck_plane():
+    r, h, z = 3.0, 2.0, 0.8
+    sac = spherical_sac(r, h)
+    rim_mm = sac.neck_mm * np.sqrt((r**2 - (h - z) ** 2) / (r**2 - h**2)) * [1, 1, 0] + [0, 0, z]
+    found = morphology(replace(tube(line(32), 1.9), aneurysms=(replace(sac, neck_mm=rim_mm),)))
+    height = r + h - z
+    assert found["sac_plane_volume_mm3"] == pytest.approx(np.pi * height**2 * (3 * r - height) / 3, rel=2e-3)
+    assert found["neck_plane_area_mm2"] == pytest.approx(np.pi * (r**2 - (h - z) ** 2), rel=2e-3)
+    assert found["sac_volume_mm3"] == pytest.approx(np.pi * (r + h) ** 2 * (3 * r - (r + h)) / 3, rel=2e-3)
+
+
+def test_every_further_sac_is_measured_beside_its_own_neck():
+    artery_of_sacs = tube(line(60), np.linspace(2, 1.4, 301))
+    large = replace(spherical_sac(3.0, 2.0), proximal_abscissa_mm=13.0, distal_abscissa_mm=17.0)
+    small = replace(spherical_sac(2.0, 1.0), proximal_abscissa_mm=43.0, distal_abscissa_mm=47.0)
+    both = morphology(replace(artery_of_sacs, aneurysms=(large, small)))
+    alone = morphology(replace(artery_of_sacs, aneurysms=(small,)))
+    second = both.pop("sac_2")
+    assert both == morphology(replace(artery_of_sacs, aneurysms=(large,)))
+    assert second == {key: alone[key] for key in second}
+    assert second["size_ratio"] == pytest.approx(3.0 / (4 - 1.2 * 45 / 60), rel=2e-3)
+    assert {"sac_volume_mm3", "neck_area_mm2", "parent_distal_diameter_mm"} <= second.keys()
 
 
 def test_an_oval_neck_has_its_two_diameters():

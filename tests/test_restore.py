@@ -1,81 +1,36 @@
 """The parent artery under a sac of known shape."""
 
-from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+from scipy.special import ndtr
 
+from sac_truth import GLUED, X, anatomy_of, relative_errors, scanned_anatomy_of
 from vstent import phantoms
 from vstent.errors import InputError
 from vstent.kernels import curves
 from vstent.measure import morphology
-from vstent.phantoms import Phantom, Scanner, torus_arc, tube, with_bleb, with_branch, with_sac
+from vstent.phantoms import tube, with_sac
 from vstent.repair import repair
 from vstent.restore import restore
+from vstent.restore.neck import Flank, unblurred
 from vstent.restore.sac import _is_island
-from vstent.segment import segment
 from vstent.surface import Surface
 from vstent.trace import trace
 from vstent.trim import trim
 from vstent.vessel import Anatomy, Vessel
 
-X = np.array([1.0, 0.0, 0.0])
-PHANTOMS: dict[str, Callable[[], Phantom]] = {
-    "straight": lambda: with_sac(tube(length_mm=40), abscissa_mm=20),
-    "tapered": lambda: with_sac(tube(length_mm=40, radius_mm=2.3, end_radius_mm=1.6), abscissa_mm=20),
-    "outside of a bend": lambda: with_sac(torus_arc(bend_radius_mm=9.0), abscissa_mm=14),
-    "inside of a bend": lambda: with_sac(torus_arc(bend_radius_mm=9.0), abscissa_mm=14, direction=_inside(14 / 9)),
-    "wide on the inside of a bend": lambda: with_sac(
-        torus_arc(bend_radius_mm=9.0), abscissa_mm=14, neck_mm=6.8, direction=_inside(14 / 9)
-    ),
-    "beside a branch": lambda: with_branch(
-        with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), abscissa_mm=24, direction=np.array([1.0, 0.3, 0.5])
-    ),
-    "touching a branch": lambda: with_branch(
-        with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), abscissa_mm=24.5, direction=X
-    ),
-    "neck of 2 diameters": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=10, neck_mm=8),
-    "sac of 3 diameters": lambda: with_sac(tube(length_mm=44), abscissa_mm=22, width_mm=12, neck_mm=5),
-    "half a sphere": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=5.6, neck_mm=5.5),
-    "tall": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=5, neck_mm=3, elongation=1.8),
-    "small": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=4, neck_mm=2.8),
-    "blebs": lambda: with_bleb(
-        with_bleb(with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), direction=np.array([0.2, 1.0, 0.3])),
-        direction=np.array([1.0, -0.3, 0.9]),
-        radius_mm=1.6,
-    ),
-    "demo": phantoms.demo_phantom,
-}
-"""The table of glued sacs."""
 IN_BRIEF = ("wide on the inside of a bend", "beside a branch")
 """Those that the default suite tries."""
 SCANS_IN_BRIEF = (("demo", 0.28),)
-NECK_TOLERANCE = {0.15: 0.05, 0.28: 0.08, 0.4: 0.12}
-"""Of a scan by voxel edge (mm): its blur fills the crevice by a quarter of a voxel on the average."""
+NECK_TOLERANCE = {0.15: 0.05, 0.28: 0.05, 0.4: 0.08}
+"""Of a scan by voxel edge (mm)."""
 
 
 def _rows(every: list, brief: tuple) -> list:
     return [pytest.param(row, marks=() if row in brief else pytest.mark.validation, id=str(row)) for row in every]
-
-
-def anatomy_of(phantom: phantoms.Phantom) -> Anatomy:
-    return restore(trace(Vessel(phantoms.phantom_surface(phantom))))
-
-
-def scanned_anatomy_of(phantom: phantoms.Phantom, voxel_mm: float) -> Anatomy:
-    scanner = Scanner(voxel_mm=voxel_mm, blur_mm=0.8 * voxel_mm)
-    return restore(trace(segment(phantoms.scan(phantom, np.random.default_rng(1), scanner=scanner))))
-
-
-def relative_errors(anatomy: Anatomy, phantom: phantoms.Phantom) -> tuple[np.ndarray, np.ndarray]:
-    """Radius error (fraction) of the landing surface's sections, and distance (mm) of its vertices to the true wall."""
-    axis = anatomy.axis
-    inner = (axis.abscissa_mm > 3) & (axis.abscissa_mm < axis.length_mm - 3)
-    place = curves.project(phantom.parent.points_mm, axis.points_mm[inner])[0]
-    true_mm = np.interp(place, phantom.parent.abscissa_mm, phantom.parent.inscribed_radius_mm)
-    rings = anatomy.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
-    wall = phantoms.tube_implicit_mm(phantom.parent, rings)[0]
-    return anatomy.section_radius_mm[inner] / true_mm - 1, np.abs(wall)
 
 
 @pytest.fixture(scope="module")
@@ -113,9 +68,9 @@ def test_neck_and_sac_share_their_rim(demo) -> None:
     np.testing.assert_allclose(flux, others[~on_neck].sum(axis=0), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", _rows(list(PHANTOMS), IN_BRIEF))
+@pytest.mark.parametrize("name", _rows(list(GLUED), IN_BRIEF))
 def test_artery_neck_and_sac_of_an_exact_wall(name: str) -> None:
-    phantom = PHANTOMS[name]()
+    phantom = GLUED[name]()
     anatomy = anatomy_of(phantom)
     radius_error, distance_mm = relative_errors(anatomy, phantom)
     assert np.abs(radius_error).mean() < 0.005
@@ -127,20 +82,56 @@ def test_artery_neck_and_sac_of_an_exact_wall(name: str) -> None:
     assert aneurysm.sac.boundary_loops == ()
 
 
-@pytest.mark.parametrize("row", _rows([(name, h) for name in PHANTOMS for h in NECK_TOLERANCE], SCANS_IN_BRIEF))
+@pytest.mark.parametrize("row", _rows([(name, h) for name in GLUED for h in NECK_TOLERANCE], SCANS_IN_BRIEF))
 def test_artery_neck_and_sac_of_a_noisy_scan(row: tuple[str, float]) -> None:
     name, voxel_mm = row
-    phantom = PHANTOMS[name]()
+    phantom = GLUED[name]()
     anatomy = scanned_anatomy_of(phantom, voxel_mm)
     radius_error, distance_mm = relative_errors(anatomy, phantom)
     assert np.abs(radius_error).mean() < 0.02
     assert np.quantile(distance_mm, 0.95) < 0.15
     assert distance_mm.max() < 0.3
     (aneurysm,) = anatomy.aneurysms
-    if (name, voxel_mm) != ("small", 0.4):  # a neck of 2.8 by 1.9 mm is 7 by 5 voxels: it comes out a fifth too large
+    if (name, voxel_mm) != ("small", 0.4):  # a neck of 2.8 by 1.9 mm is 7 by 5 voxels: it comes out a sixth too large
         np.testing.assert_allclose(aneurysm.neck.area_mm2, phantom.neck_area_mm2, rtol=NECK_TOLERANCE[voxel_mm])
     # A wall of constant convexity is blurred inwards: a shallow sac loses more of its volume.
     np.testing.assert_allclose(aneurysm.sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.03 if voxel_mm < 0.3 else 0.05)
+
+
+def test_two_sacs_are_both_found_and_the_one_at_a_point_alone() -> None:
+    long = phantoms.tube(length_mm=46)
+    first = with_sac(long, abscissa_mm=15, width_mm=5.0, neck_mm=3.6, direction=X)
+    second = with_sac(long, abscissa_mm=30, width_mm=7.0, neck_mm=4.5, direction=np.array([-0.5, 1.0, 0.0]))
+    assert first.sac is not None
+    assert second.sac is not None
+    vessel = trace(Vessel(phantoms.phantom_surface(replace(first, blebs=(second.sac,)), edge_mm=0.3)))
+    anatomy = restore(vessel)
+    found = {
+        round(a.center_abscissa_mm if anatomy.axis.points_mm[0, 2] < 1 else 46 - a.center_abscissa_mm): a
+        for a in anatomy.aneurysms
+    }
+    assert list(found) == [30, 15]  # the larger first
+    for abscissa_mm, phantom in ((15, first), (30, second)):
+        np.testing.assert_allclose(found[abscissa_mm].sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.01)
+        np.testing.assert_allclose(found[abscissa_mm].neck.area_mm2, phantom.neck_area_mm2, rtol=0.03)
+    (alone,) = restore(vessel, at_mm=first.sac.center_mm).aneurysms
+    np.testing.assert_allclose(alone.sac.volume_mm3, first.sac_volume_mm3, rtol=0.01)
+
+
+def test_the_flank_is_freed_of_the_blur_of_the_artery_below_it() -> None:
+    """A wall along z, the artery's wall at z = 0: the tissue between them is blurred from both sides."""
+    y, z = np.meshgrid(np.linspace(-1, 1, 5), np.linspace(0.4, 2.0, 33), indexing="ij")
+    number = np.arange(y.size).reshape(y.shape)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    faces = np.concatenate([np.stack([q.ravel() for q in t], axis=1) for t in ((a, b, c), (a, c, d))])
+    blur_mm = 0.25
+    # Tissue between the sac (x < 0) and the artery (z < 0), both flat: seen at the x where it is half of itself.
+    x = np.array([brentq(lambda x, h=h: ndtr(x / blur_mm) - ndtr(-h / blur_mm) - 0.5, 0, 3) for h in z.ravel()])
+    seen = Flank(np.stack([x, y.ravel(), z.ravel()], axis=1), faces, z.ravel(), number[:, 0])
+    assert x.max() > 0.03
+    freed = unblurred(seen, blur_mm).vertices_mm
+    inner = (np.abs(y.ravel()) < 0.9) & (z.ravel() > 0.45)
+    assert np.abs(freed[inner, 0]).max() < 0.12 * x[inner].max()  # the normals lean where the flank leans
 
 
 def test_the_neck_lies_on_the_landing_surface_in_the_lumen(demo) -> None:
@@ -153,7 +144,7 @@ def test_the_neck_lies_on_the_landing_surface_in_the_lumen(demo) -> None:
 
 
 def test_a_branch_that_passes_close_to_the_sac_takes_nothing_of_its_wall() -> None:
-    phantom = PHANTOMS["touching a branch"]()
+    phantom = GLUED["touching a branch"]()
     (aneurysm,) = anatomy_of(phantom).aneurysms
     assert phantom.sac is not None
     angle = np.linspace(-0.5, 0.5, 21)
@@ -192,10 +183,6 @@ def test_the_neck_does_not_depend_on_the_mesh(demo) -> None:
     np.testing.assert_allclose(coarse.aneurysms[0].neck.area_mm2, anatomy.aneurysms[0].neck.area_mm2, rtol=0.02)
 
 
-def _inside(angle_rad: float) -> np.ndarray:
-    return -np.array([np.cos(angle_rad), 0.0, np.sin(angle_rad)])
-
-
 def test_without_a_sac_the_landing_surface_is_the_wall() -> None:
     phantom = phantoms.siphon()
     anatomy = anatomy_of(phantom)
@@ -212,13 +199,15 @@ def test_a_point_far_from_any_sac_is_refused() -> None:
         restore(vessel, at_mm=np.array([0.0, 10.0, 8.0]))
 
 
-def test_rigid_motion_moves_the_sac(demo) -> None:
+def test_motion_mirror_and_order_of_the_triangles_do_not_change_the_sac(demo) -> None:
     anatomy, _ = demo
-    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
-    turn *= np.sign(np.linalg.det(turn))
-    lumen = Surface(anatomy.vessel.lumen.vertices_mm @ turn.T + [5.0, 60.0, -9.0], anatomy.vessel.lumen.faces)
-    moved = restore(trace(Vessel(lumen)))
-    np.testing.assert_allclose(moved.aneurysms[0].sac.volume_mm3, anatomy.aneurysms[0].sac.volume_mm3, rtol=0.01)
+    rng = np.random.default_rng(5)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= -np.sign(np.linalg.det(turn))  # mirrored besides, and the triangles in another order
+    faces = rng.permutation(anatomy.vessel.lumen.faces)[:, ::-1]
+    moved = restore(trace(Vessel(Surface(anatomy.vessel.lumen.vertices_mm @ turn.T + [5.0, 60.0, -9.0], faces))))
+    np.testing.assert_allclose(moved.aneurysms[0].sac.volume_mm3, anatomy.aneurysms[0].sac.volume_mm3, rtol=0.005)
+    np.testing.assert_allclose(moved.aneurysms[0].neck.area_mm2, anatomy.aneurysms[0].neck.area_mm2, rtol=0.02)
     there = anatomy.axis.points_mm @ turn.T + [5.0, 60.0, -9.0]
     assert curves.project(there, moved.axis.points_mm)[1].max() < 0.05
 
@@ -233,6 +222,18 @@ def test_trimming_cuts_a_long_artery_square_and_keeps_the_sac() -> None:
     assert restore(vessel).aneurysms[0].sac.volume_mm3 == pytest.approx(phantom.sac_volume_mm3, rel=0.03)
 
 
+def test_a_sac_that_trimming_takes_off_is_told() -> None:
+    long = phantoms.tube(length_mm=100)
+    near, far = (with_sac(long, abscissa_mm=s, width_mm=w, neck_mm=4.0) for s, w in ((20, 7.0), (85, 6.0)))
+    assert far.sac is not None
+    wall = phantoms.phantom_surface(replace(near, blebs=(far.sac,)), edge_mm=0.4)
+    vessel = trim(trace(Vessel(wall), inlet_mm=np.zeros(3)))
+    assert "Another sac, 5." in vessel.notes[-1]
+    place_mm = [float(x) for x in vessel.notes[-1].split(" at ")[1].split(" mm")[0].split(", ")]
+    assert far.sac.implicit_mm(np.array([place_mm]))[0] == pytest.approx(0.0, abs=0.1)
+    assert len(restore(vessel).aneurysms) == 1
+
+
 def test_the_real_sac_is_that_of_aneurisk_web(shared_data) -> None:
     from vstent.io.surfaces import read_surface
 
@@ -241,8 +242,9 @@ def test_the_real_sac_is_that_of_aneurisk_web(shared_data) -> None:
     found = morphology(anatomy)
     # AneuriskWeb closes the sac by a plane: its 344.4 mm3 leave out what hangs down both sides of the artery, which the
     # neck embraces by more than half a turn, and its 38.5 mm2 lie between our curved neck and that neck's projection.
+    assert found["sac_plane_volume_mm3"] == pytest.approx(344.4, rel=0.10)
+    assert found["neck_plane_area_mm2"] == pytest.approx(38.5, rel=0.15)
     assert aneurysm.sac.volume_mm3 == pytest.approx(344.4, rel=0.15)
-    assert aneurysm.sac.volume_mm3 > 344.4
     assert found["neck_area_mm2"] < 38.5 < found["neck_surface_area_mm2"]
 
 

@@ -84,7 +84,9 @@ def test_threshold_is_that_of_the_blurred_wall():
     phantom = tube(length_mm=10.0, radius_mm=2.0)
     blur = np.hypot(0.3, 0.25 / np.sqrt(12))
     image = scan(phantom, np.random.default_rng(2), scanner=Scanner(0.25, 0.3, 0.03, structure=0.0))
-    assert threshold_of(segment(image)) == pytest.approx(100 + 2000 * ndtr(-blur / 4.0), abs=40)
+    vessel = segment(image)
+    assert threshold_of(vessel) == pytest.approx(100 + 2000 * ndtr(-blur / 4.0), abs=40)
+    assert vessel.blur_mm == pytest.approx(blur, rel=0.05)
 
 
 def test_intensities_may_be_scaled_and_shifted(demo):

@@ -1,15 +1,33 @@
-"""A study stopped in the middle of a flow keeps what was finished, and goes on from there."""
+"""What a study writes, and that one stopped in the middle of a flow goes on from there."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from tubes import line, tube, with_neck
 from vstent import phantoms
 from vstent.cli import main
 from vstent.flow import FlowCase, FlowField
+from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
 from vstent.study import stages
+from vstent.study.outputs import write_anatomy
+
+
+def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path) -> None:
+    artery = with_neck(tube(line(40.0), 2.0), 10.0, 14.0)
+    (first,) = artery.aneurysms
+    (second,) = with_neck(tube(line(40.0), 2.0), 24.0, 29.0).aneurysms
+    (tmp_path / "sac_mine.vtp").write_text("a user's own")
+    write_anatomy(tmp_path, replace(artery, aneurysms=(first, second)))
+    for number, aneurysm in (("", first), ("_2", second)):
+        sac, _ = read_surface(tmp_path / f"sac{number}.vtp", units="mm")
+        assert sac.area_mm2 == pytest.approx(aneurysm.sac.area_mm2, rel=1e-5)
+        assert (tmp_path / f"neck{number}.vtp").stat().st_size > 500
+    write_anatomy(tmp_path, artery)
+    assert {file.name for file in tmp_path.glob("[sn][ae]c*.vtp")} == {"sac.vtp", "neck.vtp", "sac_mine.vtp"}
 
 
 def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from vstent import phantoms
 from vstent.image import Image
 from vstent.io.surfaces import read_surface
-from vstent.kernels import curves
+from vstent.kernels import curves, triangles
 from vstent.phantoms import Phantom, Scanner
 from vstent.repair import repair
 from vstent.restore import restore
@@ -96,9 +96,26 @@ def _is_whole(phantom: Phantom, axis: np.ndarray, place: np.ndarray) -> np.ndarr
     return result
 
 
-def traced(phantom: Phantom, edge_mm: float) -> Vessel:
+def traced(phantom: Phantom, surface: Surface) -> Vessel:
     """Trace a phantom's exact surface from the end that is its inlet."""
-    return trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=edge_mm)), inlet_mm=phantom.ends[0][0])
+    return trace(Vessel(surface), inlet_mm=phantom.ends[0][0])
+
+
+def halved(phantom: Phantom, surface: Surface) -> Surface:
+    """A phantom's exact surface with every triangle in four, the new vertices on the true wall too.
+
+    Triangles keep their shapes, so that errors tell their order; a mesh made anew lies otherwise in the wall.
+    """
+    ends = np.sort(triangles.directed_edges(surface.faces), axis=1)
+    edges, number = np.unique(ends, axis=0, return_inverse=True)
+    middle = surface.vertices_mm[edges].mean(axis=1)
+    for _ in range(3):
+        value, gradient = phantom.implicit_mm(middle)
+        middle = middle - value[:, None] * gradient
+    a, b, c = surface.faces.T
+    ab, bc, ca = (len(surface.vertices_mm) + number.ravel()).reshape(3, -1)
+    faces = [np.stack(corner, axis=1) for corner in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+    return Surface(np.concatenate([surface.vertices_mm, middle]), np.concatenate(faces))
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Measure: the aneurysm's morphology, and how a deployed device lies on the wall."""
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -11,11 +12,14 @@ from vstent.device import coverage_fraction, grid, piece_length_mm, pore_density
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats
 from vstent.stent import Deployment, Stent
+from vstent.surface import Surface
 from vstent.units import MM_PER_UM
 from vstent.vessel import Anatomy, Aneurysm
 
 Measures = dict[str, float | str]
 """Numbers by names that end in their unit; a few names hold words."""
+Morphology = dict[str, float | str | Measures]
+"""The same, with the measures of each further sac under a name of their own: ``sac_2``, ``sac_3``, ..."""
 
 NECK_TOLERANCE_MM: Final = 0.02
 """The neck's triangles lie on the landing surface to within this: they are other triangles than its own."""
@@ -201,24 +205,33 @@ def _branches(anatomy: Anatomy, stent: Stent) -> Measures:
     return found
 
 
-def morphology(anatomy: Anatomy) -> Measures:
-    """Measure the largest aneurysm and its parent artery.
+def morphology(anatomy: Anatomy) -> Morphology:
+    """Measure the parent artery and its aneurysms: the largest first, others under ``sac_2``, ``sac_3`` and so on.
 
     Height, aspect ratio and size ratio as defined by Dhar et al. 2008 (Neurosurgery 63:185): the height is measured
     square to the neck plane; the size ratio takes the longest distance from the neck's center to the dome; the neck's
     diameter in the aspect ratio is twice the mean distance from its center to its rim. Volume and area are those of
-    the sac, closed across the neck. Curvature and torsion are those of the parent axis (Piccinelli et al. 2009, IEEE
-    Trans. Med. Imaging 28:1141), of a quartic through one diameter of it to both sides; that much is left out at its
-    ends.
+    the sac, closed across the neck, which is curved like the artery's wall. Most of the literature cuts a sac by a
+    plane instead (Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355): the sac beyond the neck plane, which goes
+    through the neck's center square to its vector area, and its section by it stand beside. Curvature and torsion are
+    those of the parent axis (Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141), of a quartic through one
+    diameter of it to both sides; that much is left out at its ends.
     """
-    proximal_mm, distal_mm = landing_diameters_mm(anatomy)
-    found: Measures = {"parent_proximal_diameter_mm": proximal_mm, "parent_distal_diameter_mm": distal_mm}
+    found: Morphology = {**_parent(anatomy)}
     if anatomy.vessel.threshold_band_mm > 0:
         found["diameter_threshold_band_mm"] = anatomy.vessel.threshold_band_mm
     found |= _course(anatomy)
-    if anatomy.aneurysms:
-        found |= _sac(anatomy.aneurysms[0], 0.5 * (proximal_mm + distal_mm))
+    for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
+        beside = _parent(replace(anatomy, aneurysms=(aneurysm,)))
+        measures = _sac(aneurysm, 0.5 * sum(beside.values()))
+        found |= measures if number == 1 else {f"sac_{number}": {**beside, **measures}}
     return found
+
+
+def _parent(anatomy: Anatomy) -> dict[str, float]:
+    """Diameters of the parent artery beside the neck of the largest aneurysm."""
+    proximal_mm, distal_mm = landing_diameters_mm(anatomy)
+    return {"parent_proximal_diameter_mm": proximal_mm, "parent_distal_diameter_mm": distal_mm}
 
 
 def _course(anatomy: Anatomy) -> Measures:
@@ -253,13 +266,16 @@ def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
     reach_mm = float(np.linalg.norm(dome_mm - center_mm, axis=1).max())
     neck_mean_mm = float(2 * np.linalg.norm(rim_mm - center_mm, axis=1).mean())
     width_mm = _widths_mm(rim_mm, normal)
+    plane_area_mm2, plane_volume_mm3 = _beyond(aneurysm.sac, center_mm, normal)
     return {
         "sac_volume_mm3": abs(aneurysm.sac.volume_mm3),
         "sac_area_mm2": aneurysm.sac.area_mm2 - aneurysm.neck.area_mm2,
         "sac_height_mm": height_mm,
         "sac_max_height_mm": reach_mm,
         "sac_max_diameter_mm": _diameter_mm(dome_mm),
+        "sac_plane_volume_mm3": plane_volume_mm3,
         "neck_area_mm2": neck_area_mm2,
+        "neck_plane_area_mm2": plane_area_mm2,
         "neck_surface_area_mm2": aneurysm.neck.area_mm2,
         "neck_perimeter_mm": triangles.perimeter(rim_mm),
         "neck_min_diameter_mm": float(width_mm.min()),
@@ -267,6 +283,16 @@ def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
         "aspect_ratio": height_mm / neck_mean_mm,
         "size_ratio": reach_mm / parent_diameter_mm,
     }
+
+
+def _beyond(sac: Surface, center_mm: Floats, normal: Floats) -> tuple[float, float]:
+    """Area of the largest piece of a sac's section by a plane, and the volume beyond that plane."""
+    below_mm = -(sac.vertices_mm - center_mm) @ normal
+    vertices, faces, _ = triangles.clip(sac.vertices_mm, sac.faces, below_mm)
+    loops = triangles.boundary_loops(vertices, faces)
+    capped, closed = triangles.cap(vertices, faces, loops)
+    areas = [float(np.linalg.norm(triangles.polygon_area_vector(vertices[loop]))) for loop in loops]
+    return max(areas, default=0.0), triangles.volume(capped[closed])
 
 
 def _diameter_mm(points_mm: Floats) -> float:

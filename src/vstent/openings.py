@@ -73,6 +73,19 @@ def with_inlet(vessel: Vessel, inlet_mm: Floats) -> Vessel:
     return replace(vessel, openings=_named(nearest, list(vessel.openings)), centerlines=())
 
 
+def still_open(vessel: Vessel) -> Vessel | None:
+    """Return the vessel with those of its openings that its lumen still has; None where fewer than two are left.
+
+    The inlet is the widest of them where the old one is gone.
+    """
+    tree = cKDTree(vessel.lumen.loop_centers_mm) if len(vessel.lumen.boundary_loops) else None
+    left = [o for o in vessel.openings if tree is not None and tree.query(o.center_mm)[0] < 0.1 * o.diameter_mm]
+    if len(left) < 2:
+        return None
+    inlet = vessel.inlet if vessel.inlet in left else max(left, key=lambda opening: opening.area_mm2)
+    return replace(vessel, openings=_named(inlet, left), centerlines=())
+
+
 def _opening(loop_mm: Floats) -> Opening:
     # A loop runs with the faces beside it: seen from outside the opening it runs clockwise.
     vector = -triangles.polygon_area_vector(loop_mm)
@@ -130,7 +143,7 @@ def _with_open_arms(lumen: Surface) -> tuple[Surface, int]:
     graph = lumen.medial
     roots = np.asarray(cKDTree(graph.points).query(lumen.loop_centers_mm)[1], dtype=np.int32)
     paths = medial.arms(graph, roots, ARM_SLENDERNESS, ARM_RADIUS_MM)
-    cuts = [_cut_of(graph.points[path], graph.radius[path]) for path in paths]
+    cuts = [_cut_of(graph.points[path], graph.radius[path]) if _is_blind(graph, path) else None for path in paths]
     n_cut = 0
     for cut in cuts:
         opened = None if cut is None else cut_square(lumen, *cut, ARM_SHARE)
@@ -138,6 +151,20 @@ def _with_open_arms(lumen: Surface) -> tuple[Surface, int]:
         if opened is not None and len(opened.boundary_loops) > len(lumen.boundary_loops):
             lumen, n_cut = opened, n_cut + 1
     return (Surface(*triangles.largest_part(lumen.vertices_mm, lumen.faces)) if n_cut else lumen), n_cut
+
+
+def _is_blind(graph: medial.Medial, path: Ints) -> bool:
+    """Tell whether an arm's tip is reached along its path (k,) only: a loop of an artery has two ways to its middle.
+
+    Ways less than half as wide as the arm, or too thin for an arm, are no way for blood.
+    """
+    abscissa, typical = curves.arc_length(graph.points[path]), float(np.median(graph.radius[path]))
+    behind = graph.points[path[np.searchsorted(abscissa, abscissa[-1] - 3.0 * typical)]]
+    passable = graph.radius > max(0.5 * typical, ARM_RADIUS_MM)
+    passable &= np.linalg.norm(graph.points - behind, axis=1) > 1.25 * typical
+    passable[path[[0, -1]]] = True
+    label = _joined(graph.edges[passable[graph.edges].all(axis=1)], len(passable))
+    return bool(label[path[0]] != label[path[-1]])
 
 
 def _cut_of(points_mm: Floats, radius_mm: Floats) -> tuple[Floats, Floats, float] | None:

@@ -28,6 +28,10 @@ SMOOTHING_STEPS: Final = 12
 PASS_BAND: Final = 0.1
 CURVATURE_ROUNDS: Final = 25
 """The wall's curvature is averaged so many times with the neighbours': over some three voxels."""
+CREVICE_ROUNDS: Final = 4
+"""Where the curvature averaged so many times is hollow, there is a crevice between two parts of the vessel..."""
+CREVICE_RINGS: Final = 3
+"""... which reaches this many rings of vertices further."""
 PROFILE_VOXELS: Final = 4.0
 """How far into the lumen and into the tissue the profiles across the wall reach."""
 PROFILES: Final = 8000
@@ -65,7 +69,7 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     band_mm = 2 * 0.05 * abs(lumen.threshold) / profile.slope_per_mm
     band = f"Threshold +-5 % changes diameters by -+{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
     all_notes = (*image.notes, *notes, band, found, smooth_note, *decimation_notes)
-    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm)
+    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm, blur_mm=profile.blur_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,10 +289,20 @@ def _unblurred(surface: Surface, profile: Profile) -> Surface:
     """Move the wall to where it was before the blur: by s^2 times its mean curvature, less that of the whole vessel.
 
     The threshold is right for the whole vessel's radius. A thin branch comes out too narrow with it and a sac too wide;
-    no shift is larger than half a voxel.
+    no shift is larger than half a voxel. A crevice turns faster than the blur resolves: it says nothing of how the wall
+    beside it is curved, and has no part in the average.
     """
-    curvature = smoothing.mean_curvature(surface.vertices_mm, surface.faces, rounds=CURVATURE_ROUNDS)
-    shift_mm = profile.blur_mm**2 * (curvature - 0.5 / profile.radius_mm)
+    curvature = smoothing.mean_curvature(surface.vertices_mm, surface.faces, rounds=CREVICE_ROUNDS)
+    mean = smoothing.averaging(len(curvature), surface.faces)
+    is_wall = curvature > 0
+    for _ in range(CREVICE_RINGS):
+        is_wall &= mean @ is_wall.astype(np.float64) > 1.0 - 1e-9
+    total, weight = np.where(is_wall, curvature, 0.0), is_wall.astype(np.float64)
+    for _ in range(CURVATURE_ROUNDS):
+        total, weight = mean @ total, mean @ weight
+    typical = 0.5 / profile.radius_mm
+    curvature = np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), typical)
+    shift_mm = profile.blur_mm**2 * (curvature - typical)
     shift_mm = np.clip(shift_mm, -0.5 * profile.voxel_mm, 0.5 * profile.voxel_mm)
     return Surface(surface.vertices_mm + shift_mm[:, None] * surface.vertex_normals, surface.faces)
 

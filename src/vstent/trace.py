@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import percentile_filter
 from scipy.spatial import cKDTree
 
+from vstent.contacts import find_contact, part
 from vstent.errors import VesselError
 from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
@@ -32,6 +33,8 @@ SMOOTHED_DIAMETERS: Final = 0.75
 """Waves of a centerline shorter than this many local diameters are smoothed away."""
 THIN: Final = 0.3
 """An outlet narrower than this fraction of the inlet may be left closed where the lumen to it is interrupted."""
+MOST_CONTACTS: Final = 12
+"""No more contacts between arteries than this are parted."""
 
 
 def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
@@ -50,12 +53,28 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
     vessel, spheres = (vessel, vessel.lumen.medial) if vessel.openings else open_ends(vessel)
     if inlet_mm is not None:
         vessel = with_inlet(vessel, np.asarray(inlet_mm, dtype=np.float64))
-    graph = _graph(vessel, spheres)
-    vessel, graph = _reachable(vessel, graph)
-    paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
-    paths = _shortest(vessel, graph, _radius_cap(graph, paths))
+    vessel, graph, paths = _paths(vessel, spheres)
+    for _ in range(MOST_CONTACTS):
+        parted = _parted(vessel, graph, paths, holds_inlet=inlet_mm is not None)
+        if parted is None:
+            break
+        vessel, graph, paths = _paths(parted, parted.lumen.medial)
     lines = tuple(_centerline(vessel.lumen, graph.points[path], graph.radius[path]) for path in paths)
     return replace(vessel, centerlines=lines)
+
+
+def _paths(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.Medial, list[Ints]]:
+    """The vessel with the outlets that can be reached, the medial graph, and the path to each of them."""
+    vessel, graph = _reachable(vessel, _graph(vessel, spheres))
+    paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
+    return vessel, graph, _shortest(vessel, graph, _radius_cap(graph, paths))
+
+
+def _parted(vessel: Vessel, graph: medial.Medial, paths: list[Ints], *, holds_inlet: bool) -> Vessel | None:
+    """The vessel without the first contact that a path slips through; None where there is none to be parted."""
+    contacts = (find_contact(graph.points[path], graph.radius[path], graph) for path in paths)
+    parted = (part(vessel, contact, holds_inlet=holds_inlet) for contact in contacts if contact is not None)
+    return next((one for one in parted if one is not None), None)
 
 
 def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:

@@ -49,8 +49,18 @@ def trim(vessel: Vessel, *, at_mm: Floats | None = None) -> Vessel:
     if lumen is vessel.lumen:
         return vessel
     note = f"Trimmed to {UPSTREAM_MM:.0f} mm of vessel before the sac and {DOWNSTREAM_MM:.0f} mm beyond it, cut square."
-    shorter = replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=(*vessel.notes, note))
-    return trace(shorter, inlet_mm=inlet_mm)
+    notes = (*vessel.notes, note, *_left_out(lumen, bulges[1:]))
+    return trace(replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=notes), inlet_mm=inlet_mm)
+
+
+def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
+    """Sentences on the sacs that are not in what is left of the lumen."""
+    return [
+        f"Another sac, {bulge.height_mm:.1f} mm high, lies beyond that at "
+        f"{', '.join(f'{x:.1f}' for x in bulge.dome_mm)} mm: give it with --at."
+        for bulge in bulges
+        if lumen.closest(bulge.dome_mm[None])[1][0] > bulge.height_mm / 2
+    ]
 
 
 def _cuts(vessel: Vessel, bulge: Bulge) -> list[tuple[Centerline, float, int]]:

@@ -85,6 +85,8 @@ class Vessel:
     threshold_band_mm: float = 0.0
     """By how much a diameter grows where the scan's threshold is 5 % lower, and shrinks where it is 5 % higher; 0 for a
     vessel that is no scan's."""
+    blur_mm: float | None = None
+    """Standard deviation of the point spread through which the scan shows the wall; None where it is not known."""
 
     @property
     def closed(self) -> Surface:

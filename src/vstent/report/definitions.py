@@ -15,6 +15,7 @@ class Definition(NamedTuple):
 
 
 _DHAR: Final = "Dhar et al. 2008, Neurosurgery 63:185"
+_RAGHAVAN: Final = "Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355"
 _PICCINELLI: Final = "Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141"
 
 DEFINITIONS: Final[dict[str, Definition]] = {
@@ -27,6 +28,9 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "Parent diameter, distal", "Diameter of the circle with the area of the parent artery's section after the neck."
     ),
     "sac_volume_mm3": Definition("Sac volume", "Volume of the lumen beyond the neck."),
+    "sac_plane_volume_mm3": Definition(
+        "Sac volume, plane cut", "Volume of the sac beyond the neck plane: the neck curve's mean plane.", _RAGHAVAN
+    ),
     "sac_area_mm2": Definition("Sac wall area", "Area of the sac's wall, without the neck."),
     "sac_height_mm": Definition("Sac height", "Largest distance of the dome from the neck plane, square to it.", _DHAR),
     "sac_max_height_mm": Definition(
@@ -34,6 +38,9 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     ),
     "sac_max_diameter_mm": Definition("Sac diameter, largest", "Largest distance between two points of the sac."),
     "neck_area_mm2": Definition("Neck area", "Area of the neck curve projected on its own mean plane."),
+    "neck_plane_area_mm2": Definition(
+        "Neck area, plane cut", "Area of the sac's largest section by the neck plane.", _RAGHAVAN
+    ),
     "neck_surface_area_mm2": Definition("Neck surface", "Area of the restored wall that closes the neck."),
     "neck_perimeter_mm": Definition("Neck perimeter", "Length of the neck curve."),
     "neck_min_diameter_mm": Definition("Neck width, smallest", "Smallest width of the neck curve in its mean plane."),

@@ -1,16 +1,18 @@
 """The neck: where the sac's flank, freed of the blur that rounds its edge, meets the parent artery.
 
 A scan's point spread fills the crevice between sac and artery: at its bottom the tissue is thinner than the blur, so
-the wall seen there lies outside of both, the more so the sharper the crevice. From a height of twice the blur's
-standard deviation on, the artery's share in the flank's intensity is below 3 % and the flank is where it is. So the
-flank is followed up from there along lines of steepest ascent, each line is continued downwards with its own slope
-and curvature (a parabola over its length), and the neck is where those parabolas meet the artery.
+the wall seen there lies outside of both, the more so the sharper the crevice. From a height of 1.9 standard deviations
+of the blur on, the artery's share in the flank's intensity is below 3 %, and what it does to the flank can be undone.
+So the flank is followed up from there along lines of steepest ascent, each line is continued downwards with its own
+slope and curvature (a parabola over its length), and the neck is where those parabolas meet the artery. The blur is
+the one measured in the scan; a surface does not tell it.
 """
 
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import ndtr, ndtri
 
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints
@@ -18,18 +20,24 @@ from vstent.restore.landing import Landing
 from vstent.restore.tubes import Tubes
 from vstent.surface import Surface
 
-BLUR_MM: Final = 0.5
-"""Lower down the flank is not believed: twice a standard deviation of 0.25 mm, which 3DRA scans are blurred by at
-least, voxel, reconstruction and smoothing of the mesh together."""
-BLUR_EDGES: Final = 2.2
-"""The same in edges of the mesh: an iso-surface has edges of 0.9 voxel, and a scan is blurred by about a voxel."""
+CLEAR: Final = 1.9
+"""Lower down than this many standard deviations of the blur the flank is not believed..."""
+CLEAR_EDGES: Final = 1.5
+"""... nor lower than this many edges of the mesh, which cuts off the bottom of the crevice by itself."""
+UNTOLD_MM: Final = 0.5
+"""Where the blur is not known, lower down than this: 1.9 times 0.26 mm, by which 3DRA scans are blurred, voxel,
+reconstruction and smoothing of the mesh together..."""
+UNTOLD_EDGES: Final = 2.2
+"""... nor lower than this many edges: an iso-surface has edges of 0.9 voxel, and a scan is blurred by about a voxel."""
+DEEPEST: Final = 0.45
+"""The artery's share in the flank's intensity is taken for no more than this."""
 BAND: Final = 3.0
 """The flank is followed up to this many times the height at which it is believed..."""
 BAND_OF_HEIGHT: Final = 0.6
 """... and no further than this fraction of the way from there to the dome's top."""
 N_LEVELS: Final = 9
 """Heights at which the flank is followed."""
-DETAIL: Final = 4.0
+DETAIL: Final = 6.0
 """The neck follows waves along its rim longer than this many times the height from which it is extrapolated."""
 REACH: Final = 3.0
 """A flank that has not met the artery within this many times that height lies along it."""
@@ -101,12 +109,26 @@ class Flank(NamedTuple):
         return np.asarray((ends[0] + share * (ends[1] - ends[0])).reshape(-1, 3))
 
 
-def believed_from_mm(lumen: Surface, foot_mm: Floats, most_mm: float) -> float:
+def believed_from_mm(lumen: Surface, foot_mm: Floats, most_mm: float, blur_mm: float | None) -> float:
     """Height from which on the flank around a bulge's foot (k, 3) is free of blur; no more than `most_mm`."""
     near = np.asarray(cKDTree(foot_mm).query(lumen.vertices_mm, distance_upper_bound=most_mm)[0]) < most_mm
     corners = lumen.corners_mm[near[lumen.faces].any(axis=1)]
     edge_mm = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
-    return min(max(BLUR_MM, BLUR_EDGES * edge_mm), most_mm)
+    if blur_mm is None:
+        return min(max(UNTOLD_MM, UNTOLD_EDGES * edge_mm), most_mm)
+    return min(max(CLEAR * blur_mm, CLEAR_EDGES * edge_mm), most_mm)
+
+
+def unblurred(flank: Flank, blur_mm: float) -> Flank:
+    """The flank where it was before the blur.
+
+    At a distance d beside the flank and h above the artery the tissue between them is seen as Phi(d / s) - Phi(-h / s)
+    of its own intensity, s the blur's standard deviation, as if both walls were flat and parallel. The wall is seen
+    where that is one half: at d = s Phi^-1(1/2 + Phi(-h / s)).
+    """
+    share = np.minimum(ndtr(-flank.height_mm / blur_mm), DEEPEST)
+    normals = Surface(flank.vertices_mm, flank.faces).vertex_normals
+    return flank._replace(vertices_mm=flank.vertices_mm - (blur_mm * ndtri(0.5 + share))[:, None] * normals)
 
 
 def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floats:

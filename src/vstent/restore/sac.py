@@ -11,7 +11,7 @@ from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.restore.bulges import FLANK, Bulge, bulge_at
 from vstent.restore.landing import Landing
-from vstent.restore.neck import Artery, Flank, believed_from_mm, skirt
+from vstent.restore.neck import Artery, Flank, believed_from_mm, skirt, unblurred
 from vstent.restore.tubes import Tubes, tubes_of
 from vstent.surface import Surface
 from vstent.vessel import Aneurysm, Centerline, Vessel
@@ -42,10 +42,11 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     if core is None:
         return None
     most_mm = FLANK * float(np.median(landing.section_radius_mm[landing.nearest_sections(core.foot_mm)]))
-    low_mm = believed_from_mm(lumen, core.foot_mm, most_mm)
+    low_mm = believed_from_mm(lumen, core.foot_mm, most_mm, vessel.blur_mm)
     flank, other_loops = _flank(lumen, height_mm, low_mm, core.dome_mm, landing)
     if flank is None:
         return None
+    flank = unblurred(flank, vessel.blur_mm) if vessel.blur_mm else flank
     rings = skirt(flank, artery, vessel.closed, n_rings=N_SKIRT)
     neck = _neck(landing, rings[-1])
     sac = _closed_sac(flank, other_loops, rings, neck)

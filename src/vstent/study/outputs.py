@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from vstent.flow import FlowField
 from vstent.io import writers
+from vstent.io.tables import write_rows
+from vstent.rank import Ranking
 from vstent.stent import Deployment
 from vstent.struts import struts
 from vstent.vessel import Anatomy, Centerline, Vessel
@@ -24,18 +26,20 @@ def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
 
 
 def write_anatomy(out: Path, anatomy: Anatomy) -> None:
-    """Write the vessel, the parent artery and the sac; a sac of an earlier input is taken away."""
+    """Write the vessel, the parent artery and the sacs; those of an earlier input are taken away."""
     write_vessel(out, anatomy.vessel, anatomy.axis)
     restored = {"is_restored": anatomy.is_restored.astype(np.uint8)}
     writers.write_surface(out / "landing_surface.vtp", anatomy.landing_surface, restored)
-    if not anatomy.aneurysms:
-        for stale in (out / "sac.vtp", out / "neck.vtp"):  # of another input or of other settings
-            stale.unlink(missing_ok=True)
-        return
-    aneurysm = anatomy.aneurysms[0]
-    writers.write_surface(out / "sac.vtp", aneurysm.sac)
-    closed = np.concatenate([aneurysm.neck_mm, aneurysm.neck_mm[:1]])
-    writers.write_lines(out / "neck.vtp", closed, np.array([0, len(closed)], dtype=np.int32))
+    written = set()
+    for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
+        sac, neck = (f"{noun}.vtp" if number == 1 else f"{noun}_{number}.vtp" for noun in ("sac", "neck"))
+        writers.write_surface(out / sac, aneurysm.sac)
+        closed = np.concatenate([aneurysm.neck_mm, aneurysm.neck_mm[:1]])
+        writers.write_lines(out / neck, closed, np.array([0, len(closed)], dtype=np.int32))
+        written |= {sac, neck}
+    for pattern in ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp"):
+        for stale in {file.name for file in out.glob(pattern)} - written:  # of another input or of other settings
+            (out / stale).unlink()
 
 
 def write_stent(folder: Path, deployment: Deployment) -> str:
@@ -64,3 +68,11 @@ def write_field(folder: Path, field: FlowField) -> None:
             "relative_residence_time_per_Pa": field.relative_residence_time_per_Pa,
         }
     writers.write_surface(folder / "wall.vtp", field.wall, of_vertex)
+
+
+def write_ranking(out: Path, ranking: Ranking) -> None:
+    """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``."""
+    rows = ranking.rows()
+    write_rows(out / "ranking.csv", rows)
+    criteria = [item.model_dump(exclude_none=True) for item in ranking.criteria.items]
+    writers.write_json(out / "ranking.json", {"criteria": criteria, "candidates": rows, "research_use_only": True})

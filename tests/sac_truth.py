@@ -1,0 +1,67 @@
+"""Arteries with a glued sac of known neck and volume: tests assert what is found of them, the benchmark prints it."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from vstent import phantoms
+from vstent.kernels import curves
+from vstent.phantoms import Phantom, Scanner, torus_arc, tube, with_bleb, with_branch, with_sac
+from vstent.restore import restore
+from vstent.segment import segment
+from vstent.trace import trace
+from vstent.vessel import Anatomy, Vessel
+
+
+def _inside(angle_rad: float) -> np.ndarray:
+    return -np.array([np.cos(angle_rad), 0.0, np.sin(angle_rad)])
+
+
+X = np.array([1.0, 0.0, 0.0])
+GLUED: dict[str, Callable[[], Phantom]] = {
+    "straight": lambda: with_sac(tube(length_mm=40), abscissa_mm=20),
+    "tapered": lambda: with_sac(tube(length_mm=40, radius_mm=2.3, end_radius_mm=1.6), abscissa_mm=20),
+    "outside of a bend": lambda: with_sac(torus_arc(bend_radius_mm=9.0), abscissa_mm=14),
+    "inside of a bend": lambda: with_sac(torus_arc(bend_radius_mm=9.0), abscissa_mm=14, direction=_inside(14 / 9)),
+    "wide on the inside of a bend": lambda: with_sac(
+        torus_arc(bend_radius_mm=9.0), abscissa_mm=14, neck_mm=6.8, direction=_inside(14 / 9)
+    ),
+    "beside a branch": lambda: with_branch(
+        with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), abscissa_mm=24, direction=np.array([1.0, 0.3, 0.5])
+    ),
+    "touching a branch": lambda: with_branch(
+        with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), abscissa_mm=24.5, direction=X
+    ),
+    "neck of 2 diameters": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=10, neck_mm=8),
+    "sac of 3 diameters": lambda: with_sac(tube(length_mm=44), abscissa_mm=22, width_mm=12, neck_mm=5),
+    "half a sphere": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=5.6, neck_mm=5.5),
+    "tall": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=5, neck_mm=3, elongation=1.8),
+    "small": lambda: with_sac(tube(length_mm=40), abscissa_mm=20, width_mm=4, neck_mm=2.8),
+    "blebs": lambda: with_bleb(
+        with_bleb(with_sac(tube(length_mm=40), abscissa_mm=20, direction=X), direction=np.array([0.2, 1.0, 0.3])),
+        direction=np.array([1.0, -0.3, 0.9]),
+        radius_mm=1.6,
+    ),
+    "demo": phantoms.demo_phantom,
+}
+"""The table of glued sacs."""
+
+
+def anatomy_of(phantom: phantoms.Phantom) -> Anatomy:
+    return restore(trace(Vessel(phantoms.phantom_surface(phantom))))
+
+
+def scanned_anatomy_of(phantom: phantoms.Phantom, voxel_mm: float) -> Anatomy:
+    scanner = Scanner(voxel_mm=voxel_mm, blur_mm=0.8 * voxel_mm)
+    return restore(trace(segment(phantoms.scan(phantom, np.random.default_rng(1), scanner=scanner))))
+
+
+def relative_errors(anatomy: Anatomy, phantom: phantoms.Phantom) -> tuple[np.ndarray, np.ndarray]:
+    """Radius error (fraction) of the landing surface's sections, and distance (mm) of its vertices to the true wall."""
+    axis = anatomy.axis
+    inner = (axis.abscissa_mm > 3) & (axis.abscissa_mm < axis.length_mm - 3)
+    place = curves.project(phantom.parent.points_mm, axis.points_mm[inner])[0]
+    true_mm = np.interp(place, phantom.parent.abscissa_mm, phantom.parent.inscribed_radius_mm)
+    rings = anatomy.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
+    wall = phantoms.tube_implicit_mm(phantom.parent, rings)[0]
+    return anatomy.section_radius_mm[inner] / true_mm - 1, np.abs(wall)
