@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -12,22 +12,19 @@ from vstent.errors import FlowError, InputError
 from vstent.flow import FlowCase, FlowSettings, flow_case
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.openfoam import Flavour, FoamCase, FoamSetup, foam_case, named_patches, program, stl_text
-from vstent.flow.openfoam.case import struts_near
+from vstent.flow.openfoam.case import STRUT_REACH_MM, struts_near
 from vstent.flow.openfoam.folder import write
 from vstent.io import writers
 from vstent.io.archive import load_noun
 from vstent.io.vtk_child import read_apart
 from vstent.stent import Deployment
 from vstent.struts import struts
+from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, hash_of
 from vstent.study.stages import deploy_all, find_anatomy
 from vstent.study.types import Progress, Settings
 from vstent.surface import Surface
 from vstent.vessel import Anatomy
-
-CACHE: Final = ".vstent"
-STRUT_REACH_MM: Final = 1.0
-"""Wires that come nearer to the neck than this are meshed."""
 
 
 def export_openfoam(
