@@ -13,6 +13,8 @@ from vstent.vessel import Vessel
 
 LATTICE: Final = "lattice_boltzmann"
 """Name of the engine that vstent brings along."""
+OPENFOAM: Final = "openfoam"
+"""Name of the engine that hands the flow to OpenFOAM, a program of its own."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,9 @@ class FlowSettings:
     lattice_speed: float = 0.15
     """Peak speed in cells per time step: sets the time step."""
     engine: str = LATTICE
-    """What computes the flow: ``lattice_boltzmann``, or the name of a plug-in (`vstent.plugins`)."""
+    """What computes the flow: ``lattice_boltzmann``, ``openfoam``, or the name of a plug-in (`vstent.plugins`)."""
+    processes: int = 1
+    """Processes on this machine, for OpenFOAM."""
 
     def inflow_factor(self, time_s: Floats) -> Floats:
         """Inflow over mean inflow at times (t,)."""
