@@ -150,7 +150,9 @@ class ConstantWire(AbstractMethod):
         state, laid_mm = self._laid(placement, state)
         is_free = FreeDiameter(placement.size.free_diameter_mm).is_reached(opened.contour.nodes_mm)
         nodes_mm = np.where(is_free[:, None, None], state.nodes_mm, laid_mm)
-        return Opened(replace(state, nodes_mm=nodes_mm), where_mm.mean(axis=1))
+        rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
+        check_inside(placement.design, placement.size, rows_mm, placement.anatomy.axis.length_mm)
+        return Opened(replace(state, nodes_mm=nodes_mm), rows_mm)
 
     def _grown(self, placement: Placement, opened: Opened) -> Opened:
         """One step of the contour; a row that reaches the free diameter stops there."""

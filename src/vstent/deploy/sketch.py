@@ -1,17 +1,18 @@
 """Sketch: where a device will lie, fast enough to follow a hand that drags it; `deploy` answers in full.
 
 The wall as the device will find it does not depend on where the device lies: it is measured once, on rays across the
-parent axis, no wider than the free device (`Bed`). A sketch marches the rows over it and draws the wires. What it
-leaves out is that crossings slide along the wall in a bend.
+parent axis, no wider than the free device (`Bed`). A sketch marches the rows over it, lets the crossings slide and
+draws the wires. What it leaves out is the contour that grows to the wall, and the last look at where the wall is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, final
 
 import numpy as np
 
-from vstent.deploy.braid import FreeDiameter, Profile, march
+from vstent.deploy import pieces
+from vstent.deploy.braid import FreeDiameter, Profile, landed_row, march
 from vstent.deploy.contour import Planes, circles, evenly_spaced, perimeters, planes
 from vstent.deploy.method import check_inside
 from vstent.deploy.wall import AbstractWall, Contact
@@ -50,8 +51,9 @@ class Bed:
 
     @cached_property
     def profile(self) -> Profile:
-        """Diameter of the device's contour along the axis."""
-        return Profile(self.abscissa_mm, perimeters(self.in_plane_mm) / np.pi)
+        """Diameter of the device's contour along the axis, and how the axis bends."""
+        bend = self.across.abscissa_mm, self.across.curvature_per_mm
+        return Profile(self.abscissa_mm, perimeters(self.in_plane_mm) / np.pi, bend)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,21 +103,26 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
     """
     design, size = wall.design, wall.size
     rows_mm = march(design, size, landing, wall.profile)
+    flat = wall.in_plane_mm.reshape(len(wall.abscissa_mm), -1)
+    in_plane_mm = curves.interpolate(wall.abscissa_mm, flat, rows_mm).reshape(len(rows_mm), -1, 2)
+    slid = pieces.slide(design, size, wall.across.place(rows_mm, in_plane_mm), landed_row(design, size, landing))
+    nodes_mm = slid.nodes_mm
+    marched_mm = rows_mm
+    rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), marched_mm, slid.row.mean(axis=1))
     check_inside(design, size, rows_mm, float(wall.abscissa_mm[-1]))
-    flat = np.concatenate([wall.in_plane_mm, wall.gap_mm[..., None]], axis=2).reshape(len(wall.abscissa_mm), -1)
-    laid = curves.interpolate(wall.abscissa_mm, flat, rows_mm).reshape(len(rows_mm), -1, 3)
-    nodes_mm = wall.across.place(rows_mm, laid[..., :2])
+    gap_mm = curves.interpolate(wall.abscissa_mm, wall.gap_mm, rows_mm)
     wires = _wires(wall, nodes_mm)
     stent = Stent(design, size, nodes_mm, rows_mm, wires.points_mm, wires.starts, wires.diameter_um)
-    ends = [_ends_mm(wall, landing, sense * wall.diameter_band_mm) for sense in (-1, 1)]
-    return Sketch(stent, laid[..., 2], (ends[0][0], ends[1][0]), (ends[0][1], ends[1][1]))
+    slid_mm = rows_mm[[0, -1]] - marched_mm[[0, -1]]
+    narrow, wide = (_ends_mm(wall, landing, sense * wall.diameter_band_mm) + slid_mm for sense in (-1, 1))
+    return Sketch(stent, gap_mm, (narrow[0], wide[0]), (narrow[1], wide[1]))
 
 
-def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> tuple[float, float]:
-    """Where the device begins and ends if the artery were wider by so much."""
-    profile = Profile(wall.abscissa_mm, np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.free_diameter_mm))
-    rows_mm = march(wall.design, wall.size, landing, profile)
-    return float(rows_mm[0]), float(rows_mm[-1])
+def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> Floats:
+    """Where (2,) the rows begin and end, before they slide, if the artery were wider by so much."""
+    diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.free_diameter_mm)
+    rows_mm = march(wall.design, wall.size, landing, replace(wall.profile, diameter_mm=diameter_mm))
+    return rows_mm[[0, -1]]
 
 
 def _wires(wall: Bed, nodes_mm: Floats) -> Wires:
