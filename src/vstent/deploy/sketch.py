@@ -2,7 +2,7 @@
 
 The wall as the device will find it does not depend on where the device lies: it is measured once, on rays across the
 parent axis, no wider than the free device (`Bed`). A sketch marches the rows over it, lets the crossings slide and
-draws the wires. What it leaves out is the contour that grows to the wall, and the last look at where the wall is.
+draws the wires. What it leaves out is to put every node to the wall again afterwards, and to march the rows once more.
 """
 
 from dataclasses import dataclass, replace
@@ -51,7 +51,7 @@ class Bed:
 
     @cached_property
     def profile(self) -> Profile:
-        """Diameter of the device's contour along the axis, and how the axis bends."""
+        """Diameter of the device's contour along the axis."""
         bend = self.across.abscissa_mm, self.across.curvature_per_mm
         return Profile(self.abscissa_mm, perimeters(self.in_plane_mm) / np.pi, bend)
 
@@ -102,27 +102,28 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
         When it would leave the artery.
     """
     design, size = wall.design, wall.size
-    rows_mm = march(design, size, landing, wall.profile)
-    flat = wall.in_plane_mm.reshape(len(wall.abscissa_mm), -1)
-    in_plane_mm = curves.interpolate(wall.abscissa_mm, flat, rows_mm).reshape(len(rows_mm), -1, 2)
-    slid = pieces.slide(design, size, wall.across.place(rows_mm, in_plane_mm), landed_row(design, size, landing))
-    nodes_mm = slid.nodes_mm
-    marched_mm = rows_mm
-    rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), marched_mm, slid.row.mean(axis=1))
+    marched_mm = rows_mm = march(design, size, landing, wall.profile)
     check_inside(design, size, rows_mm, float(wall.abscissa_mm[-1]))
-    gap_mm = curves.interpolate(wall.abscissa_mm, wall.gap_mm, rows_mm)
-    wires = _wires(wall, nodes_mm)
-    stent = Stent(design, size, nodes_mm, rows_mm, wires.points_mm, wires.starts, wires.diameter_um)
-    slid_mm = rows_mm[[0, -1]] - marched_mm[[0, -1]]
-    narrow, wide = (_ends_mm(wall, landing, sense * wall.diameter_band_mm) + slid_mm for sense in (-1, 1))
-    return Sketch(stent, gap_mm, (narrow[0], wide[0]), (narrow[1], wide[1]))
+    flat = np.concatenate([wall.in_plane_mm, wall.gap_mm[..., None]], axis=2).reshape(len(wall.abscissa_mm), -1)
+    laid = curves.interpolate(wall.abscissa_mm, flat, rows_mm).reshape(len(rows_mm), -1, 3)
+    held = landed_row(design, size, landing)
+    slid = pieces.slide(design, size, wall.across.place(rows_mm, laid[..., :2]), held)
+    rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), rows_mm, slid.row.mean(axis=1))
+    near = np.clip(np.rint(slid.row).astype(int), 0, len(rows_mm) - 1)
+    gap_mm = np.take_along_axis(laid[..., 2], near, axis=0)
+    wires = _wires(wall, slid.nodes_mm)
+    stent = Stent(design, size, slid.nodes_mm, rows_mm, wires.points_mm, wires.starts, wires.diameter_um)
+    moved_mm = (rows_mm - marched_mm)[[0, -1]]
+    ends_mm = [_ends_mm(wall, landing, sense * wall.diameter_band_mm) + moved_mm for sense in (-1, 1)]
+    (first, last), (other_first, other_last) = (ends.tolist() for ends in ends_mm)
+    return Sketch(stent, gap_mm, (first, other_first), (last, other_last))
 
 
 def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> Floats:
-    """Where (2,) the rows begin and end, before they slide, if the artery were wider by so much."""
+    """Where (2,) rows as marched begin and end if the artery were wider by so much."""
     diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.free_diameter_mm)
-    rows_mm = march(wall.design, wall.size, landing, replace(wall.profile, diameter_mm=diameter_mm))
-    return rows_mm[[0, -1]]
+    profile = replace(wall.profile, diameter_mm=diameter_mm)
+    return march(wall.design, wall.size, landing, profile)[[0, -1]]
 
 
 def _wires(wall: Bed, nodes_mm: Floats) -> Wires:
