@@ -257,6 +257,12 @@ def test_where_the_artery_widens_only_the_wide_part_stands_off():
     assert done.wall_gap_mm[wide].mean(axis=1) == pytest.approx((lumen_mm[wide] - 4.2) / 2 - 0.05, abs=0.02)
 
 
+def test_in_a_bend_wider_than_the_device_tilted_rows_are_no_wider_than_the_free_device():
+    stent = deploy(SILK, tube(arc(BEND_MM, np.pi / 2, 14), 2.5), size=SILK_SIZE).stent
+    assert stent.row_diameter_mm.max() <= SILK_SIZE.free_diameter_mm * (1 + 1e-6)
+    assert stent.row_diameter_mm == pytest.approx(np.full(len(stent.nodes_mm), 4.2), rel=0.01)
+
+
 @pytest.mark.parametrize("artery", [straight, tapered, bent, oval])
 @DEVICES
 def test_the_ends_lie_as_close_to_the_wall_as_the_middle(artery, design, size):

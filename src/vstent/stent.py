@@ -56,18 +56,7 @@ class Stent:
     @cached_property
     def row_diameter_mm(self) -> Floats:
         """(rows,) diameter of the circle of every row's perimeter, seen along the device: a row may be tilted."""
-        around_mm = np.roll(self.nodes_mm, -1, axis=1) - self.nodes_mm
-        columns = self.nodes_mm.shape[1]
-        center_mm = self.nodes_mm.mean(axis=1)
-        # The direction of the device is taken over about one diameter: centers of rows wobble.
-        radius_mm = np.linalg.norm(around_mm, axis=2).sum(axis=1).mean() / (2 * np.pi)
-        step_mm = np.linalg.norm(np.diff(center_mm, axis=0), axis=1).mean()
-        reach, row = max(1, round(radius_mm / step_mm)), np.arange(len(center_mm))
-        ahead = center_mm[np.minimum(row + reach, row[-1])] - center_mm[np.maximum(row - reach, 0)]
-        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-        across_mm = around_mm - np.einsum("ijk,ik->ij", around_mm, ahead)[..., None] * ahead[:, None]
-        # A regular polygon is shorter than its circle by (pi/n) / sin(pi/n).
-        return np.linalg.norm(across_mm, axis=2).sum(axis=1) / (columns * np.sin(np.pi / columns))
+        return row_diameters_mm(self.nodes_mm)
 
     @property
     def proximal_abscissa_mm(self) -> float:
@@ -111,6 +100,22 @@ class Deployment:
         freeze(self, "wall_gap_mm", np.float64, self.stent.nodes_mm.shape[:2])
         freeze(self, "history_mm", np.float64, (-1, *self.stent.nodes_mm.shape))
         freeze(self, "energy_mm2", np.float64, (len(self.history_mm),))
+
+
+def row_diameters_mm(nodes_mm: Floats) -> Floats:
+    """Diameters (rows,) of the circles of the perimeters of rows (rows, columns, 3), seen along the device."""
+    around_mm = np.roll(nodes_mm, -1, axis=1) - nodes_mm
+    columns = nodes_mm.shape[1]
+    center_mm = nodes_mm.mean(axis=1)
+    # The direction of the device is taken over about one diameter: centers of rows wobble.
+    radius_mm = np.linalg.norm(around_mm, axis=2).sum(axis=1).mean() / (2 * np.pi)
+    step_mm = np.linalg.norm(np.diff(center_mm, axis=0), axis=1).mean()
+    reach, row = max(1, round(radius_mm / step_mm)), np.arange(len(center_mm))
+    ahead = center_mm[np.minimum(row + reach, row[-1])] - center_mm[np.maximum(row - reach, 0)]
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    across_mm = around_mm - np.einsum("ijk,ik->ij", around_mm, ahead)[..., None] * ahead[:, None]
+    # A regular polygon is shorter than its circle by (pi/n) / sin(pi/n).
+    return np.linalg.norm(across_mm, axis=2).sum(axis=1) / (columns * np.sin(np.pi / columns))
 
 
 def tube_faces(rows: int, columns: int) -> Ints:

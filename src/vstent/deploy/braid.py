@@ -11,7 +11,7 @@ from vstent.deploy.contour import evenly_spaced, perimeters, planes
 from vstent.deploy.method import AbstractMethod, Opened, Placement, check_inside
 from vstent.device import Design, Size, grid, row_spacing_mm
 from vstent.kernels.arrays import Bools, Floats
-from vstent.stent import Landing
+from vstent.stent import Landing, row_diameters_mm
 from vstent.units import MM_PER_UM
 from vstent.vessel import Anatomy
 
@@ -19,8 +19,6 @@ ROUNDS = 8
 """Rows are marched anew at most so often."""
 SETTLED_MM = 0.1
 """Rows have settled when none moves further than this from one round to the next."""
-FREE_SLACK = 1e-3
-"""A row this near to the free perimeter, relative, has reached it."""
 LAST_STEPS = 5
 """Steps at most for the last nodes, once 99 % have terminated."""
 TABLE_ROWS = 501
@@ -96,10 +94,6 @@ class FreeDiameter:
     diameter_mm: float
     """The free diameter."""
 
-    def is_reached(self, nodes_mm: Floats) -> Bools:
-        """Tell which rows (rows,) are as wide as the free device."""
-        return perimeters(nodes_mm) > (1 - FREE_SLACK) * np.pi * self.diameter_mm
-
     def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
         """Let every row go from `before_mm` towards `after_mm` only as far as its perimeter may grow."""
         allowed = np.pi * self.diameter_mm
@@ -148,9 +142,20 @@ class ConstantWire(AbstractMethod):
         clearance_mm = np.maximum(opened.contour.clearance_mm - off_mm, 0.0)
         state = replace(opened.contour, nodes_mm=slid.nodes_mm, centers_mm=centers_mm, clearance_mm=clearance_mm)
         state, laid_mm = self._laid(placement, state)
-        is_free = FreeDiameter(placement.size.free_diameter_mm).is_reached(opened.contour.nodes_mm)
-        nodes_mm = np.where(is_free[:, None, None], state.nodes_mm, laid_mm)
-        return Opened(replace(state, nodes_mm=nodes_mm), where_mm.mean(axis=1))
+        nodes_mm = self._no_wider(state.nodes_mm, laid_mm, placement.size.free_diameter_mm)
+        rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
+        check_inside(placement.design, placement.size, rows_mm, placement.anatomy.axis.length_mm)
+        return Opened(replace(state, nodes_mm=nodes_mm), rows_mm)
+
+    @staticmethod
+    def _no_wider(slid_mm: Floats, laid_mm: Floats, free_mm: float) -> Floats:
+        """Lay rows on the wall only as far as they stay no wider, seen along the device, than it is when free."""
+        old, new = row_diameters_mm(slid_mm), row_diameters_mm(laid_mm)
+        share = np.where(new > free_mm, (free_mm - old) / np.maximum(new - old, 1e-12), 1.0)
+        nodes_mm = slid_mm + np.clip(share, 0.0, 1.0)[:, None, None] * (laid_mm - slid_mm)
+        middle_mm = nodes_mm.mean(axis=1, keepdims=True)
+        shrunk = np.minimum(free_mm / row_diameters_mm(nodes_mm), 1.0)[:, None, None]
+        return middle_mm + shrunk * (nodes_mm - middle_mm)
 
     def _grown(self, placement: Placement, opened: Opened) -> Opened:
         """One step of the contour; a row that reaches the free diameter stops there."""

@@ -5,7 +5,7 @@ parent axis, no wider than the free device (`Bed`). A sketch marches the rows ov
 draws the wires. What it leaves out is to put every node to the wall again afterwards, and to march the rows once more.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, final
 
@@ -52,7 +52,8 @@ class Bed:
     @cached_property
     def profile(self) -> Profile:
         """Diameter of the device's contour along the axis."""
-        return Profile(self.abscissa_mm, perimeters(self.in_plane_mm) / np.pi)
+        bend = self.across.abscissa_mm, self.across.curvature_per_mm
+        return Profile(self.abscissa_mm, perimeters(self.in_plane_mm) / np.pi, bend)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,7 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
     laid = curves.interpolate(wall.abscissa_mm, flat, rows_mm).reshape(len(rows_mm), -1, 3)
     held = landed_row(design, size, landing)
     slid = pieces.slide(design, size, wall.across.place(rows_mm, laid[..., :2]), held)
-    rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), rows_mm, slid.row).mean(axis=1)
+    rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), rows_mm, slid.row.mean(axis=1))
     near = np.clip(np.rint(slid.row).astype(int), 0, len(rows_mm) - 1)
     gap_mm = np.take_along_axis(laid[..., 2], near, axis=0)
     wires = _wires(wall, slid.nodes_mm)
@@ -120,7 +121,8 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
 
 def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> Floats:
     """Where (2,) rows as marched begin and end if the artery were wider by so much."""
-    profile = Profile(wall.abscissa_mm, np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.free_diameter_mm))
+    diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.free_diameter_mm)
+    profile = replace(wall.profile, diameter_mm=diameter_mm)
     return march(wall.design, wall.size, landing, profile)[[0, -1]]
 
 
