@@ -18,8 +18,8 @@ def trouble(state: State) -> str:
     when_ms = 1e3 * state.steps * state.scales.step_s
     if not good:
         return (
-            f"the flow diverged within the first {when_ms:.3g} ms, before any good check: the time step is too long for its "
-            "speed; halve the lattice speed or the cell size"
+            f"the flow diverged within the first {when_ms:.3g} ms, before any good check: the time step is too long"
+            " for its speed; halve the lattice speed or the cell size"
         )
     last = good[-1]
     speed = np.linalg.norm(last.velocity, axis=1)
