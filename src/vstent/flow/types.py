@@ -13,6 +13,8 @@ from vstent.vessel import Vessel
 
 LATTICE: Final = "lattice_boltzmann"
 """Name of the engine that vstent brings along."""
+OPENFOAM: Final = "openfoam"
+"""Name of the engine that hands the flow to OpenFOAM, a program of its own."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,9 @@ class FlowSettings:
     lattice_speed: float = 0.15
     """Peak speed in cells per time step: sets the time step."""
     engine: str = LATTICE
-    """What computes the flow: ``lattice_boltzmann``, or the name of a plug-in (`vstent.plugins`)."""
+    """What computes the flow: ``lattice_boltzmann``, ``openfoam``, or the name of a plug-in (`vstent.plugins`)."""
+    processes: int = 1
+    """Processes on this machine, for OpenFOAM."""
 
     def inflow_factor(self, time_s: Floats) -> Floats:
         """Inflow over mean inflow at times (t,)."""
@@ -268,7 +272,7 @@ class FlowField:
 
     @cached_property
     def oscillatory_shear_index(self) -> Floats:
-        """(v,) (1 - |mean stress| / mean |stress|) / 2 (He and Ku 1996, J. Biomech. Eng. 118, 74); 0 in steady flow."""
+        """(v,) (1 - norm(mean stress) / mean norm) / 2 (He and Ku 1996, J. Biomech. Eng. 118, 74); 0 in steady flow."""
         # The stress is linear in the velocity: that of the mean flow is the mean stress.
         return 0.5 * (1 - np.linalg.norm(self.wall_shear_stress_Pa, axis=1) / np.maximum(self.shear_Pa, 1e-12))
 
