@@ -60,7 +60,7 @@ def experiments(shared_data: Path) -> list[dict[str, np.ndarray]]:
     if not archive.exists():
         pytest.skip("the PIV data (../shared/reference) are not on this machine")
     with zipfile.ZipFile(archive) as files:
-        texts = [files.read(name).decode() for name in files.namelist() if name.endswith(".txt")]
+        texts = [files.read(name).decode().replace("\r\n", "\n") for name in files.namelist() if name.endswith(".txt")]
     assert len(texts) == 5
     return [_plots(text) for text in texts]
 
