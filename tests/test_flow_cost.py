@@ -9,6 +9,7 @@ from tubes import line, tube
 from vstent.errors import FlowError
 from vstent.flow import FlowCase, FlowSettings, domain, simulate_case
 from vstent.flow.cost import block_rate, estimate, free_memory_bytes, refuse_too_large
+from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_pulse import PHASES, PulsatileLatticeBoltzmann
 from vstent.flow.waveform import OLDER_ADULT_ICA
 
@@ -59,14 +60,27 @@ def test_what_does_not_fit_is_refused_with_the_cell_size_that_does():
 
 def test_too_long_a_time_step_is_named_with_the_last_good_state():
     with pytest.raises(FlowError, match="diverged") as error:
-        simulate_case(case_of(cell_size_mm=0.4, lattice_speed=1.5, max_steps=4000))
+        simulate_case(case_of(cell_size_mm=0.4, lattice_speed=4.0, max_steps=4000))
     assert "halve the lattice speed" in str(error.value)
+
+
+def test_a_narrow_place_inside_is_computed_with_a_shorter_time_step(monkeypatch):
+    case, tried = case_of(cell_size_mm=0.4, inflow_mL_s=1.0, tolerance=0.02), []
+    real = LatticeBoltzmann.init
+
+    def ill_guessed(engine, case, start):
+        tried.append(case.settings.lattice_speed)
+        faster = replace(case.settings, lattice_speed=8 * case.settings.lattice_speed)
+        return real(engine, replace(case, settings=faster), start)
+
+    monkeypatch.setattr(LatticeBoltzmann, "init", ill_guessed)
+    field = simulate_case(case)
+    assert tried == pytest.approx([0.15, 0.4 * 0.15])
+    assert field.outlets_mL_s.sum() == pytest.approx(field.inlet_mL_s, rel=0.02)
 
 
 def test_the_last_good_check_is_told_with_time_speed_and_place():
     case = case_of(cell_size_mm=0.4, inflow_mL_s=1.0)
-    from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
-
     engine = LatticeBoltzmann(0.4)
     state = engine.init(case, None)
     while len(state.history) < 3:

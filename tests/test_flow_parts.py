@@ -1,5 +1,8 @@
 """The parts of the flow floor whose answer is known without a run: screen, profile, wall stress, convergence."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -10,7 +13,7 @@ from vstent.flow import Blood, FlowCase, FlowSettings, domain, screen
 from vstent.flow.engines import AbstractEngine, run
 from vstent.flow.engines.lattice_boltzmann import fraction_left
 from vstent.flow.profile import developed_profile
-from vstent.flow.screen import drag_per_length, inertial_loss, on_grid
+from vstent.flow.screen import CROSSING_PER_SOLIDITY, crossing_factor, drag_per_length, inertial_loss, on_grid
 from vstent.flow.wall_stress import wall_stress
 from vstent.stent import Stent
 
@@ -57,10 +60,20 @@ def test_the_screen_of_a_braid_resists_as_its_closed_form(degrees, expected):
     spacing_mm = np.pi * DIAMETER_MM * np.cos(np.radians(degrees)) / (N_WIRES / 2)
     law = 2 * 0.004 * drag_per_length(0.03, spacing_mm) / (spacing_mm * 1e-3)
     assert law == pytest.approx(expected, rel=0.01)
+    law *= crossing_factor(0.03, spacing_mm)
     assert found.mean() == pytest.approx(law, rel=0.02)
     assert found.std() < 0.03 * law
     np.testing.assert_allclose(made.tangential_resistance_Pa_s_m, 0.5 * made.normal_resistance_Pa_s_m)
     assert made.area_mm2.sum() == pytest.approx(np.pi * DIAMETER_MM * LENGTH_MM, rel=0.005)
+
+
+def test_crossing_wires_resist_as_the_kept_table_of_resolved_ones():
+    table = json.loads((Path(__file__).parents[1] / "benchmarks" / "screen.json").read_text())
+    for row in table:
+        assert crossing_factor(row["diameter_over_spacing"], 1.0) == pytest.approx(row["crossing_factor"], rel=0.05)
+    slope = np.mean([(row["crossing_factor"] - 1) / row["diameter_over_spacing"] for row in table])
+    assert slope == pytest.approx(CROSSING_PER_SOLIDITY, abs=0.01)
+    assert crossing_factor(0.0, 1.0) == 1
 
 
 def test_thicker_wires_resist_more_and_none_of_it_is_lost_inside_the_blood():

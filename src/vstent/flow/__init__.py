@@ -8,7 +8,7 @@ from vstent import plugins
 from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
-from vstent.flow.engines import AbstractEngine, Bookmark, Progress, Saved, run
+from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
 from vstent.flow.screen import screen
@@ -40,6 +40,9 @@ COARSENING = 2.0
 """Cells of the first guess, over those of the answer: it costs a sixteenth per second of flow."""
 COARSE_SHARE = 0.12
 """Part of the whole time that each coarse run takes, for the progress."""
+
+SLOWER = 0.4
+"""A run that diverged is tried once more with a time step so much shorter."""
 
 OnProgress = Callable[[Progress], None]
 
@@ -175,8 +178,14 @@ def _run(
     progress: OnProgress | None,
     bookmark: Bookmark | None,
 ) -> FlowField:
-    engine = _engine(case.settings)
-    return run(engine(cell_size_mm), case, start=start, progress=progress, bookmark=bookmark)
+    engine = _engine(case.settings)(cell_size_mm)
+    try:
+        return run(engine, case, start=start, progress=progress, bookmark=bookmark)
+    except DivergenceError:
+        # The fastest blood is guessed from the openings: a narrow place inside may hold faster.
+        anew = None if bookmark is None else replace(bookmark, saved=None)
+        settings = replace(case.settings, lattice_speed=SLOWER * case.settings.lattice_speed)
+        return run(engine, replace(case, settings=settings), start=start, progress=progress, bookmark=anew)
 
 
 def _engine(settings: FlowSettings) -> Callable[[float], AbstractEngine[Any]]:

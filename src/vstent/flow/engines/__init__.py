@@ -63,6 +63,10 @@ class Bookmark:
     """Takes the state of the run from time to time."""
 
 
+class DivergenceError(FlowError):
+    """A run has grown without bounds."""
+
+
 class AbstractEngine(ABC, Generic[State]):
     """A way to compute a steady flow."""
 
@@ -114,7 +118,7 @@ def run(
 
     Raises
     ------
-    FlowError
+    DivergenceError
         When the computation diverges.
     """
     began = perf_counter()
@@ -133,7 +137,7 @@ def run(
         reached = engine.terminate(state)
         if reached is not None:
             if np.isnan(reached):
-                raise FlowError(engine.trouble(state))
+                raise DivergenceError(engine.trouble(state))
             residual.append(reached)
             if progress is not None:
                 progress(_progress(residual, limit, tolerance, seconds()[1]))

@@ -164,8 +164,9 @@ def step(state: State) -> None:
     advance(state, min(_slice_steps(state), state.steps_per_check - state.steps % state.steps_per_check))
     state.loop_seconds += perf_counter() - began
     if is_at_check(state):
-        state.snapshots.append(_snapshot(state))
-        state.history.append(_monitor(state, state.snapshots[-1]))
+        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is told of, not warned of
+            state.snapshots.append(_snapshot(state))
+            state.history.append(_monitor(state, state.snapshots[-1]))
 
 
 def is_at_check(state: State) -> bool:

@@ -6,18 +6,20 @@ from vstent.flow.engines.lattice_setup import CELL_REYNOLDS_AT_END
 from vstent.flow.engines.lattice_state import Snapshot, State
 from vstent.kernels.arrays import Floats
 
+SOUND = 3**-0.5
+"""Speed of the lattice's sound, in cells per time step; faster blood is no flow."""
 FAST = 0.3
-"""Speed in cells per time step from which the lattice's own sound (0.58) is too near."""
+"""Speed from which the sound is too near."""
 
 
 def trouble(state: State) -> str:
     """One sentence: what happened, the last good state, the likeliest cause and what to do about it."""
-    good = [one for one in state.snapshots if np.isfinite(one.velocity).all()]
+    good = [one for one in state.snapshots if np.abs(one.velocity).max() < SOUND]
     when_ms = 1e3 * state.steps * state.scales.step_s
     if not good:
         return (
-            f"the flow diverged within the first {when_ms:.3g} ms, before any check: the time step is too long for its "
-            "speed; halve the lattice speed or the cell size"
+            f"the flow diverged within the first {when_ms:.3g} ms, before any good check: the time step is too long"
+            " for its speed; halve the lattice speed or the cell size"
         )
     last = good[-1]
     speed = np.linalg.norm(last.velocity, axis=1)
