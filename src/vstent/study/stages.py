@@ -19,7 +19,7 @@ from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.engines.openfoam import simulate_in
 from vstent.flow.openfoam.case import STRUT_REACH_MM, struts_near
 from vstent.flow.openfoam.cost import tell_cost
-from vstent.flow.types import OPENFOAM
+from vstent.flow.types import LATTICE, OPENFOAM
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
@@ -122,13 +122,14 @@ def compute_flows(
     if settings.flow is None:
         return {}
     fields: dict[str, FlowField] = {}
-    _plan(anatomy, settings.flow, ledger)
     for name in (BARE, *deployments):
         stent = deployments[name].stent if name in deployments else None
         placing = settings.placing(name) if stent else None
         stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, placing)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
+            if name == BARE and settings.flow.engine == LATTICE:
+                _plan(anatomy, settings.flow, ledger)
             with ledger.stage(stage) as tell:
                 if settings.flow.engine == OPENFOAM:
                     folder = out / "flow" / name / OPENFOAM
