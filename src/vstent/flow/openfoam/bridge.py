@@ -75,12 +75,12 @@ def bridge(case: FlowCase, domain: Domain, folder: Path) -> Bridge:
         ostium_mm, area_mm2 = sampling.surface_samples(case.ostium, domain.cell_size_mm)
     lumen = case.vessel.lumen
     return Bridge(
-        scatter.linear_fits(known_mm, domain.centers_mm),
-        scatter.linear_fits(inside_mm, domain.centers_mm),
-        scatter.linear_fits(known_mm, ostium_mm),
+        scatter.fits(known_mm, domain.centers_mm),
+        scatter.fits(inside_mm, domain.centers_mm),
+        scatter.fits(known_mm, ostium_mm),
         area_mm2,
         _wall_to_lumen(case, np.concatenate(list(at_rest.values())), 2 * domain.cell_size_mm),
-        scatter.linear_fits(inside_mm, lumen.vertices_mm),
+        scatter.fits(inside_mm, lumen.vertices_mm),
         {name: len(faces) for name, faces in at_rest.items()},
         len(inside_mm),
     )

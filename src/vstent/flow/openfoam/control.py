@@ -55,7 +55,7 @@ def solution() -> str:
         },
         "PIMPLE": {"nOuterCorrectors": 1, "nCorrectors": 2, "nNonOrthogonalCorrectors": 1},
         "potentialFlow": {"nNonOrthogonalCorrectors": 5},
-        "relaxationFactors": {"equations": {"U": 0.8, "UFinal": 1}},
+        "relaxationFactors": {"equations": {"U": 0.9, "UFinal": 1}},
         "cache": {"grad(U)": ""},
     }
     return foam_file("fvSolution", entries)

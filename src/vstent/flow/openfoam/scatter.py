@@ -1,4 +1,4 @@
-"""From scattered points to others: linear fits as one sparse matrix."""
+"""From scattered points to others: local fits as one sparse matrix."""
 
 from typing import Final
 
@@ -8,17 +8,19 @@ from scipy.spatial import cKDTree
 
 from vstent.kernels.arrays import Floats
 
-NEIGHBOURS: Final = 16
+NEIGHBOURS: Final = 32
 """Points of a fit."""
-BLOCK: Final = 50_000
+RIDGE: Final = 1e-5
+"""Pull of slopes and curvatures towards zero, over the weight of the points."""
+BLOCK: Final = 20_000
 """Fits solved at once."""
 
 
-def linear_fits(sources: Floats, targets: Floats) -> csr_matrix:
-    """Matrix (t, s) that takes values at sources (s, 3) to targets (t, 3): exact for linear functions.
+def fits(sources: Floats, targets: Floats) -> csr_matrix:
+    """Matrix (t, s) that takes values at sources (s, 3) to targets (t, 3): exact for quadratic functions.
 
     Moving least squares (Lancaster and Salkauskas 1981, Math. Comput. 37, 141) over the nearest sources. Where these
-    lie on a plane, the slope across it is taken for zero.
+    lie on a plane, what they cannot tell is taken for zero.
     """
     count = min(NEIGHBOURS, len(sources))
     tree = cKDTree(sources)
@@ -37,11 +39,12 @@ def _fit(offset: Floats, distance: Floats) -> Floats:
     """Weights (t, k) of the neighbours at offsets (t, k, 3)."""
     reach = 1.05 * distance[:, -1:]
     weight = (1 - (distance / reach) ** 2) ** 2
-    basis = np.concatenate([np.ones((*distance.shape, 1)), offset / reach[..., None]], axis=2)
+    x, y, z = np.moveaxis(offset / reach[..., None], 2, 0)
+    basis = np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=2)
     weighted = basis * weight[..., None]
     matrix = np.einsum("tki,tkj->tij", weighted, basis)
-    matrix[:, 1:, 1:] += 1e-6 * weight.sum(axis=1)[:, None, None] * np.eye(3)
-    value = np.zeros((len(matrix), 4, 1))
+    matrix[:, 1:, 1:] += RIDGE * weight.sum(axis=1)[:, None, None] * np.eye(9)
+    value = np.zeros((len(matrix), 10, 1))
     value[:, 0] = 1
     return np.asarray(np.einsum("tki,ti->tk", weighted, np.linalg.solve(matrix, value)[..., 0]))
 

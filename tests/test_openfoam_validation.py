@@ -1,0 +1,89 @@
+"""The embedded engine against OpenFOAM, bare, on the demo and on a real carotid; `docs/openfoam.md` keeps the table."""
+
+import resource
+import shutil
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vstent import phantoms
+from vstent.flow import FlowCase, FlowField, FlowSettings, flow_case, indices, sampling, simulate_case
+from vstent.flow.domain import cells_inside
+from vstent.flow.engines import run
+from vstent.flow.engines.openfoam import OpenFoam
+from vstent.io.surfaces import read_surface
+from vstent.repair import repair
+from vstent.restore import restore
+from vstent.trace import trace
+from vstent.trim import trim
+from vstent.vessel import Vessel
+
+pytestmark = [
+    pytest.mark.validation,
+    pytest.mark.skipif(
+        shutil.which("simpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)"
+    ),
+]
+LIMITS = {"mean_sac_velocity_m_s": 0.05, "neck_inflow_mL_s": 0.05, "mean_sac_wss_Pa": 0.10}
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """OpenFOAM's result beside the embedded engine's."""
+
+    ratios: dict[str, float]
+    """Of every index, OpenFOAM over embedded."""
+    nrmse: float
+    """Root-mean-square difference of the velocities in the vessel over the largest speed."""
+    relative_rms: float
+    """The same over the root-mean-square speed."""
+
+
+def agreement(case: FlowCase, embedded: FlowField, foam: FlowField) -> Agreement:
+    """Compare two flows: indices, and velocities in the cells of the vessel, extensions left out."""
+    ours, theirs = (indices(field, case.sac, case.ostium) for field in (embedded, foam))
+    inside = cells_inside(case.vessel.closed, embedded.centers_mm, embedded.cell_size_mm)
+    velocity = embedded.velocity_m_s[inside]
+    error = np.linalg.norm(sampling.values_at(foam, embedded.centers_mm[inside])[0] - velocity, axis=1)
+    rms = float(np.sqrt((error**2).mean()))
+    speed = np.linalg.norm(velocity, axis=1)
+    ratios = {key: theirs[key] / value for key, value in ours.items() if value}
+    return Agreement(ratios, rms / float(speed.max()), rms / float(np.sqrt((speed**2).mean())))
+
+
+def compared(case: FlowCase, folder: Path, cell_size_mm: float) -> Agreement:
+    """Compute a bare flow both ways and print a row of the table."""
+    embedded = simulate_case(case)
+    began = time.perf_counter()
+    foam = run(OpenFoam(cell_size_mm, folder, grid_size_mm=embedded.cell_size_mm), case)
+    seconds, peak = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    found = agreement(case, embedded, foam)
+    print(f"{foam.advice} {seconds:.0f} s, {peak / 1e9:.2f} GB; embedded: {embedded.advice} {embedded.seconds:.0f} s")  # noqa: T201
+    print(found)  # noqa: T201
+    return found
+
+
+def check(found: Agreement) -> None:
+    off = {key: found.ratios[key] - 1 for key, limit in LIMITS.items() if abs(found.ratios[key] - 1) > limit}
+    assert not off
+    assert found.nrmse < 0.05
+
+
+def restored(vessel: Vessel) -> FlowCase:
+    return flow_case(restore(trim(trace(vessel))), None, FlowSettings())
+
+
+def test_the_demo(tmp_path: Path) -> None:
+    case = restored(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))
+    check(compared(case, tmp_path / "demo", 0.2))
+
+
+def test_a_real_carotid_at_half_its_flow(shared_data: Path, tmp_path: Path) -> None:
+    # At its mean flow the blood swings in this siphon and no steady solver settles; at half of it, it is steady.
+    lumen, _ = repair(read_surface(shared_data / "aneurisk_C0038.vtp")[0])
+    case = restored(Vessel(lumen))
+    half = replace(case, settings=replace(case.settings, inflow_mL_s=0.5 * case.inflow_mL_s))
+    check(compared(half, tmp_path / "C0038", 0.25))
