@@ -111,6 +111,7 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
 
 
 def drag(page, selector, right, down):
+    page.wait_for_selector(selector, state="visible")
     box = page.locator(selector).bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y)

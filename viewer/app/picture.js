@@ -171,6 +171,7 @@ export class Picture {
   setMarks(marks) {
     this.drawnMarks = marks;
     this.marks.replaceChildren(...marks.map(({ element }) => element));
+    if (this.stage) marks.forEach((mark) => this.placeMark(mark));
     this.stage?.redraw();
   }
 
