@@ -35,7 +35,7 @@ $(VENV)/.ready: pyproject.toml
 	  { echo "Python's venv module is missing: install the package python3-venv (Debian, Ubuntu)"; exit 1; }
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --editable ".[app]"
 	$(BIN)/python -m vstent.kernels.warm
 	@touch $@
 

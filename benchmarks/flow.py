@@ -17,6 +17,7 @@ from vstent.trace import trace
 from vstent.vessel import Vessel
 
 RADIUS_MM, INFLOW_ML_S, VISCOSITY_PA_S = 2.0, 0.5, 0.004
+STEPS = 20
 BYTES_PER_UPDATE = 19 * 4 * 2
 """Read and write every population once, in place; addresses are one per segment."""
 
@@ -46,14 +47,13 @@ def bandwidth_GB_s(n_bytes: int) -> float:
 def throughput(vessel: Vessel, cell_mm: float) -> None:
     case = FlowCase(vessel, settings=FlowSettings(inflow_mL_s=INFLOW_ML_S))
     state = LatticeBoltzmann(cell_mm).init(case, None)
-    state.steps_per_check = 20
-    advance(state)
+    advance(state, STEPS)
     times = []
     for _ in range(5):
         began = time.perf_counter()
-        advance(state)
+        advance(state, STEPS)
         times.append(time.perf_counter() - began)
-    rate = len(state.domain.cells) * state.steps_per_check / min(times)
+    rate = len(state.domain.cells) * STEPS / min(times)
     limit = bandwidth_GB_s(state.populations.nbytes) * 1e9 / BYTES_PER_UPDATE
     print(
         f"| {len(state.domain.cells)} | {state.populations.nbytes / 1e6:.0f} | {rate / 1e6:.0f} | {limit / 1e6:.0f} "

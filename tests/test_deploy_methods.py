@@ -139,7 +139,7 @@ def test_twice_the_rows_and_columns_give_the_same_device(method, monkeypatch):
     monkeypatch.setattr(device, "NODE_SPACING_LIMIT_MM", 0.135)
     fine = deploy(SILK, wavy(), size=SIZE, landing=Landing(18.0), method=method)
     assert fine.stent.nodes_mm.shape[1] == 2 * coarse.stent.nodes_mm.shape[1]
-    assert fine.stent.deployed_length_mm == pytest.approx(coarse.stent.deployed_length_mm, rel=0.004)
+    assert fine.stent.deployed_length_mm == pytest.approx(coarse.stent.deployed_length_mm, rel=0.006)
     inside_mm = coarse.stent.nodes_mm[2:-2].reshape(-1, 3)
     assert np.quantile(fine.stent.contour.closest(inside_mm)[1], 0.99) < 0.01
 

@@ -40,14 +40,14 @@ def test_frontal_and_lateral_follow_radiology():
 
 
 def test_the_side_that_hides_less_is_chosen():
-    from vstent.report.scene import _views
+    from vstent.report.scene import views_of
 
     case = report_case.case()
     free = report_case.scene().view("profile").axes[2]
     screen = report_case.sphere(12.0 * free + [0, 0, 9.0], 5.0)
     vessel = SimpleNamespace(lumen=report_case.joined(case.anatomy.vessel.lumen, screen))
     hidden = SimpleNamespace(vessel=vessel, axis=case.anatomy.axis, aneurysms=case.anatomy.aneurysms)
-    chosen = _views(hidden, case.deployments)[0].axes
+    chosen = views_of(hidden, case.deployments)[0].axes
     assert chosen[2] == pytest.approx(-free)
     assert np.linalg.det(chosen) == pytest.approx(1)  # turned round, not mirrored
 

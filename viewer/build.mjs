@@ -1,27 +1,37 @@
-// Builds the one bundle that the report and the page embed, and puts the licences of what is in it beside it.
+// Builds the two bundles, the report's viewer and the page, and puts the licences of what is in them beside them.
 import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { copyFile, readdir, readFile, writeFile } from "node:fs/promises";
 
 const assets = new URL("../src/vstent/report/assets/", import.meta.url);
+const page = new URL("../src/vstent/app/assets/", import.meta.url);
 
-// The sources' hash goes into the bundle: a test tells when one was changed and the other was not.
-const hash = createHash("sha256");
-for (const name of (await readdir("src")).sort()) hash.update(await readFile(`src/${name}`));
-hash.update(await readFile("package-lock.json"));
+/** The sources' hash goes into a bundle: a test tells when one was changed and the other was not. */
+async function digest(...folders) {
+  const hash = createHash("sha256");
+  for (const folder of folders) for (const name of (await readdir(folder)).sort()) hash.update(await readFile(`${folder}/${name}`));
+  hash.update(await readFile("package-lock.json"));
+  return hash.digest("hex");
+}
 
-await build({
-  entryPoints: ["src/viewer.js"],
-  outfile: new URL("viewer.js", assets).pathname,
-  bundle: true,
-  minify: true,
-  format: "iife",
-  globalName: "VstentViewer",
-  target: ["chrome100", "firefox100", "safari15"],
-  legalComments: "none",
-  banner: { js: `/* vstent viewer with three.js and fflate (MIT, see LICENSES.txt); sources ${hash.digest("hex")} */` },
-  charset: "utf8",
-});
+async function bundle(entry, outfile, sources, more) {
+  await build({
+    entryPoints: [entry],
+    outfile: outfile.pathname,
+    bundle: true,
+    minify: true,
+    format: "iife",
+    target: ["chrome100", "firefox100", "safari15"],
+    legalComments: "none",
+    banner: { js: `/* vstent with three.js and fflate (MIT, see LICENSES.txt); sources ${sources} */` },
+    charset: "utf8",
+    ...more,
+  });
+}
+
+await bundle("src/viewer.js", new URL("viewer.js", assets), await digest("src"), { globalName: "VstentViewer" });
+await bundle("app/main.js", new URL("app.js", page), await digest("src", "app"), {});
+await copyFile("app/app.css", new URL("app.css", page));
 await copyFile("src/viewer.css", new URL("viewer.css", assets));
 
 const licences = [];

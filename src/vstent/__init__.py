@@ -22,6 +22,7 @@ _HOMES = {
     "simulate": "vstent.flow",
     "measure": "vstent.measure",
     "morphology": "vstent.measure",
+    "rank": "vstent.rank",
     "catalogue": "vstent.device",
     "find_design": "vstent.device",
     "run": "vstent.study",

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from statistics import median
 from typing import Any, Final
 
 from rich.console import Console as RichConsole
@@ -10,6 +11,8 @@ from rich.status import Status
 from rich.table import Table
 
 from vstent.device import Design
+from vstent.flow.convergence import Refinement
+from vstent.rank import Ranking
 from vstent.vessel import Opening
 
 ROWS: Final = (
@@ -63,6 +66,10 @@ class Console:
             self._told = now
             self._err.print(f"{stage:18} {fraction:4.0%} {detail}", soft_wrap=True)
 
+    def say(self, text: str) -> None:
+        """Print a line on standard error."""
+        self._err.print(text, soft_wrap=True, markup=False)
+
     def print(self, item: Any) -> None:
         """Print a line or a table on standard output."""
         self._out.print(item)
@@ -85,6 +92,66 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
     return table
 
 
+COHORT_COLUMNS: Final = (
+    ("length, mm", "deployment.deployed_length_mm", "{:.1f}"),
+    ("apposed", "deployment.apposed_fraction", "{:.0%}"),
+    ("metal at neck", "deployment.neck_metal_coverage_fraction", "{:.0%}"),
+    ("neck inflow, after / before", "ratios.neck_inflow_mL_s_ratio", "{:.2f}"),
+    ("s a case", "case_s", "{:.1f}"),
+    ("CPU s a case", "case_cpu_s", "{:.1f}"),
+    ("MB", "peak_memory_MB", "{:.0f}"),
+)
+"""Columns of a cohort: title, key, form."""
+RANKING_COLUMNS: Final = (
+    ("length, mm", "deployed_length_mm", "{:.1f}"),
+    ("apposed", "apposed_fraction", "{:.0%}"),
+    ("beyond neck, mm", "landing_length_mm", "{:.1f}"),
+    ("metal at neck", "neck_metal_coverage_fraction", "{:.0%}"),
+)
+"""Columns of the ranking: title, key of the measure, its form."""
+
+
+def ranking_table(ranking: Ranking, shown: int) -> Table:
+    """Table of the best candidates, and how many there are beyond."""
+    titles = [title for title, _, _ in RANKING_COLUMNS]
+    table = Table("", "device and size", "shift, mm", "score", *titles, "why")
+    for number, candidate in enumerate(ranking.candidates[:shown], start=1):
+        values = [(candidate.measures.get(key), form) for _, key, form in RANKING_COLUMNS]
+        cells = ["" if value is None else form.format(value) for value, form in values]
+        score = f"{candidate.score:.2f}" if candidate.is_suitable else "out"
+        table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells, candidate.reason)
+    table.caption = f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable"
+    return table
+
+
+def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Table of a cohort: a line a device, with medians of what came through."""
+    columns = [column for column in COHORT_COLUMNS if any(row.get(column[1]) is not None for row in rows)]
+    table = Table("device", "done", "failed", "lost", *(title for title, _, _ in columns))
+    for device in dict.fromkeys(row["device"] for row in rows):
+        own = [row for row in rows if row["device"] == device]
+        counts = [str(sum(row["outcome"] == outcome for row in own)) for outcome in ("done", "failed", "lost")]
+        found = [[row[key] for row in own if row.get(key) is not None] for _, key, _ in columns]
+        cells = [
+            form.format(median(values)) if values else "" for values, (*_, form) in zip(found, columns, strict=True)
+        ]
+        table.add_row(device, *counts, *cells)
+    table.caption = "medians"
+    return table
+
+
+def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
+    """Table of intervals: each result of each device, and the causes of its spread."""
+    from vstent.report.uncertainty import intervals
+
+    table = Table("device", "result", "mean", "95 % between", "and", "because of", title="what is not sure, varied")
+    for name, stent in metrics["stents"].items():
+        for row in intervals(stent):
+            causes = ", ".join(f"{cause} {share:.0%}" for cause, share in row.shares if share >= 0.005)
+            table.add_row(name, row.name, row.mean, row.low, row.high, causes)
+    return table
+
+
 def opening_table(openings: Sequence[Opening]) -> Table:
     """Table of the vessel's ends: role, diameter, area, where."""
     table = Table("opening", "diameter, mm", "area, mm²", "center, mm (LPS)")
@@ -101,6 +168,32 @@ def morphology_table(measures: Mapping[str, Any]) -> Table:
     table = Table("morphology", "")
     for quantity in flatten(measures):
         table.add_row(quantity.name, quantity.text)
+    return table
+
+
+def flow_table(metrics: Mapping[str, Any]) -> Table:
+    """Table of every index of the flow: bare, and with each device with its change."""
+    from vstent.report.quantities import flatten
+
+    stents = metrics["stents"]
+    table = Table("flow", "bare", *stents)
+    for quantity in flatten(metrics["bare"]):
+        changes = (_change(quantity.value, stent["flow"][quantity.key]) for stent in stents.values())
+        table.add_row(quantity.name, quantity.text, *changes)
+    return table
+
+
+def convergence_table(found: Refinement) -> Table:
+    """Table of one refinement: every quantity at three sizes, its observed order, its value at size zero."""
+    from vstent.report.quantities import flatten
+
+    columns = (f"{size:.3g}" for size in found.sizes)
+    table = Table(found.name.replace("_", " "), *columns, "order", "limit", "±")
+    for key, one in found.quantities.items():
+        order = "not one way" if one.order is None else f"{one.order:.1f}"
+        values = [quantity.text for value in one.values for quantity in flatten({key: value})]
+        name = flatten({key: 0.0})[0].name
+        table.add_row(name, *values, order, _cell(one.extrapolated), f"{one.uncertainty_fraction:.1%}")
     return table
 
 

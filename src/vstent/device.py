@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from vstent import plugins
 from vstent.errors import DeviceError
 from vstent.units import MM_PER_UM
 
@@ -23,6 +24,12 @@ Confidence = Literal["cited", "derived", "estimated"]
 
 STEEP_RAD = 0.1, 1.5
 """Angles between wire and axis that a device may have at its free diameter."""
+BEND_SAMPLES, BEND_STEPS = 24, 6
+"""Angles round the axis, and Newton steps, in which the spacing of rows in a bend is computed."""
+STEEPEST_BEND = 0.9
+"""Artery's radius over the bend's, at most: sharper ones are only sharp where the wall is folded."""
+STRAIGHTEST = 0.995
+"""Cosine of the angle that wires outside a bend have to the axis, at most."""
 NODE_SPACING_LIMIT_MM = 0.35
 """A contour's nodes are never further apart than this at the label diameter."""
 
@@ -231,9 +238,29 @@ def angle_rad(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np
     return np.arcsin(_free_sine(design, size) * np.minimum(diameter_mm, size.free_diameter_mm) / size.free_diameter_mm)
 
 
-def row_spacing_mm(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np.ndarray:
-    """Distance h(D) along the axis between rows of junctions at a local diameter, at most the free one."""
-    return piece_length_mm(design, size) * np.cos(angle_rad(design, size, diameter_mm))
+def row_spacing_mm(
+    design: Design, size: Size, diameter_mm: float | np.ndarray, curvature_per_mm: float | np.ndarray = 0.0
+) -> np.ndarray:
+    """Distance h along the axis between rows of junctions at a local diameter, at most the free one.
+
+    Where the axis bends, rows are h (1 + k cos(theta)) apart at the angle theta round it, k = curvature D / 2. Pieces
+    of wire keep their length l, so that cos(alpha) = h (1 + k cos(theta)) / l and n columns fill the circumference
+    when the mean of 1 / sin(alpha) round it is n l / (pi D): h is less than in a straight artery. The joined cells of
+    a laser-cut device do not crowd outside a bend: its axis keeps its length.
+    """
+    piece_mm, angle = piece_length_mm(design, size), angle_rad(design, size, diameter_mm)
+    if isinstance(design, LaserCut) or not np.any(curvature_per_mm):
+        return piece_mm * np.cos(angle)
+    bend = np.minimum(0.5 * np.abs(curvature_per_mm) * diameter_mm, STEEPEST_BEND)
+    apart = 1 + np.multiply.outer(bend, np.cos(2 * np.pi * (np.arange(BEND_SAMPLES) + 0.5) / BEND_SAMPLES))
+    longest = STRAIGHTEST / (1 + bend)
+    cosine = np.minimum(np.cos(angle), longest)
+    for _ in range(BEND_STEPS):  # Newton's; the mean grows faster than linearly with the cosine
+        steep = 1 - (cosine[..., None] * apart) ** 2
+        excess = (1 / np.sqrt(steep)).mean(axis=-1) - 1 / np.sin(angle)
+        slope = (cosine[..., None] * apart**2 / steep**1.5).mean(axis=-1)
+        cosine = np.clip(cosine - excess / slope, 0.0, longest)
+    return piece_mm * cosine
 
 
 def deployed_length_mm(design: Design, size: Size, diameter_mm: float) -> float:
@@ -269,20 +296,27 @@ def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> floa
 
 @cache
 def catalogue() -> dict[str, Design]:
-    """Return every device by its key: those of the catalogue, then those that the user has added.
+    """Return every device by its key: those of the catalogue, of plug-ins, then those that the user has added.
 
     Raises
     ------
     DeviceError
         When a catalogue breaks its schema or names a device that another one names.
+    PluginError
+        When a plug-in cannot be loaded.
     """
     from importlib.resources import files
 
     from vstent.device_schema import parse  # pydantic is loaded only when the catalogue is
 
     designs = parse(files("vstent").joinpath("devices.toml").read_text(encoding="utf-8"))
+    for name, entry in plugins.plugins("vstent.devices").items():
+        text = plugins.load("vstent.devices", name, built_in="vstent")()
+        added = parse(text, f"The plug-in {name} ({entry.value})")
+        _check_new(added, designs, f"The plug-in {name}")
+        designs |= added
     for path in sorted(user_folder().glob("*.toml")):
-        added = parse(path.read_text(encoding="utf-8"), str(path))
+        added = parse(_text(path), str(path))
         _check_new(added, designs, path)
         designs |= added
     return designs
@@ -306,12 +340,9 @@ def add_devices(path: Path) -> dict[str, Design]:
     """
     from vstent.device_schema import parse
 
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DeviceError(f"{path} cannot be read as text: give a TOML file of devices.") from error
+    text = _text(path)
     added, kept = parse(text, str(path)), user_folder() / f"{path.stem}.toml"
-    others = parse(kept.read_text(encoding="utf-8"), str(kept)) if kept.exists() else {}
+    others = parse(_text(kept), str(kept)) if kept.exists() else {}
     _check_new(added, {key: design for key, design in catalogue().items() if key not in others}, path)
     kept.parent.mkdir(parents=True, exist_ok=True)
     partial = kept.with_suffix(".partial")
@@ -321,10 +352,17 @@ def add_devices(path: Path) -> dict[str, Design]:
     return added
 
 
-def _check_new(added: Iterable[str], known: Iterable[str], path: Path) -> None:
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DeviceError(f"{path} cannot be read as text: give a TOML file of devices, or remove it.") from error
+
+
+def _check_new(added: Iterable[str], known: Iterable[str], source: object) -> None:
     twice = sorted(set(added) & set(known))
     if twice:
-        raise DeviceError(f"{path} names a device that the catalogue has already, {twice[0]}: give it another key.")
+        raise DeviceError(f"{source} names a device that the catalogue has already, {twice[0]}: give it another key.")
 
 
 def find_design(name: str) -> Design:

@@ -1,12 +1,22 @@
 """The catalogue's schema: every number carries its source and its confidence."""
 
 import tomllib
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vstent.device import Braid, Confidence, Design, Fact, LaserCut, Size
 from vstent.errors import DeviceError
+
+MOST_WIRES: Final = 1000
+LARGEST_UM: Final = 1000.0
+LARGEST_MM: Final = 200.0
+MOST_SIZES: Final = 100
+
+_Whole = Annotated[int, Field(gt=0, le=MOST_WIRES)]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Width_um = Annotated[float, Field(gt=0, le=LARGEST_UM)]
+_Lengths_mm = Annotated[list[Annotated[float, Field(gt=0, le=LARGEST_MM)]], Field(min_length=1, max_length=MOST_SIZES)]
 
 
 class _Strict(BaseModel):
@@ -19,11 +29,15 @@ class _Sourced(_Strict):
 
 
 class _Number(_Sourced):
-    value: PositiveFloat
+    value: _Positive
+
+
+class _Width(_Sourced):
+    value: _Width_um
 
 
 class _Count(_Sourced):
-    value: PositiveInt
+    value: _Whole
 
 
 class _Margin(_Sourced):
@@ -31,13 +45,13 @@ class _Margin(_Sourced):
 
 
 class _Wires(_Sourced):
-    count: PositiveInt
-    diameter_um: PositiveFloat
+    count: _Whole
+    diameter_um: _Width_um
 
 
 class _Sizes(_Sourced):
-    diameters_mm: list[PositiveFloat] = Field(min_length=1)
-    lengths_mm: list[PositiveFloat] = Field(min_length=1)
+    diameters_mm: _Lengths_mm
+    lengths_mm: _Lengths_mm
 
 
 class _Device(_Strict):
@@ -82,8 +96,8 @@ class _Braid(_Device):
 class _LaserCut(_Device):
     kind: Literal["laser_cut"]
     n_columns: _Count
-    strut_width_um: _Number
-    strut_thickness_um: _Number
+    strut_width_um: _Width
+    strut_thickness_um: _Width
     cell_angle_rad: _Number
 
     def design(self) -> Design:
@@ -119,12 +133,14 @@ def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:
     """
     try:
         found = _Catalogue.model_validate(tomllib.loads(text)).device
-    except tomllib.TOMLDecodeError as error:
-        raise DeviceError(f"{name} is not valid TOML: {error}. Correct that line.") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise DeviceError(f"{name} is wrong at {where}: {first['msg']}. Correct that entry.") from error
+    except ValueError as error:  # no TOML, or a number of thousands of digits
+        raise DeviceError(f"{name} is not valid TOML: {error}. Correct that line.") from error
+    except RecursionError:
+        raise DeviceError(f"{name} is nested too deeply to be a catalogue: give it the form of devices.toml.") from None
     designs = {entry.key: entry.design() for entry in found}
     if len(designs) < len(found):
         raise DeviceError(f"{name} uses one key for two devices: give each its own.")

@@ -8,8 +8,10 @@ The tree::
     │   ├── UnitError           a size that no intracranial vessel has, or a spacing that is not known
     │   ├── VesselError         a surface without a lumen to work in: no openings, no volume, no path
     │   ├── DeviceError         a device, size or wire that does not exist
-    │   └── LandingError        a landing zone that does not fit the artery
-    └── FlowError               a flow computation that cannot start or has diverged
+    │   ├── LandingError        a landing zone that does not fit the artery
+    │   └── PluginError         a plug-in that does not exist or cannot be loaded
+    ├── FlowError               a flow computation that cannot start or has diverged
+    └── FolderError             a case folder that another process works in, or that cannot be written to
 
 Each message says what, where (mm), why, and one thing to do.
 """
@@ -43,5 +45,13 @@ class LandingError(InputError):
     """A landing zone that does not fit the artery."""
 
 
+class PluginError(InputError):
+    """A plug-in that does not exist or cannot be loaded."""
+
+
 class FlowError(VstentError):
     """A flow computation that cannot start or has diverged."""
+
+
+class FolderError(VstentError):
+    """A case folder that another process works in, or that cannot be written to."""

@@ -27,3 +27,10 @@ export function numbers(buffer, block) {
   }
   return values;
 }
+
+/** Manifest and bytes of a message: the length of the manifest in four bytes, the manifest, the bytes. */
+export function opened(message) {
+  const length = new DataView(message).getUint32(0, true);
+  const manifest = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
+  return { manifest, buffer: message.slice(4 + length) };
+}

@@ -19,13 +19,37 @@ export class Stage {
     this.waiting = false;
     this.drawn = () => {};
     this.orbit = new Orbit(this.camera, () => this.redraw());
-    this.scales = Object.fromEntries(
-      manifest.scales.map((scale) => [scale.id, { ...scale, texture: paint.lookup(integers(buffer, scale.colours)) }]),
-    );
-    this.layers = manifest.layers.map((layer) => this.build(layer, buffer));
-    this.layers.forEach((layer) => this.scene.add(layer.object));
+    this.scales = {};
+    this.layers = [];
     this.panes = [];
     this.shown = new Set();
+    this.put(manifest, buffer);
+  }
+
+  /** Add layers and their scales; a layer of the same name in the same pane is replaced. */
+  put(manifest, buffer) {
+    for (const scale of manifest.scales)
+      this.scales[scale.id] = { ...scale, texture: paint.lookup(integers(buffer, scale.colours)) };
+    for (const { id, pane } of manifest.layers) this.drop((layer) => layer.id === id && layer.pane === pane);
+    for (const layer of manifest.layers) {
+      const built = this.build(layer, buffer);
+      this.layers.push(built);
+      this.scene.add(built.object);
+    }
+    this.redraw();
+  }
+
+  /** Take away the layers that `isChosen`. */
+  drop(isChosen) {
+    for (const layer of this.layers.filter(isChosen)) {
+      this.scene.remove(layer.object);
+      layer.object.traverse((part) => {
+        part.geometry?.dispose();
+        part.material?.dispose();
+      });
+    }
+    this.layers = this.layers.filter((layer) => !isChosen(layer));
+    this.redraw();
   }
 
   build(layer, buffer) {

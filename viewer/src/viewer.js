@@ -1,6 +1,7 @@
 // The viewer: mount(element, manifest, base64) draws a scene with its switches; report.html and the page both call it.
-import { Vector3 } from "three";
 import { unpack } from "./decode.js";
+import { make } from "./dom.js";
+import { annotate, annotations, colourBar, gradient } from "./furniture.js";
 import { Stage } from "./stage.js";
 
 const MODES = [
@@ -94,8 +95,7 @@ class Viewer {
   pane({ id, title, note }) {
     const button = make("button", { className: "viewer-solo", type: "button", title: "Show this alone, or all again" }, ["⤢"]);
     button.setAttribute("aria-label", `Show ${title} alone, or all again`);
-    const length = make("span", { className: "viewer-length" });
-    const compass = svg("svg", { class: "viewer-compass", viewBox: "-26 -26 52 52", "aria-hidden": "true" });
+    const { length, compass } = annotations();
     const head = make("div", { className: "viewer-title" }, [make("strong", {}, [title]), make("span", {}, [note || ""])]);
     const element = make("div", { className: "viewer-pane" }, [head, button, length, compass]);
     button.addEventListener("click", () => {
@@ -257,67 +257,13 @@ class Viewer {
 
   /** Length bar and compass of every pane, for the camera as it is. */
   annotate() {
-    const { camera, orbit } = this.stage;
-    const [, height] = this.paneSize();
-    const perMm = height / (2 * orbit.distance * Math.tan((camera.fov * Math.PI) / 360));
-    const length = [50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1].find((mm) => mm * perMm < 110) || 0.1;
-    const inverse = orbit.turned.clone().invert();
-    const arms = [["L", 1, 0, 0], ["P", 0, 1, 0], ["S", 0, 0, 1]].map(([name, ...axis]) => {
-      const v = new Vector3(...axis).applyQuaternion(inverse);
-      return { name, x: 17 * v.x, y: -17 * v.y, z: v.z };
-    });
-    for (const pane of this.panes) {
-      pane.length.style.width = `${length * perMm}px`;
-      pane.length.textContent = `${length} mm`;
-      pane.compass.replaceChildren(...arms.sort((a, b) => a.z - b.z).flatMap(arm));
-    }
+    annotate(this.panes, this.stage, this.paneSize()[1]);
   }
 }
 
 const needed = (mode) => ({ device: "contour", wires: "wires", flow: "streamlines", shear: "shear" })[mode];
 
-function arm({ name, x, y, z }) {
-  const ink = z < -0.05 ? "#9fb0b8" : "#2c4650";
-  const text = svg("text", { x: 1.32 * x, y: 1.32 * y, fill: ink });
-  text.textContent = name;
-  return [svg("line", { x1: 0, y1: 0, x2: x, y2: y, stroke: ink, "stroke-width": 1.6 }), text];
-}
-
-function colourBar(scale) {
-  const bar = make("i", { className: "viewer-ramp" });
-  bar.style.background = gradient(scale);
-  const middle = (scale.low + scale.high) / 2;
-  const ticks = [scale.low, middle, scale.high].map((value) => make("span", {}, [String(Number(value.toPrecision(3)))]));
-  return make("div", { className: "viewer-bar" }, [
-    make("span", { className: "viewer-quantity" }, [scale.title, make("em", {}, [` ${scale.unit}`])]),
-    make("div", {}, [bar, make("div", { className: "viewer-ticks" }, ticks)]),
-  ]);
-}
-
-function gradient(scale) {
-  const texels = scale.texture.image.data;
-  const stops = Array.from({ length: 17 }, (_, i) => `rgb(${texels.slice(4 * Math.min(16 * i, 255), 4 * Math.min(16 * i, 255) + 3)})`);
-  return `linear-gradient(90deg, ${stops.join(", ")})`;
-}
-
 function group(label, children, className = "") {
   const element = make("div", { className: `viewer-group ${className}`, role: "group", ariaLabel: label }, children);
-  return element;
-}
-
-function make(tag, properties = {}, children = []) {
-  const element = document.createElement(tag);
-  for (const [name, value] of Object.entries(properties)) {
-    if (name === "role") element.setAttribute("role", value);
-    else if (name.startsWith("aria")) element.setAttribute(`aria-${name.slice(4).toLowerCase()}`, value);
-    else element[name] = value;
-  }
-  element.append(...children);
-  return element;
-}
-
-function svg(tag, attributes) {
-  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
   return element;
 }

@@ -1,16 +1,17 @@
 """Command line: one module a command. The only place that prints, and that knows of files' names on a shell."""
 
 import argparse
+import errno
 import os
 import sys
 from collections.abc import Sequence
 from typing import Final
 
-from vstent.cli import demo, devices, restore, run, trace
+from vstent.cli import app, batch, demo, devices, export, flow, rank, restore, run, trace
 from vstent.cli.options import EPILOG
 from vstent.errors import InputError, VstentError
 
-COMMANDS: Final = (run, trace, restore, demo, devices)
+COMMANDS: Final = (run, app, trace, restore, rank, batch, flow, export, demo, devices)
 """In the order of the help."""
 BAD_INPUT: Final = 2
 FAILED: Final = 1
@@ -30,9 +31,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(str(error), FAILED)
     except KeyboardInterrupt:
         return _fail("stopped. What was finished is kept: give the same command again to go on.", INTERRUPTED)
+    except MemoryError:
+        return _fail(
+            "there is not enough memory for this. What was finished is kept: give the same command on a machine with "
+            "more of it, or a part of the scan, or a larger --cell-size.",
+            FAILED,
+        )
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
-        return _fail(f"{error.strerror or error}{where}: nothing half-written was left", FAILED)
+        return _fail(f"{error.strerror or error}{where}. {_remedy(error)}", FAILED)
+
+
+def _remedy(error: OSError) -> str:
+    """One thing to do about what the system refused."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "What was finished is kept, and nothing half-written: make room and give the same command again."
+    return "Nothing half-written was left: mend that and give the same command again."
 
 
 def _fail(sentence: str, code: int) -> int:

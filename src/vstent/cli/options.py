@@ -1,11 +1,14 @@
 """Options that several commands share, and what they say to a study."""
 
 import argparse
+import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 if TYPE_CHECKING:
     from vstent.flow.types import FlowSettings, Waveform
+    from vstent.uncertainty import Ranges
 
 EPILOG: Final = (
     "Research use only: not cleared for diagnosis or treatment. Lengths in mm, flow in SI; coordinates are LPS."
@@ -15,6 +18,19 @@ PUBLISHED: Final = "published"
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """What a command adds itself to."""
+
+
+def number(text: str) -> float:
+    """Read a number; argparse makes a sentence of the complaint."""
+    return _numbers(text, float, 1)[0]
+
+
+def positive(text: str) -> float:
+    """Read a number above zero."""
+    value = number(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above zero")
+    return value
 
 
 def add_command(commands: Commands, name: str, text: str) -> argparse.ArgumentParser:
@@ -28,11 +44,16 @@ def add_geometry(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         "input", type=Path, help="DICOM folder, NIfTI, NRRD, MHA, raw volume, STL, VTP, VTK, OBJ or PLY"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="case folder to write, or to go on with")
+    return add_given(parser)
+
+
+def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add what may be said of the vessel; return the group."""
     given = parser.add_argument_group("instead of what is guessed or proposed")
     given.add_argument("--units", choices=("m", "cm", "mm"), help="length unit of a surface file")
     given.add_argument("--spacing", type=_spacing, metavar="S|X,Y,Z", help="voxel edges of a raw volume, mm")
     given.add_argument("--shape", type=_shape, metavar="I,J,K", help="voxel counts of a raw volume")
-    given.add_argument("--threshold", type=float, metavar="T", help="intensity of the lumen's wall in a scan")
+    given.add_argument("--threshold", type=number, metavar="T", help="intensity of the lumen's wall in a scan")
     given.add_argument("--at", type=_point, metavar="X,Y,Z", help="a point near the sac, mm")
     given.add_argument("--inlet", type=_point, metavar="X,Y,Z", help="a point near the inlet, mm")
     return given
@@ -53,8 +74,10 @@ def add_devices(parser: argparse.ArgumentParser) -> None:
 def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
     """Add how the flow is computed; return the group."""
     flow = parser.add_argument_group("flow")
-    flow.add_argument("--flow-rate", type=float, metavar="ML_S", help="mean inflow (0.27 m/s times the inlet's area)")
-    flow.add_argument("--cell-size", type=float, metavar="MM", help="edge of a flow cell")
+    flow.add_argument(
+        "--flow-rate", type=positive, metavar="ML_S", help="mean inflow (0.27 m/s times the inlet's area)"
+    )
+    flow.add_argument("--cell-size", type=positive, metavar="MM", help="edge of a flow cell")
     flow.add_argument(
         "--pulsatile",
         nargs="?",
@@ -62,22 +85,95 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         metavar="CSV",
         help="follow a pulse: columns time in s and flow in any unit (the published one of the internal carotid)",
     )
+    flow.add_argument("--engine", default="lattice_boltzmann", metavar="NAME", help="a plug-in that computes the flow")
     flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
     return flow
 
 
-def _numbers(text: str, kind: type) -> list[float]:
+def add_jobs(group: "argparse._ArgumentGroup") -> None:
+    """Add how many processes work at once."""
+    group.add_argument("--jobs", type=_jobs, default=_cores(), metavar="N", help="processes at once (one a core)")
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _jobs(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of processes such as 2")
+    return int(text)
+
+
+def numbers(text: str) -> list[float]:
+    """Read numbers parted by commas."""
+    return _numbers(text, float)
+
+
+def add_uncertainty(parser: argparse.ArgumentParser) -> None:
+    """Add what is varied to tell how sure the results are."""
+    group = parser.add_argument_group("uncertainty")
+    group.add_argument("--uncertainty", type=int, metavar="N", help="deploy N times with what is not sure varied")
+    group.add_argument(
+        "--uncertain-flows",
+        type=int,
+        default=0,
+        metavar="M",
+        help="compute the flows of M of them too, before and after",
+    )
+    group.add_argument(
+        "--vary",
+        type=_cause,
+        action="append",
+        default=[],
+        metavar="CAUSE=RANGE",
+        help="how far to either side: threshold=MM (of all diameters; the scan's own band), landing=MM (1), "
+        "device=MM (0.1), inflow=FRACTION (0.2)",
+    )
+
+
+RANGES: Final = {
+    "threshold": "threshold_mm",
+    "landing": "landing_mm",
+    "device": "device_mm",
+    "inflow": "inflow_fraction",
+}
+"""Causes of uncertainty on the command line, and the fields that hold their ranges."""
+
+
+def _cause(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
     try:
-        return [kind(part) for part in text.replace("x", ",").split(",")]
+        return RANGES[name], float(value)
+    except (KeyError, ValueError):
+        raise argparse.ArgumentTypeError(f"{text!r} is none of {'=, '.join(RANGES)}= with a number") from None
+
+
+def given_ranges(arguments: argparse.Namespace) -> "Ranges | None":
+    """Collect what is to be varied, and how far."""
+    if arguments.uncertainty is None:
+        return None
+    from vstent.uncertainty import Ranges
+
+    return Ranges(arguments.uncertainty, arguments.uncertain_flows, **dict(arguments.vary))
+
+
+def _numbers(text: str, kind: type, count: int | None = None) -> list[float]:
+    """Read numbers parted by commas, `count` of them where that is said."""
+    try:
+        numbers = [kind(part) for part in text.replace("x", ",").split(",")]
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers such as 1,2,3") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not {'a number' if count == 1 else 'like 1,2,3'}") from None
+    if count is not None and len(numbers) != count:
+        raise argparse.ArgumentTypeError(f"{text!r} has {len(numbers)} numbers, not {count}")
+    if not all(math.isfinite(value) for value in numbers):
+        raise argparse.ArgumentTypeError(f"{text!r} is not finite")
+    return numbers
 
 
 def _three(text: str, kind: type) -> tuple[float, float, float]:
-    numbers = _numbers(text, kind)
-    if len(numbers) != 3:
-        raise argparse.ArgumentTypeError(f"{text!r} has {len(numbers)} numbers, not 3")
-    return numbers[0], numbers[1], numbers[2]
+    first, second, third = _numbers(text, kind, 3)
+    return first, second, third
 
 
 def _point(text: str) -> tuple[float, float, float]:
@@ -119,6 +215,7 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
         waveform=_waveform(arguments.pulsatile),
         outlets=arguments.outlets,
         cell_size_mm=arguments.cell_size,
+        engine=arguments.engine,
     )
 
 

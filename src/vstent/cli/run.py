@@ -15,9 +15,11 @@ def add(commands: options.Commands) -> None:
     parser = options.add_command(commands, "run", "scan or surface -> stented artery, flow compared, report")
     given = options.add_geometry(parser)
     options.add_outlet(given)
-    given.add_argument("--diameter", type=float, metavar="MM", help="label diameter of the devices")
-    given.add_argument("--length", type=float, metavar="MM", help="label length of the devices")
-    given.add_argument("--center", type=float, metavar="MM", help="where on the parent axis the device's middle lies")
+    given.add_argument("--diameter", type=options.positive, metavar="MM", help="label diameter of the devices")
+    given.add_argument("--length", type=options.positive, metavar="MM", help="label length of the devices")
+    given.add_argument(
+        "--center", type=options.number, metavar="MM", help="where on the parent axis the device's middle lies"
+    )
     add_study(parser)
     parser.set_defaults(command=_run)
 
@@ -27,6 +29,7 @@ def add_study(parser: argparse.ArgumentParser) -> None:
     options.add_devices(parser)
     flow = options.add_flow(parser)
     flow.add_argument("--no-flow", action="store_true", help="stop after the deployment")
+    options.add_uncertainty(parser)
 
 
 def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
@@ -34,12 +37,13 @@ def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
     from vstent.study import Settings
 
     flow = None if arguments.no_flow else options.given_flow(arguments)
-    return Settings(devices=options.given_devices(arguments), flow=flow, **given)  # type: ignore[arg-type]
+    devices, ranges = options.given_devices(arguments), options.given_ranges(arguments)
+    return Settings(devices=devices, flow=flow, uncertainty=ranges, **given)  # type: ignore[arg-type]
 
 
 def study(path: Path, out: Path, settings: "Settings") -> "CaseResult":
     """Run a study with its progress shown; write the report and print the table."""
-    from vstent.console import Console, comparison_table
+    from vstent.console import Console, comparison_table, uncertainty_table
     from vstent.study import run
 
     console = Console()
@@ -52,6 +56,8 @@ def study(path: Path, out: Path, settings: "Settings") -> "CaseResult":
         write_text(out / "report.html", report(case))
         console.progress("report", 1.0, str(out / "report.html"))
     console.print(comparison_table(case.metrics))
+    if settings.uncertainty is not None:
+        console.print(uncertainty_table(case.metrics))
     console.print(f"Results in {out}; open {out / 'report.html'}. Research use only.")
     return case
 

@@ -83,7 +83,7 @@ def deploy(
     chosen = _method(method).beside(design.wall_offset_um * MM_PER_UM)
     size = compacted(design, size or propose_size(design, anatomy), compaction_fraction)
     landing = landing or propose_landing(design, anatomy, size)
-    wall, is_patient = landing_wall(anatomy, inside)
+    wall, is_patient = landing_wall(anatomy, inside, chosen.wall)
     course = run(chosen, Placement(design, size, landing, anatomy, wall), progress)
     nodes_mm = course.opened.contour.nodes_mm
     drawn = wires.draw(design, size, nodes_mm, wall)

@@ -7,7 +7,7 @@ import numpy as np
 
 from vstent.deploy import pieces
 from vstent.deploy.active_contour import State
-from vstent.deploy.contour import evenly_spaced, perimeters
+from vstent.deploy.contour import evenly_spaced, perimeters, planes
 from vstent.deploy.method import AbstractMethod, Opened, Placement, check_inside
 from vstent.device import Design, Size, grid, row_spacing_mm
 from vstent.kernels.arrays import Bools, Floats
@@ -17,13 +17,13 @@ from vstent.vessel import Anatomy
 
 ROUNDS = 8
 """Rows are marched anew at most so often."""
-SETTLED_MM = 0.02
+SETTLED_MM = 0.1
 """Rows have settled when none moves further than this from one round to the next."""
 FREE_SLACK = 1e-3
 """A row this near to the free perimeter, relative, has reached it."""
 LAST_STEPS = 5
 """Steps at most for the last nodes, once 99 % have terminated."""
-TABLE_ROWS = 2001
+TABLE_ROWS = 501
 """Samples of the row spacing along the artery."""
 BEYOND_MM = 500.0
 """Rows are counted so far beyond the artery, to say by how much a device misses it."""
@@ -31,16 +31,22 @@ BEYOND_MM = 500.0
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """The contour's diameter along the parent axis."""
+    """The contour's diameter along the parent axis, and how the axis bends."""
 
     abscissa_mm: Floats
     """(k,) arc lengths."""
     diameter_mm: Floats
     """(k,) diameters of the circles of the same perimeter."""
+    bend: tuple[Floats, Floats] = (np.zeros(1), np.zeros(1))
+    """(m,) arc lengths and (m,) the axis's curvature there, per mm."""
 
     def at(self, abscissa_mm: Floats) -> Floats:
         """Return the diameter at arc lengths; beyond the ends it stays what it is there."""
         return np.interp(abscissa_mm, self.abscissa_mm, self.diameter_mm)
+
+    def spacing_mm(self, design: Design, size: Size, abscissa_mm: Floats) -> Floats:
+        """Return the distance between lattice rows of a device at arc lengths."""
+        return row_spacing_mm(design, size, self.at(abscissa_mm), np.interp(abscissa_mm, *self.bend))
 
     def corrected(self, abscissa_mm: Floats, diameter_mm: Floats) -> "Profile":
         """Return the profile through (r,) measured diameters; beyond them it keeps its shape, shifted."""
@@ -49,13 +55,21 @@ class Profile:
         together = np.concatenate([self.abscissa_mm[outside], abscissa_mm])
         values = np.concatenate([(self.diameter_mm + error_mm)[outside], diameter_mm])
         order = np.argsort(together)
-        return Profile(together[order], values[order])
+        return replace(self, abscissa_mm=together[order], diameter_mm=values[order])
 
 
 def expected_profile(design: Design, anatomy: Anatomy) -> Profile:
     """Diameter that the contour will have where it lies against the landing surface."""
     offset_mm = design.wall_offset_um * MM_PER_UM
-    return Profile(anatomy.axis.abscissa_mm, 2 * (anatomy.section_radius_mm - offset_mm))
+    across = planes(anatomy.axis)
+    diameter_mm = 2 * (anatomy.section_radius_mm - offset_mm)
+    return Profile(anatomy.axis.abscissa_mm, diameter_mm, (across.abscissa_mm, across.curvature_per_mm))
+
+
+def landed_row(design: Design, size: Size, landing: Landing) -> int:
+    """Return the row of nodes that lies where the device is landed."""
+    rows = grid(design, size).rows
+    return {"proximal": 0, "center": (rows - 1) // 2, "distal": rows - 1}[landing.anchor]
 
 
 def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Floats:
@@ -65,10 +79,10 @@ def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Flo
     the diameter is that of its end.
     """
     shape = grid(design, size)
-    start = {"proximal": 0, "center": (shape.rows - 1) // 2, "distal": shape.rows - 1}[landing.anchor]
+    start = landed_row(design, size, landing)
     first, last = profile.abscissa_mm[[0, -1]]
     table_mm = np.concatenate([[first - BEYOND_MM], np.linspace(first, last, TABLE_ROWS), [last + BEYOND_MM]])
-    per_mm = shape.row_split / row_spacing_mm(design, size, profile.at(table_mm))
+    per_mm = shape.row_split / profile.spacing_mm(design, size, table_mm)
     count = np.concatenate([[0.0], np.cumsum(0.5 * (per_mm[1:] + per_mm[:-1]) * np.diff(table_mm))])
     wanted = np.interp(landing.abscissa_mm, table_mm, count) + np.arange(shape.rows) - start
     return np.interp(wanted, count, table_mm)
@@ -124,8 +138,9 @@ class ConstantWire(AbstractMethod):
             if opened.contour.is_terminated.all():
                 break
             opened = self._grown(placement, opened)
-        slid = pieces.slide(placement.design, placement.size, opened.contour.nodes_mm)
         rows = np.arange(len(opened.abscissa_mm))
+        held = landed_row(placement.design, placement.size, placement.landing)
+        slid = pieces.slide(placement.design, placement.size, opened.contour.nodes_mm, held)
         where_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row)
         centers_mm = placement.across.at(where_mm.ravel())[0].reshape(slid.nodes_mm.shape)
         # The clearance falls off from a row's center no faster than one moves away from it.
@@ -135,7 +150,7 @@ class ConstantWire(AbstractMethod):
         state, laid_mm = self._laid(placement, state)
         is_free = FreeDiameter(placement.size.free_diameter_mm).is_reached(opened.contour.nodes_mm)
         nodes_mm = np.where(is_free[:, None, None], state.nodes_mm, laid_mm)
-        return replace(opened, contour=replace(state, nodes_mm=nodes_mm))
+        return Opened(replace(state, nodes_mm=nodes_mm), where_mm.mean(axis=1))
 
     def _grown(self, placement: Placement, opened: Opened) -> Opened:
         """One step of the contour; a row that reaches the free diameter stops there."""

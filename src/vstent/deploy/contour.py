@@ -1,6 +1,7 @@
 """Contour: rows of nodes on planes across the parent axis, and the plane coordinates they are moved in."""
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -32,6 +33,11 @@ class Planes:
         freeze(self, "centers_mm", np.float64, (len(self.abscissa_mm), 3))
         freeze(self, "frames", np.float64, (len(self.abscissa_mm), 3, 3))
 
+    @cached_property
+    def curvature_per_mm(self) -> Floats:
+        """(k,) by how much the normals turn, rad per mm."""
+        return np.linalg.norm(np.gradient(self.frames[:, 0], self.abscissa_mm, axis=0), axis=1)
+
     def at(self, abscissa_mm: Floats) -> tuple[Floats, Floats]:
         """Return centers (n, 3) and frames (n, 3, 3) at arc lengths (n,)."""
         flat = np.concatenate([self.centers_mm, self.frames[:, 0], self.frames[:, 1]], axis=1)
@@ -52,6 +58,7 @@ class Planes:
         return (points_mm - centers_mm[:, None]) @ frames[:, 1:].transpose(0, 2, 1)
 
 
+@lru_cache(maxsize=8)
 def planes(axis: Centerline) -> Planes:
     """Planes across the axis.
 
@@ -105,11 +112,16 @@ def circles(radius_mm: Floats, columns: int) -> Floats:
 def perimeters(nodes: Floats) -> Floats:
     """Length (n,) of the closed rows (n, m, d), as smooth curves.
 
-    A regular polygon of m corners is shorter than its circle by (pi/m) / sin(pi/m): that is put back.
+    An arc is longer than its chord by 8/3 of the squared height over it, per chord; four points in a row show the
+    height. What that leaves of a circle is put back.
     """
-    m = nodes.shape[1]
-    chords = np.linalg.norm(np.roll(nodes, -1, axis=1) - nodes, axis=2).sum(axis=1)
-    return chords * (np.pi / m) / np.sin(np.pi / m)
+    m, ahead = nodes.shape[1], np.roll(nodes, -1, axis=1)
+    bend = nodes + ahead - np.roll(nodes, 1, axis=1) - np.roll(ahead, -1, axis=1)
+    chord = np.maximum(np.linalg.norm(ahead - nodes, axis=2), 1e-300)
+    length = (chord + (bend**2).sum(axis=2) / (96 * chord)).sum(axis=1)
+    half = np.pi / m
+    circle = 2 * np.sin(half) + (np.cos(half) - np.cos(3 * half)) ** 2 / (48 * np.sin(half))
+    return length * 2 * half / circle
 
 
 def evenly_spaced(nodes: Floats) -> Floats:

@@ -4,14 +4,13 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Literal, Self, final
 
 import numpy as np
 
 from vstent.deploy.active_contour import ActiveContour, State
 from vstent.deploy.contour import Planes, circles, planes
-from vstent.deploy.wall import AbstractWall
+from vstent.deploy.wall import TREE, AbstractWall
 from vstent.device import Design, Size, grid
 from vstent.errors import InputError, LandingError
 from vstent.kernels.arrays import Floats
@@ -38,7 +37,7 @@ class Placement:
     wall: AbstractWall
     """What the device opens against."""
 
-    @cached_property
+    @property
     def across(self) -> Planes:
         """Planes on which rows lie."""
         return planes(self.anatomy.axis)
@@ -77,6 +76,8 @@ class AbstractMethod(ABC):
 
     contour: ActiveContour = field(default_factory=ActiveContour)
     """The active contour, eq. (1-7) of the paper, that carries the device to the wall: a1..a5, k1, k2, dd."""
+    wall: str = TREE
+    """How the wall is searched: ``tree``, or the name of a plug-in (`vstent.plugins`)."""
 
     def beside(self, dd_mm: float) -> Self:
         """Return the method for a device whose contour keeps `dd_mm` from the wall."""

@@ -7,6 +7,7 @@ from typing import Final, NamedTuple, final
 
 import numpy as np
 
+from vstent import plugins
 from vstent.deploy.contour import normals
 from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats, Ints
@@ -15,6 +16,8 @@ from vstent.surface import Surface
 from vstent.units import MM_PER_UM
 from vstent.vessel import Anatomy
 
+TREE: Final = "tree"
+"""Name of the wall that is searched through a tree."""
 OVERLAP_MM: Final = 0.5
 """The artery's wall is kept this far behind the ends of a device that lies in it."""
 ON_WALL_MM: Final = 1e-9
@@ -80,11 +83,17 @@ class TreeWall(AbstractWall):
         return self.surface.crosses(starts_mm, ends_mm)
 
 
-def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = ()) -> tuple[TreeWall, Bools]:
+def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = TREE) -> tuple[AbstractWall, Bools]:
     """Return what a device opens against, and which of its faces (m,) are the patient's own wall.
 
     That is the landing surface or, where devices already lie in it, their inner faces, the last one foremost.
+
+    Raises
+    ------
+    PluginError
+        When no plug-in is called `search`.
     """
+    kind = TreeWall if search == TREE else plugins.load("vstent.walls", search, built_in=TREE)
     surface = anatomy.landing_surface
     is_patient = np.logical_not(anatomy.is_restored[surface.faces].all(axis=1))
     for stent in inside:
@@ -94,7 +103,7 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = ()) -> tuple[TreeWa
         surface = _joined(Surface(surface.vertices_mm, surface.faces[is_open]), inner_face(stent))
         n_inner = len(surface.faces) - int(is_open.sum())
         is_patient = np.concatenate([is_patient[is_open], np.zeros(n_inner, dtype=bool)])
-    return TreeWall(surface), is_patient
+    return kind(surface), is_patient
 
 
 def inner_face(stent: Stent) -> Surface:

@@ -2,20 +2,23 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any, Protocol
 
+from vstent import plugins
 from vstent.flow import sampling
 from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
-from vstent.flow.engines import Progress, run
+from vstent.flow.engines import AbstractEngine, Bookmark, Progress, Saved, run
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
 from vstent.flow.screen import screen
 from vstent.flow.streamlines import Streamlines, streamlines
-from vstent.flow.types import Blood, FlowCase, FlowField, FlowSettings, Screen
+from vstent.flow.types import LATTICE, Blood, FlowCase, FlowField, FlowSettings, Screen
 from vstent.stent import Stent
 from vstent.vessel import Anatomy
 
 __all__ = [
     "Blood",
+    "Checkpoint",
     "FlowCase",
     "FlowField",
     "FlowSettings",
@@ -38,6 +41,16 @@ COARSE_SHARE = 0.12
 """Part of the whole time that each coarse run takes, for the progress."""
 
 OnProgress = Callable[[Progress], None]
+
+
+class Checkpoint(Protocol):
+    """Keeps the runs of one flow while they are under way, each by its name."""
+
+    def load(self, run: str) -> Saved | None:
+        """Return what was saved of a run last; None where nothing was, or it is damaged."""
+
+    def save(self, run: str, saved: Saved) -> None:
+        """Keep the state of a run instead of the one before."""
 
 
 def simulate(
@@ -85,13 +98,20 @@ def flow_case(
     )
 
 
-def simulate_case(case: FlowCase, *, start: FlowField | None = None, progress: OnProgress | None = None) -> FlowField:
+def simulate_case(
+    case: FlowCase,
+    *,
+    start: FlowField | None = None,
+    progress: OnProgress | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> FlowField:
     """Compute one flow: steady, or pulsatile where the settings have a waveform.
 
     Parameters
     ----------
     start : a flow in the same vessel without a screen, to start from.
     progress : called at every check; what it raises ends the run.
+    checkpoint : keeps what is under way; the same flow goes on from there, and its result is the same to the last bit.
 
     Raises
     ------
@@ -99,9 +119,17 @@ def simulate_case(case: FlowCase, *, start: FlowField | None = None, progress: O
         When the vessel cannot be put on a grid, or the computation diverges.
     """
     cell_size_mm = default_cell_size_mm(case)
+    answer = _bookmark(checkpoint, "answer")
     steady = replace(case, settings=replace(case.settings, waveform=None))
-    guess = _guess(steady, start, COARSENING * cell_size_mm, progress)
-    return _run(case, cell_size_mm, guess, _stage(progress, _coarse_runs(case, start) * COARSE_SHARE, 1.0))
+    is_begun = answer is not None and answer.saved is not None
+    guess = None if is_begun else _guess(steady, start, COARSENING * cell_size_mm, progress, checkpoint)
+    return _run(case, cell_size_mm, guess, _stage(progress, _coarse_runs(case, start) * COARSE_SHARE, 1.0), answer)
+
+
+def _bookmark(checkpoint: Checkpoint | None, name: str) -> Bookmark | None:
+    if checkpoint is None:
+        return None
+    return Bookmark(checkpoint.load(name), lambda saved: checkpoint.save(name, saved))
 
 
 def _coarse_runs(case: FlowCase, start: FlowField | None) -> int:
@@ -111,7 +139,11 @@ def _coarse_runs(case: FlowCase, start: FlowField | None) -> int:
 
 
 def _guess(
-    case: FlowCase, start: FlowField | None, cell_size_mm: float, progress: OnProgress | None
+    case: FlowCase,
+    start: FlowField | None,
+    cell_size_mm: float,
+    progress: OnProgress | None,
+    checkpoint: Checkpoint | None,
 ) -> FlowField | None:
     """First guess for the fine grid, from coarse ones; only `start` where the coarse grid would be too coarse.
 
@@ -122,9 +154,11 @@ def _guess(
     if is_tiny or (start is not None and case.screen is None):
         return start
     if start is None:
-        return _run(case, cell_size_mm, None, _stage(progress, 0.0, COARSE_SHARE))
-    bare = _run(replace(case, screen=None), cell_size_mm, start, _stage(progress, 0.0, COARSE_SHARE))
-    stented = _run(case, cell_size_mm, bare, _stage(progress, COARSE_SHARE, 2 * COARSE_SHARE))
+        first = _bookmark(checkpoint, "guess")
+        return _run(case, cell_size_mm, None, _stage(progress, 0.0, COARSE_SHARE), first)
+    first, second = _bookmark(checkpoint, "bare guess"), _bookmark(checkpoint, "stented guess")
+    bare = _run(replace(case, screen=None), cell_size_mm, start, _stage(progress, 0.0, COARSE_SHARE), first)
+    stented = _run(case, cell_size_mm, bare, _stage(progress, COARSE_SHARE, 2 * COARSE_SHARE), second)
     before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))
     return replace(
         start,
@@ -133,12 +167,27 @@ def _guess(
     )
 
 
-def _run(case: FlowCase, cell_size_mm: float, start: FlowField | None, progress: OnProgress | None) -> FlowField:
+def _run(
+    case: FlowCase,
+    cell_size_mm: float,
+    start: FlowField | None,
+    progress: OnProgress | None,
+    bookmark: Bookmark | None,
+) -> FlowField:
+    engine = _engine(case.settings)
+    return run(engine(cell_size_mm), case, start=start, progress=progress, bookmark=bookmark)
+
+
+def _engine(settings: FlowSettings) -> Callable[[float], AbstractEngine[Any]]:
     from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
     from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
 
-    engine = LatticeBoltzmann if case.settings.waveform is None else PulsatileLatticeBoltzmann
-    return run(engine(cell_size_mm), case, start=start, progress=progress)
+    if settings.engine != LATTICE:
+        found: Callable[[float], AbstractEngine[Any]] = plugins.load(
+            "vstent.engines", settings.engine, built_in=LATTICE
+        )
+        return found
+    return LatticeBoltzmann if settings.waveform is None else PulsatileLatticeBoltzmann
 
 
 def _stage(progress: OnProgress | None, begin: float, end: float) -> OnProgress | None:

@@ -1,5 +1,7 @@
 """Fully developed laminar profile on a section of any shape."""
 
+from typing import Final
+
 import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
@@ -7,7 +9,7 @@ from scipy.sparse.linalg import spsolve
 from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats
 
-POINTS = 64
+POINTS: Final = 64
 """Grid points across a section."""
 
 
@@ -25,9 +27,19 @@ def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> 
     low = polygon.min(axis=0) - 2.01 * spacing
     shape = np.ceil(np.ptp(polygon, axis=0) / spacing).astype(int) + 5
     grid = low + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-    speed = _poisson(_inside(polygon, grid))
+    depth = _depth(polygon, grid)
+    speed = _beyond(_poisson(depth / spacing), depth)
     where = ((points_mm - center) @ across - low) / spacing
-    return ndimage.map_coordinates(speed, where.T, order=1, mode="constant")
+    return np.maximum(ndimage.map_coordinates(speed, where.T, order=1, mode="constant"), 0.0)
+
+
+def _depth(polygon: Floats, points: Floats) -> Floats:
+    """Distance (...) of points (..., 2) from a polygon (k, 2), negative outside."""
+    nearest = np.full(points.shape[:-1], np.inf)
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        along = np.clip((points - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-300), 0.0, 1.0)
+        nearest = np.minimum(nearest, np.linalg.norm(points - a - along[..., None] * (b - a), axis=-1))
+    return np.where(_inside(polygon, points), nearest, -nearest)
 
 
 def _inside(polygon: Floats, points: Floats) -> Bools:
@@ -40,17 +52,41 @@ def _inside(polygon: Floats, points: Floats) -> Bools:
     return result
 
 
-def _poisson(inside: Bools) -> Floats:
-    """Solve lap u = -1 in the unit of the grid, u = 0 at the points outside."""
+_NEIGHBOURS: Final = ((1, 0), (-1, 0), (0, 1), (0, -1))
+
+
+def _poisson(depth: Floats) -> Floats:
+    """Solve lap u = -1 where the depth is positive, u = 0 where it is zero, both in the unit of the grid; 0 outside.
+
+    The zero is met between the grid points, to second order (Gibou et al. 2002, J. Comput. Phys. 176, 205).
+    """
+    inside = depth > 0
     number = np.full(inside.shape, -1)
     count = int(inside.sum())
     number[inside] = np.arange(count)
     place = np.argwhere(inside)
-    matrix = sparse.diags([4.0], [0], shape=(count, count)).tocsr()
-    for offset in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        neighbour = number[tuple((place + offset).T)]
-        has = np.flatnonzero(neighbour >= 0)
-        matrix = matrix - sparse.csr_matrix((np.ones(len(has)), (has, neighbour[has])), shape=(count, count))
+    diagonal = np.zeros(count)
+    links = sparse.csr_matrix((count, count))
+    for offset in _NEIGHBOURS:
+        beside = tuple((place + offset).T)
+        has = np.flatnonzero(number[beside] >= 0)
+        links = links + sparse.csr_matrix((np.ones(len(has)), (has, number[beside][has])), shape=(count, count))
+        part = depth[inside] / (depth[inside] - np.minimum(depth[beside], 0.0))
+        diagonal += np.where(number[beside] >= 0, 1.0, 1 / np.maximum(part, 1e-3))
     speed = np.zeros(inside.shape)
-    speed[inside] = spsolve(matrix.tocsc(), np.ones(count))
+    speed[inside] = spsolve((sparse.diags(diagonal) - links).tocsc(), np.ones(count))
     return speed
+
+
+def _beyond(speed: Floats, depth: Floats) -> Floats:
+    """Continue a speed to the grid points just outside, so that it is zero at the edge between them, not beyond it."""
+    result = speed.copy()
+    outside = depth <= 0
+    total, count = np.zeros(speed.shape), np.zeros(speed.shape)
+    for offset in _NEIGHBOURS:
+        u, d = np.roll(speed, offset, axis=(0, 1)), np.roll(depth, offset, axis=(0, 1))
+        is_edge = outside & (d > 0)
+        total[is_edge] += (u * depth)[is_edge] / np.maximum(d, -0.5 * depth)[is_edge]
+        count[is_edge] += 1
+    result[count > 0] = total[count > 0] / count[count > 0]
+    return result

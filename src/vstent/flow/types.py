@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -10,6 +10,9 @@ from vstent.kernels import voxels
 from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.surface import Surface
 from vstent.vessel import Vessel
+
+LATTICE: Final = "lattice_boltzmann"
+"""Name of the engine that vstent brings along."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +78,8 @@ class FlowSettings:
     """Most time steps on the fine grid."""
     lattice_speed: float = 0.15
     """Peak speed in cells per time step: sets the time step."""
+    engine: str = LATTICE
+    """What computes the flow: ``lattice_boltzmann``, or the name of a plug-in (`vstent.plugins`)."""
 
     def inflow_factor(self, time_s: Floats) -> Floats:
         """Inflow over mean inflow at times (t,)."""

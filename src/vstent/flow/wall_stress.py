@@ -9,7 +9,7 @@ from vstent.kernels.arrays import Floats
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
 
-REACH = 4
+REACH = 5
 """Radius of the neighbourhood of a wall point, in cells."""
 
 

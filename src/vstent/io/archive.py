@@ -22,6 +22,8 @@ Noun = TypeVar("Noun")
 
 _ROOT: Final = "vstent."
 _KIND: Final = "is"
+MOST_BYTES: Final = 1 << 33
+"""No noun is larger, unpacked."""
 
 
 def save_noun(path: Path, noun: Any) -> None:
@@ -53,6 +55,7 @@ def load_noun(path: Path, noun_type: type[Noun]) -> Noun:
     path = existing(path)
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            _refuse_bomb(archive)
             noun = _unpacked(json.loads(archive["noun"].tobytes()), archive)
     except (
         OSError,
@@ -62,6 +65,9 @@ def load_noun(path: Path, noun_type: type[Noun]) -> Noun:
         AttributeError,
         ImportError,
         EOFError,
+        NotImplementedError,
+        RuntimeError,
+        MemoryError,
         zipfile.BadZipFile,
         zlib.error,
     ):
@@ -71,6 +77,12 @@ def load_noun(path: Path, noun_type: type[Noun]) -> Noun:
     if not isinstance(noun, noun_type):
         raise ReadError(f"{path} holds a {type(noun).__name__} where a {noun_type.__name__} is needed; delete it.")
     return noun
+
+
+def _refuse_bomb(archive: Any) -> None:
+    """Raise ValueError where the archive would unpack to more than any noun holds."""
+    if sum(entry.file_size for entry in archive.zip.infolist()) > MOST_BYTES:
+        raise ValueError("the archive unpacks to more than any noun holds")
 
 
 def _packed(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:

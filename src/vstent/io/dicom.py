@@ -3,6 +3,7 @@
 import logging
 import struct
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,10 @@ from vstent.image import Image
 from vstent.io.files import silenced
 from vstent.kernels.arrays import Floats
 
+MOST_VOXELS: Final = 1 << 31
+"""A series of more voxels is none of a head, or its headers lie."""
+MOST_UNPACKED: Final = 1 << 29
+"""Bytes that a packed (deflated) file may hold."""
 SPACING_TOLERANCE: Final = 0.02
 """Slices may lie this fraction of their distance off the regular grid."""
 
@@ -68,7 +73,7 @@ def read_dicom(path: Path) -> Image:
     UnitError
         The size of the pixels is not stated.
     """
-    with _quiet():
+    with quiet():
         series, note = _choose(path)
         slices = [plane for file, dataset in series for plane in _planes(file, dataset)]
         slices, affine = _arrange(slices)
@@ -78,7 +83,7 @@ def read_dicom(path: Path) -> Image:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keep pydicom's remarks on small faults to itself: what matters is raised."""
     logger = logging.getLogger("pydicom")
     level = logger.level
@@ -91,19 +96,19 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _damage() -> tuple[type[Exception], ...]:
+def damage() -> tuple[type[Exception], ...]:
     """Give all that pydicom raises for files and pixels that it cannot decode."""
     from pydicom.errors import BytesLengthException, InvalidDicomError
 
     plain = (ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError)
-    return (*plain, ValueError, struct.error, BytesLengthException, InvalidDicomError)
+    return (*plain, ValueError, struct.error, zlib.error, BytesLengthException, InvalidDicomError)
 
 
 def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
     """Files of one series: the one with most voxels, or that of the file given."""
     folder = path if path.is_dir() else path.parent
     found: dict[str, list[tuple[Path, Any]]] = {}
-    for file in sorted(p for p in folder.rglob("*") if is_dicom(p)) if path.is_dir() else [path, *_siblings(path)]:
+    for file in _candidates(folder) if path.is_dir() else [path, *_siblings(path)]:
         dataset = _header(file)
         if dataset is not None:
             found.setdefault(str(getattr(dataset, "SeriesInstanceUID", "")), []).append((file, dataset))
@@ -112,8 +117,21 @@ def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
     uid = max(found, key=lambda key: sum(_n_voxels(dataset) for _, dataset in found[key]))
     if path.is_file():
         uid = next(key for key, files in found.items() if any(file == path for file, _ in files))
+    if (n_voxels := sum(_n_voxels(dataset) for _, dataset in found[uid])) > MOST_VOXELS:
+        raise ReadError(
+            f"{path} announces {n_voxels / 1e9:.3g} billion voxels, more than any scan of a head; export it again."
+        )
     note = f"{len(found)} DICOM series found; the one of {len(found[uid])} files taken." if len(found) > 1 else ""
     return found[uid], (note,) if note else ()
+
+
+def _candidates(folder: Path) -> list[Path]:
+    """All DICOM files below a folder; one that only bears the name is damaged, and its slice would be missing."""
+    files = sorted(p for p in folder.rglob("*") if not p.name.startswith("."))
+    for file in files:
+        if file.suffix.lower() == ".dcm" and not file.is_dir() and not is_dicom(file):
+            raise ReadError(f"{file.name} is no DICOM file, or its beginning is damaged; copy it again, or remove it.")
+    return [file for file in files if is_dicom(file)]
 
 
 def _siblings(path: Path) -> list[Path]:
@@ -125,16 +143,34 @@ def _header(file: Path) -> Any:
     import pydicom
 
     try:
+        _refuse_bomb(file)
         dataset = pydicom.dcmread(file, stop_before_pixels=True)
         is_image = "Image Storage" in dataset.file_meta.MediaStorageSOPClassUID.name
         if not is_image and "Rows" not in dataset:
             return None
         _ = dataset.SeriesInstanceUID, _n_voxels(dataset)  # values are decoded, and faults met, on first use
         return dataset
-    except _damage():
+    except damage():
         raise ReadError(
             f"{file.name} is damaged; copy it again, or remove it if it is not part of the series."
         ) from None
+
+
+def _refuse_bomb(file: Path) -> None:
+    """Refuse a deflated file that unpacks to more than a series holds: pydicom would unpack it whole."""
+    from pydicom.filereader import read_file_meta_info
+    from pydicom.uid import DeflatedExplicitVRLittleEndian
+
+    meta = read_file_meta_info(file)
+    if meta.get("TransferSyntaxUID") != DeflatedExplicitVRLittleEndian:
+        return
+    with file.open("rb") as stream:
+        stream.seek(144 + meta.FileMetaInformationGroupLength)  # preamble, magic and this element go before
+        unpacker, length = zlib.decompressobj(-zlib.MAX_WBITS), 0
+        while length <= MOST_UNPACKED and (packed := unpacker.unconsumed_tail or stream.read(1 << 16)):
+            length += len(unpacker.decompress(packed, 1 << 22))
+    if length > MOST_UNPACKED:
+        raise ReadError(f"{file.name} unpacks to more than {MOST_UNPACKED / 1e9:.1f} GB; export the series again.")
 
 
 def _n_voxels(dataset: Any) -> int:
@@ -145,7 +181,7 @@ def _planes(file: Path, dataset: Any) -> list[_Slice]:
     """Slices of one file: itself, or its frames."""
     try:
         return _frames(file, dataset)
-    except _damage():
+    except damage():
         raise ReadError(f"{file.name} is damaged: its position, orientation or pixel size cannot be read.") from None
 
 
@@ -304,7 +340,7 @@ def _decoded(plane: _Slice) -> NDArray[Any]:
         if "PixelData" not in plane.dataset:
             _load_pixels(plane)
         array = plane.dataset.pixel_array
-    except _damage():
+    except damage():
         array = _decoded_by_gdcm(plane)
     return array if plane.frame is None or array.ndim == 2 else array[plane.frame]
 

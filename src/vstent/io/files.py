@@ -1,7 +1,8 @@
 """Paths: what a file is by its name, and writing without ever leaving half a file behind."""
 
 import os
-import tempfile
+import secrets
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -11,6 +12,9 @@ from vstent.errors import ReadError
 
 SURFACE_SUFFIXES: Final = (".stl", ".vtp", ".vtk", ".obj", ".ply")
 IMAGE_SUFFIXES: Final = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".raw", ".raw.gz", ".dcm")
+PARTIAL: Final = ".partial-"
+"""How the name of a file begins while it is being written; the process follows."""
+_ONE_AT_A_TIME: Final = threading.RLock()
 
 
 def is_surface_file(path: Path) -> bool:
@@ -43,32 +47,49 @@ def atomic(path: Path) -> Iterator[Path]:
     """Give a path in the same folder to write to; it becomes `path` when the block ends well, and vanishes if not."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
+    name = path.parent / f"{PARTIAL}{os.getpid()}-{secrets.token_hex(8)}{path.suffix}"
+    name.touch(exist_ok=False)
     try:
-        yield Path(name)
-        os.chmod(name, 0o666 & ~_umask())  # mkstemp makes files that only their owner can read
+        yield name
         os.replace(name, path)
     finally:
         with suppress(FileNotFoundError):
             os.unlink(name)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def sweep(folder: Path) -> None:
+    """Take away what processes that were killed have left half-written in a folder and the two floors below it."""
+    for depth in ("", "*/", "*/*/"):
+        for partial in folder.glob(f"{depth}{PARTIAL}*"):
+            if partial.is_file() and not _is_running(partial.name[len(PARTIAL) :].partition("-")[0]):
+                partial.unlink(missing_ok=True)
+
+
+def _is_running(process: str) -> bool:
+    if not process.isdigit():
+        return False
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 @contextmanager
 def silenced() -> Iterator[None]:
-    """Keep what C and C++ libraries write to standard error off the user's terminal; our own errors say it better."""
-    saved = os.dup(2)
-    sink = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 2)
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(sink)
+    """Keep what C and C++ libraries write to standard error off the user's terminal; our own errors say it better.
+
+    Standard error belongs to the process: threads take turns.
+    """
+    with _ONE_AT_A_TIME:
+        saved = os.dup(2)
+        sink = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(sink, 2)
+            yield
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            os.close(sink)

@@ -1,6 +1,7 @@
 """Scans -> Image: DICOM, NIfTI, NRRD, MetaImage and raw voxels, in the LPS frame and mm."""
 
 import gzip
+import math
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +17,12 @@ from vstent.io.files import IMAGE_SUFFIXES, existing, silenced, suffix
 
 VOXEL_MM: Final = (0.01, 5.0)
 """Voxel edges that a scan of the head can have."""
+MOST_BYTES: Final = 1 << 32
+"""A scan of more bytes is refused: it is none of a head, or its header lies."""
+LONGEST_LINE: Final = 1000
+"""Characters of a line of a header."""
+MOST_PACKED: Final = 1032
+"""No packer of these formats makes one byte of more."""
 
 
 def read_image(
@@ -85,6 +92,10 @@ def _plausible(image: Image, path: Path) -> Image:
         )
     if image.voxels.dtype.kind == "f" and not np.isfinite(image.voxels).all():
         raise ReadError(f"{path.name} has voxels that are not numbers; export it again with integers.")
+    if image.voxels.dtype.kind in "iu" and image.voxels.dtype.itemsize == 2:
+        middle = np.ravel(image.voxels[:, :, image.voxels.shape[2] // 2], order="F")
+        if SWAPPED_ROUGHNESS * _roughness(middle.byteswap()) < _roughness(middle):
+            raise ReadError(f"{path.name} has voxels whose bytes are in the other order; export it again.")
     return image
 
 
@@ -94,17 +105,21 @@ def _plausible(image: Image, path: Path) -> Image:
 def _read_itk(path: Path, kind: str, *, has_spacing: bool) -> Image:
     import SimpleITK
 
-    if kind == ".nii.gz":
-        _refuse_torn(path, kind)
+    if kind in (".mha", ".mhd"):
+        _refuse_odd_meta(path)
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(str(path))
     try:
         with silenced():
-            scan = SimpleITK.ReadImage(str(path))
+            reader.ReadImageInformation()
+            _refuse_untrue(path, kind, reader)
+            scan = reader.Execute()
     except RuntimeError as error:
-        raise ReadError(f"{path.name} is damaged or not a {kind} file{_reason(error)}.") from None
+        raise ReadError(
+            f"{path.name} is damaged or not a {kind} file{_reason(error)}; copy it again or export it anew."
+        ) from None
     if not has_spacing and not _states_spacing(path, kind):
-        raise UnitError(f"{path.name} does not say how far its voxels are apart; give --spacing in mm.")
-    if kind == ".nii":
-        _refuse_torn(path, kind, 352 + scan.GetNumberOfPixels() * scan.GetSizeOfPixelComponent())
+        raise UnitError(f"{path.name} does not say how far its voxels are apart, above zero; give --spacing in mm.")
     if scan.GetDimension() == 4 and scan.GetSize()[3] == 1:
         scan = scan[:, :, :, 0]
     if scan.GetDimension() != 3 or scan.GetNumberOfComponentsPerPixel() != 1 or scan.GetPixelID() < 0:
@@ -118,12 +133,44 @@ def _read_itk(path: Path, kind: str, *, has_spacing: bool) -> Image:
     return Image(SimpleITK.GetArrayViewFromImage(scan).transpose(), affine)
 
 
-def _refuse_torn(path: Path, kind: str, n_bytes: int = 348) -> None:
-    """Refuse a NIfTI file that breaks off before `n_bytes`: ITK reads zeros there."""
+def _refuse_odd_meta(path: Path) -> None:
+    """Refuse a MetaImage header whose counts contradict each other: ITK crashes on those."""
+    with path.open("rb") as file:
+        head = file.read(65536).partition(b"ElementDataFile")[0]
+    pairs = [line.partition(b"=") for line in head.splitlines()]
+    values = {key.strip().lower(): value.split() for key, _, value in pairs}
+    n_axes = {b"2": 2, b"3": 3, b"4": 4}.get(b" ".join(values.get(b"ndims", [])), 0)
+    counts = {b"dimsize": n_axes, b"elementspacing": n_axes, b"transformmatrix": n_axes**2, b"offset": n_axes}
+    wrong = [key for key, n in counts.items() if key in values and len(values[key]) != n]
+    if len(values) < len(pairs) or n_axes == 0 or wrong or any(len(line) > LONGEST_LINE for line in head.splitlines()):
+        raise ReadError(f"{path.name} is damaged: its header contradicts itself; copy it again or export it anew.")
+
+
+def _refuse_untrue(path: Path, kind: str, reader: Any) -> None:
+    """Refuse a header that announces more than the file holds, before memory is asked for: ITK may read zeros there."""
+    import SimpleITK
+
+    size = reader.GetSize()
+    if min(size) < 1 or reader.GetPixelID() < 0:
+        raise ReadError(f"{path.name} has no voxels of a known kind; copy it again or export it anew.")
+    voxel = SimpleITK.Image([1] * reader.GetDimension(), reader.GetPixelID(), reader.GetNumberOfComponents())
+    n_bytes = math.prod(size) * voxel.GetNumberOfComponentsPerPixel() * voxel.GetSizeOfPixelComponent()
+    announced = f"{path.name} announces {' x '.join(map(str, size))} voxels, {n_bytes / 1e9:.3g} GB"
+    n_held = path.stat().st_size
+    if kind not in (".nhdr", ".mhd") and n_bytes > MOST_PACKED * n_held:
+        raise ReadError(f"{announced}, but has {n_held} bytes: it is damaged and breaks off; copy it again.")
+    if n_bytes > MOST_BYTES:
+        raise ReadError(f"{announced}, more than any scan of a head; export the part about the aneurysm.")
+    if kind in (".nii", ".nii.gz"):
+        _refuse_torn(path, kind, _nifti_begin(path, kind) + n_bytes)
+
+
+def _refuse_torn(path: Path, kind: str, n_bytes: int) -> None:
+    """Refuse a NIfTI file that breaks off before `n_bytes`."""
     length = 0
     try:
         with gzip.open(path) if kind == ".nii.gz" else path.open("rb") as file:
-            while part := file.read(1 << 22):
+            while length <= n_bytes and (part := file.read(1 << 22)):
                 length += len(part)
     except (OSError, EOFError, zlib.error):
         length = -1
@@ -135,28 +182,55 @@ def _reason(error: Exception) -> str:
     """Return the last plain sentence of an ITK exception in brackets, where it says more than that it failed."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     last = lines[-1].split("): ", 1)[-1].rstrip(".") if lines else ""
-    return "" if not last or "sitk::ERROR" in last or last.startswith("Reason:") else f" ({last[:150]})"
+    says_little = (
+        not last or "sitk::ERROR" in last or last.startswith("Reason:") or " " not in last.strip("0123456789 ")
+    )
+    return "" if says_little else f" ({last[:150]})"
 
 
 def _states_spacing(path: Path, kind: str) -> bool:
     """Tell whether the header says how far voxels are apart; ITK takes 1 mm where it does not."""
+    if kind in (".nii", ".nii.gz"):
+        head, order = _nifti_head(path, kind)
+        edges = head[80:92], f"{order}f4"
+        if len(head) >= NIFTI_2:
+            edges = head[112:136], f"{order}f8"
+        return bool((np.abs(np.frombuffer(*edges)) > 0).all())
     with path.open("rb") as file:
         head = file.read(65536)
-    if kind in (".nii", ".nii.gz"):
-        return _nifti_spacing(head if kind == ".nii" else zlib.decompressobj(31).decompress(head, 4096))
     text = head.split(b"\n\n")[0] if kind in (".nrrd", ".nhdr") else head.split(b"ElementDataFile")[0]
     keys = (b"spacings:", b"space directions:") if kind in (".nrrd", ".nhdr") else (b"elementspacing", b"elementsize")
-    return any(line.strip().lower().startswith(keys) and b"nan" not in line.lower() for line in text.splitlines())
+    return any(line.strip().lower().startswith(keys) and _may_be_spacing(line) for line in text.splitlines())
 
 
-def _nifti_spacing(head: bytes) -> bool:
-    for order in ("<", ">"):
-        size = int(np.frombuffer(head[:4].ljust(4, b"\0"), order + "i4")[0])
-        if size == 348 and len(head) >= 92:
-            return bool((np.abs(np.frombuffer(head[80:92], order + "f4")) > 0).all())
-        if size == 540 and len(head) >= 168:
-            return bool((np.abs(np.frombuffer(head[112:136], order + "f8")) > 0).all())
-    return True  # not NIfTI at all: ITK will say so
+def _may_be_spacing(line: bytes) -> bool:
+    """Tell whether a line of a header holds numbers, and no edge below zero: ITK drops the sign."""
+    key, _, values = line.lower().replace(b"=", b":").partition(b":")
+    is_edges = b"directions" not in key
+    return b"nan" not in values and not (is_edges and any(word.startswith(b"-") for word in values.split()))
+
+
+NIFTI_2: Final = 540
+"""Bytes of a NIfTI-2 header; one of NIfTI-1 has 348."""
+
+
+def _nifti_head(path: Path, kind: str) -> tuple[bytes, str]:
+    """Return the header of a NIfTI file that ITK has accepted, and its byte order."""
+    with gzip.open(path) if kind == ".nii.gz" else path.open("rb") as file:
+        head = file.read(NIFTI_2)
+    order = "<" if int.from_bytes(head[:4], "little") in (348, NIFTI_2) else ">"
+    size = int.from_bytes(head[:4], "little" if order == "<" else "big")
+    return head[: NIFTI_2 if size == NIFTI_2 else 348], order
+
+
+def _nifti_begin(path: Path, kind: str) -> int:
+    """Return where the voxels begin."""
+    head, order = _nifti_head(path, kind)
+    place = (head[168:176], f"{order}i8") if len(head) == NIFTI_2 else (head[108:112], f"{order}f4")
+    begin = float(np.frombuffer(*place)[0])
+    if not len(head) + 4 <= begin <= MOST_BYTES:
+        raise ReadError(f"{path.name} is damaged: its voxels would begin at byte {begin:g}; copy it again.")
+    return int(begin)
 
 
 # -- raw voxels --------------------------------------------------------------------------------------------------------
@@ -170,8 +244,8 @@ def _read_raw(
     if shape is None or len(shape) != 3 or min(shape) < 1:
         raise ReadError(f"{path.name} has no header; give the number of voxels with --shape NI,NJ,NK.")
     spacing = _three(spacing_mm, "spacing")
-    data = _bytes(path)
-    n = int(np.prod(np.asarray(shape, dtype=np.int64)))
+    n = math.prod(shape)
+    data = _bytes(path, n * LARGEST_VOXEL)
     kind, note = (np.dtype(dtype), ()) if dtype is not None else _guessed_dtype(data, n, path)
     if len(data) != n * kind.itemsize:
         raise ReadError(
@@ -183,12 +257,17 @@ def _read_raw(
     return _plausible(Image(voxels.astype(kind.newbyteorder("="), copy=False), affine, notes=note), path)
 
 
-def _bytes(path: Path) -> bytes:
-    data = path.read_bytes()
-    if suffix(path) != ".raw.gz":
-        return data
+SWAPPED_ROUGHNESS: Final = 2.0
+"""Voxels so many times as rough as with their bytes swapped are in the wrong order; in the right one they are less."""
+LARGEST_VOXEL: Final = 8
+"""Bytes of the largest kind of voxel."""
+
+
+def _bytes(path: Path, most: int) -> bytes:
+    """Return what a file holds, unpacked, but not much more than `most` bytes of it."""
     try:
-        return gzip.decompress(data)
+        with gzip.open(path) if suffix(path) == ".raw.gz" else path.open("rb") as file:
+            return file.read(min(most, MOST_BYTES) + 1)
     except (OSError, EOFError, zlib.error):
         raise ReadError(f"{path.name} is damaged: it cannot be unpacked.") from None
 

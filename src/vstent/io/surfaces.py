@@ -67,7 +67,10 @@ def _read(path: Path) -> Surface:
     _refuse_mislabelled(path, kind)
     mesh = read_apart(path)
     if mesh is None or len(mesh[1]) == 0:
-        raise ReadError(f"{path.name} holds no triangles: it is empty, damaged or not a {kind} file.")
+        raise ReadError(
+            f"{path.name} holds no triangles, or not all that it announces: it is empty, damaged or not a {kind} file; "
+            "copy it again or export it anew."
+        )
     return Surface(*mesh)
 
 
@@ -81,8 +84,15 @@ def _refuse_mislabelled(path: Path, kind: str) -> None:
     wrong = kind in _BEGINS and not head.lstrip(b"\xef\xbb\xbf \r\n\t").lower().startswith(_BEGINS[kind])
     if kind == ".stl":
         wrong = not (_is_ascii_stl(head) or _is_binary_stl(path, head))
+    if kind == ".stl" and wrong and not head.lstrip().lower().startswith(b"solid") and len(head) >= 84:
+        raise ReadError(
+            f"{path.name} breaks off, or is not a .stl file: its header announces {_n_stl(head)} triangles and there "
+            f"is room for {(path.stat().st_size - 84) // 50}; copy it again."
+        )
     if wrong:
-        raise ReadError(f"{path.name} is not a {kind} file, whatever its name says: it begins with {head[:16]!r}.")
+        raise ReadError(
+            f"{path.name} is not a {kind} file, whatever its name says: it begins with {head[:16]!r}; export it again."
+        )
 
 
 def _is_ascii_stl(head: bytes) -> bool:
@@ -90,20 +100,26 @@ def _is_ascii_stl(head: bytes) -> bool:
 
 
 def _is_binary_stl(path: Path, head: bytes) -> bool:
-    n_faces = int.from_bytes(head[80:84], "little")
-    return len(head) >= 84 and path.stat().st_size >= 84 + 50 * n_faces
+    return len(head) >= 84 and path.stat().st_size >= 84 + 50 * _n_stl(head)
+
+
+def _n_stl(head: bytes) -> int:
+    """Triangles that a binary STL file announces."""
+    return int.from_bytes(head[80:84], "little")
 
 
 def _checked(surface: Surface, path: Path) -> Surface:
     if len(surface.faces) < 4:
-        raise ReadError(f"{path.name} holds {len(surface.faces)} triangles, which is no vessel.")
+        raise ReadError(
+            f"{path.name} holds {len(surface.faces)} triangles, which is no vessel; give the wall of the vessel."
+        )
     bad = ~np.isfinite(surface.vertices_mm).all(axis=1)
     if bad.any():
         raise ReadError(
             f"{path.name} has {bad.sum()} vertices that are not numbers (first: vertex {bad.argmax()}); repair it."
         )
     if not surface.areas_mm2.sum() > 0 or not np.isfinite(_diagonal(surface)):
-        raise ReadError(f"{path.name} has no area: all of its triangles are lines or points.")
+        raise ReadError(f"{path.name} has no area: all of its triangles are lines or points; export it again.")
     return surface
 
 
@@ -114,8 +130,11 @@ def _diagonal(surface: Surface) -> float:
 
 def hydraulic_diameter(surface: Surface) -> float:
     """Return 4 V / A of the capped surface in its own unit: the diameter, if it were one long tube."""
-    faces, _ = topology.oriented(surface.faces)
-    vertices, closed = triangles.cap(surface.vertices_mm, faces, triangles.boundary_loops(surface.vertices_mm, faces))
+    kept, same = topology.first_equals(surface.vertices_mm)
+    welded = same[surface.faces].astype(np.int32)
+    faces, _ = topology.oriented(welded[topology.sound_faces(welded)])
+    points = surface.vertices_mm[kept]
+    vertices, closed = triangles.cap(points, faces, triangles.boundary_loops(points, faces))
     return float(4 * abs(triangles.volume(vertices[closed])) / surface.area_mm2)
 
 

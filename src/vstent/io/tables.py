@@ -1,11 +1,16 @@
-"""Tables of numbers in text files."""
+"""Tables in text files."""
 
+import csv
+import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from vstent.errors import ReadError
-from vstent.io.files import existing
+from vstent.io.files import atomic, existing
+from vstent.io.writers import SIGNIFICANT_DIGITS, write_text
 from vstent.kernels.arrays import Floats
 
 
@@ -30,6 +35,41 @@ def read_columns(path: Path, count: int) -> Floats:
     if not rows:
         raise ReadError(f"{path} holds no numbers: give {count} columns, parted by commas")
     return np.array(rows)
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows of named values as CSV: every name a column, in the order of first use; what a row lacks is empty.
+
+    Floats have seven digits, truths are ``true`` and ``false``.
+    """
+    names = columns_of(rows)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([_plain(row.get(name)) for name in names] for row in rows)
+    write_text(path, text.getvalue())
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the names of all columns, in the order of first use."""
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Write rows of named values as Parquet; False, and nothing written, where pyarrow is not installed."""
+    try:
+        from pyarrow import parquet, table
+    except ImportError:
+        return False
+    with atomic(path) as partial:
+        parquet.write_table(table({name: [row.get(name) for row in rows] for name in columns_of(rows)}), partial)
+    return True
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bool | np.bool_):
+        return "true" if value else "false"
+    return f"{value:.{SIGNIFICANT_DIGITS}g}" if isinstance(value, float) else value
 
 
 def _number(word: str) -> float | None:

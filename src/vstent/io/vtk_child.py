@@ -4,6 +4,7 @@ They are fast and know every dialect, but a damaged file can crash them, and us 
 memory there is. So a child reads the file and hands over bare arrays; when it dies, the file was damaged.
 """
 
+import errno
 import os
 import subprocess
 import sys
@@ -22,6 +23,10 @@ SECONDS: Final = 8.0
 SECONDS_PER_BYTE: Final = 1e-6
 MEMORY_BYTES: Final = 2_000_000_000
 MEMORY_PER_BYTE: Final = 40
+DISK_FULL: Final = 28
+"""Exit code where the arrays could not be written."""
+LEAST_USED: Final = 0.9
+"""Part of the points of an OBJ file that belong to triangles; they come first, so a file that breaks off has more."""
 
 
 def read_apart(path: Path) -> tuple[Floats, Ints] | None:
@@ -39,7 +44,11 @@ def read_apart(path: Path) -> tuple[Floats, Ints] | None:
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
             )
-        except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
+        except subprocess.CalledProcessError as died:
+            if died.returncode == DISK_FULL:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), folder) from None
+            return None
+        except subprocess.TimeoutExpired:
             return None
         with np.load(result) as arrays:
             return arrays["vertices"], arrays["faces"]
@@ -79,6 +88,34 @@ def _reader(kind: str) -> Any:
     return vtkSTLReader() if kind == ".stl" else vtkOBJReader()
 
 
+def _faults() -> list[str]:
+    """Return a list that fills with whatever VTK complains of: after that it hands over what it has, zeros included."""
+    from vtkmodules.util.misc import calldata_type
+    from vtkmodules.vtkCommonCore import VTK_STRING, vtkOutputWindow
+
+    faults: list[str] = []
+
+    @calldata_type(VTK_STRING)
+    def note(_: Any, event: str, text: str) -> None:
+        if event == "ErrorEvent" or "Error reading" in text:  # binary data that end early are only warned of
+            faults.append(text)
+
+    window: Any = vtkOutputWindow.GetInstance()
+    for event in ("ErrorEvent", "WarningEvent"):
+        window.AddObserver(event, note)
+    return faults
+
+
+def _announced(path: Path) -> int:
+    """Return how many polygons the header of a PLY file announces; VTK is content with fewer."""
+    if suffix(path) != ".ply":
+        return 0
+    with path.open("rb") as file:
+        head = file.read(1 << 16).partition(b"end_header")[0]
+    counts = [line.split()[2] for line in head.splitlines() if line.startswith(b"element face")]
+    return int(counts[0]) if counts else 0
+
+
 def _polygons(data: Any) -> Any:
     """Return polygons as they are, the outer faces of a volume mesh, and None for anything else."""
     if data is None or data.IsA("vtkPolyData"):
@@ -98,12 +135,20 @@ def main(path: Path, result: Path) -> int:
     _limit_memory(path.stat().st_size)
     reader = _reader(suffix(path))
     reader.SetFileName(str(path))
+    faults = _faults()
     reader.Update()
     data = _polygons(reader.GetOutput())
-    if data is None:
+    if data is None or faults:
         return 1
     vertices, faces = triangles_of(data)
-    np.savez(result, vertices=vertices.astype(np.float64), faces=faces.astype(np.int32))
+    if len(faces) < _announced(path):
+        return 1
+    if suffix(path) == ".obj" and len(np.unique(faces)) < LEAST_USED * len(vertices):
+        return 1
+    try:
+        np.savez(result, vertices=vertices.astype(np.float64), faces=faces.astype(np.int32))
+    except OSError:
+        return DISK_FULL
     return 0
 
 

@@ -1,7 +1,9 @@
 """Nouns and arrays -> files: VTP, VTU, STL, JSON, text. Every file is complete or not there at all."""
 
+import errno
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -9,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.io.files import atomic
+from vstent.io.files import atomic, silenced
 from vstent.io.polydata import cells_of, points_of, polydata_of, ragged_cells
 from vstent.kernels.arrays import Floats, Ints
 from vstent.surface import Surface
@@ -133,8 +135,10 @@ def _write_xml(path: Path, data: Any) -> None:
     writer.SetCompressionLevel(1)
     with atomic(path) as partial:
         writer.SetFileName(str(partial))
-        if writer.Write() != 1:
-            raise OSError(f"{path} could not be written: is the disk full?")
+        with silenced():
+            is_written = writer.Write() == 1
+        if not is_written or partial.stat().st_size == 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 _STL_FACE: Final = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

@@ -50,3 +50,21 @@ def _crossings(vertices: Floats, edges: Ints, value: Floats) -> tuple[Floats, In
     created = vertices[a] + t * (vertices[b] - vertices[a])
     answer = np.where(on_zero, np.where(value[low] == 0, low, high), len(vertices) + inverse)
     return np.concatenate([vertices, created]), answer.astype(np.int32)
+
+
+def section(vertices: Floats, faces: Ints, value: Floats) -> Floats:
+    """Segments (s, 2, 3) along which a mesh meets the zero of `value` (n,), linear on every face."""
+    is_positive = value[faces] > 0
+    count = is_positive.sum(axis=1)
+    lone = np.concatenate(
+        [
+            _rotated(faces[count == 1], np.argmax(is_positive[count == 1], axis=1)),
+            _rotated(faces[count == 2], np.argmin(is_positive[count == 2], axis=1)),
+        ]
+    )
+    ends = []
+    for other in (1, 2):
+        a, b = lone[:, 0], lone[:, other]
+        share = (value[a] / (value[a] - value[b]))[:, None]
+        ends.append(vertices[a] + share * (vertices[b] - vertices[a]))
+    return np.stack(ends, axis=1)

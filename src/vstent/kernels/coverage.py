@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy.spatial import cKDTree
 
 from vstent.kernels.arrays import Floats
@@ -27,7 +27,7 @@ def covered_fractions(nodes: Floats, starts: Floats, ends: Floats, radius: Float
     order = np.argsort(home, kind="stable")
     first = np.searchsorted(home[order], np.arange(rows * columns + 1)).astype(np.int32)
     return _fractions(
-        np.ascontiguousarray(nodes),
+        np.array(nodes, order="C"),  # a copy: what may not be written would be compiled anew
         np.ascontiguousarray(starts[order]),
         np.ascontiguousarray(ends[order]),
         np.ascontiguousarray(radius[order]),
@@ -146,9 +146,9 @@ def _row_fractions(
         result[row, column] = _share_under(row * columns + column, corners, frame, flat[:n_flat], samples)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def _fractions(nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int) -> Any:
     result = np.zeros((nodes.shape[0] - 1, nodes.shape[1]))
-    for row in prange(len(result)):
+    for row in range(len(result)):
         _row_fractions(row, nodes, starts, ends, radius, first, samples, result)
     return result

@@ -46,10 +46,21 @@ def edges_of(faces: Ints) -> Edges:
 
 def weld(vertices: Floats, faces: Ints, tolerance: float) -> tuple[Floats, Ints]:
     """Make one vertex of all that are closer than `tolerance` (transitively); the first of them stays."""
-    pairs = cKDTree(vertices).query_pairs(tolerance, output_type="ndarray")
-    label = _components(len(vertices), pairs[:, 0], pairs[:, 1])
+    kept, same = first_equals(vertices)  # of a million points at one place, every pair would be near
+    pairs = cKDTree(vertices[kept]).query_pairs(tolerance, output_type="ndarray")
+    label = _components(len(kept), pairs[:, 0], pairs[:, 1])
     _, first = np.unique(label, return_index=True)
-    return vertices[first], label[faces].astype(np.int32)
+    return vertices[kept[first]], label[same[faces]].astype(np.int32)
+
+
+def first_equals(vertices: Floats) -> tuple[Ints, Ints]:
+    """Return the first (k,) of each set of equal vertices, in order, and for every vertex (n,) its place there."""
+    rows = np.ascontiguousarray(vertices + 0.0, dtype=np.float64).view("V24").ravel()
+    _, first, same = np.unique(rows, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    place = np.zeros(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    return first[order], place[same.ravel()]
 
 
 def _components(n: int, a: NDArray[np.integer], b: NDArray[np.integer]) -> Labels:

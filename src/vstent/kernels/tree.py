@@ -154,16 +154,22 @@ def _add_edge_normals(faces: Any, n_vertices: int, result: Any) -> None:
                         result[f, 1 + k, axis] += result[g, 0, axis]
 
 
+def _plain(points: Floats) -> Floats:
+    """Points as one kind of array: numba compiles a kernel anew for arrays that may not be written."""
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    return points if points.flags.writeable else points.copy()
+
+
 def closest_points(tree: Tree, points: Floats) -> tuple[Floats, Floats, Ints]:
     """Closest point (n, 3), distance (n,) and face (n,) for points (n, 3)."""
-    points = np.ascontiguousarray(points, dtype=np.float64)
+    points = _plain(points)
     closest, distance, triangle, _ = _closest_all(tree.corners, tree.low, tree.high, points)
     return closest, distance, tree.face[triangle]
 
 
 def signed_distances(tree: Tree, points: Floats) -> Floats:
     """Distance (n,) of points (n, 3) to a closed surface, negative inside."""
-    points = np.ascontiguousarray(points, dtype=np.float64)
+    points = _plain(points)
     closest, distance, triangle, feature = _closest_all(tree.corners, tree.low, tree.high, points)
     normal = tree.pseudonormal[triangle, feature]
     return np.where(np.einsum("ij,ij->i", points - closest, normal) < 0, -distance, distance)
@@ -171,15 +177,13 @@ def signed_distances(tree: Tree, points: Floats) -> Floats:
 
 def segments_cross(tree: Tree, starts: Floats, ends: Floats) -> Bools:
     """Tell for each segment, from starts (n, 3) to ends (n, 3), whether it meets a triangle."""
-    starts = np.ascontiguousarray(starts, dtype=np.float64)
-    ends = np.ascontiguousarray(ends, dtype=np.float64)
+    starts = _plain(starts)
     return _first_hit_all(tree.corners, tree.low, tree.high, starts, ends - starts, 1.0)[0] <= 1.0
 
 
 def first_hits(tree: Tree, origins: Floats, directions: Floats) -> Floats:
     """Distance (n,) from origins (n, 3) along unit directions (n, 3) to the first triangle; inf where none."""
-    origins = np.ascontiguousarray(origins, dtype=np.float64)
-    directions = np.ascontiguousarray(directions, dtype=np.float64)
+    origins, directions = _plain(origins), _plain(directions)
     return _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)[0]
 
 
@@ -188,8 +192,7 @@ def sees_inside(tree: Tree, origins: Floats, directions: Floats) -> Bools:
 
     Any ray of a point inside does. Where walls are all about as near, this is much faster than the nearest of them.
     """
-    origins = np.ascontiguousarray(origins, dtype=np.float64)
-    directions = np.ascontiguousarray(directions, dtype=np.float64)
+    origins, directions = _plain(origins), _plain(directions)
     hit, triangle = _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)
     return np.isfinite(hit) & (np.einsum("ij,ij->i", tree.pseudonormal[triangle, 0], directions) > 0)
 

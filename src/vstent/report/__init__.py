@@ -1,5 +1,6 @@
-"""The report of a case: one HTML file with its viewer, its pictures and every number, and nothing from a network."""
+"""The reports of a case and of a cohort: one HTML file each, with every number, and nothing from a network."""
 
+from vstent.report.cohort import cohort_report
 from vstent.report.page import report
 
-__all__ = ["report"]
+__all__ = ["cohort_report", "report"]

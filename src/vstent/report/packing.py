@@ -2,11 +2,14 @@
 
 Every array is an integer block ``{offset, length, type}`` in the bytes, little-endian, at a multiple of 4. A quantised
 array carries ``low`` and ``step``, one per component besides: number = low + step * integer. Contours over time are one
-block of all their frames. The bytes are zlib-compressed and written in base64.
+block of all their frames. In the report the bytes are zlib-compressed and written in base64; over HTTP they follow the
+manifest (`framed`): the length of its JSON in four bytes, the JSON padded with spaces to a multiple of 4, the bytes.
 """
 
 import base64
+import json
 import zlib
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -52,6 +55,25 @@ class Packer:
     def text(self) -> str:
         """Return everything compressed, as base64."""
         return base64.b64encode(zlib.compress(b"".join(self._parts), 9)).decode("ascii")
+
+    def framed(self, manifest: Mapping[str, Any]) -> bytes:
+        """Return a manifest and everything as one message."""
+        words = json.dumps(manifest, separators=(",", ":"), allow_nan=False).encode()
+        words += b" " * (-len(words) % 4)
+        return len(words).to_bytes(4, "little") + words + b"".join(self._parts)
+
+
+def message(
+    layers: Iterable[MeshLayer | LineLayer], scales: Iterable[Scale] = (), views: Iterable[View] = (), **more: Any
+) -> bytes:
+    """Return layers, scales and views as one message for the page; `more` stands in its manifest beside them."""
+    packer = Packer()
+    manifest = {
+        "scales": [_scale(scale, packer) for scale in scales],
+        "views": [_view(view) for view in views],
+        "layers": [_layer(layer, packer) for layer in layers],
+    }
+    return packer.framed(manifest | more)
 
 
 def pack(scene: Scene, notes: dict[str, str]) -> tuple[dict[str, Any], str]:

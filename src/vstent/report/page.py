@@ -15,6 +15,7 @@ from vstent.report.figures import pictures
 from vstent.report.packing import pack
 from vstent.report.quantities import Change, Quantity, compare, flatten, format_change
 from vstent.report.scene import BARE, device_title, scene_of
+from vstent.report.uncertainty import uncertainty_of
 from vstent.stent import Deployment
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def report(case: "CaseResult") -> str:
         name=case.name,
         sections=_sections(case),
         script_hashes=Markup(" ".join(_hash(script) for script in scripts.values())),
-        style=Markup(_asset("report.css") + _asset("viewer.css")),
+        style=Markup(asset("report.css") + asset("viewer.css")),
         **{name: Markup(script) for name, script in scripts.items()},
         devices=devices,
         change=format_change,
@@ -58,6 +59,7 @@ def report(case: "CaseResult") -> str:
         stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
         flow=rows,
         flow_only=_flow_only(metrics, rows, dict(devices)),
+        uncertainty=uncertainty_of(metrics, dict(devices)),
         other=_other(metrics),
         notes=case.notes,
         limits=LIMITS,
@@ -68,12 +70,13 @@ def report(case: "CaseResult") -> str:
     )
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Return the text of a file that pages are made of."""
     return files("vstent.report").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _script(name: str) -> str:
-    return _asset(name).replace("</script", "<\\/script")
+    return asset(name).replace("</script", "<\\/script")
 
 
 def _hash(script: str) -> str:
@@ -87,6 +90,8 @@ def _sections(case: "CaseResult") -> list[tuple[str, str]]:
         titles["devices"] = "Devices"
     if case.metrics.get("bare"):
         titles["flow"] = "Blood flow"
+    if any("uncertainty" in stent for stent in case.metrics.get("stents", {}).values()):
+        titles["uncertainty"] = "Uncertainty"
     titles |= {"notes": "Notes and limits", "definitions": "Definitions", "provenance": "How this was made"}
     return list(titles.items())
 
@@ -144,7 +149,7 @@ def _other(metrics: dict[str, Any]) -> list[Quantity]:
     """Whatever the metrics hold besides the parts that have a place of their own."""
     top = {key: value for key, value in metrics.items() if key not in ("vessel", "bare", "stents")}
     stents = {
-        name: {key: value for key, value in stent.items() if key not in ("deployment", "flow", "ratios")}
+        name: {key: value for key, value in stent.items() if key not in ("deployment", "flow", "ratios", "uncertainty")}
         for name, stent in metrics.get("stents", {}).items()
     }
     return flatten(top) + list(flatten(stents))

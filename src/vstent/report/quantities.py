@@ -46,6 +46,10 @@ UNITS: dict[str, tuple[str, float]] = {
 """End of a key -> unit for people, and the factor to it (angles in degrees and fractions in percent: here only)."""
 
 
+NOTHING = 1e-13
+"""What is smaller is what rounding leaves of zero."""
+
+
 @dataclass(frozen=True)
 class Quantity:
     """One number of the metrics."""
@@ -125,7 +129,7 @@ def format_value(key: str, value: Any) -> str:
 
 def format_number(value: float) -> str:
     """Return a number with three significant digits, and no fewer than all before the point: 0.0412, 3.14, 1520."""
-    if value == 0:
+    if abs(value) < NOTHING:
         return "0"
     magnitude = math.floor(math.log10(abs(value)))
     if magnitude < -4 or magnitude > 6:

@@ -141,16 +141,16 @@ def scene_of(case: "CaseResult") -> Scene:
     """Return the scene of a case, thinned to what a screen can show."""
     anatomy: Anatomy = case.anatomy
     devices = tuple((name, device_title(deployment)) for name, deployment in case.deployments.items())
-    layers: list[MeshLayer | LineLayer] = _anatomy_layers(anatomy)
+    layers: list[MeshLayer | LineLayer] = anatomy_layers(anatomy)
     for name, deployment in case.deployments.items():
-        layers += _device_layers(name, deployment, anatomy)
+        layers += device_layers(name, deployment, anatomy)
     for name, field in case.fields.items():
-        layers += _flow_layers(name, field, anatomy)
+        layers += flow_layers(name, field, anatomy)
     return Scene(
         panes=((BARE, "Before (no device)"), *devices),
         layers=tuple(layers),
-        scales=_scales(layers),
-        views=_views(anatomy, case.deployments),
+        scales=scales_of(layers),
+        views=views_of(anatomy, case.deployments),
         fade_mm=1.2 * float(np.median(anatomy.section_radius_mm)),
     )
 
@@ -168,31 +168,34 @@ _INK = (0.10, 0.17, 0.20)
 _STEEL = (0.33, 0.38, 0.43)
 
 
-def _anatomy_layers(anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+def anatomy_layers(anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+    """Return lumen, landing surface, axes, sacs and necks."""
     lumen, _ = thin_surface(anatomy.vessel.lumen, 40_000)
     landing, _ = thin_surface(anatomy.landing_surface, 24_000)
     layers: list[MeshLayer | LineLayer] = [
         MeshLayer(id="lumen", pane="", colour=_WALL, surface=lumen, opacity=0.16, **_PLAIN),
         MeshLayer(id="landing", pane="", colour=(0.80, 0.74, 0.66), surface=landing, **_PLAIN),
-        _curves("centerlines", [line.points_mm for line in anatomy.vessel.centerlines], 0.05, (0.45, 0.36, 0.58)),
-        _curves("axis", [anatomy.axis.points_mm], 0.06, (0.17, 0.32, 0.55)),
+        curves_layer("centerlines", [line.points_mm for line in anatomy.vessel.centerlines], 0.05, (0.45, 0.36, 0.58)),
+        curves_layer("axis", [anatomy.axis.points_mm], 0.06, (0.17, 0.32, 0.55)),
     ]
     if anatomy.aneurysms:
         sacs = [thin_surface(aneurysm.sac, 12_000)[0] for aneurysm in anatomy.aneurysms]
         rings = [np.vstack([aneurysm.neck_mm, aneurysm.neck_mm[:1]]) for aneurysm in anatomy.aneurysms]
         layers += [MeshLayer(id="sac", pane="", colour=_SAC, surface=sac, opacity=0.45, **_PLAIN) for sac in sacs]
-        layers += [_curves("neck", rings, 0.08, (0.72, 0.20, 0.16))]
+        layers += [curves_layer("neck", rings, 0.08, (0.72, 0.20, 0.16))]
     return layers
 
 
-def _curves(name: str, curves: list[Floats], radius_mm: float, colour: tuple[float, float, float]) -> LineLayer:
+def curves_layer(name: str, curves: list[Floats], radius_mm: float, colour: tuple[float, float, float]) -> LineLayer:
+    """Return plain curves (n, 3) as one layer of every pane."""
     starts = np.concatenate([[0], np.cumsum([len(curve) for curve in curves])]).astype(np.int32)
     points = np.concatenate([np.zeros((0, 3)), *curves])
     radii = np.full(len(curves), radius_mm)
     return LineLayer(id=name, pane="", colour=colour, points_mm=points, starts=starts, radius_mm=radii, **_PLAIN)
 
 
-def _device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+def device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+    """Return the contour with its expansion, and the wires, for the pane `name`."""
     frames_mm, gaps_mm = thin_frames(deployment, anatomy.landing_surface, n_frames=24)
     stent = deployment.stent
     points, starts, _ = thin_lines(stent.wire_points_mm, stent.wire_starts, np.zeros(0), 60_000)
@@ -213,7 +216,8 @@ def _device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[
     return [contour, wires]
 
 
-def _flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+    """Return the wall coloured by its shear stress, and streamlines, for the pane `name`."""
     wall, origin = thin_surface(field.wall, 40_000)
     shear = MeshLayer(
         id="shear",
@@ -249,11 +253,14 @@ _SCALES = {
     "speed": ("Speed", "m/s", "viridis", 0.05),
     "shear": ("Wall shear stress", "Pa", "plasma", 1.0),
     "wall_gap": ("Gap between device and wall", "mm", "cividis", 0.1),
+    "coverage": ("Metal coverage", "%", "viridis", 40.0),
+    "diameter": ("Deployed diameter", "mm", "viridis", 1.0),
 }
 """Name -> title, unit, colour map and the smallest range worth a scale."""
 
 
-def _scales(layers: list[MeshLayer | LineLayer]) -> tuple[Scale, ...]:
+def scales_of(layers: list[MeshLayer | LineLayer]) -> tuple[Scale, ...]:
+    """Return the scales that the layers use, each wide enough for all of them."""
     scales = []
     for name, (title, unit, colour_map, least) in _SCALES.items():
         values = [layer.values for layer in layers if layer.scale == name and len(layer.values)]
@@ -276,24 +283,25 @@ def _colours(name: str) -> Floats:
     return matplotlib.colormaps[name](np.linspace(0.0, 0.93, 256))[:, :3]
 
 
-def _views(anatomy: Anatomy, deployments: dict[str, Deployment]) -> tuple[View, ...]:
+def views_of(anatomy: Anatomy, deployments: dict[str, Deployment]) -> tuple[View, ...]:
+    """Return the directions to look from, the profile of the largest sac first."""
     points = [deployment.stent.nodes_mm.reshape(-1, 3) for deployment in deployments.values()]
     points += [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
     treated = np.concatenate(points or [anatomy.axis.points_mm])
     whole = anatomy.vessel.lumen.vertices_mm
     right, up, toward = _profile(anatomy)
-    profile = _view("profile", np.stack([right, up, toward]), treated)
-    opposite = _view("profile", np.stack([-right, up, -toward]), treated)
+    profile = view_of("profile", np.stack([right, up, toward]), treated)
+    opposite = view_of("profile", np.stack([-right, up, -toward]), treated)
     views = [profile if _hidden(whole, profile) <= _hidden(whole, opposite) else opposite]
     if anatomy.aneurysms:
         right, up, toward = views[0].axes
-        views.append(_view("neck", np.stack([right, -toward, up]), anatomy.aneurysms[0].neck_mm, 1.3))
-    views.append(_view("frontal", np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), whole))
-    views.append(_view("lateral", np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), whole))
+        views.append(view_of("neck", np.stack([right, -toward, up]), anatomy.aneurysms[0].neck_mm, 1.3))
+    views.append(view_of("frontal", np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), whole))
+    views.append(view_of("lateral", np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), whole))
     return tuple(views)
 
 
-def _view(name: str, axes: Floats, points_mm: Floats, room: float = 1.0) -> View:
+def view_of(name: str, axes: Floats, points_mm: Floats, room: float = 1.0) -> View:
     """Frame points (n, 3) as they show from there, with some room."""
     seen = points_mm @ axes.T
     middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))

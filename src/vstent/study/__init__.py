@@ -12,21 +12,36 @@ from pathlib import Path
 from typing import Any, Final
 
 from vstent.device import find_design
+from vstent.flow.convergence import Refinement
 from vstent.io import writers
 from vstent.measure import morphology
+from vstent.study.folder import CACHE, claiming
 from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
-from vstent.study.outputs import write_anatomy, write_stent, write_vessel
-from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all
-from vstent.study.types import CaseResult, Progress, Settings
+from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
+from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all, refine, vary_all
+from vstent.study.types import CaseResult, Placing, Progress, Settings
 from vstent.vessel import Anatomy, Vessel
 
-__all__ = ["CaseResult", "Progress", "Settings", "restore_vessel", "run", "trace_vessel"]
+__all__ = [
+    "CACHE",
+    "INPUT",
+    "CaseResult",
+    "Placing",
+    "Progress",
+    "Settings",
+    "refine_flow",
+    "restore_vessel",
+    "run",
+    "trace_vessel",
+    "write_ranking",
+]
 
 PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
-CACHE: Final = ".vstent"
-"""Folder inside the case folder that holds finished stages."""
+INPUT: Final = "input.json"
+"""File in the case folder that says where the input lies: not for handing on, for its path may name the patient."""
 
 
+@claiming
 def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseResult:
     """Run one study and write its folder; a study already begun there goes on where it stopped.
 
@@ -43,6 +58,8 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
         Something given cannot be used; nothing has been written.
     FlowError
         A flow could not be computed; everything before it is kept.
+    FolderError
+        Another process works in the folder, or it cannot be written to.
     """
     designs = {name: find_design(name) for name in settings.devices}
     ledger = Ledger(out / CACHE, progress)
@@ -51,12 +68,16 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     deployments = deploy_all(designs, anatomy, settings, ledger)
     ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
     write_anatomy(out, anatomy)
+    writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve())})
     for name, deployment in deployments.items():
         with ledger.stage(f"struts {name}") as tell:
             tell(write_stent(out / "stents" / name, deployment))
     fields = compute_flows(out, anatomy, deployments, settings, ledger, source)
+    varied = vary_all(anatomy, deployments, settings, ledger, source)
     with ledger.stage("measure"):
         metrics = measure_all(anatomy, deployments, fields)
+        for name, spread in varied.items():
+            metrics["stents"][name]["uncertainty"] = spread
         writers.write_json(out / "metrics.json", metrics)
     provenance = _provenance(path, source, settings, ledger)
     writers.write_json(out / "run.json", provenance)
@@ -64,6 +85,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, provenance, notes)
 
 
+@claiming
 def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> Vessel:
     """Find the vessel, its openings and its centerlines, untrimmed; write them into the folder `out`.
 
@@ -85,6 +107,7 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) 
     return vessel
 
 
+@claiming
 def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Anatomy, dict[str, Any]]:
     """Shrink the sac: find the parent artery and measure it; write it into the folder `out`.
 
@@ -110,6 +133,33 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
     write_anatomy(out, anatomy)
     writers.write_json(out / "morphology.json", measures)
     return anatomy, measures
+
+
+@claiming
+def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Refinement, Refinement]:
+    """Compute the flow without a device on three grids and with three time steps; write ``convergence.json``.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : what is given; the cell size, given or proposed, is the finest.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    FlowError
+        A flow could not be computed.
+    """
+    ledger = Ledger(out / CACHE, progress)
+    source = hash_of(path)
+    anatomy = find_anatomy(path, source, settings, ledger)
+    ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
+    found = refine(anatomy, settings, ledger)
+    writers.write_json(out / "convergence.json", {one.name: asdict(one) for one in found})
+    return found
 
 
 def _provenance(path: Path, source: str, settings: Settings, ledger: Ledger) -> dict[str, Any]:

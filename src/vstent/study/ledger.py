@@ -92,7 +92,8 @@ def hash_of(path: Path) -> str:
 
 def anatomy_key(source: str, settings: Settings) -> str:
     """Key of the geometry of an input: devices and flow do not change it."""
-    return key_of(source, replace(settings, devices=(), diameter_mm=None, length_mm=None, center_mm=None, flow=None))
+    geometry = replace(settings, devices=(), diameter_mm=None, length_mm=None, center_mm=None, flow=None, placings={})
+    return key_of(source, replace(geometry, uncertainty=None))
 
 
 def key_of(*parts: Any) -> str:

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from vstent.flow import FlowField
 from vstent.io import writers
+from vstent.io.tables import write_rows
+from vstent.rank import Ranking
 from vstent.stent import Deployment
 from vstent.struts import struts
 from vstent.vessel import Anatomy, Centerline, Vessel
@@ -66,3 +68,11 @@ def write_field(folder: Path, field: FlowField) -> None:
             "relative_residence_time_per_Pa": field.relative_residence_time_per_Pa,
         }
     writers.write_surface(folder / "wall.vtp", field.wall, of_vertex)
+
+
+def write_ranking(out: Path, ranking: Ranking) -> None:
+    """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``."""
+    rows = ranking.rows()
+    write_rows(out / "ranking.csv", rows)
+    criteria = [item.model_dump(exclude_none=True) for item in ranking.criteria.items]
+    writers.write_json(out / "ranking.json", {"criteria": criteria, "candidates": rows, "research_use_only": True})

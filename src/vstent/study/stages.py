@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,7 +10,9 @@ import numpy as np
 
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_size
-from vstent.flow import FlowField, compare, flow_case, indices, ostium, simulate_case
+from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, ostium, simulate_case
+from vstent.flow.convergence import Refinement, convergence
+from vstent.flow.cost import estimate, refuse_too_large
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
@@ -19,11 +22,13 @@ from vstent.repair import repair
 from vstent.restore import restore
 from vstent.segment import segment
 from vstent.stent import Deployment, Landing
+from vstent.study.checkpoint import FlowCheckpoint
 from vstent.study.ledger import Ledger, anatomy_key, key_of
 from vstent.study.outputs import write_field
-from vstent.study.types import Point, Settings
+from vstent.study.types import Placing, Point, Settings
 from vstent.trace import trace
 from vstent.trim import trim
+from vstent.uncertainty import Uncertainty, vary
 from vstent.vessel import Anatomy, Vessel
 
 BARE: Final = "bare"
@@ -74,24 +79,26 @@ def deploy_all(
     deployments = {}
     for name, design in designs.items():
         with ledger.stage(f"deploy {name}") as tell:
-            deployments[name] = _deploy(design, anatomy, settings)
+            deployments[name] = deploy_one(design, anatomy, settings.placing(name))
             tell(deployments[name].advice)
     return deployments
 
 
-def _deploy(design: Design, anatomy: Anatomy, settings: Settings) -> Deployment:
-    landing = None if settings.center_mm is None else Landing(settings.center_mm)
-    return deploy(design, anatomy, size=_size(design, anatomy, settings), landing=landing)
+def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
+    """Deploy a device in the size and at the place that are given, or proposed where they are not."""
+    landing = None if placing.center_mm is None else Landing(placing.center_mm)
+    return deploy(design, anatomy, size=size_of(design, anatomy, placing), landing=landing)
 
 
-def _size(design: Design, anatomy: Anatomy, settings: Settings) -> Size:
-    if settings.diameter_mm is None and settings.length_mm is None:
-        return propose_size(design, anatomy)
+def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
+    """Return the size given; what of it is not given is as proposed."""
     proposed = propose_size(design, anatomy)
+    if placing.diameter_mm is None and placing.length_mm is None:
+        return proposed
     return find_size(
         design,
-        diameter_mm=settings.diameter_mm or proposed.diameter_mm,
-        length_mm=settings.length_mm or proposed.length_mm,
+        diameter_mm=placing.diameter_mm or proposed.diameter_mm,
+        length_mm=placing.length_mm or proposed.length_mm,
     )
 
 
@@ -107,20 +114,72 @@ def compute_flows(
     if settings.flow is None:
         return {}
     fields: dict[str, FlowField] = {}
+    _plan(anatomy, settings.flow, ledger)
     for name in (BARE, *deployments):
         stent = deployments[name].stent if name in deployments else None
-        placing = (name, settings.diameter_mm, settings.length_mm, settings.center_mm) if stent else BARE
-        stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, placing)
+        placing = settings.placing(name) if stent else None
+        stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, placing)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
             with ledger.stage(stage) as tell:
                 case = flow_case(anatomy, stent, settings.flow)
-                field = simulate_case(case, start=fields.get(BARE), progress=ledger.teller(stage))
+                begun = FlowCheckpoint(ledger.folder, stage, key)
+                field = simulate_case(case, start=fields.get(BARE), progress=ledger.teller(stage), checkpoint=begun)
                 tell(field.advice)
             ledger.keep(stage, key, field)
         fields[name] = field
         write_field(out / "flow" / name, field)
     return fields
+
+
+def refine(anatomy: Anatomy, settings: Settings, ledger: Ledger) -> tuple[Refinement, Refinement]:
+    """Compute the flow without a device on three grids and with three time steps."""
+    flow = settings.flow or FlowSettings()
+    _plan(anatomy, flow, ledger)
+    with ledger.stage("convergence") as tell:
+        done: list[str] = []
+
+        def told(sentence: str) -> None:
+            done.append(sentence)
+            ledger.progress("convergence", len(done) / 6, sentence)
+
+        found = convergence(flow_case(anatomy, None, flow), told=told)
+        tell(" ".join(done))
+    return found
+
+
+def _plan(anatomy: Anatomy, settings: FlowSettings, ledger: Ledger) -> None:
+    """Say what a flow will cost; refuse one that does not fit in the memory."""
+    with ledger.stage("plan flow") as tell:
+        case = flow_case(anatomy, None, settings)
+        refuse_too_large(case)
+        tell(str(estimate(case)))
+
+
+def vary_all(
+    anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
+) -> dict[str, dict[str, Any]]:
+    """Vary what is not sure about every deployment; return the metrics of each, none where it was not asked for."""
+    if settings.uncertainty is None:
+        return {}
+    flow = settings.flow if settings.uncertainty.flow_samples else None
+    found = {}
+    for name, deployment in deployments.items():
+        stage = f"vary {name}"
+        key = key_of(anatomy_key(source, settings), settings.uncertainty, flow, name, settings.placing(name))
+        varied = ledger.recall(stage, key, Uncertainty)
+        if varied is None:
+            with ledger.stage(stage) as tell:
+                told = partial(_tell_count, ledger, stage)
+                varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told)
+                tell(f"{len(varied.points)} deployments, {varied.n_failed} of them did not fit.")
+            ledger.keep(stage, key, varied)
+        found[name] = varied.metrics()
+    return found
+
+
+def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
+    ledger.progress(stage, 0.99 * done / total, f"{done} of {total}")
 
 
 def measure_all(

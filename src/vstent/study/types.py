@@ -5,9 +5,22 @@ from typing import Any, Literal, Protocol
 
 from vstent.flow import FlowField, FlowSettings
 from vstent.stent import Deployment
+from vstent.uncertainty import Ranges
 from vstent.vessel import Anatomy
 
 Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Size and place of one device; None means that it is proposed."""
+
+    diameter_mm: float | None = None
+    """Label diameter."""
+    length_mm: float | None = None
+    """Label length."""
+    center_mm: float | None = None
+    """Abscissa on the parent axis where the middle of the device is to lie."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +51,15 @@ class Settings:
     """Abscissa on the parent axis where the middle of the device is to lie."""
     flow: FlowSettings | None = field(default_factory=FlowSettings)
     """How to compute the flow; None: not at all."""
+    placings: dict[str, Placing] = field(default_factory=dict)
+    """Sizes and places of single devices, by name, instead of those above that hold for all."""
+
+    uncertainty: Ranges | None = None
+    """What of the deployment is varied, and how far; None: nothing."""
+
+    def placing(self, device: str) -> Placing:
+        """Return what is given of the size and the place of a device."""
+        return self.placings.get(device) or Placing(self.diameter_mm, self.length_mm, self.center_mm)
 
 
 class Progress(Protocol):

@@ -9,14 +9,22 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vstent.errors import FlowError
 from vstent.flow.types import FlowCase, FlowField
 
 State = TypeVar("State")
+Saved: TypeAlias = dict[str, NDArray[Any]]
+"""A run under way, as named arrays."""
+
+SAVE_EVERY_S = 20.0
+"""Time between saved states of a run: no more is lost when it is stopped."""
+SAVE_SHARE = 0.05
+"""Most of the time that saving may take: what is slow to save is saved more seldom."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +53,16 @@ class Outcome:
     """Time in the steps alone."""
 
 
+@dataclass(frozen=True, eq=False)
+class Bookmark:
+    """Where a run left off, and where it leaves word how far it has come."""
+
+    saved: Saved | None
+    """What the run saved last; None: it begins."""
+    save: Callable[[Saved], None]
+    """Takes the state of the run from time to time."""
+
+
 class AbstractEngine(ABC, Generic[State]):
     """A way to compute a steady flow."""
 
@@ -54,11 +72,26 @@ class AbstractEngine(ABC, Generic[State]):
 
     @abstractmethod
     def step(self, state: State) -> State:
-        """Advance to the next check."""
+        """Advance by a few seconds, no further than to the next check."""
 
     @abstractmethod
-    def terminate(self, state: State) -> float:
-        """Return the largest fraction that any monitored quantity has left to go; nan when diverged."""
+    def terminate(self, state: State) -> float | None:
+        """Return the largest fraction that any monitored quantity has left to go; nan when diverged.
+
+        None between checks.
+        """
+
+    @abstractmethod
+    def save(self, state: State) -> Saved:
+        """Return the run as arrays."""
+
+    @abstractmethod
+    def resume(self, case: FlowCase, saved: Saved) -> State:
+        """Return the run as it was saved: what follows is the same to the last bit."""
+
+    @abstractmethod
+    def trouble(self, state: State) -> str:
+        """Say in one sentence why the run diverged, the last good state, and what to do."""
 
     @abstractmethod
     def max_checks(self, state: State) -> int:
@@ -75,6 +108,7 @@ def run(
     *,
     start: FlowField | None = None,
     progress: Callable[[Progress], None] | None = None,
+    bookmark: Bookmark | None = None,
 ) -> FlowField:
     """Drive an engine until its residual is below the case's tolerance or its limit is reached.
 
@@ -84,25 +118,46 @@ def run(
         When the computation diverges.
     """
     began = perf_counter()
-    state = engine.init(case, start)
-    loop_began = perf_counter()
-    limit = engine.max_checks(state)
-    residual: list[float] = []
-    while len(residual) < limit:
+    saved = None if bookmark is None else bookmark.saved
+    state = engine.init(case, start) if saved is None else engine.resume(case, saved)
+    residual = [] if saved is None else saved["residual"].tolist()
+    before, loop_before = (0.0, 0.0) if saved is None else saved["seconds"].tolist()
+    limit, tolerance = engine.max_checks(state), case.settings.tolerance
+    saver, loop_began = _Saver(bookmark), perf_counter()
+
+    def seconds() -> tuple[float, float]:
+        return before + perf_counter() - began, loop_before + perf_counter() - loop_began
+
+    while len(residual) < limit and not (residual and residual[-1] < tolerance):
         state = _step(engine, state)
-        residual.append(engine.terminate(state))
-        if np.isnan(residual[-1]):
-            raise FlowError(
-                f"the flow diverged at check {len(residual)} of {limit}: the time step is too long for this grid; "
-                "halve the lattice speed or the cell size"
-            )
-        if progress is not None:
-            progress(_progress(residual, limit, case.settings.tolerance, perf_counter() - loop_began))
-        if residual[-1] < case.settings.tolerance:
-            break
-    now = perf_counter()
-    is_converged = residual[-1] < case.settings.tolerance
-    return engine.result(state, Outcome(is_converged, tuple(residual), now - began, now - loop_began))
+        reached = engine.terminate(state)
+        if reached is not None:
+            if np.isnan(reached):
+                raise FlowError(engine.trouble(state))
+            residual.append(reached)
+            if progress is not None:
+                progress(_progress(residual, limit, tolerance, seconds()[1]))
+        if saver.is_due():
+            saver.save(engine.save(state) | {"residual": np.array(residual), "seconds": np.array(seconds())})
+    return engine.result(state, Outcome(residual[-1] < tolerance, tuple(residual), *seconds()))
+
+
+class _Saver:
+    """Saves a run every so often."""
+
+    def __init__(self, bookmark: Bookmark | None) -> None:
+        self._bookmark = bookmark
+        self._due_s = perf_counter() + SAVE_EVERY_S
+
+    def is_due(self) -> bool:
+        return self._bookmark is not None and perf_counter() >= self._due_s
+
+    def save(self, saved: Saved) -> None:
+        began = perf_counter()
+        if self._bookmark is not None:
+            self._bookmark.save(saved)
+        now = perf_counter()
+        self._due_s = now + max(SAVE_EVERY_S, (now - began) / SAVE_SHARE)
 
 
 def _step(engine: AbstractEngine[State], state: State) -> State:

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vstent.flow.engines import AbstractEngine, Outcome
+from vstent.flow.engines import AbstractEngine, Outcome, Saved
+from vstent.flow.engines.lattice_checkpoint import pack, unpack
 from vstent.flow.engines.lattice_setup import Scales
-from vstent.flow.engines.lattice_state import State, build, check, field_of, peak_speed_m_s, read
+from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, peak_speed_m_s, read, step
+from vstent.flow.engines.lattice_trouble import trouble
 from vstent.flow.types import FlowCase, FlowField
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
@@ -34,15 +36,29 @@ class LatticeBoltzmann(AbstractEngine[State]):
         scales = Scales(cell_m, case.settings.lattice_speed * cell_m / peak_speed_m_s(case, start), case.blood)
         return build(case, scales, _steps_per_check(case, scales), start=start, kept=CHECKS_AVERAGED)
 
+    def save(self, state: State) -> Saved:
+        """Return the run as arrays."""
+        return pack(state)
+
+    def resume(self, case: FlowCase, saved: Saved) -> State:
+        """Build the run anew and put it where it was."""
+        return unpack(case, self.cell_size_mm, saved)
+
     def step(self, state: State) -> State:
-        """Advance to the next check."""
-        check(state)
+        """Advance towards the next check."""
+        step(state)
         return state
 
-    def terminate(self, state: State) -> float:
+    def terminate(self, state: State) -> float | None:
         """Fraction that the monitored quantities have left to go, the worst of the last checks."""
+        if not is_at_check(state):
+            return None
         history = np.array(state.history)
         return max(fraction_left(history[: len(history) - k]) for k in range(min(CHECKS_AGREEING, len(history))))
+
+    def trouble(self, state: State) -> str:
+        """Say why the run diverged."""
+        return trouble(state)
 
     def max_checks(self, state: State) -> int:
         """Checks within the limit of time steps."""

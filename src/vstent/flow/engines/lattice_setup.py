@@ -232,8 +232,8 @@ def build_links(case: FlowCase, domain: Domain, addressing: Addressing, scales: 
     patch = domain.link_patch[order]
     start = np.searchsorted(patch[: int((patch > 0).sum())], np.arange(1, len(domain.sections) + 2)).astype(np.int32)
     fraction = domain.link_fraction[order]
-    weight = _linear_weights(fraction, addressing.link_has_one[order])
-    correction = _quadratic_weights(fraction)
+    weight = linear_weights(fraction, addressing.link_has_one[order])
+    correction = quadratic_weights(fraction)
     correction[:, :3] -= weight
     correction[~addressing.link_has_two[order]] = 0.0
     shape = np.zeros(start[-1])
@@ -261,7 +261,7 @@ def _link_order(domain: Domain) -> Ints:
     return np.argsort(np.where(domain.link_patch == 0, len(domain.sections) + 1, domain.link_patch), kind="stable")
 
 
-def _linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
+def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
     """Linear interpolated reflection (Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids 13, 3452, eq. 5).
 
     Half-way where it would need the cell behind and that is no blood.
@@ -274,7 +274,7 @@ def _linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
     return weight
 
 
-def _quadratic_weights(fraction: Floats) -> Floats:
+def quadratic_weights(fraction: Floats) -> Floats:
     """Quadratic interpolated reflection (Lallemand and Luo 2003, J. Comput. Phys. 184, 406, eq. 10): (l, 5)."""
     x, zero = fraction, np.zeros_like(fraction)
     near = np.stack([x * (1 + 2 * x), 1 - 4 * x**2, zero, -x * (1 - 2 * x), zero], axis=1)

@@ -36,6 +36,8 @@ DEFER_PAIRS = 8
 """Step pairs between updates of what is deferred."""
 DEFER_PART = 0.15
 """Part of the way that each update goes."""
+SLICE_UPDATES = 2e8
+"""Cell updates between looks at the clock: a few seconds of one core."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,24 +158,35 @@ def _begin_from(state: State, start: FlowField) -> None:
     links.openings[0, 2] = lattice.moments(state.populations, state.addressing.stride, at_inlet)[:, 0].mean()
 
 
-def check(state: State) -> None:
-    """Make the time steps to the next check and read the monitored quantities."""
+def step(state: State) -> None:
+    """Make the time steps of a few seconds, no further than to the next check; there, read the monitored quantities."""
     began = perf_counter()
-    advance(state)
+    advance(state, min(_slice_steps(state), state.steps_per_check - state.steps % state.steps_per_check))
     state.loop_seconds += perf_counter() - began
-    state.snapshots.append(_snapshot(state))
-    state.history.append(_monitor(state, state.snapshots[-1]))
+    if is_at_check(state):
+        state.snapshots.append(_snapshot(state))
+        state.history.append(_monitor(state, state.snapshots[-1]))
 
 
-def advance(state: State) -> None:
-    """Make the time steps to the next check, in pairs."""
+def is_at_check(state: State) -> bool:
+    """Whether the last steps ended at a check."""
+    return state.steps % state.steps_per_check == 0
+
+
+def _slice_steps(state: State) -> int:
+    return 2 * max(1, round(SLICE_UPDATES / len(state.domain.cells) / 2))
+
+
+def advance(state: State, steps: int) -> None:
+    """Make an even number of time steps, in pairs."""
     f, links, refill = state.populations, state.links, state.refill
     a, screen = state.addressing, state.screen
     threads = numba.get_num_threads()
     relaxation = np.float32(state.scales.relaxation_steps), state.limit, np.float32(ODD_RATE)
     opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
-    middle = state.steps + 1 + np.arange(0, state.steps_per_check, 2)
+    middle = state.steps + 1 + np.arange(0, steps, 2)
     factor = state.case.settings.inflow_factor(np.float64(state.scales.step_s) * middle)
+    first_pair = state.steps % state.steps_per_check // 2
     for pair in range(len(factor)):
         links.openings[:, 1] = state.wanted * factor[pair]
         lattice.drive(
@@ -200,11 +213,11 @@ def advance(state: State) -> None:
             )
             lattice.reflect(f, links.address, links.weight, links.source, refill.place, refill.refill, is_even)
             lattice.swap(f, *a.swap_address)
-        if pair % DEFER_PAIRS == 0:
+        if (first_pair + pair) % DEFER_PAIRS == 0:
             part = np.float32(DEFER_PART)
             lattice.defer(f, links.address[wall], links.correction[wall], links.source[wall], part)
             lattice.balance(f, links.address[wall], refill.link_group, refill.count, refill.member, refill.refill, part)
-    state.steps += state.steps_per_check
+    state.steps += steps
 
 
 def _snapshot(state: State) -> Snapshot:

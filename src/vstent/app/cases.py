@@ -1,0 +1,262 @@
+"""Cases: what was chosen for a patient, which steps that leaves done or stale, and the file that remembers it."""
+
+import asyncio
+import hashlib
+import json
+import re
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from vstent.app.choices import Choices
+from vstent.errors import InputError, ReadError
+from vstent.io.files import atomic
+
+STATE: Final = "app.json"
+"""File of a case folder that remembers the page's state."""
+STEPS: Final = ("image", "vessel", "sac", "device", "deploy", "flow", "report")
+"""From left to right."""
+UNDOS: Final = 100
+"""Changes that can be taken back."""
+
+Status = Literal["todo", "running", "done", "stale", "failed"]
+
+
+class Conflict(InputError):
+    """Somebody else has changed the case since it was looked at."""
+
+
+class State(BaseModel):
+    """What a case folder remembers."""
+
+    model_config = ConfigDict(frozen=True)
+
+    name: str
+    revision: int = 0
+    input: str = ""
+    """The scan or surface: inside the case folder, or anywhere on this machine where it was given at the shell."""
+    source: str = ""
+    """SHA-256 of the input."""
+    choices: Choices = Choices()
+    undo: tuple[Choices, ...] = ()
+    redo: tuple[Choices, ...] = ()
+    done: dict[str, str] = Field(default_factory=dict)
+    """Step -> what it depended on when it was done."""
+    failed: dict[str, str] = Field(default_factory=dict)
+    """Step -> why."""
+    anatomy: str = ""
+    """Key of the anatomy in the ledger."""
+    job: str = ""
+    """What is at work or, after the server was killed, was."""
+
+
+def dependencies(state: State) -> dict[str, str]:
+    """Return for every step a digest of all that it depends on."""
+    chosen = state.choices.model_dump(mode="json")
+    sizes = [[device.name, device.diameter_mm, device.length_mm] for device in state.choices.devices]
+    centers = [device.center_mm for device in state.choices.devices]
+    parts: dict[str, Any] = {
+        "image": [state.source, *(chosen[name] for name in ("units", "spacing_mm", "shape", "threshold", "at_mm"))],
+        "vessel": chosen["inlet_mm"],
+        "sac": chosen["outlet_mm"],
+        "device": sizes,
+        "deploy": centers,
+        "flow": chosen["flow"],
+        "report": "",
+    }
+    digest, found = "", {}
+    for step in STEPS:
+        digest = hashlib.sha256(json.dumps([digest, parts[step]]).encode()).hexdigest()[:16]
+        found[step] = digest
+    return found
+
+
+def statuses(state: State, at_work: str) -> dict[str, Status]:
+    """Return how every step stands; `at_work` is the step that a job is at, or empty."""
+    keys = dependencies(state)
+
+    def status(step: str) -> Status:
+        if step == at_work:
+            return "running"
+        if step in state.failed:
+            return "failed"
+        if step not in state.done:
+            return "todo"
+        return "done" if state.done[step] == keys[step] else "stale"
+
+    return {step: status(step) for step in STEPS}
+
+
+class Case:
+    """A case folder that several tabs look at and change, one change at a time."""
+
+    def __init__(self, case_id: str, folder: Path, state: State) -> None:
+        self.id, self.folder = case_id, folder
+        self._state = state
+        self._lock = threading.RLock()
+        self._listeners: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
+
+    @property
+    def state(self) -> State:
+        """What is chosen and done."""
+        return self._state
+
+    @property
+    def input(self) -> Path:
+        """The scan or surface."""
+        if not self._state.input:
+            raise ReadError(f"{self._state.name} has no scan yet: drop one on the page.")
+        return self.folder / self._state.input
+
+    def change(self, revision: int, choices: Choices) -> State:
+        """Take other choices, unless the case was changed since `revision`.
+
+        Raises
+        ------
+        Conflict
+            It was.
+        """
+        with self._lock:
+            self._check(revision)
+            before = self._state
+            if choices == before.choices:
+                return before
+            undo = (*before.undo, before.choices)[-UNDOS:]
+            return self.update(choices=choices, undo=undo, redo=(), revision=before.revision + 1)
+
+    def step_back(self, revision: int, *, forward: bool = False) -> State:
+        """Undo the last change, or do it again.
+
+        Raises
+        ------
+        Conflict
+            The case was changed since `revision`, or there is nothing to undo.
+        """
+        with self._lock:
+            self._check(revision)
+            now = self._state
+            taken, given = (now.redo, now.undo) if forward else (now.undo, now.redo)
+            if not taken:
+                raise Conflict("There is nothing to redo." if forward else "There is nothing to undo.")
+            rest, other = taken[:-1], (*given, now.choices)
+            undo, redo = (other, rest) if forward else (rest, other)
+            return self.update(choices=taken[-1], undo=undo, redo=redo, revision=now.revision + 1)
+
+    def update(self, **changes: Any) -> State:
+        """Change the state, write it down, and tell all who look."""
+        with self._lock:
+            self._state = self._state.model_copy(update=changes)
+            with atomic(self.folder / STATE) as partial:
+                partial.write_text(self._state.model_dump_json(indent=1), encoding="utf-8")
+        self.tell()
+        return self._state
+
+    def _check(self, revision: int) -> None:
+        if revision != self._state.revision:
+            raise Conflict(
+                f"This case was changed elsewhere (revision {self._state.revision}, not {revision}): "
+                "what you see has been brought up to date; make your change again."
+            )
+
+    def tell(self) -> None:
+        """Wake all who look."""
+        for loop, event in tuple(self._listeners):
+            with suppress(RuntimeError):  # the loop of a client that is gone is closed
+                loop.call_soon_threadsafe(event.set)
+
+    def listen(self) -> asyncio.Event:
+        """Return what is set whenever something has changed; to be called in the client's loop."""
+        event = asyncio.Event()
+        self._listeners.add((asyncio.get_running_loop(), event))
+        return event
+
+    def leave(self, event: asyncio.Event) -> None:
+        """Tell a client no more."""
+        self._listeners = {pair for pair in self._listeners if pair[1] is not event}
+
+
+def load(case_id: str, folder: Path) -> Case:
+    """Return the case of a folder.
+
+    Raises
+    ------
+    ReadError
+        The folder remembers no state, or not one that can be read.
+    """
+    try:
+        state = State.model_validate_json((folder / STATE).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ReadError(f"{folder} is no case of the page: it has no {STATE}.") from None
+    except (OSError, ValidationError, UnicodeDecodeError):
+        raise ReadError(f"{folder / STATE} is damaged: delete it and open the scan again.") from None
+    return Case(case_id, folder, state)
+
+
+def identifier(name: str) -> str:
+    """Return a name for a folder and a URL: letters, digits, points, dashes and underlines."""
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-._")[:60]
+    return plain or "case"
+
+
+class Store:
+    """All cases of a workspace, and the one given at the shell."""
+
+    def __init__(self, workspace: Path) -> None:
+        self.workspace = workspace
+        self._cases: dict[str, Case] = {}
+        self._lock = threading.Lock()
+
+    def ids(self) -> list[str]:
+        """Return the cases there are, the latest first."""
+        found = [path.parent for path in self.workspace.glob(f"*/{STATE}")]
+        found.sort(key=lambda folder: -(folder / STATE).stat().st_mtime)
+        return list(dict.fromkeys([*self._cases, *(folder.name for folder in found)]))
+
+    def get(self, case_id: str) -> Case:
+        """Return a case.
+
+        Raises
+        ------
+        ReadError
+            There is none of that name.
+        """
+        with self._lock:
+            if case_id not in self._cases:
+                if identifier(case_id) != case_id:
+                    raise ReadError("There is no such case.")
+                self._cases[case_id] = load(case_id, self.workspace / case_id)
+            return self._cases[case_id]
+
+    def create(self, name: str, folder: Path | None = None, **known: Any) -> Case:
+        """Make a case, in a folder of its own in the workspace unless one is given."""
+        with self._lock:
+            case_id = free = identifier(name)
+            count = 1
+            while folder is None and (free in self._cases or (self.workspace / free).exists()):
+                count += 1
+                free = f"{case_id}-{count}"
+            place = folder or self.workspace / free
+            place.mkdir(parents=True, exist_ok=True)
+            case = Case(free, place, State(name=name[:120], **known))
+            self._cases[free] = case
+        case.update()
+        return case
+
+    def of_input(self, path: Path) -> Case | None:
+        """Return the case that was begun with a file of this machine, if there is one."""
+        for case_id in self.ids():
+            with suppress(ReadError):
+                case = self.get(case_id)
+                if case.state.input == str(path):
+                    return case
+        return None
+
+    def adopt(self, folder: Path) -> Case:
+        """Take in a case folder that lies anywhere."""
+        case = load(identifier(folder.resolve().name), folder.resolve())
+        with self._lock:
+            self._cases[case.id] = case
+        return case

@@ -1,0 +1,99 @@
+"""What a user has chosen, as the page and the REST interface say it, and as a study understands it."""
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+if TYPE_CHECKING:  # a study's modules are loaded when it is to be told something: the page must be there at once
+    from vstent.flow import FlowSettings
+    from vstent.study import Placing, Settings
+
+Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
+Length = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+
+
+class Strict(BaseModel):
+    """A model that refuses names it does not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DeviceChoice(Strict):
+    """A device, its size and where its middle lies; what is not given is proposed."""
+
+    name: str = Field(max_length=60)
+    diameter_mm: Length | None = None
+    length_mm: Length | None = None
+    center_mm: Coordinate | None = None
+
+
+class FlowChoice(Strict):
+    """How the blood flow is to be computed."""
+
+    is_wanted: bool = True
+    cell_size_mm: Annotated[float, Field(ge=0.04, le=1.0)] | None = None
+    inflow_mL_s: Annotated[float, Field(gt=0, le=50)] | None = None
+    is_pulsatile: bool = False
+    outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
+
+    def settings(self) -> "FlowSettings | None":
+        """Return what a study is told of the flow."""
+        from vstent.flow import FlowSettings
+        from vstent.flow.waveform import OLDER_ADULT_ICA
+
+        if not self.is_wanted:
+            return None
+        return FlowSettings(
+            inflow_mL_s=self.inflow_mL_s,
+            waveform=OLDER_ADULT_ICA if self.is_pulsatile else None,
+            outlets=self.outlets,
+            cell_size_mm=self.cell_size_mm,
+        )
+
+
+class Choices(Strict):
+    """Everything a user may choose; what is left out is proposed."""
+
+    units: Literal["m", "cm", "mm"] | None = None
+    spacing_mm: tuple[Length, Length, Length] | None = None
+    shape: tuple[int, int, int] | None = None
+    threshold: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    at_mm: Point | None = None
+    inlet_mm: Point | None = None
+    outlet_mm: Point | None = None
+    devices: tuple[DeviceChoice, ...] = Field(
+        default=(DeviceChoice(name="silk"), DeviceChoice(name="enterprise")), max_length=3
+    )
+    flow: FlowChoice = FlowChoice()
+
+    @field_validator("devices")
+    @classmethod
+    def _each_once(cls, devices: tuple[DeviceChoice, ...]) -> tuple[DeviceChoice, ...]:
+        if len({device.name for device in devices}) < len(devices):
+            raise ValueError("a device can be chosen once")
+        return devices
+
+    def settings(self) -> "Settings":
+        """Return what a study is told."""
+        from vstent.study import Placing, Settings
+
+        return Settings(
+            devices=tuple(device.name for device in self.devices),
+            units=self.units,
+            spacing_mm=self.spacing_mm,
+            shape=self.shape,
+            threshold=self.threshold,
+            at_mm=self.at_mm,
+            inlet_mm=self.inlet_mm,
+            outlet_mm=self.outlet_mm,
+            flow=self.flow.settings(),
+            placings={device.name: placing for device in self.devices if (placing := placing_of(device)) != Placing()},
+        )
+
+
+def placing_of(device: DeviceChoice) -> "Placing":
+    """Return what a study is told of a device's size and place."""
+    from vstent.study import Placing
+
+    return Placing(device.diameter_mm, device.length_mm, device.center_mm)

@@ -1,0 +1,63 @@
+"""Cuts: a flow on the plane that the sac is seen in, and a pulsating flow at one moment."""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from vstent.flow import FlowField
+from vstent.flow.sampling import values_at
+from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.report.scene import MeshLayer, views_of
+from vstent.surface import Surface
+from vstent.vessel import Anatomy
+
+STEP_CELLS: Final = 0.6
+"""Distance between the points of a cut, in cells of the flow."""
+
+
+def at_phase(field: FlowField, number: int) -> FlowField:
+    """Return a pulsating flow at one moment of its last cycle, as a flow of its own."""
+    phase = field.phases[number]
+    return replace(
+        field,
+        velocity_m_s=phase.velocity_m_s,
+        pressure_Pa=phase.pressure_Pa,
+        wall_shear_stress_Pa=phase.wall_shear_stress_Pa,
+        phases=(),
+    )
+
+
+def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
+    """Return the speed on the plane through the sac's middle, or the axis's, that the profile view looks at."""
+    right, up = views_of(anatomy, {})[0].axes[:2]
+    sacs = anatomy.aneurysms
+    middle = sacs[0].sac.vertices_mm.mean(axis=0) if sacs else anatomy.axis.points_mm.mean(axis=0)
+    step_mm = STEP_CELLS * field.cell_size_mm
+    seen = (field.centers_mm - middle) @ np.stack([right, up], axis=1)
+    ticks = [np.arange(low, high + step_mm, step_mm) for low, high in zip(seen.min(0), seen.max(0), strict=True)]
+    columns, rows = np.meshgrid(*ticks, indexing="ij")
+    points_mm = middle + columns[..., None] * right + rows[..., None] * up
+    speed = np.linalg.norm(values_at(field, points_mm.reshape(-1, 3))[0], axis=1)
+    surface, used = _where_blood_is(points_mm, _is_blood(field, points_mm.reshape(-1, 3)))
+    return MeshLayer("slice", pane, (0.5, 0.5, 0.5), "speed", speed[used], surface)
+
+
+def _is_blood(field: FlowField, points_mm: Floats) -> Bools:
+    place = np.rint((points_mm - field.origin_mm) / field.cell_size_mm).astype(int)
+    is_near = ((place >= 0) & (place < field.index.shape)).all(axis=1)
+    found = np.zeros(len(points_mm), dtype=bool)
+    found[is_near] = field.index[tuple(place[is_near].T)] >= 0
+    return found
+
+
+def _where_blood_is(points_mm: Floats, is_blood: Bools) -> tuple[Surface, Ints]:
+    """Triangles of a grid of points (n, m, 3) between those in blood (n m,), and which points they use."""
+    n, m = points_mm.shape[:2]
+    number = np.arange(n * m).reshape(n, m)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    quads = np.stack([a, b, c, d], axis=-1).reshape(-1, 4)
+    quads = quads[is_blood[quads].all(axis=1)]
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    used, compact = np.unique(faces, return_inverse=True)
+    return Surface(points_mm.reshape(-1, 3)[used], compact.reshape(-1, 3)), used

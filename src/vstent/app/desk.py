@@ -1,0 +1,286 @@
+"""Desk: the cases on the table, with what is at work on them; everything that the routes of the server ask for."""
+
+import json
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any, Literal
+
+from vstent.app import intake
+from vstent.app.cases import STATE, STEPS, Case, Conflict, Store, dependencies, statuses
+from vstent.app.choices import DeviceChoice
+from vstent.app.jobs import KINDS, RANKING, Jobs
+from vstent.app.reopening import RUN, reopened, stem
+from vstent.errors import InputError, ReadError
+from vstent.io.files import existing
+
+
+class Desk:
+    """Cases, jobs, and what answers at once."""
+
+    def __init__(self, store: Store, *, opened: str = "") -> None:
+        self.store, self.opened = store, opened
+        self.jobs = Jobs()
+        self.is_closing = False
+        self._lives: dict[str, Any] = {}
+        self._scans: dict[str, Any] = {}
+        self._lock = threading.Lock()
+        self._to_begin: tuple[Case, Path] | None = None
+
+    # -- cases ---------------------------------------------------------------------------------------------------------
+
+    def open(self, path: Path) -> None:
+        """Put what was given at the shell on the table: a case of the page, one of `vstent run`, or a scan or surface.
+
+        Raises
+        ------
+        ReadError
+            There is nothing at that path.
+        """
+        existing(path)
+        if (path / STATE).is_file():
+            self.opened = self.store.adopt(path).id
+        elif (path / RUN).is_file():
+            self.opened = reopened(self.store, path).id
+        else:
+            case = self.store.of_input(path) or self.store.create(stem(path))
+            self.opened = case.id
+            if not case.state.source:
+                self._to_begin = (case, path)
+
+    def listed(self) -> list[dict[str, Any]]:
+        """Return every case with what it is called and how far it is."""
+        found = []
+        for case_id in self.store.ids():
+            try:
+                case = self.store.get(case_id)
+            except ReadError:
+                continue  # somebody else's folder, or a damaged one
+            steps = statuses(case.state, "")
+            found.append({"id": case_id, "name": case.state.name, "done": [s for s in STEPS if steps[s] == "done"]})
+        return found
+
+    def view(self, case: Case) -> dict[str, Any]:
+        """Return all that a tab must know of a case."""
+        state, job = case.state, self.jobs.of(case)
+        is_at_work = job is not None and job.is_alive
+        return {
+            "id": case.id,
+            "name": state.name,
+            "folder": str(case.folder),
+            "revision": state.revision,
+            "choices": state.choices.model_dump(mode="json"),
+            "steps": statuses(state, job.step if job is not None and is_at_work else ""),
+            "failed": state.failed,
+            "can_undo": bool(state.undo),
+            "can_redo": bool(state.redo),
+            "has_input": bool(state.source),
+            "is_scan": bool(state.source) and not _is_surface(case),
+            "has_anatomy": bool(state.anatomy),
+            "anatomy": state.anatomy,
+            "has_report": (case.folder / "report.html").is_file(),
+            "has_ranking": (case.folder / RANKING).is_file(),
+            "has_flow": (case.folder / "metrics.json").is_file() and "flow" in state.done,
+            "job": job.told() if job is not None and is_at_work else None,
+        }
+
+    def demo(self) -> Case:
+        """Make a case of the synthetic scan."""
+        from vstent.demo import write_scan
+
+        case = self.store.create("demo")
+        write_scan(case.folder / intake.FOLDER / intake.SERIES)
+        self.begin(case)
+        return case
+
+    def begin(self, case: Case) -> None:
+        """Everything is in: find the vessel."""
+        self.point(case, intake.found(case.folder))
+        self.start(case, "anatomy")
+
+    def point(self, case: Case, path: str) -> None:
+        """Say where the scan or surface lies."""
+        from vstent.study.ledger import hash_of
+
+        source = hash_of(case.folder / path)
+        case.update(input=path, source=source, revision=case.state.revision + 1)
+        with self._lock:
+            self._scans.pop(case.id, None)
+
+    def start(self, case: Case, kind: str) -> None:
+        """Start a job.
+
+        Raises
+        ------
+        ReadError
+            There is no scan yet.
+        """
+        if not case.input.exists():
+            raise ReadError(f"The scan of {case.state.name} is not where it was: {case.input}. Put it back.")
+        if kind != "anatomy" and not case.state.choices.devices:
+            raise InputError("No device is chosen: choose one in the step Device.")
+        self.jobs.start(case, kind)
+
+    def resume(self, case: Case) -> None:
+        """Go on with what was at work when the server was killed."""
+        job = self.jobs.of(case)
+        if case.state.job in KINDS and job is None and case.state.source:
+            self.start(case, case.state.job)
+
+    def note_deployed(self, case: Case, device: DeviceChoice) -> None:
+        """Remember that the devices as chosen were seen deployed."""
+        keys = dependencies(case.state)
+        is_current = device in case.state.choices.devices and case.state.done.get("sac") == keys["sac"]
+        chosen = {step: keys[step] for step in ("device", "deploy")}
+        if is_current and any(case.state.done.get(step) != key for step, key in chosen.items()):
+            case.update(done=case.state.done | chosen)
+
+    # -- what answers at once ------------------------------------------------------------------------------------------
+
+    def live(self, case: Case) -> Any:
+        """Return what answers for a case."""
+        from vstent.app.live import Live
+
+        with self._lock:
+            if case.id not in self._lives:
+                self._lives[case.id] = Live(case)
+            return self._lives[case.id]
+
+    def scan(self, case: Case) -> Any:
+        """Return the scan of a case.
+
+        Raises
+        ------
+        InputError
+            It is a surface.
+        """
+        from vstent.app.scans import Scan
+        from vstent.io.images import read_image
+
+        if not case.state.source or _is_surface(case):
+            raise InputError("This case has no scan: it began with a surface.")
+        with self._lock:
+            if case.id not in self._scans:
+                settings = case.state.choices.settings()
+                image = read_image(case.input, spacing_mm=settings.spacing_mm, shape=settings.shape)
+                self._scans[case.id] = Scan(image)
+            return self._scans[case.id]
+
+    def surface(self, case: Case, threshold: float) -> bytes:
+        """Return the surface that a threshold gives."""
+        from vstent.app.live import LOCK
+
+        scan = self.scan(case)
+        with LOCK:
+            return bytes(scan.surface(threshold))
+
+    def numbers(self, case: Case) -> dict[str, Any]:
+        """Return every number found so far: anatomy, and flow before and after."""
+        from vstent.app import sheets
+
+        found: dict[str, Any] = {"anatomy": [], "flow": []}
+        if case.state.anatomy:
+            found["anatomy"] = self.live(case).anatomy_sheet()
+        path = case.folder / "metrics.json"
+        if path.is_file():
+            metrics = json.loads(path.read_text(encoding="utf-8"))
+            found["flow"] = sheets.flow(metrics, _titles(metrics, case))
+        return found
+
+    def warm(self) -> None:
+        """Load what the first click will need, while the page is being looked at."""
+        if self._to_begin is not None:
+            case, path = self._to_begin
+            self.point(case, str(path))
+            self.start(case, "anatomy")
+        from vstent.app import live  # noqa: F401
+        from vstent.device import catalogue
+
+        catalogue()
+
+    def close(self) -> None:
+        """Stop everything; cases remember what there was to do."""
+        self.is_closing = True
+        self.jobs.abandon()
+
+
+def code_of(error: Exception) -> int:
+    """Return the HTTP status that says what kind of error it is."""
+    if isinstance(error, Conflict):
+        return 409
+    return 422 if isinstance(error, InputError) else 500
+
+
+def begin_upload(case: Case, name: str) -> Path:
+    """Return a file to write an upload to."""
+    intake.checked_name(name)
+    folder = case.folder / intake.FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = tempfile.NamedTemporaryFile(prefix=".part-", dir=folder, delete=False)
+    handle.close()
+    return Path(handle.name)
+
+
+def end_upload(case: Case, partial: Path, name: str) -> None:
+    """Take an upload that is whole."""
+    intake.take(partial, name, case.folder)
+
+
+def devices() -> list[dict[str, Any]]:
+    """Return the catalogue, as the page lists it."""
+    from vstent.device import catalogue
+
+    return [
+        {
+            "key": key,
+            "name": design.name,
+            "maker": design.maker,
+            "kind": design.kind.replace("_", "-"),
+            "sizes": [[size.diameter_mm, size.length_mm] for size in design.sizes],
+            "n_estimated": sum(fact.confidence == "estimated" for fact in design.facts),
+            "n_facts": len(design.facts),
+        }
+        for key, design in catalogue().items()
+    ]
+
+
+def landing(abscissa_mm: float | None, anchor: Literal["proximal", "center", "distal"]) -> Any:
+    """Return where a device is to lie, or None where nothing is said."""
+    from vstent.stent import Landing
+
+    return None if abscissa_mm is None else Landing(abscissa_mm, anchor)
+
+
+def ranking(case: Case) -> dict[str, Any]:
+    """Return the sizes ranked, and whether they are of the case as it is."""
+    path = case.folder / RANKING
+    if not path.is_file():
+        return {"rows": [], "is_current": False}
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    names = sorted(device.name for device in case.state.choices.devices)
+    is_current = found.get("anatomy") == case.state.anatomy and found.get("devices") == names
+    return found | {"is_current": is_current}
+
+
+def pulse() -> dict[str, Any]:
+    """Return the published pulse: times and flow over mean flow."""
+    import numpy as np
+
+    from vstent.flow.waveform import OLDER_ADULT_ICA
+
+    time_s = np.linspace(0.0, OLDER_ADULT_ICA.period_s, 101)
+    return {"time_s": time_s.tolist(), "factor": OLDER_ADULT_ICA.factor(time_s).tolist()}
+
+
+def _titles(metrics: dict[str, Any], case: Case) -> dict[str, str]:
+    """Names of the devices with their sizes, in the order in which they were chosen."""
+    order = [device.name for device in case.state.choices.devices]
+    found = {name: stent["deployment"] for name, stent in metrics.get("stents", {}).items()}
+    names = sorted(found, key=lambda name: order.index(name) if name in order else len(order))
+    return {name: f"{found[name]['device']} {found[name]['size']}" for name in names}
+
+
+def _is_surface(case: Case) -> bool:
+    from vstent.io.files import is_surface_file
+
+    return is_surface_file(case.input)

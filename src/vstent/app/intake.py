@@ -1,0 +1,158 @@
+"""Files that come in through the door: their names, their sizes, what is packed in them, and no patient's record.
+
+A file lies in the case's folder `input` as soon as it is whole. DICOM slices are written anew without the patient's
+record and under numbers for names, for names too can be a patient's; archives are unpacked under a limit, whatever
+paths are in them.
+"""
+
+import gzip
+import shutil
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from vstent.errors import ReadError
+from vstent.io.dicom import is_dicom
+from vstent.io.dicom_strip import strip_dicom
+from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
+
+FOLDER: Final = "input"
+"""Where a case keeps what came in."""
+SERIES: Final = "series"
+"""Folder in it for DICOM slices."""
+UNPACKED_LIMIT: Final = 4 << 30
+"""Bytes that archives may unpack to, all together."""
+MOST_FILES: Final = 5000
+"""Files of a case, and entries of an archive."""
+LONGEST_NAME: Final = 120
+_BLOCK: Final = 1 << 20
+_TOO_MUCH: Final = f"The archive holds more than {UNPACKED_LIMIT >> 30} GB or {MOST_FILES} files: too much."
+
+
+def checked_name(name: str) -> str:
+    """Return the name of an upload if it is the plain name of a file that can be read here.
+
+    Raises
+    ------
+    ReadError
+        It is a path, hidden, too long, or of a kind that cannot be read.
+    """
+    is_plain = name and not any(mark in name for mark in ("/", "\\", "\0")) and not name.startswith(".")
+    if not is_plain or len(name) > LONGEST_NAME or not name.isprintable():
+        raise ReadError("That is no plain file name: rename the file, and drop it again.")
+    kind = suffix(Path(name))
+    has_kind = kind in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES, ".zip", ".ima", "")
+    if not has_kind and kind.lstrip(".").isalpha():
+        known = ", ".join((*SURFACE_SUFFIXES, *IMAGE_SUFFIXES, ".zip"))
+        raise ReadError(f"{name} is neither a scan nor a surface: drop a DICOM folder or one of {known}.")
+    return name
+
+
+def take(partial: Path, name: str, case_folder: Path) -> None:
+    """Put a file that has come in whole where it belongs; `partial` is gone afterwards.
+
+    Raises
+    ------
+    ReadError
+        It is damaged, unpacks to too much, or there are too many.
+    """
+    folder = case_folder / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        if is_dicom(partial):
+            _take_slice(partial, folder)
+        elif zipfile.is_zipfile(partial):
+            _take_archive(partial, folder)
+        else:
+            _refuse_bomb(partial, name)
+            shutil.move(partial, folder / checked_name(name))
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def found(case_folder: Path) -> str:
+    """Return what a study is to read, relative to the case folder.
+
+    Raises
+    ------
+    ReadError
+        Nothing that can be read has come in.
+    """
+    folder = case_folder / FOLDER
+    if (folder / SERIES).is_dir():
+        return f"{FOLDER}/{SERIES}"
+    files = sorted(path for path in folder.glob("*") if path.is_file() and not path.name.startswith("."))
+    known = [path for path in files if suffix(path) in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES)]
+    # A header that names its data file says more than that.
+    known.sort(key=lambda path: suffix(path) not in (".mhd", ".nhdr"))
+    if not known:
+        raise ReadError("Nothing that has come in is a scan or a surface: drop a DICOM folder, a volume or a surface.")
+    return f"{FOLDER}/{known[0].name}"
+
+
+def _take_slice(path: Path, folder: Path) -> None:
+    series = folder / SERIES
+    series.mkdir(exist_ok=True)
+    count = sum(1 for _ in series.iterdir())
+    if count >= MOST_FILES:
+        raise ReadError(f"More than {MOST_FILES} slices: drop one series.")
+    strip_dicom(path, series / f"slice-{count + 1:05}.dcm")
+
+
+def _take_archive(path: Path, folder: Path) -> None:
+    """Unpack what can be read; the paths in the archive are not used."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+            if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > UNPACKED_LIMIT:
+                raise ReadError(_TOO_MUCH)
+            left = UNPACKED_LIMIT
+            for number, entry in enumerate(entries):
+                left = _take_entry(archive, entry, folder / f".entry-{number}", folder, left)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError):
+        raise ReadError("The archive is damaged or locked: unpack it, and drop the folder.") from None
+
+
+def _take_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, partial: Path, folder: Path, left: int) -> int:
+    """Unpack one entry and take it if it can be read; return how many bytes may still come."""
+    try:
+        with archive.open(entry) as packed, partial.open("wb") as out:
+            for block in iter(lambda: packed.read(_BLOCK), b""):
+                left -= len(block)
+                if left < 0:  # sizes in an archive can lie
+                    raise ReadError(f"The archive unpacks to more than {UNPACKED_LIMIT >> 30} GB: too much.")
+                out.write(block)
+        name = entry.filename.replace("\\", "/").rpartition("/")[2]
+        if is_dicom(partial):
+            _take_slice(partial, folder)
+        elif suffix(Path(name)) in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES):
+            _refuse_bomb(partial, name)
+            shutil.move(partial, folder / checked_name(name))
+    finally:
+        partial.unlink(missing_ok=True)
+    return left
+
+
+def _refuse_bomb(path: Path, name: str) -> None:
+    """See that a compressed file unpacks to no more than the limit."""
+    if suffix(Path(name)).endswith(".gz") and _unpacked_size(_blocks(path)) > UNPACKED_LIMIT:
+        raise ReadError(f"{name} unpacks to more than {UNPACKED_LIMIT >> 30} GB: too much.")
+
+
+def _blocks(path: Path) -> Iterable[bytes]:
+    try:
+        with gzip.open(path) as stream:
+            yield from iter(lambda: stream.read(_BLOCK), b"")
+    except (OSError, EOFError, zlib.error):
+        raise ReadError("The compressed file is damaged: copy it again from where it came.") from None
+
+
+def _unpacked_size(blocks: Iterable[bytes]) -> int:
+    total = 0
+    for block in blocks:
+        total += len(block)
+        if total > UNPACKED_LIMIT:
+            break
+    return total

@@ -1,0 +1,213 @@
+"""Jobs: the long stages of a case, in a process of their own, so that the page stays quick and can stop them."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from contextlib import suppress
+from typing import Any, Final
+
+from vstent.app.cases import Case, State, dependencies
+
+KINDS: Final = {
+    "anatomy": ("image", "vessel", "sac"),
+    "rank": ("device",),
+    "flow": ("device", "deploy", "flow", "report"),
+}
+"""Kind of a job -> the steps that are done when it is."""
+FIRST: Final = {"anatomy": "image", "rank": "device", "flow": "flow"}
+"""Kind of a job -> the step that it is said to be at before it has said a word."""
+STAGES: Final = {
+    "scan": "image",
+    "segment": "image",
+    "trace": "vessel",
+    "trim": "vessel",
+    "anatomy": "sac",
+    "restore": "sac",
+    "rank": "device",
+    "deploy": "deploy",
+    "struts": "deploy",
+    "plan": "flow",
+    "flow": "flow",
+    "measure": "flow",
+    "report": "report",
+}
+"""First word of a study's stage -> step of the page."""
+SETTLING: Final = re.compile(r"([\d.]+)% left to settle, (?:.*?)(\d+) s left")
+"""How a ledger tells of a flow (`vstent.study.ledger.Ledger.teller`)."""
+STOPPED: Final = "Stopped. What was finished is kept."
+POINTS_KEPT: Final = 600
+RANKING: Final = "ranking.json"
+"""File of a case folder that holds the sizes ranked."""
+
+
+class Job:
+    """One process at work on a case."""
+
+    def __init__(self, case: Case, kind: str) -> None:
+        self.case, self.kind = case, kind
+        self.began = time.time()
+        self.stage, self.fraction, self.detail = "", 0.0, ""
+        self.finished: list[dict[str, Any]] = []
+        self.residual: deque[tuple[float, float]] = deque(maxlen=POINTS_KEPT)
+        self._given = case.state
+        self._is_stopped = False
+        command = [sys.executable, "-m", "vstent.app.worker", kind, str(case.folder)]
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,  # closes when the server is gone, however it went: then the job ends too
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            bufsize=1,
+            start_new_session=True,  # a job's own processes end with it
+        )
+        self._thread = threading.Thread(target=self._follow, daemon=True)
+        self._thread.start()
+
+    @property
+    def step(self) -> str:
+        """The step that is at work; empty once all is done."""
+        if self._process.poll() is not None and not self._thread.is_alive():
+            return ""
+        return STAGES.get(self.stage.partition(" ")[0], FIRST[self.kind])
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it is still at work."""
+        return self._thread.is_alive()
+
+    def told(self) -> dict[str, Any]:
+        """Return how far it is."""
+        return {
+            "kind": self.kind,
+            "stage": self.stage,
+            "fraction": self.fraction,
+            "detail": self.detail,
+            "seconds": time.time() - self.began,
+            "finished": self.finished,
+            "residual": list(self.residual),
+        }
+
+    def stop(self) -> None:
+        """Stop at once; what was finished is kept."""
+        self._is_stopped = True
+        self._kill()
+        self._thread.join(5.0)
+
+    def abandon(self) -> None:
+        """Stop because the server ends; the case remembers that there was something to do."""
+        self.case = _Deaf(self.case)  # type: ignore[assignment]
+        self._kill()
+
+    def _kill(self) -> None:
+        with suppress(ProcessLookupError):
+            if hasattr(os, "killpg"):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            else:
+                self._process.kill()
+
+    def _follow(self) -> None:
+        assert self._process.stdout is not None
+        assert self._process.stdin is not None
+        failure = ""
+        for line in self._process.stdout:
+            told = json.loads(line)
+            if "error" in told:
+                failure = told["error"]
+            elif "anatomy" in told:
+                self.case.update(anatomy=told["anatomy"])
+            else:
+                self._take(told["stage"], told["fraction"], told["detail"])
+        self._process.stdout.close()
+        self._process.stdin.close()
+        code = self._process.wait()
+        if self._is_stopped:
+            failure = STOPPED
+        elif code and not failure:
+            failure = "The computation broke off; what was finished is kept. Start it again to go on."
+        self._close(failure)
+
+    def _take(self, stage: str, fraction: float, detail: str) -> None:
+        if stage != self.stage:
+            self.residual.clear()
+        self.stage, self.fraction, self.detail = stage, fraction, detail
+        settling = SETTLING.search(detail)
+        if settling:
+            self.residual.append((fraction, float(settling[1]) / 100))
+        if fraction >= 1.0:
+            self.finished.append({"stage": stage, "detail": detail})
+        self._pass()
+        self.case.tell()
+
+    def _pass(self) -> None:
+        """Steps before the one at work are done."""
+        steps, keys, done = KINDS[self.kind], dependencies(self._given), self.case.state.done
+        passed = steps[: steps.index(self.step)] if self.step in steps else ()
+        if any(done.get(step) != keys[step] for step in passed):
+            self.case.update(done=done | {step: keys[step] for step in passed})
+
+    def _close(self, failure: str) -> None:
+        state = self.case.state
+        failed = {step: why for step, why in state.failed.items() if step not in KINDS[self.kind]}
+        done = dict(state.done)
+        if failure:
+            failed[self.step or KINDS[self.kind][0]] = failure
+        else:
+            keys = dependencies(self._given)
+            done |= {step: keys[step] for step in KINDS[self.kind]}
+        self.case.update(done=done, failed=failed, job="")
+
+
+class _Deaf:
+    """Stands in for a case that must not be told any more."""
+
+    def __init__(self, case: Case) -> None:
+        self.state: State = case.state
+
+    def update(self, **_: Any) -> State:
+        """Do nothing."""
+        return self.state
+
+    def tell(self) -> None:
+        """Do nothing."""
+
+
+class Jobs:
+    """At most one job per case."""
+
+    def __init__(self) -> None:
+        self._jobs: dict[str, Job] = {}
+        self._lock = threading.Lock()
+
+    def of(self, case: Case) -> Job | None:
+        """Return what is at work on a case, or was last."""
+        return self._jobs.get(case.id)
+
+    def start(self, case: Case, kind: str) -> Job:
+        """Start a job; one that is at work is stopped first."""
+        with self._lock:
+            current = self._jobs.get(case.id)
+            if current is not None and current.is_alive:
+                current.stop()
+            failed = {step: why for step, why in case.state.failed.items() if step not in KINDS[kind]}
+            case.update(job=kind, failed=failed)
+            self._jobs[case.id] = Job(case, kind)
+            return self._jobs[case.id]
+
+    def stop(self, case: Case) -> None:
+        """Stop what is at work on a case."""
+        job = self._jobs.get(case.id)
+        if job is not None and job.is_alive:
+            job.stop()
+
+    def abandon(self) -> None:
+        """Stop everything because the server ends; cases go on when it starts again."""
+        for job in self._jobs.values():
+            if job.is_alive:
+                job.abandon()

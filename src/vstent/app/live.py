@@ -1,0 +1,417 @@
+"""Live: what a hand on the page asks is answered here, at once, from what the case has found so far."""
+
+import threading
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, Literal, TypeVar
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.app import sheets
+from vstent.app.cases import Case
+from vstent.app.choices import DeviceChoice, placing_of
+from vstent.app.cuts import at_phase, cut
+from vstent.deploy import propose_landing
+from vstent.deploy.contour import planes
+from vstent.deploy.sketch import Bed, Sketch, bed, sketch
+from vstent.device import coverage_fraction, find_design
+from vstent.errors import ReadError
+from vstent.flow import FlowField
+from vstent.io.archive import load_noun
+from vstent.kernels import clipping
+from vstent.kernels.arrays import Floats
+from vstent.measure import coverage_fractions, measure, morphology
+from vstent.report.packing import message
+from vstent.report.scene import (
+    LineLayer,
+    MeshLayer,
+    Scale,
+    View,
+    anatomy_layers,
+    device_layers,
+    device_title,
+    flow_layers,
+    round_up,
+    scales_of,
+    view_of,
+    views_of,
+)
+from vstent.stent import Deployment, Landing, Stent
+from vstent.study import CACHE
+from vstent.study.stages import BARE, deploy_one, size_of
+from vstent.surface import Surface
+from vstent.vessel import Anatomy, Opening
+
+Colour = Literal["wall_gap", "coverage", "diameter"]
+Anchor = Literal["proximal", "center", "distal"]
+Found = TypeVar("Found")
+
+LOCK: Final = threading.RLock()
+"""One computation at a time: compiled loops with threads of their own do not share them."""
+KEPT: Final = 40
+"""Results remembered per case."""
+SECTION_REACH_MM: Final = 9.0
+"""A section shows what is this near to the axis."""
+BESIDE_SAC_MM: Final = 1.0
+"""What is this near to the sac says how wide the scales of the flow are."""
+BESIDE_MM: Final = 8.0
+"""The profile shows so much of the artery beside the neck."""
+NEIGHBOURS: Final = 3
+"""Every so many points of a wire are coloured after the nearest node, those between like them."""
+OPENING_COLOURS: Final = (
+    (0.00, 0.45, 0.70),
+    (0.90, 0.62, 0.00),
+    (0.00, 0.62, 0.45),
+    (0.80, 0.47, 0.65),
+    (0.34, 0.71, 0.91),
+)
+"""Okabe and Ito's colours, told apart by the colour-blind; the inlet has the first."""
+
+
+class Live:
+    """The nouns of one case, loaded and computed when they are asked for, and remembered."""
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        self._memory: dict[Hashable, Any] = {}
+
+    def remembered(self, key: Hashable, find: Callable[[], Found]) -> Found:
+        """Return what was found under a key before, or find it now."""
+        with LOCK:
+            if key not in self._memory:
+                found = find()
+                while len(self._memory) >= KEPT:
+                    self._memory.pop(next(iter(self._memory)))
+                self._memory[key] = found
+            found = self._memory[key]
+        return found
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The anatomy found last.
+
+        Raises
+        ------
+        ReadError
+            None was found yet.
+        """
+        key = self.case.state.anatomy
+        path = self.case.folder / CACHE / f"anatomy-{key}.npz"
+        if not key:
+            raise ReadError("The vessel has not been found yet: run the first three steps.")
+        return self.remembered(("anatomy", key), lambda: load_noun(path, Anatomy))
+
+    def choice(self, name: str) -> DeviceChoice:
+        """Return what was chosen of a device.
+
+        Raises
+        ------
+        ReadError
+            It was not chosen.
+        """
+        for device in self.case.state.choices.devices:
+            if device.name == name:
+                return device
+        raise ReadError(f"{name} is not among the devices chosen.")
+
+    def bed(self, choice: DeviceChoice) -> Bed:
+        """Return the wall as a device finds it."""
+        key = ("bed", self.case.state.anatomy, choice.name, choice.diameter_mm, choice.length_mm)
+
+        def find() -> Bed:
+            design = find_design(choice.name)
+            return bed(design, size_of(design, self.anatomy, placing_of(choice)), self.anatomy)
+
+        return self.remembered(key, find)
+
+    def sketch(self, choice: DeviceChoice, landing: Landing | None) -> Sketch:
+        """Return where a device would lie; centred on the neck where nothing is said."""
+        with LOCK:
+            wall = self.bed(choice)
+            if landing is None and choice.center_mm is not None:
+                landing = Landing(choice.center_mm)
+            return sketch(wall, landing or propose_landing(wall.design, self.anatomy, wall.size))
+
+    def deployment(self, choice: DeviceChoice) -> Deployment:
+        """Return the deployed device."""
+        key = ("deployment", self.case.state.anatomy, *choice.model_dump().values())
+        return self.remembered(key, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice)))
+
+    def flows(self) -> dict[str, Path]:
+        """Return where the flows computed last are kept, ``bare`` first."""
+        names = (BARE, *(device.name for device in self.case.state.choices.devices))
+        paths = {name: _kept(self.case.folder / CACHE, f"flow {name}") for name in names}
+        return {name: path for name, path in paths.items() if path is not None}
+
+    def _field(self, path: Path, moment: int | None) -> FlowField:
+        """A flow: its mean, or a moment of its last cycle."""
+        field = self.remembered(("flow", path, path.stat().st_mtime_ns), lambda: load_noun(path, FlowField))
+        return field if moment is None or not field.phases else at_phase(field, moment % len(field.phases))
+
+    def _flow_layers(self, name: str, path: Path, moment: int | None) -> list[MeshLayer | LineLayer]:
+        key = ("flow layers", path, path.stat().st_mtime_ns, self.case.state.anatomy, moment)
+
+        def find() -> list[MeshLayer | LineLayer]:
+            field = self._field(path, moment)
+            return [*flow_layers(name, field, self.anatomy), cut(name, field, self.anatomy)]
+
+        return self.remembered(key, find)
+
+    # -- messages for the page -----------------------------------------------------------------------------------------
+
+    def anatomy_message(self) -> bytes:
+        """Return vessel, openings, sac, neck, parent artery and axis, with their numbers."""
+        anatomy = self.anatomy
+        openings = anatomy.vessel.openings
+        layers = [*anatomy_layers(anatomy), *(_disc(k, opening) for k, opening in enumerate(openings))]
+        return message(
+            layers,
+            views=_views(anatomy),
+            fade=1.2 * float(np.median(anatomy.section_radius_mm)),
+            axis=_axis(anatomy),
+            openings=[_said(opening) for opening in openings],
+            notes=[*anatomy.vessel.notes, *anatomy.notes],
+            neck=_neck_span(anatomy),
+        )
+
+    def anatomy_sheet(self) -> list[dict[str, Any]]:
+        """Return the anatomy's numbers."""
+        measures = self.remembered(("morphology", self.case.state.anatomy), lambda: morphology(self.anatomy))
+        return sheets.anatomy(measures)
+
+    def sketch_message(self, choice: DeviceChoice, landing: Landing | None, colour: Colour) -> bytes:
+        """Return the wires of a device where it would lie."""
+        with LOCK:
+            found = self.sketch(choice, landing)
+            wires = _wires(choice.name, found.stent, found.gap_mm, colour, _formula_coverage(found.stent))
+            return message([wires], scales_of([wires]), **_place(found, found.stent))
+
+    def deployment_message(self, choice: DeviceChoice, colour: Colour) -> bytes:
+        """Return a deployed device with its expansion and its numbers."""
+        with LOCK:
+            deployment = self.deployment(choice)
+            stent, gap_mm = deployment.stent, deployment.wall_gap_mm
+            key = (self.case.state.anatomy, *choice.model_dump().values())
+            coverage = self.remembered(("coverage", *key), lambda: _node_coverage(stent))
+            wires = _wires(choice.name, stent, gap_mm, colour, coverage)
+            contour = device_layers(choice.name, deployment, self.anatomy)[0]
+            layers = [wires, contour]
+            center_mm = choice.center_mm if choice.center_mm is not None else _center_mm(stent)
+            found = self.sketch(choice, Landing(center_mm))
+            measures = self.remembered(("measures", *key), lambda: measure(self.anatomy, deployment))
+            return message(
+                layers,
+                scales_of(layers),
+                **_place(found, stent),
+                title=device_title(deployment),
+                advice=deployment.advice,
+                measures=sheets.device(device_title(deployment), measures),
+            )
+
+    def flow_message(self, moment: int | None) -> bytes:
+        """Return wall shear stress, streamlines and a cut of every flow, on one scale: the mean, or one moment."""
+        with LOCK:
+            paths = self.flows()
+            if not paths:
+                raise ReadError("No flow has been computed yet: run the step Flow.")
+            layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]
+            bare = self._field(next(iter(paths.values())), None)
+            most = _peak(bare)
+            of_scales = layers if moment is None or most is None else self._flow_layers(BARE, paths[BARE], most)
+            return message(
+                layers, _scales_about_the_sac(of_scales, self.anatomy), **_moments(bare, moment), panes=list(paths)
+            )
+
+    def section(self, name: str | None, abscissa_mm: float) -> dict[str, Any]:
+        """Return what a plane across the parent axis cuts: curves in the plane and diameters."""
+        with LOCK:
+            anatomy = self.anatomy
+            across = self.remembered(("planes", self.case.state.anatomy), lambda: planes(anatomy.axis))
+            at_mm = float(np.clip(abscissa_mm, 0.0, anatomy.axis.length_mm))
+            center, frame = (found[0] for found in across.at(np.array([at_mm])))
+            radius_mm = float(np.interp(at_mm, anatomy.axis.abscissa_mm, anatomy.section_radius_mm))
+            shown = {
+                "abscissa_mm": at_mm,
+                "artery_diameter_mm": 2 * radius_mm,
+                "lumen": _cut(anatomy.vessel.lumen, center, frame),
+                "landing": _cut(anatomy.landing_surface, center, frame),
+            }
+            if name is None:
+                return shown
+            deployment = self.deployment(self.choice(name))
+            return shown | _row(deployment, at_mm, center, frame)
+
+
+def _views(anatomy: Anatomy) -> list[View]:
+    """The report's directions, the profile as wide as where a device will lie, and the whole vessel from there."""
+    profile, *others = views_of(anatomy, {})
+    axis, span = anatomy.axis, _neck_span(anatomy) or [0.0, anatomy.axis.length_mm]
+    is_near = (axis.abscissa_mm > span[0] - BESIDE_MM) & (axis.abscissa_mm < span[1] + BESIDE_MM)
+    sacs = [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
+    treated = np.concatenate([axis.points_mm[is_near], *sacs])
+    whole = view_of("whole", profile.axes, anatomy.vessel.lumen.vertices_mm)
+    return [view_of("profile", profile.axes, treated, 1.15), whole, *others]
+
+
+def _scales_about_the_sac(layers: Sequence[MeshLayer | LineLayer], anatomy: Anatomy) -> list[Scale]:
+    """The scales of the layers, as wide as what the flow without a device has about the sac, which it is all about."""
+    scales = list(scales_of(list(layers)))
+    if not anatomy.aneurysms:
+        return scales
+    tree = cKDTree(anatomy.aneurysms[0].sac.vertices_mm)
+    found = []
+    for scale in scales:
+        layer = next(layer for layer in layers if layer.scale == scale.id)
+        points_mm = layer.points_mm if isinstance(layer, LineLayer) else layer.surface.vertices_mm
+        near = layer.values[tree.query(points_mm, distance_upper_bound=BESIDE_SAC_MM)[0] < BESIDE_SAC_MM]
+        high = round_up(float(np.percentile(near, 98))) if len(near) and near.max() > 0 else scale.high
+        found.append(replace(scale, high=high))
+    return found
+
+
+def _axis(anatomy: Anatomy) -> dict[str, list[float]]:
+    axis = anatomy.axis
+    return {
+        "points": np.round(axis.points_mm, 3).ravel().tolist(),
+        "abscissa": np.round(axis.abscissa_mm, 3).tolist(),
+        "diameter": np.round(2 * anatomy.section_radius_mm, 3).tolist(),
+    }
+
+
+def _peak(field: FlowField) -> int | None:
+    """The moment of the largest inflow; None for a steady flow."""
+    return max(range(len(field.phases)), key=lambda k: field.phases[k].inlet_mL_s) if field.phases else None
+
+
+def _moments(field: FlowField, moment: int | None) -> dict[str, Any]:
+    """Times of the moments there are, and the one shown."""
+    return {"times_s": [phase.time_s for phase in field.phases], "moment": moment if field.phases else None}
+
+
+def _kept(folder: Path, stage: str) -> Path | None:
+    found = (path for path in sorted(folder.glob(f"{stage}-*.npz")) if not path.name.endswith(".running.npz"))
+    return next(found, None)
+
+
+def _said(opening: Opening) -> dict[str, Any]:
+    return {
+        "role": opening.role,
+        "center_mm": opening.center_mm.tolist(),
+        "area_mm2": opening.area_mm2,
+        "diameter_mm": opening.diameter_mm,
+        "colour": [round(255 * part) for part in _opening_colour(opening)],
+    }
+
+
+def _opening_colour(opening: Opening) -> tuple[float, float, float]:
+    number = 0 if opening.role == "inlet" else int(opening.role.rpartition("_")[2])
+    return OPENING_COLOURS[number] if number < len(OPENING_COLOURS) else (0.45, 0.50, 0.54)
+
+
+def _disc(number: int, opening: Opening) -> MeshLayer:
+    """A disc of the opening's area, a little outside of it."""
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    first = np.cross(opening.normal, np.eye(3)[np.argmin(np.abs(opening.normal))])
+    first /= np.linalg.norm(first)
+    second = np.cross(opening.normal, first)
+    ring = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
+    center = opening.center_mm + 0.05 * opening.normal
+    points = np.concatenate([center[None], center + 0.5 * opening.diameter_mm * ring])
+    around = np.arange(40)
+    faces = np.stack([np.zeros(40, int), 1 + around, 1 + (around + 1) % 40], axis=1)
+    surface = Surface(points, faces)
+    nothing = np.zeros(0)
+    return MeshLayer(f"opening {number}", "", _opening_colour(opening), "", nothing, surface)
+
+
+def _neck_span(anatomy: Anatomy) -> list[float]:
+    if not anatomy.aneurysms:
+        return []
+    return [anatomy.aneurysms[0].proximal_abscissa_mm, anatomy.aneurysms[0].distal_abscissa_mm]
+
+
+def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Floats) -> LineLayer:
+    """Wires coloured after the nodes (rows, columns) beside them."""
+    diameter_mm = np.broadcast_to(stent.row_diameter_mm[:, None], gap_mm.shape)
+    of_node = {"wall_gap": gap_mm, "coverage": 100 * coverage, "diameter": diameter_mm}[colour].ravel()
+    some = stent.wire_points_mm[::NEIGHBOURS]
+    near = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(some)[1]
+    values = np.repeat(of_node[near], NEIGHBOURS)[: len(stent.wire_points_mm)]
+    return LineLayer(
+        "wires",
+        name,
+        (0.33, 0.38, 0.43),
+        colour,
+        values,
+        stent.wire_points_mm,
+        stent.wire_starts,
+        stent.wire_diameter_um / 2000,
+    )
+
+
+def _formula_coverage(stent: Stent) -> Floats:
+    """Coverage (rows, columns) by the formula, from every row's diameter."""
+    of_row = [coverage_fraction(stent.design, stent.size, float(d)) for d in stent.row_diameter_mm]
+    return np.broadcast_to(np.array(of_row)[:, None], stent.nodes_mm.shape[:2])
+
+
+def _node_coverage(stent: Stent) -> Floats:
+    """Coverage (rows, columns) as measured on the wires in the quads around every node, smoothed over a few cells."""
+    from scipy.ndimage import uniform_filter
+
+    quads = coverage_fractions(stent)
+    smooth = uniform_filter(quads, size=(7, 7), mode=("nearest", "wrap"))
+    return np.concatenate([smooth, smooth[-1:]])
+
+
+def _center_mm(stent: Stent) -> float:
+    """Where the middle row lies on the parent axis."""
+    return float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
+
+
+def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
+    """Where a device lies, with the band of its ends about where the sketch has them."""
+    ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
+    sketched = (found.stent.proximal_abscissa_mm, found.stent.distal_abscissa_mm)
+    bands = [
+        [end + edge - middle for edge in sorted(band)]
+        for end, middle, band in zip(ends, sketched, (found.proximal_band_mm, found.distal_band_mm), strict=True)
+    ]
+    lengths = sorted(b - a for a, b in zip(found.proximal_band_mm, found.distal_band_mm, strict=True))
+    shift = stent.deployed_length_mm - (sketched[1] - sketched[0])
+    return {
+        "device": stent.design.key,
+        "size": stent.size.label,
+        "center_mm": _center_mm(stent),
+        "ends_mm": ends,
+        "ends_band_mm": bands,
+        "profile": np.round(np.stack([stent.row_abscissa_mm, stent.row_diameter_mm], axis=1), 3).tolist(),
+        "length_mm": stent.deployed_length_mm,
+        "length_band_mm": [length + shift for length in lengths],
+    }
+
+
+def _cut(surface: Surface, center: Floats, frame: Floats) -> list[float]:
+    """Segments of a section as numbers x1, y1, x2, y2 in the plane, those near the axis."""
+    near = np.linalg.norm(surface.corners_mm[:, 0] - center, axis=1) < SECTION_REACH_MM
+    offset = surface.vertices_mm - center
+    segments = clipping.section(offset, surface.faces[near], offset @ frame[0])
+    return np.round(segments @ frame[1:].T, 3).ravel().tolist()
+
+
+def _row(deployment: Deployment, at_mm: float, center: Floats, frame: Floats) -> dict[str, Any]:
+    """What the plane cuts of a device."""
+    stent = deployment.stent
+    if not stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm:
+        return {}
+    row = int(np.argmin(np.abs(stent.row_abscissa_mm - at_mm)))
+    ring = (stent.nodes_mm[row] - stent.nodes_mm[row].mean(axis=0)) @ frame[1:].T
+    middle = (stent.nodes_mm[row].mean(axis=0) - center) @ frame[1:].T
+    return {
+        "device": np.round(np.append(ring, ring[:1], axis=0) + middle, 3).ravel().tolist(),
+        "device_diameter_mm": float(stent.row_diameter_mm[row]),
+        "free_diameter_mm": stent.size.free_diameter_mm,
+        "max_gap_mm": float(deployment.wall_gap_mm[row].max()),
+    }

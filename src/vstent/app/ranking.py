@@ -1,0 +1,48 @@
+"""Ranking: all sizes of the devices chosen, deployed and ranked, kept in the case folder for the page's table."""
+
+import os
+from typing import Any, Final
+
+from vstent.app.cases import Case
+from vstent.app.jobs import RANKING
+from vstent.device import find_design
+from vstent.io.writers import write_json
+from vstent.rank import rank
+from vstent.study import CACHE, Progress
+from vstent.study.ledger import Ledger
+from vstent.study.stages import find_anatomy
+
+MOST_PROCESSES: Final = 4
+WORTH_A_PROCESS: Final = 12
+"""So many sizes take longer than another process takes to start."""
+
+
+def rank_sizes(case: Case, progress: Progress) -> None:
+    """Rank every size of the devices chosen and write it down.
+
+    Raises
+    ------
+    InputError
+        No device is chosen.
+    """
+    settings = case.state.choices.settings()
+    ledger = Ledger(case.folder / CACHE, progress)
+    anatomy = find_anatomy(case.input, case.state.source, settings, ledger)
+
+    def told(n_done: int, n_all: int) -> None:
+        progress("rank", min(n_done / n_all, 0.99), f"{n_done} of {n_all} sizes")
+
+    progress("rank", 0.0, "")
+    designs = [find_design(name) for name in settings.devices]
+    n_sizes = sum(len(design.sizes) for design in designs)
+    jobs = min(os.cpu_count() or 1, MOST_PROCESSES, 1 + n_sizes // WORTH_A_PROCESS)
+    found = rank(anatomy, designs, jobs=jobs, progress=told)
+    rows = found.rows()
+    content: dict[str, Any] = {
+        "anatomy": case.state.anatomy,
+        "devices": sorted(settings.devices),
+        "names": {design.key: design.name for design in designs},
+        "rows": rows,
+    }
+    write_json(case.folder / RANKING, content)
+    progress("rank", 1.0, f"{len(found.suitable)} of {len(rows)} sizes suit.")

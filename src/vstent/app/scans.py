@@ -1,0 +1,84 @@
+"""Scans: slices of a volume, and the surface that a threshold gives, for the first step of the page."""
+
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+
+from vstent.errors import InputError
+from vstent.image import Image
+from vstent.kernels import topology, triangles
+from vstent.kernels.arrays import Floats
+from vstent.kernels.isosurface import isosurface
+from vstent.report.packing import Packer, message
+from vstent.report.scene import MeshLayer
+from vstent.report.thinning import thin_surface
+from vstent.segment import propose
+from vstent.surface import Surface
+
+COARSE: Final = 2.5e6
+"""Voxels in which the live surface is sought, at most."""
+LIVE_FACES: Final = 40_000
+SPECK: Final = 0.01
+"""Pieces smaller than this part of the largest are not drawn."""
+
+
+class Scan:
+    """A volume, looked at."""
+
+    def __init__(self, image: Image) -> None:
+        self.image = image
+
+    @cached_property
+    def _range(self) -> tuple[float, float]:
+        sample = self.image.voxels[::3, ::3, ::3]
+        return float(np.percentile(sample, 0.5)), float(self.image.voxels.max())
+
+    @cached_property
+    def proposed_threshold(self) -> float:
+        """The threshold that a study would take."""
+        return propose(self.image)[0].threshold
+
+    def told(self) -> dict[str, Any]:
+        """Return shape, spacing, range and the threshold proposed."""
+        return {
+            "shape": self.image.voxels.shape,
+            "spacing_mm": self.image.spacing_mm.tolist(),
+            "affine_mm": self.image.affine_mm.ravel().tolist(),
+            "modality": self.image.modality,
+            "range": self._range,
+            "proposed_threshold": self.proposed_threshold,
+        }
+
+    def slice(self, axis: int, index: int) -> bytes:
+        """Return one slice across a voxel axis: its values, quantised, columns fastest.
+
+        Raises
+        ------
+        InputError
+            There is no such slice.
+        """
+        if not 0 <= index < self.image.voxels.shape[axis]:
+            raise InputError(f"The scan has no slice {index} there: it has {self.image.voxels.shape[axis]}.")
+        plane = np.take(self.image.voxels, index, axis=axis).astype(np.float64)
+        packer = Packer()
+        values = packer.add_numbers(plane.T[..., None])
+        return packer.framed({"width": plane.shape[0], "height": plane.shape[1], "values": values})
+
+    def surface(self, threshold: float) -> bytes:
+        """Return the surface that a threshold gives, coarsened so that it follows a slider."""
+        stride = max(1, int(np.ceil((self.image.voxels.size / COARSE) ** (1 / 3))))
+        field = self.image.voxels[::stride, ::stride, ::stride].astype(np.float32)
+        index, faces = isosurface(field, threshold)
+        layers = []
+        if len(faces):
+            index, faces = _without_specks(index, faces)
+            surface = thin_surface(Surface(self.image.to_mm(stride * index), faces), LIVE_FACES)[0]
+            layers = [MeshLayer("live", "", (0.80, 0.62, 0.55), "", np.zeros(0), surface)]
+        return message(layers, threshold=threshold)
+
+
+def _without_specks(index: Floats, faces: Any) -> tuple[Floats, Any]:
+    label = topology.face_components(faces)
+    count = np.bincount(label)
+    return triangles.compact(index, faces[count[label] >= SPECK * count.max()])

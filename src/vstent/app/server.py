@@ -1,0 +1,275 @@
+"""Server: the page's files and the REST interface, all of it described at /api/docs."""
+
+import asyncio
+import json
+import secrets
+import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from fastapi import FastAPI, Query, Request
+from fastapi.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from pydantic import Field
+
+from vstent.app import desk as desks
+from vstent.app.choices import Choices, DeviceChoice, Strict
+from vstent.app.desk import Desk
+from vstent.app.security import REPORT_POLICY, Guard
+from vstent.errors import ReadError, VstentError
+
+MEDIA: Final = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css"}
+BINARY: Final = "application/octet-stream"
+"""A manifest and its arrays, as `vstent.report.packing` says."""
+ASSETS: Final = ("index.html", "app.js", "app.css", "viewer.css", "docs.html", "docs.js")
+FILES: Final = ("metrics.json", "run.json", "report.html")
+BEAT_S: Final = 15.0
+"""A quiet stream of events says something this often."""
+
+Revision = Annotated[int, Field(ge=0)]
+
+
+class NewCase(Strict):
+    """A case to be made."""
+
+    name: str = Field(max_length=120, min_length=1)
+
+
+class Change(Strict):
+    """Other choices, made on what a tab has seen last."""
+
+    revision: Revision
+    choices: Choices
+
+
+class Seen(Strict):
+    """What a tab has seen last."""
+
+    revision: Revision
+
+
+class SketchWanted(Strict):
+    """A device at a place, to be drawn."""
+
+    device: DeviceChoice
+    anchor: Literal["proximal", "center", "distal"] = "center"
+    abscissa_mm: float | None = Field(default=None, ge=-1000, le=1000)
+    colour: Literal["wall_gap", "coverage", "diameter"] = "wall_gap"
+
+
+def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
+    """Return the whole server: the interface behind its guard."""
+
+    @asynccontextmanager
+    async def life(_: FastAPI) -> AsyncIterator[None]:
+        threading.Thread(target=desk.warm, daemon=True).start()
+        yield
+        desk.close()
+
+    app = FastAPI(
+        title="vstent",
+        version=version("vstent"),
+        description="Plan a stent: from a scan to the blood flow before and after. Research use only.",
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/api/openapi.json",
+        lifespan=life,
+    )
+    app.add_exception_handler(VstentError, _said)
+    _add_page(app)
+    _add_cases(app, desk)
+    _add_input(app, desk)
+    _add_jobs(app, desk)
+    _add_scenes(app, desk)
+    return Guard(app, token=token, hosts=hosts)
+
+
+def new_token() -> str:
+    """Return a key that nobody can guess."""
+    return secrets.token_urlsafe(24)
+
+
+def _said(_: Request, error: Exception) -> JSONResponse:
+    return JSONResponse({"detail": str(error)}, desks.code_of(error))
+
+
+def asset(name: str) -> Response:
+    """Return one of the page's files."""
+    package = "vstent.report" if name == "viewer.css" else "vstent.app"
+    text = files(package).joinpath("assets", name).read_bytes()
+    return Response(text, media_type=MEDIA[Path(name).suffix])
+
+
+def _add_page(app: FastAPI) -> None:
+    @app.get("/", include_in_schema=False)
+    def page() -> Response:
+        return asset("index.html")
+
+    @app.get("/api/docs", include_in_schema=False)
+    def docs() -> Response:
+        return asset("docs.html")
+
+    @app.get("/assets/{name}", include_in_schema=False)
+    def one(name: str) -> Response:
+        if name not in ASSETS:
+            raise ReadError("There is no such file.")
+        return asset(name)
+
+    @app.get("/api/catalogue", summary="Devices and their sizes")
+    def catalogue() -> list[dict[str, Any]]:
+        return desks.devices()
+
+
+def _add_cases(app: FastAPI, desk: Desk) -> None:
+    @app.get("/api/cases", summary="All cases, the latest first")
+    def cases() -> dict[str, Any]:
+        return {"cases": desk.listed(), "opened": desk.opened}
+
+    @app.post("/api/cases", status_code=201, summary="Make a case")
+    def create_case(wanted: NewCase) -> dict[str, Any]:
+        return desk.view(desk.store.create(wanted.name))
+
+    @app.post("/api/demo", status_code=201, summary="Make a case of a synthetic scan")
+    def demo() -> dict[str, Any]:
+        return desk.view(desk.demo())
+
+    @app.get("/api/cases/{case_id}", summary="What is chosen and done; an interrupted job goes on")
+    def case(case_id: str) -> dict[str, Any]:
+        found = desk.store.get(case_id)
+        desk.resume(found)
+        return desk.view(found)
+
+    @app.put("/api/cases/{case_id}/choices", summary="Choose; 409 where the case was changed elsewhere")
+    def choose(case_id: str, change: Change) -> dict[str, Any]:
+        found = desk.store.get(case_id)
+        found.change(change.revision, change.choices)
+        return desk.view(found)
+
+    @app.post("/api/cases/{case_id}/undo", summary="Take the last change back")
+    def undo(case_id: str, seen: Seen) -> dict[str, Any]:
+        found = desk.store.get(case_id)
+        found.step_back(seen.revision)
+        return desk.view(found)
+
+    @app.post("/api/cases/{case_id}/redo", summary="Make the change taken back again")
+    def redo(case_id: str, seen: Seen) -> dict[str, Any]:
+        found = desk.store.get(case_id)
+        found.step_back(seen.revision, forward=True)
+        return desk.view(found)
+
+    @app.get("/api/cases/{case_id}/events", summary="The same, again whenever it changes (server-sent events)")
+    async def events(case_id: str) -> StreamingResponse:
+        found = await asyncio.to_thread(desk.store.get, case_id)
+        return StreamingResponse(_stream(desk, found), media_type="text/event-stream")
+
+
+async def _stream(desk: Desk, case: Any) -> AsyncIterator[str]:
+    event = case.listen()
+    try:
+        while not desk.is_closing:
+            event.clear()
+            yield f"data: {json.dumps(desk.view(case))}\n\n"
+            try:
+                await asyncio.wait_for(event.wait(), BEAT_S)
+                await asyncio.sleep(0.05)  # words that follow each other quickly are told together
+            except TimeoutError:
+                yield ": still here\n\n"
+    finally:
+        case.leave(event)
+
+
+def _add_input(app: FastAPI, desk: Desk) -> None:
+    @app.put("/api/cases/{case_id}/input", summary="Bring in a volume, a surface, a DICOM slice, or a ZIP of them")
+    async def bring(case_id: str, request: Request, name: Annotated[str, Query(max_length=300)]) -> dict[str, Any]:
+        found = await asyncio.to_thread(desk.store.get, case_id)
+        partial = await asyncio.to_thread(desks.begin_upload, found, name)
+        try:
+            with partial.open("wb") as out:
+                async for block in request.stream():
+                    out.write(block)
+            await asyncio.to_thread(desks.end_upload, found, partial, name)
+        finally:
+            partial.unlink(missing_ok=True)
+        return {"taken": True}
+
+    @app.post("/api/cases/{case_id}/input/done", summary="All files are in: find the vessel")
+    def done(case_id: str) -> dict[str, Any]:
+        found = desk.store.get(case_id)
+        desk.begin(found)
+        return desk.view(found)
+
+    @app.get("/api/cases/{case_id}/image", summary="Shape, spacing, range and proposed threshold of the scan")
+    def image(case_id: str) -> dict[str, Any]:
+        return desk.scan(desk.store.get(case_id)).told()
+
+    @app.get("/api/cases/{case_id}/image/slice", summary="One slice of the scan (binary)")
+    def one_slice(case_id: str, axis: Annotated[int, Query(ge=0, le=2)], index: int) -> Response:
+        return Response(desk.scan(desk.store.get(case_id)).slice(axis, index), media_type=BINARY)
+
+    @app.get("/api/cases/{case_id}/image/surface", summary="The surface that a threshold gives (binary)")
+    def surface(case_id: str, threshold: float) -> Response:
+        return Response(desk.surface(desk.store.get(case_id), threshold), media_type=BINARY)
+
+
+def _add_jobs(app: FastAPI, desk: Desk) -> None:
+    @app.post("/api/cases/{case_id}/jobs/{kind}", status_code=202, summary="Start a long stage")
+    def start(case_id: str, kind: Literal["anatomy", "rank", "flow"]) -> dict[str, Any]:
+        found = desk.store.get(case_id)
+        desk.start(found, kind)
+        return desk.view(found)
+
+    @app.delete("/api/cases/{case_id}/jobs", summary="Stop it at once; what was finished is kept")
+    def stop(case_id: str) -> dict[str, Any]:
+        found = desk.store.get(case_id)
+        desk.jobs.stop(found)
+        return desk.view(found)
+
+    @app.get("/api/cases/{case_id}/ranking", summary="The sizes of the chosen devices, ranked")
+    def ranking(case_id: str) -> dict[str, Any]:
+        return desks.ranking(desk.store.get(case_id))
+
+    @app.get("/api/cases/{case_id}/numbers", summary="Every number found, with unit and definition")
+    def numbers(case_id: str) -> dict[str, Any]:
+        return desk.numbers(desk.store.get(case_id))
+
+    @app.get("/api/cases/{case_id}/files/{name}", summary="metrics.json, run.json or report.html")
+    def one_file(case_id: str, name: Literal["metrics.json", "run.json", "report.html"]) -> Response:
+        path = desk.store.get(case_id).folder / name
+        if not path.is_file():
+            raise ReadError(f"{name} has not been written yet: run the step Flow.")
+        headers = {"content-security-policy": REPORT_POLICY} if name == "report.html" else {}
+        return FileResponse(path, headers=headers)
+
+
+def _add_scenes(app: FastAPI, desk: Desk) -> None:
+    @app.get("/api/cases/{case_id}/anatomy", summary="Vessel, sac, neck and parent artery (binary)")
+    def anatomy(case_id: str) -> Response:
+        return Response(desk.live(desk.store.get(case_id)).anatomy_message(), media_type=BINARY)
+
+    @app.post("/api/cases/{case_id}/sketch", summary="Where a device would lie, at once (binary)")
+    def sketch(case_id: str, wanted: SketchWanted) -> Response:
+        live = desk.live(desk.store.get(case_id))
+        landing = desks.landing(wanted.abscissa_mm, wanted.anchor)
+        return Response(live.sketch_message(wanted.device, landing, wanted.colour), media_type=BINARY)
+
+    @app.post("/api/cases/{case_id}/deployment", summary="A device deployed, with its expansion and numbers (binary)")
+    def deployment(case_id: str, wanted: SketchWanted) -> Response:
+        found = desk.store.get(case_id)
+        answer = desk.live(found).deployment_message(wanted.device, wanted.colour)
+        desk.note_deployed(found, wanted.device)
+        return Response(answer, media_type=BINARY)
+
+    @app.get("/api/cases/{case_id}/section", summary="What a plane across the parent axis cuts")
+    def section(case_id: str, abscissa_mm: float, device: str | None = None) -> dict[str, Any]:
+        return desk.live(desk.store.get(case_id)).section(device, abscissa_mm)
+
+    @app.get("/api/cases/{case_id}/flow", summary="Wall shear stress, streamlines and a cut, on one scale (binary)")
+    def flow(case_id: str, moment: Annotated[int | None, Query(ge=0)] = None) -> Response:
+        return Response(desk.live(desk.store.get(case_id)).flow_message(moment), media_type=BINARY)
+
+    @app.get("/api/waveform", summary="The pulse of the internal carotid: flow over mean flow")
+    def waveform() -> dict[str, Any]:
+        return desks.pulse()

@@ -1,0 +1,70 @@
+"""Sheets: metrics as the page lists them, each with its unit and its definition."""
+
+from typing import Any, Final
+
+from vstent.report.definitions import HEADLINES
+from vstent.report.quantities import Quantity, compare, flatten, format_change
+
+Sheet = dict[str, Any]
+
+FIRST: Final = {
+    "anatomy": (
+        "sac_volume_mm3",
+        "sac_height_mm",
+        "neck_area_mm2",
+        "neck_max_diameter_mm",
+        "aspect_ratio",
+        "size_ratio",
+        "parent_proximal_diameter_mm",
+        "parent_distal_diameter_mm",
+    ),
+    "device": (
+        "deployed_length_mm",
+        "neck_metal_coverage_fraction",
+        "apposed_fraction",
+        "max_wall_gap_mm",
+        "neck_to_proximal_end_mm",
+        "neck_to_distal_end_mm",
+        "mean_diameter_mm",
+        "jailed_branches_count",
+    ),
+}
+"""What is shown before one asks for more."""
+
+
+def anatomy(measures: dict[str, Any]) -> list[Sheet]:
+    """Return the sheet of the vessel."""
+    return [_plain("Anatomy", flatten(measures), FIRST["anatomy"])]
+
+
+def device(title: str, measures: dict[str, Any]) -> Sheet:
+    """Return the sheet of one deployed device."""
+    numbers = {key: value for key, value in measures.items() if not isinstance(value, str)}
+    return _plain(title, flatten(numbers), FIRST["device"])
+
+
+def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
+    """Return the sheet of the flow: before, and with every device after and change."""
+    changes = compare(metrics)
+    rows = []
+    for change in changes:
+        cells = [change.before.text]
+        for name in titles:
+            after = change.after.get(name)
+            cells += [after.text, format_change(change.before.value, after.value)] if after else ["–", "–"]
+        rows.append(_row(change.before, cells, is_first=change.before.key in HEADLINES))
+    rows.sort(key=lambda row: HEADLINES.index(row["key"]) if row["key"] in HEADLINES else len(HEADLINES))
+    words = {"title": "Blood flow", "names": list(titles), "devices": list(titles.values())}
+    return [words | {"rows": rows}] if rows else []
+
+
+def _plain(title: str, quantities: list[Quantity], first: tuple[str, ...]) -> Sheet:
+    rows = [_row(quantity, [quantity.text], is_first=quantity.key in first) for quantity in quantities]
+    rows.sort(key=lambda row: first.index(row["key"]) if row["key"] in first else len(first))
+    return {"title": title, "names": [], "devices": [], "rows": rows}
+
+
+def _row(quantity: Quantity, cells: list[str], *, is_first: bool) -> dict[str, Any]:
+    meaning = quantity.definition
+    words = {"key": quantity.key, "name": quantity.name, "meaning": meaning.meaning, "source": meaning.source}
+    return words | {"cells": cells, "is_first": is_first}

@@ -1,0 +1,89 @@
+"""Worker: `python -m vstent.app.worker KIND FOLDER` does one job of a case and tells of it, a line of JSON each time.
+
+Its standard input closes when the server that started it is gone, however it went; it then ends with all its processes,
+so that the case folder is free when the server starts again.
+"""
+
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.app.cases import Case, load
+from vstent.errors import VstentError
+from vstent.study import run
+from vstent.study.ledger import anatomy_key, hash_of
+
+
+def end_with_the_server() -> None:
+    """Wait until the server is gone, and end."""
+    sys.stdin.read()
+    if hasattr(os, "killpg"):
+        os.killpg(0, signal.SIGKILL)
+    os._exit(1)
+
+
+def tell(**told: Any) -> None:
+    """Say a line to the server."""
+    sys.stdout.write(json.dumps(told) + "\n")
+    sys.stdout.flush()
+
+
+def progress(stage: str, fraction: float, detail: str) -> None:
+    """Tell of a study's stage."""
+    tell(stage=stage, fraction=fraction, detail=detail)
+
+
+def find_anatomy(case: Case) -> None:
+    """Find vessel, sac, neck and parent artery."""
+    from vstent.study import restore_vessel
+
+    _tell_anatomy(case, restore_vessel(case.input, case.folder, case.state.choices.settings(), progress))
+
+
+def _tell_anatomy(case: Case, _: Any) -> None:
+    tell(anatomy=anatomy_key(hash_of(case.input), case.state.choices.settings()))
+
+
+def compute(case: Case) -> None:
+    """Deploy, compute the flow where it is wanted, and write the report: what `vstent run` does."""
+    from vstent.io.writers import write_text
+    from vstent.report import report
+
+    result = run(case.input, case.folder, case.state.choices.settings(), progress)
+    _tell_anatomy(case, result)
+    progress("report", 0.0, "")
+    write_text(case.folder / "report.html", report(result))
+    progress("report", 1.0, "")
+
+
+def rank(case: Case) -> None:
+    """Deploy all sizes of the devices chosen and rank them."""
+    from vstent.app.ranking import rank_sizes
+
+    rank_sizes(case, progress)
+
+
+JOBS: Final[dict[str, Callable[[Case], None]]] = {"anatomy": find_anatomy, "rank": rank, "flow": compute}
+
+
+def main(kind: str, folder: Path) -> int:
+    """Do a job; return the exit code."""
+    threading.Thread(target=end_with_the_server, daemon=True).start()
+    try:
+        JOBS[kind](load(folder.name, folder))
+    except VstentError as error:
+        tell(error=str(error))
+        return 1
+    except OSError as error:
+        tell(error=f"{error.strerror or error}: what was finished is kept.")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1], Path(sys.argv[2])))

@@ -1,0 +1,69 @@
+"""`vstent app`: the page in the browser."""
+
+import argparse
+import importlib.util
+import socket
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vstent.cli import options
+
+if TYPE_CHECKING:
+    from vstent.app.desk import Desk
+
+
+def add(commands: options.Commands) -> None:
+    """Add the command."""
+    parser = options.add_command(commands, "app", "plan a stent on a page in the browser")
+    parser.add_argument("input", type=Path, nargs="?", help="scan, surface or case folder (else drop one on the page)")
+    parser.add_argument("--cases", type=Path, default=Path("vstent-cases"), metavar="DIR", help="folder of the cases")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
+    parser.add_argument("--port", type=int, default=0, help="port to listen at (default: a free one)")
+    parser.add_argument("--no-browser", action="store_true", help="only print the page's address")
+    parser.set_defaults(command=_app)
+
+
+def _app(arguments: argparse.Namespace) -> int:
+    from vstent.errors import InputError
+
+    if importlib.util.find_spec("fastapi") is None or importlib.util.find_spec("uvicorn") is None:
+        raise InputError("The page needs two more packages: run `pip install 'vstent[app]'`, then try again.")
+    import uvicorn
+
+    from vstent.app.server import create, new_token
+
+    desk = open_desk(arguments.input, arguments.cases)
+    listener = _listen(arguments.host, arguments.port)
+    port = listener.getsockname()[1]
+    token = new_token()
+    hosts = tuple(dict.fromkeys(f"{name}:{port}" for name in (arguments.host, "127.0.0.1", "localhost")))
+    guard = create(desk, token=token, hosts=hosts)
+    url = f"http://{arguments.host}:{port}/?token={token}"
+    config = uvicorn.Config(guard, log_level="warning", timeout_graceful_shutdown=1, access_log=False)
+    print(f"vstent is at  {url}\nStop it with Ctrl-C. Research use only.", flush=True)
+    if not arguments.no_browser:
+        webbrowser.open(url)
+    uvicorn.Server(config).run(sockets=[listener])
+    return 0
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """Listen from now on, so that the address printed answers; the server takes over what has come in."""
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener.bind((host, port))
+    listener.listen(128)
+    return listener
+
+
+def open_desk(given: Path | None, workspace: Path) -> "Desk":
+    """Return a desk with what was given at the shell on it, if anything was."""
+    from vstent.app.cases import Store
+    from vstent.app.desk import Desk
+
+    store = Store(workspace.resolve())
+    desk = Desk(store)
+    if given is not None:
+        desk.open(given.resolve())
+    return desk

@@ -1,0 +1,78 @@
+"""`vstent batch`: a folder or a CSV file of cases, with every device, into one table."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vstent.cli import options, run
+
+if TYPE_CHECKING:
+    from vstent.cohort import AbstractCrew, Estimate
+
+
+def add(commands: options.Commands) -> None:
+    """Add the command."""
+    parser = options.add_command(commands, "batch", "many cases x devices -> one table, with a report of the cohort")
+    parser.add_argument("cohort", type=Path, help="folder of scans or surfaces, or CSV file with a column `input`")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, or to go on with")
+    options.add_outlet(options.add_given(parser))
+    run.add_study(parser)
+    working = parser.add_argument_group("working")
+    options.add_jobs(working)
+    working.add_argument("--scheduler", metavar="ADDRESS", help="let the workers of this Dask scheduler do it")
+    working.add_argument("--slurm", action="store_true", help="let --jobs jobs of a Slurm queue do it (dask-jobqueue)")
+    working.add_argument("--files", action="store_true", help="keep all that `vstent run` writes of every case")
+    parser.set_defaults(command=_batch)
+
+
+def _batch(arguments: argparse.Namespace) -> int:
+    from vstent.cohort import collect, device_rows, estimate, find_cases, left_to_do, run_cohort, write_table
+    from vstent.console import Console, cohort_table
+
+    console = Console()
+    settings = run.given_study(arguments, **options.given_geometry(arguments))
+    cases = find_cases(arguments.cohort, settings)
+    tasks = left_to_do(cases, arguments.out, keeps_files=arguments.files)
+    foreseen = estimate([task.case for task in tasks], arguments.jobs)
+    console.print(f"{len(cases)} cases, {device_rows(cases)} rows; {len(tasks)} cases to do: {foreseen.sentence}.")
+    with console.live():
+        run_cohort(tasks, arguments.out, _crew(arguments, foreseen), _teller(console))
+    rows = collect(cases, arguments.out)
+    written = write_table(arguments.out, rows)
+    _report(arguments.out, rows)
+    console.print(cohort_table(rows))
+    console.print(f"Results in {', '.join(str(path) for path in [*written, arguments.out / 'cohort.html'])}.")
+    if len(written) == 1:
+        console.say("No Parquet file: it needs pyarrow, pip install 'vstent[parquet]'.")
+    console.print("Research use only.")
+    return 0
+
+
+def _crew(arguments: argparse.Namespace, foreseen: "Estimate") -> "AbstractCrew":
+    from vstent.cohort import DaskCluster, Processes, Slurm
+
+    if arguments.scheduler:
+        return DaskCluster(arguments.scheduler)
+    if arguments.slurm:
+        return Slurm(arguments.jobs, foreseen.memory_MB)
+    return Processes(foreseen.jobs)
+
+
+def _teller(console: Any) -> Any:
+    def tell(done: int, total: int, name: str, rows: Sequence[dict[str, Any]]) -> None:
+        faults = [f" {row['device']}, {row['outcome']}: {row['sentence']}" for row in rows if row["outcome"] != "done"]
+        console.say(f"{done}/{total} {name} {_seconds(rows)}{''.join(faults)}")
+
+    return tell
+
+
+def _seconds(rows: Sequence[dict[str, Any]]) -> str:
+    return ", ".join(sorted({f"{row['case_s']:.0f} s" for row in rows if "case_s" in row}))
+
+
+def _report(out: Path, rows: Sequence[dict[str, Any]]) -> None:
+    from vstent.io.writers import write_text
+    from vstent.report import cohort_report
+
+    write_text(out / "cohort.html", cohort_report(out.resolve().name, rows))

@@ -1,0 +1,59 @@
+"""`vstent export`: a case for other solvers."""
+
+import argparse
+
+from vstent.cli import options
+
+
+def add(commands: options.Commands) -> None:
+    """Add the command and its own."""
+    parser = options.add_command(commands, "export", "case folder, scan or surface -> files for other solvers")
+    kinds = parser.add_subparsers(required=True, metavar="WHAT")
+    foam = options.add_command(kinds, "openfoam", "an OpenFOAM case folder: mesh, boundary conditions, scripts")
+    _add_input(foam)
+    foam.add_argument("--device", metavar="NAME", help="mesh this device's struts over the neck (none)")
+    options.add_flow(foam)
+    group = foam.add_argument_group("OpenFOAM")
+    group.add_argument("--flavour", choices=("com", "org"), help="openfoam.com or .org (the one found, or com)")
+    group.add_argument("-j", "--processes", type=int, default=1, metavar="N", help="parts to compute at once (1)")
+    group.add_argument("--layers", type=int, default=2, metavar="N", help="layers of flat cells along the wall (2)")
+    foam.set_defaults(command=_openfoam)
+    patches = options.add_command(kinds, "patches", "the blood's boundary as watertight named patches")
+    _add_input(patches)
+    patches.set_defaults(command=_patches)
+
+
+def _add_input(parser: argparse.ArgumentParser) -> None:
+    options.add_outlet(options.add_geometry(parser))
+
+
+def _openfoam(arguments: argparse.Namespace) -> int:
+    from vstent.console import Console
+    from vstent.study import Settings
+    from vstent.study.exports import export_openfoam
+
+    devices = (arguments.device,) if arguments.device else ()
+    settings = Settings(devices=devices, flow=options.given_flow(arguments), **options.given_geometry(arguments))
+    foam = {"processes": arguments.processes, "layers": arguments.layers}
+    if arguments.flavour:
+        foam["flavour"] = arguments.flavour
+    console = Console()
+    with console.live():
+        export_openfoam(arguments.input, arguments.out, settings, foam, console.progress)
+    console.print(f"OpenFOAM case in {arguments.out}: {arguments.out / 'Allrun'} runs it. Research use only.")
+    return 0
+
+
+def _patches(arguments: argparse.Namespace) -> int:
+    from vstent.console import Console
+    from vstent.study import Settings
+    from vstent.study.exports import export_patches
+
+    settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
+    console = Console()
+    with console.live():
+        patches = export_patches(arguments.input, arguments.out, settings, console.progress)
+    for patch in patches:
+        console.print(f"{patch['patch_id']:3d}  {patch['name']:10s} {patch['area_mm2']:9.2f} mm2")
+    console.print(f"Patches in {arguments.out}, lengths in mm. Research use only.")
+    return 0

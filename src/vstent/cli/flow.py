@@ -1,0 +1,64 @@
+"""`vstent flow`: the flow alone, in any vessel, sac or not, stent or not."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vstent.cli import options
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from vstent.console import Console
+    from vstent.study import Settings
+
+
+def add(commands: options.Commands) -> None:
+    """Add the command."""
+    parser = options.add_command(
+        commands, "flow", "scan or surface -> blood flow, in any vessel, with or without devices"
+    )
+    options.add_outlet(options.add_geometry(parser))
+    parser.add_argument("--device", action="append", metavar="NAME", help="a device of the catalogue too; repeatable")
+    flow = options.add_flow(parser)
+    flow.add_argument("--steady", action="store_true", help="at the mean inflow, not pulsing (the default)")
+    flow.add_argument(
+        "--convergence", action="store_true", help="the bare flow on three grids and with three time steps, compared"
+    )
+    parser.set_defaults(command=_flow)
+
+
+def _flow(arguments: argparse.Namespace) -> int:
+    from vstent.console import Console
+    from vstent.study import Settings
+
+    flow = options.given_flow(arguments)
+    if arguments.steady:
+        flow = replace(flow, waveform=None)
+    devices = tuple(dict.fromkeys(arguments.device or ()))
+    settings = Settings(devices=devices, flow=flow, **options.given_geometry(arguments))
+    console = Console()
+    compute = _converge if arguments.convergence else _compute
+    for table in compute(arguments.input, arguments.out, settings, console):
+        console.print(table)
+    console.print(f"Results in {arguments.out}. Research use only.")
+    return 0
+
+
+def _compute(path: Path, out: Path, settings: "Settings", console: "Console") -> "list[Table]":
+    from vstent.console import flow_table
+    from vstent.study import run
+
+    with console.live():
+        case = run(path, out, settings, console.progress)
+    return [flow_table(case.metrics)]
+
+
+def _converge(path: Path, out: Path, settings: "Settings", console: "Console") -> "list[Table]":
+    from vstent.console import convergence_table
+    from vstent.study import refine_flow
+
+    with console.live():
+        found = refine_flow(path, out, settings, console.progress)
+    return [convergence_table(one) for one in found]

@@ -1,0 +1,144 @@
+"""Cases: what a folder or a CSV file says is to be done."""
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.device import find_design
+from vstent.errors import InputError, ReadError
+from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
+from vstent.study import Settings
+from vstent.study.ledger import hash_of, key_of, refuse_missing
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One patient of a cohort."""
+
+    name: str
+    """Its name in the table, and that of its folder."""
+    path: Path
+    """Scan or surface."""
+    settings: Settings
+    """What is given; its devices are those to do."""
+
+    @cached_property
+    def keys(self) -> dict[str, str]:
+        """Key of every device's row: names everything that the row depends on."""
+        source = hash_of(self.path)
+        return {name: key_of(source, replace(self.settings, devices=(name,))) for name in self.settings.devices}
+
+
+def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:
+    """Return the cases of a folder (every scan or surface in it) or of a CSV file.
+
+    Parameters
+    ----------
+    cohort : a folder, or a CSV file with titles. Its column ``input`` holds paths (relative ones from the file's
+        folder), ``case`` names (else the file's), ``devices`` names parted by blanks; the other columns are settings:
+        ``units``, ``threshold``, ``at``, ``inlet``, ``outlet``, ``spacing``, ``shape``, ``diameter``, ``length``,
+        ``center``. An empty cell takes what `settings` says.
+    settings : for every case.
+
+    Raises
+    ------
+    ReadError
+        When there is no such folder or file, or no case in it.
+    InputError
+        When a row of the file is wrong or two cases have one name.
+    """
+    refuse_missing(cohort)
+    cases = _in_folder(cohort, settings) if cohort.is_dir() else _in_file(cohort, settings)
+    if not cases:
+        raise ReadError(f"{cohort} holds no case: give a folder of scans or surfaces, or a CSV file of their paths")
+    names = [case.name for case in cases]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"{cohort} has two cases called {twice[0]}: name them in a CSV file's column `case`")
+    for device in {device for case in cases for device in case.settings.devices}:
+        find_design(device)
+    return tuple(cases)
+
+
+def _in_folder(folder: Path, settings: Settings) -> list[Case]:
+    shown = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    return [Case(_name(path), path, settings) for path in shown if _is_case(path)]
+
+
+def _is_case(path: Path) -> bool:
+    if path.is_dir():
+        return any(file.is_file() for file in path.iterdir())  # a DICOM series has no names to go by
+    return suffix(path) in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES)
+
+
+def _name(path: Path) -> str:
+    return path.name if path.is_dir() else path.name[: len(path.name) - len(suffix(path))] or path.name
+
+
+def _in_file(path: Path, settings: Settings) -> list[Case]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} cannot be read as a CSV file: {error}. Write it in UTF-8, with titles.") from error
+    return [_case(path, number, row, settings) for number, row in enumerate(rows, start=2)]
+
+
+def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Case:
+    given = {str(key).strip(): value.strip() for key, value in row.items() if isinstance(value, str) and value.strip()}
+    where = f"line {line} of {file}"
+    unknown = sorted(set(given) - {"case", "input", *COLUMNS})
+    if unknown:
+        raise InputError(f"{where} has a column {unknown[0]!r}: the columns are case, input, {', '.join(COLUMNS)}")
+    if "input" not in given:
+        raise InputError(f"{where} names no input: fill its column `input`")
+    path = file.parent / given["input"]
+    changes: dict[str, Any] = {}
+    for title in set(given) & set(COLUMNS):
+        name, read = COLUMNS[title]
+        try:
+            changes[name] = read(given[title])
+        except ValueError as error:
+            raise InputError(f"{where}: {title} is {given[title]!r}, which cannot be used: {error}") from error
+    name = given.get("case", _name(path))
+    if Path(name).name != name:
+        raise InputError(f"{where} calls its case {name!r}: give a name without slashes")
+    return Case(name, path, replace(settings, **changes))
+
+
+def _three(kind: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+    def read(text: str) -> tuple[Any, ...]:
+        values = tuple(kind(word) for word in text.replace(",", " ").replace(";", " ").split())
+        if len(values) != 3:
+            raise ValueError("three numbers are needed")
+        return values
+
+    return read
+
+
+def _devices(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(text.replace(",", " ").replace(";", " ").split()))
+
+
+COLUMNS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
+    "devices": ("devices", _devices),
+    "units": ("units", str),
+    "threshold": ("threshold", float),
+    "at": ("at_mm", _three(float)),
+    "inlet": ("inlet_mm", _three(float)),
+    "outlet": ("outlet_mm", _three(float)),
+    "spacing": ("spacing_mm", _three(float)),
+    "shape": ("shape", _three(int)),
+    "diameter": ("diameter_mm", float),
+    "length": ("length_mm", float),
+    "center": ("center_mm", float),
+}
+"""Titles of a CSV file's columns: the setting each fills, and how it is read."""
+
+
+def device_rows(cases: Sequence[Case]) -> int:
+    """Number of rows that the cohort's table will have."""
+    return sum(len(case.settings.devices) for case in cases)

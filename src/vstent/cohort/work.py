@@ -1,0 +1,158 @@
+"""Work: one case done, whatever comes: a row a device, written as soon as it is known."""
+
+import json
+import shutil
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.cohort.cases import Case
+from vstent.errors import VstentError
+from vstent.io.writers import write_json, write_text
+from vstent.study import Progress, Settings, restore_vessel, run
+
+Row = dict[str, Any]
+"""One case with one device: names to values."""
+
+DONE: Final = "done"
+FAILED: Final = "failed"
+"""The input cannot be used, or a flow cannot be computed: doing it again changes nothing."""
+LOST: Final = "lost"
+"""The process died: done again by the next run."""
+MB: Final = 1e6
+_ALONE: Final = threading.Lock()
+"""Compiled kernels that run in parallel bear one caller in a process; a Dask worker may have several threads."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is left to do of one case."""
+
+    case: Case
+    """The case; its devices are those whose rows are missing."""
+    folder: Path
+    """Where its rows are written."""
+    keys: Mapping[str, str]
+    """Key of every missing row, by device."""
+    keeps_files: bool = False
+    """Keep all that `vstent run` writes, in ``study`` beside the rows."""
+
+
+class _Watch:
+    """Knows which stage is at work."""
+
+    stage = "read"
+
+    def __call__(self, stage: str, fraction: float, detail: str) -> None:
+        self.stage = stage
+
+
+def row_path(folder: Path, device: str) -> Path:
+    """Where the row of a device lies in a case's folder."""
+    return folder / f"{device}.json"
+
+
+def work(task: Task) -> None:
+    """Do one case: run its study with every missing device and write the rows.
+
+    A device that does not fit, or an input that cannot be used, is a row too, with the stage and the sentence.
+    """
+    import numba
+
+    with _ALONE:
+        numba.set_num_threads(1)  # as many cases at once as there are cores
+        began, cpu = time.perf_counter(), time.process_time()
+        rows = _rows(task)
+        done = tuple(device for device, row in rows.items() if row["outcome"] == DONE)
+        if task.keeps_files and len(done) > 1:  # the folder of one study with all devices: nothing is computed anew
+            run(task.case.path, task.folder / "study", replace(task.case.settings, devices=done), _Watch())
+        if not task.keeps_files:
+            shutil.rmtree(task.folder / "study", ignore_errors=True)
+        cost = {
+            "case_s": time.perf_counter() - began,
+            "case_cpu_s": time.process_time() - cpu,
+            "peak_memory_MB": peak_memory_MB(),
+        }
+        for device, row in rows.items():
+            write_row(task, device, row | cost)
+
+
+def _rows(task: Task) -> dict[str, Row]:
+    """Do the artery once, then every device in it; what cannot be done is told in the row."""
+    case, study = task.case, task.folder / "study"
+    devices = case.settings.devices
+    failed = _failure(task, lambda watch: restore_vessel(case.path, study, case.settings, watch))
+    if failed:
+        return dict.fromkeys(devices, failed)
+    rows: dict[str, Row] = {}
+    for device in devices:
+        alone = replace(case.settings, devices=(device,))
+
+        def with_device(watch: Progress, device: str = device, alone: Settings = alone) -> None:
+            found = run(case.path, study, alone, watch)
+            advice = found.deployments[device].advice
+            rows[device] = {"outcome": DONE, "stage": "", "sentence": advice} | flat_metrics(found.metrics, device)
+
+        failed = _failure(task, with_device)
+        if failed:
+            rows[device] = failed
+    return rows
+
+
+def _failure(task: Task, do: Callable[[Progress], object]) -> Row:
+    """Do something; return the row of its failure, empty where there was none."""
+    watch = _Watch()
+    try:
+        do(watch)
+    except VstentError as error:
+        return {"outcome": FAILED, "stage": watch.stage, "sentence": str(error)}
+    except Exception as error:  # noqa: BLE001 one case's fault must not end the cohort; it is told in its row
+        write_text(task.folder / "traceback.txt", traceback.format_exc())
+        sentence = f"vstent did not foresee this, {type(error).__name__}: {error}. Report it with traceback.txt."
+        return {"outcome": FAILED, "stage": watch.stage, "sentence": sentence}
+    return {}
+
+
+def flat_metrics(metrics: Mapping[str, Any], device: str) -> Row:
+    """Every number of a study's metrics that concerns a device, under names parted by dots."""
+    parts = {"vessel": metrics["vessel"], "bare": metrics.get("bare", {})} | dict(metrics["stents"][device])
+    return _flat(parts, "")
+
+
+def _flat(values: Mapping[str, Any], before: str) -> Row:
+    row: Row = {}
+    for name, value in values.items():
+        row |= _flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {f"{before}{name}": value}
+    return row
+
+
+def write_row(task: Task, device: str, row: Row) -> None:
+    """Write the row of a device, with the key of all that it depends on."""
+    named = {"case": task.case.name, "device": device} | row
+    kept = {"key": task.keys[device], "row": named, "settings": asdict(task.case.settings)}
+    write_json(row_path(task.folder, device), kept)
+
+
+def read_row(folder: Path, device: str, key: str) -> Row | None:
+    """Return the row of a device; None where it is missing, damaged, or of another input or version."""
+    try:
+        kept = json.loads(row_path(folder, device).read_text(encoding="utf-8"))
+        return dict(kept["row"]) if kept["key"] == key else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def peak_memory_MB() -> float | None:
+    """Largest resident memory of this process so far; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    import sys
+
+    per_unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * per_unit / MB

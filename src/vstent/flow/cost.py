@@ -1,0 +1,149 @@
+"""What a flow will cost, told before it is spent; what does not fit in the memory is refused."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from time import perf_counter
+
+import numba
+import numpy as np
+
+from vstent.errors import FlowError
+from vstent.flow.domain import INLET_EXTENSION, OUTLET_EXTENSION, default_cell_size_mm
+from vstent.flow.engines import lattice_pulse
+from vstent.flow.types import FlowCase
+from vstent.kernels import lattice
+
+BYTES_PER_CELL = 600
+"""Peak memory per blood cell (measured on 0.3 to 0.8 million cells: 300 to build and step, 130 for the last checks; the
+rest is what other flows of the same study keep)."""
+BYTES_PER_PHASE_AND_CELL = 32
+"""Memory for every kept phase of a cycle and its cell."""
+BYTES_PER_GRID_POINT = 6
+"""Memory per point of the box around the vessel (3 measured)."""
+BYTES_AT_LEAST = 4.5e8
+"""Memory of the program itself, its compiled kernels and one surface."""
+WHOLE_OVER_BLOCK = 1.3
+"""Time of a flow over that of its steps in a block of blood: walls, openings, checks, the first guess (measured)."""
+BLOCK_ROWS = 4096
+"""Rows of the block that the rate is measured on."""
+MARGIN = 1.05
+"""The cell size that is said to fit leaves this much room."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one flow will take."""
+
+    cell_size_mm: float
+    """Edge of a cell."""
+    cells: int
+    """Cells of blood, extensions included."""
+    memory_bytes: int
+    """Peak memory."""
+    steps: int
+    """Most time steps."""
+    seconds: float
+    """Most time, at the measured rate."""
+
+    def __str__(self) -> str:
+        """One sentence."""
+        return (
+            f"{self.cells / 1e3:,.0f} thousand cells of {self.cell_size_mm:.3g} mm, {self.memory_bytes / 1e9:.2g} GB, "
+            f"at most {self.steps:,} time steps or {self.seconds / 60:.2g} min a flow."
+        )
+
+
+def estimate(case: FlowCase) -> Cost:
+    """Estimate what a flow takes, from the vessel's volume and a rate measured here and now."""
+    cell_size_mm = default_cell_size_mm(case)
+    cells, memory_bytes = _size(case, cell_size_mm)
+    steps = _steps(case, cell_size_mm)
+    return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, cells * steps / block_rate() * WHOLE_OVER_BLOCK)
+
+
+def refuse_too_large(case: FlowCase, free_bytes: float | None = None) -> None:
+    """Refuse a flow that does not fit in the free memory.
+
+    Raises
+    ------
+    FlowError
+        Naming the cell size that would fit.
+    """
+    free_bytes = free_memory_bytes() if free_bytes is None else free_bytes
+    cell_size_mm = default_cell_size_mm(case)
+    cells, memory_bytes = _size(case, cell_size_mm)
+    if memory_bytes <= free_bytes:
+        return
+    fitting_mm = cell_size_mm
+    while _size(case, fitting_mm)[1] > free_bytes and fitting_mm < 1e3 * cell_size_mm:
+        fitting_mm *= MARGIN
+    raise FlowError(
+        f"the flow on {cells / 1e6:.3g} million cells of {cell_size_mm:.3g} mm needs {memory_bytes / 1e9:.2g} GB, but "
+        f"{free_bytes / 1e9:.2g} GB of memory are free: set a cell size of {fitting_mm:.2g} mm"
+    )
+
+
+def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
+    """Cells and bytes."""
+    vessel = case.vessel
+    ends = [
+        k.area_mm2 * k.diameter_mm * (OUTLET_EXTENSION if n else INLET_EXTENSION) for n, k in enumerate(vessel.openings)
+    ]
+    volume_mm3 = abs(vessel.closed.volume_mm3) + sum(ends)
+    widest = max(opening.diameter_mm for opening in vessel.openings)
+    box_mm3 = float(np.prod(np.ptp(vessel.lumen.vertices_mm, axis=0) + 2 * widest))
+    cells = volume_mm3 / cell_size_mm**3
+    phases = 0 if case.settings.waveform is None else lattice_pulse.PHASES
+    per_cell = BYTES_PER_CELL + phases * BYTES_PER_PHASE_AND_CELL
+    return cells, BYTES_AT_LEAST + cells * per_cell + box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT
+
+
+def _steps(case: FlowCase, cell_size_mm: float) -> int:
+    """Most time steps."""
+    settings = case.settings
+    if settings.waveform is None:
+        return settings.max_steps
+    engine = lattice_pulse.PulsatileLatticeBoltzmann(cell_size_mm)
+    return engine.steps_per_phase(case, None) * lattice_pulse.PHASES * settings.max_cycles
+
+
+@cache
+def block_rate() -> float:
+    """Cell updates per second in a block of blood without walls, measured with the threads that will be used."""
+    length, threads = np.full(BLOCK_ROWS, 64, np.int32), numba.get_num_threads()
+    stride = int(length.sum())
+    address = (64 * np.arange(BLOCK_ROWS)[:, None] + stride * np.arange(19)).astype(np.int32)
+    f = np.zeros(19 * stride + lattice.LANES, np.float32)
+    nothing = np.zeros(BLOCK_ROWS + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
+    limit = np.full(BLOCK_ROWS, np.inf, np.float32)
+    times: list[float] = []
+    for _ in range(4):
+        began = perf_counter()
+        lattice.update(f, address, length, np.float32(0.6), limit, np.float32(0.7), *nothing, threads)
+        times.append(perf_counter() - began)
+    return stride / min(times)
+
+
+def free_memory_bytes() -> float:
+    """Memory that can be had: the machine's, or the container's where that is less; infinite where neither says."""
+    return min(_available_bytes(), _container_bytes())
+
+
+def _available_bytes() -> float:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return float("inf")
+
+
+def _container_bytes() -> float:
+    """What a Linux control group leaves; file pages that it can drop count as free."""
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit, used = (float((group / name).read_text()) for name in ("memory.max", "memory.current"))
+        of_files = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        return limit - used + float(of_files.get("inactive_file", 0))
+    except (OSError, ValueError):
+        return float("inf")

@@ -1,0 +1,58 @@
+"""Why a lattice-Boltzmann run diverged, from the last check at which all was well."""
+
+import numpy as np
+
+from vstent.flow.engines.lattice_setup import CELL_REYNOLDS_AT_END
+from vstent.flow.engines.lattice_state import Snapshot, State
+from vstent.kernels.arrays import Floats
+
+FAST = 0.3
+"""Speed in cells per time step from which the lattice's own sound (0.58) is too near."""
+
+
+def trouble(state: State) -> str:
+    """One sentence: what happened, the last good state, the likeliest cause and what to do about it."""
+    good = [one for one in state.snapshots if np.isfinite(one.velocity).all()]
+    when_ms = 1e3 * state.steps * state.scales.step_s
+    if not good:
+        return (
+            f"the flow diverged within the first {when_ms:.3g} ms, before any check: the time step is too long for its "
+            "speed; halve the lattice speed or the cell size"
+        )
+    last = good[-1]
+    speed = np.linalg.norm(last.velocity, axis=1)
+    fastest = int(speed.argmax())
+    behind = next(k for k, one in enumerate(reversed(state.snapshots)) if one is last)
+    good_ms = when_ms - 1e3 * behind * state.steps_per_check * state.scales.step_s
+    return (
+        f"the flow diverged between {good_ms:.3g} and {when_ms:.3g} ms; at the last good check the fastest blood moved "
+        f"{speed[fastest] * state.scales.speed_m_s:.2g} m/s at {_place(state.domain.centers_mm[fastest])}: "
+        + _cause(state, last, speed, fastest)
+    )
+
+
+def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
+    if speed[fastest] > FAST:
+        return (
+            f"the time step is too long, for that is {speed[fastest]:.2g} cells a step; halve the lattice speed "
+            f"({state.case.settings.lattice_speed:.3g})"
+        )
+    coming_back = [k for k in range(1, len(last.outflow)) if _backflow(state, last, k) > FAST * speed[fastest]]
+    if coming_back:
+        role = state.case.vessel.openings[coming_back[0]].role
+        return f"blood comes back through {role}; cut the vessel further from there, or share the outflow (murray)"
+    cell_reynolds = speed[fastest] / state.scales.viscosity
+    return (
+        f"the grid is too coarse for it (speed x cell / viscosity = {cell_reynolds:.0f}, in the openings' extensions "
+        f"at most {CELL_REYNOLDS_AT_END:.0f}); set a cell size of {0.7 * state.domain.cell_size_mm:.2g} mm"
+    )
+
+
+def _backflow(state: State, last: Snapshot, k: int) -> float:
+    """Fastest blood that enters through outlet k, in cells a step."""
+    cell = state.domain.link_cell[state.domain.link_patch == k + 1]
+    return float(-(last.velocity[cell] @ state.case.vessel.openings[k].normal).min()) if len(cell) else 0.0
+
+
+def _place(point_mm: Floats) -> str:
+    return "(" + ", ".join(f"{x:.1f}" for x in point_mm) + ") mm"

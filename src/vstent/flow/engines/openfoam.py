@@ -1,0 +1,244 @@
+"""The engine that hands the flow to OpenFOAM: meshes, computes from check to check, reads the fields back.
+
+The finite volumes of OpenFOAM are of any shape; what is returned lies on the same regular grid as the embedded engine's
+flow, so that every index, streamline and picture takes either.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.errors import FlowError
+from vstent.flow import domain as domains
+from vstent.flow.engines import AbstractEngine, Outcome
+from vstent.flow.engines.lattice_boltzmann import CHECKS_AGREEING, CHECKS_AVERAGED, fraction_left
+from vstent.flow.engines.lattice_pulse import PHASES, cycle_change
+from vstent.flow.openfoam import folder as folders
+from vstent.flow.openfoam import program, results
+from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
+from vstent.flow.openfoam.case import foam_case
+from vstent.flow.openfoam.setup import FoamSetup
+from vstent.flow.types import FlowCase, FlowField, Phase
+from vstent.kernels.arrays import Floats, Ints
+from vstent.surface import Surface
+
+CHECK_ITERATIONS: Final = 20
+"""Iterations of a steady flow between checks."""
+CHECKS_HELD: Final = 3
+"""Checks at which the inflow is corrected for the inlet's meshed area."""
+
+
+@dataclass(eq=False)
+class State:
+    """A run under way in a folder; its files change."""
+
+    case: FlowCase
+    """What is computed."""
+    setup: FoamSetup
+    """How."""
+    found: program.Program
+    """OpenFOAM."""
+    application: str
+    """The solver's program."""
+    folder: Path
+    """The case folder."""
+    domain: domains.Domain
+    """The grid of the result."""
+    bridge: Bridge
+    """From OpenFOAM's cells to it."""
+    sac_cells: Ints
+    """Cells of the sac, or of the whole lumen where there is none."""
+    snapshots: deque[Snapshot]
+    """The flow at the last checks."""
+    is_settled: bool = False
+    """Whether the solver's own residuals are below their limits."""
+    history: list[Floats] = field(default_factory=list)
+    """Monitored quantities at every check."""
+    loop_seconds: float = 0.0
+    """Time in the solver."""
+
+    @property
+    def is_pulse(self) -> bool:
+        """Whether the inflow follows a waveform."""
+        return self.case.settings.waveform is not None
+
+
+@dataclass(frozen=True, eq=False)
+class OpenFoam(AbstractEngine[State]):
+    """OpenFOAM's laminar solvers on a mesh by snappyHexMesh: simpleFoam, or pimpleFoam along a waveform."""
+
+    cell_size_mm: float
+    """Edge of a cell of OpenFOAM's mesh in the vessel, before layers and refinement."""
+    folder: Path
+    """Case folder; a run of the same case that stopped there goes on from the last time written."""
+    processes: int = 1
+    """Processes on this machine."""
+    struts: Surface | None = None
+    """Solids of a device to mesh."""
+    layers: int = 2
+    """Layers of flat cells along the wall."""
+    grid_size_mm: float | None = None
+    """Edge of a cell of the result's grid; None: as OpenFOAM's."""
+
+    def init(self, case: FlowCase, start: FlowField | None) -> State:
+        """Find OpenFOAM, write the case, mesh it, and find the way from its cells to the grid."""
+        if case.screen is not None:
+            raise FlowError(
+                "OpenFOAM's porous zones resist alike in every cell, a screen does not: mesh the device's struts, or "
+                "take the embedded engine"
+            )
+        found = program.find()
+        setup = FoamSetup(self.cell_size_mm, found.flavour, self.layers, processes=self.processes, struts=self.struts)
+        foam = foam_case(case, setup)
+        folders.prepare(self.folder, foam)
+        folders.mesh(found, self.folder, setup)
+        if start is not None and not results.times(self.folder):
+            folders.begin_from(self.folder, start)
+        domain = domains.build(case.vessel, self.grid_size_mm or self.cell_size_mm)
+        sac = np.arange(len(domain.cells), dtype=np.int32)
+        if case.sac is not None:
+            sac = domains.cells_inside(case.sac, domain.centers_mm, domain.cell_size_mm).astype(np.int32)
+        across = bridge(case, domain, self.folder)
+        kept: deque[Snapshot] = deque(maxlen=PHASES if case.settings.waveform else CHECKS_AVERAGED)
+        return State(case, setup, found, foam.application, self.folder, domain, across, sac, kept)
+
+    def step(self, state: State) -> State:
+        """Run the solver to the next check and read what it wrote."""
+        began = perf_counter()
+        reached = results.times(state.folder)
+        end = _next_end(state, float(reached[-1]) if reached else 0.0)
+        folders.stop_at(state.folder, end, every=None if state.is_pulse else CHECK_ITERATIONS)
+        said = program.run(state.found, state.folder, [state.application], processes=state.setup.processes)
+        state.loop_seconds += perf_counter() - began
+        state.snapshots.append(read(state.case, state.bridge, state.folder, results.times(state.folder)[-1]))
+        state.history.append(_monitored(state, state.snapshots[-1]))
+        state.is_settled = not _correct_inflow(state) and "solution converged" in said
+        return state
+
+    def terminate(self, state: State) -> float:
+        """Fraction that the monitored quantities have left to go, or the change from cycle to cycle."""
+        history = np.array(state.history)
+        if not np.isfinite(history[-1]).all():
+            return float("nan")
+        if state.is_pulse:
+            return cycle_change(history)
+        if state.is_settled:
+            return 0.0
+        return max(fraction_left(history[: len(history) - k]) for k in range(min(CHECKS_AGREEING, len(history))))
+
+    def save(self, state: State) -> dict[str, NDArray[Any]]:
+        """Return nothing: OpenFOAM's own times in the case folder are what a run goes on from."""
+        return {}
+
+    def resume(self, case: FlowCase, saved: dict[str, NDArray[Any]]) -> State:
+        """Go on from the last time written."""
+        return self.init(case, None)
+
+    def trouble(self, state: State) -> str:
+        """Say where the run diverged."""
+        good = state.snapshots[-2].time if len(state.snapshots) > 1 else "none"
+        return (
+            f"OpenFOAM's flow diverged at time {state.snapshots[-1].time} (last good state: {good}) in {state.folder}: "
+            "change the cell size a little or take fewer layers"
+        )
+
+    def max_checks(self, state: State) -> int:
+        """Checks within the limit of iterations, or phases of all cycles."""
+        if state.is_pulse:
+            return PHASES * state.case.settings.max_cycles
+        return state.setup.iterations // CHECK_ITERATIONS
+
+    def result(self, state: State, outcome: Outcome) -> FlowField:
+        """Return the last check, or the mean: of the last checks where the flow has not settled, of a pulse's cycle."""
+        is_last = outcome.is_converged and not state.is_pulse
+        return _field_of(state, [state.snapshots[-1]] if is_last else list(state.snapshots), outcome)
+
+
+def _next_end(state: State, reached: float) -> float:
+    waveform = state.case.settings.waveform
+    if waveform is None:
+        return reached + CHECK_ITERATIONS
+    phase_s = waveform.period_s / PHASES
+    return (round(reached / phase_s) + 1) * phase_s
+
+
+def _monitored(state: State, now: Snapshot) -> Floats:
+    """Mean speed of the sac, pressure at the inlet, mean speed of the vessel, neck inflow: as the embedded engine."""
+    speed = np.linalg.norm(now.velocity_m_s, axis=1)
+    inlet = state.domain.link_cell[state.domain.link_patch == 1]
+    values = [speed[state.sac_cells].mean(), now.pressure_Pa[inlet].mean(), speed.mean()]
+    return np.array([*values, now.neck_inflow_mL_s] if state.case.ostium is not None else values, dtype=float)
+
+
+def _correct_inflow(state: State) -> bool:
+    """Correct the inlet's mean speed for its meshed area, less than its section's; tell whether that was due."""
+    settings, now = state.case.settings, state.snapshots[-1]
+    wanted_mL_s = state.case.inflow_mL_s * float(settings.inflow_factor(np.array([float(now.time)]))[0])
+    if len(state.history) > CHECKS_HELD or abs(wanted_mL_s) < 0.2 * state.case.inflow_mL_s:
+        return False
+    factor = -wanted_mL_s / now.outflow_mL_s[0]
+    return abs(factor - 1) > 1e-5 and folders.scale_inflow(state.folder, factor)
+
+
+def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField:
+    def mean(name: str) -> Floats:
+        return np.asarray(np.mean([getattr(one, name) for one in kept], axis=0))
+
+    vessel, domain = state.case.vessel, state.domain
+    pressure_Pa, outflow_mL_s = mean("pressure_Pa"), mean("outflow_mL_s")
+    section_Pa = np.array([_section_pressure_Pa(state, pressure_Pa, k) for k in range(len(vessel.openings))])
+    steps = len(state.history) * (1 if state.is_pulse else CHECK_ITERATIONS)
+    return FlowField(
+        cells=domain.cells,
+        origin_mm=domain.origin_mm,
+        cell_size_mm=domain.cell_size_mm,
+        velocity_m_s=mean("velocity_m_s"),
+        pressure_Pa=pressure_Pa,
+        wall=vessel.lumen,
+        wall_shear_stress_Pa=mean("wall_shear_stress_Pa"),
+        wall_pressure_Pa=mean("wall_pressure_Pa"),
+        inlet_mL_s=-outflow_mL_s[0],
+        outlets_mL_s=outflow_mL_s[1:],
+        inlet_pressure_Pa=section_Pa[0],
+        outlet_pressure_Pa=section_Pa[1:],
+        blood=state.case.blood,
+        is_converged=outcome.is_converged,
+        advice=_advice(state, outcome),
+        residual=np.array(outcome.residual),
+        steps=steps,
+        seconds=outcome.seconds,
+        updates_per_s=state.bridge.n_cells * steps / max(state.loop_seconds, 1e-9),
+        phases=tuple(map(_phase, kept)) if state.is_pulse else (),
+    )
+
+
+def _phase(one: Snapshot) -> Phase:
+    inlet_mL_s = -float(one.outflow_mL_s[0])
+    return Phase(float(one.time), inlet_mL_s, one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa)
+
+
+def _section_pressure_Pa(state: State, pressure_Pa: Floats, k: int) -> float:
+    """Mean pressure of the cells on the plane of opening k itself, not of its extension's end."""
+    opening = state.case.vessel.openings[k]
+    offset = state.domain.centers_mm - opening.center_mm
+    near = np.abs(offset @ opening.normal) < state.domain.cell_size_mm
+    near &= np.linalg.norm(offset, axis=1) < 0.75 * opening.diameter_mm
+    return float(pressure_Pa[near].mean()) if near.any() else float("nan")
+
+
+def _advice(state: State, outcome: Outcome) -> str:
+    mesh = f"OpenFOAM on {state.bridge.n_cells} cells ({state.folder})."
+    if state.is_pulse:
+        cycles = len(state.history) // PHASES
+        return f"Cycle {cycles} repeats the one before to within {100 * outcome.residual[-1]:.1f} %. {mesh}"
+    if outcome.is_converged:
+        return f"The flow has settled. {mesh}"
+    return (
+        f"The steady solver has not settled in {state.setup.iterations} iterations: the flow may be unsteady by "
+        f"nature; follow it in time with a waveform. {mesh}"
+    )

@@ -1,0 +1,177 @@
+"""Dictionaries of the computation: schemes, solvers, times, fluid, what is sampled, how it is cut into parts."""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from vstent.flow.openfoam.dictionary import foam_file
+from vstent.flow.openfoam.mesh import NECK
+from vstent.flow.openfoam.setup import FoamSetup
+from vstent.flow.types import Blood, FlowCase
+from vstent.kernels.arrays import Floats
+
+PHASES: Final = 20
+"""Times at which a cycle is written."""
+MAX_COURANT: Final = 2.0
+"""Largest Courant number of a transient flow: implicit steps may pass 1 where cells are flat or small."""
+FIELD_LIBRARY: Final = ['"libfieldFunctionObjects.so"']
+
+
+def schemes(*, is_steady: bool) -> str:
+    """fvSchemes: second order in space, and in time where it counts."""
+    bounded = "bounded Gauss" if is_steady else "Gauss"
+    entries = {
+        "ddtSchemes": {"default": "steadyState" if is_steady else "backward"},
+        "gradSchemes": {"default": "Gauss linear", "grad(U)": "Gauss linear"},
+        "divSchemes": {
+            "default": "none",
+            "div(phi,U)": f"{bounded} LUST grad(U)",
+            "div((nuEff*dev2(T(grad(U)))))": "Gauss linear",
+        },
+        "laplacianSchemes": {"default": "Gauss linear limited 0.5"},
+        "interpolationSchemes": {"default": "linear"},
+        "snGradSchemes": {"default": "limited 0.5"},
+    }
+    return foam_file("fvSchemes", entries)
+
+
+def solution() -> str:
+    """fvSolution: SIMPLE for steady flow, PISO (PIMPLE with one outer loop) for transient."""
+    pressure = {"solver": "GAMG", "smoother": "GaussSeidel", "tolerance": 1e-9, "relTol": 0.05}
+    velocity = {"solver": "smoothSolver", "smoother": "symGaussSeidel", "tolerance": 1e-9, "relTol": 0.05}
+    entries = {
+        "solvers": {
+            "p": pressure,
+            "pFinal": pressure | {"relTol": 0.01},
+            "Phi": pressure,
+            "U": velocity,
+            "UFinal": velocity | {"relTol": 0},
+        },
+        "SIMPLE": {
+            "consistent": True,
+            "nNonOrthogonalCorrectors": 1,
+            "residualControl": {"p": 1e-5, "U": 1e-5},
+        },
+        "PIMPLE": {"nOuterCorrectors": 1, "nCorrectors": 2, "nNonOrthogonalCorrectors": 1},
+        "potentialFlow": {"nNonOrthogonalCorrectors": 5},
+        "relaxationFactors": {"equations": {"U": 0.8, "UFinal": 1}},
+        "cache": {"grad(U)": ""},
+    }
+    return foam_file("fvSolution", entries)
+
+
+def control(case: FlowCase, setup: FoamSetup, step_s: float, *, walls: Sequence[str], has_neck: bool) -> str:
+    """controlDict: steady in iterations, or transient in seconds with steps bounded by the Courant number.
+
+    Parameters
+    ----------
+    case, setup : what is computed, and where.
+    step_s : first time step of a transient flow.
+    walls : names of the patches that are wall.
+    has_neck : whether the flow through the neck is sampled.
+    """
+    is_org, is_steady = setup.flavour == "org", case.settings.waveform is None
+    program = "foamRun" if is_org else "simpleFoam" if is_steady else "pimpleFoam"
+    patches = [opening.role for opening in case.vessel.openings]
+    entries: dict[str, Any] = {"application": program} | ({"solver": "incompressibleFluid"} if is_org else {})
+    entries |= {"startFrom": "latestTime", "startTime": 0, "stopAt": "endTime"}
+    entries |= _steady_times(setup) if is_steady else _transient_times(case, step_s)
+    entries |= {
+        "writeFormat": "ascii",
+        "writePrecision": 9,
+        "timePrecision": 9,
+        "runTimeModifiable": False,
+        "functions": _functions(setup, patches, walls, has_neck),
+    }
+    return foam_file("controlDict", entries)
+
+
+def _steady_times(setup: FoamSetup) -> dict[str, Any]:
+    every = {"writeControl": "timeStep", "writeInterval": 50, "purgeWrite": 2}
+    return {"endTime": setup.iterations, "deltaT": 1} | every
+
+
+def _transient_times(case: FlowCase, step_s: float) -> dict[str, Any]:
+    waveform = case.settings.waveform
+    assert waveform is not None
+    return {
+        "endTime": case.settings.max_cycles * waveform.period_s,
+        "deltaT": step_s,
+        "adjustTimeStep": True,
+        "maxCo": MAX_COURANT,
+        "maxDeltaT": waveform.period_s / PHASES,
+        "writeControl": "adjustableRunTime",
+        "writeInterval": waveform.period_s / PHASES,
+        "purgeWrite": 2 * PHASES,
+    }
+
+
+def _functions(setup: FoamSetup, patches: Sequence[str], walls: Sequence[str], has_neck: bool) -> dict[str, Any]:
+    functions: dict[str, Any] = {}
+    for name in patches:
+        functions[f"flow_{name}"] = _over_patch(name, "sum", "phi")
+        functions[f"pressure_{name}"] = _over_patch(name, "areaAverage", "p")
+    stress = {"type": "wallShearStress", "libs": FIELD_LIBRARY, "patches": list(walls), "writeControl": "writeTime"}
+    functions["wallShearStress"] = stress
+    if has_neck and setup.flavour == "com":
+        functions[NECK] = {
+            "type": "surfaces",
+            "libs": ['"libsampling.so"'],
+            "writeControl": "writeTime",
+            "surfaceFormat": "vtk",
+            "fields": ["U", "p"],
+            "interpolationScheme": "cellPoint",
+            "surfaces": [
+                NECK,
+                {"type": "sampledTriSurfaceMesh", "surface": f"{NECK}.stl", "source": "cells", "interpolate": True},
+            ],
+        }
+    return functions
+
+
+def _over_patch(name: str, operation: str, field: str) -> dict[str, Any]:
+    # The first two lines are openfoam.com's name of a patch, the third openfoam.org's.
+    where = {"regionType": "patch", "name": name, "patch": name}
+    what = {"operation": operation, "fields": [field], "writeFields": False, "log": False}
+    when = {"writeControl": "timeStep", "writeInterval": 1}
+    return {"type": "surfaceFieldValue", "libs": FIELD_LIBRARY} | where | what | when
+
+
+def decomposition(setup: FoamSetup, extent_mm: Floats) -> str:
+    """decomposeParDict: cut along the axes, the longest most often: Debian's Scotch is a stub."""
+    parts = np.ones(3, dtype=int)
+    for factor in _prime_factors(setup.processes):
+        parts[np.argmax(extent_mm / parts)] *= factor
+    coefficients = {"n": tuple(int(n) for n in parts), "delta": 0.001, "order": "xyz"}
+    entries = {"numberOfSubdomains": setup.processes, "method": "hierarchical", "hierarchicalCoeffs": coefficients}
+    return foam_file("decomposeParDict", entries)
+
+
+def _prime_factors(number: int) -> list[int]:
+    """Prime factors, the largest first."""
+    factors, divisor = [], 2
+    while number > 1:
+        if number % divisor == 0:
+            factors.append(divisor)
+            number //= divisor
+        else:
+            divisor += 1
+    return factors[::-1]
+
+
+def fluid(blood: Blood, setup: FoamSetup) -> dict[str, str]:
+    """Properties of the blood by file name: kinematic viscosity, no turbulence."""
+    nu = f"[0 2 -1 0 0 0 0] {blood.kinematic_viscosity_m2_s:.9g}"
+    note = f"Blood: {blood.viscosity_Pa_s:.6g} Pa s at {blood.density_kg_m3:.6g} kg/m3; p is pressure over density."
+    if setup.flavour == "org":
+        return {
+            "physicalProperties": foam_file("physicalProperties", {"viscosityModel": "constant", "nu": nu}, note=note),
+            "momentumTransport": foam_file("momentumTransport", {"simulationType": "laminar"}),
+        }
+    return {
+        "transportProperties": foam_file(
+            "transportProperties", {"transportModel": "Newtonian", "nu": f"nu {nu}"}, note=note
+        ),
+        "turbulenceProperties": foam_file("turbulenceProperties", {"simulationType": "laminar"}),
+    }

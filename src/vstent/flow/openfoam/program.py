@@ -1,0 +1,129 @@
+"""OpenFOAM itself, a separate program: found on this machine, run in a folder, its failures put into a sentence."""
+
+import os
+import re
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from vstent.errors import FlowError
+from vstent.flow.openfoam.setup import Flavour
+
+DEBIAN_FOLDER: Final = Path("/usr/share/openfoam")
+"""Where Debian's package keeps the settings its programs look for."""
+INSTALLED: Final = ("/usr/lib/openfoam/openfoam*", "/opt/openfoam*", "/opt/OpenFOAM/OpenFOAM-*")
+"""Where the packages of openfoam.com and openfoam.org lie; each has an etc/bashrc."""
+INSTALL: Final = "install it (Debian, Ubuntu: sudo apt-get install openfoam), or take the embedded engine"
+
+
+@dataclass(frozen=True)
+class Program:
+    """An OpenFOAM found on this machine."""
+
+    flavour: Flavour
+    """Whose it is."""
+    bashrc: Path | None
+    """What to source before its programs run; None where they are on the path."""
+
+    def command(self, *words: str) -> list[str]:
+        """Return the command line that runs one of its programs."""
+        if self.bashrc is None:
+            return list(words)
+        return ["bash", "-c", '. "$0" > /dev/null 2>&1; exec "$@"', str(self.bashrc), *words]
+
+
+def find() -> Program:
+    """Find OpenFOAM: on the path, or where its packages install it, the newest first.
+
+    Raises
+    ------
+    FlowError
+        When there is none.
+    """
+    if shutil.which("blockMesh"):
+        return Program("org" if shutil.which("foamRun") else "com", None)
+    for pattern in INSTALLED:
+        for folder in sorted(Path("/").glob(pattern[1:]), reverse=True):
+            if (bashrc := folder / "etc" / "bashrc").exists():
+                return Program("org" if "applications/solvers/foamRun" in _solvers(folder) else "com", bashrc)
+    raise FlowError(f"OpenFOAM was not found: {INSTALL}")
+
+
+def _solvers(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.glob("applications/solvers/*")} | {
+        "applications/solvers/foamRun" for _ in folder.glob("platforms/*/bin/foamRun")
+    }
+
+
+def run(program: Program, folder: Path, words: list[str], *, processes: int = 1) -> str:
+    """Run a program of OpenFOAM in a case folder, its output appended to log.NAME; return what it said this time.
+
+    Raises
+    ------
+    FlowError
+        When it fails, with its reason.
+    """
+    name = words[0]
+    if processes > 1:
+        words = ["mpirun", "-np", str(processes), *words, "-parallel"]
+    log = folder / f"log.{name}"
+    before = log.stat().st_size if log.exists() else 0
+    with log.open("ab") as output:
+        try:
+            done = subprocess.run(
+                program.command(*words),
+                cwd=folder,
+                env=_environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                check=False,
+            )
+        except FileNotFoundError:
+            raise FlowError(f"{words[0]} was not found beside OpenFOAM: {INSTALL}") from None
+    with log.open("rb") as stream:
+        stream.seek(before)
+        said = stream.read().decode(errors="replace")
+    if done.returncode != 0 or "FOAM FATAL" in said:
+        raise FlowError(f"{name} failed: {cause(said, done.returncode)} ({log} has the whole of it)")
+    return said
+
+
+def _environment() -> dict[str, str]:
+    environment = dict(os.environ)
+    if DEBIAN_FOLDER.is_dir():
+        environment.setdefault("WM_PROJECT_DIR", str(DEBIAN_FOLDER))
+    if hasattr(os, "geteuid") and os.geteuid() == 0:  # in containers; Open MPI refuses root unless told twice
+        environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    return environment
+
+
+def cause(said: str, code: int) -> str:
+    """One sentence for what a program of OpenFOAM stopped at.
+
+    Parameters
+    ----------
+    said : its output.
+    code : its exit status.
+    """
+    if code == -9 or "Killed" in said or "bad_alloc" in said:
+        return "it was ended for want of memory; take a larger cell size or fewer processes"
+    if fatal := re.search(r"FOAM FATAL(?: IO)? ERROR:?\s*(.*?)(?:\n\s*\n\s*From|\n\nfile:|\Z)", said, re.DOTALL):
+        return " ".join(fatal[1].split())[:300]
+    if "sigFpe" in said or "Floating point exception" in said or code == 136:
+        return f"the flow diverged, {_divergence(said)}"
+    return f"it ended with status {code}; {' '.join(said.splitlines()[-1:])}"
+
+
+def _divergence(said: str) -> str:
+    """Which of the usual three it was: the time step, a backflow at an outlet, or the mesh."""
+    courant = [float(number) for number in re.findall(r"Courant Number mean: \S+ max: (\S+)", said)]
+    if courant and courant[-1] > 20:
+        return f"the time step is too long (Courant number {courant[-1]:.0f}); shorten it or take a smaller cell size"
+    times = re.findall(r"^Time = (\S+)", said, re.MULTILINE)
+    return (
+        f"at {times[-1] if times else 'the start'}: a cell of the mesh is too flat or blood rushes back through an "
+        "outlet; change the cell size a little, take fewer layers, or lengthen the outlets"
+    )

@@ -1,0 +1,91 @@
+"""What OpenFOAM wrote: fields on cells and boundary faces, and the mesh's size."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from vstent.errors import ReadError
+from vstent.kernels.arrays import Floats
+
+_LIST: Final = re.compile(r"nonuniform\s+(?:List<(\w+)>\s*)?(\d+)\s*([({])")
+_UNIFORM: Final = re.compile(r"uniform\s+(\([^)]*\)|[^\s;]+)\s*;")
+_PATCH: Final = re.compile(r"^ {4}(\w+)\n {4}\{\n(.*?)^ {4}\}", re.DOTALL | re.MULTILINE)
+_ENTRY: Final = re.compile(r"^\s*value\s+", re.MULTILINE)
+
+
+@dataclass(frozen=True, eq=False)
+class VolumeField:
+    """A field of OpenFOAM, of one or of all processes."""
+
+    inside: Floats
+    """(n, d) in the cells; (1, d) where it is uniform."""
+    patches: dict[str, Floats]
+    """(f, d) on the faces of every patch that has values; (1, d) where they are uniform."""
+
+
+def read_field(folder: Path, time: str, name: str) -> VolumeField:
+    """Read an ASCII field of a case, from its processes' folders where it has been cut into parts.
+
+    Raises
+    ------
+    ReadError
+        When it is missing or damaged.
+    """
+    parts = sorted(folder.glob("processor[0-9]*"), key=lambda part: int(part.name[9:])) or [folder]
+    fields = [_parsed(part / time / name) for part in parts]
+    names = {patch for field in fields for patch in field.patches}
+    patches = {patch: _joined([f.patches[patch] for f in fields if patch in f.patches]) for patch in names}
+    return VolumeField(np.concatenate([field.inside for field in fields]), patches)
+
+
+def _joined(parts: list[Floats]) -> Floats:
+    """Values of all processes; an empty part does not know how wide they are."""
+    return np.concatenate([part for part in parts if len(part)] or parts[:1])
+
+
+def _parsed(path: Path) -> VolumeField:
+    try:
+        text = path.read_text()
+        inside, _, boundary = text.partition("boundaryField")
+        patches = {
+            name: _values(body[entry.end() :])
+            for name, body in _PATCH.findall(boundary)
+            if (entry := _ENTRY.search(body))
+        }
+        return VolumeField(_values(inside[inside.index("internalField") :]), patches)
+    except (OSError, ValueError) as error:
+        raise ReadError(f"OpenFOAM's field {path} is missing or damaged ({error}): delete its folder's run") from error
+
+
+def _values(text: str) -> Floats:
+    """Values (n, d) of the first entry of a text, ``uniform v`` as one row."""
+    listed, uniform = _LIST.search(text), _UNIFORM.search(text)
+    if listed is None or (uniform is not None and uniform.start() + 3 < listed.start()):
+        if uniform is None:
+            raise ValueError("an entry has no value")
+        return _numbers(uniform[1])[None]
+    kind, count = listed[1], int(listed[2])
+    end = re.compile(r"\)\s*;" if listed[3] == "(" else r"\}\s*;").search(text, listed.end() - 1)
+    if end is None:
+        raise ValueError("a list does not end")
+    numbers = _numbers(text[listed.end() : end.start()])
+    width = {"scalar": 1, "vector": 3, None: 1}[kind]
+    if listed[3] == "{":
+        return np.tile(numbers, (count, 1))
+    if len(numbers) != count * width:
+        raise ValueError(f"a list of {count} has {len(numbers)} numbers")
+    return numbers.reshape(count, width)
+
+
+def _numbers(text: str) -> Floats:
+    return np.array(text.translate(str.maketrans("()", "  ")).split(), dtype=np.float64)
+
+
+def times(folder: Path) -> list[str]:
+    """Names of the times written, in order, without 0; of the first process where the case has been cut into parts."""
+    place = folder / "processor0" if (folder / "processor0").is_dir() else folder
+    names = [entry.name for entry in place.iterdir() if entry.is_dir() and re.fullmatch(r"[0-9.e+-]+", entry.name)]
+    return sorted((name for name in names if float(name) > 0 and (place / name / "U").exists()), key=float)

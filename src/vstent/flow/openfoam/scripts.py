@@ -1,0 +1,58 @@
+"""Shell scripts beside a case: run it here, run it on a cluster, begin again."""
+
+from vstent.flow.openfoam.setup import FoamSetup
+
+_DEBIAN = """\
+# Debian's package has no folder of its own to source; its programs only need to know where their settings lie.
+if [ -z "$WM_PROJECT_DIR" ] && [ -d /usr/share/openfoam/etc ]; then export WM_PROJECT_DIR=/usr/share/openfoam; fi
+"""
+
+
+def all_run(setup: FoamSetup, application: str) -> str:
+    """Allrun: mesh once, then compute; given again it goes on from the last time written."""
+    features = "surfaceFeatures" if setup.flavour == "org" else "surfaceFeatureExtract"
+    solve = application
+    before = after = ""
+    if setup.processes > 1:
+        solve = f"mpirun -np {setup.processes} {application} -parallel"
+        before = "[ -d processor0 ] || decomposePar > log.decomposePar 2>&1\n"
+        after = "reconstructPar -latestTime > log.reconstructPar 2>&1\n"
+    return f"""\
+#!/bin/sh
+set -e
+cd "${{0%/*}}"
+{_DEBIAN}\
+if [ ! -f constant/polyMesh/owner ] || [ ! -f log.snappyHexMesh ]; then
+    {features} > log.{features} 2>&1
+    blockMesh > log.blockMesh 2>&1
+    snappyHexMesh -overwrite > log.snappyHexMesh 2>&1
+    checkMesh > log.checkMesh 2>&1
+    renumberMesh -overwrite > log.renumberMesh 2>&1
+fi
+{before}{solve} >> log.{application} 2>&1
+{after}"""
+
+
+def slurm(setup: FoamSetup) -> str:
+    """Slurm script: the same over the processes asked for."""
+    return f"""\
+#!/bin/sh
+#SBATCH --job-name=vstent
+#SBATCH --ntasks={setup.processes}
+#SBATCH --time=04:00:00
+#SBATCH --mem-per-cpu=2G
+#SBATCH --output=slurm-%j.log
+# Load your site's OpenFOAM here, for example: module load openfoam
+# A job that ran out of time goes on where it stopped: submit it again.
+./Allrun
+"""
+
+
+def all_clean() -> str:
+    """Allclean: back to what was exported."""
+    return """\
+#!/bin/sh
+cd "${0%/*}" || exit 1
+rm -rf constant/polyMesh constant/extendedFeatureEdgeMesh constant/triSurface/*.eMesh processor* postProcessing
+rm -rf log.* [1-9]* 0.[0-9]*
+"""

@@ -1,0 +1,34 @@
+"""How an OpenFOAM case is to be set up."""
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from vstent.surface import Surface
+
+Flavour: TypeAlias = Literal["com", "org"]
+"""openfoam.com (Debian's 1912 and later) or openfoam.org (11 and later): their dictionaries differ in a few names."""
+
+BASE_LEVEL = 2
+"""Times that snappyHexMesh halves the background's cells to the vessel's: the background is this much coarser."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoamSetup:
+    """Mesh, machine and dialect of a case."""
+
+    cell_size_mm: float
+    """Edge of a cell in the vessel."""
+    flavour: Flavour = "com"
+    """Whose OpenFOAM is to read it."""
+    layers: int = 2
+    """Layers of flat cells along the wall."""
+    neck_levels: int = 1
+    """Times that cells near the neck are halved."""
+    strut_levels: int = 3
+    """Times that cells at the struts are halved."""
+    processes: int = 1
+    """Parts that the mesh is cut into, each for a process of its own."""
+    iterations: int = 600
+    """Most iterations of a steady flow."""
+    struts: Surface | None = None
+    """The device's solids (closed, in mm), meshed where they span the neck; None: the bare vessel."""

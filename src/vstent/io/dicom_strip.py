@@ -1,0 +1,70 @@
+"""DICOM files without the patient: what is needed to read the voxels is kept by name, everything else is dropped."""
+
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.errors import ReadError
+from vstent.io.dicom import damage, quiet
+from vstent.io.files import atomic
+
+KEPT: Final = frozenset(
+    """
+    SOPClassUID Modality Rows Columns NumberOfFrames PixelSpacing SliceThickness SpacingBetweenSlices
+    ImagePositionPatient ImageOrientationPatient BitsAllocated BitsStored HighBit PixelRepresentation SamplesPerPixel
+    PhotometricInterpretation PlanarConfiguration RescaleSlope RescaleIntercept SharedFunctionalGroupsSequence
+    PerFrameFunctionalGroupsSequence PlanePositionSequence PlaneOrientationSequence PixelMeasuresSequence
+    PixelValueTransformationSequence PixelData FloatPixelData DoubleFloatPixelData
+    """.split()
+)
+"""Elements that a volume is read from; none names anybody."""
+RENAMED: Final = ("SeriesInstanceUID", "SOPInstanceUID")
+"""Identifiers that tell files of one series apart from another's: kept as digests."""
+
+
+def strip_dicom(path: Path, out: Path) -> None:
+    """Write a DICOM file again with nothing in it but what its voxels need.
+
+    Raises
+    ------
+    ReadError
+        It is damaged.
+    """
+    import pydicom
+
+    try:
+        with quiet():
+            given = pydicom.dcmread(path)
+            kept = _kept(given)
+            for name in RENAMED:
+                if name in given:
+                    setattr(kept, name, pydicom.uid.generate_uid(entropy_srcs=[str(given[name].value)]))
+            kept.file_meta = _meta(given, kept)
+            with atomic(out) as partial:
+                kept.save_as(partial, enforce_file_format=True)
+    except damage():
+        raise ReadError(f"{out.name} is damaged, or no DICOM image; copy it again from where it came.") from None
+
+
+def _kept(given: Any) -> Any:
+    from pydicom.dataset import Dataset
+    from pydicom.sequence import Sequence
+
+    kept = Dataset()
+    for element in given:
+        if element.keyword not in KEPT:
+            continue
+        if element.VR == "SQ":
+            element.value = Sequence([_kept(item) for item in element.value])
+        kept.add(element)
+    return kept
+
+
+def _meta(given: Any, kept: Any) -> Any:
+    from pydicom.dataset import FileMetaDataset
+    from pydicom.uid import ImplicitVRLittleEndian
+
+    meta = FileMetaDataset()
+    meta.TransferSyntaxUID = getattr(given.file_meta, "TransferSyntaxUID", ImplicitVRLittleEndian)
+    meta.MediaStorageSOPClassUID = kept.SOPClassUID
+    meta.MediaStorageSOPInstanceUID = kept.SOPInstanceUID
+    return meta

@@ -1,0 +1,124 @@
+"""Criteria: what makes a device and a size good, each with its numbers, its weight and its source."""
+
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+from math import inf
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, ValidationError, model_validator
+
+from vstent.device import Design
+from vstent.errors import InputError
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Criterion(_Strict):
+    """One measure, and what it is worth."""
+
+    key: str
+    """Name of the measure."""
+    title: str
+    """What it is, in words."""
+    weight: NonNegativeFloat
+    """Weight of its grade in the score; 0 leaves it out."""
+    none: float
+    """Value worth nothing."""
+    full: float
+    """Value worth everything."""
+    enough: float | None = None
+    """Up to here it stays worth everything; None: however far."""
+    beyond: float | None = None
+    """From here on it is worth nothing again."""
+    kind: Literal["braid", "laser_cut"] | None = None
+    """Family of devices that it concerns; None: all."""
+    phrase: str
+    """The measure in words, with a place for its value."""
+    source: Annotated[str, Field(min_length=3)]
+    """Where its numbers come from."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "Criterion":
+        if self.none == self.full:
+            raise ValueError("none and full must differ")
+        if (self.enough is None) != (self.beyond is None):
+            raise ValueError("enough and beyond come together")
+        if self.beyond is not None and not self.none < self.full <= self.enough < self.beyond:  # type: ignore[operator]
+            raise ValueError("none < full <= enough < beyond must hold")
+        self.phrase.format(0.0)
+        return self
+
+    def concerns(self, design: Design) -> bool:
+        """Tell whether a device is graded by it."""
+        return self.weight > 0 and self.kind in (None, design.kind)
+
+    def grade(self, value: float) -> float:
+        """What a value is worth, 0 to 1."""
+        rising = (value - self.none) / (self.full - self.none)
+        falling = inf if self.beyond is None else (self.beyond - value) / (self.beyond - self.enough)  # type: ignore[operator]
+        return float(np.clip(min(rising, falling), 0.0, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Criteria:
+    """What a ranking goes by."""
+
+    items: tuple[Criterion, ...]
+    """In the order in which they are told."""
+
+    def of(self, design: Design) -> tuple[Criterion, ...]:
+        """Return those that concern a device."""
+        return tuple(item for item in self.items if item.concerns(design))
+
+
+class _File(_Strict):
+    criterion: list[Criterion] = Field(min_length=1)
+
+
+@cache
+def default_criteria() -> Criteria:
+    """Return vstent's own criteria, ``vstent/rank/criteria.toml``."""
+    from importlib.resources import files
+
+    return parse(files("vstent.rank").joinpath("criteria.toml").read_text(encoding="utf-8"))
+
+
+def read_criteria(path: Path) -> Criteria:
+    """Read criteria from a TOML file, written like ``vstent/rank/criteria.toml``.
+
+    Raises
+    ------
+    InputError
+        When it is no readable text or breaks the schema.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read as text: give a TOML file of criteria.") from error
+    return parse(text, str(path))
+
+
+def parse(text: str, name: str = "The file of criteria") -> Criteria:
+    """Read criteria (TOML) called `name`.
+
+    Raises
+    ------
+    InputError
+        When it is no TOML, breaks the schema or gives no criterion any weight.
+    """
+    try:
+        items = _File.model_validate(tomllib.loads(text)).criterion
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{name} is not valid TOML: {error}. Correct that line.") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{name} is wrong at {where}: {first['msg']}. Correct that entry.") from error
+    if not any(item.weight > 0 for item in items):
+        raise InputError(f"{name} gives no criterion any weight: give one a weight above 0.")
+    return Criteria(tuple(items))

@@ -1,0 +1,138 @@
+"""A case, or an input not yet studied, handed over to other solvers: an OpenFOAM case folder, or named patches."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from vstent.device import find_design
+from vstent.errors import FlowError, InputError
+from vstent.flow import FlowCase, FlowSettings, flow_case
+from vstent.flow.domain import default_cell_size_mm
+from vstent.flow.openfoam import Flavour, FoamCase, FoamSetup, foam_case, named_patches, program, stl_text
+from vstent.flow.openfoam.case import struts_near
+from vstent.flow.openfoam.folder import write
+from vstent.io import writers
+from vstent.io.archive import load_noun
+from vstent.io.surfaces import read_surface
+from vstent.stent import Deployment
+from vstent.struts import struts
+from vstent.study.ledger import Ledger, hash_of
+from vstent.study.stages import deploy_all, find_anatomy
+from vstent.study.types import Progress, Settings
+from vstent.surface import Surface
+from vstent.vessel import Anatomy
+
+CACHE: Final = ".vstent"
+STRUT_REACH_MM: Final = 1.0
+"""Wires that come nearer to the neck than this are meshed."""
+
+
+def export_openfoam(
+    path: Path, out: Path, settings: Settings, foam: Mapping[str, Any], progress: Progress
+) -> tuple[FlowCase, FoamCase]:
+    """Write an OpenFOAM case folder.
+
+    Parameters
+    ----------
+    path : a case folder of `run`, or a scan or surface.
+    out : the folder to write.
+    settings : what is given; the struts of its first device, if it names one, are meshed.
+    foam : fields of `FoamSetup`; where they name no flavour it is that of the OpenFOAM on this machine.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    """
+    ledger = Ledger(out / CACHE, progress)
+    anatomy = _anatomy(path, settings, ledger)
+    case = flow_case(anatomy, None, settings.flow or FlowSettings())
+    setup = FoamSetup(default_cell_size_mm(case))
+    setup = replace(
+        setup, **{"flavour": _flavour_here(), **foam}, struts=_struts(path, case, anatomy, settings, ledger)
+    )
+    with ledger.stage("export") as tell:
+        written = foam_case(case, setup)
+        write(out, written)
+        tell(f"{len(written.files)} files, cells of {setup.cell_size_mm:.3g} mm, for {written.application}.")
+    return case, written
+
+
+def export_patches(path: Path, out: Path, settings: Settings, progress: Progress) -> list[dict[str, Any]]:
+    """Write the boundary of the blood as watertight named patches; return name, id, area, centre and normal of each.
+
+    ``patches.stl`` has one named solid per patch, ``patches.vtp`` the same faces with their ``patch_id``, both in mm;
+    ``patches.json`` says which is which, ``neck.stl`` is what blood crosses into the sac.
+
+    Parameters
+    ----------
+    path : a case folder of `run`, or a scan or surface.
+    out : the folder to write.
+    settings : what is given of the vessel.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    """
+    ledger = Ledger(out / CACHE, progress)
+    case = flow_case(_anatomy(path, settings, ledger), None, FlowSettings())
+    with ledger.stage("export") as tell:
+        patches, _ = named_patches(case)
+        patch_id = np.zeros(len(patches[0].surface.faces), dtype=np.int32)
+        said = []
+        for k, patch in enumerate(patches):
+            patch_id[patch.face_id] = k
+            said.append({"name": patch.name, "patch_id": k, "area_mm2": patch.area_mm2, **_middle(patch.corners_mm)})
+        writers.write_text(out / "patches.stl", stl_text({one.name: one.corners_mm for one in patches}, 1.0))
+        writers.write_surface(out / "patches.vtp", patches[0].surface, cell_data={"patch_id": patch_id})
+        if case.ostium is not None:
+            writers.write_stl(out / "neck.stl", case.ostium)
+        writers.write_json(out / "patches.json", {"length_unit": "mm", "frame": "LPS", "patches": said})
+        tell(f"{len(patches)} patches, {len(patch_id)} triangles.")
+    return said
+
+
+def _middle(corners_mm: np.ndarray) -> dict[str, Any]:
+    area_mm2 = 0.5 * np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    size_mm2 = np.linalg.norm(area_mm2, axis=1)
+    total = area_mm2.sum(axis=0)
+    center_mm = np.average(corners_mm.mean(axis=1), axis=0, weights=size_mm2)
+    return {"center_mm": center_mm, "normal": total / max(float(np.linalg.norm(total)), 1e-12)}
+
+
+def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
+    """The anatomy kept in a case folder, or that of an input."""
+    kept = sorted((path / CACHE).glob("anatomy-*.npz")) if path.is_dir() else []
+    if not kept:
+        return find_anatomy(path, hash_of(path), settings, ledger)
+    with ledger.stage("anatomy") as tell:
+        anatomy = load_noun(kept[-1], Anatomy)
+        tell(f"taken from {path}")
+    return anatomy
+
+
+def _struts(path: Path, case: FlowCase, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Surface | None:
+    """Solids of the first device that cross the neck: those in the case folder, or of a deployment made for this."""
+    if not settings.devices:
+        return None
+    if case.ostium is None:
+        raise InputError("struts are meshed over the neck, and this vessel has no sac: leave --device away")
+    name = settings.devices[0]
+    file = path / "stents" / name / "struts.stl"
+    if file.exists():
+        return struts_near(read_surface(file, units="mm")[0], case.ostium, STRUT_REACH_MM)
+    deployments: dict[str, Deployment] = deploy_all({name: find_design(name)}, anatomy, settings, ledger)
+    return struts_near(struts(deployments[name].stent), case.ostium, STRUT_REACH_MM)
+
+
+def _flavour_here() -> Flavour:
+    try:
+        return program.find().flavour
+    except FlowError:
+        return "com"

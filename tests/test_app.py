@@ -1,0 +1,320 @@
+"""The page's server: the same numbers by every way in, choices that keep their order, cases that outlive the server."""
+
+import hashlib
+import json
+import time
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import app_case
+import vstent
+from vstent import phantoms
+from vstent.app.cases import STEPS
+from vstent.cli import main
+from vstent.deploy import deploy
+from vstent.device import find_design
+from vstent.io.archive import load_noun
+from vstent.io.dicom_writer import write_dicom
+from vstent.io.images import read_image
+from vstent.io.writers import write_stl
+from vstent.measure import measure
+from vstent.stent import Landing
+from vstent.study import CACHE, Settings
+from vstent.vessel import Anatomy
+
+SILK = {"name": "silk"}
+
+
+@pytest.fixture(scope="module")
+def artery(tmp_path_factory):
+    path = tmp_path_factory.mktemp("input") / "phantom.stl"
+    write_stl(path, app_case.phantom_surface())
+    return path
+
+
+@pytest.fixture(scope="module")
+def study(artery, tmp_path_factory):
+    """The same at the command line."""
+    out = tmp_path_factory.mktemp("study") / "study"
+    command = ["run", str(artery), "--out", str(out), "--device", "silk", "--units", "mm", "--no-flow"]
+    assert main(command) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    return tmp_path_factory.mktemp("cases")
+
+
+@pytest.fixture(scope="module")
+def client(workspace):
+    with app_case.served(workspace) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def case(client, artery):
+    """A case brought in by HTTP, its vessel found; Silk alone is chosen, no flow is wanted."""
+    case = client.post("/api/cases", json={"name": "Phantom"}).json()
+    answer = client.put(f"/api/cases/{case['id']}/input", params={"name": "phantom.stl"}, content=artery.read_bytes())
+    assert answer.json() == {"taken": True}
+    choices = case["choices"] | {"devices": [SILK], "flow": {"is_wanted": False}, "units": "mm"}
+    client.put(f"/api/cases/{case['id']}/choices", json={"revision": case["revision"], "choices": choices})
+    client.post(f"/api/cases/{case['id']}/input/done")
+    view = app_case.wait(client, case["id"])
+    assert view["failed"] == {}
+    assert [view["steps"][step] for step in STEPS[:3]] == ["done"] * 3
+    return f"/api/cases/{case['id']}"
+
+
+def anatomy_of(client, case, workspace):
+    path = next((workspace / client.get(case).json()["id"] / CACHE).glob("anatomy-*.npz"))
+    return load_noun(path, Anatomy)
+
+
+def choose(client, case, **changes):
+    view = client.get(case).json()
+    body = {"revision": view["revision"], "choices": view["choices"] | changes}
+    return client.put(f"{case}/choices", json=body)
+
+
+def test_command_line_rest_and_python_find_the_same_numbers(client, case, artery, study, tmp_path):
+    client.post(f"{case}/jobs/flow")
+    view = app_case.wait(client, case.rpartition("/")[2])
+    assert set(view["steps"].values()) == {"done"}
+    by_rest = client.get(f"{case}/files/metrics.json").json()
+    by_cli = json.loads((study / "metrics.json").read_text())
+    settings = Settings(devices=("silk",), units="mm", flow=None)
+    vstent.run(artery, tmp_path / "python", settings, lambda *_: None)
+    by_python = json.loads((tmp_path / "python" / "metrics.json").read_text())
+    assert by_rest == by_cli == by_python
+    assert by_rest["stents"]["silk"]["deployment"]["deployed_length_mm"] > 10
+    report = client.get(f"{case}/files/report.html")
+    assert "Silk" in report.text
+    assert "sandbox" in report.headers["content-security-policy"]
+
+
+def test_a_second_tab_cannot_undo_what_the_first_has_done(client, case):
+    before = client.get(case).json()
+    assert choose(client, case, inlet_mm=[1.0, 2.0, 3.0]).status_code == 200
+    late = client.put(
+        f"{case}/choices", json={"revision": before["revision"], "choices": before["choices"] | {"threshold": 9.0}}
+    )
+    assert late.status_code == 409
+    now = client.get(case).json()
+    assert now["choices"]["inlet_mm"] == [1.0, 2.0, 3.0]
+    assert now["choices"]["threshold"] is None
+    # What depends on the inlet is out of date and not gone; the image does not depend on it.
+    assert now["steps"]["image"] == "done"
+    assert {now["steps"][step] for step in ("vessel", "sac")} == {"stale"}
+    assert client.get(f"{case}/anatomy").status_code == 200
+    undone = client.post(f"{case}/undo", json={"revision": now["revision"]}).json()
+    assert undone["choices"] == before["choices"]
+    assert undone["steps"] == before["steps"]
+    redone = client.post(f"{case}/redo", json={"revision": undone["revision"]}).json()
+    assert redone["choices"] == now["choices"]
+    client.post(f"{case}/undo", json={"revision": redone["revision"]})
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"devices": [{"name": "silk"}, {"name": "silk"}]},
+        {"inlet_mm": [1.0, 2.0]},
+        {"inlet_mm": [1.0, 2.0, 1e9]},
+        {"flow": {"cell_size_mm": 0.001}},
+        {"nonsense": 1},
+        {"threshold": "high"},
+    ],
+)
+def test_choices_that_mean_nothing_are_refused(client, case, changes):
+    before = client.get(case).json()
+    assert choose(client, case, **changes).status_code == 422
+    assert client.get(case).json()["revision"] == before["revision"]
+
+
+def test_a_dragged_end_lies_where_the_hand_is_and_where_the_deployment_puts_it(client, case, workspace):
+    anatomy = anatomy_of(client, case, workspace)
+    design = find_design("silk")
+    for anchor, end in (("proximal", 0), ("distal", 1)):
+        start, _ = app_case.opened(client.post(f"{case}/sketch", json={"device": SILK}))
+        wanted = start["ends_mm"][end] + 1.3
+        answer = client.post(f"{case}/sketch", json={"device": SILK, "anchor": anchor, "abscissa_mm": wanted})
+        sketched, data = app_case.opened(answer)
+        assert sketched["ends_mm"][end] == pytest.approx(wanted, abs=1e-6)
+        stent = deploy(design, anatomy, landing=Landing(sketched["center_mm"])).stent
+        ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
+        np.testing.assert_allclose(sketched["ends_mm"], ends, atol=0.05)
+        # The end in hand stays there; how sure the artery's diameter is shows at the other one.
+        widths = [high - low for low, high in sketched["ends_band_mm"]]
+        assert widths[end] == pytest.approx(0, abs=1e-6)
+        low, high = sketched["ends_band_mm"][1 - end]
+        assert low < ends[1 - end] < high
+        (wires,) = sketched["layers"]
+        points = app_case.numbers(wires["points"], data)
+        apart = np.linalg.norm(points - stent.wire_points_mm, axis=1)
+        assert np.median(apart) < 0.15  # crossings slide along the wall in the deployment alone
+
+
+def test_a_device_dragged_out_of_the_artery_is_refused_with_a_sentence(client, case):
+    answer = client.post(f"{case}/sketch", json={"device": SILK, "anchor": "proximal", "abscissa_mm": -5})
+    assert answer.status_code == 422
+    assert "leaves the artery" in answer.json()["detail"]
+
+
+def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
+    anatomy = anatomy_of(client, case, workspace)
+    device = SILK | {"center_mm": round(anatomy.axis.length_mm / 2, 3)}
+    assert choose(client, case, devices=[device]).status_code == 200
+    told, data = app_case.opened(client.post(f"{case}/deployment", json={"device": device, "colour": "coverage"}))
+    deployment = deploy(find_design("silk"), anatomy, landing=Landing(device["center_mm"]))
+    measures = measure(anatomy, deployment)
+    assert told["length_mm"] == pytest.approx(measures["deployed_length_mm"], rel=1e-9)
+    row = next(row for row in told["measures"]["rows"] if row["key"] == "deployed_length_mm")
+    assert float(row["cells"][0].split("\u202f")[0]) == pytest.approx(measures["deployed_length_mm"], rel=5e-3)
+    assert row["meaning"]
+    wires = next(layer for layer in told["layers"] if layer["id"] == "wires")
+    coverage = app_case.numbers(wires["values"], data)
+    assert coverage.mean() == pytest.approx(100 * measures["metal_coverage_fraction"], rel=0.05)
+    steps = client.get(case).json()["steps"]
+    assert (steps["device"], steps["deploy"]) == ("done", "done")
+    choose(client, case, devices=[SILK])
+
+
+def test_the_section_has_the_phantoms_radius(client, case):
+    start, _ = app_case.opened(client.post(f"{case}/sketch", json={"device": SILK}))
+    place = start["ends_mm"][0] + 1.0
+    section = client.get(f"{case}/section", params={"abscissa_mm": place, "device": "silk"}).json()
+    segments = np.array(section["landing"]).reshape(-1, 2, 2)
+    near = np.linalg.norm(segments, axis=2).max(axis=1) < section["artery_diameter_mm"]
+    length = np.linalg.norm(segments[near, 1] - segments[near, 0], axis=1).sum()
+    assert length / np.pi == pytest.approx(section["artery_diameter_mm"], rel=0.03)
+    assert section["device_diameter_mm"] < section["artery_diameter_mm"]
+
+
+def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
+    choose(client, case, devices=[{"name": "enterprise"}])
+    client.post(f"{case}/jobs/rank")
+    view = app_case.wait(client, case.rpartition("/")[2])
+    assert view["failed"] == {}
+    ranking = client.get(f"{case}/ranking").json()
+    assert ranking["is_current"]
+    assert [row["rank"] for row in ranking["rows"]] == list(range(1, 1 + len(find_design("enterprise").sizes)))
+    scores = [row["score"] for row in ranking["rows"] if row["is_suitable"]]
+    assert scores == sorted(scores, reverse=True)
+    assert all(row["reason"] for row in ranking["rows"])
+    choose(client, case, devices=[SILK])
+    assert not client.get(f"{case}/ranking").json()["is_current"]
+
+
+def test_a_job_is_stopped_within_a_second_and_said_so(client, case):
+    client.post(f"{case}/jobs/anatomy")
+    time.sleep(0.3)
+    began = time.monotonic()
+    view = client.delete(f"{case}/jobs").json()
+    assert time.monotonic() - began < 1.0
+    assert view["job"] is None
+    assert view["failed"]["image"].startswith("Stopped")
+
+
+def test_a_tab_is_told_of_every_change(client, case):
+    with client.stream("GET", f"{case}/events") as events:
+        lines = (line for line in events.iter_lines() if line.startswith("data: "))
+        first = json.loads(next(lines)[6:])
+        answer = choose(client, case, threshold=123.0).json()
+        assert answer["revision"] == first["revision"] + 1
+        second = json.loads(next(lines)[6:])
+    assert (second["revision"], second["choices"]["threshold"]) == (answer["revision"], 123.0)
+    client.post(f"{case}/undo", json={"revision": second["revision"]})
+
+
+def test_a_server_that_was_killed_at_work_goes_on_when_it_starts_again(artery, tmp_path):
+    with app_case.served(tmp_path, artery) as client:
+        case = client.get("/api/cases").json()["opened"]
+        until = time.monotonic() + 60
+        while client.get(f"/api/cases/{case}").json()["job"] is None:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+    state = json.loads((tmp_path / case / "app.json").read_text())
+    assert (state["job"], state["anatomy"]) == ("anatomy", "")
+    with app_case.served(tmp_path) as client:
+        assert client.get(f"/api/cases/{case}").json()["job"]["kind"] == "anatomy"
+        assert client.delete(f"/api/cases/{case}/jobs").json()["job"] is None
+
+
+def test_a_folder_of_vstent_run_opens_with_all_that_it_holds(study, tmp_path):
+    with app_case.served(tmp_path / "cases", study) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        view = client.get(case).json()
+        assert [device["name"] for device in view["choices"]["devices"]] == ["silk"]
+        assert view["choices"]["units"] == "mm"
+        assert not view["choices"]["flow"]["is_wanted"]
+        assert [step for step in STEPS if view["steps"][step] == "done"] == list(STEPS[:5])
+        told, _ = app_case.opened(client.post(f"{case}/deployment", json={"device": SILK}))
+        measured = json.loads((study / "metrics.json").read_text())["stents"]["silk"]["deployment"]
+        assert told["length_mm"] == pytest.approx(measured["deployed_length_mm"], rel=1e-6)
+
+
+def test_slices_hold_the_scans_voxels_and_the_live_surface_is_its_wall(tmp_path):
+    rng = np.random.default_rng(3)
+    voxels = rng.normal(100, 5, (40, 36, 30))
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in voxels.shape), indexing="ij"), axis=-1)
+    voxels[np.linalg.norm(grid - [20, 18, 15], axis=-1) < 9] = 1000
+    write_dicom(vstent_image(voxels), tmp_path / "scan")
+    with app_case.served(tmp_path / "cases", tmp_path / "scan") as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        while not client.get(case).json()["has_input"]:
+            time.sleep(0.02)
+        image = read_image(tmp_path / "scan")
+        told, data = app_case.opened(client.get(f"{case}/image/slice", params={"axis": 2, "index": 15}))
+        shown = app_case.numbers(told["values"], data).reshape(told["height"], told["width"])
+        np.testing.assert_allclose(shown, image.voxels[:, :, 15].T, atol=0.02)
+        assert client.get(f"{case}/image/slice", params={"axis": 2, "index": 30}).status_code == 422
+        told, data = app_case.opened(client.get(f"{case}/image/surface", params={"threshold": 550}))
+        points = app_case.numbers(told["layers"][0]["points"], data)
+        radius = np.linalg.norm(points - image.to_mm(np.array([[20, 18, 15]])), axis=1)
+        assert radius.mean() == pytest.approx(8.75 * 0.4, rel=0.03)
+
+
+def vstent_image(voxels):
+    from vstent.image import Image
+
+    return Image(voxels.astype(np.int16), np.diag([0.4, 0.4, 0.4, 1.0]), "XA")
+
+
+def test_the_interface_is_described_and_its_page_needs_no_network(client):
+    api = client.get("/api/openapi.json").json()
+    assert "/api/cases/{case_id}/choices" in api["paths"]
+    assert all(verb["summary"] for verbs in api["paths"].values() for verb in verbs.values())
+    for path in ("/api/docs", "/assets/docs.js", "/", "/assets/app.css"):
+        assert "https://" not in client.get(path).text
+
+
+def test_the_page_was_built_from_the_sources_beside_it():
+    viewer = Path(__file__).resolve().parents[1] / "viewer"
+    sources = [source for folder in ("src", "app") for source in sorted((viewer / folder).iterdir())]
+    built = files("vstent.app").joinpath("assets", "app.js").read_text(encoding="utf-8")
+    digest = hashlib.sha256(
+        b"".join(path.read_bytes() for path in [*sources, viewer / "package-lock.json"])
+    ).hexdigest()
+    assert f"sources {digest} */" in built[:300], "run `npm ci && npm run build` in viewer/"
+    style = files("vstent.app").joinpath("assets", "app.css").read_text(encoding="utf-8")
+    assert style == (viewer / "app" / "app.css").read_text(encoding="utf-8")
+
+
+@pytest.mark.validation
+def test_with_flow_all_ways_in_agree_too(tmp_path):
+    path = tmp_path / "phantom.stl"
+    write_stl(path, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
+    with app_case.served(tmp_path / "cases", path) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        app_case.wait(client, case.rpartition("/")[2])
+        assert choose(client, case, devices=[SILK], flow={"cell_size_mm": 0.35}).status_code == 200
+        client.post(f"{case}/jobs/flow")
+        app_case.wait(client, case.rpartition("/")[2], 1200)
+        by_rest = client.get(f"{case}/files/metrics.json").json()
+    assert main(["run", str(path), "--out", str(tmp_path / "cli"), "--device", "silk", "--cell-size", "0.35"]) == 0
+    assert by_rest == json.loads((tmp_path / "cli" / "metrics.json").read_text())

@@ -1,0 +1,162 @@
+"""The page in a real browser, as a user goes through it: nothing complains, nothing is fetched from elsewhere."""
+
+import base64
+import json
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import app_case
+from vstent.io.writers import write_stl
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: no test in a real browser")
+pytestmark = pytest.mark.skipif(
+    BROWSER is None, reason="no chromium on this machine: the page is not tried in a browser"
+)
+
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
+SECOND = 1000
+COARSE_MM = "0.4"
+
+
+@contextmanager
+def browsing(client, width=1280, height=720):
+    """A page let in by the address that the server prints; it ends without a word on the console or a foreign call."""
+    host = client.base_url.netloc.decode()
+    complaints: list[str] = []
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=BROWSER, args=FLAGS)
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.set_default_timeout(120 * SECOND)
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        own = (f"http://{host}/", "data:", "blob:")
+        page.on("request", lambda request: request.url.startswith(own) or complaints.append(request.url))
+        page.goto(f"http://{host}/?token={app_case.TOKEN}")
+        yield page
+        browser.close()
+    assert complaints == []
+
+
+def drop(page, path: Path):
+    """Drop a file on the page as a hand does."""
+    page.wait_for_selector(".drop")
+    give = """([name, text]) => {
+        const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+        const transfer = new DataTransfer();
+        transfer.items.add(new File([bytes], name));
+        return transfer;
+    }"""
+    transfer = page.evaluate_handle(give, [path.name, base64.b64encode(path.read_bytes()).decode()])
+    page.dispatch_event(".drop", "drop", {"dataTransfer": transfer})
+
+
+def place_of(page, end):
+    """Where the end of the device in view lies, as its handle says."""
+    word = page.locator(f".handle.{end} .handle-word")
+    playwright.expect(word).to_contain_text("mm")
+    return float(word.inner_text().split()[0])
+
+
+def step(page, title):
+    page.locator(".stepper").get_by_role("button", name=title, exact=False).click()
+
+
+def drawn(page, box):
+    """Part of the picture that is not paper."""
+    import io
+
+    from matplotlib.image import imread
+
+    image = imread(io.BytesIO(page.screenshot(clip=box)))[..., :3]
+    return float((np.abs(image - np.array([0xF6, 0xF8, 0xF9]) / 255).max(axis=2) > 0.01).mean())
+
+
+@pytest.fixture
+def artery(tmp_path):
+    path = tmp_path / "phantom.stl"
+    write_stl(path, app_case.phantom_surface())
+    return path
+
+
+def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        assert page.locator(".badge").inner_text() == "Research use only"
+        drop(page, artery)
+        page.wait_for_selector(".step.done:nth-child(3)")
+        step(page, "Vessel")
+        page.wait_for_selector(".opening b")
+        assert page.locator(".opening-row.inlet").count() == 1
+        assert drawn(page, page.locator(".viewer-area").bounding_box()) > 0.05
+        step(page, "Deploy")
+        page.wait_for_selector(".sheet .row")
+        before = place_of(page, "distal")
+        drag(page, ".handle.distal .knob", -60, 0)
+        page.wait_for_selector(".step.done:nth-child(5)")
+        page.wait_for_function("() => !document.querySelector('button[aria-label=Undo]').disabled")
+        after = place_of(page, "distal")
+        assert abs(after - before) > 0.5
+        view = client.get(f"/api/cases/{client.get('/api/cases').json()['cases'][0]['id']}").json()
+        assert view["choices"]["devices"][0]["center_mm"] is not None
+        # What was done is there after the page has been loaded anew.
+        page.reload()
+        page.wait_for_selector(".sheet .row")
+        assert place_of(page, "distal") == pytest.approx(after, abs=0.11)
+        page.keyboard.press("Control+z")
+        page.wait_for_function("() => document.querySelector('button[aria-label=Undo]').disabled")
+
+
+def drag(page, selector, right, down):
+    box = page.locator(selector).bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for i in range(1, 9):
+        page.mouse.move(x + right * i / 8, y + down * i / 8)
+    page.mouse.up()
+
+
+def whole_way(client, page, path):
+    """Every step, from a dropped file to the open report."""
+    drop(page, path)
+    page.wait_for_selector(".step.done:nth-child(3)")
+    step(page, "Device")
+    page.locator(".device", has_text="Silk").locator("input").uncheck()
+    page.wait_for_selector(".device:has-text('Silk') input:not(:checked)")
+    page.get_by_role("button", name="Rank all sizes").click()
+    page.locator(".ranking tbody tr").first.click()
+    page.wait_for_selector(".sheet .row")
+    drag(page, ".handle.proximal .knob", 40, 0)
+    step(page, "Flow")
+    page.fill("#field-cell", COARSE_MM)
+    page.keyboard.press("Tab")
+    page.wait_for_timeout(SECOND)
+    page.get_by_role("button", name="Run the flow").click()
+    page.wait_for_selector(".step.done:nth-child(7)", timeout=1200 * SECOND)
+    page.wait_for_selector(".card")
+    assert page.locator(".viewer-pane").count() == 2
+    step(page, "Report")
+    with page.context.expect_page() as opened:
+        page.get_by_role("link", name="Open the report").click()
+    report = opened.value
+    report.wait_for_selector(".viewer-pane")
+    assert report.locator("h1").inner_text()
+    case = client.get("/api/cases").json()["cases"][0]["id"]
+    metrics = json.loads(client.get(f"/api/cases/{case}/files/metrics.json").text)
+    assert metrics["stents"]["enterprise"]["flow"]["neck_inflow_mL_s"] > 0
+
+
+@pytest.mark.validation
+def test_the_whole_way_on_a_phantom(artery, tmp_path):
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        whole_way(client, page, artery)
+
+
+@pytest.mark.validation
+def test_the_whole_way_on_a_real_carotid(shared_data, tmp_path):
+    with app_case.served(tmp_path / "cases") as client, browsing(client, 1920, 1080) as page:
+        whole_way(client, page, shared_data / "aneurisk_C0038.vtp")

@@ -1,0 +1,49 @@
+"""`vstent flow` as a user meets it, in a vessel without a sac."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+from vstent import phantoms
+from vstent.cli import main
+from vstent.io.writers import write_stl
+
+RADIUS_MM, LENGTH_MM, INFLOW_ML_S = 2.0, 16.0, 0.8
+STRESS_PA = 4 * 0.004 * INFLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 3)
+
+
+def test_flow_alone_in_a_tube_is_poiseuilles_and_is_not_computed_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_stl(tmp_path / "tube.stl", phantoms.phantom_surface(phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM)))
+    out = tmp_path / "out"
+    command = ["flow", str(tmp_path / "tube.stl"), "--out", str(out), "--units", "mm", "--steady"]
+    command += ["--flow-rate", str(INFLOW_ML_S), "--cell-size", "0.25"]
+    assert main(command) == 0
+    said = capsys.readouterr()
+    assert "Inlet flow" in said.out
+    assert "thousand cells of 0.25 mm" in said.err
+    assert sorted(file.name for file in (out / "flow" / "bare").iterdir()) == ["field.vtu", "wall.vtp"]
+    bare = json.loads((out / "metrics.json").read_text())["bare"]
+    assert bare["inlet_flow_mL_s"] == pytest.approx(INFLOW_ML_S, rel=5e-3)
+    assert bare["outlet_1_flow_mL_s"] == pytest.approx(bare["inlet_flow_mL_s"], rel=1e-3)
+    assert bare["pressure_drop_Pa"] == pytest.approx(2 * LENGTH_MM / RADIUS_MM * STRESS_PA, rel=0.05)
+    points, stress = _wall(out / "flow" / "bare" / "wall.vtp")
+    middle = np.abs(points[:, 2] - LENGTH_MM / 2) < 4
+    along = np.sign(stress[middle, 2].mean())
+    np.testing.assert_allclose(along * stress[middle].mean(axis=0), [0, 0, STRESS_PA], atol=0.03 * STRESS_PA)
+    assert main(command) == 0
+    assert "already done" in capsys.readouterr().err
+
+
+def _wall(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    reader = vtkXMLPolyDataReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    data = reader.GetOutput()
+    stress = data.GetPointData().GetArray("wall_shear_stress_Pa")
+    return vtk_to_numpy(data.GetPoints().GetData()), vtk_to_numpy(stress)

@@ -1,0 +1,342 @@
+"""A cohort: one table whatever happens to whom; workers are killed, and the table is the same."""
+
+import csv
+import importlib.util
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from multiprocessing import active_children
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vstent import phantoms
+from vstent.cli import main
+from vstent.cohort import (
+    LOST,
+    DaskCluster,
+    Processes,
+    Slurm,
+    collect,
+    estimate,
+    find_cases,
+    left_to_do,
+    run_cohort,
+)
+from vstent.cohort.estimate import START_CPU_S
+from vstent.cohort.work import flat_metrics, read_row, row_path, work
+from vstent.errors import InputError, ReadError, VstentError
+from vstent.io.tables import write_parquet
+from vstent.io.writers import write_stl
+from vstent.report import cohort_report
+from vstent.report.cohort import modified_z_scores
+from vstent.study import Settings
+from vstent.study import run as run_study
+
+COST = ("case_s", "case_cpu_s", "peak_memory_MB")
+"""Columns that no two runs agree on."""
+SETTINGS = Settings(devices=("silk", "enterprise"), flow=None, units="mm")
+
+needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="Dask is not installed")
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    """An artery with a sac, one too short for an Enterprise, and a file that is no surface."""
+    folder = tmp_path_factory.mktemp("scäns of a cohort")
+    for name, length_mm in (("a", 22.0), ("b", 11.0)):
+        artery = phantoms.with_sac(
+            phantoms.tube(length_mm=length_mm), abscissa_mm=0.5 * length_mm, width_mm=5.0, neck_mm=3.5
+        )
+        write_stl(folder / f"{name}.stl", phantoms.phantom_surface(artery, edge_mm=0.45))
+    (folder / "c.stl").write_text("no surface")
+    (folder / "notes.txt").write_text("no case")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def table(scans, tmp_path_factory):
+    """The cohort's rows, computed one case after another in this process."""
+    out = tmp_path_factory.mktemp("alone")
+    cases = find_cases(scans, SETTINGS)
+    for task in left_to_do(cases, out):
+        work(task)
+    return bare(collect(cases, out))
+
+
+def bare(rows):
+    return [{key: value for key, value in row.items() if key not in COST} for row in rows]
+
+
+def told(done, total, name, rows):
+    pass
+
+
+def killed(task):
+    """Die as a worker does that runs out of memory, in the middle of case c."""
+    if task.case.name == "c":
+        os.kill(os.getpid(), signal.SIGKILL)
+    work(task)
+
+
+def held(task):
+    """Do every case but c, which waits until its worker is killed."""
+    while task.case.name == "c":
+        time.sleep(0.1)
+    work(task)
+
+
+def test_the_table_has_a_row_a_case_and_device_with_every_metric_or_the_failure(scans, table, tmp_path):
+    assert [(row["case"], row["device"]) for row in table] == [(c, d) for c in "abc" for d in SETTINGS.devices]
+    by_name = {(row["case"], row["device"]): row for row in table}
+    study = run_study(scans / "a.stl", tmp_path / "a", SETTINGS, lambda *_: None)
+    metrics = json.loads((tmp_path / "a" / "metrics.json").read_text())
+    for device in SETTINGS.devices:
+        row = by_name["a", device]
+        wanted = json.loads(json.dumps(flat_metrics(metrics, device)))
+        assert {key: row[key] for key in wanted} == wanted
+        assert row["outcome"] == "done"
+        assert row["sentence"] == study.deployments[device].advice
+    assert by_name["b", "silk"]["outcome"] == "done"
+    assert by_name["b", "enterprise"]["outcome"] == "failed"
+    assert by_name["b", "enterprise"]["stage"] == "deploy enterprise"
+    assert "shortest would be" in by_name["b", "enterprise"]["sentence"]
+    for device in SETTINGS.devices:
+        assert by_name["c", device]["outcome"] == "failed"
+        assert by_name["c", device]["stage"] == "segment"
+        assert "not a .stl" in by_name["c", device]["sentence"]
+
+
+def test_a_worker_killed_midway_is_replaced_and_the_table_is_the_same(scans, table, tmp_path):
+    cases = find_cases(scans, SETTINGS)
+    victims = []
+
+    def kill_one():
+        while not victims:
+            for child in active_children():
+                time.sleep(1.0)
+                victims.append(child.pid)
+                os.kill(child.pid, signal.SIGKILL)
+                return
+            time.sleep(0.01)
+
+    killer = threading.Thread(target=kill_one)
+    killer.start()
+    run_cohort(left_to_do(cases, tmp_path), tmp_path, Processes(2), told)
+    killer.join()
+    assert victims
+    assert bare(collect(cases, tmp_path)) == table
+
+
+def test_a_case_whose_process_always_dies_costs_only_itself_and_is_done_by_the_next_run(scans, table, tmp_path):
+    cases = find_cases(scans, SETTINGS)[1:]
+    run_cohort(left_to_do(cases, tmp_path), tmp_path, Processes(2, killed), told)
+    rows = collect(cases, tmp_path)
+    assert [row["outcome"] for row in rows] == ["done", "failed", LOST, LOST]
+    assert "killed by signal 9" in rows[2]["sentence"]
+    assert bare(rows)[:2] == table[2:4]
+    (task,) = left_to_do(cases, tmp_path)
+    assert task.case.name == "c"
+    work(task)
+    assert bare(collect(cases, tmp_path)) == table[2:]
+
+
+def test_a_second_run_does_only_what_is_missing(scans, table, tmp_path):
+    cases = find_cases(scans, SETTINGS)
+    for case in cases:
+        for device, key in case.keys.items():
+            row = next(row for row in table if (row["case"], row["device"]) == (case.name, device))
+            path = row_path(tmp_path / "cases" / case.name, device)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps({"key": key, "row": row}))
+    assert left_to_do(cases, tmp_path) == []
+    # one row damaged, one input changed, one more device: just these are missing
+    row_path(tmp_path / "cases" / "a", "silk").write_text('{"key": ')
+    changed = [replace(case, path=scans / "a.stl") if case.name == "b" else case for case in cases]
+    more = [replace(c, settings=replace(c.settings, devices=("silk", "enterprise", "pipeline"))) for c in changed]
+    missing = {task.case.name: task.case.settings.devices for task in left_to_do(more, tmp_path)}
+    assert missing == {
+        "a": ("silk", "pipeline"),
+        "b": ("silk", "enterprise", "pipeline"),
+        "c": ("pipeline",),
+    }
+    # another threshold is another study
+    other = [replace(cases[0], settings=replace(SETTINGS, threshold=100.0))]
+    assert left_to_do(other, tmp_path)[0].case.settings.devices == SETTINGS.devices
+
+
+def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path, capsys):
+    out = tmp_path / "out"
+    listed = tmp_path / "cohort.csv"
+    listed.write_text(f"case,input,devices,at\nfirst,{scans / 'a.stl'},silk,\nlast,{scans / 'b.stl'},,\n")
+    command = ["batch", str(listed), "--out", str(out), "--no-flow", "--units", "mm", "--device", "enterprise"]
+    assert main([*command, "--jobs", "2", "--files"]) == 0
+    said = capsys.readouterr()
+    assert "2 cases, 2 rows; 2 cases to do: about 1 min" in said.out
+    with (out / "cohort.csv").open(newline="") as file:
+        first, last = csv.DictReader(file)
+    assert (first["case"], first["device"], first["outcome"]) == ("first", "silk", "done")
+    assert (last["device"], last["outcome"], last["stage"]) == ("enterprise", "failed", "deploy enterprise")
+    alone = next(row for row in table if (row["case"], row["device"]) == ("a", "silk"))
+    key = "deployment.deployed_length_mm"
+    assert float(first[key]) == pytest.approx(alone[key], rel=1e-5)
+    study = json.loads((out / "cases" / "first" / "study" / "metrics.json").read_text())
+    assert study["stents"]["silk"]["deployment"]["deployed_length_mm"] == pytest.approx(alone[key], rel=1e-5)
+    page = (out / "cohort.html").read_text()
+    assert last["sentence"] in page.replace("&#39;", "'")
+    assert main([*command, "--jobs", "2"]) == 0
+    assert "0 cases to do" in capsys.readouterr().out
+
+
+def test_parquet_holds_what_the_rows_hold(table, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    assert write_parquet(tmp_path / "t.parquet", table)
+    found = parquet.read_table(tmp_path / "t.parquet").to_pylist()
+    assert [{key: value for key, value in row.items() if value is not None} for row in found] == table
+
+
+BAD_LISTS = {
+    "an unknown column": ("input,sac\na.stl,1\n", "column 'sac'"),
+    "no input": ("case\nfirst\n", "names no input"),
+    "a point of two numbers": ("input,at\na.stl,1 2\n", "three numbers"),
+    "a threshold in words": ("input,threshold\na.stl,high\n", "threshold is 'high'"),
+    "a name with a slash": ("case,input\n../up,a.stl\n", "without slashes"),
+    "one name twice": ("case,input\nx,a.stl\nx,b.stl\n", "two cases called x"),
+    "no case at all": ("case,input\n", "holds no case"),
+    "a device that does not exist": ("input,devices\na.stl,slik\n", "silk"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_LISTS)
+def test_a_bad_list_is_refused_before_anything_is_done(name, tmp_path, capsys):
+    text, said = BAD_LISTS[name]
+    (tmp_path / "list.csv").write_text(text)
+    assert main(["batch", str(tmp_path / "list.csv"), "--out", str(tmp_path / "out"), "--no-flow"]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_holds_its_surfaces_scans_and_series(scans, tmp_path):
+    assert [case.name for case in find_cases(scans, SETTINGS)] == ["a", "b", "c"]
+    series = tmp_path / "cohort" / "patient 1"
+    series.mkdir(parents=True)
+    (series / "IM0001").write_bytes(b"")
+    (tmp_path / "cohort" / "empty").mkdir()
+    (tmp_path / "cohort" / "two.nii.gz").write_bytes(b"")
+    assert [case.name for case in find_cases(tmp_path / "cohort", SETTINGS)] == ["patient 1", "two"]
+    with pytest.raises(ReadError, match="does not exist"):
+        find_cases(tmp_path / "none", SETTINGS)
+
+
+def test_an_estimate_grows_with_cases_devices_and_flow_and_heeds_memory(scans, monkeypatch):
+    cases = find_cases(scans, SETTINGS)
+    one, all_three = estimate(cases[:1], 2), estimate(cases, 2)
+    assert one.cpu_s > START_CPU_S
+    assert all_three.cpu_s > 2 * one.cpu_s
+    flowing = [replace(case, settings=Settings(units="mm")) for case in cases]
+    assert estimate(flowing, 2).cpu_s > 10 * all_three.cpu_s
+    monkeypatch.setattr(sys.modules["vstent.cohort.estimate"], "_free_memory_MB", lambda: 3.5 * one.memory_MB)
+    assert estimate(cases[:1], 8).jobs == 3
+
+
+def test_outliers_are_found_by_the_modified_z_score():
+    values = [1.0, 2.0, 3.0, 4.0, 5.0, 40.0]
+    away = np.abs(np.array(values) - 3.5)
+    wanted = 0.6745 * (np.array(values) - 3.5) / np.median(away)
+    assert modified_z_scores(values) == pytest.approx(wanted)
+    key = "deployment.deployed_length_mm"
+    rows = [{"case": f"<c{i}>", "device": "silk", "outcome": "done", key: v} for i, v in enumerate(values)]
+    page = cohort_report("x", rows)
+    outliers = page[page.index('id="outliers"') : page.index('id="failures"')]
+    assert re.findall(r'<th scope="row">(.*?)</th>', outliers) == ["&lt;c5&gt;"]
+    assert page.count("<circle") == 6
+    assert page.count("class=apart") == 1
+    assert "://" not in page
+
+
+@needs_dask
+def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_keeps_what_is_done(
+    scans, table, tmp_path
+):
+    cases = find_cases(scans, SETTINGS)
+    with Scheduler(tmp_path) as scheduler:
+        scheduler.add_worker()
+        victim = scheduler.add_worker()
+        # the worker dies with a case in its hands, as soon as another case is done
+        run_cohort(left_to_do(cases, tmp_path), tmp_path, DaskCluster(scheduler.address), lambda *_: victim.kill())
+        assert bare(collect(cases, tmp_path)) == table
+        # the scheduler itself is lost as soon as one case is done
+        for device in SETTINGS.devices:
+            for name in "bc":
+                row_path(tmp_path / "cases" / name, device).unlink()
+        tasks = left_to_do(cases, tmp_path)
+        with pytest.raises(VstentError, match="scheduler is lost"):
+            run_cohort(tasks, tmp_path, DaskCluster(scheduler.address, held), lambda *_: scheduler.process.kill())
+    assert [task.case.name for task in left_to_do(cases, tmp_path)] == ["c"]
+    run_cohort(left_to_do(cases, tmp_path), tmp_path, Processes(1), told)
+    assert bare(collect(cases, tmp_path)) == table
+
+
+@needs_dask
+def test_no_scheduler_is_told_in_a_sentence(scans, tmp_path, monkeypatch):
+    monkeypatch.setattr("vstent.cohort.crews.SCHEDULER_S", 0.5)
+    with pytest.raises(InputError, match="No Dask scheduler answers"):
+        list(DaskCluster("tcp://127.0.0.1:9").do(left_to_do(find_cases(scans, SETTINGS), tmp_path)))
+
+
+def test_a_slurm_job_asks_for_twice_the_memory_foreseen_and_holds_one_case():
+    pytest.importorskip("dask_jobqueue")
+    with Slurm(3, 412.4).cluster() as cluster:
+        script = cluster.job_script()
+    assert float(re.search(r"--mem=(\d+)M", script)[1]) == pytest.approx(2 * 412.4e6 / 2**20, abs=1)
+    assert "#SBATCH --cpus-per-task=1" in script
+    assert "--nthreads 1" in script
+
+
+class Scheduler:
+    """A Dask scheduler and its workers, each a process of its own."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.processes = []
+
+    def __enter__(self):
+        file = self.folder / "scheduler.json"
+        options = ["--port", "0", "--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", str(file)]
+        self.process = self._start("dask_scheduler", options)
+        while not (file.exists() and file.stat().st_size):
+            assert self.process.poll() is None
+            time.sleep(0.05)
+        self.address = json.loads(file.read_text())["address"]
+        return self
+
+    def add_worker(self):
+        options = [self.address, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+        return self._start("dask_worker", [*options, "--local-directory", str(self.folder), "--death-timeout", "30"])
+
+    def _start(self, module, options):
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+        log = (self.folder / f"{module}-{len(self.processes)}.log").open("wb")
+        with log:
+            command = [sys.executable, "-m", f"distributed.cli.{module}", *options]
+            process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+        self.processes.append(process)
+        return process
+
+    def __exit__(self, *_):
+        for process in self.processes:
+            process.kill()
+            process.wait()
+
+
+def test_rows_of_another_key_are_not_believed(tmp_path):
+    row_path(tmp_path, "silk").write_text('{"key": "one", "row": {"outcome": "done"}}')
+    assert read_row(tmp_path, "silk", "one") == {"outcome": "done"}
+    assert read_row(tmp_path, "silk", "two") is None

@@ -1,0 +1,124 @@
+"""Bad input and bad machines: one sentence, the right exit code, nothing half-written, nothing lost."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from faults import DONE, FAULTS, Fault, artery, play
+from vstent.io.writers import write_stl
+from vstent.study import Settings, run
+
+KEPT = {"disk full", "kept stages that unpack to 16 GB"}
+"""Faults after which the case folder holds what was finished before."""
+
+
+def test_the_list_is_long_and_has_no_name_twice() -> None:
+    assert len({(fault.group, fault.name) for fault in FAULTS}) == len(FAULTS)
+    assert len(FAULTS) >= 60
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        pytest.param(fault, id=f"{fault.group}: {fault.name}", marks=[pytest.mark.validation] if fault.is_heavy else [])
+        for fault in FAULTS
+    ],
+)
+def test_a_fault_ends_in_one_sentence_and_leaves_nothing_behind(
+    fault: Fault, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    outcome = play(fault, tmp_path)
+    assert outcome.code == fault.code, outcome.told
+    assert fault.said in " ".join(outcome.told.split())
+    assert "Traceback" not in outcome.told
+    assert capfd.readouterr() == ("", "")
+    if fault.code != DONE:
+        assert len([line for line in outcome.told.splitlines() if line.startswith("vstent")]) == 1
+        assert len(outcome.sentence.split()) >= 8, outcome.sentence
+    if fault.name not in KEPT and fault.code != DONE:
+        assert not (tmp_path / "out").exists()
+    assert not [*tmp_path.rglob(".partial-*"), *tmp_path.rglob("lock")]
+
+
+KILLED = """
+import os, pathlib, signal, sys
+from vstent.study import Settings, run
+
+moment, path, out, cell = sys.argv[1:]
+replace = os.replace
+
+def die(now):
+    if now == moment:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+def replacing(source, target):
+    die(f"writing {pathlib.Path(target).name}")
+    replace(source, target)
+
+os.replace = replacing
+flow = None
+if cell:
+    from vstent.flow import FlowSettings
+    flow = FlowSettings(cell_size_mm=float(cell))
+settings = Settings(devices=("silk",), units="mm", flow=flow)
+run(pathlib.Path(path), pathlib.Path(out), settings, lambda stage, fraction, detail: die(f"{stage} {fraction:.0f}"))
+"""
+"""A study that kills itself, without a chance to tidy up, at a moment given: a stage's begin (0) or end (1)."""
+
+
+def killed(moment: str, path: Path, out: Path, cell: str = "") -> int:
+    """Run it; return how it ended."""
+    command = [sys.executable, "-c", KILLED, moment, str(path), str(out), cell]
+    return subprocess.run(command, capture_output=True, timeout=600, check=False).returncode
+
+
+def written(out: Path) -> dict[str, bytes]:
+    """Return what lies in a case folder by now, times taken aside."""
+    files = (path for path in out.rglob("*") if path.is_file() and path.name not in ("run.json", "lock"))
+    return {str(path.relative_to(out)): path.read_bytes() for path in files if path.suffix != ".npz"}
+
+
+BRIEF = ["writing contour.vtp"]
+EVERY = [
+    "segment 0",
+    "trace 0",
+    "restore 0",
+    "deploy silk 1",
+    "writing vessel.vtp",
+    *BRIEF,
+    "struts silk 1",
+    "measure 0",
+]
+
+
+@pytest.mark.parametrize("moments", [BRIEF, pytest.param(EVERY, marks=pytest.mark.validation)], ids=["once", "often"])
+def test_killed_at_any_stage_the_same_command_goes_on(moments: list[str], tmp_path: Path) -> None:
+    write_stl(tmp_path / "artery.stl", artery())
+    run(tmp_path / "artery.stl", tmp_path / "whole", Settings(devices=("silk",), units="mm", flow=None), _silent)
+    whole, out = written(tmp_path / "whole"), tmp_path / "out"
+    for moment in moments:
+        assert killed(moment, tmp_path / "artery.stl", out) == -signal.SIGKILL, moment
+        left = {name: data for name, data in written(out).items() if ".partial-" not in name}
+        assert left.items() <= whole.items(), moment  # whatever is there is complete
+    assert killed("never", tmp_path / "artery.stl", out) == 0
+    assert written(out) == whole
+
+
+@pytest.mark.validation
+def test_killed_in_a_flow_the_finished_one_is_kept(tmp_path: Path) -> None:
+    write_stl(tmp_path / "artery.stl", artery())
+    out = tmp_path / "out"
+    assert killed("flow silk 0", tmp_path / "artery.stl", out, "0.45") == -signal.SIGKILL
+    bare = written(out)
+    assert {"flow/bare/field.vtu", "flow/bare/wall.vtp"} <= bare.keys()
+    assert killed("flow bare 0", tmp_path / "artery.stl", out, "0.45") == -signal.SIGKILL  # told that it is done
+    assert killed("never", tmp_path / "artery.stl", out, "0.45") == 0
+    assert bare.items() <= written(out).items()
+    assert "metrics.json" in written(out)
+
+
+def _silent(stage: str, fraction: float, detail: str) -> None:
+    """Hear of a stage and say nothing."""

@@ -1,0 +1,119 @@
+"""A flow stopped at any moment goes on as if it had not been."""
+
+import subprocess
+import sys
+import time
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vstent import phantoms
+from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, engines, simulate_case
+from vstent.flow.engines import lattice_state
+from vstent.flow.types import Waveform
+from vstent.study.checkpoint import FlowCheckpoint
+from vstent.trace import trace
+from vstent.vessel import Vessel
+
+SETTINGS = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.3, max_steps=800)
+PULSE = FlowSettings(
+    inflow_mL_s=1.0, cell_size_mm=0.4, waveform=Waveform(0.05, (0.5,), (0.0,)), max_cycles=2, lattice_speed=0.2
+)
+
+
+@cache
+def vessel() -> Vessel:
+    return trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.4)))
+
+
+def screen() -> Screen:
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(-2.2, 2.2, 0.1), np.arange(-2.2, 2.2, 0.1)))
+    n = len(x)
+    points = np.stack([x, y, np.full(n, 5.0)], axis=1)
+    normals = np.tile([0.0, 0.0, 1.0], (n, 1))
+    return Screen(points, normals, np.full(n, 0.01), np.full(n, 300.0), np.full(n, 150.0), np.zeros(n))
+
+
+class Stopping(FlowCheckpoint):
+    """Stops the run right after it has been saved for the `last` time."""
+
+    last = 3
+
+    def save(self, run: str, saved: engines.Saved) -> None:
+        super().save(run, saved)
+        self.last -= 1
+        if self.last == 0:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("kind", ["steady", "pulsatile", "stented"])
+@pytest.mark.parametrize("saves", [2, 9])
+def test_a_stopped_flow_goes_on_to_the_same_bits(
+    kind: str, saves: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engines, "SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr(engines, "SAVE_SHARE", np.inf)
+    monkeypatch.setattr(lattice_state, "SLICE_UPDATES", 5e5)  # stops between checks too
+    case = FlowCase(vessel(), settings=PULSE if kind == "pulsatile" else SETTINGS)
+    start = None
+    if kind == "stented":
+        start = simulate_case(case)
+        case = FlowCase(vessel(), screen=screen(), settings=SETTINGS)
+    whole = simulate_case(case, start=start)
+    stopping = Stopping(tmp_path, "flow", "key")
+    stopping.last = saves
+    with pytest.raises(KeyboardInterrupt):
+        simulate_case(case, start=start, checkpoint=stopping)
+    resumed = simulate_case(case, start=start, checkpoint=FlowCheckpoint(tmp_path, "flow", "key"))
+    assert_same(resumed, whole)
+
+
+def assert_same(a: FlowField, b: FlowField) -> None:
+    np.testing.assert_array_equal(a.velocity_m_s, b.velocity_m_s)
+    np.testing.assert_array_equal(a.pressure_Pa, b.pressure_Pa)
+    np.testing.assert_array_equal(a.residual, b.residual)
+    assert (a.steps, a.advice, len(a.phases)) == (b.steps, b.advice, len(b.phases))
+    for one, other in zip(a.phases, b.phases, strict=True):
+        np.testing.assert_array_equal(one.velocity_m_s, other.velocity_m_s)
+
+
+KILLED = f"""
+import sys
+from pathlib import Path
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+import test_flow_checkpoint as here
+here.engines.SAVE_EVERY_S = 0.05
+case = here.FlowCase(here.vessel(), settings=here.LONG)
+here.simulate_case(case, checkpoint=here.FlowCheckpoint(Path(sys.argv[1]), "flow", "key"))
+"""
+LONG = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.3, max_steps=1600, tolerance=1e-9)
+
+
+def test_a_killed_flow_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path)])
+    try:
+        deadline = time.monotonic() + 120
+        while not list(tmp_path.glob("flow-key-answer.running.npz")):
+            assert process.poll() is None, "it ended before anything was saved"
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        time.sleep(0.2)
+    finally:
+        process.kill()
+        process.wait()
+    case = FlowCase(vessel(), settings=LONG)
+    resumed = simulate_case(case, checkpoint=FlowCheckpoint(tmp_path, "flow", "key"))
+    assert_same(resumed, simulate_case(case))
+
+
+def test_what_is_damaged_or_was_never_saved_is_begun_anew(tmp_path: Path) -> None:
+    kept = FlowCheckpoint(tmp_path, "flow", "key")
+    assert kept.load("answer") is None
+    kept.save("answer", {"steps": np.array(7)})
+    assert kept.load("answer") == {"steps": 7}
+    file = next(tmp_path.iterdir())
+    file.write_bytes(file.read_bytes()[:-40])
+    assert kept.load("answer") is None
+    assert FlowCheckpoint(tmp_path, "flow", "other").load("answer") is None

@@ -1,0 +1,82 @@
+"""What a flow will cost is foretold, and why it failed is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tubes import line, tube
+from vstent.errors import FlowError
+from vstent.flow import FlowCase, FlowSettings, domain, simulate_case
+from vstent.flow.cost import block_rate, estimate, free_memory_bytes, refuse_too_large
+from vstent.flow.engines.lattice_pulse import PHASES, PulsatileLatticeBoltzmann
+from vstent.flow.waveform import OLDER_ADULT_ICA
+
+SETTINGS = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.2)
+
+
+def case_of(**changes):
+    return FlowCase(tube(line(8.0), 2.0).vessel, settings=replace(SETTINGS, **changes))
+
+
+def test_the_cells_foretold_are_the_grids():
+    case = case_of()
+    assert estimate(case).cells == pytest.approx(len(domain.build(case.vessel, 0.2).cells), rel=0.01)
+
+
+def test_twice_as_fine_costs_eight_times_the_cells_and_pulsatile_steps_twice():
+    coarse, fine = (estimate(case_of(cell_size_mm=size, waveform=OLDER_ADULT_ICA)) for size in (0.2, 0.1))
+    assert fine.cells == pytest.approx(8 * coarse.cells, rel=1e-3)
+    assert fine.steps == pytest.approx(2 * coarse.steps, rel=0.02)
+    assert fine.seconds == pytest.approx(16 * coarse.seconds, rel=0.02)
+    per_cell = (fine.memory_bytes - coarse.memory_bytes) / (fine.cells - coarse.cells)
+    assert 600 < per_cell < 1600
+
+
+def test_the_pulsatile_steps_foretold_are_those_made():
+    case = case_of(waveform=OLDER_ADULT_ICA)
+    state = PulsatileLatticeBoltzmann(0.2).init(case, None)
+    assert estimate(case).steps == state.steps_per_check * PHASES * case.settings.max_cycles
+
+
+def test_the_time_foretold_is_of_a_measured_rate():
+    assert 1e6 < block_rate() < 1e11
+    cost = estimate(case_of())
+    assert cost.seconds == pytest.approx(1.3 * cost.cells * 24_000 / block_rate(), rel=1e-4)
+
+
+def test_what_does_not_fit_is_refused_with_the_cell_size_that_does():
+    case, free_bytes = case_of(cell_size_mm=0.02), 1e9
+    with pytest.raises(FlowError, match="set a cell size of") as refusal:
+        refuse_too_large(case, free_bytes)
+    fitting_mm = float(str(refusal.value).split("cell size of ")[1].split(" mm")[0])
+    assert 0.02 < fitting_mm < 0.1
+    refuse_too_large(case_of(cell_size_mm=1.05 * fitting_mm), free_bytes)
+    with pytest.raises(FlowError):
+        refuse_too_large(case_of(cell_size_mm=0.9 * fitting_mm), free_bytes)
+    assert free_memory_bytes() > 1e7
+
+
+def test_too_long_a_time_step_is_named_with_the_last_good_state():
+    with pytest.raises(FlowError, match="diverged") as error:
+        simulate_case(case_of(cell_size_mm=0.4, lattice_speed=1.5, max_steps=4000))
+    assert "halve the lattice speed" in str(error.value)
+
+
+def test_the_last_good_check_is_told_with_time_speed_and_place():
+    case = case_of(cell_size_mm=0.4, inflow_mL_s=1.0)
+    from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
+
+    engine = LatticeBoltzmann(0.4)
+    state = engine.init(case, None)
+    while len(state.history) < 3:
+        state = engine.step(state)
+    good_ms = 1e3 * state.steps * state.scales.step_s
+    speed = np.linalg.norm(state.snapshots[-1].velocity, axis=1).max() * state.scales.speed_m_s
+    state.populations[:] = np.nan
+    while not (reached := engine.terminate(engine.step(state))) or not np.isnan(reached):
+        pass
+    said = engine.trouble(state)
+    assert f"between {good_ms:.3g} and" in said
+    assert f"{speed:.2g} m/s at (" in said
+    assert "too coarse" in said  # neither too fast for its time step, nor coming back

@@ -1,0 +1,215 @@
+"""vstent as a library for others: its names, their types, plug-ins, threads."""
+
+import inspect
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vstent
+from faults import artery
+from vstent import device, plugins
+from vstent.deploy import ConstantWire, deploy
+from vstent.errors import DeviceError, PluginError
+from vstent.flow import FlowSettings, flow_case, simulate_case
+from vstent.restore import restore
+from vstent.stent import Deployment, Landing
+from vstent.trace import trace
+from vstent.trim import trim
+from vstent.vessel import Anatomy, Vessel
+
+VERBS = (
+    "catalogue",
+    "deploy",
+    "find_design",
+    "measure",
+    "morphology",
+    "rank",
+    "read_image",
+    "read_surface",
+    "repair",
+    "report",
+    "restore",
+    "run",
+    "segment",
+    "simulate",
+    "struts",
+    "trace",
+    "trim",
+)
+"""What others may rely on; a name goes only with a line in the changelog."""
+
+
+def test_the_public_names_are_these() -> None:
+    assert tuple(vstent.__all__) == VERBS
+    for name in VERBS:
+        verb = getattr(vstent, name)
+        assert callable(verb)
+        assert verb.__name__ == name
+        assert verb.__doc__
+
+
+def test_every_public_name_says_its_types() -> None:
+    assert resources.files("vstent").joinpath("py.typed").is_file()
+    for name in VERBS:
+        signature = inspect.signature(inspect.unwrap(getattr(vstent, name)))
+        assert signature.return_annotation is not inspect.Signature.empty, name
+        assert all(p.annotation is not inspect.Parameter.empty for p in signature.parameters.values()), name
+
+
+@pytest.fixture(scope="module")
+def anatomy() -> Anatomy:
+    return restore(trim(trace(Vessel(artery()))))
+
+
+PLUGIN = '''
+from vstent.deploy.wall import TreeWall
+from vstent.flow.engines import AbstractEngine
+
+
+def devices():
+    return """
+[[device]]
+key = "plugged"
+name = "Plugged in"
+maker = "a test"
+kind = "braid"
+wires = [{ count = 48, diameter_um = 30, source = "none", confidence = "estimated" }]
+braid_angle_rad = { value = 1.15, source = "none", confidence = "estimated" }
+free_diameter_margin_mm = { value = 0.2, source = "none", confidence = "estimated" }
+sizes = [{ diameters_mm = [4.0], lengths_mm = [15], source = "none", confidence = "estimated" }]
+"""
+
+
+class CountingWall:
+    """The wall itself, and how often it was asked."""
+
+    asked = 0
+
+    def __init__(self, surface):
+        self.tree = TreeWall(surface)
+
+    def contact(self, points_mm):
+        CountingWall.asked += 1
+        return self.tree.contact(points_mm)
+
+    def crosses(self, starts_mm, ends_mm):
+        return self.tree.crosses(starts_mm, ends_mm)
+
+
+class Still(AbstractEngine):
+    """An engine in which nothing moves."""
+
+    def __init__(self, cell_size_mm):
+        self.cell_size_mm = cell_size_mm
+
+    def init(self, case, start):
+        return case
+
+    def step(self, state):
+        return state
+
+    def terminate(self, state):
+        return 0.0
+
+    def max_checks(self, state):
+        return 1
+
+    def result(self, state, outcome):
+        return ("still", self.cell_size_mm, outcome.is_converged)
+
+    def save(self, state):
+        return {}
+
+    def resume(self, case, saved):
+        return case
+
+    def trouble(self, state):
+        return "none"
+
+'''
+
+
+@pytest.fixture
+def distribution(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A distribution, tiny but whole, that plugs in a device, an engine and a wall."""
+    (tmp_path / "tiny_plugin.py").write_text(PLUGIN)
+    info = tmp_path / "tiny_plugin-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tiny-plugin\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[vstent.devices]\ntiny = tiny_plugin:devices\n\n"
+        "[vstent.engines]\nstill = tiny_plugin:Still\nmissing = tiny_plugin:Nothing\n\n"
+        "[vstent.walls]\ncounting = tiny_plugin:CountingWall\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "tiny_plugin", raising=False)
+    device.catalogue.cache_clear()
+    yield tmp_path
+    monkeypatch.undo()
+    device.catalogue.cache_clear()
+
+
+@pytest.mark.usefixtures("distribution")
+def test_a_device_is_plugged_in() -> None:
+    plugged = vstent.find_design("plugged")
+    assert (plugged.maker, plugged.n_wires, plugged.facts[0].confidence) == ("a test", 48, "estimated")
+    assert set(device.catalogue()) > {"silk", "enterprise"}
+
+
+def test_a_device_that_is_plugged_in_twice_is_refused(distribution: Path) -> None:
+    text = (distribution / "tiny_plugin.py").read_text().replace('key = "plugged"', 'key = "silk"')
+    (distribution / "tiny_plugin.py").write_text(text)
+    with pytest.raises(DeviceError, match="plug-in tiny names a device that the catalogue has already, silk"):
+        vstent.catalogue()
+
+
+@pytest.mark.usefixtures("distribution")
+def test_a_wall_is_plugged_in_and_gives_the_same_deployment(anatomy: Anatomy) -> None:
+    design = vstent.find_design("silk")
+    plain, plugged = deploy(design, anatomy), deploy(design, anatomy, method=ConstantWire(wall="counting"))
+    assert plugins.load("vstent.walls", "counting", built_in="tree").asked > 2
+    np.testing.assert_array_equal(plain.stent.nodes_mm, plugged.stent.nodes_mm)
+
+
+@pytest.mark.usefixtures("distribution")
+def test_a_flow_engine_is_plugged_in(anatomy: Anatomy) -> None:
+    case = flow_case(anatomy, None, FlowSettings(engine="still", cell_size_mm=3.0))
+    assert simulate_case(case) == ("still", 3.0, True)
+
+
+@pytest.mark.usefixtures("distribution")
+def test_plugins_that_are_not_there_are_named(anatomy: Anatomy) -> None:
+    with pytest.raises(
+        PluginError, match=r"no 'stil' in vstent.engines: choose one of lattice_boltzmann, missing, still"
+    ):
+        simulate_case(flow_case(anatomy, None, FlowSettings(engine="stil", cell_size_mm=3.0)))
+    with pytest.raises(PluginError, match=r"missing of vstent.engines cannot be loaded"):
+        simulate_case(flow_case(anatomy, None, FlowSettings(engine="missing", cell_size_mm=3.0)))
+    with pytest.raises(PluginError, match=r"no 'x' in vstent.walls: choose one of tree, counting"):
+        deploy(vstent.find_design("silk"), anatomy, method=ConstantWire(wall="x"))
+
+
+def test_two_threads_deploy_as_one_does(anatomy: Anatomy) -> None:
+    jobs = [(name, shift_mm) for shift_mm in (-1.5, 0.0, 1.5) for name in ("silk", "enterprise")]
+    gate = threading.Barrier(2)
+    middle_mm = float(deploy(vstent.find_design("silk"), anatomy).stent.row_abscissa_mm.mean())
+
+    def work(job: tuple[str, float]) -> Deployment:
+        return deploy(vstent.find_design(job[0]), anatomy, landing=Landing(middle_mm + job[1]))
+
+    def together(job: tuple[str, float]) -> Deployment:
+        gate.wait(60)  # both begin at once, every time
+        return work(job)
+
+    with ThreadPoolExecutor(2) as pool:
+        at_once = list(pool.map(together, jobs))
+    for job, found in zip(jobs, at_once, strict=True):
+        alone = work(job)
+        for name in ("nodes_mm", "wire_points_mm", "row_abscissa_mm"):
+            np.testing.assert_array_equal(getattr(found.stent, name), getattr(alone.stent, name))
+        np.testing.assert_array_equal(found.wall_gap_mm, alone.wall_gap_mm)

@@ -1,0 +1,181 @@
+"""The case handed to OpenFOAM: syntax, units, watertight patches, the flow that was asked for."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from shapes import sphere
+from vstent import phantoms
+from vstent.errors import ReadError
+from vstent.flow import FlowCase, FlowSettings
+from vstent.flow.openfoam import FoamSetup, foam_case, named_patches
+from vstent.flow.openfoam.case import struts_near
+from vstent.flow.openfoam.dictionary import foam_file, parse
+from vstent.flow.waveform import OLDER_ADULT_ICA
+from vstent.surface import Surface
+from vstent.trace import trace
+from vstent.vessel import Vessel
+
+RADIUS_MM, BRANCH_MM, FLOW_ML_S = 2.0, 1.2, 3.0
+SETUP = FoamSetup(0.25, processes=4)
+
+
+@cache
+def case(outlets: str = "zero_pressure", *, is_pulse: bool = False) -> FlowCase:
+    straight = phantoms.tube(length_mm=14.0, radius_mm=RADIUS_MM)
+    phantom = phantoms.with_branch(straight, abscissa_mm=6.0, direction=[1, 0, 1], radius_mm=BRANCH_MM, length_mm=7.0)
+    vessel = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.4)))
+    waveform = OLDER_ADULT_ICA if is_pulse else None
+    return FlowCase(vessel, settings=FlowSettings(inflow_mL_s=FLOW_ML_S, outlets=outlets, waveform=waveform))
+
+
+def with_sac() -> FlowCase:
+    """The sac is whatever of the wall lies within a sphere: enough to name its faces."""
+    lumen = case().vessel.lumen
+    inside = np.linalg.norm(lumen.corners_mm.mean(axis=1) - [-RADIUS_MM, 0, 7.0], axis=1) < 1.5
+    cut = Surface(lumen.vertices_mm, lumen.faces[inside])
+    return replace(case(), sac=cut, ostium=sphere(1.0))
+
+
+@pytest.mark.parametrize("flavour", ["com", "org"])
+@pytest.mark.parametrize("is_pulse", [False, True])
+@pytest.mark.parametrize("outlets", ["zero_pressure", "murray"])
+def test_every_dictionary_is_one(flavour: str, is_pulse: bool, outlets: str) -> None:
+    foam = foam_case(case(outlets, is_pulse=is_pulse), replace(SETUP, flavour=flavour, struts=sphere(1.0)))
+    parsed = {name: parse(text) for name, text in foam.files.items() if text.startswith("FoamFile")}
+    for name, entries in parsed.items():
+        assert entries["FoamFile"]["object"] == [name.rpartition("/")[2]]
+    program = ["foamRun"] if flavour == "org" else ["pimpleFoam"] if is_pulse else ["simpleFoam"]
+    assert parsed["system/controlDict"]["application"] == program
+    patches = {"wall", "struts", "inlet", "outlet_1", "outlet_2"}
+    for quantity in ("0/U", "0/p"):
+        assert set(parsed[quantity]["boundaryField"]) == patches
+    meshed = parsed["system/snappyHexMeshDict"]
+    regions = meshed["geometry"]["lumen"]["regions"]
+    assert set(regions) | {"struts"} == patches
+    assert all(meshed["castellatedMeshControls"]["refinementSurfaces"]["lumen"]["regions"][name] for name in regions)
+    assert set(meshed["addLayersControls"]["layers"]) == {"wall"}
+    parts = parsed["system/decomposeParDict"]
+    assert parts["numberOfSubdomains"] == ["4"]
+    assert parts["hierarchicalCoeffs"]["n"] == ["(", "1", "1", "4", ")"]  # the tube is longest along z
+    viscosity = parsed["constant/" + ("physicalProperties" if flavour == "org" else "transportProperties")]["nu"]
+    assert float(viscosity[-1]) == pytest.approx(0.004 / 1060)
+
+
+def test_what_is_written_is_read_and_what_is_damaged_is_refused() -> None:
+    text = foam_file("x", {"a_key_of_more_than_sixteen": 1.5, "b": {"c": ["d", (1, 2)], "e": True}}, note="why; {")
+    entries = parse(text)
+    assert entries["a_key_of_more_than_sixteen"] == ["1.5"]
+    assert entries["b"] == {"c": ["(", "d", "(", "1", "2", ")", ")"], "e": ["yes"]}
+    for damaged in (text.replace("1.5;", "1.5"), text[:-2], text + "}"):
+        with pytest.raises(ReadError):
+            parse(damaged)
+
+
+def test_the_patches_are_watertight_and_as_large_as_the_openings() -> None:
+    patches, sections = named_patches(with_sac())
+    surface = patches[0].surface
+    assert sorted(np.concatenate([one.face_id for one in patches])) == list(range(len(surface.faces)))
+    edges = np.concatenate([surface.faces[:, [k, (k + 1) % 3]] for k in range(3)])
+    there, back = ({tuple(edge) for edge in way} for way in (edges, edges[:, ::-1]))
+    assert len(there) == len(edges)
+    assert there == back
+    assert surface.volume_mm3 > 0
+    areas = {one.name: one.area_mm2 for one in patches}
+    assert areas["sac"] == pytest.approx(with_sac().sac.area_mm2, rel=1e-9)
+    for opening in case().vessel.openings:
+        assert areas[opening.role] == pytest.approx(opening.area_mm2, rel=0.01)
+    assert areas["inlet"] == pytest.approx(np.pi * RADIUS_MM**2, rel=0.01)
+    assert sum(areas.values()) == pytest.approx(surface.area_mm2)
+    assert len(sections) == 3
+
+
+def solids(text: str) -> dict[str, np.ndarray]:
+    """Corners (f, 3, 3) by solid of an ASCII STL."""
+    found = {}
+    for part in text.split("endsolid")[:-1]:
+        name = part.split("solid ")[1].split()[0]
+        rows = [line.split()[1:] for line in part.splitlines() if line.startswith("vertex")]
+        found[name] = np.array(rows, dtype=float).reshape(-1, 3, 3)
+    return found
+
+
+def test_lengths_are_metres_and_solids_are_the_patches() -> None:
+    foam = foam_case(with_sac(), SETUP)
+    patches, _ = named_patches(with_sac())
+    found = solids(foam.files["constant/triSurface/lumen.stl"])
+    assert list(found) == [one.name for one in patches]
+    for one in patches:
+        np.testing.assert_allclose(found[one.name], one.corners_mm * 1e-3, atol=1e-10)
+    assert list(solids(foam.files["constant/triSurface/ends.stl"])) == ["inlet", "outlet_1", "outlet_2"]
+    everything = np.concatenate(list(found.values())).reshape(-1, 3)
+    block = parse(foam.files["system/blockMeshDict"])
+    corners = np.array([float(x) for x in block["vertices"] if x not in "()"]).reshape(-1, 3)
+    assert (corners.min(axis=0) < everything.min(axis=0)).all()
+    assert (corners.max(axis=0) > everything.max(axis=0)).all()
+    counts = np.array([x for x in block["blocks"] if x not in "()"][9:12], dtype=int)
+    np.testing.assert_allclose(np.ptp(corners, axis=0) / counts, 4 * 0.25e-3, rtol=1e-6)
+    snappy = parse(foam.files["system/snappyHexMeshDict"])["castellatedMeshControls"]
+    inside_mm = 1e3 * np.array([snappy["locationInMesh"][1:4]], dtype=float)
+    assert patches[0].surface.signed_distance(inside_mm)[0] < -0.3
+
+
+def vectors(text: str) -> np.ndarray:
+    """All vectors (n, 3) of a text, one a line."""
+    return np.array([line.strip("()").split() for line in text.splitlines() if line.count(" ") == 2], dtype=float)
+
+
+def test_the_inlet_carries_the_flow_that_was_asked_for() -> None:
+    files = foam_case(case(), SETUP).files
+    points_m, velocity = (vectors(files[f"constant/boundaryData/inlet/{name}"]) for name in ("points", "0/U"))
+    mean, velocity = velocity[-1], velocity[:-1]
+    inlet = case().vessel.inlet
+    area_m2 = next(one.area_mm2 for one in named_patches(case())[0] if one.name == "inlet") * 1e-6
+    assert -mean @ inlet.normal * area_m2 == pytest.approx(FLOW_ML_S * 1e-6, rel=1e-6)
+    # A parabola: twice the mean in the middle, zero at the wall and beyond.
+    radius_m = np.linalg.norm(np.cross(points_m - inlet.center_mm * 1e-3, inlet.normal), axis=1)
+    shape = -velocity @ inlet.normal / np.linalg.norm(mean)
+    expected = np.maximum(2 * (1 - (radius_m / (RADIUS_MM * 1e-3)) ** 2), 0.0)
+    np.testing.assert_allclose(shape, expected, atol=0.05)
+
+
+def pairs(text: str) -> np.ndarray:
+    """A table (t, 2) of time and value."""
+    return np.array(text.replace("(", " ").replace(")", " ").split(), dtype=float).reshape(-1, 2)
+
+
+def test_a_pulse_repeats_and_keeps_its_mean() -> None:
+    foam = foam_case(case("murray", is_pulse=True), SETUP).files
+    com = parse(foam["0/U"])["boundaryField"]
+    org = parse(foam_case(case("murray", is_pulse=True), replace(SETUP, flavour="org")).files["0/U"])["boundaryField"]
+    for patch, key in (("inlet", "scale"), ("outlet_2", "volumetricFlowRate")):
+        assert com[patch][key] == ["tableFile"]
+        assert com[patch][f"{key}Coeffs"] == {"file": [f'"<constant>/flow_{patch}"'], "outOfBounds": ["repeat"]}
+    time_s, factor = pairs(foam["constant/flow_inlet"]).T
+    assert (time_s[0], time_s[-1]) == (0.0, OLDER_ADULT_ICA.period_s)
+    np.testing.assert_allclose(factor, OLDER_ADULT_ICA.factor(time_s), rtol=1e-8)
+    assert factor[:-1].mean() == pytest.approx(1.0, abs=1e-8)
+    flow = org["inlet"]["volumetricFlowRate"]
+    assert (flow["type"], flow["outOfBounds"]) == (["table"], ["repeat"])
+    np.testing.assert_allclose(pairs(" ".join(flow["values"]))[:, 1], FLOW_ML_S * 1e-6 * factor, rtol=1e-8)
+    cubes = np.array([outlet.diameter_mm**3 for outlet in case().vessel.outlets])
+    out = pairs(foam["constant/flow_outlet_2"])[:, 1]
+    np.testing.assert_allclose(out, FLOW_ML_S * 1e-6 * factor * cubes[1] / cubes.sum(), rtol=1e-8)
+    steady = parse(foam_case(case("murray"), SETUP).files["0/U"])["boundaryField"]["outlet_2"]["volumetricFlowRate"]
+    assert float(steady[1]) == pytest.approx(FLOW_ML_S * 1e-6 * cubes[1] / cubes.sum())
+    control = parse(foam_case(case("murray", is_pulse=True), SETUP).files["system/controlDict"])
+    assert float(control["endTime"][0]) == pytest.approx(4 * OLDER_ADULT_ICA.period_s)
+
+
+def test_only_wires_at_the_neck_are_meshed_each_whole() -> None:
+    near, far = sphere(0.5), sphere(0.5)
+    both = Surface(
+        np.concatenate([near.vertices_mm + 1.2 * np.eye(3)[2], far.vertices_mm + 9.0 * np.eye(3)[2]]),
+        np.concatenate([near.faces, far.faces + len(near.vertices_mm)]),
+    )
+    kept = struts_near(both, sphere(0.4), 0.5)
+    assert len(kept.faces) == len(near.faces)
+    assert kept.volume_mm3 == pytest.approx(near.volume_mm3)
+    assert kept.corners_mm[..., 2].max() < 2.0

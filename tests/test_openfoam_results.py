@@ -1,0 +1,145 @@
+"""What comes back from OpenFOAM: fields read, brought to the grid, failures put into words, a tube's exact flow."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vstent import phantoms
+from vstent.errors import FlowError, ReadError
+from vstent.flow import FlowCase, FlowSettings, Screen, sampling
+from vstent.flow.engines import run
+from vstent.flow.engines.openfoam import OpenFoam
+from vstent.flow.openfoam import program, results, scatter
+from vstent.trace import trace
+from vstent.vessel import Vessel
+
+HEADER = "FoamFile\n{\n    class volVectorField;\n}\ndimensions [0 1 -1 0 0 0 0];\n"
+
+
+def write(path: Path, inside: str, **patches: str) -> None:
+    body = "".join(f"    {name}\n    {{\n        type x;\n        {value}\n    }}\n" for name, value in patches.items())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"{HEADER}internalField {inside};\n\nboundaryField\n{{\n{body}}}\n")
+
+
+def test_fields_are_read_as_openfoam_writes_them(tmp_path: Path) -> None:
+    write(
+        tmp_path / "7" / "U",
+        "nonuniform List<vector>\n3\n(\n(1 2 3)\n(4 5 -6e-7)\n(7 8 9)\n)\n",
+        wall="",
+        inlet="value           nonuniform List<vector> 2((1 0 0) (0 1 0));",
+        outlet_1="value           uniform (0 0 2.5);",
+        outlet_2="value           nonuniform List<vector> 2{(1 1 1)};",
+    )
+    found = results.read_field(tmp_path, "7", "U")
+    np.testing.assert_array_equal(found.inside, [[1, 2, 3], [4, 5, -6e-7], [7, 8, 9]])
+    assert {name: rows.tolist() for name, rows in found.patches.items()} == {
+        "inlet": [[1, 0, 0], [0, 1, 0]],
+        "outlet_1": [[0, 0, 2.5]],
+        "outlet_2": [[1, 1, 1]] * 2,
+    }
+    assert results.times(tmp_path) == ["7"]
+
+
+def test_parts_are_put_together_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for part in range(11):
+        wall = "nonuniform 0()" if part else "nonuniform List<scalar> 1(5)"
+        write(tmp_path / f"processor{part}" / "0.05" / "p", f"nonuniform List<scalar> 2({part} {part + 0.5})")
+        write(tmp_path / f"processor{part}" / "0.05" / "U", "uniform 0", wall=f"value {wall};")
+        (tmp_path / f"processor{part}" / "0.3").mkdir()
+    np.testing.assert_array_equal(results.read_field(tmp_path, "0.05", "p").inside[:, 0], np.arange(22) / 2)
+    np.testing.assert_array_equal(results.read_field(tmp_path, "0.05", "U").patches["wall"], [[5.0]])
+    assert results.times(tmp_path) == ["0.05"]  # 0.3 is not complete
+
+
+@pytest.mark.parametrize(
+    "inside", ["nonuniform List<vector> 2((1 2 3))", "nonuniform List<vector> 2((1 2 3", "uniform"]
+)
+def test_a_damaged_field_is_refused(inside: str, tmp_path: Path) -> None:
+    write(tmp_path / "1" / "U", inside)
+    with pytest.raises(ReadError, match="damaged"):
+        results.read_field(tmp_path, "1", "U")
+
+
+def test_fits_are_exact_for_linear_functions_and_second_order_for_others() -> None:
+    rng = np.random.default_rng(3)
+    error = []
+    for count in (4000, 32000):
+        sources = rng.uniform(-1, 1, (count, 3))
+        targets = rng.uniform(-0.8, 0.8, (200, 3))
+        fit = scatter.linear_fits(sources, targets)
+        slope = np.array([[1.0, -2.0, 0.5]]).T
+        np.testing.assert_allclose(fit @ (sources @ slope + 4), targets @ slope + 4, atol=1e-4)
+        error.append(np.sqrt(np.mean((fit @ np.sin(3 * sources[:, 0]) - np.sin(3 * targets[:, 0])) ** 2)))
+    assert error[1] < 0.35 * error[0]  # half the spacing: a quarter of the error
+    flat = np.concatenate([rng.uniform(-1, 1, (500, 2)), np.zeros((500, 1))], axis=1)
+    above = scatter.linear_fits(flat, np.array([[0.1, 0.2, 0.05]]))
+    assert above @ flat[:, 0] == pytest.approx(0.1, abs=1e-3)
+
+
+def test_a_mean_of_near_points_keeps_between_them_and_apart_by_normals() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.01]])
+    normals = np.array([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, -1]])
+    mean = scatter.near_means(np.hstack([points, normals]), np.array([[0.0, 0, 0.005, 0, 0, 1]]), 0.1)
+    weight = np.asarray(mean.todense())[0]
+    assert weight.sum() == pytest.approx(1)
+    assert weight[0] > 0.9
+    assert weight[3] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("said", "code", "words"),
+    [
+        ("Time = 3\n#0 Foam::sigFpe::sigHandler\nCourant Number mean: 2 max: 345.6\n", 136, "time step is too long"),
+        ("Time = 3\n\nsigFpe\n", 136, "at 3: a cell of the mesh is too flat or blood rushes back"),
+        ("--> FOAM FATAL ERROR: \nno such\nfield\n\n    From function x\n", 1, "no such field"),
+        ("", -9, "want of memory"),
+    ],
+)
+def test_a_failure_is_put_into_words(said: str, code: int, words: str) -> None:
+    assert words in program.cause(said, code)
+
+
+def test_without_openfoam_its_install_command_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(program, "INSTALLED", ())
+    with pytest.raises(FlowError, match="apt-get install openfoam"):
+        run(OpenFoam(0.3, tmp_path / "case"), FlowCase(tube(), settings=FlowSettings(inflow_mL_s=1.0)))
+    assert not (tmp_path / "case").exists()
+
+
+def test_a_screen_is_refused() -> None:
+    one = np.ones(1)
+    screen = Screen(np.zeros((1, 3)), np.ones((1, 3)), one, one, one, one)
+    with pytest.raises(FlowError, match="struts"):
+        OpenFoam(0.3, Path("nowhere")).init(FlowCase(tube(), screen=screen), None)
+
+
+RADIUS_MM, LENGTH_MM, FLOW_ML_S = 2.0, 14.0, 3.0
+
+
+def tube() -> Vessel:
+    return trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM))))
+
+
+@pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")
+def test_openfoams_flow_in_a_tube_is_poiseuilles(tmp_path: Path) -> None:
+    engine = OpenFoam(0.3, tmp_path / "case")
+    case = FlowCase(tube(), settings=FlowSettings(inflow_mL_s=FLOW_ML_S))
+    field = run(engine, case)
+    assert field.is_converged
+    assert field.inlet_mL_s == pytest.approx(FLOW_ML_S, rel=1e-4)
+    assert field.outlets_mL_s.sum() == pytest.approx(field.inlet_mL_s, rel=1e-3)
+    along = np.sign(field.velocity_m_s[:, 2].mean())
+    pressure = sampling.values_at(field, np.array([[0, 0, 4.0], [0, 0, 10.0]]))[1]
+    gradient = 8 * 0.004 * FLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 4)
+    assert -along * np.diff(pressure)[0] / 6e-3 == pytest.approx(gradient, rel=0.02)
+    z = field.wall.vertices_mm[:, 2]
+    stress = along * field.wall_shear_stress_Pa[(z > 5) & (z < 9), 2]
+    expected = 4 * 0.004 * FLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 3)
+    assert stress.mean() == pytest.approx(expected, rel=0.02)
+    assert np.abs(stress / expected - 1).max() < 0.05
+    # The same case goes on from the last time written: nothing is left to do.
+    assert run(engine, case).steps < field.steps

@@ -1,0 +1,573 @@
+// The page: seven steps from a scan to a report, the scene in the middle, the numbers beside it.
+import { make } from "../src/dom.js";
+import { drop, get, getBinary, Newest, post, put } from "./api.js";
+import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js";
+import { Deploying } from "./deploy.js";
+import { changeSheet, placeWords, plainSheet } from "./numbers.js";
+import { panels } from "./panels.js";
+import { Picture } from "./picture.js";
+import { rankingTable } from "./ranking.js";
+import { Slices } from "./slices.js";
+import { startPage } from "./start.js";
+
+export const STEPS = [
+  ["image", "Image"],
+  ["vessel", "Vessel"],
+  ["sac", "Sac and parent"],
+  ["device", "Device"],
+  ["deploy", "Deploy"],
+  ["flow", "Flow"],
+  ["report", "Report"],
+];
+const SIGNS = { todo: "", running: "", done: "✓", stale: "↻", failed: "!" };
+const WORDS = { todo: "not done yet", running: "at work", done: "done", stale: "out of date: something before it has changed", failed: "failed" };
+
+class Page {
+  constructor(root) {
+    this.root = root;
+    this.toasts = make("div", { className: "toasts", role: "status", ariaLive: "polite" });
+    this.root.append(this.toasts);
+    this.colour = "wall_gap";
+    this.memory = {};
+    this.isWhole = false;
+    this.measures = {};
+    addEventListener("keydown", (event) => this.key(event));
+    addEventListener("hashchange", () => this.route());
+    this.begin();
+  }
+
+  async begin() {
+    this.catalogue = await get("/api/catalogue").catch((problem) => this.complain(problem)) || [];
+    if (!location.hash) {
+      const { opened } = await get("/api/cases");
+      if (opened) history.replaceState(null, "", `#${opened}`);
+    }
+    this.route();
+  }
+
+  /** The address says which case and which step. */
+  route() {
+    const [id, step] = decodeURIComponent(location.hash.slice(1)).split("/");
+    if (!id) return this.showStart();
+    if (this.view?.id === id) return this.go(step, false);
+    this.openCase(id, step);
+  }
+
+  showStart() {
+    this.close();
+    this.frame?.remove();
+    this.frame = make("div", { className: "page" }, [
+      make("header", {}, [this.brand(), make("div", { className: "spring" }), this.badge()]),
+      startPage((id) => (location.hash = id), (problem) => this.complain(problem)),
+    ]);
+    this.root.prepend(this.frame);
+    document.title = "vstent";
+  }
+
+  brand() {
+    return make("button", { type: "button", className: "brand", title: "All cases", onClick: () => (location.hash = "") }, ["vstent"]);
+  }
+
+  badge() {
+    return make("span", { className: "badge", title: "Not cleared for diagnosis or treatment" }, ["Research use only"]);
+  }
+
+  close() {
+    this.events?.close();
+    this.view = null;
+    this.anatomyKey = this.flowKey = this.scanKey = undefined;
+    this.anatomy = null;
+    this.slices = null;
+    this.measures = {};
+    this.moment = this.times = this.flowPanes = this.sheets = undefined;
+  }
+
+  async openCase(id, step) {
+    this.close();
+    this.path = `/api/cases/${encodeURIComponent(id)}`;
+    let view;
+    try {
+      view = await get(this.path);
+    } catch (problem) {
+      this.complain(problem);
+      location.hash = "";
+      return;
+    }
+    this.build();
+    this.step = step || this.proposedStep(view);
+    this.take(view);
+    this.events = new EventSource(`${this.path}/events`);
+    this.events.onmessage = ({ data }) => this.take(JSON.parse(data));
+    this.events.onerror = () => this.frame?.classList.add("lost");
+    this.events.onopen = () => this.frame?.classList.remove("lost");
+  }
+
+  proposedStep(view) {
+    if (view.job) return STEPS.find(([name]) => view.steps[name] === "running")?.[0] || "image";
+    const open = STEPS.find(([name]) => view.steps[name] !== "done");
+    return open ? open[0] : "report";
+  }
+
+  // -- what does not change while a case is open ------------------------------------------------------------------
+
+  build() {
+    this.frame?.remove();
+    this.picture = new Picture();
+    this.along = new AlongChart();
+    this.section = new SectionChart();
+    this.deploying = new Deploying({
+      path: () => this.path,
+      picture: this.picture,
+      along: this.along,
+      section: this.section,
+      colour: () => this.colour,
+      choice: (name) => this.view.choices.devices.find((device) => device.name === name),
+      chosen: (name, center) => this.changeDevice(name, { center_mm: Number(center.toFixed(3)) }),
+      told: (name, manifest, isWhole) => this.toldDevice(name, manifest, isWhole),
+      failed: (problem) => this.complain(problem),
+    });
+    this.along.chosen = (mm) => this.deploying.look(mm);
+    this.surfaces = new Newest(
+      (answer) => this.picture.put(answer),
+      (problem) => this.complain(problem),
+    );
+    this.moments = new Newest(
+      () => {},
+      (problem) => this.complain(problem),
+    );
+    this.stepper = make("nav", { className: "stepper", ariaLabel: "Steps" });
+    this.undoButton = make("button", { type: "button", className: "icon", title: "Undo (Ctrl+Z)", ariaLabel: "Undo", onClick: () => this.stepBack("undo") }, ["↶"]);
+    this.redoButton = make("button", { type: "button", className: "icon", title: "Redo (Ctrl+Shift+Z)", ariaLabel: "Redo", onClick: () => this.stepBack("redo") }, ["↷"]);
+    this.caseName = make("span", { className: "case-name" });
+    this.panel = make("section", { className: "panel", ariaLabel: "Step" });
+    this.work = make("section", { className: "work", ariaLabel: "At work" });
+    this.sliceBox = make("div", { className: "slices", hidden: true });
+    this.strip = make("section", { className: "strip", ariaLabel: "Details" });
+    this.numbers = make("section", { className: "numbers", ariaLabel: "Numbers" });
+    this.frame = make("div", { className: "page" }, [
+      make("header", {}, [this.brand(), this.caseName, this.stepper, make("div", { className: "spring" }), this.undoButton, this.redoButton, this.badge()]),
+      make("main", { className: "desk" }, [
+        make("aside", { className: "left" }, [this.panel, this.work]),
+        make("div", { className: "middle" }, [this.sliceBox, this.picture.element, this.strip]),
+        make("aside", { className: "right" }, [this.numbers]),
+      ]),
+    ]);
+    this.root.prepend(this.frame);
+    this.picture.layout();
+  }
+
+  // -- the state that the server tells ------------------------------------------------------------------------------
+
+  take(view) {
+    const before = this.view;
+    this.view = view;
+    document.title = `${view.name} · vstent`;
+    this.caseName.textContent = view.name;
+    this.undoButton.disabled = !view.can_undo;
+    this.redoButton.disabled = !view.can_redo;
+    this.renderSteps();
+    this.renderWork();
+    const follows = before?.job && !view.job && before.steps[this.step] === "running";
+    if (before?.job && view.job && before.steps[this.step] === "running" && view.steps[this.step] !== "running") this.follow(view);
+    if (follows) this.finished(before);
+    this.load();
+    const shape = JSON.stringify([view.choices, view.steps, view.failed, view.has_report, view.has_ranking, !view.job, this.step, view.anatomy]);
+    if (shape === this.shape) {
+      if (this.step === "flow") this.renderStrip();
+      return;
+    }
+    this.shape = shape;
+    this.render();
+  }
+
+  /** Go along with a job through its steps. */
+  follow(view) {
+    const running = STEPS.find(([name]) => view.steps[name] === "running");
+    if (running && ["image", "vessel", "sac"].includes(this.step)) this.go(running[0]);
+    else if (running && running[0] === "flow") this.go("flow");
+  }
+
+  finished(before) {
+    const failed = Object.entries(this.view.failed)[0];
+    if (failed) return;
+    if (before.job.kind === "anatomy") this.go("sac");
+    if (before.job.kind === "flow") this.go("flow");
+  }
+
+  /** Fetch what has changed for the picture. */
+  load() {
+    const { view } = this;
+    if (view.is_scan && this.step === "image" && this.scanKey !== view.id) this.loadScan();
+    if (view.has_anatomy && this.anatomyKey !== view.anatomy) this.loadAnatomy();
+    const flow = view.has_flow ? `${view.steps.flow} ${view.anatomy} ${!view.job}` : undefined;
+    if (view.has_flow && !view.job && this.flowKey !== flow && ["flow", "report"].includes(this.step)) {
+      this.flowKey = flow;
+      this.loadFlow();
+    }
+  }
+
+  async loadScan() {
+    this.scanKey = this.view.id;
+    try {
+      const scan = await get(`${this.path}/image`);
+      this.scan = scan;
+      this.slices = new Slices(this.path, (point, isLumen) => (isLumen ? this.setSeed(point) : this.tell("There is no lumen at that point: click a bright one.")), (problem) => this.complain(problem));
+      this.sliceBox.replaceChildren(...this.slices.elements);
+      this.slices.show(scan, this.neckPoint());
+      this.showThreshold(this.view.choices.threshold ?? scan.proposed_threshold);
+      this.render();
+    } catch (problem) {
+      this.complain(problem);
+    }
+  }
+
+  /** The middle of the neck on the parent axis, where one is known. */
+  neckPoint() {
+    const neck = this.anatomy?.neck;
+    return neck?.length ? this.deploying.at((neck[0] + neck[1]) / 2) : null;
+  }
+
+  /** The live surface and the outline at a threshold. */
+  showThreshold(threshold) {
+    this.slices?.setThreshold(threshold);
+    this.surfaces.ask(() => getBinary(`${this.path}/image/surface?threshold=${threshold}`));
+  }
+
+  async loadAnatomy() {
+    this.anatomyKey = this.view.anatomy;
+    try {
+      const answer = await getBinary(`${this.path}/anatomy`);
+      const isFirst = !this.anatomy;
+      this.anatomy = answer.manifest;
+      this.picture.stage?.drop(({ id }) => id.startsWith("opening ") || ["lumen", "landing", "sac", "neck", "wires", "contour"].includes(id));
+      this.picture.put(answer);
+      if (isFirst) this.picture.look(VIEW[this.step], false);
+      this.deploying.setAxis(answer.manifest.axis);
+      this.along.set({ axis: answer.manifest.axis, neck: answer.manifest.neck });
+      this.sheets = (await get(`${this.path}/numbers`));
+      this.measures = {};
+      this.render();
+    } catch (problem) {
+      this.complain(problem);
+    }
+  }
+
+  async loadFlow() {
+    try {
+      const [answer, sheets] = await Promise.all([getBinary(`${this.path}/flow${this.moment === undefined ? "" : `?moment=${this.moment}`}`), get(`${this.path}/numbers`)]);
+      this.sheets = sheets;
+      this.flowPanes = answer.manifest.panes;
+      this.times = answer.manifest.times_s;
+      this.picture.put(answer);
+      this.render();
+    } catch (problem) {
+      this.complain(problem);
+    }
+  }
+
+  // -- what is drawn anew when something has changed ----------------------------------------------------------------
+
+  renderSteps() {
+    this.stepper.replaceChildren(
+      ...STEPS.map(([name, title], i) => {
+        const status = this.view.steps[name];
+        const button = make(
+          "button",
+          { type: "button", className: `step ${status}`, title: `${title}: ${WORDS[status]}`, ariaCurrent: name === this.step ? "step" : "false", onClick: () => this.go(name) },
+          [make("span", { className: "sign" }, [SIGNS[status] || (status === "running" ? "" : String(i + 1))]), make("span", {}, [title])],
+        );
+        return button;
+      }),
+    );
+  }
+
+  go(step, push = true) {
+    if (!step || !STEPS.some(([name]) => name === step)) return;
+    if (VIEW[step] !== VIEW[this.step]) this.picture.look(VIEW[step]);
+    this.step = step;
+    if (push) history.replaceState(null, "", `#${this.view.id}/${step}`);
+    this.shape = null;
+    this.renderSteps();
+    this.load();
+    this.render();
+  }
+
+  render() {
+    if (!this.view) return;
+    this.frame.dataset.step = this.step;
+    const focus = document.activeElement?.dataset?.key;
+    this.panel.replaceChildren(...panels[this.step](this));
+    if (focus) this.panel.querySelector(`[data-key="${focus}"]`)?.focus();
+    this.renderScene();
+    this.renderStrip();
+    this.renderNumbers();
+  }
+
+  get device() {
+    const names = this.view.choices.devices.map(({ name }) => name);
+    return names.includes(this.active) ? this.active : names[0];
+  }
+
+  deviceTitle(name) {
+    return this.catalogue.find(({ key }) => key === name)?.name || name;
+  }
+
+  renderScene() {
+    const isScan = this.step === "image" && this.view.is_scan && this.slices;
+    this.sliceBox.hidden = !isScan;
+    this.frame.classList.toggle("with-slices", Boolean(isScan));
+    const layers = LAYERS[this.step](this);
+    this.picture.setPanes(this.step === "flow" || this.step === "report" ? this.panes() : [{ id: this.device || "one", title: "" }]);
+    this.picture.setLayers(layers, (this.memory[this.step] ??= {}));
+    this.picture.clicked = this.step === "sac" ? (point) => point && this.setSeed(point) : null;
+    this.picture.moved = null;
+    this.picture.setMarks([]);
+    if (!this.anatomy) return;
+    if (this.step === "vessel") this.picture.setMarks(this.openingMarks());
+    if (this.step === "deploy") this.renderDeploy();
+  }
+
+  panes() {
+    const names = this.flowPanes?.length ? this.flowPanes : ["bare"];
+    const sheet = this.sheets?.flow?.[0];
+    const row = sheet?.rows.find(({ key }) => key === "neck_inflow_mL_s");
+    return names.map((name) => {
+      const i = sheet?.names.indexOf(name) ?? -1;
+      const said = i < 0 ? row?.cells[0] : `${row?.cells[1 + 2 * i]} (${row?.cells[2 + 2 * i]})`;
+      const note = row && (i >= 0 || name === "bare") ? `${row.name} ${said}` : "";
+      return { id: name, title: name === "bare" ? "Before (no device)" : this.deviceTitle(name), note };
+    });
+  }
+
+  openingMarks() {
+    return this.anatomy.openings.map(({ role, center_mm, area_mm2, diameter_mm, colour }) => {
+      const title = role === "inlet" ? "Inlet" : role.replace("outlet_", "Outlet ");
+      const dot = make("i");
+      dot.style.background = `rgb(${colour})`;
+      const element = make("button", { type: "button", className: "opening", title: role === "inlet" ? "Blood enters here" : "Click to let blood enter here" }, [
+        dot,
+        make("b", {}, [title]),
+        make("span", {}, [`${area_mm2.toFixed(1)} mm² · ⌀ ${diameter_mm.toFixed(1)} mm`]),
+      ]);
+      element.addEventListener("click", () => role !== "inlet" && this.choose({ inlet_mm: center_mm.map((x) => Number(x.toFixed(2))) }));
+      return { element, point: () => center_mm };
+    });
+  }
+
+  renderDeploy() {
+    const name = this.device;
+    if (!name) return;
+    this.picture.setMarks([...this.deploying.handles, this.deploying.cursorMark]);
+    this.picture.moved = (event) => this.deploying.look(this.deploying.under(event, null));
+    const key = JSON.stringify([this.deploying.host.choice(name), this.colour, this.view.anatomy]);
+    if (this.shownDevice !== key || this.deploying.name !== name || !this.measures[name]) {
+      this.shownDevice = key;
+      this.deploying.show(name);
+    }
+  }
+
+  renderStrip() {
+    const parts = {
+      device: () => (this.view.has_ranking || this.view.job?.kind === "rank" ? [rankingTable(this)] : []),
+      deploy: () => [this.along.element, this.section.element],
+      flow: () => this.flowStrip(),
+    }[this.step]?.() || [];
+    this.frame.classList.toggle("with-strip", parts.length > 0);
+    if (this.step === "deploy" && this.strip.firstChild === this.along.element) return;
+    this.strip.replaceChildren(...parts);
+  }
+
+  flowStrip() {
+    const { job } = this.view;
+    return job?.kind === "flow" ? [residualChart(job.residual)] : [];
+  }
+
+  renderWork() {
+    const { job } = this.view;
+    this.work.hidden = !job;
+    if (!job) return this.work.replaceChildren();
+    const bar = make("i");
+    bar.style.width = `${Math.max(2, 100 * job.fraction)}%`;
+    const words = make("div", { className: "work-words" }, [make("b", {}, [spoken(job.stage) || "Starting"]), make("span", {}, [job.detail || "…"])]);
+    const stop = make("button", { type: "button", onClick: () => drop(`${this.path}/jobs`).catch((problem) => this.complain(problem)) }, ["Cancel"]);
+    const done = job.finished.map(({ stage }) => spoken(stage)).filter(Boolean);
+    const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "It goes on when this tab is closed."]);
+    this.work.replaceChildren(words, make("div", { className: "bar", role: "progressbar", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
+  }
+
+  renderNumbers() {
+    const head = (title) =>
+      make("div", { className: "numbers-head" }, [
+        make("h2", {}, [title]),
+        make("button", { type: "button", className: "link", onClick: () => ((this.isWhole = !this.isWhole), this.renderNumbers()) }, [this.isWhole ? "Fewer" : "All"]),
+      ]);
+    const parts = [];
+    const flow = this.sheets?.flow?.[0];
+    if (["flow", "report"].includes(this.step) && flow) {
+      const stale = this.view.steps.flow !== "done" ? [make("p", { className: "note stale" }, ["Of an earlier choice: run the step Flow again."])] : [];
+      parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole, (name) => this.deviceTitle(name)));
+    }
+    if (["device", "deploy"].includes(this.step)) {
+      const sheets = this.view.choices.devices.map(({ name }) => this.measures[name]).filter(Boolean);
+      if (sheets.length) parts.push(head("Deployed"), plainSheet(sheets, this.isWhole));
+    }
+    if (this.sheets?.anatomy?.length && !(flow && ["flow", "report"].includes(this.step))) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));
+    if (!parts.length) parts.push(make("h2", {}, ["Numbers"]), make("p", { className: "hint" }, ["They appear here as the steps are done, each with its unit and definition."]));
+    else parts.push(make("p", { className: "hint" }, ["Rest the pointer on a name for its definition."]));
+    this.numbers.replaceChildren(...parts);
+  }
+
+  toldDevice(name, manifest, isWhole) {
+    this.place = manifest;
+    if (isWhole) {
+      this.measures[name] = manifest.measures;
+      this.advice = manifest.advice;
+      this.renderNumbers();
+      this.panel.querySelector(".advice")?.replaceChildren(manifest.advice);
+      if (this.deploying.cursor === undefined && this.anatomy.neck.length) this.deploying.look((this.anatomy.neck[0] + this.anatomy.neck[1]) / 2);
+      else this.deploying.look(this.deploying.cursor);
+    }
+    const place = this.panel.querySelector(".place");
+    if (place) place.replaceChildren(...placeWords(manifest));
+  }
+
+  /** The inlet's pulse, for the left side. */
+  pulseChart() {
+    const box = make("div", { className: "pulse" });
+    const shown = (moment) => {
+      this.moment = moment;
+      draw();
+      this.moments.ask(() => this.loadFlow());
+    };
+    const draw = () => box.replaceChildren(pulseChart(this.pulse, this.view.choices.flow.is_pulsatile, this.times || [], this.moment, shown));
+    if (this.pulse) draw();
+    else get("/api/waveform").then((pulse) => ((this.pulse = pulse), draw())).catch((problem) => this.complain(problem));
+    return box;
+  }
+
+  // -- what a user does ---------------------------------------------------------------------------------------------
+
+  async choose(changes) {
+    try {
+      this.take(await put(`${this.path}/choices`, { revision: this.view.revision, choices: { ...this.view.choices, ...changes } }));
+    } catch (problem) {
+      this.complain(problem);
+      if (problem.status === 409) this.take(await get(this.path));
+      this.shape = null;
+      this.render();
+    }
+  }
+
+  changeDevice(name, changes) {
+    return this.choose({ devices: this.view.choices.devices.map((device) => (device.name === name ? { ...device, ...changes } : device)) });
+  }
+
+  chooseFlow(changes) {
+    return this.choose({ flow: { ...this.view.choices.flow, ...changes } });
+  }
+
+  /** A size was chosen in the table: see it deployed. */
+  goTo(name) {
+    this.active = name;
+    this.go("deploy");
+  }
+
+  /** The contour's way to the wall, as a short film. */
+  playExpansion() {
+    const { stage } = this.picture;
+    if (!stage?.nFrames) return;
+    const shown = new Set(this.picture.shown);
+    const started = performance.now();
+    const run = (this.film = Symbol("film"));
+    this.picture.shown = new Set([...shown].filter((id) => id !== "wires").concat("contour"));
+    this.picture.apply();
+    const step = (now) => {
+      if (this.film !== run) return;
+      const moment = Math.min(1, Math.max(0, now - started) / 2200);
+      stage.expand(moment);
+      if (moment < 1) return requestAnimationFrame(step);
+      setTimeout(() => this.film === run && this.renderScene(), 500);
+    };
+    requestAnimationFrame(step);
+  }
+
+  setSeed(point) {
+    this.choose({ at_mm: point.map((x) => Number(x.toFixed(2))) });
+    this.tell("Seed set: find the vessel again to use it.");
+  }
+
+  async start(kind) {
+    try {
+      this.take(await post(`${this.path}/jobs/${kind}`));
+    } catch (problem) {
+      this.complain(problem);
+    }
+  }
+
+  async stepBack(which) {
+    try {
+      this.take(await post(`${this.path}/${which}`, { revision: this.view.revision }));
+    } catch (problem) {
+      if (problem.status === 409) this.take(await get(this.path));
+      this.tell(problem.message);
+    }
+  }
+
+  key(event) {
+    if (!this.view || event.target.closest("input, select, textarea")) return;
+    const isUndo = (event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z";
+    if (isUndo) {
+      event.preventDefault();
+      this.stepBack(event.shiftKey ? "redo" : "undo");
+    } else if (event.altKey && (event.key === "ArrowRight" || event.key === "ArrowLeft")) {
+      event.preventDefault();
+      const i = STEPS.findIndex(([name]) => name === this.step) + (event.key === "ArrowRight" ? 1 : -1);
+      if (STEPS[i]) this.go(STEPS[i][0]);
+    }
+  }
+
+  tell(sentence, kind = "") {
+    const toast = make("div", { className: `toast ${kind}` }, [sentence]);
+    this.toasts.append(toast);
+    setTimeout(() => toast.remove(), kind ? 9000 : 5000);
+  }
+
+  complain(problem) {
+    this.tell(problem.message || String(problem), "problem");
+  }
+}
+
+const SPOKEN = { segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes", measure: "Numbers", report: "Report" };
+
+function spoken(stage) {
+  const [first, ...rest] = stage.split(" ");
+  const named = { deploy: "Deploying", struts: "Struts of", flow: "Flow," }[first];
+  return named ? `${named} ${rest.join(" ") === "bare" ? "before" : rest.join(" ")}` : SPOKEN[first] || stage;
+}
+
+/** From where each step looks at first. */
+const VIEW = { image: "whole", vessel: "whole", sac: "profile", device: "profile", deploy: "profile", flow: "profile", report: "profile" };
+const LUMEN = { id: "lumen", title: "Lumen", on: true };
+const NECK = { id: "neck", title: "Neck", on: true };
+const LAYERS = {
+  image: (page) =>
+    page.view.is_scan && page.slices
+      ? [{ id: "live", title: "Surface at the threshold", on: true }]
+      : [{ ...LUMEN, title: "Vessel" }, { id: "landing", title: "Inside", on: false }],
+  vessel: (page) => [
+    LUMEN,
+    { id: "centerlines", title: "Centerlines", on: true },
+    { id: "opening 0", title: "Openings", on: true, also: (page.anatomy?.openings || []).map((_, k) => `opening ${k}`) },
+  ],
+  sac: () => [LUMEN, { id: "landing", title: "Parent artery", on: true }, { id: "sac", title: "Sac", on: true }, NECK, { id: "axis", title: "Axis", on: false }],
+  device: () => [LUMEN, { id: "landing", title: "Parent artery", on: true }, { id: "sac", title: "Sac", on: true }, NECK],
+  deploy: () => [LUMEN, { id: "wires", title: "Wires", on: true }, { id: "contour", title: "Contour", on: false }, NECK, { id: "axis", title: "Axis", on: true }, { id: "landing", title: "Parent artery", on: false }],
+  flow: (page) => {
+    const mode = page.memory.mode || "streamlines";
+    const shear = mode === "shear";
+    return [{ id: "lumen", title: "Lumen", on: !shear }, { id: "streamlines", on: mode === "streamlines" }, { id: "slice", on: mode === "slice" }, { id: "shear", on: shear }, { id: "wires", title: "Wires", on: false }, NECK];
+  },
+  report: (page) => LAYERS.flow(page),
+};
+
+new Page(document.getElementById("app"));

@@ -1,0 +1,49 @@
+// Numbers: each with its unit, its definition at rest of the pointer, before, after and change.
+import { make } from "../src/dom.js";
+
+function term({ name, meaning, source }) {
+  const title = meaning ? meaning + (source ? ` (${source})` : "") : "";
+  return make("span", { className: title ? "term defined" : "term", title, tabIndex: title ? 0 : -1 }, [name]);
+}
+
+/** Numbers with one value, or one per sheet side by side. */
+export function plainSheet(sheets, isWhole) {
+  const rows = sheets[0].rows.filter((row) => isWhole || row.is_first);
+  const head = sheets.length > 1 ? [make("div", { className: "row head" }, [make("span"), ...sheets.map(({ title }) => make("b", {}, [title]))])] : [];
+  const lines = rows.map((row) => {
+    const values = sheets.map((sheet) => sheet.rows.find(({ key }) => key === row.key)?.cells[0] ?? "–");
+    return make("div", { className: "row" }, [term(row), ...values.map((value) => make("b", {}, [value]))]);
+  });
+  return make("div", { className: `sheet columns-${sheets.length}` }, [...head, ...lines]);
+}
+
+/** Numbers before, after and change: a card each. */
+export function changeSheet(sheet, isWhole, named) {
+  const rows = sheet.rows.filter((row) => isWhole || row.is_first);
+  return make(
+    "div",
+    { className: "cards" },
+    rows.map((row) => {
+      const columns = [cell("Before", "without a device", row.cells[0], "")];
+      sheet.names.forEach((name, i) => columns.push(cell(named(name), sheet.devices[i], row.cells[1 + 2 * i], row.cells[2 + 2 * i])));
+      return make("div", { className: "card" }, [term(row), make("div", { className: "card-cells" }, columns)]);
+    }),
+  );
+}
+
+function cell(words, title, value, change) {
+  const parts = [make("small", { title }, [words]), make("b", {}, [value])];
+  if (change) parts.push(make("em", { className: change.startsWith("−") ? "down" : "up" }, [change]));
+  return make("div", {}, parts);
+}
+
+/** Where a device lies, in words with their bands. */
+export function placeWords({ length_mm, length_band_mm, ends_mm, ends_band_mm }) {
+  const band = ([low, high]) => `${low.toFixed(1)} to ${high.toFixed(1)}`;
+  const rows = [
+    ["Deployed length", `${length_mm.toFixed(1)} mm`, band(length_band_mm)],
+    ["Proximal end", `${ends_mm[0].toFixed(1)} mm`, band(ends_band_mm[0])],
+    ["Distal end", `${ends_mm[1].toFixed(1)} mm`, band(ends_band_mm[1])],
+  ];
+  return rows.map(([name, value, range]) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [range])]));
+}

@@ -1,0 +1,277 @@
+// The left side: what each step is, what can be chosen in it, and its one main button.
+import { make } from "../src/dom.js";
+import { placeWords } from "./numbers.js";
+
+const title = (words, text) => [make("h2", {}, [words]), make("p", { className: "lead" }, [text])];
+
+function failure(page) {
+  const why = page.view.failed[page.step];
+  return why ? [make("p", { className: "note failed", role: "alert" }, [why])] : [];
+}
+
+function staleness(page) {
+  return page.view.steps[page.step] === "stale" ? [make("p", { className: "note stale" }, ["Something before this step has changed. What you see is from before the change."])] : [];
+}
+
+function main(page, words, act, isOff = false) {
+  return make("button", { type: "button", className: "primary wide", disabled: isOff, onClick: act }, [words]);
+}
+
+function next(page, step, words) {
+  return make("button", { type: "button", className: "wide next", onClick: () => page.go(step) }, [words]);
+}
+
+function number(page, key, label, unit, value, changed, { placeholder = "proposed", step = "any", min } = {}) {
+  const input = make("input", { type: "number", value: value ?? "", placeholder, step, id: `field-${key}` });
+  if (min !== undefined) input.min = min;
+  input.dataset.key = key;
+  input.addEventListener("change", () => changed(input.value === "" ? null : Number(input.value)));
+  return make("label", { className: "field", htmlFor: `field-${key}` }, [make("span", {}, [label]), input, make("small", {}, [unit])]);
+}
+
+function select(key, label, value, options, changed) {
+  const box = make("select", { id: `field-${key}` }, options.map(([id, words]) => make("option", { value: id, selected: String(id) === String(value) }, [words])));
+  box.dataset.key = key;
+  box.addEventListener("change", () => changed(box.value));
+  return make("label", { className: "field", htmlFor: `field-${key}` }, [make("span", {}, [label]), box, make("small")]);
+}
+
+function notes(page, count) {
+  const all = page.anatomy?.notes || [];
+  if (!all.length) return [];
+  const list = (some) => make("ul", { className: "notes" }, some.map((note) => make("li", {}, [note])));
+  const details = make("details", {}, [make("summary", {}, ["What was found, guessed or repaired"]), list(all)]);
+  return [count ? list(all.slice(0, count)) : details];
+}
+
+function point(page, key, label) {
+  const value = page.view.choices[key];
+  if (!value) return [];
+  return [
+    make("div", { className: "given" }, [
+      make("span", {}, [`${label}: ${value.map((x) => x.toFixed(1)).join(", ")} mm`]),
+      make("button", { type: "button", className: "link", onClick: () => page.choose({ [key]: null }) }, ["Propose again"]),
+    ]),
+  ];
+}
+
+function again(page) {
+  const { steps, job, has_anatomy } = page.view;
+  const isCurrent = ["image", "vessel", "sac"].every((step) => steps[step] === "done");
+  if (job) return [];
+  if (isCurrent) return [];
+  return [main(page, has_anatomy ? "Find the vessel again" : "Find the vessel", () => page.start("anatomy"))];
+}
+
+export const panels = {
+  image(page) {
+    const parts = [...title("Image", page.view.is_scan ? "The lumen is what is brighter than the threshold." : "This case began with a surface: there is no scan to look at.")];
+    if (page.view.is_scan && page.scan) parts.push(...threshold(page));
+    if (!page.view.is_scan) {
+      parts.push(select("units", "Length unit", page.view.choices.units ?? "", [["", "guessed"], ["mm", "mm"], ["cm", "cm"], ["m", "m"]], (unit) => page.choose({ units: unit || null })));
+    }
+    parts.push(...point(page, "at_mm", "Seed"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
+    if (page.view.steps.image === "done") parts.push(next(page, "vessel", "Vessel →"));
+    return parts;
+  },
+
+  vessel(page) {
+    const parts = [...title("Vessel", "Openings are where the vessel was cut. Blood enters through the inlet: click another opening to change it.")];
+    if (page.anatomy) parts.push(openings(page));
+    parts.push(...point(page, "inlet_mm", "Inlet near"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
+    if (page.view.steps.vessel === "done") parts.push(next(page, "sac", "Sac and parent →"));
+    return parts;
+  },
+
+  sac(page) {
+    const parts = [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Click a sac to choose it.")];
+    if (page.anatomy) parts.push(select("outlet", "Parent leads to", near(page), [["", "proposed"], ...outlets(page)], (role) => page.choose({ outlet_mm: center(page, role) })));
+    parts.push(...point(page, "at_mm", "Seed"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
+    if (page.view.steps.sac === "done") parts.push(next(page, "device", "Device →"));
+    return parts;
+  },
+
+  device(page) {
+    const { job, choices, has_ranking } = page.view;
+    const chosen = new Map(choices.devices.map((device) => [device.name, device]));
+    const parts = [...title("Device", "Choose up to three devices to compare. Every size of each is deployed in this artery and ranked.")];
+    parts.push(make("div", { className: "devices" }, page.catalogue.map((design) => deviceBox(page, design, chosen))));
+    parts.push(...failure(page));
+    if (!job) parts.push(main(page, has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !chosen.size));
+    parts.push(next(page, "deploy", "Deploy →"));
+    return parts;
+  },
+
+  deploy(page) {
+    const { choices } = page.view;
+    const parts = [...title("Deploy", "Drag either end along the artery. The length follows from the wires, which cannot stretch.")];
+    if (!page.device) return [...parts, make("p", { className: "note" }, ["Choose a device first."]), next(page, "device", "← Device")];
+    const tabs = choices.devices.map(({ name }) => {
+      const button = make("button", { type: "button", ariaPressed: String(name === page.device) }, [page.deviceTitle(name)]);
+      button.addEventListener("click", () => {
+        page.active = name;
+        page.render();
+      });
+      return button;
+    });
+    parts.push(make("div", { className: "tabs", role: "group", ariaLabel: "Device" }, tabs), ...sizes(page));
+    const place = make("div", { className: "place" });
+    if (page.place && page.deploying.name === page.device) place.append(...placeWords(page.place));
+    parts.push(place, ...colours(page), expansion(page));
+    parts.push(make("p", { className: "advice" }, [page.advice && page.deploying.name === page.device ? page.advice : ""]), ...failure(page));
+    parts.push(next(page, "flow", "Flow →"));
+    return parts;
+  },
+
+  flow(page) {
+    const { choices, job, steps } = page.view;
+    const { flow } = choices;
+    const parts = [...title("Blood flow", "The flow without a device, then with each. All pictures share one camera and one scale.")];
+    parts.push(
+      number(page, "inflow", "Mean inflow", "mL/s", flow.inflow_mL_s, (value) => page.chooseFlow({ inflow_mL_s: value }), { min: 0 }),
+      number(page, "cell", "Grid cell", "mm", flow.cell_size_mm, (value) => page.chooseFlow({ cell_size_mm: value }), { min: 0.04, step: 0.01 }),
+      select("pulse", "Inlet", flow.is_pulsatile ? "1" : "", [["", "steady, at the mean"], ["1", "pulse of the carotid"]], (value) => page.chooseFlow({ is_pulsatile: Boolean(value) })),
+      select("outlets", "Outlets", flow.outlets, [["zero_pressure", "zero pressure"], ["murray", "split by r³ (Murray)"]], (value) => page.chooseFlow({ outlets: value })),
+    );
+    parts.push(page.pulseChart(), ...failure(page), ...staleness(page));
+    if (!job) parts.push(main(page, steps.flow === "done" ? "Run again" : "Run the flow", () => page.start("flow"), !page.view.has_anatomy || !page.device));
+    if (page.flowPanes?.length) parts.push(modes(page));
+    if (page.view.has_report && steps.report === "done") parts.push(next(page, "report", "Report →"));
+    return parts;
+  },
+
+  report(page) {
+    const parts = [...title("Report", "One file with the case in 3-D, pictures, every number with its definition, and how it was made. It needs no network.")];
+    const { has_report, steps } = page.view;
+    const link = (file, words, isMain) => make("a", { className: `button wide ${isMain ? "primary" : ""}`, href: `${page.path}/files/${file}`, target: "_blank", rel: "noopener" }, [words]);
+    parts.push(...staleness(page), ...failure(page));
+    if (has_report) parts.push(link("report.html", "Open the report", true), link("metrics.json", "Numbers (JSON)"), link("run.json", "How it was made (JSON)"));
+    if (!has_report || steps.report !== "done") {
+      parts.push(make("p", { className: "note" }, ["The report is written when the flow has been computed."]), next(page, "flow", "← Flow"));
+    }
+    parts.push(make("p", { className: "hint" }, [`The case lies in ${page.view.folder}.`]));
+    return parts;
+  },
+};
+
+function threshold(page) {
+  const { scan, view } = page;
+  const value = view.choices.threshold ?? scan.proposed_threshold;
+  const [low, high] = scan.range;
+  const slider = make("input", { type: "range", min: low, max: high, step: (high - low) / 500, value, id: "field-threshold" });
+  slider.dataset.key = "threshold";
+  const shown = make("b", {}, [value.toFixed(0)]);
+  slider.addEventListener("input", () => {
+    shown.textContent = Number(slider.value).toFixed(0);
+    page.showThreshold(Number(slider.value));
+  });
+  slider.addEventListener("change", () => page.choose({ threshold: Number(slider.value) }));
+  const parts = [make("label", { className: "slider", htmlFor: "field-threshold" }, [make("span", {}, ["Threshold ", shown]), slider])];
+  if (view.choices.threshold !== null) {
+    const reset = () => {
+      page.choose({ threshold: null });
+      page.showThreshold(scan.proposed_threshold);
+    };
+    parts.push(make("button", { type: "button", className: "link", onClick: reset }, [`Back to the proposed ${scan.proposed_threshold.toFixed(0)}`]));
+  }
+  const size = `${scan.shape.join(" × ")} voxels of ${scan.spacing_mm.map((x) => x.toFixed(2)).join(" × ")} mm`;
+  parts.push(make("p", { className: "hint" }, [`${size}. Drag in a slice for window and level, click for a seed, turn the wheel for the next slice. Orange is the wall at the threshold.`]));
+  return parts;
+}
+
+function openings(page) {
+  const rows = page.anatomy.openings.map(({ role, area_mm2, diameter_mm, colour, center_mm }) => {
+    const dot = make("i", { className: "dot" });
+    dot.style.background = `rgb(${colour})`;
+    const isInlet = role === "inlet";
+    return make("button", { type: "button", className: `opening-row ${isInlet ? "inlet" : ""}`, onClick: () => !isInlet && page.choose({ inlet_mm: center_mm.map((x) => Number(x.toFixed(2))) }) }, [
+      dot,
+      make("span", {}, [isInlet ? "Inlet" : role.replace("outlet_", "Outlet ")]),
+      make("b", {}, [`${area_mm2.toFixed(2)} mm²`]),
+      make("small", {}, [`⌀ ${diameter_mm.toFixed(2)}`]),
+    ]);
+  });
+  return make("div", { className: "openings" }, rows);
+}
+
+const outlets = (page) => page.anatomy.openings.filter(({ role }) => role !== "inlet").map(({ role, diameter_mm }) => [role, `${role.replace("outlet_", "outlet ")} (⌀ ${diameter_mm.toFixed(1)} mm)`]);
+
+function center(page, role) {
+  const opening = page.anatomy.openings.find((one) => one.role === role);
+  return opening ? opening.center_mm.map((x) => Number(x.toFixed(2))) : null;
+}
+
+function near(page) {
+  const given = page.view.choices.outlet_mm;
+  if (!given) return "";
+  const distance = ({ center_mm }) => Math.hypot(...center_mm.map((x, i) => x - given[i]));
+  return page.anatomy.openings.filter(({ role }) => role !== "inlet").sort((a, b) => distance(a) - distance(b))[0]?.role || "";
+}
+
+function deviceBox(page, design, chosen) {
+  const device = chosen.get(design.key);
+  const box = make("input", { type: "checkbox", checked: Boolean(device) });
+  box.dataset.key = `device-${design.key}`;
+  box.disabled = !device && chosen.size >= 3;
+  box.addEventListener("change", () => {
+    const others = page.view.choices.devices.filter(({ name }) => name !== design.key);
+    page.choose({ devices: box.checked ? [...others, { name: design.key }] : others });
+  });
+  const size = device?.diameter_mm ? `${device.diameter_mm} × ${device.length_mm} mm` : device ? "size proposed" : design.kind;
+  const sure = `${design.n_facts - design.n_estimated} of ${design.n_facts} numbers are cited or derived, the rest estimated`;
+  return make("label", { className: "device", title: `${design.maker}, ${design.sizes.length} sizes; ${sure}` }, [
+    box,
+    make("span", {}, [make("b", {}, [design.name]), make("small", {}, [design.maker])]),
+    make("em", {}, [size]),
+  ]);
+}
+
+function sizes(page) {
+  const device = page.view.choices.devices.find(({ name }) => name === page.device);
+  const design = page.catalogue.find(({ key }) => key === page.device);
+  const proposed = page.place && page.deploying.name === page.device ? page.place.size.match(/([\d.]+) x ([\d.]+)/) : null;
+  const now = [device.diameter_mm ?? Number(proposed?.[1] ?? 0), device.length_mm ?? Number(proposed?.[2] ?? 0)];
+  const options = design.sizes.map(([d, l]) => [`${d},${l}`, `${d.toFixed(2)} × ${l} mm`]);
+  const value = device.diameter_mm ? now.join(",") : "";
+  const words = proposed ? `proposed: ${now[0].toFixed(2)} × ${now[1]} mm` : "proposed";
+  const change = (text) => {
+    const [diameter_mm, length_mm] = text ? text.split(",").map(Number) : [null, null];
+    page.changeDevice(page.device, { diameter_mm, length_mm });
+  };
+  const parts = [select("size", "Size", value, [["", words], ...options], change)];
+  if (device.center_mm !== null) {
+    parts.push(make("button", { type: "button", className: "link", onClick: () => page.changeDevice(page.device, { center_mm: null }) }, ["Center it on the neck again"]));
+  }
+  return parts;
+}
+
+function colours(page) {
+  const options = [["wall_gap", "Wall gap"], ["coverage", "Coverage"], ["diameter", "Diameter"]].map(([id, words]) => {
+    const button = make("button", { type: "button", ariaPressed: String(page.colour === id) }, [words]);
+    button.addEventListener("click", () => {
+      page.colour = id;
+      page.render();
+    });
+    return button;
+  });
+  return [make("div", { className: "label" }, ["Colour of the wires"]), make("div", { className: "tabs", role: "group", ariaLabel: "Colour of the wires" }, options)];
+}
+
+function expansion(page) {
+  const play = make("button", { type: "button" }, ["▶ Play the expansion"]);
+  play.addEventListener("click", () => page.playExpansion());
+  return play;
+}
+
+function modes(page) {
+  const options = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall stress"]].map(([id, words]) => {
+    const button = make("button", { type: "button", ariaPressed: String((page.memory.mode || "streamlines") === id) }, [words]);
+    button.addEventListener("click", () => {
+      page.memory.mode = id;
+      page.memory.flow = {};
+      page.render();
+    });
+    return button;
+  });
+  return make("div", { className: "tabs", role: "group", ariaLabel: "Show" }, options);
+}

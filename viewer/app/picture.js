@@ -1,0 +1,214 @@
+// The picture: one canvas, panes with a locked camera, buttons for layers and views, marks that lie on the scene.
+import { Raycaster, Vector2, Vector3 } from "three";
+import { make } from "../src/dom.js";
+import { annotate, annotations, colourBar } from "../src/furniture.js";
+import { Stage } from "../src/stage.js";
+
+const VIEWS = { profile: ["Profile", "The neck in profile"], whole: ["Whole", "The whole vessel"], neck: ["Neck", "From the sac onto the neck"], frontal: ["Front", "From the front"], lateral: ["Left", "From the left"] };
+const EMPTY = { scales: [], layers: [], views: [], fade: 2 };
+
+export class Picture {
+  constructor() {
+    this.canvas = make("canvas", { className: "viewer-canvas", ariaHidden: "true" });
+    this.grid = make("div", { className: "viewer-panes" });
+    this.marks = make("div", { className: "marks" });
+    this.bars = make("div", { className: "picture-bars" });
+    this.toolbar = make("div", { className: "picture-tools" });
+    this.area = make(
+      "div",
+      { className: "viewer-area", tabIndex: 0, role: "application", ariaLabel: "3-D view. Arrow keys turn, plus and minus zoom, 1 to 4 are views." },
+      [this.canvas, this.grid, this.marks],
+    );
+    this.element = make("div", { className: "picture" }, [this.area, this.toolbar, this.bars]);
+    this.views = [];
+    this.panes = [];
+    this.switches = [];
+    this.shown = new Set();
+    this.drawnMarks = [];
+    this.moved = null;
+    this.clicked = null;
+    try {
+      this.stage = new Stage(this.canvas, EMPTY, new ArrayBuffer(0));
+    } catch (problem) {
+      this.area.replaceChildren(
+        make("p", { className: "viewer-sorry", role: "status" }, ["The 3-D view needs WebGL, which this browser does not offer here."]),
+      );
+      return;
+    }
+    this.stage.orbit.listen(this.area, () => this.paneSize()[1]);
+    for (const name of ["pointerdown", "wheel", "keydown"])
+      this.area.addEventListener(name, (event) => event.target.closest("button") || (this.lastLook = null), { passive: true });
+    this.stage.drawn = () => this.afterDrawing();
+    this.area.addEventListener("keydown", (event) => this.key(event));
+    this.area.addEventListener("pointermove", (event) => event.buttons === 0 && this.moved?.(event));
+    this.listenForClicks();
+    new ResizeObserver(() => this.layout()).observe(this.area);
+    this.setPanes([{ id: "one", title: "" }]);
+  }
+
+  listenForClicks() {
+    let down = null;
+    this.area.addEventListener("pointerdown", (event) => (down = [event.clientX, event.clientY]));
+    this.area.addEventListener("pointerup", (event) => {
+      if (!down || !this.clicked || event.target.closest("button")) return;
+      if (Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 4) this.clicked(this.pick(event));
+    });
+  }
+
+  /** Add layers; a layer of the same name in the same pane is replaced. */
+  put({ manifest, buffer }) {
+    if (!this.stage) return;
+    this.stage.put(manifest, buffer);
+    if (manifest.fade) this.stage.shared.fade = manifest.fade;
+    if (manifest.views?.length) {
+      const isFirst = !this.views.length;
+      this.views = manifest.views;
+      if (isFirst) this.look("profile", false);
+    }
+    this.apply();
+  }
+
+  clear() {
+    this.views = [];
+    this.stage?.drop(() => true);
+  }
+
+  setPanes(panes) {
+    if (!this.stage || JSON.stringify(panes) === JSON.stringify(this.panes.map(({ id, title, note }) => ({ id, title, note })))) return;
+    this.panes = panes.map(({ id, title, note }) => {
+      const { length, compass } = annotations();
+      const head = make("div", { className: "viewer-title" }, [make("strong", {}, [title || ""]), make("span", {}, [note || ""])]);
+      const element = make("div", { className: "viewer-pane" }, [head, length, compass]);
+      return { id, title, note, element, length, compass };
+    });
+    this.grid.replaceChildren(...this.panes.map(({ element }) => element));
+    this.layout();
+  }
+
+  /** Offer these layers: [{id, title, on}]; what was switched before stays so. */
+  setLayers(layers, memory) {
+    this.switches = layers;
+    this.memory = memory;
+    this.shown = new Set(layers.filter(({ id, on }) => memory[id] ?? on).flatMap(({ id, also = [] }) => [id, ...also]));
+    this.renderTools();
+    this.apply();
+  }
+
+  renderTools() {
+    const layers = this.switches
+      .filter(({ title }) => title)
+      .map(({ id, title, also = [] }) => {
+        const button = make("button", { type: "button", className: "chip", ariaPressed: String(this.shown.has(id)) }, [title]);
+        button.addEventListener("click", () => {
+          const on = !this.shown.has(id);
+          this.memory[id] = on;
+          for (const one of [id, ...also]) this.shown[on ? "add" : "delete"](one);
+          button.setAttribute("aria-pressed", String(on));
+          this.apply();
+        });
+        return button;
+      });
+    const views = this.views.map(({ id }, i) =>
+      make("button", { type: "button", className: "chip view", title: `${VIEWS[id][1]} (key ${i + 1})`, onClick: () => this.look(id) }, [VIEWS[id][0]]),
+    );
+    this.toolbar.replaceChildren(make("div", { className: "chips" }, layers), make("div", { className: "chips" }, views));
+  }
+
+  apply() {
+    if (!this.stage) return;
+    this.stage.show([...this.shown]);
+    const panes = new Set(this.panes.map(({ id }) => id));
+    const used = new Set(
+      this.stage.layers
+        .filter((layer) => this.shown.has(layer.id) && (layer.pane === "" || panes.has(layer.pane)))
+        .map((layer) => layer.scale),
+    );
+    const scales = Object.values(this.stage.scales).filter((scale) => used.has(scale.id));
+    this.bars.replaceChildren(...scales.map(colourBar));
+    this.bars.hidden = !scales.length;
+  }
+
+  look(id, glide = true) {
+    const view = this.views.find((one) => one.id === id);
+    if (!view || !this.stage) return;
+    const [width, height] = this.paneSize();
+    this.lastLook = id;
+    this.stage.orbit.look(view.axes, view.center, view.radius, width / height, glide);
+  }
+
+  paneSize() {
+    const { element } = this.panes[0];
+    return [Math.max(element.clientWidth, 1), Math.max(element.clientHeight, 1)];
+  }
+
+  layout() {
+    if (!this.stage || !this.panes.length) return;
+    const [width, height] = [this.area.clientWidth, this.area.clientHeight];
+    const places = this.panes.map(({ id, element }) => ({
+      id,
+      left: element.offsetLeft,
+      bottom: height - element.offsetTop - element.offsetHeight,
+      width: element.offsetWidth,
+      height: element.offsetHeight,
+    }));
+    this.stage.arrange(places, width, height);
+    // Until somebody turns it, the picture fits the room it has.
+    if (this.lastLook) this.look(this.lastLook, false);
+  }
+
+  key(event) {
+    const view = this.views[Number(event.key) - 1];
+    if (view) this.look(view.id);
+    else if (event.key === "r" || event.key === "R") this.look("profile");
+  }
+
+  afterDrawing() {
+    annotate(this.panes, this.stage, this.paneSize()[1]);
+    for (const mark of this.drawnMarks) this.placeMark(mark);
+  }
+
+  /** Lay elements on the scene: [{element, point: () => [x, y, z]}]; they follow the camera. */
+  setMarks(marks) {
+    this.drawnMarks = marks;
+    this.marks.replaceChildren(...marks.map(({ element }) => element));
+    this.stage?.redraw();
+  }
+
+  placeMark(mark) {
+    const point = mark.point();
+    mark.element.hidden = !point;
+    if (!point) return;
+    const [x, y] = this.onScreen(point);
+    mark.element.style.transform = `translate(${x}px, ${y}px)`;
+  }
+
+  /** Pixel in the first pane where a point of the world is seen. */
+  onScreen(point) {
+    const { element } = this.panes[0];
+    const camera = this.stage.camera;
+    camera.aspect = element.offsetWidth / Math.max(element.offsetHeight, 1);
+    camera.updateProjectionMatrix();
+    camera.updateMatrixWorld();
+    const seen = new Vector3(...point).project(camera);
+    return [element.offsetLeft + (0.5 + seen.x / 2) * element.offsetWidth, element.offsetTop + (0.5 - seen.y / 2) * element.offsetHeight];
+  }
+
+  /** Where a pointer is, in pixels of the picture. */
+  where(event) {
+    const box = this.area.getBoundingClientRect();
+    return [event.clientX - box.left, event.clientY - box.top];
+  }
+
+  /** Point of the nearest visible surface under a pointer, or null. */
+  pick(event) {
+    const [x, y] = this.where(event);
+    const { element } = this.panes[0];
+    this.onScreen([0, 0, 0]);
+    const place = new Vector2((2 * (x - element.offsetLeft)) / element.offsetWidth - 1, 1 - (2 * (y - element.offsetTop)) / element.offsetHeight);
+    const caster = new Raycaster();
+    caster.setFromCamera(place, this.stage.camera);
+    const meshes = this.stage.layers.filter((layer) => layer.kind === "mesh" && this.shown.has(layer.id)).map(({ object }) => object);
+    const hit = caster.intersectObjects(meshes, true)[0];
+    return hit ? hit.point.toArray() : null;
+  }
+}

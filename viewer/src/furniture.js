@@ -1,0 +1,52 @@
+// What stands on a picture: colour bars, the length bar, the compass.
+import { Vector3 } from "three";
+import { make, svg } from "./dom.js";
+
+/** CSS gradient of a scale's colours. */
+export function gradient(scale) {
+  const texels = scale.texture.image.data;
+  const stops = Array.from({ length: 17 }, (_, i) => `rgb(${texels.slice(4 * Math.min(16 * i, 255), 4 * Math.min(16 * i, 255) + 3)})`);
+  return `linear-gradient(90deg, ${stops.join(", ")})`;
+}
+
+/** A scale with its quantity, unit and three numbers. */
+export function colourBar(scale) {
+  const bar = make("i", { className: "viewer-ramp" });
+  bar.style.background = gradient(scale);
+  const middle = (scale.low + scale.high) / 2;
+  const ticks = [scale.low, middle, scale.high].map((value) => make("span", {}, [String(Number(value.toPrecision(3)))]));
+  return make("div", { className: "viewer-bar" }, [
+    make("span", { className: "viewer-quantity" }, [scale.title, make("em", {}, [` ${scale.unit}`])]),
+    make("div", {}, [bar, make("div", { className: "viewer-ticks" }, ticks)]),
+  ]);
+}
+
+/** Length bar and compass that `annotate` keeps true. */
+export function annotations() {
+  const length = make("span", { className: "viewer-length" });
+  const compass = svg("svg", { class: "viewer-compass", viewBox: "-26 -26 52 52", "aria-hidden": "true" });
+  return { length, compass };
+}
+
+/** Bring length bars and compasses to the camera as it is; `height` is that of a pane in pixels. */
+export function annotate(panes, { camera, orbit }, height) {
+  const perMm = height / (2 * orbit.distance * Math.tan((camera.fov * Math.PI) / 360));
+  const length = [50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1].find((mm) => mm * perMm < 110) || 0.1;
+  const inverse = orbit.turned.clone().invert();
+  const arms = [["L", 1, 0, 0], ["P", 0, 1, 0], ["S", 0, 0, 1]].map(([name, ...axis]) => {
+    const v = new Vector3(...axis).applyQuaternion(inverse);
+    return { name, x: 17 * v.x, y: -17 * v.y, z: v.z };
+  });
+  for (const pane of panes) {
+    pane.length.style.width = `${length * perMm}px`;
+    pane.length.textContent = `${length} mm`;
+    pane.compass.replaceChildren(...arms.sort((a, b) => a.z - b.z).flatMap(arm));
+  }
+}
+
+function arm({ name, x, y, z }) {
+  const ink = z < -0.05 ? "#9fb0b8" : "#2c4650";
+  const text = svg("text", { x: 1.32 * x, y: 1.32 * y, fill: ink });
+  text.textContent = name;
+  return [svg("line", { x1: 0, y1: 0, x2: x, y2: y, stroke: ink, "stroke-width": 1.6 }), text];
+}
