@@ -42,6 +42,16 @@ def test_closest_point_equals_brute_force(n: int) -> None:
     np.testing.assert_allclose(brute[np.arange(40), face], distance, atol=1e-9)
 
 
+@pytest.mark.parametrize("corners", [(0, 0, 1), (0, 1, 1), (0, 1, 0), (0, 0, 0), (0, 1, 2), (2, 0, 1), (1, 2, 0)])
+def test_triangles_without_area_are_as_near_as_their_edges(corners: tuple[int, int, int]) -> None:
+    on_line = np.array([[0.0, 0, 0], [3, 6, 9], [1, 2, 3]])[list(corners)]
+    points = np.random.default_rng(2).uniform(-5, 12, (60, 3))
+    distance = Surface(on_line, np.array([[0, 1, 2]])).closest(points)[1]
+    line = on_line.min(axis=0) + np.linspace(0, 1, 20001)[:, None] * np.ptp(on_line, axis=0)
+    brute = np.linalg.norm(points[:, None] - line, axis=2).min(axis=1)
+    np.testing.assert_allclose(distance, brute, atol=1e-6)
+
+
 def test_crossing_and_first_hit_equal_brute_force() -> None:
     rng = np.random.default_rng(7)
     soup = random_soup(rng, 150)

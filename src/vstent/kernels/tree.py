@@ -212,6 +212,23 @@ def _dot(a0: float, a1: float, a2: float, b0: float, b1: float, b2: float) -> fl
 
 
 @njit(cache=True)
+def _closest_on_longest_edge(t: Any, p: Any, ab_ab: float, ac_ac: float) -> tuple[float, float, int]:
+    """As `closest_on_triangle`, of a triangle whose corners lie on one line."""
+    bc_bc = 0.0
+    for k in range(3):
+        bc_bc += (t[2, k] - t[1, k]) ** 2
+    first, last = (1, 2) if bc_bc >= max(ab_ab, ac_ac) else (0, 1) if ab_ab >= ac_ac else (0, 2)
+    reach, length2 = 0.0, 0.0
+    for k in range(3):
+        reach += (t[last, k] - t[first, k]) * (p[k] - t[first, k])
+        length2 += (t[last, k] - t[first, k]) ** 2
+    share = min(max(reach / max(length2, 1e-300), 0.0), 1.0)
+    if first == 1:
+        return 1.0 - share, share, 2
+    return (share, 0.0, 1) if last == 1 else (0.0, share, 3)
+
+
+@njit(cache=True)
 def closest_on_triangle(p: Any, t: Any) -> tuple[float, float, int]:
     """Barycentric weights (v, w) of the closest point a + v ab + w ac, and the feature it lies on.
 
@@ -230,7 +247,7 @@ def closest_on_triangle(p: Any, t: Any) -> tuple[float, float, int]:
     if d3 >= 0.0 and d4 <= d3:
         return 1.0, 0.0, 5
     vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0 and d1 > d3:  # d1 = d3: a and b are one point, the other edges decide
         return d1 / (d1 - d3), 0.0, 1
     cp0, cp1, cp2 = p[0] - t[2, 0], p[1] - t[2, 1], p[2] - t[2, 2]
     d5 = _dot(ab0, ab1, ab2, cp0, cp1, cp2)
@@ -238,13 +255,16 @@ def closest_on_triangle(p: Any, t: Any) -> tuple[float, float, int]:
     if d6 >= 0.0 and d5 <= d6:
         return 0.0, 1.0, 6
     vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0 and d2 > d6:
         return 0.0, d2 / (d2 - d6), 3
     va = d3 * d6 - d5 * d4
-    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0 and d4 - d3 + d5 - d6 > 0.0:
         w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
         return 1.0 - w, w, 2
     total = va + vb + vc
+    ab_ab, ac_ac = _dot(ab0, ab1, ab2, ab0, ab1, ab2), _dot(ac0, ac1, ac2, ac0, ac1, ac2)
+    if total <= 1e-13 * max(ab_ab, ac_ac) ** 2:  # no area but rounding: the longest edge is all of it
+        return _closest_on_longest_edge(t, p, ab_ab, ac_ac)
     return vb / total, vc / total, 0
 
 
