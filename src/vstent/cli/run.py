@@ -1,6 +1,8 @@
 """`vstent run`: a patient's scan or surface, whole."""
 
 import argparse
+from dataclasses import asdict
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +14,9 @@ if TYPE_CHECKING:
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "run", "scan or surface -> stented artery, flow compared, report")
+    parser = options.add_command(
+        commands, "run", "scan or surface -> stented artery, flow compared, report; run.json -> the same again"
+    )
     given = options.add_geometry(parser)
     options.add_outlet(given)
     given.add_argument("--diameter", type=options.positive, metavar="MM", help="label diameter of the devices")
@@ -21,6 +25,10 @@ def add(commands: options.Commands) -> None:
         "--center", type=options.number, metavar="MM", help="where on the parent axis the device's middle lies"
     )
     add_study(parser)
+    parser.add_argument("--crate", action="store_true", help="describe the folder as an RO-Crate besides")
+    parser.add_argument(
+        "--input", dest="moved_to", type=Path, metavar="PATH", help="where the input of a run.json lies now"
+    )
     parser.set_defaults(command=_run)
 
 
@@ -70,5 +78,33 @@ def _run(arguments: argparse.Namespace) -> int:
         length_mm=arguments.length,
         center_mm=arguments.center,
     )
-    study(arguments.input, arguments.out, settings)
+    if arguments.input.suffix == ".json":
+        return _again(arguments, settings)
+    _finish(arguments, study(arguments.input, arguments.out, settings))
     return 0
+
+
+def _again(arguments: argparse.Namespace, given: "Settings") -> int:
+    """Repeat a run from its run.json; say what is not as it was, and how far the results agree."""
+    from vstent.console import Console
+    from vstent.errors import InputError
+    from vstent.study import Settings, agreement, read_record
+
+    if asdict(given) != asdict(Settings()):
+        raise InputError(f"{arguments.input} says all settings: give no option but --out, --input and --crate with it.")
+    record = read_record(arguments.input, arguments.moved_to)
+    if arguments.out.resolve() == record.folder.resolve():
+        raise InputError(f"{arguments.out} is the folder of the run itself: give another --out to repeat it in.")
+    console = Console()
+    for difference in record.differences:
+        console.say(f"Not as then: {difference}.")
+    _finish(arguments, study(record.input, arguments.out, record.settings))
+    console.print(agreement(record.folder, arguments.out))
+    return 0
+
+
+def _finish(arguments: argparse.Namespace, case: "CaseResult") -> None:
+    from vstent.study import write_crate
+
+    if arguments.crate:
+        write_crate(arguments.out, case.provenance, date.today().isoformat())

@@ -71,7 +71,10 @@ def read_image(
 def _three(values: Sequence[float], what: str) -> NDArray[np.float64]:
     given = np.atleast_1d(np.asarray(values, dtype=np.float64))
     if len(given) not in (1, 3) or not (np.isfinite(given) & (given > 0)).all():
-        raise UnitError(f"The {what} must be one or three positive numbers, not {', '.join(f'{v:g}' for v in given)}.")
+        raise UnitError(
+            f"The {what} must be one or three positive numbers, not {', '.join(f'{v:g}' for v in given)}; "
+            "give --spacing in mm."
+        )
     return np.broadcast_to(given, (3,)).astype(np.float64)
 
 
@@ -94,7 +97,8 @@ def _plausible(image: Image, path: Path) -> Image:
         raise ReadError(f"{path.name} has voxels that are not numbers; export it again with integers.")
     if image.voxels.dtype.kind in "iu" and image.voxels.dtype.itemsize == 2:
         middle = np.ravel(image.voxels[:, :, image.voxels.shape[2] // 2], order="F")
-        if SWAPPED_ROUGHNESS * _roughness(middle.byteswap()) < _roughness(middle):
+        swapped = _roughness(middle.byteswap())
+        if swapped < min(SMOOTH, _roughness(middle) / SWAPPED_ROUGHNESS):
             raise ReadError(f"{path.name} has voxels whose bytes are in the other order; export it again.")
     return image
 
@@ -259,6 +263,8 @@ def _read_raw(
 
 SWAPPED_ROUGHNESS: Final = 2.0
 """Voxels so many times as rough as with their bytes swapped are in the wrong order; in the right one they are less."""
+SMOOTH: Final = 0.1
+"""Scans are this smooth in the right order, noise included; patterns and pure noise are in neither."""
 LARGEST_VOXEL: Final = 8
 """Bytes of the largest kind of voxel."""
 

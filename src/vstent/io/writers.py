@@ -153,30 +153,29 @@ def write_stl(path: Path, surface: Surface) -> None:
         partial.write_bytes(header + faces.tobytes())
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write numbers, strings, lists, mappings and arrays as JSON: sorted keys, floats of seven digits.
+def write_json(path: Path, content: Any, *, is_exact: bool = False) -> None:
+    """Write numbers, strings, lists, mappings and arrays as JSON: sorted keys, floats of seven digits, or exact ones.
 
     Raises
     ------
     ValueError
         A number is not finite, or an object is none of these; nothing is written.
     """
-    write_text(
-        path, json.dumps(_plain(content, ""), indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
-    )
+    plain = _plain(content, "", is_exact)
+    write_text(path, json.dumps(plain, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def _plain(value: Any, where: str) -> Any:
+def _plain(value: Any, where: str, is_exact: bool) -> Any:
     if isinstance(value, Mapping):
-        return {str(key): _plain(item, f"{where}.{key}") for key, item in value.items()}
+        return {str(key): _plain(item, f"{where}.{key}", is_exact) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
+        return [_plain(item, f"{where}[{i}]", is_exact) for i, item in enumerate(value)]
     if isinstance(value, (np.ndarray, np.generic)):
-        return _plain(value.tolist(), where)
+        return _plain(value.tolist(), where, is_exact)
     if isinstance(value, float):
         if not math.isfinite(value):
             raise ValueError(f"{where.lstrip('.')} is {value}, which JSON cannot hold")
-        return float(f"{value:.{SIGNIFICANT_DIGITS}g}")
+        return value if is_exact else float(f"{value:.{SIGNIFICANT_DIGITS}g}")
     if value is None or isinstance(value, (str, int, bool)):
         return value
     if isinstance(value, Path):

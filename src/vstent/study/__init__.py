@@ -5,19 +5,20 @@ device is deployed, so that a wrong input leaves nothing behind. From then on ea
 under a key that names everything it depends on; running the same study again reads it back instead of computing it.
 """
 
-import platform
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from vstent.device import find_design
 from vstent.flow.convergence import Refinement
 from vstent.io import writers
 from vstent.measure import morphology
+from vstent.study.crate import write_crate
 from vstent.study.folder import CACHE, claiming
 from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
 from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
+from vstent.study.provenance import INPUT, METRICS, provenance
+from vstent.study.repeat import Record, agreement, read_record
 from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all, refine, vary_all
 from vstent.study.types import CaseResult, Placing, Progress, Settings
 from vstent.vessel import Anatomy, Vessel
@@ -28,17 +29,17 @@ __all__ = [
     "CaseResult",
     "Placing",
     "Progress",
+    "Record",
     "Settings",
+    "agreement",
+    "read_record",
     "refine_flow",
     "restore_vessel",
     "run",
     "trace_vessel",
+    "write_crate",
     "write_ranking",
 ]
-
-PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
-INPUT: Final = "input.json"
-"""File in the case folder that says where the input lies: not for handing on, for its path may name the patient."""
 
 
 @claiming
@@ -78,11 +79,11 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
         metrics = measure_all(anatomy, deployments, fields)
         for name, spread in varied.items():
             metrics["stents"][name]["uncertainty"] = spread
-        writers.write_json(out / "metrics.json", metrics)
-    provenance = _provenance(path, source, settings, ledger)
-    writers.write_json(out / "run.json", provenance)
+        writers.write_json(out / METRICS, metrics)
+    told = provenance(path, source, settings, ledger.seconds)
+    writers.write_json(out / "run.json", told, is_exact=True)
     notes = (*anatomy.vessel.notes, *anatomy.notes)
-    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, provenance, notes)
+    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, notes)
 
 
 @claiming
@@ -160,13 +161,3 @@ def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -
     found = refine(anatomy, settings, ledger)
     writers.write_json(out / "convergence.json", {one.name: asdict(one) for one in found})
     return found
-
-
-def _provenance(path: Path, source: str, settings: Settings, ledger: Ledger) -> dict[str, Any]:
-    return {
-        "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
-        "input": {"name": "DICOM folder" if path.is_dir() else path.name, "sha256": source},
-        "settings": asdict(settings),
-        "seconds": ledger.seconds,
-        "research_use_only": True,
-    }

@@ -78,12 +78,12 @@ def refuse_missing(path: Path) -> None:
 
 
 def hash_of(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a folder in the order of their names."""
+    """SHA-256 of a file, whatever its name, or of all files of a folder with their names, in the order of these."""
     refuse_missing(path)
     digest = hashlib.sha256()
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if file.is_file():
-            digest.update(file.name.encode() + b"\0")
+            digest.update(file.name.encode() + b"\0" if path.is_dir() else b"")
             with file.open("rb") as stream:
                 while block := stream.read(1 << 20):
                     digest.update(block)

@@ -1,0 +1,129 @@
+"""Crate: a case folder as an RO-Crate: what each file is, and what made it.
+
+Version 1.1, https://w3id.org/ro/crate/1.1 (Soiland-Reyes et al. 2022, Data Science 5:97).
+"""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.errors import ReadError
+from vstent.io.writers import write_json
+
+NAME: Final = "ro-crate-metadata.json"
+LICENSE: Final = "https://spdx.org/licenses/BSD-3-Clause"
+"""Of the program."""
+FORMATS: Final = {
+    ".json": "application/json",
+    ".csv": "text/csv",
+    ".html": "text/html",
+    ".vtp": "application/vnd.vtk.polydata+xml",
+    ".vtu": "application/vnd.vtk.unstructuredgrid+xml",
+    ".stl": "model/stl",
+    ".png": "image/png",
+}
+ABOUT: Final = {
+    "metrics.json": "Every number, its unit in its key",
+    "run.json": "Versions, input with SHA-256, settings: enough to repeat the run",
+    "report.html": "The case in 3-D, before, after and change",
+    "vessel.vtp": "The lumen",
+    "centerlines.vtp": "Centerlines, under VMTK's array names",
+    "landing_surface.vtp": "The parent artery, sac and branches closed: what the device expands against",
+    "sac.vtp": "The sac",
+    "neck.vtp": "The neck",
+    "openings.json": "Every opening, and what was repaired or guessed",
+    "contour.vtp": "Contour of the deployed device, with its distance from the wall",
+    "wires.vtp": "Axes of the wires",
+    "struts.stl": "Solids of the wires",
+    "field.vtu": "Velocity and pressure",
+    "wall.vtp": "Wall shear stress",
+}
+
+
+def write_crate(folder: Path, provenance: Mapping[str, Any], when: str) -> None:
+    """Describe every file of a finished case folder in ``ro-crate-metadata.json``; hidden ones are left out.
+
+    Parameters
+    ----------
+    folder : the case folder.
+    provenance : what its ``run.json`` says.
+    when : the day, ISO 8601.
+
+    Raises
+    ------
+    ReadError
+        There is no finished case in the folder.
+    """
+    if not (folder / "metrics.json").exists():
+        raise ReadError(f"{folder} holds no finished case: run it first.")
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and _is_shown(path.relative_to(folder))]
+    files = [_file(folder, path) for path in paths]
+    write_json(
+        folder / NAME,
+        {
+            "@context": "https://w3id.org/ro/crate/1.1/context",
+            "@graph": [*_crate(folder, files, when), *files, *_making(provenance, files, when)],
+        },
+    )
+
+
+def _is_shown(path: Path) -> bool:
+    return path.name != NAME and not any(part.startswith(".") for part in path.parts)
+
+
+def _file(folder: Path, path: Path) -> dict[str, Any]:
+    return {
+        "@id": path.relative_to(folder).as_posix(),
+        "@type": "File",
+        "name": ABOUT.get(path.name, path.name),
+        "encodingFormat": FORMATS.get(path.suffix, "application/octet-stream"),
+        "contentSize": str(path.stat().st_size),
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+    }
+
+
+def _crate(folder: Path, files: list[dict[str, Any]], when: str) -> list[dict[str, Any]]:
+    return [
+        {
+            "@id": NAME,
+            "@type": "CreativeWork",
+            "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
+            "about": {"@id": "./"},
+        },
+        {
+            "@id": "./",
+            "@type": "Dataset",
+            "name": f"Virtual stenting of {folder.resolve().name}",
+            "description": "A virtual stenting by vstent. Research use only: not for diagnosis or treatment.",
+            "datePublished": when,
+            "license": "Not for publication unless whoever holds the rights in the scan allows it",
+            "hasPart": [{"@id": file["@id"]} for file in files],
+            "mentions": {"@id": "#run"},
+        },
+    ]
+
+
+def _making(provenance: Mapping[str, Any], files: list[dict[str, Any]], when: str) -> list[dict[str, Any]]:
+    """Which program made the files, from what."""
+    given = provenance["input"]
+    return [
+        {
+            "@id": "#vstent",
+            "@type": "SoftwareApplication",
+            "name": "vstent",
+            "version": provenance["versions"]["vstent"],
+            "license": {"@id": LICENSE},
+        },
+        {"@id": LICENSE, "@type": "CreativeWork", "name": "BSD 3-Clause"},
+        {"@id": "#input", "@type": "CreativeWork", "name": given["name"], "sha256": given["sha256"]},
+        {
+            "@id": "#run",
+            "@type": "CreateAction",
+            "name": "vstent run",
+            "endTime": when,
+            "instrument": {"@id": "#vstent"},
+            "object": {"@id": "#input"},
+            "result": [{"@id": file["@id"]} for file in files],
+        },
+    ]

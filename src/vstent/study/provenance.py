@@ -1,0 +1,45 @@
+"""Provenance: everything that it takes to repeat a run."""
+
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.device import find_design
+from vstent.study.ledger import key_of
+from vstent.study.types import Settings
+
+PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
+INPUT: Final = "input.json"
+"""File in the case folder that says where the input lies: not for handing on, for its path may name the patient."""
+METRICS: Final = "metrics.json"
+
+
+def provenance(path: Path, source: str, settings: Settings, seconds: Mapping[str, float]) -> dict[str, Any]:
+    """Return versions, machine, devices, input with its hash `source`, settings, and the seconds of every stage."""
+    return {
+        "versions": versions(),
+        "machine": machine(),
+        "devices": devices_of(settings.devices),
+        "input": {"name": "DICOM folder" if path.is_dir() else path.name, "sha256": source},
+        "settings": asdict(settings),
+        "seconds": seconds,
+        "research_use_only": True,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of everything that computes."""
+    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+
+
+def machine() -> dict[str, str]:
+    """Return what of the machine can change the last bits of a number."""
+    return {"system": platform.system(), "processor": platform.machine()}
+
+
+def devices_of(names: Iterable[str]) -> dict[str, str]:
+    """Return a fingerprint of every device's numbers: a catalogue can change."""
+    return {name: key_of(find_design(name)) for name in names}

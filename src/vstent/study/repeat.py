@@ -1,0 +1,125 @@
+"""Repeat: a run done again from what `run.json` says of it, and how far the two agree."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.errors import InputError, ReadError
+from vstent.study.folder import CACHE
+from vstent.study.ledger import hash_of
+from vstent.study.provenance import INPUT, METRICS, devices_of, machine, versions
+from vstent.study.types import Settings
+
+MISSING: Final = "absent"
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A run as its `run.json` tells it."""
+
+    folder: Path
+    """The case folder."""
+    input: Path
+    """Scan or surface: seen to be the same file."""
+    settings: Settings
+    """All of them, to the last bit."""
+    differences: tuple[str, ...]
+    """What is not as it was then: versions, machine, devices; a sentence each."""
+
+
+def read_record(path: Path, moved_to: Path | None = None) -> Record:
+    """Read a `run.json` and find its input.
+
+    Parameters
+    ----------
+    path : the file, in its case folder.
+    moved_to : where the input lies now; None: where it lay then.
+
+    Raises
+    ------
+    ReadError
+        The file is not of this version's kind, or the input is not where it was.
+    InputError
+        The input is another one than then.
+    """
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        settings, sha256 = _settings(told["settings"]), str(told["input"]["sha256"])
+        differences = _differences(told, settings)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise ReadError(f"{path} is no run.json of this version: give the scan and the options again.") from None
+    source = moved_to or _input(path.parent)
+    if not source.exists():
+        raise ReadError(f"{source}, the input of {path}, is not there: say where it is now with --input.")
+    if hash_of(source) != sha256:
+        raise InputError(f"{source} is not the input of {path}: it has changed since. Give that file with --input.")
+    return Record(path.parent, source, settings, differences)
+
+
+def _input(folder: Path) -> Path:
+    try:
+        return Path(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ReadError(
+            f"{folder} does not say where its input lay (its folder {CACHE} is gone): say it with --input."
+        ) from None
+
+
+def _settings(told: Mapping[str, Any]) -> Settings:
+    """Rebuild the settings; ValueError where this version does not know one."""
+    from pydantic import TypeAdapter  # its ValidationError is a ValueError
+
+    unknown = sorted(set(told) - {field.name for field in fields(Settings)})
+    if unknown:
+        raise ValueError(f"unknown settings: {unknown}")
+    return TypeAdapter(Settings).validate_python(dict(told))
+
+
+def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]:
+    now = {"versions": versions(), "machine": machine(), "devices": devices_of(settings.devices)}
+    return tuple(
+        f"{name.replace('_', ' ')} ({part}): {told.get(part, {}).get(name, MISSING)} then, {value} now"
+        for part, values in now.items()
+        for name, value in values.items()
+        if told.get(part, {}).get(name, MISSING) != value
+    )
+
+
+def agreement(first: Path, second: Path) -> str:
+    """Return a sentence on how far the metrics of two case folders agree.
+
+    Raises
+    ------
+    ReadError
+        One of them has none.
+    """
+    try:
+        one, other = ((folder / METRICS).read_bytes() for folder in (first, second))
+    except OSError as error:
+        raise ReadError(f"{error.filename} cannot be read: nothing to compare with.") from None
+    if one == other:
+        return "The metrics are the same to the last bit."
+    then, now = dict(_numbers(json.loads(one))), dict(_numbers(json.loads(other)))
+    if set(then) != set(now):
+        return f"The metrics differ: {len(set(then) ^ set(now))} of them are in one run only."
+    apart = {name: _relative(then[name], now[name]) for name in then}
+    worst = max(apart, key=lambda name: apart[name])
+    n_apart = sum(value > 0 for value in apart.values())
+    return f"{n_apart} of {len(apart)} metrics differ, {worst} most: by {apart[worst]:.2g} of itself."
+
+
+def _relative(one: Any, other: Any) -> float:
+    if one == other:
+        return 0.0
+    if isinstance(one, str) or isinstance(other, str):
+        return 1.0
+    return float(abs(one - other) / max(abs(one), abs(other)))
+
+
+def _numbers(values: Mapping[str, Any], before: str = "") -> list[tuple[str, Any]]:
+    found = []
+    for name, value in values.items():
+        found += _numbers(value, f"{before}{name}.") if isinstance(value, Mapping) else [(f"{before}{name}", value)]
+    return found

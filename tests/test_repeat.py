@@ -1,0 +1,138 @@
+"""A run is repeated from its run.json to the last bit, and what is not as it was is told."""
+
+import hashlib
+import json
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from vstent import phantoms
+from vstent.cli import main
+from vstent.flow import FlowSettings
+from vstent.flow.waveform import OLDER_ADULT_ICA
+from vstent.io.writers import write_json, write_stl
+from vstent.study import Placing, Settings, agreement, write_crate
+from vstent.study import repeat as repeating
+from vstent.uncertainty import Ranges
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    """A run with settings that seven digits do not hold, a coarse flow, and varied causes."""
+    folder = tmp_path_factory.mktemp("repeat")
+    artery = phantoms.with_sac(phantoms.tube(length_mm=24), abscissa_mm=12, width_mm=5.0, neck_mm=3.5)
+    write_stl(folder / "ä scan.stl", phantoms.phantom_surface(artery, edge_mm=0.45))
+    options = ["--units", "mm", "--device", "silk", "--at=0.1234567891,3,12", "--center", "12.000000123"]
+    flow = ["--cell-size", "0.333333333333", "--flow-rate", "2.7182818284590"]
+    varied = ["--uncertainty", "2", "--vary", "landing=0.1"]
+    command = ["run", str(folder / "ä scan.stl"), "--out", str(folder / "first"), *options, *flow, *varied]
+    assert main(command) == 0
+    return folder
+
+
+def test_a_repeated_run_is_the_same_to_the_last_bit(case, capsys):
+    assert main(["run", str(case / "first" / "run.json"), "--out", str(case / "again"), "--crate"]) == 0
+    said = capsys.readouterr()
+    assert "the same to the last bit" in said.out
+    assert "Not as then" not in said.err
+    assert "already done" not in said.err
+    first, again = case / "first", case / "again"
+    for name in ("metrics.json", "vessel.vtp", "stents/silk/wires.vtp", "flow/silk/wall.vtp", "flow/bare/field.vtu"):
+        assert (first / name).read_bytes() == (again / name).read_bytes()
+    one, other = (json.loads((folder / "run.json").read_text()) for folder in (first, again))
+    assert one["settings"] == other["settings"]
+    assert one["settings"]["center_mm"] == 12.000000123
+    assert one["settings"]["flow"]["cell_size_mm"] == 0.333333333333
+    _check_crate(again)
+
+
+def _check_crate(folder: Path) -> None:
+    graph = json.loads((folder / "ro-crate-metadata.json").read_text())["@graph"]
+    by_id = {entity["@id"]: entity for entity in graph}
+    assert len(by_id) == len(graph)
+    assert by_id["ro-crate-metadata.json"]["conformsTo"] == {"@id": "https://w3id.org/ro/crate/1.1"}
+    shown = {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file() and ".vstent" not in path.parts and path.name != "ro-crate-metadata.json"
+    }
+    assert {part["@id"] for part in by_id["./"]["hasPart"]} == shown
+    for name in shown:
+        assert by_id[name]["sha256"] == hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        assert by_id[name]["contentSize"] == str((folder / name).stat().st_size)
+        assert by_id[name]["encodingFormat"] != "application/octet-stream"
+    for entity in graph:
+        for value in entity.values():
+            for link in value if isinstance(value, list) else [value]:
+                if isinstance(link, dict) and link["@id"] != "https://w3id.org/ro/crate/1.1":
+                    assert link["@id"] in by_id
+
+
+def test_another_input_is_refused_and_a_moved_one_is_found(case, tmp_path, capsys):
+    moved = tmp_path / "moved"
+    shutil.copytree(case / "first", moved / "first")
+    shutil.copy(case / "ä scan.stl", moved / "scan.stl")
+    write_json(moved / "first" / ".vstent" / "input.json", {"path": str(moved / "gone.stl")})
+    command = ["run", str(moved / "first" / "run.json"), "--out", str(moved / "again")]
+    assert main(command) == 2
+    assert "--input" in capsys.readouterr().err
+    found = repeating.read_record(moved / "first" / "run.json", moved / "scan.stl")
+    assert found.input == moved / "scan.stl"
+    (moved / "scan.stl").write_bytes((moved / "scan.stl").read_bytes() + b" ")
+    assert main([*command, "--input", str(moved / "scan.stl")]) == 2
+    assert "has changed since" in capsys.readouterr().err
+    assert not (moved / "again").exists()
+
+
+def test_other_versions_and_devices_are_told(case):
+    told = json.loads((case / "first" / "run.json").read_text())
+    told["versions"]["numpy"] = "1.0"
+    told["devices"]["silk"] = "other wires"
+    del told["machine"]
+    (case / "first" / "other.json").write_text(json.dumps(told))
+    differences = repeating.read_record(case / "first" / "other.json").differences
+    assert any("numpy (versions): 1.0 then" in sentence for sentence in differences)
+    assert any("silk (devices): other wires then" in sentence for sentence in differences)
+    assert sum("(machine): absent then" in sentence for sentence in differences) == 2
+    assert len(differences) == 4
+    (case / "first" / "other.json").unlink()
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"settings": {"colour": 1}, "input": {"sha256": ""}}', '{"settings": {}}'])
+def test_what_is_no_record_is_refused_in_a_sentence(text, tmp_path, capsys):
+    (tmp_path / "run.json").write_text(text)
+    assert main(["run", str(tmp_path / "run.json"), "--out", str(tmp_path / "out")]) == 2
+    assert "no run.json of this version" in capsys.readouterr().err
+
+
+def test_a_record_takes_no_other_settings_nor_its_own_folder(case, capsys):
+    record = str(case / "first" / "run.json")
+    assert main(["run", record, "--out", str(case / "x"), "--threshold", "3"]) == 2
+    assert "give no option" in capsys.readouterr().err
+    assert main(["run", record, "--out", str(case / "first")]) == 2
+    assert "another --out" in capsys.readouterr().err
+
+
+def test_settings_come_back_from_json_to_the_last_bit(tmp_path):
+    flow = FlowSettings(inflow_mL_s=1 / 3, waveform=OLDER_ADULT_ICA, outlets="murray")
+    settings = Settings(
+        devices=("silk",), at_mm=(0.1, 1e-17, -2 / 3), flow=flow, placings={"silk": Placing(4.0)}, uncertainty=Ranges(7)
+    )
+    write_json(tmp_path / "s.json", asdict(settings), is_exact=True)
+    back = repeating._settings(json.loads((tmp_path / "s.json").read_text()))
+    assert asdict(back) == asdict(settings)
+
+
+def test_disagreement_is_told_by_its_worst(tmp_path):
+    for name, length in (("one", 10.0), ("other", 11.0)):
+        write_json(tmp_path / name / "metrics.json", {"vessel": {"a_mm": 1.0}, "stents": {"silk": {"b_mm": length}}})
+    assert agreement(tmp_path / "one", tmp_path / "other") == (
+        "1 of 2 metrics differ, stents.silk.b_mm most: by 0.091 of itself."
+    )
+
+
+def test_an_unfinished_folder_is_no_crate(tmp_path):
+    with pytest.raises(Exception, match="holds no finished case"):
+        write_crate(tmp_path, {}, "2026-01-01")
