@@ -179,7 +179,7 @@ def speed(anatomy: Anatomy) -> list[str]:
 
 
 def beside_rods() -> list[str]:
-    """The braid beside elastic rods (``benchmarks/braid_rods.py``), as ``tests/test_deploy_rods.py`` compares them."""
+    """The braid beside elastic rods (``benchmarks/offline/braid_rods.py``), as the tests compare them."""
     lines = []
     for name in ("tube", "taper", "bend"):
         rods_mm, ours_mm, apart_mm = compared(name)

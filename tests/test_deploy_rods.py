@@ -1,4 +1,4 @@
-"""The braid of constant wires beside an independent model of it: elastic rods (``benchmarks/braid_rods.py``)."""
+"""The braid of constant wires beside elastic rods, an independent model (``benchmarks/offline/braid_rods.py``)."""
 
 import json
 from functools import cache

@@ -1,7 +1,7 @@
 """An independent model of a braid in an artery: elastic Cosserat rods, pushed apart by their own springiness alone.
 
 Run from the repository, offline, some minutes a case: ``pip install pyelastica``, then
-``python benchmarks/braid_rods.py``. What comes out is kept in ``tests/data/braid_rods.json`` and compared with
+``python benchmarks/offline/braid_rods.py``. What comes out is kept in ``tests/data/braid_rods.json`` and compared with
 `vstent.deploy` by ``tests/test_deploy_rods.py``. Rods are those of PyElastica (Gazzola et al. 2018, R. Soc. Open Sci.
 5:171628; MIT licence); nothing of vstent's deployment is used.
 
@@ -42,7 +42,7 @@ STEPS = 1000
 LOOKS, BENDING_LOOKS = 120, 25
 AT_REST_MM = 3e-4
 """The braid is at rest when no node moves further than this from one look to the next."""
-OUT = Path(__file__).parents[1] / "tests" / "data" / "braid_rods.json"
+OUT = Path(__file__).parents[2] / "tests" / "data" / "braid_rods.json"
 
 
 @dataclass(frozen=True)
