@@ -96,7 +96,7 @@ def outside(field: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: fl
 def test_the_profile_in_the_throat_is_inside_the_spread_of_the_experiments(
     experiments: list[dict[str, np.ndarray]],
 ) -> None:
-    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.55)
+    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.5)
     field = simulate_case(FlowCase(nozzle(-4.0), blood=BLOOD, settings=settings))
     assert field.outlets_mL_s[0] == pytest.approx(field.inlet_mL_s, rel=1e-3)
     assert field.inlet_mL_s == pytest.approx(INFLOW_ML_S, rel=5e-3)
