@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test validation check lint benchmark clean
+.PHONY: demo test validation check lint benchmark docs licences wheel-check clean
 
 demo: $(VENV)/.ready
 	$(BIN)/vstent demo --out demo
@@ -12,7 +12,7 @@ test: $(VENV)/.ready-dev
 	$(BIN)/python -m pytest -m "not validation"
 
 validation: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest -m validation -rP
+	$(BIN)/python tools/record.py validation
 
 check: lint test
 
@@ -23,10 +23,21 @@ lint: $(VENV)/.ready-dev
 	$(BIN)/lint-imports
 
 benchmark: $(VENV)/.ready-dev
-	for script in benchmarks/*.py; do $(BIN)/python $$script; done
+	$(BIN)/python tools/record.py benchmark
+
+docs: $(VENV)/.ready-docs
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
+
+licences: $(VENV)/.ready-dev
+	$(BIN)/python tools/licences.py
+
+# In brief; with PYTHONS="python3.11 python3.12 python3.13", in an empty environment of each that there is.
+wheel-check: $(VENV)/.ready
+	$(BIN)/python tools/wheel_check.py $(PYTHONS)
 
 clean:
-	rm -rf $(VENV) demo
+	rm -rf $(VENV) demo docs/_build docs/examples docs/generated
 
 $(VENV)/.ready: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -41,4 +52,8 @@ $(VENV)/.ready: pyproject.toml
 
 $(VENV)/.ready-dev: $(VENV)/.ready
 	$(BIN)/python -m pip install --quiet --group dev
+	@touch $@
+
+$(VENV)/.ready-docs: $(VENV)/.ready-dev
+	$(BIN)/python -m pip install --quiet --group docs
 	@touch $@

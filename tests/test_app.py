@@ -3,6 +3,7 @@
 import hashlib
 import json
 import time
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -10,12 +11,15 @@ import numpy as np
 import pytest
 
 import app_case
+import report_case
 import vstent
 from vstent import phantoms
+from vstent.app import cuts
 from vstent.app.cases import STEPS
 from vstent.cli import main
 from vstent.deploy import deploy
 from vstent.device import find_design
+from vstent.flow.types import Phase
 from vstent.io.archive import load_noun
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
@@ -144,10 +148,10 @@ def test_a_dragged_end_lies_where_the_hand_is_and_where_the_deployment_puts_it(c
         wanted = start["ends_mm"][end] + 1.3
         answer = client.post(f"{case}/sketch", json={"device": SILK, "anchor": anchor, "abscissa_mm": wanted})
         sketched, data = app_case.opened(answer)
-        assert sketched["ends_mm"][end] == pytest.approx(wanted, abs=1e-6)
+        assert sketched["ends_mm"][end] == pytest.approx(wanted, abs=1e-3)
         stent = deploy(design, anatomy, landing=Landing(sketched["center_mm"])).stent
         ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
-        np.testing.assert_allclose(sketched["ends_mm"], ends, atol=0.05)
+        np.testing.assert_allclose(sketched["ends_mm"], ends, atol=0.1)
         # The end in hand stays there; how sure the artery's diameter is shows at the other one.
         widths = [high - low for low, high in sketched["ends_band_mm"]]
         assert widths[end] == pytest.approx(0, abs=1e-6)
@@ -156,7 +160,7 @@ def test_a_dragged_end_lies_where_the_hand_is_and_where_the_deployment_puts_it(c
         (wires,) = sketched["layers"]
         points = app_case.numbers(wires["points"], data)
         apart = np.linalg.norm(points - stent.wire_points_mm, axis=1)
-        assert np.median(apart) < 0.15  # crossings slide along the wall in the deployment alone
+        assert np.median(apart) < 0.06
 
 
 def test_a_device_dragged_out_of_the_artery_is_refused_with_a_sentence(client, case):
@@ -283,6 +287,22 @@ def vstent_image(voxels):
     from vstent.image import Image
 
     return Image(voxels.astype(np.int16), np.diag([0.4, 0.4, 0.4, 1.0]), "XA")
+
+
+def test_a_cut_lies_in_one_plane_and_has_the_flows_speed_at_a_moment_or_in_the_mean():
+    anatomy, mean = report_case.anatomy(), report_case.field(1.0)
+    fast = Phase(0.25, 7.0, 2 * mean.velocity_m_s, mean.pressure_Pa, 3 * mean.wall_shear_stress_Pa)
+    pulsing = replace(mean, phases=(fast,))
+    layers = [cuts.cut("bare", field, anatomy) for field in (mean, cuts.at_phase(pulsing, 0))]
+    points = layers[0].surface.vertices_mm
+    assert np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[2] < 1e-9
+    # In the bend's plane the speed is Poiseuille's: its largest, on the axis, is 0.5 m/s.
+    off = np.hypot(points[:, 0], points[:, 2]) - report_case.BEND_MM
+    on_axis = (np.abs(off) < 0.1) & (points[:, 2] > 3) & (np.abs(points[:, 1]) < 0.1)
+    assert on_axis.sum() > 10
+    np.testing.assert_allclose(layers[0].values[on_axis], 0.5, rtol=0.08)
+    np.testing.assert_allclose(layers[1].values, 2 * layers[0].values, rtol=1e-5)
+    np.testing.assert_allclose(cuts.at_phase(pulsing, 0).shear_Pa, 3 * mean.shear_Pa, rtol=1e-5)
 
 
 def test_the_interface_is_described_and_its_page_needs_no_network(client):

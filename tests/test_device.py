@@ -199,3 +199,23 @@ def test_an_own_file_spoiled_later_is_named(own_folder):
     (own_folder / "mine.toml").write_text("spoiled")
     with pytest.raises(DeviceError, match=r"mine\.toml is not valid TOML"):
         device.catalogue()
+
+
+PUBLISHED = {
+    "pipeline": ("pore_density_per_mm2", 3.75, 12.5, 20.0),  # Babiker et al. 2015, J Med Devices 9
+    "leo": ("coverage_fraction", 4.5, 0.13, 0.15),  # Cho et al. 2017, Neurointervention 12:31: 14 %
+    "enterprise": ("coverage_fraction", 4.5, 0.05, 0.10),  # the same: 5 %, others up to 10 %
+}
+
+
+@pytest.mark.parametrize("key", PUBLISHED)
+def test_what_a_device_derives_is_what_was_measured_on_it(key):
+    formula, diameter_mm, low, high = PUBLISHED[key]
+    design = device.find_design(key)
+    size = device.find_size(design, diameter_mm=diameter_mm)
+    assert low <= getattr(device, formula)(design, size, diameter_mm) <= high
+
+
+def test_the_catalogue_has_the_devices_in_use():
+    wanted = "silk enterprise pipeline surpass_evolve derivo p64 fred lvis leo neuroform_atlas"
+    assert set(wanted.split()) <= set(device.catalogue())

@@ -37,10 +37,10 @@ def womersley_wss_Pa() -> tuple[float, complex]:
 
 
 @cache
-def pulsing() -> FlowField:
+def pulsing(cell_size_mm: float = 0.25) -> FlowField:
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=14.0, radius_mm=2.0))))
     inflow_mL_s = MEAN_MEAN_M_S * np.pi * RADIUS_M**2 * 1e6
-    settings = FlowSettings(inflow_mL_s=inflow_mL_s, cell_size_mm=0.25, waveform=PULSE, lattice_speed=0.05)
+    settings = FlowSettings(inflow_mL_s=inflow_mL_s, cell_size_mm=cell_size_mm, waveform=PULSE, lattice_speed=0.05)
     return simulate_case(FlowCase(vessel, settings=settings))
 
 
@@ -48,8 +48,13 @@ def along(field: FlowField) -> float:
     return np.sign(field.velocity_m_s[:, 2].mean())
 
 
-def test_velocity_is_womersleys_at_every_phase() -> None:
-    field = pulsing()
+FINE = pytest.param(0.2, 0.01, 2.0, marks=pytest.mark.validation)
+"""20 cells a diameter, as the issue's table has it."""
+
+
+@pytest.mark.parametrize(("cell_size_mm", "of_peak", "degrees"), [(0.25, 0.012, 2.5), FINE])
+def test_velocity_is_womersleys_at_every_phase(cell_size_mm: float, of_peak: float, degrees: float) -> None:
+    field = pulsing(cell_size_mm)
     assert field.is_converged
     r_mm = np.linspace(0, 1.8, 10)
     points = np.stack([r_mm, 0 * r_mm, np.full(10, 7.0)], axis=1)
@@ -57,7 +62,9 @@ def test_velocity_is_womersleys_at_every_phase() -> None:
     for phase in field.phases:
         found = along(field) * sampling.values_at(field.at_phase(phase), points)[0][:, 2]
         error.append(np.abs(found - womersley_m_s(r_mm * 1e-3, phase.time_s)).max())
-    assert max(error) < 0.015 * womersley_m_s(np.zeros(1), 0.0).max()
+    peak_m_s = womersley_m_s(np.zeros(1), 0.0).max()
+    print(f"Womersley, {cell_size_mm} mm: within {max(error) / peak_m_s:.2%} of the peak")  # noqa: T201
+    assert max(error) < of_peak * peak_m_s
 
 
 def test_inflow_is_the_waveforms() -> None:
@@ -68,16 +75,21 @@ def test_inflow_is_the_waveforms() -> None:
     np.testing.assert_allclose(found / found.mean(), PULSE.factor(time_s), atol=0.002)
 
 
-def test_wall_shear_stress_has_womersleys_amplitude_and_phase() -> None:
-    field = pulsing()
+@pytest.mark.parametrize(("cell_size_mm", "of_peak", "degrees"), [(0.25, 0.012, 2.5), FINE])
+def test_wall_shear_stress_has_womersleys_amplitude_and_phase(
+    cell_size_mm: float, of_peak: float, degrees: float
+) -> None:
+    field = pulsing(cell_size_mm)
     z = field.wall.vertices_mm[:, 2]
     time_s = np.array([phase.time_s for phase in field.phases])
     stress = along(field) * np.array([p.wall_shear_stress_Pa[(z > 5) & (z < 9), 2].mean() for p in field.phases])
     mean_Pa, amplitude_Pa = womersley_wss_Pa()
     found = 2 * (stress * np.exp(-1j * OMEGA * time_s)).mean()
+    lag = np.degrees(np.angle(found / amplitude_Pa))
+    print(f"Womersley, {cell_size_mm} mm: WSS phase {lag:+.2f} degrees, amplitude {abs(found / amplitude_Pa) - 1:+.2%}")  # noqa: T201
     assert stress.mean() == pytest.approx(mean_Pa, rel=0.02)
     assert abs(found) == pytest.approx(abs(amplitude_Pa), rel=0.02)
-    assert np.degrees(np.angle(found / amplitude_Pa)) == pytest.approx(0.0, abs=4.0)
+    assert abs(lag) < degrees
 
 
 def test_time_averaged_stress_and_its_oscillation_are_those_of_the_phases() -> None:

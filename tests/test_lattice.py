@@ -17,11 +17,11 @@ def populations(seed=0):
     return np.concatenate([small.ravel(), np.zeros(lattice.LANES, np.float32)])
 
 
-def even_step(f, screen=NO_SCREEN, limit=NO_LIMIT):
+def even_step(f, screen=NO_SCREEN, limit=NO_LIMIT, law=(0, 0, 0, 0)):
     """Collide all cells and bring the populations home: the even step leaves each at its opposite's place."""
     result = f.copy()
     address = (np.arange(19) * STRIDE)[None].astype(np.int32)
-    relaxation = np.float32(1 / RATE), np.float32([limit]), np.float32(ODD_RATE)
+    relaxation = np.float32(1 / RATE), np.float32(law), np.float32([limit]), np.float32(ODD_RATE)
     lattice.update(result, address, np.array([STRIDE], np.int32), *relaxation, *screen, 1)
     return result[: -lattice.LANES].reshape(19, STRIDE)[lattice.OPPOSITE]
 
@@ -83,6 +83,19 @@ def test_fast_blood_is_as_thick_as_the_cell_reynolds_number_allows(is_screened):
     assert 0.2 < (viscosity > (1 / RATE - 0.5) / 3).mean() < 0.8
     kept = 1 - 1 / (3 * viscosity + 0.5)
     np.testing.assert_allclose(stress(after), kept[:, None, None] * stress(before), atol=1e-6)
+
+
+@pytest.mark.parametrize("is_screened", [False, True])
+def test_thinning_blood_relaxes_at_the_time_of_its_own_shear_rate(is_screened):
+    f, law = populations(5), np.array([0.4, 30.0, 1.25, -0.624])
+    before = f[: -lattice.LANES].reshape(19, STRIDE).astype(float)
+    after = even_step(f, screen_of((0, 0, 1), 0, 0) if is_screened else NO_SCREEN, law=law).astype(float)
+    size = np.sqrt(2 * (stress(before) ** 2).sum(axis=(1, 2)))
+    time = np.full(STRIDE, 1 / RATE + law[0])
+    for _ in range(50):
+        time = 1 / RATE + law[0] * (1 + (law[1] * 1.5 * size / time) ** law[2]) ** law[3]
+    assert np.ptp(time) > 0.02
+    np.testing.assert_allclose(stress(after), (1 - 1 / time)[:, None, None] * stress(before), atol=2e-4)
 
 
 def screen_of(normal, along, across, quadratic=0.0):

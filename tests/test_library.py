@@ -1,6 +1,7 @@
 """vstent as a library for others: its names, their types, plug-ins, threads."""
 
 import inspect
+import re
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -213,3 +214,8 @@ def test_two_threads_deploy_as_one_does(anatomy: Anatomy) -> None:
         for name in ("nodes_mm", "wire_points_mm", "row_abscissa_mm"):
             np.testing.assert_array_equal(getattr(found.stent, name), getattr(alone.stent, name))
         np.testing.assert_array_equal(found.wall_gap_mm, alone.wall_gap_mm)
+
+
+def test_type_checkers_see_what_is_loaded_late() -> None:
+    source = resources.files("vstent").joinpath("__init__.py").read_text()
+    assert sorted(re.findall(r"(\w+) as \1\b", source)) == list(VERBS)

@@ -142,4 +142,4 @@ def test_openfoams_flow_in_a_tube_is_poiseuilles(tmp_path: Path) -> None:
     assert stress.mean() == pytest.approx(expected, rel=0.02)
     assert np.abs(stress / expected - 1).max() < 0.05
     # The same case goes on from the last time written: nothing is left to do.
-    assert run(engine, case).steps < field.steps
+    assert run(engine, case).steps <= field.steps / 2

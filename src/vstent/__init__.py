@@ -7,7 +7,26 @@ name: `vstent.trace` is the verb, also once the module is loaded, and `from vste
 import sys
 from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vstent.deploy import deploy as deploy
+    from vstent.device import catalogue as catalogue
+    from vstent.device import find_design as find_design
+    from vstent.flow import simulate as simulate
+    from vstent.io.images import read_image as read_image
+    from vstent.io.surfaces import read_surface as read_surface
+    from vstent.measure import measure as measure
+    from vstent.measure import morphology as morphology
+    from vstent.rank import rank as rank
+    from vstent.repair import repair as repair
+    from vstent.report import report as report
+    from vstent.restore import restore as restore
+    from vstent.segment import segment as segment
+    from vstent.struts import struts as struts
+    from vstent.study import run as run
+    from vstent.trace import trace as trace
+    from vstent.trim import trim as trim
 
 _HOMES = {
     "read_image": "vstent.io.images",

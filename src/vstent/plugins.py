@@ -1,10 +1,10 @@
-"""Plug-ins: what other distributions add to vstent by entry points.
+"""Plug-ins: what other distributions add to vstent by entry points, in three groups.
 
-| group | name | what it leads to |
-|---|---|---|
-| ``vstent.devices`` | any | a function that returns a catalogue: TOML text, every number with its source |
-| ``vstent.engines`` | the engine's | a class of `vstent.flow.engines.AbstractEngine`, made with the cell size in mm |
-| ``vstent.walls`` | the wall's | a class of `vstent.deploy.wall.AbstractWall`, made with the surface |
+``vstent.devices``: a function that returns a catalogue, TOML text in which every number has its source.
+
+``vstent.engines``: a class of `vstent.flow.engines.AbstractEngine`, made with the cell size in mm.
+
+``vstent.walls``: a class of `vstent.deploy.wall.AbstractWall`, made with the surface.
 """
 
 from importlib.metadata import EntryPoint, entry_points

@@ -13,6 +13,13 @@ function staleness(page) {
   return page.view.steps[page.step] === "stale" ? [make("p", { className: "note stale" }, ["Something before this step has changed. What you see is from before the change."])] : [];
 }
 
+/** A word where the vessel itself is out of date. */
+function earlier(page) {
+  const stale = ["image", "vessel", "sac"].find((step) => page.view.steps[step] === "stale");
+  if (!stale) return [];
+  return [make("p", { className: "note stale" }, ["The vessel shown is of an earlier choice. ", make("button", { type: "button", className: "link", onClick: () => page.go(stale) }, ["Find it again"])])];
+}
+
 function main(page, words, act, isOff = false) {
   return make("button", { type: "button", className: "primary wide", disabled: isOff, onClick: act }, [words]);
 }
@@ -94,7 +101,7 @@ export const panels = {
   device(page) {
     const { job, choices, has_ranking } = page.view;
     const chosen = new Map(choices.devices.map((device) => [device.name, device]));
-    const parts = [...title("Device", "Choose up to three devices to compare. Every size of each is deployed in this artery and ranked.")];
+    const parts = [...title("Device", "Choose up to three devices to compare. Every size of each is deployed in this artery and ranked."), ...earlier(page)];
     parts.push(make("div", { className: "devices" }, page.catalogue.map((design) => deviceBox(page, design, chosen))));
     parts.push(...failure(page));
     if (!job) parts.push(main(page, has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !chosen.size));
@@ -104,7 +111,7 @@ export const panels = {
 
   deploy(page) {
     const { choices } = page.view;
-    const parts = [...title("Deploy", "Drag either end along the artery. The length follows from the wires, which cannot stretch.")];
+    const parts = [...title("Deploy", "Drag either end along the artery. The length follows from the wires, which cannot stretch."), ...earlier(page)];
     if (!page.device) return [...parts, make("p", { className: "note" }, ["Choose a device first."]), next(page, "device", "← Device")];
     const tabs = choices.devices.map(({ name }) => {
       const button = make("button", { type: "button", ariaPressed: String(name === page.device) }, [page.deviceTitle(name)]);

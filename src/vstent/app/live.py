@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -185,7 +186,7 @@ class Live:
         """Return the wires of a device where it would lie."""
         with LOCK:
             found = self.sketch(choice, landing)
-            wires = _wires(choice.name, found.stent, found.gap_mm, colour, _formula_coverage(found.stent))
+            wires = _wires(choice.name, found.stent, found.gap_mm, colour, lambda: _formula_coverage(found.stent))
             return message([wires], scales_of([wires]), **_place(found, found.stent))
 
     def deployment_message(self, choice: DeviceChoice, colour: Colour) -> bytes:
@@ -194,8 +195,8 @@ class Live:
             deployment = self.deployment(choice)
             stent, gap_mm = deployment.stent, deployment.wall_gap_mm
             key = (self.case.state.anatomy, *choice.model_dump().values())
-            coverage = self.remembered(("coverage", *key), lambda: _node_coverage(stent))
-            wires = _wires(choice.name, stent, gap_mm, colour, coverage)
+            measured = partial(self.remembered, ("coverage", *key), lambda: _node_coverage(stent))
+            wires = _wires(choice.name, stent, gap_mm, colour, measured)
             contour = device_layers(choice.name, deployment, self.anatomy)[0]
             layers = [wires, contour]
             center_mm = choice.center_mm if choice.center_mm is not None else _center_mm(stent)
@@ -332,13 +333,16 @@ def _neck_span(anatomy: Anatomy) -> list[float]:
     return [anatomy.aneurysms[0].proximal_abscissa_mm, anatomy.aneurysms[0].distal_abscissa_mm]
 
 
-def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Floats) -> LineLayer:
+def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Callable[[], Floats]) -> LineLayer:
     """Wires coloured after the nodes (rows, columns) beside them."""
-    diameter_mm = np.broadcast_to(stent.row_diameter_mm[:, None], gap_mm.shape)
-    of_node = {"wall_gap": gap_mm, "coverage": 100 * coverage, "diameter": diameter_mm}[colour].ravel()
+    of_node = gap_mm
+    if colour == "coverage":
+        of_node = 100 * coverage()
+    elif colour == "diameter":
+        of_node = np.broadcast_to(stent.row_diameter_mm[:, None], gap_mm.shape)
     some = stent.wire_points_mm[::NEIGHBOURS]
     near = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(some)[1]
-    values = np.repeat(of_node[near], NEIGHBOURS)[: len(stent.wire_points_mm)]
+    values = np.repeat(of_node.ravel()[near], NEIGHBOURS)[: len(stent.wire_points_mm)]
     return LineLayer(
         "wires",
         name,

@@ -24,7 +24,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = _parser().parse_args(argv)
     try:
-        return int(arguments.command(arguments))
+        if arguments.command.__module__ in (app.__name__, devices.__name__):  # they begin without kernels
+            return int(arguments.command(arguments))
+        from vstent.kernels.first_use import telling
+
+        with telling(_first_use):
+            return int(arguments.command(arguments))
     except InputError as error:
         return _fail(str(error), BAD_INPUT)
     except VstentError as error:
@@ -47,6 +52,11 @@ def _remedy(error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "What was finished is kept, and nothing half-written: make room and give the same command again."
     return "Nothing half-written was left: mend that and give the same command again."
+
+
+def _first_use() -> None:
+    said = "first use of this version: its kernels are compiled, once, which takes about a minute."
+    print(f"vstent: {said}", file=sys.stderr, flush=True)
 
 
 def _fail(sentence: str, code: int) -> int:

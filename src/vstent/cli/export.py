@@ -15,7 +15,6 @@ def add(commands: options.Commands) -> None:
     options.add_flow(foam)
     group = foam.add_argument_group("OpenFOAM")
     group.add_argument("--flavour", choices=("com", "org"), help="openfoam.com or .org (the one found, or com)")
-    group.add_argument("-j", "--processes", type=int, default=1, metavar="N", help="parts to compute at once (1)")
     group.add_argument("--layers", type=int, default=2, metavar="N", help="layers of flat cells along the wall (2)")
     foam.set_defaults(command=_openfoam)
     patches = options.add_command(kinds, "patches", "the blood's boundary as watertight named patches")

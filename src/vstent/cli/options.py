@@ -85,7 +85,10 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         metavar="CSV",
         help="follow a pulse: columns time in s and flow in any unit (the published one of the internal carotid)",
     )
-    flow.add_argument("--engine", default="lattice_boltzmann", metavar="NAME", help="a plug-in that computes the flow")
+    flow.add_argument(
+        "--engine", default="lattice_boltzmann", metavar="NAME", help="openfoam, or a plug-in that computes the flow"
+    )
+    flow.add_argument("-j", "--processes", type=_jobs, default=1, metavar="N", help="processes for OpenFOAM (1)")
     flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
     return flow
 
@@ -216,6 +219,7 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
         outlets=arguments.outlets,
         cell_size_mm=arguments.cell_size,
         engine=arguments.engine,
+        processes=arguments.processes,
     )
 
 

@@ -1,8 +1,8 @@
 """Sketch: where a device will lie, fast enough to follow a hand that drags it; `deploy` answers in full.
 
 The wall as the device will find it does not depend on where the device lies: it is measured once, on rays across the
-parent axis, no wider than the free device (`Bed`). A sketch marches the rows over it and draws the wires. What it
-leaves out is that crossings slide along the wall in a bend.
+parent axis, no wider than the free device (`Bed`). A sketch marches the rows over it, lets the crossings slide and
+draws the wires. What it leaves out is to put every node to the wall again afterwards, and to march the rows once more.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,8 @@ from typing import Final, final
 
 import numpy as np
 
-from vstent.deploy.braid import FreeDiameter, Profile, march
+from vstent.deploy import pieces
+from vstent.deploy.braid import FreeDiameter, Profile, landed_row, march
 from vstent.deploy.contour import Planes, circles, evenly_spaced, perimeters, planes
 from vstent.deploy.method import check_inside
 from vstent.deploy.wall import AbstractWall, Contact
@@ -100,22 +101,27 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
         When it would leave the artery.
     """
     design, size = wall.design, wall.size
-    rows_mm = march(design, size, landing, wall.profile)
+    marched_mm = rows_mm = march(design, size, landing, wall.profile)
     check_inside(design, size, rows_mm, float(wall.abscissa_mm[-1]))
     flat = np.concatenate([wall.in_plane_mm, wall.gap_mm[..., None]], axis=2).reshape(len(wall.abscissa_mm), -1)
     laid = curves.interpolate(wall.abscissa_mm, flat, rows_mm).reshape(len(rows_mm), -1, 3)
-    nodes_mm = wall.across.place(rows_mm, laid[..., :2])
-    wires = _wires(wall, nodes_mm)
-    stent = Stent(design, size, nodes_mm, rows_mm, wires.points_mm, wires.starts, wires.diameter_um)
-    ends = [_ends_mm(wall, landing, sense * wall.diameter_band_mm) for sense in (-1, 1)]
-    return Sketch(stent, laid[..., 2], (ends[0][0], ends[1][0]), (ends[0][1], ends[1][1]))
+    held = landed_row(design, size, landing)
+    slid = pieces.slide(design, size, wall.across.place(rows_mm, laid[..., :2]), held)
+    rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), rows_mm, slid.row).mean(axis=1)
+    near = np.clip(np.rint(slid.row).astype(int), 0, len(rows_mm) - 1)
+    gap_mm = np.take_along_axis(laid[..., 2], near, axis=0)
+    wires = _wires(wall, slid.nodes_mm)
+    stent = Stent(design, size, slid.nodes_mm, rows_mm, wires.points_mm, wires.starts, wires.diameter_um)
+    moved_mm = (rows_mm - marched_mm)[[0, -1]]
+    ends_mm = [_ends_mm(wall, landing, sense * wall.diameter_band_mm) + moved_mm for sense in (-1, 1)]
+    (first, last), (other_first, other_last) = (ends.tolist() for ends in ends_mm)
+    return Sketch(stent, gap_mm, (first, other_first), (last, other_last))
 
 
-def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> tuple[float, float]:
-    """Where the device begins and ends if the artery were wider by so much."""
+def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> Floats:
+    """Where (2,) rows as marched begin and end if the artery were wider by so much."""
     profile = Profile(wall.abscissa_mm, np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.free_diameter_mm))
-    rows_mm = march(wall.design, wall.size, landing, profile)
-    return float(rows_mm[0]), float(rows_mm[-1])
+    return march(wall.design, wall.size, landing, profile)[[0, -1]]
 
 
 def _wires(wall: Bed, nodes_mm: Floats) -> Wires:

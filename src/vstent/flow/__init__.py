@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from vstent import plugins
+from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, Progress, Saved, run
@@ -12,7 +13,7 @@ from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
 from vstent.flow.screen import screen
 from vstent.flow.streamlines import Streamlines, streamlines
-from vstent.flow.types import LATTICE, Blood, FlowCase, FlowField, FlowSettings, Screen
+from vstent.flow.types import LATTICE, OPENFOAM, Blood, FlowCase, FlowField, FlowSettings, Screen
 from vstent.stent import Stent
 from vstent.vessel import Anatomy
 
@@ -182,6 +183,8 @@ def _engine(settings: FlowSettings) -> Callable[[float], AbstractEngine[Any]]:
     from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
     from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
 
+    if settings.engine == OPENFOAM:
+        raise FlowError("OpenFOAM needs a folder to work in: call flow.engines.openfoam.simulate_in, or vstent flow")
     if settings.engine != LATTICE:
         found: Callable[[float], AbstractEngine[Any]] = plugins.load(
             "vstent.engines", settings.engine, built_in=LATTICE

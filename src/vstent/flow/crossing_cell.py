@@ -1,8 +1,8 @@
 """Flow through a periodic cell of resolved wires: what the screen's law is calibrated on.
 
 The cell repeats in all three directions. Its wires are straight cylinders, solid grid cells with the exact place of
-their wall on every link; a body force drives the blood through, as a pressure gradient would. What the wires take is
-known without looking at their surface: in steady flow it is the gradient times the cell's volume.
+their wall on every link; a body force drives the blood through them, as a pressure gradient would. What the wires take
+of it is known without looking at their surface: in steady flow it is the gradient times the cell's volume.
 """
 
 from dataclasses import dataclass
@@ -201,7 +201,7 @@ class _Grid:
         nothing: tuple[NDArray[np.int32], NDArray[np.float32]] = np.zeros(0, np.int32), np.zeros(0, np.float32)
         no_screen = np.zeros(len(self._length) + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
         limit = np.full(len(self._length), np.inf, np.float32)
-        relaxation = np.float32(RELAXATION_STEPS), limit, np.float32(ODD_RATE)
+        relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
             for address, is_even in ((self._even, True), (self._odd, False)):

@@ -13,21 +13,51 @@ from vstent.vessel import Vessel
 
 LATTICE: Final = "lattice_boltzmann"
 """Name of the engine that vstent brings along."""
+OPENFOAM: Final = "openfoam"
+"""Name of the engine that hands the flow to OpenFOAM, a program of its own."""
+
+
+@dataclass(frozen=True)
+class CarreauYasuda:
+    """Blood that thins with the shear rate g: mu = m + (m0 - m) (1 + (t g)^a)^((n - 1) / a), m being at high shear.
+
+    Bird, Armstrong and Hassager 1987, Dynamics of Polymeric Liquids 1, eq. 4.1-8; values of blood, with m = 0.00345
+    Pa s, as Cho and Kensey 1991 (Biorheology 28, 241) fit them.
+    """
+
+    rest_viscosity_Pa_s: float = 0.056
+    """m0, viscosity at rest."""
+    time_s: float = 1.902
+    """t."""
+    a: float = 1.25
+    """a."""
+    n: float = 0.22
+    """n."""
 
 
 @dataclass(frozen=True, eq=False)
 class Blood:
-    """A Newtonian fluid (design.md section 5: the paper's values)."""
+    """A fluid (design.md section 5: the paper's values), Newtonian unless its thinning is given."""
 
     density_kg_m3: float = 1060.0
     """Mass density."""
     viscosity_Pa_s: float = 0.004
-    """Dynamic viscosity."""
+    """Dynamic viscosity; that at high shear where blood thins."""
+    thinning: CarreauYasuda | None = None
+    """How the viscosity falls with the shear rate; None: it does not."""
 
     @property
     def kinematic_viscosity_m2_s(self) -> float:
         """Viscosity divided by density."""
         return self.viscosity_Pa_s / self.density_kg_m3
+
+    def viscosity_at_Pa_s(self, rate_per_s: Floats) -> Floats:
+        """Dynamic viscosity (n,) at shear rates (n,)."""
+        law = self.thinning
+        if law is None:
+            return np.full_like(rate_per_s, self.viscosity_Pa_s)
+        falling = (1 + (law.time_s * rate_per_s) ** law.a) ** ((law.n - 1) / law.a)
+        return self.viscosity_Pa_s + (law.rest_viscosity_Pa_s - self.viscosity_Pa_s) * falling
 
 
 @dataclass(frozen=True)
@@ -79,7 +109,9 @@ class FlowSettings:
     lattice_speed: float = 0.15
     """Peak speed in cells per time step: sets the time step."""
     engine: str = LATTICE
-    """What computes the flow: ``lattice_boltzmann``, or the name of a plug-in (`vstent.plugins`)."""
+    """What computes the flow: ``lattice_boltzmann``, ``openfoam``, or the name of a plug-in (`vstent.plugins`)."""
+    processes: int = 1
+    """Processes on this machine, for OpenFOAM."""
 
     def inflow_factor(self, time_s: Floats) -> Floats:
         """Inflow over mean inflow at times (t,)."""
@@ -240,7 +272,7 @@ class FlowField:
 
     @cached_property
     def oscillatory_shear_index(self) -> Floats:
-        """(v,) (1 - |mean stress| / mean |stress|) / 2 (He and Ku 1996, J. Biomech. Eng. 118, 74); 0 in steady flow."""
+        """(v,) (1 - norm(mean stress) / mean norm) / 2 (He and Ku 1996, J. Biomech. Eng. 118, 74); 0 in steady flow."""
         # The stress is linear in the velocity: that of the mean flow is the mean stress.
         return 0.5 * (1 - np.linalg.norm(self.wall_shear_stress_Pa, axis=1) / np.maximum(self.shear_Pa, 1e-12))
 

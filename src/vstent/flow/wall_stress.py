@@ -36,7 +36,8 @@ def wall_stress(
         -lumen.vertex_normals,
         REACH,
     )
-    traction_Pa = blood.viscosity_Pa_s * fit[:, :3] / (domain.cell_size_mm * M_PER_MM)
+    gradient_per_s = fit[:, :3] / (domain.cell_size_mm * M_PER_MM)
     normal = lumen.vertex_normals
-    along = np.einsum("ij,ij->i", traction_Pa, normal)
-    return traction_Pa - along[:, None] * normal, fit[:, 3]
+    shear_per_s = gradient_per_s - np.einsum("ij,ij->i", gradient_per_s, normal)[:, None] * normal
+    viscosity_Pa_s = blood.viscosity_at_Pa_s(np.linalg.norm(shear_per_s, axis=1))
+    return viscosity_Pa_s[:, None] * shear_per_s, fit[:, 3]

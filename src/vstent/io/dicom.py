@@ -364,7 +364,10 @@ def _decoded_by_gdcm(plane: _Slice) -> NDArray[Any]:
         with silenced():
             scan = SimpleITK.ReadImage(str(plane.path))
     except RuntimeError:
-        raise ReadError(f"The pixels of slice {plane.name} are damaged or in a format that is not known.") from None
+        raise ReadError(
+            f"The pixels of slice {plane.name} are damaged or in a format that is not known; "
+            "copy it again, or export the series uncompressed."
+        ) from None
     array = SimpleITK.GetArrayFromImage(scan)
     stored = (array - plane.intercept) / plane.slope  # GDCM has rescaled
     return stored if plane.frame is not None else stored[0]

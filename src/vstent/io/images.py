@@ -71,7 +71,10 @@ def read_image(
 def _three(values: Sequence[float], what: str) -> NDArray[np.float64]:
     given = np.atleast_1d(np.asarray(values, dtype=np.float64))
     if len(given) not in (1, 3) or not (np.isfinite(given) & (given > 0)).all():
-        raise UnitError(f"The {what} must be one or three positive numbers, not {', '.join(f'{v:g}' for v in given)}.")
+        raise UnitError(
+            f"The {what} must be one or three positive numbers, not {', '.join(f'{v:g}' for v in given)}; "
+            "give --spacing in mm."
+        )
     return np.broadcast_to(given, (3,)).astype(np.float64)
 
 

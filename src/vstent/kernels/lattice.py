@@ -141,7 +141,28 @@ def _kept(ux: float, uy: float, uz: float, time: float, limit: float) -> float:
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _collide(f: Any, n: int, time: float, limit: float, odd_rate: float) -> None:
+def _thin(f: Any, n: int, time: float, law: Any, times: Any) -> None:
+    """Relaxation times of n cells whose blood thins with the shear rate, from the stress that they hold.
+
+    Strain rate = 1.5 / time of the second moments' departure from equilibrium (Boyd, Buick and Green 2006, J. Phys. A
+    39, 14241, eq. 9), which depends on the time sought: three rounds from blood at rest.
+    """
+    for k in range(n):
+        _, ux, uy, uz, pxx, pyy, pzz, pxy, pxz, pyz = _sums(f, k)
+        qxx, qyy, qzz = pxx - ux * ux, pyy - uy * uy, pzz - uz * uz
+        trace = (qxx + qyy + qzz) * _REST
+        qxx, qyy, qzz = qxx - trace, qyy - trace, qzz - trace
+        qxy, qxz, qyz = pxy - ux * uy, pxz - ux * uz, pyz - uy * uz
+        size = np.sqrt(_TWO * (qxx * qxx + qyy * qyy + qzz * qzz + _TWO * (qxy * qxy + qxz * qxz + qyz * qyz)))
+        found = time + law[0]
+        for _ in range(3):
+            rate = _THREE_HALVES * size / found
+            found = time + law[0] * (_ONE + (law[1] * rate) ** law[2]) ** law[3]
+        times[k] = found
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _collide(f: Any, n: int, times: Any, limit: float, odd_rate: float) -> None:
     """Collide n cells of the buffer f (19 * SEGMENT) and swap opposite populations.
 
     Regularised: of the even part only the stress survives (Latt and Chopard 2006, Math. Comput. Simul. 72:165, eq 12),
@@ -152,7 +173,7 @@ def _collide(f: Any, n: int, time: float, limit: float, odd_rate: float) -> None
     kept_odd, zero = _ONE - odd_rate, np.float32(0.0)
     for k in range(n):
         density, ux, uy, uz, pxx, pyy, pzz, pxy, pxz, pyz = _sums(f, k)
-        keep = _kept(ux, uy, uz, time, limit)
+        keep = _kept(ux, uy, uz, times[k], limit)
         qxx, qyy, qzz = pxx - ux * ux, pyy - uy * uy, pzz - uz * uz
         trace = (qxx + qyy + qzz) * _REST
         _relax(
@@ -193,7 +214,7 @@ def _resist(entry: Any, ux: float, uy: float, uz: float) -> tuple[float, float, 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _collide_screened(
-    f: Any, g: Any, n: int, time: float, limit: float, odd_rate: float, place: Any, entries: Any
+    f: Any, g: Any, n: int, times: Any, limit: float, odd_rate: float, place: Any, entries: Any
 ) -> None:
     """As `_collide`, where the cells `place` of the segment carry the resistances `entries` (see `_resist`).
 
@@ -219,7 +240,7 @@ def _collide_screened(
         density, _, _, _, pxx, pyy, pzz, pxy, pxz, pyz = _sums(f, k)
         ux, uy, uz = g[k], g[SEGMENT + k], g[2 * SEGMENT + k]
         fx, fy, fz = g[3 * SEGMENT + k], g[4 * SEGMENT + k], g[5 * SEGMENT + k]
-        keep = _kept(ux, uy, uz, time, limit)
+        keep = _kept(ux, uy, uz, times[k], limit)
         half = _HALF + _HALF * keep
         qxx, qyy, qzz = pxx - ux * ux, pyy - uy * uy, pzz - uz * uz
         trace = (qxx + qyy + qzz) * _REST
@@ -275,6 +296,7 @@ def update(
     address: Any,
     length: Any,
     time: float,
+    law: Any,
     limit: Any,
     odd_rate: float,
     screen_start: Any,
@@ -290,7 +312,9 @@ def update(
     address : (segments, 19) int32, where the populations of each segment begin: its own in an even step, its
         neighbours' in an odd one.
     length : (segments,) int32 cells of each segment, at most SEGMENT.
-    time : float32 relaxation time of the stress.
+    time : float32 relaxation time of the stress, at high shear.
+    law : (4,) float32 what blood at rest has more of it, the time by which shear rates count, and the exponents a and
+        (n - 1) / a of Carreau and Yasuda's law; the first is 0 where the viscosity is the same everywhere.
     limit : (segments,) float32 largest cell Reynolds number, speed over viscosity: faster blood is made that thick.
     odd_rate : float32 relaxation rate of the odd part.
     screen_start : (segments + 1,) int32 first screen entry of every segment.
@@ -301,15 +325,18 @@ def update(
     for chunk in prange(threads):
         buffer = np.zeros(19 * SEGMENT, np.float32)
         extra = np.zeros(6 * SEGMENT, np.float32)
+        times = np.full(SEGMENT, time)
         for s in range(n * chunk // threads, n * (chunk + 1) // threads):
             _load(f, address[s], length[s], buffer)
             lanes = (length[s] + LANES - 1) // LANES * LANES
+            if law[0] > 0.0:
+                _thin(buffer, lanes, time, law, times)
             begin, end = screen_start[s], screen_start[s + 1]
             if begin == end:
-                _collide(buffer, lanes, time, limit[s], odd_rate)
+                _collide(buffer, lanes, times, limit[s], odd_rate)
             else:
                 _collide_screened(
-                    buffer, extra, lanes, time, limit[s], odd_rate, screen_place[begin:end], screen[begin:end]
+                    buffer, extra, lanes, times, limit[s], odd_rate, screen_place[begin:end], screen[begin:end]
                 )
             _store(buffer, address[s], length[s], f)
 

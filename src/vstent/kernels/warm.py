@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vstent.kernels import coverage, tree
+from vstent.kernels import coverage, net, tree
 
 
 def warm() -> None:
@@ -14,6 +14,17 @@ def warm() -> None:
     row, column = np.meshgrid(np.arange(3.0), np.arange(4.0), indexing="ij")
     nodes = np.stack([np.cos(np.pi / 2 * column), np.sin(np.pi / 2 * column), row], axis=-1)
     coverage.covered_fractions(nodes, nodes[0], nodes[1], np.full(4, 0.01), 2)
+    _slide(nodes)
+
+
+def _slide(nodes_mm: np.ndarray) -> None:
+    line, column = np.array([0, 0, 1, 1, 2, 2]), np.array([0, 2, 1, 3, 0, 2])
+    ends = np.array([[0, 1, 2, 3], [2, 3, 5, 4]])
+    around_mm = 0.5 * (np.roll(nodes_mm, -1, axis=1) - np.roll(nodes_mm, 1, axis=1))
+    chart = np.concatenate([nodes_mm, np.gradient(nodes_mm, axis=0), around_mm], axis=2)
+    beside, bends = np.array([1, 0, 3, 2, 5, 4]), np.array([[0], [2], [5]])
+    tiny = net.Net(chart, line, column, line, beside, ends, np.ones(2), np.zeros(3), bends)
+    net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1), 1, 0.1, 0.1)
 
 
 if __name__ == "__main__":

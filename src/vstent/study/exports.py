@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -12,22 +12,19 @@ from vstent.errors import FlowError, InputError
 from vstent.flow import FlowCase, FlowSettings, flow_case
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.openfoam import Flavour, FoamCase, FoamSetup, foam_case, named_patches, program, stl_text
-from vstent.flow.openfoam.case import struts_near
+from vstent.flow.openfoam.case import STRUT_REACH_MM, struts_near
 from vstent.flow.openfoam.folder import write
 from vstent.io import writers
 from vstent.io.archive import load_noun
-from vstent.io.surfaces import read_surface
+from vstent.io.vtk_child import read_apart
 from vstent.stent import Deployment
 from vstent.struts import struts
+from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, hash_of
 from vstent.study.stages import deploy_all, find_anatomy
 from vstent.study.types import Progress, Settings
 from vstent.surface import Surface
 from vstent.vessel import Anatomy
-
-CACHE: Final = ".vstent"
-STRUT_REACH_MM: Final = 1.0
-"""Wires that come nearer to the neck than this are meshed."""
 
 
 def export_openfoam(
@@ -125,8 +122,9 @@ def _struts(path: Path, case: FlowCase, anatomy: Anatomy, settings: Settings, le
         raise InputError("struts are meshed over the neck, and this vessel has no sac: leave --device away")
     name = settings.devices[0]
     file = path / "stents" / name / "struts.stl"
-    if file.exists():
-        return struts_near(read_surface(file, units="mm")[0], case.ostium, STRUT_REACH_MM)
+    solids = read_apart(file) if file.exists() else None
+    if solids is not None:
+        return struts_near(Surface(*solids), case.ostium, STRUT_REACH_MM)
     deployments: dict[str, Deployment] = deploy_all({name: find_design(name)}, anatomy, settings, ledger)
     return struts_near(struts(deployments[name].stent), case.ostium, STRUT_REACH_MM)
 

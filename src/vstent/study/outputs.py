@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from vstent.flow import FlowField
 from vstent.io import writers
 from vstent.io.tables import write_rows
+from vstent.io.three_mf import write_3mf
 from vstent.rank import Ranking
 from vstent.stent import Deployment
 from vstent.struts import struts
@@ -52,6 +53,7 @@ def write_stent(folder: Path, deployment: Deployment) -> str:
     writers.write_lines(folder / "wires.vtp", stent.wire_points_mm, stent.wire_starts, cell_data=of_wire)
     solid = struts(stent)
     writers.write_stl(folder / "struts.stl", solid)
+    write_3mf(folder / "struts.3mf", solid)
     return f"{len(wire_id)} wires, {len(solid.faces)} triangles."
 
 

@@ -1,6 +1,6 @@
 """Stages of a study: each timed and told of by the ledger."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,9 +10,16 @@ import numpy as np
 
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_size
+from vstent.errors import InputError
 from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, ostium, simulate_case
+from vstent.flow import Progress as FlowProgress
 from vstent.flow.convergence import Refinement, convergence
 from vstent.flow.cost import estimate, refuse_too_large
+from vstent.flow.domain import default_cell_size_mm
+from vstent.flow.engines.openfoam import simulate_in
+from vstent.flow.openfoam.case import STRUT_REACH_MM, struts_near
+from vstent.flow.openfoam.cost import tell_cost
+from vstent.flow.types import LATTICE, OPENFOAM
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
@@ -21,7 +28,8 @@ from vstent.measure import measure, morphology
 from vstent.repair import repair
 from vstent.restore import restore
 from vstent.segment import segment
-from vstent.stent import Deployment, Landing
+from vstent.stent import Deployment, Landing, Stent
+from vstent.struts import struts
 from vstent.study.checkpoint import FlowCheckpoint
 from vstent.study.ledger import Ledger, anatomy_key, key_of
 from vstent.study.outputs import write_field
@@ -114,22 +122,44 @@ def compute_flows(
     if settings.flow is None:
         return {}
     fields: dict[str, FlowField] = {}
-    _plan(anatomy, settings.flow, ledger)
     for name in (BARE, *deployments):
         stent = deployments[name].stent if name in deployments else None
         placing = settings.placing(name) if stent else None
         stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, placing)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
+            if name == BARE and settings.flow.engine == LATTICE:
+                _plan(anatomy, settings.flow, ledger)
             with ledger.stage(stage) as tell:
-                case = flow_case(anatomy, stent, settings.flow)
-                begun = FlowCheckpoint(ledger.folder, stage, key)
-                field = simulate_case(case, start=fields.get(BARE), progress=ledger.teller(stage), checkpoint=begun)
+                if settings.flow.engine == OPENFOAM:
+                    folder = out / "flow" / name / OPENFOAM
+                    field = by_openfoam(folder, anatomy, stent, settings.flow, ledger.teller(stage))
+                else:
+                    case = flow_case(anatomy, stent, settings.flow)
+                    begun = FlowCheckpoint(ledger.folder, stage, key)
+                    field = simulate_case(case, start=fields.get(BARE), progress=ledger.teller(stage), checkpoint=begun)
                 tell(field.advice)
             ledger.keep(stage, key, field)
         fields[name] = field
         write_field(out / "flow" / name, field)
     return fields
+
+
+def by_openfoam(
+    folder: Path,
+    anatomy: Anatomy,
+    stent: Stent | None,
+    settings: FlowSettings,
+    progress: Callable[[FlowProgress], None],
+) -> FlowField:
+    """Compute a flow with OpenFOAM, a stent as the struts that span the neck."""
+    case = flow_case(anatomy, None, settings)
+    solids = None
+    if stent is not None:
+        if case.ostium is None:
+            raise InputError("OpenFOAM meshes struts over the neck, and this vessel has no sac: leave --device away")
+        solids = struts_near(struts(stent), case.ostium, STRUT_REACH_MM)
+    return simulate_in(folder, case, struts=solids, progress=progress)
 
 
 def refine(anatomy: Anatomy, settings: Settings, ledger: Ledger) -> tuple[Refinement, Refinement]:
@@ -152,6 +182,9 @@ def _plan(anatomy: Anatomy, settings: FlowSettings, ledger: Ledger) -> None:
     """Say what a flow will cost; refuse one that does not fit in the memory."""
     with ledger.stage("plan flow") as tell:
         case = flow_case(anatomy, None, settings)
+        if settings.engine == OPENFOAM:
+            tell(tell_cost(case, default_cell_size_mm(case)))
+            return
         refuse_too_large(case)
         tell(str(estimate(case)))
 

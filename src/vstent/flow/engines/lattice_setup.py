@@ -83,6 +83,15 @@ class Scales:
         return self.blood.kinematic_viscosity_m2_s * self.step_s / self.cell_m**2
 
     @property
+    def thinning(self) -> NDArray[np.float32]:
+        """(4,) the blood's law in lattice units (see `lattice.update`)."""
+        law = self.blood.thinning
+        if law is None:
+            return np.zeros(4, np.float32)
+        more = (law.rest_viscosity_Pa_s - self.blood.viscosity_Pa_s) / self.blood.viscosity_Pa_s
+        return np.array([3 * self.viscosity * more, law.time_s / self.step_s, law.a, (law.n - 1) / law.a], np.float32)
+
+    @property
     def relaxation_steps(self) -> float:
         """Relaxation time of the stress, in time steps."""
         return 3 * self.viscosity + 0.5

@@ -182,10 +182,11 @@ def advance(state: State, steps: int) -> None:
     f, links, refill = state.populations, state.links, state.refill
     a, screen = state.addressing, state.screen
     threads = numba.get_num_threads()
-    relaxation = np.float32(state.scales.relaxation_steps), state.limit, np.float32(ODD_RATE)
+    scales = state.scales
+    relaxation = np.float32(scales.relaxation_steps), scales.thinning, state.limit, np.float32(ODD_RATE)
     opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
     middle = state.steps + 1 + np.arange(0, steps, 2)
-    factor = state.case.settings.inflow_factor(np.float64(state.scales.step_s) * middle)
+    factor = state.case.settings.inflow_factor(np.float64(scales.step_s) * middle)
     first_pair = state.steps % state.steps_per_check // 2
     for pair in range(len(factor)):
         links.openings[:, 1] = state.wanted * factor[pair]

@@ -5,17 +5,18 @@ flow, so that every index, streamline and picture takes either.
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
-from vstent.flow.engines import AbstractEngine, Outcome
+from vstent.flow.domain import default_cell_size_mm
+from vstent.flow.engines import AbstractEngine, Outcome, Progress, Saved, run
 from vstent.flow.engines.lattice_boltzmann import CHECKS_AGREEING, CHECKS_AVERAGED, fraction_left
 from vstent.flow.engines.lattice_pulse import PHASES, cycle_change
 from vstent.flow.openfoam import folder as folders
@@ -27,7 +28,7 @@ from vstent.flow.types import FlowCase, FlowField, Phase
 from vstent.kernels.arrays import Floats, Ints
 from vstent.surface import Surface
 
-CHECK_ITERATIONS: Final = 20
+CHECK_ITERATIONS: Final = 50
 """Iterations of a steady flow between checks."""
 CHECKS_HELD: Final = 3
 """Checks at which the inflow is corrected for the inlet's meshed area."""
@@ -131,11 +132,11 @@ class OpenFoam(AbstractEngine[State]):
             return 0.0
         return max(fraction_left(history[: len(history) - k]) for k in range(min(CHECKS_AGREEING, len(history))))
 
-    def save(self, state: State) -> dict[str, NDArray[Any]]:
+    def save(self, state: State) -> Saved:
         """Return nothing: OpenFOAM's own times in the case folder are what a run goes on from."""
         return {}
 
-    def resume(self, case: FlowCase, saved: dict[str, NDArray[Any]]) -> State:
+    def resume(self, case: FlowCase, saved: Saved) -> State:
         """Go on from the last time written."""
         return self.init(case, None)
 
@@ -157,6 +158,33 @@ class OpenFoam(AbstractEngine[State]):
         """Return the last check, or the mean: of the last checks where the flow has not settled, of a pulse's cycle."""
         is_last = outcome.is_converged and not state.is_pulse
         return _field_of(state, [state.snapshots[-1]] if is_last else list(state.snapshots), outcome)
+
+
+def simulate_in(
+    folder: Path,
+    case: FlowCase,
+    *,
+    struts: Surface | None = None,
+    start: FlowField | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> FlowField:
+    """Compute one flow with OpenFOAM in a folder; one that stopped there goes on.
+
+    Parameters
+    ----------
+    folder : the case folder to write.
+    case : what to compute; it has no screen.
+    struts : the device's solids, meshed.
+    start : a flow in the same vessel to start from.
+    progress : called at every check; what it raises ends the run.
+
+    Raises
+    ------
+    FlowError
+        When there is no OpenFOAM, the case does not fit in the memory, or a program of OpenFOAM fails.
+    """
+    engine = OpenFoam(default_cell_size_mm(case), folder, case.settings.processes, struts)
+    return run(engine, case, start=start, progress=progress)
 
 
 def _next_end(state: State, reached: float) -> float:

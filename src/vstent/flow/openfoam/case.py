@@ -1,6 +1,7 @@
 """A flow case as OpenFOAM's case folder, in memory: relative path to text."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -12,7 +13,9 @@ from vstent.kernels.arrays import Floats
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
 
-README = """\
+STRUT_REACH_MM: Final = 1.0
+"""Wires that come nearer to the neck than this are meshed."""
+README: Final = """\
 OpenFOAM case written by vstent (research use only). Lengths are metres: the vessel's millimetres, LPS, times 0.001.
 
   ./Allrun             mesh and compute here; given again it goes on from the last time written

@@ -9,7 +9,7 @@ from vstent.flow.types import FlowCase
 from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.surface import Surface
 
-ON_SAC_MM = 0.02
+ON_SAC_MM = 1e-3
 """Faces of the wall nearer to the sac's surface than this are the sac's."""
 
 

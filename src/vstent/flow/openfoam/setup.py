@@ -28,7 +28,7 @@ class FoamSetup:
     """Times that cells at the struts are halved."""
     processes: int = 1
     """Parts that the mesh is cut into, each for a process of its own."""
-    iterations: int = 600
+    iterations: int = 1000
     """Most iterations of a steady flow."""
     struts: Surface | None = None
     """The device's solids (closed, in mm), meshed where they span the neck; None: the bare vessel."""

@@ -1,0 +1,113 @@
+"""Pages that are made, not written: the devices of the catalogue, and what every fault of the tests' list gets."""
+
+import contextlib
+import io
+import os
+import re
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+GENERATED = Path(__file__).parent / "generated"
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Make the pages before Sphinx looks for them."""
+    app.connect("config-inited", lambda *_: write())
+    return {"parallel_read_safe": True}
+
+
+def write() -> None:
+    """Write all pages."""
+    GENERATED.mkdir(exist_ok=True)
+    for name, text in (("devices", devices()), ("faults", faults())):
+        (GENERATED / f"{name}.inc").write_text(text, encoding="utf-8")
+
+
+def table(titles: list[str], rows: list[list[str]], widths: str = "auto") -> str:
+    """Return a list-table."""
+    lines = [".. list-table::", "   :header-rows: 1", f"   :widths: {widths}", ""]
+    for row in [titles, *rows]:
+        lines += [f"   {'*' if k == 0 else ' '} - {cell}" for k, cell in enumerate(row)]
+    return "\n".join([*lines, "", ""])
+
+
+def devices() -> str:
+    """Return one section a device, every number with its source and confidence, and a count of these."""
+    from vstent.device import Braid, catalogue
+
+    designs = catalogue()
+    sure = Counter(fact.confidence for design in designs.values() for fact in design.facts)
+    total = sum(sure.values())
+    text = [f"The catalogue has {len(designs)} devices and {total} sourced entries: "]
+    text.append(", ".join(f"{n} {kind}" for kind, n in sorted(sure.items())) + ".\n\n")
+    for design in designs.values():
+        text.append(f"{design.name}\n{'-' * len(design.name)}\n\n")
+        kind = "braid" if isinstance(design, Braid) else "laser-cut"
+        wires = (
+            " and ".join(f"{count} wires of {diameter:g} um" for count, diameter in design.wires)
+            if isinstance(design, Braid)
+            else f"{design.n_columns} struts round, {design.strut_width_um:g} um wide"
+        )
+        text.append(f"``{design.key}``, {design.maker}: {kind}, {wires}, {design.angle_rad:.3f} rad to the axis; ")
+        text.append(f"{len(design.sizes)} sizes, {_range(design.sizes)}.\n\n")
+        rows = [[f"``{fact.name}``", fact.confidence, _escaped(fact.source)] for fact in design.facts]
+        text.append(table(["number", "confidence", "source"], rows, "20 15 65"))
+    return "".join(text)
+
+
+def _range(sizes: Any) -> str:
+    diameters = [size.diameter_mm for size in sizes]
+    lengths = [size.length_mm for size in sizes]
+    return f"{min(diameters):g} to {max(diameters):g} mm wide, {min(lengths):g} to {max(lengths):g} mm long"
+
+
+def faults() -> str:
+    """Play every fault that is quick and say what came of it; of the others, what the tests want."""
+    from faults import FAULTS, play
+
+    text = [f"{len(FAULTS)} faults, played when this page was built.\n\n"]
+    for group in dict.fromkeys(fault.group for fault in FAULTS):
+        title = group[0].upper() + group[1:]
+        text.append(f"{title}\n{'-' * len(title)}\n\n")
+        rows = []
+        for fault in (fault for fault in FAULTS if fault.group == group):
+            if fault.is_heavy:
+                rows.append([fault.name, str(fault.code), f"(played by ``make validation``) ... {fault.said}"])
+                continue
+            with tempfile.TemporaryDirectory(prefix="fault-") as folder, _without(folder):
+                outcome = play(fault, Path(folder))
+                sentence = outcome.sentence.replace(os.path.realpath(folder), "").replace(folder, "")
+            if outcome.code != fault.code:
+                raise RuntimeError(f"{fault.name} ended with {outcome.code}: {outcome.told}")
+            rows.append(
+                [_escaped(fault.name), str(outcome.code), _escaped(_answer(outcome.code, sentence, fault.said))]
+            )
+        text.append(table(["fault", "exit code", "answer"], rows, "30 10 60"))
+    return "".join(text)
+
+
+@contextlib.contextmanager
+def _without(folder: str) -> Any:
+    """Keep the user's own devices out, and what a command prints."""
+    before = os.environ.get("XDG_CONFIG_HOME")
+    os.environ["XDG_CONFIG_HOME"] = folder
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        os.environ.pop("XDG_CONFIG_HOME")
+        if before is not None:
+            os.environ["XDG_CONFIG_HOME"] = before
+
+
+def _answer(code: int, sentence: str, said: str) -> str:
+    if code == 0:
+        notes = re.split(r"(?<=\.)\s+", " ".join(sentence.split()))
+        return "Done. " + " ".join(note for note in notes if said and said in note)
+    return sentence.removeprefix("vstent: ").partition(": error: ")[2] or sentence.removeprefix("vstent: ")
+
+
+def _escaped(text: str) -> str:
+    return re.sub(r"([\\*`|_])", r"\\\1", text)

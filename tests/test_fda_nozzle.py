@@ -1,0 +1,117 @@
+"""The FDA's benchmark nozzle at throat Re 500 against its five PIV experiments (Hariharan et al. 2011).
+
+Hariharan et al. 2011, J. Biomech. Eng. 133, 041002; sudden expansion, z = 0 where it is, flow along +z.
+"""
+
+import re
+import zipfile
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vstent.flow import Blood, FlowCase, FlowField, FlowSettings, sampling, simulate_case
+from vstent.surface import Surface
+from vstent.vessel import Opening, Vessel
+
+BLOOD = Blood(density_kg_m3=1056.0, viscosity_Pa_s=0.0035)
+INFLOW_ML_S = 5.20624
+INLET_MM, CONE_MM, THROAT_MM, WIDE_RADIUS_MM, RADIUS_MM = 12.0, 22.685, 40.0, 6.0, 2.0
+AROUND, EDGE_MM = 96, 0.5
+BEYOND = 0.03
+"""How far outside the spread of the five a velocity may be, as a fraction of the section's peak."""
+
+
+def nozzle(end_mm: float) -> Vessel:
+    """Inlet tube, cone, throat and what follows up to z = `end_mm`: the wide tube behind the step where that is > 0."""
+    knots = [(-THROAT_MM - CONE_MM - INLET_MM, WIDE_RADIUS_MM), (-THROAT_MM - CONE_MM, WIDE_RADIUS_MM)]
+    knots += [(-THROAT_MM, RADIUS_MM), (min(end_mm, 0.0), RADIUS_MM)]
+    if end_mm > 0:
+        knots += [(0.0, WIDE_RADIUS_MM), (end_mm, WIDE_RADIUS_MM)]
+    profile = np.concatenate([_cut(a, b) for a, b in pairwise(knots)] + [[knots[-1]]])
+    angle = 2 * np.pi * np.arange(AROUND) / AROUND
+    rings = [np.stack([r * np.cos(angle), r * np.sin(angle), np.full(AROUND, z)], axis=1) for z, r in profile]
+    wall = Surface(np.concatenate(rings), _tube_faces(len(profile)))
+    ends = [(profile[0], -1.0, "inlet"), (profile[-1], 1.0, "outlet_1")]
+    area = 0.5 * AROUND * np.sin(2 * np.pi / AROUND)
+    openings = [Opening([0, 0, z], [0, 0, sign], area * r**2, role) for (z, r), sign, role in ends]
+    return Vessel(wall, tuple(openings))
+
+
+def _cut(a: tuple[float, float], b: tuple[float, float]) -> np.ndarray:
+    """Points (k, 2) from a to b, b left out."""
+    count = max(1, round(np.hypot(b[0] - a[0], b[1] - a[1]) / EDGE_MM))
+    return np.linspace(a, b, count, endpoint=False)
+
+
+def _tube_faces(rings: int) -> np.ndarray:
+    """Faces between rings of `AROUND` vertices along +z, outward."""
+    i, j = np.meshgrid(np.arange(rings - 1), np.arange(AROUND), indexing="ij")
+    a, b = i * AROUND + j, i * AROUND + (j + 1) % AROUND
+    c, d = a + AROUND, b + AROUND
+    return np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, d), (a, d, c))]).astype(np.int32)
+
+
+@pytest.fixture(scope="module")
+def experiments(shared_data: Path) -> list[dict[str, np.ndarray]]:
+    """Every experiment: arrays (n, 2) of a place and an axial velocity by the name of the plot."""
+    archive = shared_data.parent / "reference" / "fda_nozzle" / "SE_exp_0500.zip"
+    if not archive.exists():
+        pytest.skip("the PIV data (../shared/reference) are not on this machine")
+    with zipfile.ZipFile(archive) as files:
+        texts = [files.read(name).decode() for name in files.namelist() if name.endswith(".txt")]
+    assert len(texts) == 5
+    return [_plots(text) for text in texts]
+
+
+def _plots(text: str) -> dict[str, np.ndarray]:
+    found = {}
+    for name, count, body in re.findall(
+        r"^plot-(\S*axial-velocity\S*(?: -?[\d.]+)?)[^\n]*\n(\d+)\n((?:[-+\d].*\n?)*)", text, re.M
+    ):
+        rows = [[float(x) for x in line.split()[:2]] for line in body.splitlines()[: int(count)]]
+        found[name.removesuffix(" 0")] = np.array(rows)
+    return found
+
+
+def spread(experiments: list[dict[str, np.ndarray]], name: str, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest velocity (n,) of the experiments that have this plot, at places (n,) in m."""
+    measured = [one[name] for one in experiments if name in one]
+    assert len(measured) >= 3
+    values = [np.interp(at, *np.array(sorted(map(tuple, one))).T) for one in measured]
+    return np.min(values, axis=0), np.max(values, axis=0)
+
+
+def outside(field: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: float) -> tuple[float, float]:
+    """How far the profile at z, and its peak, are outside the spread, as fractions of the measured peak."""
+    r_mm = np.linspace(-0.9, 0.9, 37) * (RADIUS_MM if z_mm <= 0 else WIDE_RADIUS_MM)
+    found = sampling.values_at(field, np.stack([r_mm, 0 * r_mm, np.full(37, z_mm)], axis=1))[0][:, 2]
+    low, high = spread(experiments, f"profile-axial-velocity-at-z {1e-3 * z_mm:.5f}", 1e-3 * r_mm)
+    beyond = np.maximum(np.maximum(low - found, found - high), 0.0) / high.max()
+    middle = 18
+    return float(beyond.max()), float(beyond[middle])
+
+
+def test_the_profile_in_the_throat_is_inside_the_spread_of_the_experiments(
+    experiments: list[dict[str, np.ndarray]],
+) -> None:
+    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.5)
+    field = simulate_case(FlowCase(nozzle(-4.0), blood=BLOOD, settings=settings))
+    assert field.outlets_mL_s[0] == pytest.approx(field.inlet_mL_s, rel=1e-3)
+    assert field.inlet_mL_s == pytest.approx(INFLOW_ML_S, rel=5e-3)
+    assert outside(field, experiments, -20.0)[1] < BEYOND
+
+
+@pytest.mark.validation
+def test_the_jet_is_inside_the_spread_of_the_experiments(experiments: list[dict[str, np.ndarray]]) -> None:
+    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.5)
+    field = simulate_case(FlowCase(nozzle(95.0), blood=BLOOD, settings=settings))
+    print(f"\n{len(field.cells)} cells, {field.steps} steps, {field.seconds:.0f} s: {field.advice}")  # noqa: T201
+    worst = []
+    for z_mm in (-20.0, -8.0, 0.0, 8.0, 16.0, 24.0, 32.0, 60.0, 80.0):
+        profile, axis = outside(field, experiments, z_mm)
+        worst.append(axis)
+        print(f"z {z_mm:5.0f} mm: outside the spread by {profile:.1%} of the peak (profile), {axis:.1%} (axis)")  # noqa: T201
+    assert field.outlets_mL_s[0] == pytest.approx(field.inlet_mL_s, rel=1e-3)
+    assert max(worst) < BEYOND

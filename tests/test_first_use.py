@@ -1,0 +1,50 @@
+"""What the first use has to compile: it is said once, and what was compiled can be kept anywhere."""
+
+import os
+
+import pytest
+from numba import njit
+
+from vstent import kernels
+from vstent.kernels import warm
+from vstent.kernels.first_use import telling
+
+
+def test_the_first_compilation_is_told_once_and_a_kept_kernel_is_not():
+    @njit
+    def double(x):
+        return 2 * x
+
+    said = []
+    with telling(lambda: said.append("compiling")):
+        double(1)
+        double(1.0)
+        assert said == ["compiling"]
+    with telling(lambda: said.append("again")):
+        double(3)
+    assert said == ["compiling"]
+
+
+def test_the_set_up_compiles_every_kernel_of_a_deployment():
+    from tubes import line, tube
+    from vstent import device
+    from vstent.deploy import deploy
+    from vstent.measure import measure
+    from vstent.stent import Landing
+
+    warm.warm()
+    said = []
+    artery = tube(line(30), 1.9, around=40)
+    with telling(lambda: said.append("compiling")):
+        design = device.find_design("silk")
+        measure(artery, deploy(design, artery, size=device.find_size(design, diameter_mm=4), landing=Landing(15.0)))
+    assert said == []
+
+
+@pytest.mark.parametrize(("writable", "is_moved"), [(True, False), (False, True)])
+def test_where_no_cache_can_be_written_kernels_are_kept_with_temporary_files(monkeypatch, writable, is_moved):
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(os, "access", lambda path, mode: writable)
+    kernels._keep_compiled()
+    assert ("NUMBA_CACHE_DIR" in os.environ) == is_moved
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
