@@ -1,7 +1,8 @@
 """Print what a cohort of phantoms costs: varied arteries, sacs and bends, two devices each, without flow.
 
-Run from the repository: ``python benchmarks/cohort.py [CASES] [JOBS]`` (200 and 2). The phantoms and the cohort's table
-are kept in ``cohort-of-phantoms`` in the temporary folder: run again, it does what is missing.
+Run from the repository: ``python benchmarks/cohort.py [CASES] [JOBS]`` (20 and 2; ``200 2`` is the full one). The
+phantoms and the cohort's table are kept in ``cohort-of-phantoms`` in the temporary folder: run again, it does what is
+missing.
 """
 
 import os
@@ -82,4 +83,4 @@ def cohort(count: int, jobs: int) -> None:
 if __name__ == "__main__":
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
     numbers = [int(word) for word in sys.argv[1:]]
-    cohort(*(numbers + [200, 2][len(numbers) :]))
+    cohort(*(numbers + [20, 2][len(numbers) :]))

@@ -17,7 +17,7 @@ from vstent.phantoms import demo_phantom, phantom_surface
 from vstent.restore import restore
 from vstent.stent import Landing
 from vstent.trace import trace
-from vstent.uncertainty import CAUSES, Ranges, made_wider, vary, widened
+from vstent.uncertainty import CAUSES, Ranges, vary, widened
 from vstent.uncertainty.shares import first_order_shares
 from vstent.vessel import Vessel
 
@@ -39,7 +39,9 @@ def deployed():
 def length_mm(threshold_mm, wider_mm=0.0):
     """The closed formula: what a Silk measures in a straight tube that is `threshold_mm` wider."""
     diameter_mm = 2 * (RADIUS_MM - DD_MM) + threshold_mm
-    return device.deployed_length_mm(SILK, made_wider(SILK, SIZE, wider_mm), diameter_mm)
+    # as many rows of pieces longer in proportion: all lengths of the lattice scale with the free diameter
+    factor = 1 + wider_mm / SIZE.free_diameter_mm
+    return factor * device.deployed_length_mm(SILK, SIZE, diameter_mm / factor)
 
 
 def test_of_a_threshold_alone_the_interval_is_the_closed_formula_at_its_ends():

@@ -103,9 +103,9 @@ COHORT_COLUMNS: Final = (
 )
 """Columns of a cohort: title, key, form."""
 RANKING_COLUMNS: Final = (
-    ("length, mm", "deployed_length_mm", "{:.1f}"),
+    ("mm long", "deployed_length_mm", "{:.1f}"),
     ("apposed", "apposed_fraction", "{:.0%}"),
-    ("beyond neck, mm", "landing_length_mm", "{:.1f}"),
+    ("mm beyond neck", "landing_length_mm", "{:.1f}"),
     ("metal at neck", "neck_metal_coverage_fraction", "{:.0%}"),
 )
 """Columns of the ranking: title, key of the measure, its form."""
@@ -113,15 +113,21 @@ RANKING_COLUMNS: Final = (
 
 def ranking_table(ranking: Ranking, shown: int) -> Table:
     """Table of the best candidates, and how many there are beyond."""
-    titles = [title for title, _, _ in RANKING_COLUMNS]
-    table = Table("", "device and size", "shift, mm", "score", *titles, "why")
+    table = Table("", "device and size", "shift", "score", *(title for title, _, _ in RANKING_COLUMNS))
     for number, candidate in enumerate(ranking.candidates[:shown], start=1):
         values = [(candidate.measures.get(key), form) for _, key, form in RANKING_COLUMNS]
         cells = ["" if value is None else form.format(value) for value, form in values]
         score = f"{candidate.score:.2f}" if candidate.is_suitable else "out"
-        table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells, candidate.reason)
+        table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells)
+    table.columns[1].no_wrap = True
     table.caption = f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable"
     return table
+
+
+def ranking_reasons(ranking: Ranking, shown: int) -> str:
+    """Lines that say why the best candidates stand where they do."""
+    best = enumerate(ranking.candidates[:shown], start=1)
+    return "\n".join(f"{number}. {candidate.label}: {candidate.reason}" for number, candidate in best)
 
 
 def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:

@@ -4,10 +4,13 @@ Processes and not threads: compiled kernels that run in parallel themselves do n
 """
 
 import multiprocessing
+import pickle
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, TypeVar
 
 from vstent.errors import VstentError
@@ -41,22 +44,27 @@ def spread(
         return
     # Spawned, not forked: a fork copies locks that other threads hold.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(jobs, len(items)), context, _start, (work, common))
-    try:
-        yield from pool.map(_answer, items)
-    except BrokenProcessPool as error:
-        raise VstentError(
-            "a worker process died, killed or out of memory: give the same command again, with fewer jobs"
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with TemporaryDirectory() as folder:
+        # In a file: what is too long for a pipe blocks this process for ever where a new one dies before it reads it.
+        path = Path(folder) / "common.pickle"
+        path.write_bytes(pickle.dumps((work, common)))
+        pool = ProcessPoolExecutor(min(jobs, len(items)), context, _start, (path,))
+        try:
+            yield from pool.map(_answer, items)
+        except BrokenProcessPool as error:
+            raise VstentError(
+                "a worker process died, killed or out of memory: give the same command again, with fewer jobs"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
-def _start(work: Callable[..., Any], common: Any) -> None:
+def _start(path: Path) -> None:
     import numba
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the first process's to answer
     numba.set_num_threads(1)
+    work, common = pickle.loads(path.read_bytes())
     _SHARED.update(work=work, common=common)
 
 

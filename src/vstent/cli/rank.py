@@ -29,7 +29,7 @@ def add(commands: options.Commands) -> None:
 
 
 def _rank(arguments: argparse.Namespace) -> int:
-    from vstent.console import Console, ranking_table
+    from vstent.console import Console, ranking_reasons, ranking_table
     from vstent.device import find_design
     from vstent.rank import default_criteria, rank, read_criteria
     from vstent.study import Settings, restore_vessel, write_ranking
@@ -50,5 +50,6 @@ def _rank(arguments: argparse.Namespace) -> int:
         )
     write_ranking(arguments.out, ranking)
     console.print(ranking_table(ranking, SHOWN))
+    console.print(ranking_reasons(ranking, SHOWN))
     console.print(f"All in {arguments.out / 'ranking.csv'} and ranking.json. Research use only.")
     return 0
