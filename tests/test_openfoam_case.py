@@ -59,7 +59,7 @@ def test_every_dictionary_is_one(flavour: str, is_pulse: bool, outlets: str) -> 
     assert set(meshed["addLayersControls"]["layers"]) == {"wall"}
     parts = parsed["system/decomposeParDict"]
     assert parts["numberOfSubdomains"] == ["4"]
-    assert parts["hierarchicalCoeffs"]["n"] == ["(", "1", "1", "4", ")"]  # the tube is longest along z
+    assert parts["hierarchicalCoeffs"]["n"] == ["(", "2", "1", "2", ")"]  # tube along z, branch along x and z
     viscosity = parsed["constant/" + ("physicalProperties" if flavour == "org" else "transportProperties")]["nu"]
     assert float(viscosity[-1]) == pytest.approx(0.004 / 1060)
 
