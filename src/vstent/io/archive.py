@@ -22,6 +22,21 @@ Noun = TypeVar("Noun")
 
 _ROOT: Final = "vstent."
 _KIND: Final = "is"
+DAMAGE: Final = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    ImportError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    MemoryError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""All that reading a damaged archive raises."""
 MOST_BYTES: Final = 1 << 33
 """No noun is larger, unpacked."""
 
@@ -57,20 +72,7 @@ def load_noun(path: Path, noun_type: type[Noun]) -> Noun:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             _refuse_bomb(archive)
             noun = _unpacked(json.loads(archive["noun"].tobytes()), archive)
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        ImportError,
-        EOFError,
-        NotImplementedError,
-        RuntimeError,
-        MemoryError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ):
+    except DAMAGE:
         raise ReadError(
             f"{path} is damaged or was written by another version; delete it to compute it again."
         ) from None

@@ -1,11 +1,11 @@
 """Checkpoint: a flow under way, kept in the case's cache until it is done."""
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from vstent.flow.engines import Saved
+from vstent.io.archive import DAMAGE
 from vstent.io.files import atomic
 
 
@@ -23,7 +23,7 @@ class FlowCheckpoint:
         try:
             with self._path(run).open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        except DAMAGE:
             return None
 
     def save(self, run: str, saved: Saved) -> None:
