@@ -58,7 +58,7 @@ def drop(page, path: Path):
 def place_of(page, end):
     """Where the end of the device in view lies, as its handle says."""
     word = page.locator(f".handle.{end} .handle-word")
-    playwright.expect(word).to_contain_text("mm")
+    playwright.expect(word).to_contain_text("mm", timeout=120 * SECOND)  # kernels may have to be compiled
     return float(word.inner_text().split()[0])
 
 

@@ -220,8 +220,11 @@ NIFTI_2: Final = 540
 
 def _nifti_head(path: Path, kind: str) -> tuple[bytes, str]:
     """Return the header of a NIfTI file that ITK has accepted, and its byte order."""
-    with gzip.open(path) if kind == ".nii.gz" else path.open("rb") as file:
-        head = file.read(NIFTI_2)
+    try:
+        with gzip.open(path) if kind == ".nii.gz" else path.open("rb") as file:
+            head = file.read(NIFTI_2)
+    except (OSError, EOFError, zlib.error):
+        raise ReadError(f"{path.name} is damaged: it breaks off in its header; copy it again.") from None
     order = "<" if int.from_bytes(head[:4], "little") in (348, NIFTI_2) else ">"
     size = int.from_bytes(head[:4], "little" if order == "<" else "big")
     return head[: NIFTI_2 if size == NIFTI_2 else 348], order

@@ -21,6 +21,7 @@ FORMATS: Final = {
     ".vtp": "application/vnd.vtk.polydata+xml",
     ".vtu": "application/vnd.vtk.unstructuredgrid+xml",
     ".stl": "model/stl",
+    ".3mf": "model/3mf",
     ".png": "image/png",
 }
 ABOUT: Final = {
