@@ -10,7 +10,9 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
 from vstent import phantoms
 from vstent.cli import main
+from vstent.errors import FlowError
 from vstent.io.writers import write_stl
+from vstent.study import stages
 
 RADIUS_MM, LENGTH_MM, INFLOW_ML_S = 2.0, 16.0, 0.8
 STRESS_PA = 4 * 0.004 * INFLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 3)
@@ -38,6 +40,24 @@ def test_flow_alone_in_a_tube_is_poiseuilles_and_is_not_computed_twice(
     np.testing.assert_allclose(along * stress[middle].mean(axis=0), [0, 0, STRESS_PA], atol=0.03 * STRESS_PA)
     assert main(command) == 0
     assert "already done" in capsys.readouterr().err
+
+
+def test_openfoam_gets_the_vessel_after_its_cost_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = []
+
+    def refused(folder: Path, case: object, **given: object) -> None:
+        asked.append((folder, given["struts"]))
+        raise FlowError("It is not here")
+
+    monkeypatch.setattr(stages, "simulate_in", refused)
+    write_stl(tmp_path / "tube.stl", phantoms.phantom_surface(phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM)))
+    command = ["flow", str(tmp_path / "tube.stl"), "--out", str(tmp_path / "out"), "--engine", "openfoam"]
+    assert main([*command, "--units", "mm"]) == 1
+    told = " ".join(capsys.readouterr().err.split())
+    assert 0 < told.index("OpenFOAM: about") < told.index("It is not here")
+    assert asked == [(tmp_path / "out" / "flow" / "bare" / "openfoam", None)]
 
 
 def _wall(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -128,7 +128,7 @@ def compute_flows(
         stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, placing)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
-            if name == BARE and settings.flow.engine == LATTICE:
+            if name == BARE and settings.flow.engine in (LATTICE, OPENFOAM):
                 _plan(anatomy, settings.flow, ledger)
             with ledger.stage(stage) as tell:
                 if settings.flow.engine == OPENFOAM:
