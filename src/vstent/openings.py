@@ -132,12 +132,6 @@ def _joined(pairs: Ints, n: int) -> Ints:
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
-def _is_flat(lumen: Surface, member: Bools) -> bool:
-    weight = lumen.areas_mm2[member]
-    mean = weight @ lumen.normals[member] / weight.sum()
-    return float(np.linalg.norm(mean)) > np.cos(CAP_ANGLE_RAD)
-
-
 def _with_open_arms(lumen: Surface) -> tuple[Surface, int]:
     """Cut open the slender arms that end blind."""
     graph = lumen.medial

@@ -291,8 +291,3 @@ class FlowField:
             inlet_mL_s=phase.inlet_mL_s,
             phases=(),
         )
-
-    @property
-    def cell_volume_mm3(self) -> float:
-        """Volume of a cell."""
-        return self.cell_size_mm**3
