@@ -16,6 +16,7 @@ from vstent.io.writers import write_stl
 from vstent.phantoms import demo_phantom, phantom_surface
 from vstent.restore import restore
 from vstent.stent import Landing
+from vstent.study.checkpoint import FlowCheckpoint
 from vstent.trace import trace
 from vstent.uncertainty import CAUSES, Ranges, vary, widened
 from vstent.uncertainty.shares import first_order_shares
@@ -169,6 +170,29 @@ def test_inflow_and_flow_are_varied_where_the_flow_is_asked(monkeypatch):
     assert ratio == pytest.approx(0.1 * 4.0 * (1 + 0.2 * found.points[:, 3]))
     shares = found.shares("neck_inflow_mL_s_ratio")
     assert shares["inflow"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_sample_whose_flow_is_done_is_not_computed_again(monkeypatch, tmp_path):
+    asked = []
+
+    def ratios(anatomy, stent, flow):
+        asked.append(flow.inflow_mL_s)
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return {"neck_inflow_mL_s_ratio": flow.inflow_mL_s**2}
+
+    monkeypatch.setattr(uncertainty, "_flow_ratios", ratios)
+    monkeypatch.setattr("vstent.flow.ostium", lambda *_: None)
+    ranges = Ranges(4, flow_samples=4, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
+    begun, flow = FlowCheckpoint(tmp_path, "vary silk", "key"), FlowSettings(inflow_mL_s=4.0)
+    with pytest.raises(KeyboardInterrupt):
+        vary(artery(), deployed(), ranges, flow=flow, checkpoint=begun)
+    resumed = vary(artery(), deployed(), ranges, flow=flow, checkpoint=begun)
+    assert len(asked) == 3 + 2
+    assert asked[3] == asked[2]  # the one that was interrupted is the first to be done
+    once = vary(artery(), deployed(), ranges, flow=flow)
+    assert resumed.names == once.names
+    assert (resumed.values == once.values).all()
 
 
 def test_a_study_tells_its_uncertainty_in_metrics_report_and_table_and_goes_on_from_it(tmp_path, capsys):

@@ -204,7 +204,8 @@ def vary_all(
         if varied is None:
             with ledger.stage(stage) as tell:
                 told = partial(_tell_count, ledger, stage)
-                varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told)
+                begun = FlowCheckpoint(ledger.folder, stage, key)
+                varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
                 tell(f"{len(varied.points)} deployments, {varied.n_failed} of them did not fit.")
             ledger.keep(stage, key, varied)
         found[name] = varied.metrics()

@@ -8,6 +8,7 @@ the same question gets the same answer.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from vstent.deploy import deploy
 from vstent.device import Design, Size
 from vstent.errors import InputError, LandingError
-from vstent.flow import FlowSettings, compare, flow_case, indices, ostium, simulate_case
+from vstent.flow import Checkpoint, FlowSettings, compare, flow_case, indices, ostium, simulate_case
 from vstent.kernels.arrays import Floats, freeze
 from vstent.measure import measure
 from vstent.stent import Deployment, Landing, Stent
@@ -131,6 +132,7 @@ def vary(
     *,
     flow: FlowSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Uncertainty:
     """Deploy a device again and again with the causes varied.
 
@@ -141,6 +143,7 @@ def vary(
     ranges : how far.
     flow : how the flow is computed, for ``ranges.flow_samples`` of the deployments.
     progress : told how many of how many are done.
+    checkpoint : keeps every sample whose flow is done, so that varying again goes on after it.
 
     Raises
     ------
@@ -157,7 +160,9 @@ def vary(
     rows = []
     for number, offset in enumerate(points * spread):
         wanted = flow if number < ranges.flow_samples else None
-        rows.append(_sample(anatomy, stent, middle_mm, offset, wanted))
+        sample = partial(_sample, anatomy, stent, middle_mm, offset, wanted)
+        # without its flow a sample is done again sooner than it is read back
+        rows.append(sample() if wanted is None or checkpoint is None else _once(sample, checkpoint, f"sample-{number}"))
         if progress is not None:
             progress(number + 1, len(points))
     names = tuple(name for name in (*RESULTS, *FLOW_RESULTS) if any(name in row for row in rows))
@@ -185,6 +190,16 @@ def made_wider(design: Design, size: Size, by_mm: float) -> Size:
         length_mm=size.length_mm * factor,
         free_diameter_mm=size.free_diameter_mm * factor,
     )
+
+
+def _once(sample: Callable[[], dict[str, float]], checkpoint: Checkpoint, name: str) -> dict[str, float]:
+    """Return a sample's results: those kept, or found now and kept."""
+    kept = checkpoint.load(name)
+    if kept is not None:
+        return {result: float(value) for result, value in kept.items()}
+    found = sample()
+    checkpoint.save(name, {result: np.array(value) for result, value in found.items()})
+    return found
 
 
 def _sample(
