@@ -8,6 +8,7 @@ import numpy as np
 
 from vstent.kernels import voxels
 from vstent.kernels.arrays import Floats, Ints, freeze
+from vstent.stent import Stent
 from vstent.surface import Surface
 from vstent.vessel import Vessel
 
@@ -153,7 +154,9 @@ class FlowCase:
     ostium: Surface | None = None
     """What blood crosses between artery and sac, its normals into the sac."""
     screen: Screen | None = None
-    """The stent, or None."""
+    """The stent as a resistance, or None."""
+    stent: Stent | None = None
+    """The stent's wires, for engines that resolve them, or None."""
     blood: Blood = field(default_factory=Blood)
     """The fluid."""
     settings: FlowSettings = field(default_factory=FlowSettings)
