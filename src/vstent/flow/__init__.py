@@ -60,7 +60,6 @@ def simulate(
     stents: Sequence[Stent | None],
     settings: FlowSettings | None = None,
     *,
-    blood: Blood | None = None,
     progress: OnProgress | None = None,
 ) -> tuple[FlowField, ...]:
     """Compute the flow, steady or pulsatile, for every stent, None standing for the bare vessel.
@@ -77,27 +76,24 @@ def simulate(
     fields: list[FlowField] = []
     bare: FlowField | None = None
     for stent in stents:
-        field = simulate_case(flow_case(anatomy, stent, settings, blood=blood), start=bare, progress=progress)
+        field = simulate_case(flow_case(anatomy, stent, settings), start=bare, progress=progress)
         if stent is None and bare is None:
             bare = field
         fields.append(field)
     return tuple(fields)
 
 
-def flow_case(
-    anatomy: Anatomy, stent: Stent | None, settings: FlowSettings | None = None, *, blood: Blood | None = None
-) -> FlowCase:
+def flow_case(anatomy: Anatomy, stent: Stent | None, settings: FlowSettings | None = None) -> FlowCase:
     """State the flow problem: the patient's lumen, its largest sac, a stent as a screen or None."""
-    blood = blood or Blood()
+    settings = settings or FlowSettings()
     largest = anatomy.aneurysms[0] if anatomy.aneurysms else None
     return FlowCase(
         vessel=anatomy.vessel,
         sac=None if largest is None else largest.sac,
         ostium=None if largest is None else ostium(largest, anatomy.vessel.lumen),
-        screen=None if stent is None else screen(stent, blood),
+        screen=None if stent is None else screen(stent, settings.blood),
         stent=stent,
-        blood=blood,
-        settings=settings or FlowSettings(),
+        settings=settings,
     )
 
 

@@ -18,6 +18,10 @@ OPENFOAM: Final = "openfoam"
 """Name of the engine that hands the flow to OpenFOAM, a program of its own."""
 
 
+HIGH_SHEAR_VISCOSITY_PA_S: Final = 0.00345
+"""Viscosity that goes with the numbers of `CarreauYasuda`."""
+
+
 @dataclass(frozen=True)
 class CarreauYasuda:
     """Blood that thins with the shear rate g: mu = m + (m0 - m) (1 + (t g)^a)^((n - 1) / a), m being at high shear.
@@ -89,6 +93,8 @@ class FlowSettings:
 
     inflow_mL_s: float | None = None
     """Mean flow through the inlet; None: 0.27 m/s times the inlet's area."""
+    blood: Blood = field(default_factory=Blood)
+    """The fluid."""
     waveform: Waveform | None = None
     """The pulse; None: steady flow at the mean."""
     max_cycles: int = 4
@@ -157,10 +163,13 @@ class FlowCase:
     """The stent as a resistance, or None."""
     stent: Stent | None = None
     """The stent's wires, for engines that resolve them, or None."""
-    blood: Blood = field(default_factory=Blood)
-    """The fluid."""
     settings: FlowSettings = field(default_factory=FlowSettings)
     """How to compute it."""
+
+    @property
+    def blood(self) -> Blood:
+        """The fluid."""
+        return self.settings.blood
 
     @property
     def inflow_mL_s(self) -> float:
