@@ -1,6 +1,8 @@
 """`vstent flow` as a user meets it, in a vessel without a sac."""
 
+import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +11,12 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
 from vstent import phantoms
-from vstent.cli import main
+from vstent.cli import main, options
 from vstent.errors import FlowError
+from vstent.flow import Blood, FlowCase
+from vstent.flow.engines.openfoam import OpenFoam
+from vstent.flow.types import CarreauYasuda
 from vstent.io.writers import write_stl
-from vstent.study import stages
 
 RADIUS_MM, LENGTH_MM, INFLOW_ML_S = 2.0, 16.0, 0.8
 STRESS_PA = 4 * 0.004 * INFLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 3)
@@ -47,17 +51,35 @@ def test_openfoam_gets_the_vessel_after_its_cost_is_told(
 ) -> None:
     asked = []
 
-    def refused(folder: Path, case: object, **given: object) -> None:
-        asked.append((folder, given["struts"]))
+    def refused(engine: OpenFoam, case: FlowCase, start: object) -> None:
+        asked.append((engine.folder, case.stent))
         raise FlowError("It is not here")
 
-    monkeypatch.setattr(stages, "simulate_in", refused)
+    monkeypatch.setattr(OpenFoam, "init", refused)
     write_stl(tmp_path / "tube.stl", phantoms.phantom_surface(phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM)))
     command = ["flow", str(tmp_path / "tube.stl"), "--out", str(tmp_path / "out"), "--engine", "openfoam"]
     assert main([*command, "--units", "mm"]) == 1
     told = " ".join(capsys.readouterr().err.split())
     assert 0 < told.index("OpenFOAM: about") < told.index("It is not here")
     assert asked == [(tmp_path / "out" / "flow" / "bare" / "openfoam", None)]
+    assert main([*command, "--units", "mm", "--convergence", "--cell-size", "0.25"]) == 1
+    assert "It is not here" in capsys.readouterr().err
+    assert asked[1] == (tmp_path / "out" / "flow" / "convergence" / "openfoam" / "cell_size_mm-0.5", None)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ([], Blood()),
+        (["--viscosity", "0.0035", "--density", "1050"], Blood(1050.0, 0.0035)),
+        (["--thinning"], Blood(1060.0, 0.00345, CarreauYasuda())),
+        (["--thinning", "--viscosity", "0.004"], Blood(1060.0, 0.004, CarreauYasuda())),
+    ],
+)
+def test_the_blood_asked_for_is_the_blood_computed(words: list[str], expected: Blood) -> None:
+    parser = argparse.ArgumentParser()
+    options.add_flow(parser)
+    assert asdict(options.given_flow(parser.parse_args(words)).blood) == asdict(expected)
 
 
 def _wall(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -96,8 +96,8 @@ def outside(field: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: fl
 def test_the_profile_in_the_throat_is_inside_the_spread_of_the_experiments(
     experiments: list[dict[str, np.ndarray]],
 ) -> None:
-    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.5)
-    field = simulate_case(FlowCase(nozzle(-4.0), blood=BLOOD, settings=settings))
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.5)
+    field = simulate_case(FlowCase(nozzle(-4.0), settings=settings))
     assert field.outlets_mL_s[0] == pytest.approx(field.inlet_mL_s, rel=1e-3)
     assert field.inlet_mL_s == pytest.approx(INFLOW_ML_S, rel=5e-3)
     assert outside(field, experiments, -20.0)[1] < BEYOND
@@ -105,8 +105,8 @@ def test_the_profile_in_the_throat_is_inside_the_spread_of_the_experiments(
 
 @pytest.mark.validation
 def test_the_jet_is_inside_the_spread_of_the_experiments(experiments: list[dict[str, np.ndarray]]) -> None:
-    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.5)
-    field = simulate_case(FlowCase(nozzle(95.0), blood=BLOOD, settings=settings))
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.5)
+    field = simulate_case(FlowCase(nozzle(95.0), settings=settings))
     print(f"\n{len(field.cells)} cells, {field.steps} steps, {field.seconds:.0f} s: {field.advice}")  # noqa: T201
     worst = []
     for z_mm in (-20.0, -8.0, 0.0, 8.0, 16.0, 24.0, 32.0, 60.0, 80.0):

@@ -33,8 +33,8 @@ def test_thinning_blood_flows_in_a_pipe_as_its_law_has_it() -> None:
     poiseuille_m_s = 2 * INFLOW_ML_S * 1e-6 / (np.pi * RADIUS_M**2)
     assert exact[0] < 0.93 * poiseuille_m_s  # blunter than Poiseuille's, so that the law shows
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=LENGTH_MM, radius_mm=1e3 * RADIUS_M))))
-    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.25, tolerance=0.005)
-    field = simulate_case(FlowCase(vessel, blood=BLOOD, settings=settings))
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.25, tolerance=0.005)
+    field = simulate_case(FlowCase(vessel, settings=settings))
     sign = np.sign(field.velocity_m_s[:, 2].mean())
     points = np.stack([1e3 * R_M[:700:50], 0 * R_M[:700:50], np.full(14, 7.0)], axis=1)
     found = sign * sampling.values_at(field, points)[0][:, 2]

@@ -16,7 +16,7 @@ from faults import artery
 from vstent import device, plugins
 from vstent.deploy import ConstantWire, deploy
 from vstent.errors import DeviceError, PluginError
-from vstent.flow import FlowSettings, flow_case, simulate_case
+from vstent.flow import FlowSettings, flow_case, foretell_cost, simulate_case
 from vstent.restore import restore
 from vstent.stent import Deployment, Landing
 from vstent.trace import trace
@@ -103,12 +103,11 @@ class CountingWall:
 
 
 class Still(AbstractEngine):
-    """An engine in which nothing moves."""
-
-    def __init__(self, cell_size_mm):
-        self.cell_size_mm = cell_size_mm
+    """An engine in which nothing moves, and that writes a file."""
 
     def init(self, case, start):
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "notes").write_text("still")
         return case
 
     def step(self, state):
@@ -178,15 +177,18 @@ def test_a_wall_is_plugged_in_and_gives_the_same_deployment(anatomy: Anatomy) ->
 
 
 @pytest.mark.usefixtures("distribution")
-def test_a_flow_engine_is_plugged_in(anatomy: Anatomy) -> None:
+def test_a_flow_engine_is_plugged_in(anatomy: Anatomy, tmp_path: Path) -> None:
     case = flow_case(anatomy, None, FlowSettings(engine="still", cell_size_mm=3.0))
     assert simulate_case(case) == ("still", 3.0, True)
+    assert simulate_case(case, folder=tmp_path / "own") == ("still", 3.0, True)
+    assert (tmp_path / "own" / "notes").read_text() == "still"
+    assert "not known" in foretell_cost(case)
 
 
 @pytest.mark.usefixtures("distribution")
 def test_plugins_that_are_not_there_are_named(anatomy: Anatomy) -> None:
     with pytest.raises(
-        PluginError, match=r"no 'stil' in vstent.engines: choose one of lattice_boltzmann, missing, still"
+        PluginError, match=r"no 'stil' in vstent.engines: choose one of lattice_boltzmann, openfoam, missing, still"
     ):
         simulate_case(flow_case(anatomy, None, FlowSettings(engine="stil", cell_size_mm=3.0)))
     with pytest.raises(PluginError, match=r"missing of vstent.engines cannot be loaded"):

@@ -9,10 +9,12 @@ import pytest
 from shapes import sphere
 from vstent import phantoms
 from vstent.errors import ReadError
-from vstent.flow import FlowCase, FlowSettings
+from vstent.flow import Blood, FlowCase, FlowSettings
 from vstent.flow.openfoam import FoamSetup, foam_case, named_patches
 from vstent.flow.openfoam.case import struts_near
+from vstent.flow.openfoam.control import fluid
 from vstent.flow.openfoam.dictionary import foam_file, parse
+from vstent.flow.types import CarreauYasuda
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.surface import Surface
 from vstent.trace import trace
@@ -62,6 +64,20 @@ def test_every_dictionary_is_one(flavour: str, is_pulse: bool, outlets: str) -> 
     assert parts["hierarchicalCoeffs"]["n"] == ["(", "2", "1", "2", ")"]  # tube along z, branch along x and z
     viscosity = parsed["constant/" + ("physicalProperties" if flavour == "org" else "transportProperties")]["nu"]
     assert float(viscosity[-1]) == pytest.approx(0.004 / 1060)
+
+
+@pytest.mark.parametrize("flavour", ["com", "org"])
+def test_blood_that_thins_has_its_law_in_openfoams_words(flavour: str) -> None:
+    thin = Blood(1050.0, 0.00345, CarreauYasuda())
+    files = {name: parse(text) for name, text in fluid(thin, replace(SETUP, flavour=flavour)).items()}
+    com, org = files.get("transportProperties", {}), files.get("momentumTransport", {})
+    law = org["laminar"] if org else com["BirdCarreauCoeffs"]
+    nu0 = files["physicalProperties"]["nu"] if org else law["nu0"]
+    assert law.get("viscosityModel", com.get("transportModel")) == ["BirdCarreau"]
+    rest, high, k, n, a = (float(one[-1]) for one in (nu0, law["nuInf"], law["k"], law["n"], law["a"]))
+    rate = np.array([0.0, 0.3, 5.0, 100.0, 1e4])
+    found = high + (rest - high) * (1 + (k * rate) ** a) ** ((n - 1) / a)
+    np.testing.assert_allclose(1050.0 * found, thin.viscosity_at_Pa_s(rate), rtol=1e-6)
 
 
 def test_what_is_written_is_read_and_what_is_damaged_is_refused() -> None:

@@ -2,7 +2,8 @@
 
 ``vstent.devices``: a function that returns a catalogue, TOML text in which every number has its source.
 
-``vstent.engines``: a class of `vstent.flow.engines.AbstractEngine`, made with the cell size in mm.
+``vstent.engines``: a class of `vstent.flow.engines.AbstractEngine`, made with the cell size in mm and a folder of its
+own, in which it may write.
 
 ``vstent.walls``: a class of `vstent.deploy.wall.AbstractWall`, made with the surface.
 """

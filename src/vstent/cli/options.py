@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 if TYPE_CHECKING:
-    from vstent.flow.types import FlowSettings, Waveform
+    from vstent.flow.types import Blood, FlowSettings, Waveform
     from vstent.uncertainty import Ranges
 
 EPILOG: Final = (
@@ -84,6 +84,11 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         const=PUBLISHED,
         metavar="CSV",
         help="follow a pulse: columns time in s and flow in any unit (the published one of the internal carotid)",
+    )
+    flow.add_argument("--density", type=positive, default=1060.0, metavar="KG_M3", help="of blood (1060)")
+    flow.add_argument("--viscosity", type=positive, metavar="PA_S", help="of blood (0.004; at high shear 0.00345)")
+    flow.add_argument(
+        "--thinning", action="store_true", help="blood thins with the shear rate, as Carreau and Yasuda's law has it"
     )
     flow.add_argument(
         "--engine", default="lattice_boltzmann", metavar="NAME", help="openfoam, or a plug-in that computes the flow"
@@ -215,12 +220,22 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
 
     return FlowSettings(
         inflow_mL_s=arguments.flow_rate,
+        blood=_blood(arguments),
         waveform=_waveform(arguments.pulsatile),
         outlets=arguments.outlets,
         cell_size_mm=arguments.cell_size,
         engine=arguments.engine,
         processes=arguments.processes,
     )
+
+
+def _blood(arguments: argparse.Namespace) -> "Blood":
+    from vstent.flow import Blood
+    from vstent.flow.types import HIGH_SHEAR_VISCOSITY_PA_S, CarreauYasuda
+
+    if not arguments.thinning:
+        return Blood(arguments.density, arguments.viscosity or Blood.viscosity_Pa_s)
+    return Blood(arguments.density, arguments.viscosity or HIGH_SHEAR_VISCOSITY_PA_S, CarreauYasuda())
 
 
 def _waveform(source: str | None) -> "Waveform | None":

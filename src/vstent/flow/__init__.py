@@ -1,11 +1,13 @@
 """Blood flow, before and after: `simulate` an anatomy with and without stents, or one case at a time."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 from vstent import plugins
-from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
@@ -28,6 +30,7 @@ __all__ = [
     "Streamlines",
     "compare",
     "flow_case",
+    "foretell_cost",
     "indices",
     "ostium",
     "screen",
@@ -36,13 +39,8 @@ __all__ = [
     "streamlines",
 ]
 
-COARSENING = 2.0
-"""Cells of the first guess, over those of the answer: it costs a sixteenth per second of flow."""
 COARSE_SHARE = 0.12
 """Part of the whole time that each coarse run takes, for the progress."""
-
-SLOWER = 0.4
-"""A run that diverged is tried once more with a time step so much shorter."""
 
 OnProgress = Callable[[Progress], None]
 
@@ -62,7 +60,6 @@ def simulate(
     stents: Sequence[Stent | None],
     settings: FlowSettings | None = None,
     *,
-    blood: Blood | None = None,
     progress: OnProgress | None = None,
 ) -> tuple[FlowField, ...]:
     """Compute the flow, steady or pulsatile, for every stent, None standing for the bare vessel.
@@ -79,26 +76,24 @@ def simulate(
     fields: list[FlowField] = []
     bare: FlowField | None = None
     for stent in stents:
-        field = simulate_case(flow_case(anatomy, stent, settings, blood=blood), start=bare, progress=progress)
+        field = simulate_case(flow_case(anatomy, stent, settings), start=bare, progress=progress)
         if stent is None and bare is None:
             bare = field
         fields.append(field)
     return tuple(fields)
 
 
-def flow_case(
-    anatomy: Anatomy, stent: Stent | None, settings: FlowSettings | None = None, *, blood: Blood | None = None
-) -> FlowCase:
+def flow_case(anatomy: Anatomy, stent: Stent | None, settings: FlowSettings | None = None) -> FlowCase:
     """State the flow problem: the patient's lumen, its largest sac, a stent as a screen or None."""
-    blood = blood or Blood()
+    settings = settings or FlowSettings()
     largest = anatomy.aneurysms[0] if anatomy.aneurysms else None
     return FlowCase(
         vessel=anatomy.vessel,
         sac=None if largest is None else largest.sac,
         ostium=None if largest is None else ostium(largest, anatomy.vessel.lumen),
-        screen=None if stent is None else screen(stent, blood),
-        blood=blood,
-        settings=settings or FlowSettings(),
+        screen=None if stent is None else screen(stent, settings.blood),
+        stent=stent,
+        settings=settings,
     )
 
 
@@ -106,6 +101,7 @@ def simulate_case(
     case: FlowCase,
     *,
     start: FlowField | None = None,
+    folder: Path | None = None,
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> FlowField:
@@ -113,7 +109,8 @@ def simulate_case(
 
     Parameters
     ----------
-    start : a flow in the same vessel without a screen, to start from.
+    start : a flow in the same vessel without a stent, to start from.
+    folder : where an engine that works with files keeps them, and finds them again; None: they are not kept.
     progress : called at every check; what it raises ends the run.
     checkpoint : keeps what is under way; the same flow goes on from there, and its result is the same to the last bit.
 
@@ -122,95 +119,130 @@ def simulate_case(
     FlowError
         When the vessel cannot be put on a grid, or the computation diverges.
     """
-    cell_size_mm = default_cell_size_mm(case)
-    answer = _bookmark(checkpoint, "answer")
-    steady = replace(case, settings=replace(case.settings, waveform=None))
-    is_begun = answer is not None and answer.saved is not None
-    guess = None if is_begun else _guess(steady, start, COARSENING * cell_size_mm, progress, checkpoint)
-    return _run(case, cell_size_mm, guess, _stage(progress, _coarse_runs(case, start) * COARSE_SHARE, 1.0), answer)
+    with nullcontext(folder) if folder is not None else TemporaryDirectory(prefix="vstent-") as own:
+        return _Runs(engine_class(case.settings), Path(own), progress, checkpoint).answer(case, start)
 
 
-def _bookmark(checkpoint: Checkpoint | None, name: str) -> Bookmark | None:
-    if checkpoint is None:
-        return None
-    return Bookmark(checkpoint.load(name), lambda saved: checkpoint.save(name, saved))
+def foretell_cost(case: FlowCase) -> str:
+    """Say in a sentence what a flow will cost.
+
+    Raises
+    ------
+    FlowError
+        When it does not fit in the free memory.
+    """
+    return engine_class(case.settings)(default_cell_size_mm(case)).cost(case)
 
 
-def _coarse_runs(case: FlowCase, start: FlowField | None) -> int:
+def engine_class(settings: FlowSettings) -> type[AbstractEngine[Any]]:
+    """Return the engine of this name: one of vstent's own, or a plug-in's.
+
+    Raises
+    ------
+    PluginError
+        When there is none.
+    """
+    from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
+    from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
+    from vstent.flow.engines.openfoam import OpenFoam
+
+    lattice = LatticeBoltzmann if settings.waveform is None else PulsatileLatticeBoltzmann
+    built_in: dict[str, type[AbstractEngine[Any]]] = {LATTICE: lattice, OPENFOAM: OpenFoam}
+    if settings.engine in built_in:
+        return built_in[settings.engine]
+    found: type[AbstractEngine[Any]] = plugins.load("vstent.engines", settings.engine, built_in=", ".join(built_in))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """The runs of one engine that make up a flow: guesses on a coarse grid, where it wants them, and the answer."""
+
+    engine: type[AbstractEngine[Any]]
+    folder: Path
+    progress: OnProgress | None
+    checkpoint: Checkpoint | None
+
+    def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
+        """Compute a flow, from a guess unless it is under way."""
+        cell_size_mm = default_cell_size_mm(case)
+        bookmark = self._bookmark("answer")
+        guess = start
+        if bookmark is None or bookmark.saved is None:
+            steady = replace(case, settings=replace(case.settings, waveform=None))
+            guess = self._guess(steady, start, cell_size_mm)
+        progress = self._part(_coarse_runs(self.engine, case, start) * COARSE_SHARE, 1.0)
+        return self._run(self.engine(cell_size_mm, self.folder), case, guess, progress, bookmark)
+
+    def _guess(self, case: FlowCase, start: FlowField | None, cell_size_mm: float) -> FlowField | None:
+        """First guess for the fine grid, from coarse ones; only `start` where the coarse grid would be too coarse.
+
+        Where a bare flow is known, the coarse grid only has to say what the screen changes (the correction scheme of
+        multigrid, Brandt 1977, Math. Comput. 31, 333).
+        """
+        if self.engine.coarsening is None:
+            return start
+        coarse_mm = self.engine.coarsening * cell_size_mm
+        is_tiny = abs(case.vessel.closed.volume_mm3) < 4 * MIN_CELLS * coarse_mm**3
+        if is_tiny or (start is not None and case.screen is None):
+            return start
+        if start is None:
+            return self._coarse(case, coarse_mm, None, "guess", 0)
+        bare = self._coarse(replace(case, screen=None, stent=None), coarse_mm, start, "bare guess", 0)
+        stented = self._coarse(case, coarse_mm, bare, "stented guess", 1)
+        before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))
+        return replace(
+            start,
+            velocity_m_s=start.velocity_m_s + after[0] - before[0],
+            pressure_Pa=start.pressure_Pa + after[1] - before[1],
+        )
+
+    def _coarse(self, case: FlowCase, cell_size_mm: float, start: FlowField | None, name: str, rank: int) -> FlowField:
+        engine = engine_class(case.settings)(cell_size_mm, self.folder / name)
+        progress = self._part(rank * COARSE_SHARE, (rank + 1) * COARSE_SHARE)
+        return self._run(engine, case, start, progress, self._bookmark(name))
+
+    def _run(
+        self,
+        engine: AbstractEngine[Any],
+        case: FlowCase,
+        start: FlowField | None,
+        progress: OnProgress | None,
+        bookmark: Bookmark | None,
+    ) -> FlowField:
+        try:
+            return run(engine, case, start=start, progress=progress, bookmark=bookmark)
+        except DivergenceError:
+            calmer = engine.calmer(case)
+            if calmer is None:
+                raise
+            anew = None if bookmark is None else replace(bookmark, saved=None)
+            return run(engine, calmer, start=start, progress=progress, bookmark=anew)
+
+    def _bookmark(self, name: str) -> Bookmark | None:
+        checkpoint = self.checkpoint
+        if checkpoint is None:
+            return None
+        return Bookmark(checkpoint.load(name), lambda saved: checkpoint.save(name, saved))
+
+    def _part(self, begin: float, end: float) -> OnProgress | None:
+        """Progress of one run among several: its part of the whole."""
+        whole = self.progress
+        if whole is None:
+            return None
+
+        def report(now: Progress) -> None:
+            fraction = begin + (end - begin) * now.fraction
+            beyond = (1 - end) / (end - begin)
+            seconds_left = now.seconds_left * (1 + beyond / max(1 - now.fraction, 0.05))
+            whole(Progress(fraction, now.residual, seconds_left))
+
+        return report
+
+
+def _coarse_runs(engine: type[AbstractEngine[Any]], case: FlowCase, start: FlowField | None) -> int:
+    if engine.coarsening is None:
+        return 0
     if start is None:
         return 1
     return 0 if case.screen is None else 2
-
-
-def _guess(
-    case: FlowCase,
-    start: FlowField | None,
-    cell_size_mm: float,
-    progress: OnProgress | None,
-    checkpoint: Checkpoint | None,
-) -> FlowField | None:
-    """First guess for the fine grid, from coarse ones; only `start` where the coarse grid would be too coarse.
-
-    Where a bare flow is known, the coarse grid only has to say what the screen changes (the correction scheme of
-    multigrid, Brandt 1977, Math. Comput. 31, 333).
-    """
-    is_tiny = abs(case.vessel.closed.volume_mm3) < 4 * MIN_CELLS * cell_size_mm**3
-    if is_tiny or (start is not None and case.screen is None):
-        return start
-    if start is None:
-        first = _bookmark(checkpoint, "guess")
-        return _run(case, cell_size_mm, None, _stage(progress, 0.0, COARSE_SHARE), first)
-    first, second = _bookmark(checkpoint, "bare guess"), _bookmark(checkpoint, "stented guess")
-    bare = _run(replace(case, screen=None), cell_size_mm, start, _stage(progress, 0.0, COARSE_SHARE), first)
-    stented = _run(case, cell_size_mm, bare, _stage(progress, COARSE_SHARE, 2 * COARSE_SHARE), second)
-    before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))
-    return replace(
-        start,
-        velocity_m_s=start.velocity_m_s + after[0] - before[0],
-        pressure_Pa=start.pressure_Pa + after[1] - before[1],
-    )
-
-
-def _run(
-    case: FlowCase,
-    cell_size_mm: float,
-    start: FlowField | None,
-    progress: OnProgress | None,
-    bookmark: Bookmark | None,
-) -> FlowField:
-    engine = _engine(case.settings)(cell_size_mm)
-    try:
-        return run(engine, case, start=start, progress=progress, bookmark=bookmark)
-    except DivergenceError:
-        # The fastest blood is guessed from the openings: a narrow place inside may hold faster.
-        anew = None if bookmark is None else replace(bookmark, saved=None)
-        settings = replace(case.settings, lattice_speed=SLOWER * case.settings.lattice_speed)
-        return run(engine, replace(case, settings=settings), start=start, progress=progress, bookmark=anew)
-
-
-def _engine(settings: FlowSettings) -> Callable[[float], AbstractEngine[Any]]:
-    from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
-    from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
-
-    if settings.engine == OPENFOAM:
-        raise FlowError("OpenFOAM needs a folder to work in: call flow.engines.openfoam.simulate_in, or vstent flow")
-    if settings.engine != LATTICE:
-        found: Callable[[float], AbstractEngine[Any]] = plugins.load(
-            "vstent.engines", settings.engine, built_in=LATTICE
-        )
-        return found
-    return LatticeBoltzmann if settings.waveform is None else PulsatileLatticeBoltzmann
-
-
-def _stage(progress: OnProgress | None, begin: float, end: float) -> OnProgress | None:
-    """Progress of one run among several: its part of the whole."""
-    if progress is None:
-        return None
-
-    def report(now: Progress) -> None:
-        fraction = begin + (end - begin) * now.fraction
-        beyond = (1 - end) / (end - begin)
-        seconds_left = now.seconds_left * (1 + beyond / max(1 - now.fraction, 0.05))
-        progress(Progress(fraction, now.residual, seconds_left))
-
-    return report

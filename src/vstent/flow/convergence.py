@@ -2,14 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
-from vstent.flow import simulate_case
+from vstent.flow import engine_class, simulate_case
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.indices import indices
-from vstent.flow.types import FlowCase, FlowField
+from vstent.flow.types import FlowCase, FlowField, FlowSettings
 
 RATIO: Final = 2**0.5
 """From one grid, or time step, to the next finer one."""
@@ -70,46 +71,65 @@ def observed(values: tuple[float, float, float], ratio: float = RATIO) -> Conver
 
 
 def convergence(
-    case: FlowCase, *, told: Callable[[str], None] = lambda sentence: None
-) -> tuple[Refinement, Refinement]:
-    """Compute a flow on three grids and, on the middle one, with three time steps.
+    case: FlowCase,
+    *,
+    folder: Path | None = None,
+    told: Callable[[float, str], None] = lambda fraction, sentence: None,
+) -> tuple[Refinement, ...]:
+    """Compute a flow on three grids and, on the middle one, with each other size of the engine's made smaller twice.
 
     Parameters
     ----------
     case : its cell size is the finest.
-    told : told of every flow computed.
+    folder : where the engine may keep files of its own, a folder in it for every flow.
+    told : told of every flow computed, with the fraction of all that is done.
 
     Raises
     ------
     FlowError
         When a flow cannot be computed.
     """
-    finest_mm, speed = default_cell_size_mm(case), case.settings.lattice_speed
-    sizes_mm = (finest_mm * RATIO**2, finest_mm * RATIO, finest_mm)
-    speeds = (speed, speed / RATIO, speed / RATIO**2)
-    fields: list[FlowField] = []
-    for size_mm in sizes_mm:
-        fields.append(_flow(case, size_mm, speed, fields[-1] if fields else None))
-        told(f"{len(fields[-1].cells)} cells of {size_mm:.3g} mm in {fields[-1].seconds:.0f} s.")
-    slower = [fields[1]]
-    for lattice_speed in speeds[1:]:
-        slower.append(_flow(case, sizes_mm[1], lattice_speed, fields[1]))
-        told(f"{slower[-1].steps} time steps at lattice speed {lattice_speed:.3g} in {slower[-1].seconds:.0f} s.")
-    return (
-        Refinement("cell_size_mm", sizes_mm, _compared(case, fields)),
-        Refinement("lattice_speed", speeds, _compared(case, slower)),
-    )
+    cell_size, *others = engine_class(case.settings).refined_by
+    runs = _Runs(case, folder, told, 3 + 2 * len(others), [])
+    settings = replace(case.settings, tolerance=min(TOLERANCE, case.settings.tolerance))
+    grids = runs.refine(cell_size, RATIO**2 * default_cell_size_mm(case), settings, None)
+    middle, known = replace(settings, cell_size_mm=grids.sizes[1]), runs.done[1]
+    return grids, *(runs.refine(name, getattr(settings, name), middle, known) for name in others)
 
 
-def _flow(case: FlowCase, cell_size_mm: float, lattice_speed: float, start: FlowField | None) -> FlowField:
-    changed = replace(
-        case.settings,
-        cell_size_mm=cell_size_mm,
-        lattice_speed=lattice_speed,
-        tolerance=min(TOLERANCE, case.settings.tolerance),
-    )
-    # A stented flow takes its start for the bare one.
-    return simulate_case(replace(case, settings=changed), start=start if case.screen is None else None)
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """All flows of one case."""
+
+    case: FlowCase
+    folder: Path | None
+    told: Callable[[float, str], None]
+    count: int
+    """Flows that there will be."""
+    done: list[FlowField]
+
+    def refine(self, name: str, coarsest: float, settings: FlowSettings, known: FlowField | None) -> Refinement:
+        """Make one setting smaller twice; `known` is the flow with the coarsest, where there is one already."""
+        sizes = (coarsest, coarsest / RATIO, coarsest / RATIO**2)
+        fields = [] if known is None else [known]
+        for size in sizes[len(fields) :]:
+            start = fields[-1] if fields else None
+            fields.append(self._flow(_changed(settings, name, size), f"{name}-{size:.4g}", start))
+        return Refinement(name, sizes, _compared(self.case, fields))
+
+    def _flow(self, settings: FlowSettings, name: str, start: FlowField | None) -> FlowField:
+        case, own = replace(self.case, settings=settings), None if self.folder is None else self.folder / name
+        # A stented flow takes its start for the bare one.
+        field = simulate_case(case, start=start if case.screen is None else None, folder=own)
+        self.done.append(field)
+        said = f"{name}: {len(field.cells)} cells, {field.steps} steps in {field.seconds:.0f} s."
+        self.told(len(self.done) / self.count, said)
+        return field
+
+
+def _changed(settings: FlowSettings, name: str, size: float) -> FlowSettings:
+    values: dict[str, Any] = {name: size}
+    return replace(settings, **values)
 
 
 def _compared(case: FlowCase, fields: list[FlowField]) -> dict[str, Convergence]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from vstent.errors import FlowError
 from vstent.flow.domain import INLET_EXTENSION, OUTLET_EXTENSION, default_cell_size_mm
-from vstent.flow.engines import lattice_pulse
+from vstent.flow.engines.lattice_state import PHASES, steps_per_phase
 from vstent.flow.types import FlowCase
 from vstent.kernels import lattice
 
@@ -94,7 +94,7 @@ def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     widest = max(opening.diameter_mm for opening in vessel.openings)
     box_mm3 = float(np.prod(np.ptp(vessel.lumen.vertices_mm, axis=0) + 2 * widest))
     cells = volume_mm3 / cell_size_mm**3
-    phases = 0 if case.settings.waveform is None else lattice_pulse.PHASES
+    phases = 0 if case.settings.waveform is None else PHASES
     per_cell = BYTES_PER_CELL + phases * BYTES_PER_PHASE_AND_CELL
     return cells, BYTES_AT_LEAST + cells * per_cell + box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT
 
@@ -104,8 +104,7 @@ def _steps(case: FlowCase, cell_size_mm: float) -> int:
     settings = case.settings
     if settings.waveform is None:
         return settings.max_steps
-    engine = lattice_pulse.PulsatileLatticeBoltzmann(cell_size_mm)
-    return engine.steps_per_phase(case, None) * lattice_pulse.PHASES * settings.max_cycles
+    return steps_per_phase(case, cell_size_mm, None) * PHASES * settings.max_cycles
 
 
 @cache

@@ -8,6 +8,7 @@ import numpy as np
 
 from vstent.kernels import voxels
 from vstent.kernels.arrays import Floats, Ints, freeze
+from vstent.stent import Stent
 from vstent.surface import Surface
 from vstent.vessel import Vessel
 
@@ -15,6 +16,10 @@ LATTICE: Final = "lattice_boltzmann"
 """Name of the engine that vstent brings along."""
 OPENFOAM: Final = "openfoam"
 """Name of the engine that hands the flow to OpenFOAM, a program of its own."""
+
+
+HIGH_SHEAR_VISCOSITY_PA_S: Final = 0.00345
+"""Viscosity that goes with the numbers of `CarreauYasuda`."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,8 @@ class FlowSettings:
 
     inflow_mL_s: float | None = None
     """Mean flow through the inlet; None: 0.27 m/s times the inlet's area."""
+    blood: Blood = field(default_factory=Blood)
+    """The fluid."""
     waveform: Waveform | None = None
     """The pulse; None: steady flow at the mean."""
     max_cycles: int = 4
@@ -153,11 +160,16 @@ class FlowCase:
     ostium: Surface | None = None
     """What blood crosses between artery and sac, its normals into the sac."""
     screen: Screen | None = None
-    """The stent, or None."""
-    blood: Blood = field(default_factory=Blood)
-    """The fluid."""
+    """The stent as a resistance, or None."""
+    stent: Stent | None = None
+    """The stent's wires, for engines that resolve them, or None."""
     settings: FlowSettings = field(default_factory=FlowSettings)
     """How to compute it."""
+
+    @property
+    def blood(self) -> Blood:
+        """The fluid."""
+        return self.settings.blood
 
     @property
     def inflow_mL_s(self) -> float:

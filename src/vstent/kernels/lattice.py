@@ -264,29 +264,20 @@ def _collide_screened(
         )
 
 
+# Plain loops over unsigned places become vectors; cut into lanes by hand they were six times slower.
 @njit(cache=True, fastmath=True, inline="always")
 def _load(f: Any, address: Any, n: int, buffer: Any) -> None:
     for q in range(19):
         source, target = _U(address[q]), _U(q * SEGMENT)
-        for _ in range((n + LANES - 1) // LANES):
-            for k in range(_U(LANES)):
-                buffer[target + k] = f[source + k]
-            source += _U(LANES)
-            target += _U(LANES)
+        for k in range(_U(n)):
+            buffer[target + k] = f[source + k]
 
 
 @njit(cache=True, fastmath=True, inline="always")
 def _store(buffer: Any, address: Any, n: int, f: Any) -> None:
-    full = n // LANES
-    rest = _U(n - full * LANES)
     for q in range(19):
         source, target = _U(q * SEGMENT), _U(address[q])
-        for _ in range(full):
-            for k in range(_U(LANES)):
-                f[target + k] = buffer[source + k]
-            source += _U(LANES)
-            target += _U(LANES)
-        for k in range(rest):
+        for k in range(_U(n)):
             f[target + k] = buffer[source + k]
 
 
@@ -327,8 +318,8 @@ def update(
         extra = np.zeros(6 * SEGMENT, np.float32)
         times = np.full(SEGMENT, time)
         for s in range(n * chunk // threads, n * (chunk + 1) // threads):
-            _load(f, address[s], length[s], buffer)
             lanes = (length[s] + LANES - 1) // LANES * LANES
+            _load(f, address[s], lanes, buffer)
             if law[0] > 0.0:
                 _thin(buffer, lanes, time, law, times)
             begin, end = screen_start[s], screen_start[s + 1]

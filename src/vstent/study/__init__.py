@@ -137,8 +137,8 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
 
 
 @claiming
-def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Refinement, Refinement]:
-    """Compute the flow without a device on three grids and with three time steps; write ``convergence.json``.
+def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Refinement, ...]:
+    """Compute the flow without a device on three grids and three time steps; write ``convergence.json``.
 
     Parameters
     ----------
@@ -158,6 +158,6 @@ def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -
     source = hash_of(path)
     anatomy = find_anatomy(path, source, settings, ledger)
     ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
-    found = refine(anatomy, settings, ledger)
+    found = refine(out, anatomy, settings, ledger)
     writers.write_json(out / "convergence.json", {one.name: asdict(one) for one in found})
     return found

@@ -1,6 +1,6 @@
 """Stages of a study: each timed and told of by the ledger."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,16 +10,8 @@ import numpy as np
 
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_size
-from vstent.errors import InputError
-from vstent.flow import FlowField, FlowSettings, compare, flow_case, indices, ostium, simulate_case
-from vstent.flow import Progress as FlowProgress
+from vstent.flow import FlowField, FlowSettings, compare, flow_case, foretell_cost, indices, ostium, simulate_case
 from vstent.flow.convergence import Refinement, convergence
-from vstent.flow.cost import estimate, refuse_too_large
-from vstent.flow.domain import default_cell_size_mm
-from vstent.flow.engines.openfoam import simulate_in
-from vstent.flow.openfoam.case import STRUT_REACH_MM, struts_near
-from vstent.flow.openfoam.cost import tell_cost
-from vstent.flow.types import LATTICE, OPENFOAM
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
@@ -28,8 +20,7 @@ from vstent.measure import measure, morphology
 from vstent.repair import repair
 from vstent.restore import restore
 from vstent.segment import segment
-from vstent.stent import Deployment, Landing, Stent
-from vstent.struts import struts
+from vstent.stent import Deployment, Landing
 from vstent.study.checkpoint import FlowCheckpoint
 from vstent.study.ledger import Ledger, anatomy_key, key_of
 from vstent.study.outputs import write_field
@@ -128,16 +119,16 @@ def compute_flows(
         stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, placing)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
-            if name == BARE and settings.flow.engine in (LATTICE, OPENFOAM):
+            if name == BARE:
                 _plan(anatomy, settings.flow, ledger)
             with ledger.stage(stage) as tell:
-                if settings.flow.engine == OPENFOAM:
-                    folder = out / "flow" / name / OPENFOAM
-                    field = by_openfoam(folder, anatomy, stent, settings.flow, ledger.teller(stage))
-                else:
-                    case = flow_case(anatomy, stent, settings.flow)
-                    begun = FlowCheckpoint(ledger.folder, stage, key)
-                    field = simulate_case(case, start=fields.get(BARE), progress=ledger.teller(stage), checkpoint=begun)
+                field = simulate_case(
+                    flow_case(anatomy, stent, settings.flow),
+                    start=fields.get(BARE),
+                    folder=out / "flow" / name / settings.flow.engine,
+                    progress=ledger.teller(stage),
+                    checkpoint=FlowCheckpoint(ledger.folder, stage, key),
+                )
                 tell(field.advice)
             ledger.keep(stage, key, field)
         fields[name] = field
@@ -145,35 +136,19 @@ def compute_flows(
     return fields
 
 
-def by_openfoam(
-    folder: Path,
-    anatomy: Anatomy,
-    stent: Stent | None,
-    settings: FlowSettings,
-    progress: Callable[[FlowProgress], None],
-) -> FlowField:
-    """Compute a flow with OpenFOAM, a stent as the struts that span the neck."""
-    case = flow_case(anatomy, None, settings)
-    solids = None
-    if stent is not None:
-        if case.ostium is None:
-            raise InputError("OpenFOAM meshes struts over the neck, and this vessel has no sac: leave --device away")
-        solids = struts_near(struts(stent), case.ostium, STRUT_REACH_MM)
-    return simulate_in(folder, case, struts=solids, progress=progress)
-
-
-def refine(anatomy: Anatomy, settings: Settings, ledger: Ledger) -> tuple[Refinement, Refinement]:
-    """Compute the flow without a device on three grids and with three time steps."""
+def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> tuple[Refinement, ...]:
+    """Compute the flow without a device on three grids and, where the engine has time steps, with three of them."""
     flow = settings.flow or FlowSettings()
     _plan(anatomy, flow, ledger)
     with ledger.stage("convergence") as tell:
         done: list[str] = []
 
-        def told(sentence: str) -> None:
+        def told(fraction: float, sentence: str) -> None:
             done.append(sentence)
-            ledger.progress("convergence", len(done) / 6, sentence)
+            ledger.progress("convergence", 0.99 * fraction, sentence)
 
-        found = convergence(flow_case(anatomy, None, flow), told=told)
+        folder = out / "flow" / "convergence" / flow.engine
+        found = convergence(flow_case(anatomy, None, flow), folder=folder, told=told)
         tell(" ".join(done))
     return found
 
@@ -181,12 +156,7 @@ def refine(anatomy: Anatomy, settings: Settings, ledger: Ledger) -> tuple[Refine
 def _plan(anatomy: Anatomy, settings: FlowSettings, ledger: Ledger) -> None:
     """Say what a flow will cost; refuse one that does not fit in the memory."""
     with ledger.stage("plan flow") as tell:
-        case = flow_case(anatomy, None, settings)
-        if settings.engine == OPENFOAM:
-            tell(tell_cost(case, default_cell_size_mm(case)))
-            return
-        refuse_too_large(case)
-        tell(str(estimate(case)))
+        tell(foretell_cost(flow_case(anatomy, None, settings)))
 
 
 def vary_all(

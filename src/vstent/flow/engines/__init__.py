@@ -6,10 +6,11 @@ the driver's.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +68,34 @@ class DivergenceError(FlowError):
     """A run has grown without bounds."""
 
 
+@dataclass(frozen=True)
 class AbstractEngine(ABC, Generic[State]):
-    """A way to compute a steady flow."""
+    """A way to compute a flow; made with a cell size and a folder."""
+
+    cell_size_mm: float
+    """Edge of a cell."""
+    folder: Path | None = None
+    """The engine's own folder for this one run, not there yet: what it writes lies there, and what lies there of the
+    same run it may go on from. None: it is asked to do without."""
+
+    coarsening: ClassVar[float | None] = None
+    """Cells of a first guess by the same engine over those of the answer; None: it finds its own way from the start."""
+    refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm",)
+    """Settings that the result converges with as they become smaller; the cell size is the first."""
+
+    def cost(self, case: FlowCase) -> str:
+        """Say in a sentence what a flow will cost.
+
+        Raises
+        ------
+        FlowError
+            When it does not fit in the free memory.
+        """
+        return "What a flow costs with this engine is not known beforehand."
+
+    def calmer(self, case: FlowCase) -> FlowCase | None:
+        """Return how to try once more what diverged; None: not at all."""
+        return None
 
     @abstractmethod
     def init(self, case: FlowCase, start: FlowField | None) -> State:
@@ -86,8 +113,8 @@ class AbstractEngine(ABC, Generic[State]):
         """
 
     @abstractmethod
-    def save(self, state: State) -> Saved:
-        """Return the run as arrays."""
+    def save(self, state: State) -> Saved | None:
+        """Return the run as arrays; None: what lies in the engine's folder is enough to go on."""
 
     @abstractmethod
     def resume(self, case: FlowCase, saved: Saved) -> State:
@@ -142,7 +169,7 @@ def run(
             if progress is not None:
                 progress(_progress(residual, limit, tolerance, seconds()[1]))
         if saver.is_due():
-            saver.save(engine.save(state) | {"residual": np.array(residual), "seconds": np.array(seconds())})
+            saver.save(engine.save(state), residual=residual, seconds=seconds())
     return engine.result(state, Outcome(residual[-1] < tolerance, tuple(residual), *seconds()))
 
 
@@ -156,10 +183,10 @@ class _Saver:
     def is_due(self) -> bool:
         return self._bookmark is not None and perf_counter() >= self._due_s
 
-    def save(self, saved: Saved) -> None:
+    def save(self, saved: Saved | None, **more: Sequence[float]) -> None:
         began = perf_counter()
-        if self._bookmark is not None:
-            self._bookmark.save(saved)
+        if self._bookmark is not None and saved is not None:
+            self._bookmark.save(saved | {name: np.array(values) for name, values in more.items()})
         now = perf_counter()
         self._due_s = now + max(SAVE_EVERY_S, (now - began) / SAVE_SHARE)
 

@@ -1,65 +1,41 @@
 """The embedded engine for pulsatile flow: the same steps, the inflow following a waveform until cycles repeat."""
 
 from dataclasses import dataclass
-from math import ceil
 
 import numpy as np
 
-from vstent.errors import FlowError
-from vstent.flow.engines import AbstractEngine, Outcome, Saved
-from vstent.flow.engines.lattice_checkpoint import pack, unpack
+from vstent.flow.engines import Outcome
+from vstent.flow.engines.lattice_boltzmann import AbstractLattice
 from vstent.flow.engines.lattice_setup import Scales
-from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, peak_speed_m_s, read, step
-from vstent.flow.engines.lattice_trouble import trouble
-from vstent.flow.types import FlowCase, FlowField, Phase, Waveform
+from vstent.flow.engines.lattice_state import (
+    PHASES,
+    State,
+    build,
+    field_of,
+    is_at_check,
+    read,
+    steps_per_phase,
+    waveform_of,
+)
+from vstent.flow.types import FlowCase, FlowField, Phase
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
-PHASES = 20
-"""Times at which a cycle is kept."""
-
 
 @dataclass(frozen=True)
-class PulsatileLatticeBoltzmann(AbstractEngine[State]):
+class PulsatileLatticeBoltzmann(AbstractLattice):
     """The sparse D3Q19 engine with a waveform at the inlet."""
-
-    cell_size_mm: float
-    """Edge of a cell."""
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Choose a time step that divides the cycle and keeps the fastest blood below `lattice_speed` cells a step."""
-        steps = self.steps_per_phase(case, start)
-        phase_s = _waveform(case).period_s / PHASES
+        steps = steps_per_phase(case, self.cell_size_mm, start)
+        phase_s = waveform_of(case).period_s / PHASES
         scales = Scales(self.cell_size_mm * M_PER_MM, phase_s / steps, case.blood)
         return build(case, scales, steps, start=start, kept=PHASES)
-
-    def steps_per_phase(self, case: FlowCase, start: FlowField | None) -> int:
-        """Time steps between two phases, even."""
-        waveform = _waveform(case)
-        peak_m_s = peak_speed_m_s(case, start) * waveform.peak_factor
-        step_s = case.settings.lattice_speed * self.cell_size_mm * M_PER_MM / peak_m_s
-        return 2 * ceil(0.5 * waveform.period_s / PHASES / step_s)
-
-    def save(self, state: State) -> Saved:
-        """Return the run as arrays."""
-        return pack(state)
-
-    def resume(self, case: FlowCase, saved: Saved) -> State:
-        """Build the run anew and put it where it was."""
-        return unpack(case, self.cell_size_mm, saved)
-
-    def step(self, state: State) -> State:
-        """Advance towards the next phase."""
-        step(state)
-        return state
 
     def terminate(self, state: State) -> float | None:
         """Relative change of the monitored quantities from the last cycle but one to the last; inf within a cycle."""
         return cycle_change(np.array(state.history)) if is_at_check(state) else None
-
-    def trouble(self, state: State) -> str:
-        """Say why the run diverged."""
-        return trouble(state)
 
     def max_checks(self, state: State) -> int:
         """Phases of all cycles allowed."""
@@ -74,12 +50,6 @@ class PulsatileLatticeBoltzmann(AbstractEngine[State]):
             inlet_mL_s = -float(flow.outflow_mL_s[0])
             phases.append(Phase(time_s, inlet_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa))
         return field_of(state, read(state, list(state.snapshots)), outcome, _advice(state, outcome), tuple(phases))
-
-
-def _waveform(case: FlowCase) -> Waveform:
-    if case.settings.waveform is None:
-        raise FlowError("pulsatile flow needs a waveform: set one, or compute the steady flow")
-    return case.settings.waveform
 
 
 def cycle_change(history: Floats) -> float:

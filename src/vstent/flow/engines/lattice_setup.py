@@ -266,8 +266,10 @@ def build_links(case: FlowCase, domain: Domain, addressing: Addressing, scales: 
 
 
 def _link_order(domain: Domain) -> Ints:
-    """Openings first, in order, then the wall; by cell within each."""
-    return np.argsort(np.where(domain.link_patch == 0, len(domain.sections) + 1, domain.link_patch), kind="stable")
+    """Openings first, in order, by cell within each; then the wall, by direction so that each address runs on."""
+    is_wall = domain.link_patch == 0
+    patch = np.where(is_wall, len(domain.sections) + 1, domain.link_patch)
+    return np.lexsort((domain.link_cell, np.where(is_wall, domain.link_direction, 0), patch))
 
 
 def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:

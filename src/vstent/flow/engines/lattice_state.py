@@ -3,12 +3,14 @@
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import ceil
 from time import perf_counter
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow import sampling
 from vstent.flow.engines import Outcome
@@ -26,7 +28,7 @@ from vstent.flow.engines.lattice_setup import (
     build_screen,
     in_extensions,
 )
-from vstent.flow.types import FlowCase, FlowField, Phase
+from vstent.flow.types import FlowCase, FlowField, Phase, Waveform
 from vstent.flow.wall_stress import wall_stress
 from vstent.kernels import lattice, lattice_sampling
 from vstent.kernels.arrays import Floats, Ints
@@ -38,6 +40,10 @@ DEFER_PART = 0.15
 """Part of the way that each update goes."""
 SLICE_UPDATES = 2e8
 """Cell updates between looks at the clock: a few seconds of one core."""
+
+
+PHASES = 20
+"""Times at which a cycle is kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +140,27 @@ def peak_speed_m_s(case: FlowCase, start: FlowField | None) -> float:
         return 1.1 * float(start.speed_m_s.max())
     narrowest_mm2 = min(case.vessel.inlet.area_mm2, sum(outlet.area_mm2 for outlet in case.vessel.outlets))
     return 3.0 * case.inflow_mL_s / narrowest_mm2
+
+
+def steps_per_phase(case: FlowCase, cell_size_mm: float, start: FlowField | None) -> int:
+    """Time steps between two phases of a pulse, even: the fastest blood stays below `lattice_speed` cells a step."""
+    waveform = waveform_of(case)
+    peak_m_s = peak_speed_m_s(case, start) * waveform.peak_factor
+    step_s = case.settings.lattice_speed * cell_size_mm * M_PER_MM / peak_m_s
+    return 2 * ceil(0.5 * waveform.period_s / PHASES / step_s)
+
+
+def waveform_of(case: FlowCase) -> Waveform:
+    """Return the pulse of a case.
+
+    Raises
+    ------
+    FlowError
+        When it has none.
+    """
+    if case.settings.waveform is None:
+        raise FlowError("pulsatile flow needs a waveform: set one, or compute the steady flow")
+    return case.settings.waveform
 
 
 def _probe(case: FlowCase, domain: domains.Domain) -> Probe:

@@ -5,7 +5,6 @@ flow, so that every index, streamline and picture takes either.
 """
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -15,17 +14,19 @@ import numpy as np
 
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
-from vstent.flow.domain import default_cell_size_mm
-from vstent.flow.engines import AbstractEngine, Outcome, Progress, Saved, run
+from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.engines.lattice_boltzmann import CHECKS_AGREEING, CHECKS_AVERAGED, fraction_left
-from vstent.flow.engines.lattice_pulse import PHASES, cycle_change
+from vstent.flow.engines.lattice_pulse import cycle_change
+from vstent.flow.engines.lattice_state import PHASES
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
-from vstent.flow.openfoam.case import foam_case
+from vstent.flow.openfoam.case import STRUT_REACH_MM, foam_case, struts_near
+from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.types import FlowCase, FlowField, Phase
 from vstent.kernels.arrays import Floats, Ints
+from vstent.struts import struts
 from vstent.surface import Surface
 
 CHECK_ITERATIONS: Final = 50
@@ -71,30 +72,29 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class OpenFoam(AbstractEngine[State]):
-    """OpenFOAM's laminar solvers on a mesh by snappyHexMesh: simpleFoam, or pimpleFoam along a waveform."""
+    """OpenFOAM's laminar solvers on a mesh by snappyHexMesh: simpleFoam, or pimpleFoam along a waveform.
 
-    cell_size_mm: float
-    """Edge of a cell of OpenFOAM's mesh in the vessel, before layers and refinement."""
-    folder: Path
-    """Case folder; a run of the same case that stopped there goes on from the last time written."""
-    processes: int = 1
-    """Processes on this machine."""
-    struts: Surface | None = None
-    """Solids of a device to mesh."""
+    The cell size is that of the mesh in the vessel, before layers and refinement; a run of the same case that
+    stopped in the folder goes on from the last time written. A stent is meshed as the struts over the neck.
+    """
+
     layers: int = 2
     """Layers of flat cells along the wall."""
     grid_size_mm: float | None = None
     """Edge of a cell of the result's grid; None: as OpenFOAM's."""
 
+    def cost(self, case: FlowCase) -> str:
+        """Say how many cells, how much memory and time, before struts."""
+        return tell_cost(case, self.cell_size_mm)
+
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Find OpenFOAM, write the case, mesh it, and find the way from its cells to the grid."""
-        if case.screen is not None:
-            raise FlowError(
-                "OpenFOAM's porous zones resist alike in every cell, a screen does not: mesh the device's struts, or "
-                "take the embedded engine"
-            )
-        found = program.find()
-        setup = FoamSetup(self.cell_size_mm, found.flavour, self.layers, processes=self.processes, struts=self.struts)
+        if self.folder is None:
+            raise FlowError("OpenFOAM needs a folder to work in: name one")
+        solids, found = _solids(case), program.find()
+        setup = FoamSetup(
+            self.cell_size_mm, found.flavour, self.layers, processes=case.settings.processes, struts=solids
+        )
         foam = foam_case(case, setup)
         folders.prepare(self.folder, foam)
         folders.mesh(found, self.folder, setup)
@@ -132,9 +132,8 @@ class OpenFoam(AbstractEngine[State]):
             return 0.0
         return max(fraction_left(history[: len(history) - k]) for k in range(min(CHECKS_AGREEING, len(history))))
 
-    def save(self, state: State) -> Saved:
+    def save(self, state: State) -> None:
         """Return nothing: OpenFOAM's own times in the case folder are what a run goes on from."""
-        return {}
 
     def resume(self, case: FlowCase, saved: Saved) -> State:
         """Go on from the last time written."""
@@ -160,31 +159,18 @@ class OpenFoam(AbstractEngine[State]):
         return _field_of(state, [state.snapshots[-1]] if is_last else list(state.snapshots), outcome)
 
 
-def simulate_in(
-    folder: Path,
-    case: FlowCase,
-    *,
-    struts: Surface | None = None,
-    start: FlowField | None = None,
-    progress: Callable[[Progress], None] | None = None,
-) -> FlowField:
-    """Compute one flow with OpenFOAM in a folder; one that stopped there goes on.
-
-    Parameters
-    ----------
-    folder : the case folder to write.
-    case : what to compute; it has no screen.
-    struts : the device's solids, meshed.
-    start : a flow in the same vessel to start from.
-    progress : called at every check; what it raises ends the run.
-
-    Raises
-    ------
-    FlowError
-        When there is no OpenFOAM, the case does not fit in the memory, or a program of OpenFOAM fails.
-    """
-    engine = OpenFoam(default_cell_size_mm(case), folder, case.settings.processes, struts)
-    return run(engine, case, start=start, progress=progress)
+def _solids(case: FlowCase) -> Surface | None:
+    """Wires of the case's stent that span the neck, as solids."""
+    if case.stent is None and case.screen is None:
+        return None
+    if case.stent is None:
+        raise FlowError(
+            "OpenFOAM's porous zones resist alike in every cell, a screen does not: give the stent, whose struts are "
+            "meshed, or take the embedded engine"
+        )
+    if case.ostium is None:
+        raise FlowError("OpenFOAM meshes struts over the neck, and this vessel has no sac: leave the device away")
+    return struts_near(struts(case.stent), case.ostium, STRUT_REACH_MM)
 
 
 def _next_end(state: State, reached: float) -> float:

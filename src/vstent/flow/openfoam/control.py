@@ -161,17 +161,32 @@ def _prime_factors(number: int) -> list[int]:
 
 
 def fluid(blood: Blood, setup: FoamSetup) -> dict[str, str]:
-    """Properties of the blood by file name: kinematic viscosity, no turbulence."""
-    nu = f"[0 2 -1 0 0 0 0] {blood.kinematic_viscosity_m2_s:.9g}"
+    """Properties of the blood by file name: kinematic viscosity, its law where it thins, no turbulence."""
     note = f"Blood: {blood.viscosity_Pa_s:.6g} Pa s at {blood.density_kg_m3:.6g} kg/m3; p is pressure over density."
+    nu, nu_at_rest, law = _viscosity(blood)
+    laminar: dict[str, Any] = {"simulationType": "laminar"}
     if setup.flavour == "org":
+        if law:
+            laminar["laminar"] = {"model": "generalisedNewtonian", "viscosityModel": "BirdCarreau", **law}
+        constant = {"viscosityModel": "constant", "nu": nu_at_rest}
         return {
-            "physicalProperties": foam_file("physicalProperties", {"viscosityModel": "constant", "nu": nu}, note=note),
-            "momentumTransport": foam_file("momentumTransport", {"simulationType": "laminar"}),
+            "physicalProperties": foam_file("physicalProperties", constant, note=note),
+            "momentumTransport": foam_file("momentumTransport", laminar),
         }
+    transport: dict[str, Any] = {"transportModel": "Newtonian", "nu": f"nu {nu}"}
+    if law:
+        transport = {"transportModel": "BirdCarreau", "BirdCarreauCoeffs": {"nu0": nu_at_rest, **law}}
     return {
-        "transportProperties": foam_file(
-            "transportProperties", {"transportModel": "Newtonian", "nu": f"nu {nu}"}, note=note
-        ),
-        "turbulenceProperties": foam_file("turbulenceProperties", {"simulationType": "laminar"}),
+        "transportProperties": foam_file("transportProperties", transport, note=note),
+        "turbulenceProperties": foam_file("turbulenceProperties", laminar),
     }
+
+
+def _viscosity(blood: Blood) -> tuple[str, str, dict[str, str]]:
+    """Kinematic viscosity at high shear and at rest, and what else Carreau and Yasuda's law (BirdCarreau) needs."""
+    nu, law = f"[0 2 -1 0 0 0 0] {blood.kinematic_viscosity_m2_s:.9g}", blood.thinning
+    if law is None:
+        return nu, nu, {}
+    nu_at_rest = f"[0 2 -1 0 0 0 0] {law.rest_viscosity_Pa_s / blood.density_kg_m3:.9g}"
+    numbers = {name: f"[0 0 0 0 0 0 0] {getattr(law, name):.9g}" for name in ("n", "a")}
+    return nu, nu_at_rest, {"nuInf": nu, "k": f"[0 0 1 0 0 0 0] {law.time_s:.9g}", **numbers}
