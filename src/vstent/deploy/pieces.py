@@ -25,12 +25,8 @@ The least that keeps every cell open in tight siphons; cells whose struts are jo
 """
 STIFFNESS: Final = 0.1
 """How much a wire that bends otherwise weighs against a piece of wire that stretches by as much."""
-STEPS: Final = 8
-"""Gauss-Newton steps at most."""
-GAIN: Final = 0.05
-"""Less gained by a step, relative, ends them."""
-TOLERANCE: Final = 0.1
-"""Of every least-squares problem, relative."""
+DESCENT: Final = net.Descent(steps=9, gain=0.03, tolerance=0.1)
+"""When the crossings have gone far enough."""
 
 
 class Slid(NamedTuple):
@@ -68,7 +64,7 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int) -> Slid:
     weights = net.Weights(
         piece_length_mm(design, size), RESISTANCE, CROWDING[design.kind], STIFFNESS, round(held / shape.row_split)
     )
-    slid = net.slide(pieces, weights, STEPS, GAIN, TOLERANCE) / spacing_mm
+    slid = net.slide(pieces, weights, DESCENT) / spacing_mm
     rows, columns = (_spread(moves, lattice, shape) for moves in slid.T)
     row = np.arange(shape.rows)[:, None] + rows - rows[held].mean()
     return Slid(_bilinear(continued_mm, row + 1, np.arange(shape.columns) + columns), row)
@@ -118,7 +114,8 @@ def _lattice(shape: Grid) -> _Lattice:
     ]
     bends = np.array(ways).transpose(1, 2, 0).reshape(3, -1)
     row, column = line * shape.row_split, column * shape.column_split
-    return _Lattice(line, row, column, beside, np.ascontiguousarray(both), np.ascontiguousarray(bends))
+    line, beside, both, bends = (values.astype(np.uint32, order="C") for values in (line, beside, both, bends))
+    return _Lattice(line, row, column, beside, both, bends)
 
 
 def _continued(nodes_mm: Floats) -> Floats:
