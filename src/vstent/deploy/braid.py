@@ -127,7 +127,7 @@ class ConstantWire(AbstractMethod):
         return self._marched(placement, opened) if self.terminate(opened) else opened
 
     def result(self, placement: Placement, opened: Opened) -> Opened:
-        """Let crossings slide until pieces of wire have their length, and put every node back to the wall."""
+        """Let crossings slide until pieces of wire have their length; put nodes to the wall but where cells leave it."""
         for _ in range(LAST_STEPS):
             if opened.contour.is_terminated.all():
                 break
@@ -143,7 +143,9 @@ class ConstantWire(AbstractMethod):
         nodes_mm = self._no_wider(state.nodes_mm, laid_mm, placement.size.free_diameter_mm)
         rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
         check_inside(placement.design, placement.size, rows_mm, placement.anatomy.axis.length_mm)
-        return Opened(replace(state, nodes_mm=nodes_mm), rows_mm)
+        is_lifted = slid.lift_mm.any(axis=2)
+        state = replace(state, nodes_mm=nodes_mm + slid.lift_mm)
+        return Opened(self.contour.classify(state, is_lifted, placement.wall), rows_mm)
 
     @staticmethod
     def _no_wider(slid_mm: Floats, laid_mm: Floats, free_mm: float) -> Floats:
