@@ -213,7 +213,8 @@ def test_without_sliding_pieces_of_wire_in_the_bend_would_stretch(monkeypatch):
 
 
 def _unslid(nodes_mm):
-    return pieces.Slid(nodes_mm, np.broadcast_to(np.arange(len(nodes_mm))[:, None], nodes_mm.shape[:2]).astype(float))
+    row = np.broadcast_to(np.arange(len(nodes_mm))[:, None], nodes_mm.shape[:2]).astype(float)
+    return pieces.Slid(nodes_mm, row, np.zeros_like(nodes_mm))
 
 
 def test_in_an_oval_lumen_the_length_follows_the_perimeter():

@@ -93,7 +93,8 @@ def start(artery, method, radius_mm, rows=ROWS):
     across = contour.planes(artery.axis)
     turn = np.array([[np.cos(0.1), np.sin(0.1)], [-np.sin(0.1), np.cos(0.1)]])  # no node has two nearest points
     nodes_mm = across.place(z, contour.circles(np.full(rows, radius_mm), COLUMNS) @ turn)
-    return method.init(nodes_mm, across.at(z)[0], TreeWall(artery.landing_surface))
+    wall, centers_mm = TreeWall(artery.landing_surface), across.middle(z)
+    return method.init(nodes_mm, centers_mm, wall.contact(centers_mm).distance_mm, wall)
 
 
 def test_forces_are_those_of_equations_4_and_5(artery):
@@ -150,7 +151,9 @@ def test_the_fraction_of_terminated_nodes_never_falls_and_terminated_nodes_stay(
     s = np.linspace(4, 10, 30)
     nodes_mm = across.place(s, contour.circles(np.full(30, 0.9), 20))
     seen = []
-    done = relax(method, method.init(nodes_mm, across.at(s)[0], wall), wall, progress=lambda i, f: seen.append((i, f)))
+    centers_mm = across.middle(s)
+    state = method.init(nodes_mm, centers_mm, wall.contact(centers_mm).distance_mm, wall)
+    done = relax(method, state, wall, progress=lambda i, f: seen.append((i, f)))
     assert done.outcome == "terminated"
     assert len(done.terminated_fraction) > 3
     assert np.all(np.diff(done.terminated_fraction) >= 0)

@@ -24,8 +24,8 @@ Confidence = Literal["cited", "derived", "estimated"]
 
 STEEP_RAD = 0.1, 1.5
 """Angles between wire and axis that a device may have at its free diameter."""
-BEND_SAMPLES, BEND_STEPS = 24, 6
-"""Angles round the axis, and Newton steps, in which the spacing of rows in a bend is computed."""
+BEND_SAMPLES, BEND_STEPS = 12, 6
+"""Angles round half the axis (the other half mirrors it), and Newton steps, in which the spacing of rows in a bend is computed."""
 STEEPEST_BEND = 0.9
 """Artery's radius over the bend's, at most: sharper ones are only sharp where the wall is folded."""
 STRAIGHTEST = 0.995
@@ -252,7 +252,7 @@ def row_spacing_mm(
     if isinstance(design, LaserCut) or not np.any(curvature_per_mm):
         return piece_mm * np.cos(angle)
     bend = np.minimum(0.5 * np.abs(curvature_per_mm) * diameter_mm, STEEPEST_BEND)
-    apart = 1 + np.multiply.outer(bend, np.cos(2 * np.pi * (np.arange(BEND_SAMPLES) + 0.5) / BEND_SAMPLES))
+    apart = 1 + np.multiply.outer(bend, np.cos(np.pi * (np.arange(BEND_SAMPLES) + 0.5) / BEND_SAMPLES))
     longest = STRAIGHTEST / (1 + bend)
     cosine = np.minimum(np.cos(angle), longest)
     for _ in range(BEND_STEPS):  # Newton's; the mean grows faster than linearly with the cosine

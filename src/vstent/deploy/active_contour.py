@@ -9,7 +9,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from vstent.deploy.contour import normals
 from vstent.deploy.wall import ON_WALL_MM, AbstractWall, Contact
-from vstent.kernels.arrays import Bools, Floats
+from vstent.kernels.arrays import Bools, Floats, Ints
 
 SAFELY: Final = 1 - 1e-9
 """Balls without a wall in them are taken smaller by this, so that rounding cannot hide a crossing."""
@@ -86,11 +86,13 @@ class State:
     stiffness: Stiffness
     """I + tau K, factored."""
 
-    def about(self, centers_mm: Floats, wall: AbstractWall) -> "State":
-        """Return the contour with a fiducial point for every row (rows, 3)."""
-        shape = self.nodes_mm.shape
-        clearance_mm = np.broadcast_to(wall.contact(centers_mm).distance_mm[:, None], shape[:2])
-        return replace(self, centers_mm=np.broadcast_to(centers_mm[:, None], shape), clearance_mm=clearance_mm)
+    def about(self, centers_mm: Floats, rows: Ints) -> "State":
+        """Return the contour with other fiducial points (rows, columns, 3), each near that of a row (rows, columns).
+
+        The clearance falls off from there no faster than one moves away.
+        """
+        off_mm = np.linalg.norm(centers_mm - self.centers_mm[rows, 0], axis=2)
+        return replace(self, centers_mm=centers_mm, clearance_mm=np.maximum(self.clearance_mm[rows, 0] - off_mm, 0.0))
 
     @cached_property
     def terminated_fraction(self) -> float:
@@ -135,15 +137,17 @@ class ActiveContour:
     iteration_limit: int = 60
     """Iterations after which the contour gives up."""
 
-    def init(self, nodes_mm: Floats, centers_mm: Floats, wall: AbstractWall) -> State:
-        """Start from a contour (rows, columns, 3) with row centers (rows, 3) inside the lumen."""
-        rows, columns = nodes_mm.shape[:2]
-        stiffness = Stiffness.of(self, rows, columns)
-        moving = np.zeros((rows, columns), dtype=bool)
-        state = State(
-            nodes_mm, nodes_mm, np.zeros((rows, columns)), moving, wall.contact(nodes_mm.reshape(-1, 3)), stiffness
+    def init(self, nodes_mm: Floats, centers_mm: Floats, clearance_mm: Floats, wall: AbstractWall) -> State:
+        """Start from a contour (rows, columns, 3) with row centers (rows, 3) inside the lumen, (rows,) off the wall."""
+        shape = nodes_mm.shape
+        return State(
+            nodes_mm,
+            np.broadcast_to(centers_mm[:, None], shape),
+            np.broadcast_to(clearance_mm[:, None], shape[:2]),
+            np.zeros(shape[:2], dtype=bool),
+            wall.contact(nodes_mm.reshape(-1, 3)),
+            Stiffness.of(self, shape[0], shape[1]),
         )
-        return state.about(centers_mm, wall)
 
     def step(self, state: State, wall: AbstractWall) -> State:
         """Move the nodes that continue, then terminate those that reach the wall or cross it."""

@@ -127,7 +127,7 @@ class ConstantWire(AbstractMethod):
         return self._marched(placement, opened) if self.terminate(opened) else opened
 
     def result(self, placement: Placement, opened: Opened) -> Opened:
-        """Let crossings slide until pieces of wire have their length, and put every node back to the wall."""
+        """Let crossings slide until pieces of wire have their length; put nodes to the wall but where cells leave it."""
         for _ in range(LAST_STEPS):
             if opened.contour.is_terminated.all():
                 break
@@ -136,16 +136,16 @@ class ConstantWire(AbstractMethod):
         held = landed_row(placement.design, placement.size, placement.landing)
         slid = pieces.slide(placement.design, placement.size, opened.contour.nodes_mm, held)
         where_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row)
-        centers_mm = placement.across.at(where_mm.ravel())[0].reshape(slid.nodes_mm.shape)
-        # The clearance falls off from a row's center no faster than one moves away from it.
-        off_mm = np.linalg.norm(centers_mm - opened.contour.centers_mm, axis=2)
-        clearance_mm = np.maximum(opened.contour.clearance_mm - off_mm, 0.0)
-        state = replace(opened.contour, nodes_mm=slid.nodes_mm, centers_mm=centers_mm, clearance_mm=clearance_mm)
-        state, laid_mm = self._laid(placement, state)
+        centers_mm = placement.across.middle(where_mm.ravel()).reshape(slid.nodes_mm.shape)
+        state = opened.contour.about(centers_mm, np.clip(np.rint(slid.row), 0, rows[-1]).astype(int))
+        everywhere = np.ones_like(state.is_terminated)
+        state, laid_mm = self._laid(placement, replace(state, nodes_mm=slid.nodes_mm), everywhere)
         nodes_mm = self._no_wider(state.nodes_mm, laid_mm, placement.size.free_diameter_mm)
         rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
         check_inside(placement.design, placement.size, rows_mm, placement.anatomy.axis.length_mm)
-        return Opened(replace(state, nodes_mm=nodes_mm), rows_mm)
+        is_lifted = slid.lift_mm.any(axis=2)
+        state = replace(state, nodes_mm=nodes_mm + slid.lift_mm)
+        return Opened(self.contour.classify(state, is_lifted, placement.wall), rows_mm)
 
     @staticmethod
     def _no_wider(slid_mm: Floats, laid_mm: Floats, free_mm: float) -> Floats:
@@ -185,23 +185,30 @@ class ConstantWire(AbstractMethod):
         return opened
 
     def _moved(self, placement: Placement, opened: Opened, rows_mm: Floats) -> Opened:
-        """Move the rows along the axis, keeping the contour's shape; space nodes evenly and put them to the wall."""
-        across, state = placement.across, opened.contour
-        in_plane_mm = evenly_spaced(across.coordinates(opened.abscissa_mm, state.nodes_mm))
-        nodes_mm = across.place(rows_mm, _interpolated(opened.abscissa_mm, in_plane_mm, rows_mm))
-        state = replace(state, nodes_mm=nodes_mm).about(across.at(rows_mm)[0], placement.wall)
-        state, laid_mm = self._laid(placement, state)
+        """Move the rows along the axis, keeping the contour's shape, and space nodes evenly.
+
+        Rows beyond where the contour was are put to the wall; those between stay near it until the result is.
+        """
+        across, state, before_mm = placement.across, opened.contour, opened.abscissa_mm
+        in_plane_mm = evenly_spaced(across.coordinates(before_mm, state.nodes_mm))
+        nodes_mm = across.place(rows_mm, _interpolated(before_mm, in_plane_mm, rows_mm))
+        near = np.rint(np.interp(rows_mm, before_mm, np.arange(len(before_mm)))).astype(int)
+        centers_mm = np.broadcast_to(across.middle(rows_mm)[:, None], nodes_mm.shape)
+        state = state.about(centers_mm, np.broadcast_to(near[:, None], nodes_mm.shape[:2]))
+        is_beyond = (rows_mm < before_mm[0]) | (rows_mm > before_mm[-1])
+        is_asked = np.broadcast_to(is_beyond[:, None], nodes_mm.shape[:2])
+        state, laid_mm = self._laid(placement, replace(state, nodes_mm=nodes_mm), is_asked)
         free = FreeDiameter(placement.size.free_diameter_mm)
         return Opened(replace(state, nodes_mm=free(state.nodes_mm, laid_mm)[0]), rows_mm)
 
-    def _laid(self, placement: Placement, state: State) -> tuple[State, Floats]:
-        """Put nodes that were moved out of the wall's way; return also where (rows, columns, 3) they lie against it.
+    def _laid(self, placement: Placement, state: State, is_asked: Bools) -> tuple[State, Floats]:
+        """Put nodes asked about (rows, columns) out of the wall's way; return also where all lie against it.
 
         A node that had terminated goes back to the wall by eq. (6, 7); one that still moves does so only where it
         would be outside or nearer than dd.
         """
-        held = state.is_terminated
-        state = self.contour.classify(state, np.ones_like(held), placement.wall)
+        held = state.is_terminated & is_asked
+        state = self.contour.classify(state, is_asked, placement.wall)
         points_mm = state.nodes_mm.reshape(-1, 3)
         is_off = held.ravel() & (state.contact.distance_mm > self.contour.dd_mm)
         back_mm = self.contour.relocated_mm(points_mm, np.zeros_like(is_off), state.contact)

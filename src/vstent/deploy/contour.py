@@ -38,14 +38,18 @@ class Planes:
         """(k,) by how much the normals turn, rad per mm."""
         return np.linalg.norm(np.gradient(self.frames[:, 0], self.abscissa_mm, axis=0), axis=1)
 
+    def middle(self, abscissa_mm: Floats) -> Floats:
+        """Return centers (n, 3) at arc lengths (n,)."""
+        return curves.interpolate(self.abscissa_mm, self.centers_mm, abscissa_mm)
+
     def at(self, abscissa_mm: Floats) -> tuple[Floats, Floats]:
         """Return centers (n, 3) and frames (n, 3, 3) at arc lengths (n,)."""
-        flat = np.concatenate([self.centers_mm, self.frames[:, 0], self.frames[:, 1]], axis=1)
+        flat = np.concatenate([self.frames[:, 0], self.frames[:, 1]], axis=1)
         found = curves.interpolate(self.abscissa_mm, flat, abscissa_mm)
-        normal = found[:, 3:6] / np.linalg.norm(found[:, 3:6], axis=1, keepdims=True)
-        first = found[:, 6:9] - np.einsum("ij,ij->i", found[:, 6:9], normal)[:, None] * normal
+        normal = found[:, :3] / np.linalg.norm(found[:, :3], axis=1, keepdims=True)
+        first = found[:, 3:] - np.einsum("ij,ij->i", found[:, 3:], normal)[:, None] * normal
         first /= np.linalg.norm(first, axis=1, keepdims=True)
-        return found[:, :3], np.stack([normal, first, np.cross(normal, first)], axis=1)
+        return self.middle(abscissa_mm), np.stack([normal, first, np.cross(normal, first)], axis=1)
 
     def place(self, abscissa_mm: Floats, in_plane_mm: Floats) -> Floats:
         """Return the points (n, m, 3) whose plane coordinates (n, m, 2) are given at arc lengths (n,)."""

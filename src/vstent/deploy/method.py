@@ -52,11 +52,12 @@ class Placement:
         """
         check_inside(self.design, self.size, rows_mm, self.anatomy.axis.length_mm)
         axis = self.anatomy.axis
-        centers_mm = self.across.at(rows_mm)[0]
+        centers_mm = self.across.middle(rows_mm)
+        clearance_mm = self.wall.contact(centers_mm).distance_mm
         radius_mm = np.interp(rows_mm, axis.abscissa_mm, axis.inscribed_radius_mm)
-        radius_mm = np.minimum(radius_mm, self.wall.contact(centers_mm).distance_mm)
-        ring = circles(np.minimum(radius_mm, 0.5 * widest_mm), grid(self.design, self.size).columns)
-        return contour.init(self.across.place(rows_mm, ring), centers_mm, self.wall)
+        radius_mm = np.minimum(np.minimum(radius_mm, clearance_mm), 0.5 * widest_mm)
+        ring = circles(radius_mm, grid(self.design, self.size).columns)
+        return contour.init(self.across.place(rows_mm, ring), centers_mm, clearance_mm, self.wall)
 
 
 @final

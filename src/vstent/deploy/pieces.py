@@ -5,6 +5,7 @@ not stretch: columns come closer together outside, where rows are farther apart,
 of them move nearer together: what a bend takes from the wires' room round the device, its length gives. The crossings
 are those of `vstent.kernels.net`: pieces of wire of the right length first, then the nearest among the many nets that
 allow it, with cells kept open where none does: outside a bend so tight that the straightened wire is still too short.
+Joints of a laser-cut device are those of `vstent.deploy.cells`: they may leave the wall.
 """
 
 from functools import cache
@@ -12,25 +13,23 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from vstent.device import Design, Grid, Size, grid, piece_length_mm
+from vstent.deploy import cells
+from vstent.deploy.contour import normals
+from vstent.device import Design, Grid, LaserCut, Size, grid, piece_length_mm
 from vstent.kernels import net
 from vstent.kernels.arrays import Floats, Ints
 
 RESISTANCE: Final = 0.01
 """How much a crossing that slides out of its row weighs against a piece of wire that stretches by as much."""
-CROWDING: Final = {"braid": 0.1, "laser_cut": 0.5}
+CROWDING: Final = 0.1
 """How much neighbours in a row that come nearer together weigh against a piece of wire that stretches by as much.
 
-The least that keeps every cell open in tight siphons; cells whose struts are joined resist more than wires that cross.
+The least that keeps every cell open in tight siphons.
 """
 STIFFNESS: Final = 0.1
 """How much a wire that bends otherwise weighs against a piece of wire that stretches by as much."""
-STEPS: Final = 8
-"""Gauss-Newton steps at most."""
-GAIN: Final = 0.05
-"""Less gained by a step, relative, ends them."""
-TOLERANCE: Final = 0.1
-"""Of every least-squares problem, relative."""
+DESCENT: Final = net.Descent(steps=9, gain=0.03, tolerance=0.1)
+"""When the crossings have gone far enough."""
 
 
 class Slid(NamedTuple):
@@ -40,6 +39,8 @@ class Slid(NamedTuple):
     """(rows, columns, 3) nodes."""
     row: Floats
     """(rows, columns) where on the old contour every node lies, in rows."""
+    lift_mm: Floats
+    """(rows, columns, 3) by how much, and where to, nodes leave the wall."""
 
 
 def slide(design: Design, size: Size, nodes_mm: Floats, held: int) -> Slid:
@@ -65,13 +66,17 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int) -> Slid:
         _bulge_mm2(nodes_mm[:: shape.row_split, :: shape.column_split]),
         lattice.bends,
     )
-    weights = net.Weights(
-        piece_length_mm(design, size), RESISTANCE, CROWDING[design.kind], STIFFNESS, round(held / shape.row_split)
-    )
-    slid = net.slide(pieces, weights, STEPS, GAIN, TOLERANCE) / spacing_mm
-    rows, columns = (_spread(moves, lattice, shape) for moves in slid.T)
-    row = np.arange(shape.rows)[:, None] + rows - rows[held].mean()
-    return Slid(_bilinear(continued_mm, row + 1, np.arange(shape.columns) + columns), row)
+    length_mm, held_line = piece_length_mm(design, size), round(held / shape.row_split)
+    if isinstance(design, LaserCut):
+        width_mm = size.free_diameter_mm * np.sin(2 * np.pi / design.n_columns)
+        moves_mm = cells.relax(pieces, length_mm, width_mm, held_line)
+    else:
+        weights = net.Weights(length_mm, RESISTANCE, CROWDING, STIFFNESS, held_line)
+        moves_mm = np.pad(net.slide(pieces, weights, DESCENT), ((0, 0), (0, 1)))
+    rows, columns, off_mm = (_spread(moves, lattice, shape) for moves in (moves_mm / [*spacing_mm, 1.0]).T)
+    row, column = np.arange(shape.rows)[:, None] + rows - rows[held].mean(), np.arange(shape.columns) + columns
+    lift_mm = -off_mm[..., None] * _bilinear(normals(continued_mm), row + 1, column)
+    return Slid(_bilinear(continued_mm, row + 1, column), row, lift_mm)
 
 
 def _bulge_mm2(nodes_mm: Floats) -> Floats:
@@ -118,7 +123,8 @@ def _lattice(shape: Grid) -> _Lattice:
     ]
     bends = np.array(ways).transpose(1, 2, 0).reshape(3, -1)
     row, column = line * shape.row_split, column * shape.column_split
-    return _Lattice(line, row, column, beside, np.ascontiguousarray(both), np.ascontiguousarray(bends))
+    line, beside, both, bends = (values.astype(np.uint32, order="C") for values in (line, beside, both, bends))
+    return _Lattice(line, row, column, beside, both, bends)
 
 
 def _continued(nodes_mm: Floats) -> Floats:

@@ -110,9 +110,10 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
     slid = pieces.slide(design, size, wall.across.place(rows_mm, laid[..., :2]), held)
     rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), rows_mm, slid.row.mean(axis=1))
     near = np.clip(np.rint(slid.row).astype(int), 0, len(rows_mm) - 1)
-    gap_mm = np.take_along_axis(laid[..., 2], near, axis=0)
-    wires = _wires(wall, slid.nodes_mm)
-    stent = Stent(design, size, slid.nodes_mm, rows_mm, wires.points_mm, wires.starts, wires.diameter_um)
+    gap_mm = np.take_along_axis(laid[..., 2], near, axis=0) + np.linalg.norm(slid.lift_mm, axis=2)
+    nodes_mm = slid.nodes_mm + slid.lift_mm
+    wires = _wires(wall, nodes_mm)
+    stent = Stent(design, size, nodes_mm, rows_mm, wires.points_mm, wires.starts, wires.diameter_um)
     moved_mm = (rows_mm - marched_mm)[[0, -1]]
     ends_mm = [_ends_mm(wall, landing, sense * wall.diameter_band_mm) + moved_mm for sense in (-1, 1)]
     (first, last), (other_first, other_last) = (ends.tolist() for ends in ends_mm)

@@ -7,8 +7,9 @@ Crossings x (c, 2), moves along and around in mm, are those of least
     +  sum over neighbours in a row of (crowding times how much nearer together or further apart they come)^2
     +  sum over neighbours on a wire of (stiffness times the second difference of their moves)^2
 
-with the mean of one row held where it is. Gauss-Newton steps; every one solves its normal equations by conjugate
-gradients, preconditioned by the diagonal and by one coarse problem: whole rows moved, tilted, turned and bunched.
+with the mean of one row held where it is. Steps of Levenberg and Marquardt (their inertia falls with every one); each
+solves its normal equations by conjugate gradients, preconditioned by the diagonal and by one coarse problem: whole rows
+moved, tilted, turned and bunched.
 """
 
 from typing import Any, Final, NamedTuple
@@ -24,10 +25,12 @@ _BAND: Final = 2 * _WAVES
 """Width of its matrix: a row and the next."""
 
 
-REACH: Final = 0.3
-"""A crossing moves no further in a step, mm."""
-SHORTEST: Final = 0.05
-"""A step that does not help is halved down to this."""
+INERTIA: Final = 0.03
+"""Weight, squared, of a crossing's move otherwise than its row in the first step."""
+CALMING: Final = 3.0
+"""It falls by this factor with every step that helps, and rises by its square when one does not."""
+STUCK: Final = 10.0
+"""With more inertia than this nothing moves any more."""
 ROUNDS: Final = 200
 """Of conjugate gradients, at most."""
 
@@ -42,7 +45,7 @@ class Net(NamedTuple):
     column: Ints
     """(c,) and its column."""
     line: Ints
-    """(c,) row of crossings, rising, that every crossing belongs to."""
+    """(c,) row of crossings, rising, that every crossing belongs to; this and what follows uint32, for speed."""
     beside: Ints
     """(c,) next crossing in the same row."""
     ends: Ints
@@ -70,19 +73,31 @@ class Weights(NamedTuple):
     """The row of crossings that stays where it is in the mean."""
 
 
-def slide(net: Net, weights: Weights, steps: int, gain: float, tolerance: float) -> Floats:
+class Descent(NamedTuple):
+    """When the crossings have gone far enough."""
+
+    steps: int
+    """Steps at most."""
+    gain: float
+    """Less gained by a step, relative, ends them."""
+    tolerance: float
+    """Of every least-squares problem, relative."""
+
+
+def slide(net: Net, weights: Weights, descent: Descent) -> Floats:
     """Moves (c, 2) of the crossings, along and around, mm."""
     angle = 2 * np.pi * net.column / net.chart.shape[1]
     waves = np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
-    return _slide(*net, *weights, waves, steps, gain, tolerance)
+    return _slide(net, weights, waves, descent)
 
 
 @njit(cache=True, nogil=True)
-def _put(chart: Any, row: Any, column: Any, spacing: Any, x: Any, places: Any) -> None:
+def _put(net: Any, x: Any, places: Any) -> None:
     """Write the chart's values (c, 9) where the crossings are; beyond its rows it goes on in straight lines."""
+    chart = net.chart
     rows, columns = chart.shape[0], chart.shape[1]
-    for c in range(len(row)):
-        along, around = row[c] + x[c, 0] / spacing[0], column[c] + x[c, 1] / spacing[1]
+    for c in range(len(net.row)):
+        along, around = net.row[c] + x[c, 0] / net.spacing[0], net.column[c] + x[c, 1] / net.spacing[1]
         i, j = min(max(int(np.floor(along)), 0), rows - 2), int(np.floor(around))
         down, right = along - i, around - j
         j, beyond = j % columns, (j + 1) % columns
@@ -93,34 +108,32 @@ def _put(chart: Any, row: Any, column: Any, spacing: Any, x: Any, places: Any) -
 
 
 @njit(cache=True, nogil=True)
-def _cost(
-    places: Any, line: Any, beside: Any, ends: Any, bulge: Any, bends: Any, weights: Any, x: Any, excess: Any
-) -> float:
+def _cost(net: Any, weights: Any, places: Any, x: Any, excess: Any) -> float:
     """Write by how much every piece (p,) is too long; return what the crossings minimise."""
-    length, resistance, crowding, stiffness, held = weights
     total = 0.0
-    for p in range(ends.shape[1]):
-        a, b = ends[0, p], ends[1, p]
-        way = bulge[line[a]]
+    for p in range(net.ends.shape[1]):
+        a, b = net.ends[0, p], net.ends[1, p]
+        way = net.bulge[net.line[a]]
         for k in range(3):
             way += (places[b, k] - places[a, k]) ** 2
-        excess[p] = np.sqrt(way) - length
+        excess[p] = np.sqrt(way) - weights.length
         total += excess[p] ** 2
-    mean, count = _row_means(line, x)
-    for c in range(len(line)):
-        off = x[c, 0] - mean[line[c]]
-        total += resistance**2 * (off * off + x[c, 1] ** 2)
-        total += (crowding * (x[beside[c], 1] - x[c, 1])) ** 2
+    mean, count = _row_means(net.line, x)
+    for c in range(len(net.line)):
+        off = x[c, 0] - mean[net.line[c]]
+        total += weights.resistance**2 * (off * off + x[c, 1] ** 2)
+        total += (weights.crowding * (x[net.beside[c], 1] - x[c, 1])) ** 2
+    bends = net.bends
     for b in range(bends.shape[1]):
         for k in range(2):
-            total += (stiffness * (x[bends[0, b], k] - 2 * x[bends[1, b], k] + x[bends[2, b], k])) ** 2
-    return total + count[held] * mean[held] ** 2
+            total += (weights.stiffness * (x[bends[0, b], k] - 2 * x[bends[1, b], k] + x[bends[2, b], k])) ** 2
+    return total + count[weights.held] * mean[weights.held] ** 2
 
 
 @njit(cache=True, nogil=True)
 def _row_means(line: Any, x: Any) -> tuple[Any, Any]:
     """Mean move along (l,) of every row of crossings, and how many they are."""
-    mean, count = np.zeros(line[-1] + 1), np.zeros(line[-1] + 1)
+    mean, count = np.zeros(int(line[-1]) + 1), np.zeros(int(line[-1]) + 1)
     for c in range(len(line)):
         mean[line[c]] += x[c, 0]
         count[line[c]] += 1.0
@@ -143,16 +156,16 @@ def _slopes(places: Any, ends: Any, slopes: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, bends: Any, weights: Any, x: Any, result: Any) -> None:
+def _multiply(net: Any, weights: Any, inertia: float, slopes: Any, x: Any, result: Any) -> None:
     """Write the normal matrix times x (c, 2)."""
-    _, resistance, crowding, stiffness, held = weights
+    line, beside, ends, bends = net.line, net.beside, net.ends, net.bends
     mean, _ = _row_means(line, x)
-    damp, crowd, stiff = resistance**2, crowding**2, stiffness**2
+    damp, crowd, stiff = weights.resistance**2, weights.crowding**2, weights.stiffness**2
     for c in range(len(line)):
-        result[c, 0] = damp * (x[c, 0] - mean[line[c]])
-        result[c, 1] = damp * x[c, 1]
-        if line[c] == held:
-            result[c, 0] += mean[held]
+        result[c, 0] = (damp + inertia) * (x[c, 0] - mean[line[c]])
+        result[c, 1] = (damp + inertia) * x[c, 1]
+        if line[c] == weights.held:
+            result[c, 0] += mean[weights.held]
     for c in range(len(line)):
         nearer = crowd * (x[beside[c], 1] - x[c, 1])
         result[beside[c], 1] += nearer
@@ -164,7 +177,7 @@ def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, bends: Any, weight
             result[before, k] += bent
             result[here, k] -= 2 * bent
             result[after, k] += bent
-    for p in range(ends.shape[1]):
+    for p in range(len(slopes)):
         a, b = ends[0, p], ends[1, p]
         longer = slopes[p, 0] * x[a, 0] + slopes[p, 1] * x[a, 1] + slopes[p, 2] * x[b, 0] + slopes[p, 3] * x[b, 1]
         result[a, 0] += slopes[p, 0] * longer
@@ -174,52 +187,55 @@ def _multiply(slopes: Any, line: Any, beside: Any, ends: Any, bends: Any, weight
 
 
 @njit(cache=True, nogil=True)
-def _diagonal(slopes: Any, ends: Any, weights: Any, n: int) -> Any:
+def _diagonal(net: Any, weights: Any, inertia: float, slopes: Any) -> Any:
     """Inverse of the normal matrix's diagonal (c, 2)."""
-    _, resistance, crowding, stiffness, _ = weights
-    inverse = np.zeros((n, 2))
-    for p in range(ends.shape[1]):
+    inverse = np.zeros((len(net.line), 2))
+    for p in range(len(slopes)):
         for k in range(2):
-            inverse[ends[0, p], k] += slopes[p, k] ** 2
-            inverse[ends[1, p], k] += slopes[p, 2 + k] ** 2
-    for c in range(n):
-        for k in range(2):  # on two wires (1, -2, 1) comes thrice
-            inverse[c, k] = 1 / (inverse[c, k] + resistance**2 + 12 * stiffness**2 + 2 * k * crowding**2)
+            inverse[net.ends[0, p], k] += slopes[p, k] ** 2
+            inverse[net.ends[1, p], k] += slopes[p, 2 + k] ** 2
+    rest = weights.resistance**2 + inertia + 12 * weights.stiffness**2  # on two wires (1, -2, 1) comes thrice
+    for c in range(len(inverse)):
+        for k in range(2):
+            inverse[c, k] = 1 / (inverse[c, k] + rest + 2 * k * weights.crowding**2)
     return inverse
 
 
 @njit(cache=True, nogil=True)
-def _coarse(slopes: Any, line: Any, beside: Any, ends: Any, weights: Any, waves: Any) -> Any:
+def _coarse(net: Any, weights: Any, inertia: float, slopes: Any, waves: Any) -> Any:
     """Banded Cholesky factor (n, BAND), lower form, of the normal matrix on moves of whole rows."""
-    _, resistance, crowding, _stiffness, held = weights
-    band = np.zeros(((line[-1] + 1) * _WAVES, _BAND))
+    line, damp, crowd = net.line, weights.resistance**2, weights.crowding**2
+    blocks = np.zeros((int(line[-1]) + 1, _BAND, _BAND))
     g = np.zeros(_BAND)
-    for p in range(ends.shape[1]):
-        a, b = ends[0, p], ends[1, p]
+    for p in range(len(slopes)):
+        a, b = net.ends[0, p], net.ends[1, p]
         for w in range(3):
             g[w], g[3 + w] = slopes[p, 0] * waves[a, w], slopes[p, 1] * waves[a, w]
             g[6 + w], g[9 + w] = slopes[p, 2] * waves[b, w], slopes[p, 3] * waves[b, w]
-        first = line[a] * _WAVES
         for i in range(_BAND):
-            for j in range(i + 1):
-                band[first + i, i - j] += g[i] * g[j]
+            for j in range(_BAND):
+                blocks[line[a], i, j] += g[i] * g[j]
     for c in range(len(line)):
-        first = line[c] * _WAVES
+        beside = net.beside[c]
         for w in range(3):
-            for v in range(w + 1):
+            for v in range(3):
                 both = waves[c, w] * waves[c, v]
-                apart = (waves[beside[c], w] - waves[c, w]) * (waves[beside[c], v] - waves[c, v])
-                if w > 0:
-                    band[first + w, w - v] += resistance**2 * both
-                band[first + 3 + w, w - v] += resistance**2 * both + crowding**2 * apart
-        if line[c] == held:
-            band[held * _WAVES, 0] += 1.0
+                apart = (waves[beside, w] - waves[c, w]) * (waves[beside, v] - waves[c, v])
+                blocks[line[c], w, v] += (damp + inertia if w + v > 0 else 0.0) * both
+                blocks[line[c], 3 + w, 3 + v] += (damp + inertia) * both + crowd * apart
+        if line[c] == weights.held:
+            blocks[weights.held, 0, 0] += 1.0
+    band = np.zeros((len(blocks) * _WAVES, _BAND))
+    for row in range(len(blocks)):
+        for i in range(_BAND if row < len(blocks) - 1 else _WAVES):
+            for j in range(i + 1):
+                band[row * _WAVES + i, i - j] += blocks[row, i, j]
     return _cholesky(band)
 
 
 @njit(cache=True, nogil=True)
 def _cholesky(band: Any) -> Any:
-    """Factor in place a symmetric matrix whose entry (i, i - k) is band[i, k]."""
+    """Factor in place a symmetric matrix whose entry (i, i - k) is band[i, k]; the diagonal becomes its inverse."""
     n, width = band.shape
     for i in range(n):
         for k in range(min(i, width - 1), -1, -1):
@@ -227,10 +243,7 @@ def _cholesky(band: Any) -> Any:
             total = band[i, k]
             for m in range(max(0, i - width + 1, j - width + 1), j):
                 total -= band[i, i - m] * band[j, j - m]
-            if k == 0:
-                band[i, 0] = np.sqrt(max(total, 1e-30))
-            else:
-                band[i, k] = total / band[j, 0]
+            band[i, k] = 1 / np.sqrt(max(total, 1e-30)) if k == 0 else total * band[j, 0]
     return band
 
 
@@ -241,9 +254,9 @@ def _solve(factor: Any, right: Any) -> None:
     for i in range(n):
         for k in range(1, min(i, width - 1) + 1):
             right[i] -= factor[i, k] * right[i - k]
-        right[i] /= factor[i, 0]
+        right[i] *= factor[i, 0]
     for i in range(n - 1, -1, -1):
-        right[i] /= factor[i, 0]
+        right[i] *= factor[i, 0]
         for k in range(1, min(i, width - 1) + 1):
             right[i - k] -= factor[i, k] * right[i]
 
@@ -251,17 +264,17 @@ def _solve(factor: Any, right: Any) -> None:
 @njit(cache=True, nogil=True)
 def _precondition(inverse: Any, factor: Any, line: Any, waves: Any, residual: Any, result: Any) -> None:
     """Write the preconditioner times the residual (c, 2)."""
-    rows = np.zeros(len(factor))
+    rows = np.zeros((len(factor) // _WAVES, 2, 3))
     for c in range(len(line)):
-        for w in range(3):
-            rows[line[c] * _WAVES + w] += waves[c, w] * residual[c, 0]
-            rows[line[c] * _WAVES + 3 + w] += waves[c, w] * residual[c, 1]
-    _solve(factor, rows)
+        for k in range(2):
+            for w in range(3):
+                rows[line[c], k, w] += waves[c, w] * residual[c, k]
+    _solve(factor, rows.reshape(-1))
     for c in range(len(line)):
         for k in range(2):
             result[c, k] = inverse[c, k] * residual[c, k]
             for w in range(3):
-                result[c, k] += waves[c, w] * rows[line[c] * _WAVES + 3 * k + w]
+                result[c, k] += waves[c, w] * rows[line[c], k, w]
 
 
 @njit(cache=True, nogil=True)
@@ -273,33 +286,28 @@ def _dot(a: Any, b: Any) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _step(
-    slopes: Any,
-    line: Any,
-    beside: Any,
-    ends: Any,
-    bends: Any,
-    weights: Any,
-    waves: Any,
-    x: Any,
-    excess: Any,
-    tolerance: float,
-) -> Any:
-    """Moves (c, 2) of a Gauss-Newton step from x, by conjugate gradients."""
-    inverse, factor = _diagonal(slopes, ends, weights, len(line)), _coarse(slopes, line, beside, ends, weights, waves)
-    n = len(line)
-    residual, image = np.zeros((n, 2)), np.zeros((n, 2))
-    _multiply(np.zeros((len(slopes), 4)), line, beside, ends, bends, weights, x, image)
-    for c in range(len(line)):
-        residual[c, 0], residual[c, 1] = -image[c, 0], -image[c, 1]
-    for p in range(ends.shape[1]):
+def _downhill(net: Any, weights: Any, slopes: Any, x: Any, excess: Any) -> Any:
+    """Half the negative gradient (c, 2) of what the crossings minimise."""
+    result = np.zeros((len(net.line), 2))
+    _multiply(net, weights, 0.0, slopes[:0], x, result)
+    for c in range(len(result)):
+        result[c, 0], result[c, 1] = -result[c, 0], -result[c, 1]
+    for p in range(len(slopes)):
         for k in range(2):
-            residual[ends[0, p], k] -= slopes[p, k] * excess[p]
-            residual[ends[1, p], k] -= slopes[p, 2 + k] * excess[p]
-    move, way, ready = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2))
-    goal, before = 0.0, np.inf
+            result[net.ends[0, p], k] -= slopes[p, k] * excess[p]
+            result[net.ends[1, p], k] -= slopes[p, 2 + k] * excess[p]
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _step(net: Any, weights: Any, inertia: float, waves: Any, slopes: Any, residual: Any, tolerance: float) -> Any:
+    """Moves (c, 2) of a step downhill, by conjugate gradients."""
+    n = len(net.line)
+    factor, inverse = _coarse(net, weights, inertia, slopes, waves), _diagonal(net, weights, inertia, slopes)
+    move, way, ready, image = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2))
+    residual, goal, before = residual.copy(), 0.0, np.inf
     for _ in range(ROUNDS):
-        _precondition(inverse, factor, line, waves, residual, ready)
+        _precondition(inverse, factor, net.line, waves, residual, ready)
         size = _dot(residual, ready)
         goal = max(goal, tolerance**2 * size)
         if size <= goal:
@@ -307,7 +315,7 @@ def _step(
         for c in range(n):
             for k in range(2):
                 way[c, k] = ready[c, k] + size / before * way[c, k]
-        _multiply(slopes, line, beside, ends, bends, weights, way, image)
+        _multiply(net, weights, inertia, slopes, way, image)
         share, before = size / _dot(way, image), size
         for c in range(n):
             for k in range(2):
@@ -317,47 +325,25 @@ def _step(
 
 
 @njit(cache=True, nogil=True)
-def _slide(
-    chart: Any,
-    row: Any,
-    column: Any,
-    line: Any,
-    beside: Any,
-    ends: Any,
-    spacing: Any,
-    bulge: Any,
-    bends: Any,
-    length: float,
-    resistance: float,
-    crowding: float,
-    stiffness: float,
-    held: int,
-    waves: Any,
-    steps: int,
-    gain: float,
-    tolerance: float,
-) -> Any:
-    weights, n = (length, resistance, crowding, stiffness, held), len(row)
-    x, tried = np.zeros((n, 2)), np.zeros((n, 2))
-    places, excess, slopes = np.zeros((n, 9)), np.zeros(ends.shape[1]), np.zeros((ends.shape[1], 4))
-    _put(chart, row, column, spacing, x, places)
-    cost = _cost(places, line, beside, ends, bulge, bends, weights, x, excess)
-    for _ in range(steps):
-        _slopes(places, ends, slopes)
-        move = _step(slopes, line, beside, ends, bends, weights, waves, x, excess, tolerance)
-        share, before = 1.0, cost
-        while True:  # a step that does not help is halved
-            for c in range(n):
-                for k in range(2):
-                    tried[c, k] = x[c, k] + share * min(max(move[c, k], -REACH), REACH)
-            _put(chart, row, column, spacing, tried, places)
-            cost = _cost(places, line, beside, ends, bulge, bends, weights, tried, excess)
+def _slide(net: Any, weights: Any, waves: Any, descent: Any) -> Any:
+    n, pieces = len(net.row), net.ends.shape[1]
+    x, inertia = np.zeros((n, 2)), INERTIA
+    places, excess, slopes = np.zeros((n, 9)), np.zeros(pieces), np.zeros((pieces, 4))
+    _put(net, x, places)
+    cost = _cost(net, weights, places, x, excess)
+    for _ in range(descent.steps):
+        _slopes(places, net.ends, slopes)
+        residual, before = _downhill(net, weights, slopes, x, excess), cost
+        while True:
+            tried = x + _step(net, weights, inertia, waves, slopes, residual, descent.tolerance)
+            _put(net, tried, places)
+            cost = _cost(net, weights, places, tried, excess)
             if cost < before:
                 break
-            share *= 0.5
-            if share < SHORTEST:
+            inertia *= CALMING**2
+            if inertia > STUCK:
                 return x
-        x, tried = tried, x
-        if 1 - cost / before < gain:
+        x, inertia = tried, inertia / CALMING
+        if 1 - cost / before < descent.gain:
             break
     return x

@@ -23,8 +23,9 @@ def _slide(nodes_mm: np.ndarray) -> None:
     around_mm = 0.5 * (np.roll(nodes_mm, -1, axis=1) - np.roll(nodes_mm, 1, axis=1))
     chart = np.concatenate([nodes_mm, np.gradient(nodes_mm, axis=0), around_mm], axis=2)
     beside, bends = np.array([1, 0, 3, 2, 5, 4]), np.array([[0], [2], [5]])
-    tiny = net.Net(chart, line, column, line, beside, ends, np.ones(2), np.zeros(3), bends)
-    net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1), 1, 0.1, 0.1)
+    numbers = (values.astype(np.uint32) for values in (line, beside, ends))
+    tiny = net.Net(chart, line, column, *numbers, np.ones(2), np.zeros(3), bends.astype(np.uint32))
+    net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1), net.Descent(1, 0.1, 0.1))
 
 
 if __name__ == "__main__":
