@@ -3,7 +3,7 @@ import { make } from "../src/dom.js";
 import { drop, get, getBinary, Newest, post, put } from "./api.js";
 import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js";
 import { Deploying } from "./deploy.js";
-import { changeSheet, placeWords, plainSheet } from "./numbers.js";
+import { changeSheet, placeWords, plainSheet, sureSheet } from "./numbers.js";
 import { panels } from "./panels.js";
 import { Picture } from "./picture.js";
 import { rankingTable } from "./ranking.js";
@@ -350,7 +350,7 @@ class Page {
         make("span", {}, [`${area_mm2.toFixed(1)} mm² · ⌀ ${diameter_mm.toFixed(1)} mm`]),
       ]);
       element.addEventListener("click", () => role !== "inlet" && this.choose({ inlet_mm: center_mm.map((x) => Number(x.toFixed(2))) }));
-      return { element, point: () => center_mm };
+      return { element, isLabel: true, point: () => center_mm };
     });
   }
 
@@ -388,9 +388,9 @@ class Page {
     if (!job) return this.work.replaceChildren();
     const bar = make("i");
     bar.style.width = `${Math.max(2, 100 * job.fraction)}%`;
-    const words = make("div", { className: "work-words" }, [make("b", {}, [spoken(job.stage) || "Starting"]), make("span", {}, [job.detail || "…"])]);
+    const words = make("div", { className: "work-words" }, [make("b", {}, [job.stage ? this.spoken(job.stage) : "Starting"]), make("span", {}, [job.detail || "…"])]);
     const stop = make("button", { type: "button", onClick: () => drop(`${this.path}/jobs`).catch((problem) => this.complain(problem)) }, ["Cancel"]);
-    const done = job.finished.map(({ stage }) => spoken(stage)).filter(Boolean);
+    const done = job.finished.map(({ stage }) => this.spoken(stage));
     const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "It goes on when this tab is closed."]);
     this.work.replaceChildren(words, make("div", { className: "bar", role: "progressbar", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
   }
@@ -411,6 +411,7 @@ class Page {
       const sheets = this.view.choices.devices.map(({ name }) => this.measures[name]).filter(Boolean);
       if (sheets.length) parts.push(head("Deployed"), plainSheet(sheets, this.isWhole));
     }
+    if (this.step === "report") for (const varied of this.sheets?.uncertainty || []) parts.push(...sureSheet(varied));
     if (this.sheets?.anatomy?.length && !(flow && ["flow", "report"].includes(this.step))) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));
     if (!parts.length) parts.push(make("h2", {}, ["Numbers"]), make("p", { className: "hint" }, ["They appear here as the steps are done, each with its unit and definition."]));
     else parts.push(make("p", { className: "hint" }, ["Rest the pointer on a name for its definition."]));
@@ -429,6 +430,14 @@ class Page {
     }
     const place = this.panel.querySelector(".place");
     if (place) place.replaceChildren(...placeWords(manifest));
+  }
+
+  /** A stage of a job in words: ``flow silk``. */
+  spoken(stage) {
+    const [first, device] = stage.split(" ");
+    const words = SPOKEN[first] || stage;
+    if (!device || first === "plan") return words;
+    return `${words} ${device === "bare" ? "before" : this.deviceTitle(device)}`;
   }
 
   /** The inlet's pulse, for the left side. */
@@ -537,13 +546,10 @@ class Page {
   }
 }
 
-const SPOKEN = { segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes", measure: "Numbers", report: "Report" };
-
-function spoken(stage) {
-  const [first, ...rest] = stage.split(" ");
-  const named = { deploy: "Deploying", struts: "Struts of", flow: "Flow," }[first];
-  return named ? `${named} ${rest.join(" ") === "bare" ? "before" : rest.join(" ")}` : SPOKEN[first] || stage;
-}
+const SPOKEN = {
+  scan: "Scan", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes",
+  deploy: "Deploying", struts: "Struts of", plan: "Cost of the flow", flow: "Flow,", vary: "How sure:", measure: "Numbers", report: "Report",
+};
 
 /** From where each step looks at first. */
 const VIEW = { image: "whole", vessel: "whole", sac: "profile", device: "profile", deploy: "profile", flow: "profile", report: "profile" };

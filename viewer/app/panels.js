@@ -149,11 +149,20 @@ export const panels = {
 
   report(page) {
     const parts = [...title("Report", "One file with the case in 3-D, pictures, every number with its definition, and how it was made. It needs no network.")];
-    const { has_report, steps } = page.view;
+    const { choices, has_flow, has_pdf, has_report, job, steps } = page.view;
     const link = (file, words, isMain) => make("a", { className: `button wide ${isMain ? "primary" : ""}`, href: `${page.path}/files/${file}`, target: "_blank", rel: "noopener" }, [words]);
     parts.push(...staleness(page), ...failure(page));
-    if (has_report) parts.push(link("report.html", "Open the report", true), link("metrics.json", "Numbers (JSON)"), link("run.json", "How it was made (JSON)"));
-    if (!has_report || steps.report !== "done") {
+    if (has_report) parts.push(link("report.html", "Open the report", true));
+    if (has_pdf) parts.push(link("report.pdf", "Report to print (PDF)"));
+    if (has_report) parts.push(link("metrics.json", "Numbers (JSON)"), link("run.json", "How it was made (JSON)"));
+    if (has_flow) {
+      const options = [["", "not asked"], ...[16, 32, 64].map((n) => [String(n), `${n} deployments`])];
+      const asked = (count) => page.choose({ uncertainty_samples: count ? Number(count) : null });
+      parts.push(select("sure", "How sure", choices.uncertainty_samples ?? "", options, asked));
+      parts.push(make("p", { className: "hint" }, ["Deploys every device again and again with threshold, landing and width of the device varied: an interval for each result, and what makes it."]));
+      if (steps.report !== "done" && steps.flow === "done" && !job) parts.push(main(page, "Write the report again", () => page.start("flow")));
+    }
+    if (steps.flow !== "done") {
       parts.push(make("p", { className: "note" }, ["The report is written when the flow has been computed."]), next(page, "flow", "← Flow"));
     }
     parts.push(make("p", { className: "hint" }, [`The case lies in ${page.view.folder}.`]));
@@ -194,8 +203,8 @@ function openings(page) {
     return make("button", { type: "button", className: `opening-row ${isInlet ? "inlet" : ""}`, onClick: () => !isInlet && page.choose({ inlet_mm: center_mm.map((x) => Number(x.toFixed(2))) }) }, [
       dot,
       make("span", {}, [isInlet ? "Inlet" : role.replace("outlet_", "Outlet ")]),
-      make("b", {}, [`${area_mm2.toFixed(2)} mm²`]),
-      make("small", {}, [`⌀ ${diameter_mm.toFixed(2)}`]),
+      make("b", {}, [`${area_mm2.toFixed(1)} mm²`]),
+      make("small", {}, [`⌀ ${diameter_mm.toFixed(1)} mm`]),
     ]);
   });
   return make("div", { className: "openings" }, rows);
@@ -240,7 +249,7 @@ function sizes(page) {
   const now = [device.diameter_mm ?? Number(proposed?.[1] ?? 0), device.length_mm ?? Number(proposed?.[2] ?? 0)];
   const options = design.sizes.map(([d, l]) => [`${d},${l}`, `${d.toFixed(2)} × ${l} mm`]);
   const value = device.diameter_mm ? now.join(",") : "";
-  const words = proposed ? `proposed: ${now[0].toFixed(2)} × ${now[1]} mm` : "proposed";
+  const words = proposed ? `${now[0].toFixed(2)} × ${now[1]} mm (proposed)` : "proposed";
   const change = (text) => {
     const [diameter_mm, length_mm] = text ? text.split(",").map(Number) : [null, null];
     page.changeDevice(page.device, { diameter_mm, length_mm });

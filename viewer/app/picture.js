@@ -164,22 +164,39 @@ export class Picture {
 
   afterDrawing() {
     annotate(this.panes, this.stage, this.paneSize()[1]);
-    for (const mark of this.drawnMarks) this.placeMark(mark);
+    this.placeMarks();
   }
 
   /** Lay elements on the scene: [{element, point: () => [x, y, z]}]; they follow the camera. */
   setMarks(marks) {
     this.drawnMarks = marks;
     this.marks.replaceChildren(...marks.map(({ element }) => element));
-    if (this.stage) marks.forEach((mark) => this.placeMark(mark));
+    if (this.stage) this.placeMarks();
     this.stage?.redraw();
+  }
+
+  /** Marks lie on their points; labels keep inside the picture, beside the buttons above it, and off each other. */
+  placeMarks() {
+    this.drawnMarks.forEach((mark) => this.placeMark(mark));
+    const [width, height, top] = [this.area.clientWidth, this.area.clientHeight, this.toolbar.offsetHeight + 28];
+    const taken = [];
+    const labels = this.drawnMarks.filter(({ isLabel, element }) => isLabel && !element.hidden);
+    for (const mark of labels.sort((a, b) => a.at[1] - b.at[1])) {
+      const { offsetWidth: w, offsetHeight: h } = mark.element;
+      const [x, y] = mark.at;
+      const left = x + w + 14 > width ? x - w - 18 : x;
+      let middle = Math.min(Math.max(y, top), height - h);
+      for (const other of taken) if (left < other.right && left + w > other.left && middle < other.bottom + h / 2 + 3) middle = other.bottom + h / 2 + 3;
+      taken.push({ left, right: left + w, bottom: middle + h / 2 });
+      mark.element.style.transform = `translate(${left}px, ${middle}px)`;
+    }
   }
 
   placeMark(mark) {
     const point = mark.point();
     mark.element.hidden = !point;
     if (!point) return;
-    const [x, y] = this.onScreen(point);
+    const [x, y] = (mark.at = this.onScreen(point));
     mark.element.style.transform = `translate(${x}px, ${y}px)`;
   }
 

@@ -65,7 +65,7 @@ def dependencies(state: State) -> dict[str, str]:
         "device": sizes,
         "deploy": centers,
         "flow": chosen["flow"],
-        "report": "",
+        "report": chosen["uncertainty_samples"],
     }
     digest, found = "", {}
     for step in STEPS:

@@ -66,6 +66,8 @@ class Choices(Strict):
         default=(DeviceChoice(name="silk"), DeviceChoice(name="enterprise")), max_length=3
     )
     flow: FlowChoice = FlowChoice()
+    uncertainty_samples: Annotated[int, Field(ge=8, le=256)] | None = None
+    """Deployments with what is not sure varied; None: none."""
 
     @field_validator("devices")
     @classmethod
@@ -77,7 +79,9 @@ class Choices(Strict):
     def settings(self) -> "Settings":
         """Return what a study is told."""
         from vstent.study import Placing, Settings
+        from vstent.uncertainty import Ranges
 
+        samples = self.uncertainty_samples
         return Settings(
             devices=tuple(device.name for device in self.devices),
             units=self.units,
@@ -89,6 +93,7 @@ class Choices(Strict):
             outlet_mm=self.outlet_mm,
             flow=self.flow.settings(),
             placings={device.name: placing for device in self.devices if (placing := placing_of(device)) != Placing()},
+            uncertainty=None if samples is None else Ranges(samples),
         )
 
 

@@ -79,6 +79,7 @@ class Desk:
             "has_anatomy": bool(state.anatomy),
             "anatomy": state.anatomy,
             "has_report": (case.folder / "report.html").is_file(),
+            "has_pdf": (case.folder / "report.pdf").is_file(),
             "has_ranking": (case.folder / RANKING).is_file(),
             "has_flow": (case.folder / "metrics.json").is_file() and "flow" in state.done,
             "job": job.told() if job is not None and is_at_work else None,
@@ -175,16 +176,17 @@ class Desk:
             return bytes(scan.surface(threshold))
 
     def numbers(self, case: Case) -> dict[str, Any]:
-        """Return every number found so far: anatomy, and flow before and after."""
+        """Return every number found so far: anatomy, flow before and after, and how sure they are."""
         from vstent.app import sheets
 
-        found: dict[str, Any] = {"anatomy": [], "flow": []}
+        found: dict[str, Any] = {"anatomy": [], "flow": [], "uncertainty": []}
         if case.state.anatomy:
             found["anatomy"] = self.live(case).anatomy_sheet()
         path = case.folder / "metrics.json"
         if path.is_file():
             metrics = json.loads(path.read_text(encoding="utf-8"))
-            found["flow"] = sheets.flow(metrics, _titles(metrics, case))
+            titles = _titles(metrics, case)
+            found |= {"flow": sheets.flow(metrics, titles), "uncertainty": sheets.uncertainty(metrics, titles)}
         return found
 
     def warm(self) -> None:

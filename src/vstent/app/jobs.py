@@ -34,7 +34,8 @@ STAGES: Final = {
     "struts": "deploy",
     "plan": "flow",
     "flow": "flow",
-    "measure": "flow",
+    "measure": "report",
+    "vary": "report",
     "report": "report",
 }
 """First word of a study's stage -> step of the page."""

@@ -52,7 +52,7 @@ def _choices(settings: dict[str, Any]) -> Choices:
     placings = settings.get("placings", {})
     shared = {name: settings[name] for name in ("diameter_mm", "length_mm", "center_mm")}
     devices = tuple(DeviceChoice(name=name, **placings.get(name, shared)) for name in settings["devices"])
-    flow = settings["flow"]
+    flow, varied = settings["flow"], settings["uncertainty"]
     chosen = FlowChoice(is_wanted=False)
     if flow is not None:
         chosen = FlowChoice(
@@ -61,4 +61,6 @@ def _choices(settings: dict[str, Any]) -> Choices:
             is_pulsatile=flow["waveform"] is not None,
             outlets=flow["outlets"],
         )
-    return Choices(devices=devices, flow=chosen, **{name: settings[name] for name in GEOMETRY})
+    geometry = {name: settings[name] for name in GEOMETRY}
+    samples = None if varied is None else varied["samples"]
+    return Choices(devices=devices, flow=chosen, uncertainty_samples=samples, **geometry)

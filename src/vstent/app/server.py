@@ -25,7 +25,6 @@ MEDIA: Final = {".html": "text/html; charset=utf-8", ".js": "text/javascript; ch
 BINARY: Final = "application/octet-stream"
 """A manifest and its arrays, as `vstent.report.packing` says."""
 ASSETS: Final = ("index.html", "app.js", "app.css", "viewer.css", "docs.html", "docs.js")
-FILES: Final = ("metrics.json", "run.json", "report.html")
 BEAT_S: Final = 15.0
 """A quiet stream of events says something this often."""
 
@@ -235,8 +234,8 @@ def _add_jobs(app: FastAPI, desk: Desk) -> None:
     def numbers(case_id: str) -> dict[str, Any]:
         return desk.numbers(desk.store.get(case_id))
 
-    @app.get("/api/cases/{case_id}/files/{name}", summary="metrics.json, run.json or report.html")
-    def one_file(case_id: str, name: Literal["metrics.json", "run.json", "report.html"]) -> Response:
+    @app.get("/api/cases/{case_id}/files/{name}", summary="What a study has written")
+    def one_file(case_id: str, name: Literal["metrics.json", "run.json", "report.html", "report.pdf"]) -> Response:
         path = desk.store.get(case_id).folder / name
         if not path.is_file():
             raise ReadError(f"{name} has not been written yet: run the step Flow.")
