@@ -1,14 +1,17 @@
 // The page: seven steps from a scan to a report, the scene in the middle, the numbers beside it.
 import { make } from "../src/dom.js";
 import { drop, get, getBinary, Newest, post, put } from "./api.js";
+import { Axis } from "./axis.js";
 import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js";
 import { Deploying } from "./deploy.js";
-import { changeSheet, placeWords, plainSheet, sureSheet } from "./numbers.js";
+import { Neck } from "./neck.js";
+import { changeSheet, neckWords, placeWords, plainSheet, sureSheet } from "./numbers.js";
 import { panels } from "./panels.js";
 import { Picture } from "./picture.js";
 import { rankingTable } from "./ranking.js";
 import { Slices } from "./slices.js";
 import { startPage } from "./start.js";
+import { Trimming } from "./trimming.js";
 
 export const STEPS = [
   ["image", "Image"],
@@ -126,6 +129,14 @@ class Page {
       told: (name, manifest, isWhole) => this.toldDevice(name, manifest, isWhole),
       failed: (problem) => this.complain(problem),
     });
+    this.neck = new Neck({
+      path: () => this.path,
+      picture: this.picture,
+      chosen: (curve) => this.choose({ neck_mm: curve.map((point) => point.map((x) => Number(x.toFixed(3)))) }),
+      told: (neck) => this.toldNeck(neck),
+      failed: (problem) => this.complain(problem),
+    });
+    this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.surfaces = new Newest(
       (answer) => this.picture.put(answer),
@@ -224,7 +235,7 @@ class Page {
   /** The middle of the neck on the parent axis, where one is known. */
   neckPoint() {
     const neck = this.anatomy?.neck;
-    return neck?.length ? this.deploying.at((neck[0] + neck[1]) / 2) : null;
+    return neck?.length ? this.axis.at((neck[0] + neck[1]) / 2) : null;
   }
 
   /** The live surface and the outline at a threshold. */
@@ -241,8 +252,11 @@ class Page {
       this.anatomy = answer.manifest;
       this.picture.stage?.drop(({ id }) => id.startsWith("opening ") || ["lumen", "landing", "sac", "neck", "wires", "contour"].includes(id));
       this.picture.put(answer);
+      this.neck.given = null; // its curve is drawn anew over the one found
       if (isFirst) this.picture.look(VIEW[this.step], false);
-      this.deploying.setAxis(answer.manifest.axis);
+      this.axis = new Axis(answer.manifest.axis, this.picture);
+      this.deploying.setAxis(this.axis);
+      this.trimming.set(this.axis, answer.manifest.neck);
       this.along.set({ axis: answer.manifest.axis, neck: answer.manifest.neck });
       this.sheets = (await get(`${this.path}/numbers`));
       this.measures = {};
@@ -323,7 +337,8 @@ class Page {
     this.picture.moved = null;
     this.picture.setMarks([]);
     if (!this.anatomy) return;
-    if (this.step === "vessel") this.picture.setMarks(this.openingMarks());
+    if (this.step === "vessel") this.picture.setMarks([...this.openingMarks(), ...this.trimming.handles]);
+    if (this.step === "sac") this.renderNeck();
     if (this.step === "deploy") this.renderDeploy();
   }
 
@@ -354,11 +369,21 @@ class Page {
     });
   }
 
+  renderNeck() {
+    const { curve_mm, handles } = this.anatomy.drawn;
+    this.neck.set(this.view.choices.neck_mm ?? curve_mm, handles);
+    this.picture.setMarks(this.neck.handles);
+  }
+
+  toldNeck(neck) {
+    this.panel.querySelector(".place")?.replaceChildren(...neckWords(neck, this.anatomy.drawn));
+  }
+
   renderDeploy() {
     const name = this.device;
     if (!name) return;
     this.picture.setMarks([...this.deploying.handles, this.deploying.cursorMark]);
-    this.picture.moved = (event) => this.deploying.look(this.deploying.under(event, null));
+    this.picture.moved = (event) => this.deploying.look(this.axis.under(event, null));
     const key = JSON.stringify([this.deploying.host.choice(name), this.colour, this.view.anatomy]);
     if (this.shownDevice !== key || this.deploying.name !== name || !this.measures[name]) {
       this.shownDevice = key;

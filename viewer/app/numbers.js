@@ -60,3 +60,10 @@ export function placeWords({ length_mm, length_band_mm, ends_mm, ends_band_mm })
   ];
   return rows.map(([name, value, range]) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [range])]));
 }
+
+/** A neck as it is drawn, beside the one that was found. */
+export function neckWords(neck, found) {
+  const row = (name, value, was) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [value === was ? "" : `of the vessel shown: ${was}`])]);
+  const [area, around] = [(x) => `${x.area_mm2.toFixed(1)} mm²`, (x) => `${x.perimeter_mm.toFixed(1)} mm`];
+  return [row("Neck area", area(neck), area(found)), row("Neck perimeter", around(neck), around(found))];
+}

@@ -83,16 +83,18 @@ export const panels = {
   },
 
   vessel(page) {
-    const parts = [...title("Vessel", "Openings are where the vessel was cut. Blood enters through the inlet: click another opening to change it.")];
+    const parts = [...title("Vessel", "Blood enters through the inlet: click another opening to change it. Drag the handles on the artery to keep less of it.")];
     if (page.anatomy) parts.push(openings(page));
+    if (page.anatomy?.neck.length) parts.push(...kept(page));
     parts.push(...point(page, "inlet_mm", "Inlet near"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
     if (page.view.steps.vessel === "done") parts.push(next(page, "sac", "Sac and parent →"));
     return parts;
   },
 
   sac(page) {
-    const parts = [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Click a sac to choose it.")];
+    const parts = [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Drag the points on the neck to draw it anew; click a sac to choose it.")];
     if (page.anatomy) parts.push(select("outlet", "Parent leads to", near(page), [["", "proposed"], ...outlets(page)], (role) => page.choose({ outlet_mm: center(page, role) })));
+    if (page.anatomy?.drawn.curve_mm.length) parts.push(make("div", { className: "place" }), ...drawn(page));
     parts.push(...point(page, "at_mm", "Seed"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
     if (page.view.steps.sac === "done") parts.push(next(page, "device", "Device →"));
     return parts;
@@ -208,6 +210,19 @@ function openings(page) {
     ]);
   });
   return make("div", { className: "openings" }, rows);
+}
+
+/** How much of the vessel is kept beside the sac. */
+function kept(page) {
+  const { upstream_mm, downstream_mm } = page.view.choices;
+  const field = (key, words, value) => number(page, key, words, "mm", value, (mm) => page.choose({ [key]: mm }), { min: 1 });
+  return [field("upstream_mm", "Keep before", upstream_mm), field("downstream_mm", "Keep beyond", downstream_mm), make("p", { className: "hint" }, ["Lengths beside the sac; every branch is cut as far beyond it."])];
+}
+
+/** A word on a neck that was drawn by hand. */
+function drawn(page) {
+  if (!page.view.choices.neck_mm) return [];
+  return [make("div", { className: "given" }, [make("span", {}, ["The neck was drawn by hand."]), make("button", { type: "button", className: "link", onClick: () => page.choose({ neck_mm: null }) }, ["Propose again"])])];
 }
 
 const outlets = (page) => page.anatomy.openings.filter(({ role }) => role !== "inlet").map(({ role, diameter_mm }) => [role, `${role.replace("outlet_", "outlet ")} (⌀ ${diameter_mm.toFixed(1)} mm)`]);

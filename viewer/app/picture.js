@@ -219,14 +219,24 @@ export class Picture {
 
   /** Point of the nearest visible surface under a pointer, or null. */
   pick(event) {
-    const [x, y] = this.where(event);
+    const isShown = (layer) => layer.kind === "mesh" && this.shown.has(layer.id);
+    return this.hits(this.where(event), isShown)[0] || null;
+  }
+
+  /** Point of a layer that is seen at a pixel, the one nearest to `point` of those in front of and behind each other. */
+  onWall(place, id, point) {
+    const away = (hit) => Math.hypot(...hit.map((x, i) => x - point[i]));
+    return this.hits(place, (layer) => layer.id === id).sort((a, b) => away(a) - away(b))[0] || null;
+  }
+
+  /** Points where the sight through a pixel meets layers, the nearest first. */
+  hits([x, y], isChosen) {
     const { element } = this.panes[0];
     this.onScreen([0, 0, 0]);
     const place = new Vector2((2 * (x - element.offsetLeft)) / element.offsetWidth - 1, 1 - (2 * (y - element.offsetTop)) / element.offsetHeight);
     const caster = new Raycaster();
     caster.setFromCamera(place, this.stage.camera);
-    const meshes = this.stage.layers.filter((layer) => layer.kind === "mesh" && this.shown.has(layer.id)).map(({ object }) => object);
-    const hit = caster.intersectObjects(meshes, true)[0];
-    return hit ? hit.point.toArray() : null;
+    const meshes = this.stage.layers.filter(isChosen).map(({ object }) => object);
+    return caster.intersectObjects(meshes, true).map(({ point }) => point.toArray());
   }
 }

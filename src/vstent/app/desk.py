@@ -3,12 +3,13 @@
 import json
 import tempfile
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Conflict, Store, dependencies, statuses
-from vstent.app.choices import DeviceChoice
+from vstent.app.choices import DeviceChoice, Point
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.app.reopening import RUN, reopened, stem
 from vstent.errors import InputError, ReadError
@@ -174,6 +175,13 @@ class Desk:
         scan = self.scan(case)
         with LOCK:
             return bytes(scan.surface(threshold))
+
+    def neck(self, case: Case, curve_mm: Sequence[Point], handle: int | None, to_mm: Point | None) -> bytes:
+        """Return a neck, with one handle pulled where it is said whither."""
+        import numpy as np
+
+        whither = None if to_mm is None else np.array(to_mm, dtype=np.float64)
+        return bytes(self.live(case).neck_message(np.array(curve_mm, dtype=np.float64), handle, whither))
 
     def numbers(self, case: Case) -> dict[str, Any]:
         """Return every number found so far: anatomy, flow before and after, and how sure they are."""

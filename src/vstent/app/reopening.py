@@ -13,7 +13,10 @@ from vstent.io.files import suffix
 
 RUN: Final = "run.json"
 """What a study says of itself."""
-GEOMETRY: Final = ("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm")
+GEOMETRY: Final = (
+    *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
+    *("neck_mm", "upstream_mm", "downstream_mm"),
+)
 
 
 def stem(path: Path) -> str:

@@ -16,7 +16,7 @@ from fastapi.responses import FileResponse, JSONResponse, Response, StreamingRes
 from pydantic import Field
 
 from vstent.app import desk as desks
-from vstent.app.choices import Choices, DeviceChoice, Strict
+from vstent.app.choices import NECK_HANDLES, Choices, DeviceChoice, Point, Strict
 from vstent.app.desk import Desk
 from vstent.app.security import REPORT_POLICY, Guard
 from vstent.errors import ReadError, VstentError
@@ -57,6 +57,14 @@ class SketchWanted(Strict):
     anchor: Literal["proximal", "center", "distal"] = "center"
     abscissa_mm: float | None = Field(default=None, ge=-1000, le=1000)
     colour: Literal["wall_gap", "coverage", "diameter"] = "wall_gap"
+
+
+class NeckWanted(Strict):
+    """A neck to be drawn, with one handle pulled to a point of the wall where they are given."""
+
+    curve_mm: tuple[Point, ...] = Field(min_length=3, max_length=1000)
+    handle: int | None = Field(default=None, ge=0, lt=NECK_HANDLES)
+    to_mm: Point | None = None
 
 
 def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
@@ -247,6 +255,10 @@ def _add_scenes(app: FastAPI, desk: Desk) -> None:
     @app.get("/api/cases/{case_id}/anatomy", summary="Vessel, sac, neck and parent artery (binary)")
     def anatomy(case_id: str) -> Response:
         return Response(desk.live(desk.store.get(case_id)).anatomy_message(), media_type=BINARY)
+
+    @app.post("/api/cases/{case_id}/neck", summary="A neck with a handle pulled, and its area, at once (binary)")
+    def neck(case_id: str, wanted: NeckWanted) -> Response:
+        return Response(desk.neck(desk.store.get(case_id), *wanted.model_dump().values()), media_type=BINARY)
 
     @app.post("/api/cases/{case_id}/sketch", summary="Where a device would lie, at once (binary)")
     def sketch(case_id: str, wanted: SketchWanted) -> Response:
