@@ -19,6 +19,7 @@ def add(commands: options.Commands) -> None:
     )
     given = options.add_geometry(parser)
     options.add_outlet(given)
+    options.add_neck(given)
     given.add_argument("--diameter", type=options.positive, metavar="MM", help="label diameter of the devices")
     given.add_argument("--length", type=options.positive, metavar="MM", help="label length of the devices")
     given.add_argument(
