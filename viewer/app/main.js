@@ -375,8 +375,13 @@ class Page {
     this.picture.setMarks(this.neck.handles);
   }
 
+  neckPlace() {
+    return this.neckDrawn ? neckWords(this.neckDrawn, this.anatomy.drawn) : [];
+  }
+
   toldNeck(neck) {
-    this.panel.querySelector(".place")?.replaceChildren(...neckWords(neck, this.anatomy.drawn));
+    this.neckDrawn = neck;
+    this.panel.querySelector(".place")?.replaceChildren(...this.neckPlace());
   }
 
   renderDeploy() {

@@ -94,7 +94,7 @@ export const panels = {
   sac(page) {
     const parts = [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Drag the points on the neck to draw it anew; click a sac to choose it.")];
     if (page.anatomy) parts.push(select("outlet", "Parent leads to", near(page), [["", "proposed"], ...outlets(page)], (role) => page.choose({ outlet_mm: center(page, role) })));
-    if (page.anatomy?.drawn.curve_mm.length) parts.push(make("div", { className: "place" }), ...drawn(page));
+    if (page.anatomy?.drawn.curve_mm.length) parts.push(make("div", { className: "place" }, page.neckPlace()), ...drawn(page));
     parts.push(...point(page, "at_mm", "Seed"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
     if (page.view.steps.sac === "done") parts.push(next(page, "device", "Device →"));
     return parts;
@@ -216,7 +216,7 @@ function openings(page) {
 function kept(page) {
   const { upstream_mm, downstream_mm } = page.view.choices;
   const field = (key, words, value) => number(page, key, words, "mm", value, (mm) => page.choose({ [key]: mm }), { min: 1 });
-  return [field("upstream_mm", "Keep before", upstream_mm), field("downstream_mm", "Keep beyond", downstream_mm), make("p", { className: "hint" }, ["Lengths beside the sac; every branch is cut as far beyond it."])];
+  return [field("upstream_mm", "Before sac", upstream_mm), field("downstream_mm", "Beyond sac", downstream_mm), make("p", { className: "hint" }, ["Lengths of vessel that are kept; every branch is cut as far beyond the sac."])];
 }
 
 /** A word on a neck that was drawn by hand. */

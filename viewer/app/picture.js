@@ -169,8 +169,10 @@ export class Picture {
 
   /** Lay elements on the scene: [{element, point: () => [x, y, z]}]; they follow the camera. */
   setMarks(marks) {
+    // One that is in hand stays where it is: it would be let go.
+    const isSame = marks.length === this.drawnMarks.length && marks.every(({ element }, i) => element === this.drawnMarks[i].element);
     this.drawnMarks = marks;
-    this.marks.replaceChildren(...marks.map(({ element }) => element));
+    if (!isSame) this.marks.replaceChildren(...marks.map(({ element }) => element));
     if (this.stage) this.placeMarks();
     this.stage?.redraw();
   }
@@ -198,6 +200,7 @@ export class Picture {
     if (!point) return;
     const [x, y] = (mark.at = this.onScreen(point));
     mark.element.style.transform = `translate(${x}px, ${y}px)`;
+    mark.element.classList.toggle("flipped", x > this.area.clientWidth - 170);
   }
 
   /** Pixel in the first pane where a point of the world is seen. */

@@ -1,4 +1,4 @@
-"""The reports of a case and of a cohort: one HTML file each with every number, nothing from a network; a case as PDF."""
+"""The reports of a case and of a cohort: one HTML file each with every number, no network; of a case a PDF too."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
