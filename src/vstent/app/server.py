@@ -24,7 +24,9 @@ from vstent.errors import ReadError, VstentError
 MEDIA: Final = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css"}
 BINARY: Final = "application/octet-stream"
 """A manifest and its arrays, as `vstent.report.packing` says."""
-ASSETS: Final = ("index.html", "app.js", "app.css", "viewer.css", "docs.html", "docs.js")
+SHARED: Final = ("viewer.js", "viewer.css")
+"""Files of the report that the page shares."""
+ASSETS: Final = ("index.html", "app.js", "app.css", "docs.html", "docs.js", *SHARED)
 BEAT_S: Final = 15.0
 """A quiet stream of events says something this often."""
 
@@ -105,7 +107,7 @@ def _said(_: Request, error: Exception) -> JSONResponse:
 
 def asset(name: str) -> Response:
     """Return one of the page's files."""
-    package = "vstent.report" if name == "viewer.css" else "vstent.app"
+    package = "vstent.report" if name in SHARED else "vstent.app"
     text = files(package).joinpath("assets", name).read_bytes()
     return Response(text, media_type=MEDIA[Path(name).suffix])
 
