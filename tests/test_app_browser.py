@@ -50,7 +50,7 @@ def at(address, width=1280, height=720):
         page.goto(address)
         yield page
         browser.close()
-    assert complaints == []
+    assert not complaints, complaints
 
 
 def drop(page, path: Path):

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import report_case
-from vstent.report.method import _bead_layer, _unit_sphere
+from vstent.report.method import _bead_layer, _expansion, _unit_sphere
 from vstent.report.pdf import WIDTH, _Paper, _wrapped, as_pdf
+from vstent.report.scene import scene_of
 from vstent.report.thinning import some_frames, thin_frames
 
 
@@ -99,3 +100,13 @@ def test_expansion_begins_at_the_first_contour_and_ends_at_the_deployed_one():
     assert chosen.tolist() == [0, 2, 4, 7]
     np.testing.assert_array_equal(frames, deployment.history_mm[chosen].reshape(4, -1, 3))
     assert (np.diff(gaps.mean(axis=1)) < 0).all()
+
+
+def test_a_contour_that_lies_on_the_wall_from_the_first_is_shown_too():
+    case = report_case.case()
+    deployment = case.deployments["silk"]
+    still = np.repeat(deployment.history_mm[-1:], 3, axis=0)
+    energy, gap = deployment.energy_mm2[:3], np.zeros_like(deployment.wall_gap_mm)
+    case.deployments = {"silk": replace(deployment, history_mm=still, energy_mm2=energy, wall_gap_mm=gap)}
+    scene = scene_of(case)
+    assert _expansion("silk", case.deployments["silk"], case.anatomy, scene).png.startswith(b"\x89PNG")

@@ -32,6 +32,7 @@ class Page {
     this.root.append(this.toasts);
     this.colour = "wall_gap";
     this.memory = {};
+    this.changes = Promise.resolve();
     this.isWhole = false;
     this.measures = {};
     addEventListener("keydown", (event) => this.key(event));
@@ -486,9 +487,17 @@ class Page {
 
   // -- what a user does ---------------------------------------------------------------------------------------------
 
-  async choose(changes) {
+  /** Choose; `changes` are made on what is chosen when it is their turn: one goes after the other. */
+  choose(changes) {
+    this.changes = this.changes.then(() => this.send(changes));
+    return this.changes;
+  }
+
+  async send(changes) {
+    const { revision, choices } = this.view;
+    const more = typeof changes === "function" ? changes(choices) : changes;
     try {
-      this.take(await put(`${this.path}/choices`, { revision: this.view.revision, choices: { ...this.view.choices, ...changes } }));
+      this.take(await put(`${this.path}/choices`, { revision, choices: { ...choices, ...more } }));
     } catch (problem) {
       this.complain(problem);
       if (problem.status === 409) this.take(await get(this.path));
@@ -498,11 +507,11 @@ class Page {
   }
 
   changeDevice(name, changes) {
-    return this.choose({ devices: this.view.choices.devices.map((device) => (device.name === name ? { ...device, ...changes } : device)) });
+    return this.choose(({ devices }) => ({ devices: devices.map((device) => (device.name === name ? { ...device, ...changes } : device)) }));
   }
 
   chooseFlow(changes) {
-    return this.choose({ flow: { ...this.view.choices.flow, ...changes } });
+    return this.choose(({ flow }) => ({ flow: { ...flow, ...changes } }));
   }
 
   /** A size was chosen in the table: see it deployed. */
@@ -536,6 +545,7 @@ class Page {
   }
 
   async start(kind) {
+    await this.changes; // what was typed last comes first
     try {
       this.take(await post(`${this.path}/jobs/${kind}`));
     } catch (problem) {
@@ -544,6 +554,7 @@ class Page {
   }
 
   async stepBack(which) {
+    await this.changes;
     try {
       this.take(await post(`${this.path}/${which}`, { revision: this.view.revision }));
     } catch (problem) {

@@ -183,7 +183,12 @@ function threshold(page) {
     shown.textContent = Number(slider.value).toFixed(0);
     page.showThreshold(Number(slider.value));
   });
-  slider.addEventListener("change", () => page.choose({ threshold: Number(slider.value) }));
+  // Keys change it step by step: it is chosen when they rest.
+  let timer;
+  slider.addEventListener("change", () => {
+    clearTimeout(timer);
+    timer = setTimeout(() => page.choose({ threshold: Number(slider.value) }), 250);
+  });
   const parts = [make("label", { className: "slider", htmlFor: "field-threshold" }, [make("span", {}, ["Threshold ", shown]), slider])];
   if (view.choices.threshold !== null) {
     const reset = () => {
@@ -245,8 +250,8 @@ function deviceBox(page, design, chosen) {
   box.dataset.key = `device-${design.key}`;
   box.disabled = !device && chosen.size >= 3;
   box.addEventListener("change", () => {
-    const others = page.view.choices.devices.filter(({ name }) => name !== design.key);
-    page.choose({ devices: box.checked ? [...others, { name: design.key }] : others });
+    const others = (devices) => devices.filter(({ name }) => name !== design.key);
+    page.choose(({ devices }) => ({ devices: box.checked ? [...others(devices), { name: design.key }] : others(devices) }));
   });
   const size = device?.diameter_mm ? `${device.diameter_mm} × ${device.length_mm} mm` : device ? "size proposed" : design.kind;
   const sure = `${design.n_facts - design.n_estimated} of ${design.n_facts} numbers are cited or derived, the rest estimated`;

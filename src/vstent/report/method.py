@@ -130,7 +130,7 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
         shots.append(Shot(words[:1].upper() + words[1:], (*_glass(scene), layer), scene.view("profile")))
     # The scale of the deployed device is too narrow for the way there.
     gap = scene.scale("wall_gap")
-    wide = replace(gap, high=max(gap.high, round_up(float(np.median(gaps_mm[0])))))
+    wide = replace(gap, high=round_up(max(gap.high, float(np.percentile(gaps_mm[0], 98)))))
     shown = replace(scene, scales=tuple(wide if scale is gap else scale for scale in scene.scales))
     title = f"Expansion of {dict(scene.panes)[name]}"
     caption = (
