@@ -7,6 +7,8 @@ Without a file it takes a phantom. The goals: a first page under 3 s, 10 redraws
 
 import argparse
 import json
+import math
+import os
 import statistics
 import subprocess
 import sys
@@ -20,6 +22,8 @@ from urllib.parse import urlsplit
 from vstent import phantoms
 from vstent.io.writers import write_stl
 
+FILES = ("viewer.js", "app.js", "app.css", "viewer.css")
+"""What the browser loads for the page."""
 START = "import sys; from vstent.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
@@ -64,7 +68,8 @@ def start(path: Path, folder: Path) -> tuple[subprocess.Popen[str], Client, floa
     assert server.stdout is not None
     client = Client(server.stdout.readline().split()[-1])
     client.ask("GET", "/")
-    client.ask("GET", "/assets/app.js")
+    for file in FILES:
+        client.ask("GET", f"/assets/{file}")
     return server, client, time.perf_counter() - began
 
 
@@ -107,13 +112,36 @@ def let_go(client: Client, case: str, name: str, count: int) -> list[float]:
     return seconds
 
 
+def pull(client: Client, case: str, count: int) -> list[float]:
+    """Pull a point of the neck to and fro; return seconds of every redraw."""
+    curve = manifest(client.ask("GET", f"{case}/anatomy"))["drawn"]["curve_mm"]
+    seconds = []
+    for i in range(count):
+        to_mm = [x + 0.05 * (i % 10 - 5) for x in curve[0]]
+        began = time.perf_counter()
+        client.ask("POST", f"{case}/neck", {"curve_mm": curve, "handle": 0, "to_mm": to_mm})
+        seconds.append(time.perf_counter() - began)
+    return seconds
+
+
 def client_center(client: Client, case: str, device: dict[str, Any]) -> float:
     return float(manifest(client.ask("POST", f"{case}/sketch", {"device": device}))["center_mm"])
 
 
-def said(title: str, seconds: list[float]) -> None:
+def processor_s(pid: int) -> float:
+    """Seconds of processor that the server has used; on other systems than Linux they are not known."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return math.nan
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def said(title: str, seconds: list[float], used_s: float) -> None:
+    """Print how long answers took, and what one cost the server on the mean."""
     high = statistics.quantiles(seconds, n=20)[-1]
-    print(f"{title:44} median {1e3 * statistics.median(seconds):6.0f} ms, 95 % {1e3 * high:6.0f} ms")
+    wall = f"median {1e3 * statistics.median(seconds):6.0f} ms, 95 % {1e3 * high:6.0f} ms"
+    print(f"{title:44} {wall}, processor {1e3 * used_s / len(seconds):6.0f} ms")
 
 
 def main() -> None:
@@ -133,12 +161,18 @@ def main() -> None:
             print(f"{'vessel, sac and parent artery':44} {time.perf_counter() - began:6.2f} s")
             device = {"name": arguments.device}
             drag(client, case, device, 3)  # the wall is measured once, kernels are loaded
+            used = processor_s(server.pid)
             seconds, sizes = drag(client, case, device, arguments.sketches)
-            said(f"a redraw of {arguments.device} while dragged", seconds)
+            said(f"a redraw of {arguments.device} while dragged", seconds, processor_s(server.pid) - used)
             let_go(client, case, arguments.device, 1)
-            said("deployed, with all numbers, after letting go", let_go(client, case, arguments.device, 8))
+            used = processor_s(server.pid)
+            seconds = let_go(client, case, arguments.device, 8)
+            said("deployed, with all numbers, after letting go", seconds, processor_s(server.pid) - used)
+            used = processor_s(server.pid)
+            seconds = pull(client, case, arguments.sketches)
+            said("a point of the neck while pulled", seconds, processor_s(server.pid) - used)
             scene = [client.ask("GET", f"{case}/anatomy"), client.ask("POST", f"{case}/deployment", {"device": device})]
-            page = sum(len(client.ask("GET", f"/assets/{file}")) for file in ("app.js", "app.css", "viewer.css"))
+            page = sum(len(client.ask("GET", f"/assets/{file}")) for file in FILES)
             print(f"{'a redraw':44} {statistics.median(sizes) / 1e6:6.2f} MB")
             print(f"{'page, anatomy and a deployed device':44} {(page + sum(map(len, scene))) / 1e6:6.2f} MB")
         finally:

@@ -7,7 +7,7 @@ import numpy as np
 
 from vstent.device import find_design
 from vstent.flow.types import Blood, FlowField
-from vstent.report import report
+from vstent.report.page import as_html, contents_of
 from vstent.report.scene import scene_of
 from vstent.stent import Deployment, Stent, tube_faces
 from vstent.surface import Surface
@@ -210,5 +210,10 @@ def scene():
 
 
 @cache
+def contents():
+    return contents_of(case())
+
+
+@cache
 def html():
-    return report(case())
+    return as_html(contents())

@@ -3,14 +3,20 @@
 import base64
 import json
 import shutil
+import socket
+import subprocess
+import sys
+import time
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 
 import app_case
 from vstent.io.writers import write_stl
+from vstent.study import CACHE
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: no test in a real browser")
@@ -23,10 +29,15 @@ SECOND = 1000
 COARSE_MM = "0.4"
 
 
-@contextmanager
 def browsing(client, width=1280, height=720):
+    """The page of a server of the tests."""
+    return at(f"http://{client.base_url.netloc.decode()}/?token={app_case.TOKEN}", width, height)
+
+
+@contextmanager
+def at(address, width=1280, height=720):
     """A page let in by the address that the server prints; it ends without a word on the console or a foreign call."""
-    host = client.base_url.netloc.decode()
+    host = urlsplit(address).netloc
     complaints: list[str] = []
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=BROWSER, args=FLAGS)
@@ -36,10 +47,10 @@ def browsing(client, width=1280, height=720):
         page.on("pageerror", lambda error: complaints.append(str(error)))
         own = (f"http://{host}/", "data:", "blob:")
         page.on("request", lambda request: request.url.startswith(own) or complaints.append(request.url))
-        page.goto(f"http://{host}/?token={app_case.TOKEN}")
+        page.goto(address)
         yield page
         browser.close()
-    assert complaints == []
+    assert not complaints, complaints
 
 
 def drop(page, path: Path):
@@ -92,6 +103,7 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         page.wait_for_selector(".opening b")
         assert page.locator(".opening-row.inlet").count() == 1
         assert drawn(page, page.locator(".viewer-area").bounding_box()) > 0.05
+        trim_and_draw_the_neck(client, page)
         step(page, "Deploy")
         page.wait_for_selector(".sheet .row")
         before = place_of(page, "distal")
@@ -110,9 +122,47 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         page.wait_for_function("() => document.querySelector('button[aria-label=Undo]').disabled")
 
 
-def drag(page, selector, right, down):
-    page.wait_for_selector(selector, state="visible")
-    box = page.locator(selector).bounding_box()
+def chosen(client):
+    case = client.get("/api/cases").json()["cases"][0]["id"]
+    return client.get(f"/api/cases/{case}").json()["choices"]
+
+
+def undone(page):
+    page.keyboard.press("Control+z")
+    page.wait_for_function("() => document.querySelector('button[aria-label=Undo]').disabled")
+
+
+def trim_and_draw_the_neck(client, page):
+    """Pull a cut towards the sac and a point of the neck along the wall; take both back."""
+    drag(page, ".handle.cut.proximal .knob", 60, 0)
+    page.wait_for_selector(".step.stale:nth-child(2)")
+    kept = chosen(client)["upstream_mm"]
+    assert 1 < kept
+    page.locator(".handle.cut.proximal").focus()
+    page.keyboard.press("ArrowRight")
+    page.wait_for_function(f"() => Number(document.querySelector('#field-upstream_mm').value) < {kept}")
+    assert chosen(client)["upstream_mm"] == pytest.approx(kept - 0.5, abs=0.02)
+    page.keyboard.press("Control+z")
+    page.wait_for_function(f"() => Number(document.querySelector('#field-upstream_mm').value) === {kept}")
+    undone(page)
+    step(page, "Sac and parent")
+    area = page.locator(".place b").first
+    playwright.expect(area).to_contain_text("mm²")
+    before = area.inner_text()
+    knobs = page.locator(".handle.small .knob")
+    lowest = max(range(knobs.count()), key=lambda i: knobs.nth(i).bounding_box()["y"])
+    drag(page, knobs.nth(lowest), 6, 12)
+    page.wait_for_selector(".step.stale:nth-child(3)")
+    assert len(chosen(client)["neck_mm"]) > 50
+    playwright.expect(area).not_to_have_text(before)
+    undone(page)
+    playwright.expect(area).to_have_text(before)
+
+
+def drag(page, what, right, down):
+    knob = page.locator(what) if isinstance(what, str) else what
+    knob.wait_for(state="visible")
+    box = knob.bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y)
     page.mouse.down()
@@ -147,7 +197,10 @@ def whole_way(client, page, path):
     report.wait_for_selector(".viewer-pane")
     assert report.locator("h1").inner_text()
     case = client.get("/api/cases").json()["cases"][0]["id"]
-    metrics = json.loads(client.get(f"/api/cases/{case}/files/metrics.json").text)
+    files = f"/api/cases/{case}/files"
+    assert len(client.get(f"{files}/report.html").content) < 10_000_000
+    assert client.get(f"{files}/report.pdf").content.startswith(b"%PDF")
+    metrics = json.loads(client.get(f"{files}/metrics.json").text)
     assert metrics["stents"]["enterprise"]["flow"]["neck_inflow_mL_s"] > 0
 
 
@@ -161,3 +214,70 @@ def test_the_whole_way_on_a_phantom(artery, tmp_path):
 def test_the_whole_way_on_a_real_carotid(shared_data, tmp_path):
     with app_case.served(tmp_path / "cases") as client, browsing(client, 1920, 1080) as page:
         whole_way(client, page, shared_data / "aneurisk_C0038.vtp")
+
+
+START = "import sys; from vstent.cli import main; sys.exit(main(sys.argv[1:]))"
+
+
+@contextmanager
+def server(workspace, port):
+    """`vstent app` in a process of its own, and the address that it prints; killed without a warning."""
+    command = [sys.executable, "-c", START, "app", "--no-browser", "--cases", str(workspace), "--port", str(port)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process.stdout.readline().split()[-1]
+        finally:
+            process.kill()
+            process.stdout.close()
+
+
+@pytest.mark.validation
+def test_a_flow_goes_on_where_it_was_when_the_server_was_killed(artery, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with server(tmp_path, port) as address, at(address) as page:
+        drop(page, artery)
+        page.wait_for_selector(".step.done:nth-child(3)")
+        step(page, "Flow")
+        page.fill("#field-cell", COARSE_MM)
+        page.keyboard.press("Tab")
+        page.wait_for_function("() => !document.querySelector('button[aria-label=Undo]').disabled")
+        page.get_by_role("button", name="Run the flow").click()
+        playwright.expect(page.locator(".work .hint")).to_contain_text("Flow, before", timeout=600 * SECOND)
+        playwright.expect(page.locator(".work-words")).to_contain_text("left to settle", timeout=600 * SECOND)
+        case = page.evaluate("location.hash").strip("#").partition("/")[0]
+        page.goto("about:blank")  # a page whose server dies says so on the console
+    (bare,) = (tmp_path / case / CACHE).glob("flow bare-*.npz")
+    computed = bare.stat().st_mtime_ns
+    assert not (tmp_path / case / "metrics.json").exists()
+    with server(tmp_path, port) as address, at(address) as page:
+        page.locator(".recent-case").first.click()
+        page.wait_for_selector(".step.done:nth-child(7)", timeout=1200 * SECOND)
+        step(page, "Report")
+        page.wait_for_selector(".card")
+    assert bare.stat().st_mtime_ns == computed
+    assert json.loads((tmp_path / case / "metrics.json").read_text())["stents"]["silk"]["flow"]["neck_inflow_mL_s"] > 0
+
+
+@pytest.mark.validation
+def test_a_new_user_ranks_devices_for_a_real_carotid_with_few_clicks(shared_data, tmp_path, record_property):
+    """From the file to the ranked list: what a user who has read nothing clicks, one by one, and how long it takes."""
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        began, clicks = time.monotonic(), 0
+        drop(page, shared_data / "aneurisk_C0038.vtp")
+        page.wait_for_selector(".step.done:nth-child(3)")
+        clicks += follow(page, "Device →")
+        clicks += follow(page, "Rank all sizes")
+        page.locator(".ranking tbody tr").first.wait_for(timeout=600 * SECOND)
+        seconds = time.monotonic() - began
+        rows = page.locator(".ranking tbody tr").count()
+        record_property("to_the_ranked_list", f"{clicks} clicks, {seconds:.0f} s, {rows} sizes")
+        assert rows > 30
+        assert clicks < 10
+        assert seconds < 120, f"{seconds:.0f} s with {clicks} clicks"
+
+
+def follow(page, name):
+    """Click a button of the panel; one click."""
+    page.locator(".panel").get_by_role("button", name=name).click()
+    return 1

@@ -234,6 +234,63 @@ def test_a_sac_that_trimming_takes_off_is_told() -> None:
     assert len(restore(vessel).aneurysms) == 1
 
 
+def test_trimming_keeps_the_lengths_that_are_given() -> None:
+    phantom = phantoms.with_sac(phantoms.tube(length_mm=50.0), abscissa_mm=25.0)
+    traced = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.35)), inlet_mm=np.zeros(3))
+    vessel = trim(traced, upstream_mm=12.0, downstream_mm=9.0)
+    low, high = sorted(opening.center_mm[2] for opening in vessel.openings)
+    assert low == pytest.approx(13.0, abs=0.1)
+    assert high == pytest.approx(34.0, abs=0.1)
+    assert "12 mm of vessel before the sac and 9 mm beyond" in vessel.notes[-1]
+    with pytest.raises(InputError, match="above zero"):
+        trim(traced, downstream_mm=0.0)
+
+
+def circle(points_mm: np.ndarray, radius_mm: float) -> np.ndarray:
+    """Points on the axis of a straight artery along z with a sac on its +x side -> a circle around the sac's mouth."""
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    return points_mm + radius_mm * np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=1)
+
+
+def test_a_neck_drawn_where_it_is_gives_the_sac_that_is_there(demo) -> None:
+    anatomy, phantom = demo
+    (found,) = anatomy.aneurysms
+    (drawn,) = restore(anatomy.vessel, neck_mm=found.neck_mm[::-1]).aneurysms
+    np.testing.assert_allclose(drawn.neck.area_mm2, phantom.neck_area_mm2, rtol=0.025)
+    np.testing.assert_allclose(drawn.sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.005)
+    assert drawn.sac.boundary_loops == ()
+    into_sac = phantom.sac.center_mm - drawn.neck.corners_mm.mean(axis=1)
+    assert (np.einsum("ij,ij->i", into_sac, drawn.neck.normals) > 0).mean() > 0.99
+
+
+def test_a_neck_drawn_up_the_sac_cuts_it_there() -> None:
+    phantom = with_sac(tube(length_mm=40, radius_mm=2.0), abscissa_mm=20, width_mm=7.0, neck_mm=4.5, direction=X)
+    assert phantom.sac is not None
+    vessel = trace(Vessel(phantoms.phantom_surface(phantom)))
+    (aneurysm,) = restore(vessel, neck_mm=circle(phantom.sac.center_mm, 3.4)).aneurysms
+    # Half of a sphere, but for the neck's arch: it is vaulted as the artery is below it.
+    volume_mm3, flat_mm2 = 2 / 3 * np.pi * 3.5**3, np.pi * 3.4**2
+    assert 0.95 * volume_mm3 < aneurysm.sac.volume_mm3 < volume_mm3
+    assert flat_mm2 < aneurysm.neck.area_mm2 < 1.1 * flat_mm2
+    np.testing.assert_allclose(aneurysm.neck_mm[:, 0], phantom.sac.center_mm[0], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("neck_mm", "complaint"),
+    [
+        (np.zeros((2, 3)), "three points or more"),
+        (np.array([[np.nan, 0, 0], [1, 0, 0], [0, 1, 0]]), "three points or more"),
+        (circle(np.array([40.0, 0, 20]), 2.0), "mm off the wall at 40.0"),
+        (circle(np.array([2.0, 0, 30]), 0.02), "parts nothing"),
+        (circle(np.array([30.0, 0, 0]), 2.0)[:, [1, 2, 0]], "around the artery"),
+    ],
+)
+def test_a_neck_that_is_none_is_refused(neck_mm: np.ndarray, complaint: str) -> None:
+    vessel = trace(Vessel(phantoms.phantom_surface(tube(length_mm=40, radius_mm=2.0), edge_mm=0.4)))
+    with pytest.raises(InputError, match=complaint):
+        restore(vessel, neck_mm=neck_mm)
+
+
 def test_the_real_sac_is_that_of_aneurisk_web(shared_data) -> None:
     from vstent.io.surfaces import read_surface
 

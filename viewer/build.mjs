@@ -23,14 +23,23 @@ async function bundle(entry, outfile, sources, more) {
     format: "iife",
     target: ["chrome100", "firefox100", "safari15"],
     legalComments: "none",
-    banner: { js: `/* vstent with three.js and fflate (MIT, see LICENSES.txt); sources ${sources} */` },
+    banner: { js: `/* vstent; three.js and fflate (MIT, see LICENSES.txt) in viewer.js; sources ${sources} */` },
     charset: "utf8",
     ...more,
   });
 }
 
+/** The page takes from the viewer's bundle what it shares with it. */
+const shared = {
+  name: "shared",
+  setup(builder) {
+    builder.onResolve({ filter: /^(three|\.\.\/src\/.*)$/ }, ({ path }) => ({ path, namespace: "shared" }));
+    builder.onLoad({ filter: /.*/, namespace: "shared" }, () => ({ contents: "module.exports = VstentViewer;" }));
+  },
+};
+
 await bundle("src/viewer.js", new URL("viewer.js", assets), await digest("src"), { globalName: "VstentViewer" });
-await bundle("app/main.js", new URL("app.js", page), await digest("src", "app"), {});
+await bundle("app/main.js", new URL("app.js", page), await digest("src", "app"), { plugins: [shared] });
 await copyFile("app/app.css", new URL("app.css", page));
 await copyFile("src/viewer.css", new URL("viewer.css", assets));
 

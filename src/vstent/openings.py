@@ -8,8 +8,6 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from vstent.errors import VesselError
@@ -103,7 +101,7 @@ def _without_caps(lumen: Surface) -> tuple[Surface, int]:
     """Take off the flat caps: round patches of coplanar faces that meet the wall in a sharp rim."""
     pairs = triangles.face_neighbours(lumen.faces)
     turn = np.arccos(np.clip(np.einsum("ij,ij->i", lumen.normals[pairs[:, 0]], lumen.normals[pairs[:, 1]]), -1, 1))
-    label = _joined(pairs[turn < CAP_ANGLE_RAD], len(lumen.faces))
+    label = triangles.joined(pairs[turn < CAP_ANGLE_RAD], len(lumen.faces))
     n_patches = int(label.max()) + 1
     area = np.bincount(label, lumen.areas_mm2)
     rim = label[pairs[:, 0]] != label[pairs[:, 1]]
@@ -125,11 +123,6 @@ def _is_disc(lumen: Surface, member: Bools) -> bool:
     edges = triangles.open_edges(lumen.faces[member])
     perimeter = np.linalg.norm(np.diff(lumen.vertices_mm[edges], axis=1), axis=2).sum()
     return bool(np.linalg.norm(mean) > np.cos(CAP_ANGLE_RAD) and 4 * np.pi * weight.sum() > 0.6 * perimeter**2)
-
-
-def _joined(pairs: Ints, n: int) -> Ints:
-    graph = coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def _with_open_arms(lumen: Surface) -> tuple[Surface, int]:
@@ -157,7 +150,7 @@ def _is_blind(graph: medial.Medial, path: Ints) -> bool:
     passable = graph.radius > max(0.5 * typical, ARM_RADIUS_MM)
     passable &= np.linalg.norm(graph.points - behind, axis=1) > 1.25 * typical
     passable[path[[0, -1]]] = True
-    label = _joined(graph.edges[passable[graph.edges].all(axis=1)], len(passable))
+    label = triangles.joined(graph.edges[passable[graph.edges].all(axis=1)], len(passable))
     return bool(label[path[0]] != label[path[-1]])
 
 
@@ -200,7 +193,7 @@ def cut_square(
     if not (beyond & (distance < 2.0 * radius_mm)).any():
         return None
     edges = triangles.directed_edges(lumen.faces)
-    label = _joined(edges[beyond[edges].all(axis=1)], len(height))
+    label = triangles.joined(edges[beyond[edges].all(axis=1)], len(height))
     tip = beyond & (label == label[np.argmin(np.where(beyond, distance, np.inf))])
     if tip.mean() > most:
         return None

@@ -5,11 +5,12 @@ neighbourhood is cut square to its centerline where it has run the stated length
 """
 
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from vstent.errors import InputError
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 from vstent.openings import cut_square
@@ -29,16 +30,47 @@ STRIDE_MM: Final = 1.0
 """The direction of a cut is that of the centerline over this length."""
 
 
-def trim(vessel: Vessel, *, at_mm: Floats | None = None) -> Vessel:
-    """Return a traced vessel cut down around its highest sac, or the one near `at_mm` (3,), and traced anew.
+class _Kept(NamedTuple):
+    """What is kept of the artery."""
+
+    upstream_mm: float
+    """Length before the sac."""
+    downstream_mm: float
+    """Length of every way beyond it."""
+    spare_mm: tuple[float, float]
+    """Nothing is cut for less than this, before and beyond the sac."""
+
+
+def trim(
+    vessel: Vessel,
+    *,
+    at_mm: Floats | None = None,
+    upstream_mm: float | None = None,
+    downstream_mm: float | None = None,
+) -> Vessel:
+    """Return a traced vessel cut down around its highest sac, and traced anew.
 
     A vessel without a sac, or short enough, is returned as it is.
+
+    Parameters
+    ----------
+    vessel : a vessel with centerlines.
+    at_mm : (3,) a point near the sac to keep; the highest otherwise.
+    upstream_mm : length of artery to keep before the sac's middle, above zero; 35 mm, and nothing is cut for less
+        than 5 mm more, where it is not given.
+    downstream_mm : length to keep of every way beyond the sac, likewise; 25 mm where it is not given.
+
+    Raises
+    ------
+    InputError
+        When a length is not above zero.
     """
+    kept = _kept(upstream_mm, downstream_mm)
     bulges = find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
     if not bulges:
         return vessel
     lumen, inlet_mm = vessel.lumen, vessel.inlet.center_mm
-    for line, abscissa_mm, sense in _cuts(vessel, bulges[0]):
+    for line, abscissa_mm, sense in _cuts(vessel, bulges[0], kept):
         center, ahead = line.at(np.array([abscissa_mm, abscissa_mm + sense * STRIDE_MM]))
         direction = (ahead - center) / np.linalg.norm(ahead - center)
         radius = float(np.interp(abscissa_mm, line.abscissa_mm, line.inscribed_radius_mm))
@@ -48,9 +80,21 @@ def trim(vessel: Vessel, *, at_mm: Floats | None = None) -> Vessel:
             inlet_mm = center if sense < 0 else inlet_mm
     if lumen is vessel.lumen:
         return vessel
-    note = f"Trimmed to {UPSTREAM_MM:.0f} mm of vessel before the sac and {DOWNSTREAM_MM:.0f} mm beyond it, cut square."
+    note = f"Trimmed to {kept.upstream_mm:.4g} mm of vessel before the sac and {kept.downstream_mm:.4g} mm beyond it, "
+    note += "cut square."
     notes = (*vessel.notes, note, *_left_out(lumen, bulges[1:]))
     return trace(replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=notes), inlet_mm=inlet_mm)
+
+
+def _kept(upstream_mm: float | None, downstream_mm: float | None) -> _Kept:
+    given = [length_mm for length_mm in (upstream_mm, downstream_mm) if length_mm is not None]
+    if not all(0 < length_mm < np.inf for length_mm in given):
+        raise InputError(f"the artery cannot be trimmed to {given[0]:g} mm beside the sac: give a length above zero")
+    return _Kept(
+        UPSTREAM_MM if upstream_mm is None else upstream_mm,
+        DOWNSTREAM_MM if downstream_mm is None else downstream_mm,
+        (SPARE_MM if upstream_mm is None else 0.0, SPARE_MM if downstream_mm is None else 0.0),
+    )
 
 
 def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
@@ -63,21 +107,22 @@ def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
     ]
 
 
-def _cuts(vessel: Vessel, bulge: Bulge) -> list[tuple[Centerline, float, int]]:
+def _cuts(vessel: Vessel, bulge: Bulge, kept: _Kept) -> list[tuple[Centerline, float, int]]:
     """Where to cut: a centerline, the abscissa on it, and whether the part behind (-1) or ahead (1) comes off."""
     foot = cKDTree(bulge.foot_mm)
     gaps = [np.asarray(foot.query(line.points_mm)[0]) for line in vessel.centerlines]
     main = int(np.argmin([gap.min() for gap in gaps]))
     parent = vessel.centerlines[main]
-    sac_mm = float(parent.abscissa_mm[np.argmin(gaps[main])])
-    cuts = [(parent, sac_mm - UPSTREAM_MM, -1)] if sac_mm > UPSTREAM_MM + SPARE_MM else []
+    sac_mm = float(parent.nearest_abscissa_mm(bulge.foot_mm).mean())
+    cuts = [(parent, sac_mm - kept.upstream_mm, -1)] if sac_mm > kept.upstream_mm + kept.spare_mm[0] else []
     for line in vessel.centerlines:
         fork_mm = min(_fork_mm(line, parent), line.length_mm)
         # A branch that leaves before the sac has run from the sac back to its fork already.
-        abscissa_mm = sac_mm + DOWNSTREAM_MM if fork_mm >= sac_mm else 2 * fork_mm - sac_mm + DOWNSTREAM_MM
+        way_mm = kept.downstream_mm
+        abscissa_mm = sac_mm + way_mm if fork_mm >= sac_mm else 2 * fork_mm - sac_mm + way_mm
         root_mm = fork_mm + 4.0 * float(np.interp(fork_mm, line.abscissa_mm, line.inscribed_radius_mm))
         abscissa_mm = max(abscissa_mm, root_mm) if line is not parent else abscissa_mm
-        if line.length_mm > abscissa_mm + SPARE_MM:
+        if line.length_mm > abscissa_mm + kept.spare_mm[1]:
             cuts.append((line, abscissa_mm, 1))
     return cuts
 

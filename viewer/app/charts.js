@@ -60,7 +60,7 @@ export class AlongChart {
     }
     for (const v of ticks(0, length, Math.max(4, width / 110))) parts.push(text(x(v), height - 9, String(v), { class: "tick middle" }));
     parts.push(text(4, 13, "Diameter, mm", { class: "axis-title" }));
-    parts.push(text(width - right, 13, width > 480 ? "along the parent artery, mm from the inlet" : "against mm from the inlet", { class: "axis-title end" }));
+    parts.push(text(width - right, 13, width > 480 ? "along the parent artery, mm from the inlet" : "at mm from the inlet", { class: "axis-title end" }));
     if (neck?.length) {
       parts.push(svg("rect", { x: x(neck[0]), width: x(neck[1]) - x(neck[0]), y: top, height: height - top - bottom, class: "neck-zone" }));
       parts.push(text((x(neck[0]) + x(neck[1])) / 2, top + 11, "neck", { class: "tick middle neck-word" }));
@@ -153,7 +153,7 @@ export function residualChart(points, tolerance = 0.01) {
 
 /** The pulse at the inlet, and the time that is shown: a click on a moment shows it, one beside the curve the mean. */
 export function pulseChart({ time_s, factor }, isPulsatile, times, moment, chosen) {
-  const [width, height, left, bottom, top] = [360, 150, 44, 26, 22];
+  const [width, height, left, bottom, top] = [258, 128, 24, 26, 22];
   const high = 1.1 * Math.max(...factor);
   const x = (t) => left + ((width - left - 8) * t) / time_s.at(-1);
   const y = (f) => height - bottom - ((height - top - bottom) * f) / high;
@@ -161,8 +161,8 @@ export function pulseChart({ time_s, factor }, isPulsatile, times, moment, chose
     svg("line", { x1: left, x2: width - 8, y1: y(v), y2: y(v), class: v ? "goal" : "grid" }),
     text(left - 6, y(v) + 4, String(v), { class: "tick end" }),
   ]);
-  const shown = moment !== undefined && times.length ? `shown: ${times[moment].toFixed(2)} s` : times.length ? "shown: mean of the cycle" : isPulsatile ? "the pulse" : "shown: steady, at the mean";
-  parts.push(text(4, 13, "Inflow / mean", { class: "axis-title" }), text(width - 8, 13, shown, { class: "axis-title end" }));
+  const shown = moment !== undefined && times.length ? `shown: ${times[moment].toFixed(2)} s` : times.length ? "shown: the cycle's mean" : isPulsatile ? "the pulse" : "steady, at the mean";
+  parts.push(text(0, 12, "Inflow / mean", { class: "axis-title" }), text(width - 8, 13, shown, { class: "axis-title end" }));
   for (const t of ticks(0, time_s.at(-1), 4)) parts.push(text(x(t), height - 8, `${t} s`, { class: "tick middle" }));
   parts.push(svg("path", { d: path(time_s.map((t, i) => [x(t), y(factor[i])])), class: isPulsatile ? "line device" : "line artery" }));
   const at = (t) => factor[Math.round((t / time_s.at(-1)) * (factor.length - 1))];

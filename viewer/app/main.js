@@ -1,14 +1,17 @@
 // The page: seven steps from a scan to a report, the scene in the middle, the numbers beside it.
 import { make } from "../src/dom.js";
 import { drop, get, getBinary, Newest, post, put } from "./api.js";
+import { Axis } from "./axis.js";
 import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js";
 import { Deploying } from "./deploy.js";
-import { changeSheet, placeWords, plainSheet } from "./numbers.js";
+import { Neck } from "./neck.js";
+import { changeSheet, neckWords, placeWords, plainSheet, sureSheet } from "./numbers.js";
 import { panels } from "./panels.js";
 import { Picture } from "./picture.js";
 import { rankingTable } from "./ranking.js";
 import { Slices } from "./slices.js";
 import { startPage } from "./start.js";
+import { Trimming } from "./trimming.js";
 
 export const STEPS = [
   ["image", "Image"],
@@ -29,6 +32,7 @@ class Page {
     this.root.append(this.toasts);
     this.colour = "wall_gap";
     this.memory = {};
+    this.changes = Promise.resolve();
     this.isWhole = false;
     this.measures = {};
     addEventListener("keydown", (event) => this.key(event));
@@ -126,6 +130,14 @@ class Page {
       told: (name, manifest, isWhole) => this.toldDevice(name, manifest, isWhole),
       failed: (problem) => this.complain(problem),
     });
+    this.neck = new Neck({
+      path: () => this.path,
+      picture: this.picture,
+      chosen: (curve) => this.choose({ neck_mm: curve.map((point) => point.map((x) => Number(x.toFixed(3)))) }),
+      told: (neck) => this.toldNeck(neck),
+      failed: (problem) => this.complain(problem),
+    });
+    this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.surfaces = new Newest(
       (answer) => this.picture.put(answer),
@@ -224,7 +236,7 @@ class Page {
   /** The middle of the neck on the parent axis, where one is known. */
   neckPoint() {
     const neck = this.anatomy?.neck;
-    return neck?.length ? this.deploying.at((neck[0] + neck[1]) / 2) : null;
+    return neck?.length ? this.axis.at((neck[0] + neck[1]) / 2) : null;
   }
 
   /** The live surface and the outline at a threshold. */
@@ -241,8 +253,11 @@ class Page {
       this.anatomy = answer.manifest;
       this.picture.stage?.drop(({ id }) => id.startsWith("opening ") || ["lumen", "landing", "sac", "neck", "wires", "contour"].includes(id));
       this.picture.put(answer);
+      this.neck.given = null; // its curve is drawn anew over the one found
       if (isFirst) this.picture.look(VIEW[this.step], false);
-      this.deploying.setAxis(answer.manifest.axis);
+      this.axis = new Axis(answer.manifest.axis, this.picture);
+      this.deploying.setAxis(this.axis);
+      this.trimming.set(this.axis, answer.manifest.neck);
       this.along.set({ axis: answer.manifest.axis, neck: answer.manifest.neck });
       this.sheets = (await get(`${this.path}/numbers`));
       this.measures = {};
@@ -323,7 +338,8 @@ class Page {
     this.picture.moved = null;
     this.picture.setMarks([]);
     if (!this.anatomy) return;
-    if (this.step === "vessel") this.picture.setMarks(this.openingMarks());
+    if (this.step === "vessel") this.picture.setMarks([...this.openingMarks(), ...this.trimming.handles]);
+    if (this.step === "sac") this.renderNeck();
     if (this.step === "deploy") this.renderDeploy();
   }
 
@@ -350,15 +366,30 @@ class Page {
         make("span", {}, [`${area_mm2.toFixed(1)} mm² · ⌀ ${diameter_mm.toFixed(1)} mm`]),
       ]);
       element.addEventListener("click", () => role !== "inlet" && this.choose({ inlet_mm: center_mm.map((x) => Number(x.toFixed(2))) }));
-      return { element, point: () => center_mm };
+      return { element, isLabel: true, point: () => center_mm };
     });
+  }
+
+  renderNeck() {
+    const { curve_mm, handles } = this.anatomy.drawn;
+    this.neck.set(this.view.choices.neck_mm ?? curve_mm, handles);
+    this.picture.setMarks(this.neck.handles);
+  }
+
+  neckPlace() {
+    return this.neckDrawn ? neckWords(this.neckDrawn, this.anatomy.drawn) : [];
+  }
+
+  toldNeck(neck) {
+    this.neckDrawn = neck;
+    this.panel.querySelector(".place")?.replaceChildren(...this.neckPlace());
   }
 
   renderDeploy() {
     const name = this.device;
     if (!name) return;
     this.picture.setMarks([...this.deploying.handles, this.deploying.cursorMark]);
-    this.picture.moved = (event) => this.deploying.look(this.deploying.under(event, null));
+    this.picture.moved = (event) => this.deploying.look(this.axis.under(event, null));
     const key = JSON.stringify([this.deploying.host.choice(name), this.colour, this.view.anatomy]);
     if (this.shownDevice !== key || this.deploying.name !== name || !this.measures[name]) {
       this.shownDevice = key;
@@ -388,9 +419,9 @@ class Page {
     if (!job) return this.work.replaceChildren();
     const bar = make("i");
     bar.style.width = `${Math.max(2, 100 * job.fraction)}%`;
-    const words = make("div", { className: "work-words" }, [make("b", {}, [spoken(job.stage) || "Starting"]), make("span", {}, [job.detail || "…"])]);
+    const words = make("div", { className: "work-words" }, [make("b", {}, [job.stage ? this.spoken(job.stage) : "Starting"]), make("span", {}, [job.detail || "…"])]);
     const stop = make("button", { type: "button", onClick: () => drop(`${this.path}/jobs`).catch((problem) => this.complain(problem)) }, ["Cancel"]);
-    const done = job.finished.map(({ stage }) => spoken(stage)).filter(Boolean);
+    const done = job.finished.map(({ stage }) => this.spoken(stage));
     const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "It goes on when this tab is closed."]);
     this.work.replaceChildren(words, make("div", { className: "bar", role: "progressbar", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
   }
@@ -411,6 +442,7 @@ class Page {
       const sheets = this.view.choices.devices.map(({ name }) => this.measures[name]).filter(Boolean);
       if (sheets.length) parts.push(head("Deployed"), plainSheet(sheets, this.isWhole));
     }
+    if (this.step === "report") for (const varied of this.sheets?.uncertainty || []) parts.push(...sureSheet(varied));
     if (this.sheets?.anatomy?.length && !(flow && ["flow", "report"].includes(this.step))) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));
     if (!parts.length) parts.push(make("h2", {}, ["Numbers"]), make("p", { className: "hint" }, ["They appear here as the steps are done, each with its unit and definition."]));
     else parts.push(make("p", { className: "hint" }, ["Rest the pointer on a name for its definition."]));
@@ -431,6 +463,14 @@ class Page {
     if (place) place.replaceChildren(...placeWords(manifest));
   }
 
+  /** A stage of a job in words: ``flow silk``. */
+  spoken(stage) {
+    const [first, device] = stage.split(" ");
+    const words = SPOKEN[first] || stage;
+    if (!device || first === "plan") return words;
+    return `${words} ${device === "bare" ? "before" : this.deviceTitle(device)}`;
+  }
+
   /** The inlet's pulse, for the left side. */
   pulseChart() {
     const box = make("div", { className: "pulse" });
@@ -447,9 +487,17 @@ class Page {
 
   // -- what a user does ---------------------------------------------------------------------------------------------
 
-  async choose(changes) {
+  /** Choose; `changes` are made on what is chosen when it is their turn: one goes after the other. */
+  choose(changes) {
+    this.changes = this.changes.then(() => this.send(changes));
+    return this.changes;
+  }
+
+  async send(changes) {
+    const { revision, choices } = this.view;
+    const more = typeof changes === "function" ? changes(choices) : changes;
     try {
-      this.take(await put(`${this.path}/choices`, { revision: this.view.revision, choices: { ...this.view.choices, ...changes } }));
+      this.take(await put(`${this.path}/choices`, { revision, choices: { ...choices, ...more } }));
     } catch (problem) {
       this.complain(problem);
       if (problem.status === 409) this.take(await get(this.path));
@@ -459,11 +507,11 @@ class Page {
   }
 
   changeDevice(name, changes) {
-    return this.choose({ devices: this.view.choices.devices.map((device) => (device.name === name ? { ...device, ...changes } : device)) });
+    return this.choose(({ devices }) => ({ devices: devices.map((device) => (device.name === name ? { ...device, ...changes } : device)) }));
   }
 
   chooseFlow(changes) {
-    return this.choose({ flow: { ...this.view.choices.flow, ...changes } });
+    return this.choose(({ flow }) => ({ flow: { ...flow, ...changes } }));
   }
 
   /** A size was chosen in the table: see it deployed. */
@@ -497,6 +545,7 @@ class Page {
   }
 
   async start(kind) {
+    await this.changes; // what was typed last comes first
     try {
       this.take(await post(`${this.path}/jobs/${kind}`));
     } catch (problem) {
@@ -505,6 +554,7 @@ class Page {
   }
 
   async stepBack(which) {
+    await this.changes;
     try {
       this.take(await post(`${this.path}/${which}`, { revision: this.view.revision }));
     } catch (problem) {
@@ -537,13 +587,10 @@ class Page {
   }
 }
 
-const SPOKEN = { segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes", measure: "Numbers", report: "Report" };
-
-function spoken(stage) {
-  const [first, ...rest] = stage.split(" ");
-  const named = { deploy: "Deploying", struts: "Struts of", flow: "Flow," }[first];
-  return named ? `${named} ${rest.join(" ") === "bare" ? "before" : rest.join(" ")}` : SPOKEN[first] || stage;
-}
+const SPOKEN = {
+  scan: "Scan", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes",
+  deploy: "Deploying", struts: "Struts of", plan: "Cost of the flow", flow: "Flow,", vary: "How sure:", measure: "Numbers", report: "Report",
+};
 
 /** From where each step looks at first. */
 const VIEW = { image: "whole", vessel: "whole", sac: "profile", device: "profile", deploy: "profile", flow: "profile", report: "profile" };

@@ -37,13 +37,33 @@ function cell(words, title, value, change) {
   return make("div", {}, parts);
 }
 
+/** How sure the results of a device are: the mean, what 95 % lie between, and what makes the spread. */
+export function sureSheet({ title, words, rows }) {
+  const cause = (shares) => shares.filter(([, share]) => share >= 0.05).map(([name, share]) => `${name} ${Math.round(100 * share)} %`).join(", ");
+  const cards = rows.map((row) =>
+    make("div", { className: "card" }, [
+      make("span", { className: "term" }, [row.name]),
+      make("div", { className: "card-cells" }, [cell("Mean", "", row.mean, ""), cell("95 % lie between", "", `${row.low} – ${row.high}`, "")]),
+      make("p", { className: "hint" }, [cause(row.shares)]),
+    ]),
+  );
+  return [make("h2", { className: "sure" }, [`How sure: ${title}`]), make("p", { className: "hint" }, [words]), make("div", { className: "cards" }, cards)];
+}
+
 /** Where a device lies, in words with their bands. */
 export function placeWords({ length_mm, length_band_mm, ends_mm, ends_band_mm }) {
-  const band = ([low, high]) => `${low.toFixed(1)} to ${high.toFixed(1)}`;
+  const band = ([low, high]) => `between ${low.toFixed(1)} and ${high.toFixed(1)} mm`;
   const rows = [
     ["Deployed length", `${length_mm.toFixed(1)} mm`, band(length_band_mm)],
     ["Proximal end", `${ends_mm[0].toFixed(1)} mm`, band(ends_band_mm[0])],
     ["Distal end", `${ends_mm[1].toFixed(1)} mm`, band(ends_band_mm[1])],
   ];
   return rows.map(([name, value, range]) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [range])]));
+}
+
+/** A neck as it is drawn, beside the one that was found. */
+export function neckWords(neck, found) {
+  const row = (name, value, was) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [value === was ? "" : `of the vessel shown: ${was}`])]);
+  const [area, around] = [(x) => `${x.area_mm2.toFixed(1)} mm²`, (x) => `${x.perimeter_mm.toFixed(1)} mm`];
+  return [row("Neck area", area(neck), area(found)), row("Neck perimeter", around(neck), around(found))];
 }

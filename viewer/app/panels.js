@@ -83,16 +83,18 @@ export const panels = {
   },
 
   vessel(page) {
-    const parts = [...title("Vessel", "Openings are where the vessel was cut. Blood enters through the inlet: click another opening to change it.")];
+    const parts = [...title("Vessel", "Blood enters through the inlet: click another opening to change it. Drag the handles on the artery to keep less of it.")];
     if (page.anatomy) parts.push(openings(page));
+    if (page.anatomy?.neck.length) parts.push(...kept(page));
     parts.push(...point(page, "inlet_mm", "Inlet near"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
     if (page.view.steps.vessel === "done") parts.push(next(page, "sac", "Sac and parent →"));
     return parts;
   },
 
   sac(page) {
-    const parts = [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Click a sac to choose it.")];
+    const parts = [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Drag the points on the neck to draw it anew; click a sac to choose it.")];
     if (page.anatomy) parts.push(select("outlet", "Parent leads to", near(page), [["", "proposed"], ...outlets(page)], (role) => page.choose({ outlet_mm: center(page, role) })));
+    if (page.anatomy?.drawn.curve_mm.length) parts.push(make("div", { className: "place" }, page.neckPlace()), ...drawn(page));
     parts.push(...point(page, "at_mm", "Seed"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
     if (page.view.steps.sac === "done") parts.push(next(page, "device", "Device →"));
     return parts;
@@ -149,11 +151,20 @@ export const panels = {
 
   report(page) {
     const parts = [...title("Report", "One file with the case in 3-D, pictures, every number with its definition, and how it was made. It needs no network.")];
-    const { has_report, steps } = page.view;
+    const { choices, has_flow, has_pdf, has_report, job, steps } = page.view;
     const link = (file, words, isMain) => make("a", { className: `button wide ${isMain ? "primary" : ""}`, href: `${page.path}/files/${file}`, target: "_blank", rel: "noopener" }, [words]);
     parts.push(...staleness(page), ...failure(page));
-    if (has_report) parts.push(link("report.html", "Open the report", true), link("metrics.json", "Numbers (JSON)"), link("run.json", "How it was made (JSON)"));
-    if (!has_report || steps.report !== "done") {
+    if (has_report) parts.push(link("report.html", "Open the report", true));
+    if (has_pdf) parts.push(link("report.pdf", "Report to print (PDF)"));
+    if (has_report) parts.push(link("metrics.json", "Numbers (JSON)"), link("run.json", "How it was made (JSON)"));
+    if (has_flow) {
+      const options = [["", "not asked"], ...[16, 32, 64].map((n) => [String(n), `${n} deployments`])];
+      const asked = (count) => page.choose({ uncertainty_samples: count ? Number(count) : null });
+      parts.push(select("sure", "How sure", choices.uncertainty_samples ?? "", options, asked));
+      parts.push(make("p", { className: "hint" }, ["Deploys every device again and again with threshold, landing and width of the device varied: an interval for each result, and what makes it."]));
+      if (steps.report !== "done" && steps.flow === "done" && !job) parts.push(main(page, "Write the report again", () => page.start("flow")));
+    }
+    if (steps.flow !== "done") {
       parts.push(make("p", { className: "note" }, ["The report is written when the flow has been computed."]), next(page, "flow", "← Flow"));
     }
     parts.push(make("p", { className: "hint" }, [`The case lies in ${page.view.folder}.`]));
@@ -172,7 +183,12 @@ function threshold(page) {
     shown.textContent = Number(slider.value).toFixed(0);
     page.showThreshold(Number(slider.value));
   });
-  slider.addEventListener("change", () => page.choose({ threshold: Number(slider.value) }));
+  // Keys change it step by step: it is chosen when they rest.
+  let timer;
+  slider.addEventListener("change", () => {
+    clearTimeout(timer);
+    timer = setTimeout(() => page.choose({ threshold: Number(slider.value) }), 250);
+  });
   const parts = [make("label", { className: "slider", htmlFor: "field-threshold" }, [make("span", {}, ["Threshold ", shown]), slider])];
   if (view.choices.threshold !== null) {
     const reset = () => {
@@ -194,11 +210,24 @@ function openings(page) {
     return make("button", { type: "button", className: `opening-row ${isInlet ? "inlet" : ""}`, onClick: () => !isInlet && page.choose({ inlet_mm: center_mm.map((x) => Number(x.toFixed(2))) }) }, [
       dot,
       make("span", {}, [isInlet ? "Inlet" : role.replace("outlet_", "Outlet ")]),
-      make("b", {}, [`${area_mm2.toFixed(2)} mm²`]),
-      make("small", {}, [`⌀ ${diameter_mm.toFixed(2)}`]),
+      make("b", {}, [`${area_mm2.toFixed(1)} mm²`]),
+      make("small", {}, [`⌀ ${diameter_mm.toFixed(1)} mm`]),
     ]);
   });
   return make("div", { className: "openings" }, rows);
+}
+
+/** How much of the vessel is kept beside the sac. */
+function kept(page) {
+  const { upstream_mm, downstream_mm } = page.view.choices;
+  const field = (key, words, value) => number(page, key, words, "mm", value, (mm) => page.choose({ [key]: mm }), { min: 1 });
+  return [field("upstream_mm", "Before sac", upstream_mm), field("downstream_mm", "Beyond sac", downstream_mm), make("p", { className: "hint" }, ["Lengths of vessel that are kept; every branch is cut as far beyond the sac."])];
+}
+
+/** A word on a neck that was drawn by hand. */
+function drawn(page) {
+  if (!page.view.choices.neck_mm) return [];
+  return [make("div", { className: "given" }, [make("span", {}, ["The neck was drawn by hand."]), make("button", { type: "button", className: "link", onClick: () => page.choose({ neck_mm: null }) }, ["Propose again"])])];
 }
 
 const outlets = (page) => page.anatomy.openings.filter(({ role }) => role !== "inlet").map(({ role, diameter_mm }) => [role, `${role.replace("outlet_", "outlet ")} (⌀ ${diameter_mm.toFixed(1)} mm)`]);
@@ -221,8 +250,8 @@ function deviceBox(page, design, chosen) {
   box.dataset.key = `device-${design.key}`;
   box.disabled = !device && chosen.size >= 3;
   box.addEventListener("change", () => {
-    const others = page.view.choices.devices.filter(({ name }) => name !== design.key);
-    page.choose({ devices: box.checked ? [...others, { name: design.key }] : others });
+    const others = (devices) => devices.filter(({ name }) => name !== design.key);
+    page.choose(({ devices }) => ({ devices: box.checked ? [...others(devices), { name: design.key }] : others(devices) }));
   });
   const size = device?.diameter_mm ? `${device.diameter_mm} × ${device.length_mm} mm` : device ? "size proposed" : design.kind;
   const sure = `${design.n_facts - design.n_estimated} of ${design.n_facts} numbers are cited or derived, the rest estimated`;
@@ -240,7 +269,7 @@ function sizes(page) {
   const now = [device.diameter_mm ?? Number(proposed?.[1] ?? 0), device.length_mm ?? Number(proposed?.[2] ?? 0)];
   const options = design.sizes.map(([d, l]) => [`${d},${l}`, `${d.toFixed(2)} × ${l} mm`]);
   const value = device.diameter_mm ? now.join(",") : "";
-  const words = proposed ? `proposed: ${now[0].toFixed(2)} × ${now[1]} mm` : "proposed";
+  const words = proposed ? `${now[0].toFixed(2)} × ${now[1]} mm (proposed)` : "proposed";
   const change = (text) => {
     const [diameter_mm, length_mm] = text ? text.split(",").map(Number) : [null, null];
     page.changeDevice(page.device, { diameter_mm, length_mm });

@@ -164,23 +164,43 @@ export class Picture {
 
   afterDrawing() {
     annotate(this.panes, this.stage, this.paneSize()[1]);
-    for (const mark of this.drawnMarks) this.placeMark(mark);
+    this.placeMarks();
   }
 
   /** Lay elements on the scene: [{element, point: () => [x, y, z]}]; they follow the camera. */
   setMarks(marks) {
+    // One that is in hand stays where it is: it would be let go.
+    const isSame = marks.length === this.drawnMarks.length && marks.every(({ element }, i) => element === this.drawnMarks[i].element);
     this.drawnMarks = marks;
-    this.marks.replaceChildren(...marks.map(({ element }) => element));
-    if (this.stage) marks.forEach((mark) => this.placeMark(mark));
+    if (!isSame) this.marks.replaceChildren(...marks.map(({ element }) => element));
+    if (this.stage) this.placeMarks();
     this.stage?.redraw();
+  }
+
+  /** Marks lie on their points; labels keep inside the picture, beside the buttons above it, and off each other. */
+  placeMarks() {
+    this.drawnMarks.forEach((mark) => this.placeMark(mark));
+    const [width, height, top] = [this.area.clientWidth, this.area.clientHeight, this.toolbar.offsetHeight + 28];
+    const taken = [];
+    const labels = this.drawnMarks.filter(({ isLabel, element }) => isLabel && !element.hidden);
+    for (const mark of labels.sort((a, b) => a.at[1] - b.at[1])) {
+      const { offsetWidth: w, offsetHeight: h } = mark.element;
+      const [x, y] = mark.at;
+      const left = x + w + 14 > width ? x - w - 18 : x;
+      let middle = Math.min(Math.max(y, top), height - h);
+      for (const other of taken) if (left < other.right && left + w > other.left && middle < other.bottom + h / 2 + 3) middle = other.bottom + h / 2 + 3;
+      taken.push({ left, right: left + w, bottom: middle + h / 2 });
+      mark.element.style.transform = `translate(${left}px, ${middle}px)`;
+    }
   }
 
   placeMark(mark) {
     const point = mark.point();
     mark.element.hidden = !point;
     if (!point) return;
-    const [x, y] = this.onScreen(point);
+    const [x, y] = (mark.at = this.onScreen(point));
     mark.element.style.transform = `translate(${x}px, ${y}px)`;
+    mark.element.classList.toggle("flipped", x > this.area.clientWidth - 170);
   }
 
   /** Pixel in the first pane where a point of the world is seen. */
@@ -202,14 +222,24 @@ export class Picture {
 
   /** Point of the nearest visible surface under a pointer, or null. */
   pick(event) {
-    const [x, y] = this.where(event);
+    const isShown = (layer) => layer.kind === "mesh" && this.shown.has(layer.id);
+    return this.hits(this.where(event), isShown)[0] || null;
+  }
+
+  /** Point of a layer that is seen at a pixel, the one nearest to `point` of those in front of and behind each other. */
+  onWall(place, id, point) {
+    const away = (hit) => Math.hypot(...hit.map((x, i) => x - point[i]));
+    return this.hits(place, (layer) => layer.id === id).sort((a, b) => away(a) - away(b))[0] || null;
+  }
+
+  /** Points where the sight through a pixel meets layers, the nearest first. */
+  hits([x, y], isChosen) {
     const { element } = this.panes[0];
     this.onScreen([0, 0, 0]);
     const place = new Vector2((2 * (x - element.offsetLeft)) / element.offsetWidth - 1, 1 - (2 * (y - element.offsetTop)) / element.offsetHeight);
     const caster = new Raycaster();
     caster.setFromCamera(place, this.stage.camera);
-    const meshes = this.stage.layers.filter((layer) => layer.kind === "mesh" && this.shown.has(layer.id)).map(({ object }) => object);
-    const hit = caster.intersectObjects(meshes, true)[0];
-    return hit ? hit.point.toArray() : null;
+    const meshes = this.stage.layers.filter(isChosen).map(({ object }) => object);
+    return caster.intersectObjects(meshes, true).map(({ point }) => point.toArray());
   }
 }

@@ -116,6 +116,10 @@ export function surface(layer, geometry, scale) {
       uniforms: { ...uniforms(layer, scale), opacity: { value: layer.opacity } },
       transparent: glass,
       depthWrite: !glass,
+      // Glass that lies on an opaque wall must not flicker with it: it is drawn a little behind.
+      polygonOffset: glass,
+      polygonOffsetFactor: 4,
+      polygonOffsetUnits: 40,
       side,
     });
   const sides = glass ? [THREE.BackSide, THREE.FrontSide] : [THREE.DoubleSide];

@@ -4,6 +4,13 @@ import { make } from "./dom.js";
 import { annotate, annotations, colourBar, gradient } from "./furniture.js";
 import { Stage } from "./stage.js";
 
+// What the page makes use of too: it is loaded beside this bundle, and three.js need not come twice.
+export * from "./decode.js";
+export * from "./dom.js";
+export * from "./furniture.js";
+export { Stage } from "./stage.js";
+export { Raycaster, Vector2, Vector3 } from "three";
+
 const MODES = [
   { id: "anatomy", title: "Anatomy", layers: ["lumen", "landing", "sac", "neck"] },
   { id: "device", title: "Device", layers: ["lumen", "wires", "contour", "neck"] },

@@ -60,12 +60,12 @@ def dependencies(state: State) -> dict[str, str]:
     centers = [device.center_mm for device in state.choices.devices]
     parts: dict[str, Any] = {
         "image": [state.source, *(chosen[name] for name in ("units", "spacing_mm", "shape", "threshold", "at_mm"))],
-        "vessel": chosen["inlet_mm"],
-        "sac": chosen["outlet_mm"],
+        "vessel": [chosen[name] for name in ("inlet_mm", "upstream_mm", "downstream_mm")],
+        "sac": [chosen["outlet_mm"], chosen["neck_mm"]],
         "device": sizes,
         "deploy": centers,
         "flow": chosen["flow"],
-        "report": "",
+        "report": chosen["uncertainty_samples"],
     }
     digest, found = "", {}
     for step in STEPS:

@@ -1,6 +1,6 @@
 """What a user has chosen, as the page and the REST interface say it, and as a study understands it."""
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -10,6 +10,8 @@ if TYPE_CHECKING:  # a study's modules are loaded when it is to be told somethin
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
 Length = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
+NECK_HANDLES: Final = 12
+"""Points of a neck that can be pulled, evenly spaced."""
 Point = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -62,10 +64,18 @@ class Choices(Strict):
     at_mm: Point | None = None
     inlet_mm: Point | None = None
     outlet_mm: Point | None = None
+    neck_mm: Annotated[tuple[Point, ...], Field(min_length=3, max_length=1000)] | None = None
+    """A neck drawn by hand: a closed curve near the wall."""
+    upstream_mm: Length | None = None
+    """Artery to keep before the sac."""
+    downstream_mm: Length | None = None
+    """Of every way beyond the sac, what is to be kept."""
     devices: tuple[DeviceChoice, ...] = Field(
         default=(DeviceChoice(name="silk"), DeviceChoice(name="enterprise")), max_length=3
     )
     flow: FlowChoice = FlowChoice()
+    uncertainty_samples: Annotated[int, Field(ge=8, le=256)] | None = None
+    """Deployments with what is not sure varied; None: none."""
 
     @field_validator("devices")
     @classmethod
@@ -77,7 +87,9 @@ class Choices(Strict):
     def settings(self) -> "Settings":
         """Return what a study is told."""
         from vstent.study import Placing, Settings
+        from vstent.uncertainty import Ranges
 
+        samples = self.uncertainty_samples
         return Settings(
             devices=tuple(device.name for device in self.devices),
             units=self.units,
@@ -87,8 +99,12 @@ class Choices(Strict):
             at_mm=self.at_mm,
             inlet_mm=self.inlet_mm,
             outlet_mm=self.outlet_mm,
+            neck_mm=self.neck_mm,
+            upstream_mm=self.upstream_mm,
+            downstream_mm=self.downstream_mm,
             flow=self.flow.settings(),
             placings={device.name: placing for device in self.devices if (placing := placing_of(device)) != Placing()},
+            uncertainty=None if samples is None else Ranges(samples),
         )
 
 

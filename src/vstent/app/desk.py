@@ -3,12 +3,13 @@
 import json
 import tempfile
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Conflict, Store, dependencies, statuses
-from vstent.app.choices import DeviceChoice
+from vstent.app.choices import DeviceChoice, Point
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.app.reopening import RUN, reopened, stem
 from vstent.errors import InputError, ReadError
@@ -79,6 +80,7 @@ class Desk:
             "has_anatomy": bool(state.anatomy),
             "anatomy": state.anatomy,
             "has_report": (case.folder / "report.html").is_file(),
+            "has_pdf": (case.folder / "report.pdf").is_file(),
             "has_ranking": (case.folder / RANKING).is_file(),
             "has_flow": (case.folder / "metrics.json").is_file() and "flow" in state.done,
             "job": job.told() if job is not None and is_at_work else None,
@@ -174,17 +176,25 @@ class Desk:
         with LOCK:
             return bytes(scan.surface(threshold))
 
+    def neck(self, case: Case, curve_mm: Sequence[Point], handle: int | None, to_mm: Point | None) -> bytes:
+        """Return a neck, with one handle pulled where it is said whither."""
+        import numpy as np
+
+        whither = None if to_mm is None else np.array(to_mm, dtype=np.float64)
+        return bytes(self.live(case).neck_message(np.array(curve_mm, dtype=np.float64), handle, whither))
+
     def numbers(self, case: Case) -> dict[str, Any]:
-        """Return every number found so far: anatomy, and flow before and after."""
+        """Return every number found so far: anatomy, flow before and after, and how sure they are."""
         from vstent.app import sheets
 
-        found: dict[str, Any] = {"anatomy": [], "flow": []}
+        found: dict[str, Any] = {"anatomy": [], "flow": [], "uncertainty": []}
         if case.state.anatomy:
             found["anatomy"] = self.live(case).anatomy_sheet()
         path = case.folder / "metrics.json"
         if path.is_file():
             metrics = json.loads(path.read_text(encoding="utf-8"))
-            found["flow"] = sheets.flow(metrics, _titles(metrics, case))
+            titles = _titles(metrics, case)
+            found |= {"flow": sheets.flow(metrics, titles), "uncertainty": sheets.uncertainty(metrics, titles)}
         return found
 
     def warm(self) -> None:

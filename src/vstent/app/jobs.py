@@ -34,13 +34,16 @@ STAGES: Final = {
     "struts": "deploy",
     "plan": "flow",
     "flow": "flow",
-    "measure": "flow",
+    "measure": "report",
+    "vary": "report",
     "report": "report",
 }
 """First word of a study's stage -> step of the page."""
 SETTLING: Final = re.compile(r"([\d.]+)% left to settle, (?:.*?)(\d+) s left")
 """How a ledger tells of a flow (`vstent.study.ledger.Ledger.teller`)."""
 STOPPED: Final = "Stopped. What was finished is kept."
+LAST_WORDS: Final = ".worker.log"
+"""File of a case folder with what a job said when it broke off."""
 POINTS_KEPT: Final = 600
 RANKING: Final = "ranking.json"
 """File of a case folder that holds the sizes ranked."""
@@ -58,15 +61,16 @@ class Job:
         self._given = case.state
         self._is_stopped = False
         command = [sys.executable, "-m", "vstent.app.worker", kind, str(case.folder)]
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,  # closes when the server is gone, however it went: then the job ends too
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            bufsize=1,
-            start_new_session=True,  # a job's own processes end with it
-        )
+        with (case.folder / LAST_WORDS).open("w", encoding="utf-8") as last_words:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,  # closes when the server is gone, however it went: then the job ends too
+                stdout=subprocess.PIPE,
+                stderr=last_words,
+                text=True,
+                bufsize=1,
+                start_new_session=True,  # a job's own processes end with it
+            )
         self._thread = threading.Thread(target=self._follow, daemon=True)
         self._thread.start()
 
@@ -130,7 +134,9 @@ class Job:
         if self._is_stopped:
             failure = STOPPED
         elif code and not failure:
-            failure = "The computation broke off; what was finished is kept. Start it again to go on."
+            failure = (
+                f"The computation broke off (its last words: {LAST_WORDS}); what was finished is kept. Start it again."
+            )
         self._close(failure)
 
     def _take(self, stage: str, fraction: float, detail: str) -> None:

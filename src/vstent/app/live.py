@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, TypeVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vstent.app import sheets
+from vstent.app import necks, sheets
 from vstent.app.cases import Case
 from vstent.app.choices import DeviceChoice, placing_of
 from vstent.app.cuts import at_phase, cut
@@ -175,7 +175,15 @@ class Live:
             openings=[_said(opening) for opening in openings],
             notes=[*anatomy.vessel.notes, *anatomy.notes],
             neck=_neck_span(anatomy),
+            drawn=necks.told(necks.curve_of(anatomy)),
         )
+
+    def neck_message(self, curve_mm: Floats, handle: int | None, to_mm: Floats | None) -> bytes:
+        """Return a neck as it is, or with one handle pulled to a point of the wall, with its area."""
+        with LOCK:
+            if handle is not None and to_mm is not None:
+                curve_mm = necks.pulled(self.anatomy, curve_mm, handle, to_mm)
+            return message([necks.layer_of(curve_mm)], neck=necks.told(curve_mm))
 
     def anatomy_sheet(self) -> list[dict[str, Any]]:
         """Return the anatomy's numbers."""

@@ -13,7 +13,10 @@ from vstent.io.files import suffix
 
 RUN: Final = "run.json"
 """What a study says of itself."""
-GEOMETRY: Final = ("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm")
+GEOMETRY: Final = (
+    *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
+    *("neck_mm", "upstream_mm", "downstream_mm"),
+)
 
 
 def stem(path: Path) -> str:
@@ -52,7 +55,7 @@ def _choices(settings: dict[str, Any]) -> Choices:
     placings = settings.get("placings", {})
     shared = {name: settings[name] for name in ("diameter_mm", "length_mm", "center_mm")}
     devices = tuple(DeviceChoice(name=name, **placings.get(name, shared)) for name in settings["devices"])
-    flow = settings["flow"]
+    flow, varied = settings["flow"], settings["uncertainty"]
     chosen = FlowChoice(is_wanted=False)
     if flow is not None:
         chosen = FlowChoice(
@@ -61,4 +64,6 @@ def _choices(settings: dict[str, Any]) -> Choices:
             is_pulsatile=flow["waveform"] is not None,
             outlets=flow["outlets"],
         )
-    return Choices(devices=devices, flow=chosen, **{name: settings[name] for name in GEOMETRY})
+    geometry = {name: settings[name] for name in GEOMETRY}
+    samples = None if varied is None else varied["samples"]
+    return Choices(devices=devices, flow=chosen, uncertainty_samples=samples, **geometry)

@@ -16,7 +16,7 @@ from fastapi.responses import FileResponse, JSONResponse, Response, StreamingRes
 from pydantic import Field
 
 from vstent.app import desk as desks
-from vstent.app.choices import Choices, DeviceChoice, Strict
+from vstent.app.choices import NECK_HANDLES, Choices, DeviceChoice, Point, Strict
 from vstent.app.desk import Desk
 from vstent.app.security import REPORT_POLICY, Guard
 from vstent.errors import ReadError, VstentError
@@ -24,8 +24,9 @@ from vstent.errors import ReadError, VstentError
 MEDIA: Final = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css"}
 BINARY: Final = "application/octet-stream"
 """A manifest and its arrays, as `vstent.report.packing` says."""
-ASSETS: Final = ("index.html", "app.js", "app.css", "viewer.css", "docs.html", "docs.js")
-FILES: Final = ("metrics.json", "run.json", "report.html")
+SHARED: Final = ("viewer.js", "viewer.css")
+"""Files of the report that the page shares."""
+ASSETS: Final = ("index.html", "app.js", "app.css", "docs.html", "docs.js", *SHARED)
 BEAT_S: Final = 15.0
 """A quiet stream of events says something this often."""
 
@@ -58,6 +59,14 @@ class SketchWanted(Strict):
     anchor: Literal["proximal", "center", "distal"] = "center"
     abscissa_mm: float | None = Field(default=None, ge=-1000, le=1000)
     colour: Literal["wall_gap", "coverage", "diameter"] = "wall_gap"
+
+
+class NeckWanted(Strict):
+    """A neck to be drawn, with one handle pulled to a point of the wall where they are given."""
+
+    curve_mm: tuple[Point, ...] = Field(min_length=3, max_length=1000)
+    handle: int | None = Field(default=None, ge=0, lt=NECK_HANDLES)
+    to_mm: Point | None = None
 
 
 def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
@@ -98,7 +107,7 @@ def _said(_: Request, error: Exception) -> JSONResponse:
 
 def asset(name: str) -> Response:
     """Return one of the page's files."""
-    package = "vstent.report" if name == "viewer.css" else "vstent.app"
+    package = "vstent.report" if name in SHARED else "vstent.app"
     text = files(package).joinpath("assets", name).read_bytes()
     return Response(text, media_type=MEDIA[Path(name).suffix])
 
@@ -235,8 +244,8 @@ def _add_jobs(app: FastAPI, desk: Desk) -> None:
     def numbers(case_id: str) -> dict[str, Any]:
         return desk.numbers(desk.store.get(case_id))
 
-    @app.get("/api/cases/{case_id}/files/{name}", summary="metrics.json, run.json or report.html")
-    def one_file(case_id: str, name: Literal["metrics.json", "run.json", "report.html"]) -> Response:
+    @app.get("/api/cases/{case_id}/files/{name}", summary="What a study has written")
+    def one_file(case_id: str, name: Literal["metrics.json", "run.json", "report.html", "report.pdf"]) -> Response:
         path = desk.store.get(case_id).folder / name
         if not path.is_file():
             raise ReadError(f"{name} has not been written yet: run the step Flow.")
@@ -248,6 +257,10 @@ def _add_scenes(app: FastAPI, desk: Desk) -> None:
     @app.get("/api/cases/{case_id}/anatomy", summary="Vessel, sac, neck and parent artery (binary)")
     def anatomy(case_id: str) -> Response:
         return Response(desk.live(desk.store.get(case_id)).anatomy_message(), media_type=BINARY)
+
+    @app.post("/api/cases/{case_id}/neck", summary="A neck with a handle pulled, and its area, at once (binary)")
+    def neck(case_id: str, wanted: NeckWanted) -> Response:
+        return Response(desk.neck(desk.store.get(case_id), *wanted.model_dump().values()), media_type=BINARY)
 
     @app.post("/api/cases/{case_id}/sketch", summary="Where a device would lie, at once (binary)")
     def sketch(case_id: str, wanted: SketchWanted) -> Response:

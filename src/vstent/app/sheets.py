@@ -4,6 +4,7 @@ from typing import Any, Final
 
 from vstent.report.definitions import HEADLINES
 from vstent.report.quantities import Quantity, compare, flatten, format_change
+from vstent.report.uncertainty import uncertainty_of
 
 Sheet = dict[str, Any]
 
@@ -56,6 +57,14 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
     rows.sort(key=lambda row: HEADLINES.index(row["key"]) if row["key"] in HEADLINES else len(HEADLINES))
     words = {"title": "Blood flow", "names": list(titles), "devices": list(titles.values())}
     return [words | {"rows": rows}] if rows else []
+
+
+def uncertainty(metrics: dict[str, Any], titles: dict[str, str]) -> list[dict[str, Any]]:
+    """Return the intervals of every device for which something was varied."""
+    return [
+        {"title": varied.title, "words": varied.words, "rows": [row._asdict() for row in varied.rows]}
+        for varied in uncertainty_of(metrics, titles)
+    ]
 
 
 def _plain(title: str, quantities: list[Quantity], first: tuple[str, ...]) -> Sheet:

@@ -51,13 +51,12 @@ def _tell_anatomy(case: Case, _: Any) -> None:
 
 def compute(case: Case) -> None:
     """Deploy, compute the flow where it is wanted, and write the report: what `vstent run` does."""
-    from vstent.io.writers import write_text
-    from vstent.report import report
+    from vstent.report import write_report
 
     result = run(case.input, case.folder, case.state.choices.settings(), progress)
     _tell_anatomy(case, result)
     progress("report", 0.0, "")
-    write_text(case.folder / "report.html", report(result))
+    write_report(result, case.folder, is_printed=True)
     progress("report", 1.0, "")
 
 

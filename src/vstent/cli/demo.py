@@ -11,6 +11,7 @@ def add(commands: options.Commands) -> None:
     parser = options.add_command(commands, "demo", "the same on a synthetic scan, beside its known truth")
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="case folder (default: demo)")
     run.add_study(parser)
+    run.add_pdf(parser)
     parser.set_defaults(command=_demo)
 
 
@@ -18,6 +19,7 @@ def _demo(arguments: argparse.Namespace) -> int:
     from vstent.console import Console, truth_table
     from vstent.demo import truth, write_scan
 
-    case = run.study(write_scan(arguments.out / "scan"), arguments.out, run.given_study(arguments))
+    scan, settings = write_scan(arguments.out / "scan"), run.given_study(arguments)
+    case = run.study(scan, arguments.out, settings, is_printed=arguments.pdf)
     Console().print(truth_table(truth(case)))
     return 0

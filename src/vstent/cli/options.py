@@ -60,8 +60,17 @@ def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
 
 
 def add_outlet(given: "argparse._ArgumentGroup") -> None:
-    """Add the point that picks the parent artery's outlet."""
+    """Add the point that picks the parent artery's outlet, and how much of the vessel is kept."""
     given.add_argument("--outlet", type=_point, metavar="X,Y,Z", help="a point near the parent artery's outlet, mm")
+    given.add_argument("--upstream", type=positive, metavar="MM", help="artery to keep before the sac (35)")
+    given.add_argument("--downstream", type=positive, metavar="MM", help="vessel to keep beyond the sac (25)")
+
+
+def add_neck(given: "argparse._ArgumentGroup") -> None:
+    """Add a neck that was drawn."""
+    given.add_argument(
+        "--neck", type=Path, metavar="CSV", help="the neck: columns x, y, z in mm of points along a closed curve"
+    )
 
 
 def add_devices(parser: argparse.ArgumentParser) -> None:
@@ -206,7 +215,16 @@ def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
         "at_mm": arguments.at,
         "inlet_mm": arguments.inlet,
         "outlet_mm": getattr(arguments, "outlet", None),
+        "upstream_mm": getattr(arguments, "upstream", None),
+        "downstream_mm": getattr(arguments, "downstream", None),
+        "neck_mm": _neck(getattr(arguments, "neck", None)),
     }
+
+
+def _neck(path: Path | None) -> tuple[tuple[float, float, float], ...] | None:
+    from vstent.io.tables import read_columns
+
+    return None if path is None else tuple((x, y, z) for x, y, z in read_columns(path, 3).tolist())
 
 
 def given_devices(arguments: argparse.Namespace) -> tuple[str, ...]:

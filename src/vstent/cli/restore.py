@@ -8,7 +8,9 @@ from vstent.cli import options
 def add(commands: options.Commands) -> None:
     """Add the command."""
     parser = options.add_command(commands, "restore", "scan or surface -> parent artery, sac, neck, measures")
-    options.add_outlet(options.add_geometry(parser))
+    given = options.add_geometry(parser)
+    options.add_outlet(given)
+    options.add_neck(given)
     parser.set_defaults(command=_restore)
 
 

@@ -19,12 +19,14 @@ def add(commands: options.Commands) -> None:
     )
     given = options.add_geometry(parser)
     options.add_outlet(given)
+    options.add_neck(given)
     given.add_argument("--diameter", type=options.positive, metavar="MM", help="label diameter of the devices")
     given.add_argument("--length", type=options.positive, metavar="MM", help="label length of the devices")
     given.add_argument(
         "--center", type=options.number, metavar="MM", help="where on the parent axis the device's middle lies"
     )
     add_study(parser)
+    add_pdf(parser)
     parser.add_argument("--crate", action="store_true", help="describe the folder as an RO-Crate besides")
     parser.add_argument(
         "--input", dest="moved_to", type=Path, metavar="PATH", help="where the input of a run.json lies now"
@@ -40,6 +42,11 @@ def add_study(parser: argparse.ArgumentParser) -> None:
     options.add_uncertainty(parser)
 
 
+def add_pdf(parser: argparse.ArgumentParser) -> None:
+    """Add whether the report is to be printed."""
+    parser.add_argument("--pdf", action="store_true", help="write the report as report.pdf besides")
+
+
 def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
     """Collect what a study is told; `given` are further settings."""
     from vstent.study import Settings
@@ -49,8 +56,8 @@ def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
     return Settings(devices=devices, flow=flow, uncertainty=ranges, **given)  # type: ignore[arg-type]
 
 
-def study(path: Path, out: Path, settings: "Settings") -> "CaseResult":
-    """Run a study with its progress shown; write the report and print the table."""
+def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool) -> "CaseResult":
+    """Run a study with its progress shown; write the report, as a PDF too where asked, and print the table."""
     from vstent.console import Console, comparison_table, uncertainty_table
     from vstent.study import run
 
@@ -58,10 +65,9 @@ def study(path: Path, out: Path, settings: "Settings") -> "CaseResult":
     with console.live():
         case = run(path, out, settings, console.progress)
         console.progress("report", 0.0, "")
-        from vstent.io.writers import write_text
-        from vstent.report import report
+        from vstent.report import write_report
 
-        write_text(out / "report.html", report(case))
+        write_report(case, out, is_printed=is_printed)
         console.progress("report", 1.0, str(out / "report.html"))
     console.print(comparison_table(case.metrics))
     if settings.uncertainty is not None:
@@ -80,7 +86,7 @@ def _run(arguments: argparse.Namespace) -> int:
     )
     if arguments.input.suffix == ".json":
         return _again(arguments, settings)
-    _finish(arguments, study(arguments.input, arguments.out, settings))
+    _finish(arguments, study(arguments.input, arguments.out, settings, is_printed=arguments.pdf))
     return 0
 
 
@@ -91,14 +97,16 @@ def _again(arguments: argparse.Namespace, given: "Settings") -> int:
     from vstent.study import Settings, agreement, read_record
 
     if asdict(given) != asdict(Settings()):
-        raise InputError(f"{arguments.input} says all settings: give no option but --out, --input and --crate with it.")
+        raise InputError(
+            f"{arguments.input} says all settings: give no option but --out, --input, --pdf and --crate with it."
+        )
     record = read_record(arguments.input, arguments.moved_to)
     if arguments.out.resolve() == record.folder.resolve():
         raise InputError(f"{arguments.out} is the folder of the run itself: give another --out to repeat it in.")
     console = Console()
     for difference in record.differences:
         console.say(f"Not as then: {difference}.")
-    _finish(arguments, study(record.input, arguments.out, record.settings))
+    _finish(arguments, study(record.input, arguments.out, record.settings, is_printed=arguments.pdf))
     console.print(agreement(record.folder, arguments.out))
     return 0
 

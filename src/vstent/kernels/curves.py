@@ -128,6 +128,13 @@ def project(polyline: Floats, points: Floats) -> tuple[Floats, Floats]:
     return best_s, best_d
 
 
+def lowpass(values: Floats, n_waves: float) -> Floats:
+    """Values (n, ...) around a ring, without waves of which more than `n_waves` fit into it."""
+    wave = np.arange(len(values) // 2 + 1)
+    gain = 1.0 / (1.0 + (wave / n_waves) ** 4)
+    return np.fft.irfft(np.fft.rfft(values, axis=0) * gain.reshape(-1, *[1] * (values.ndim - 1)), n=len(values), axis=0)
+
+
 def roughness(n: int, order: int, strength: Floats | float = 1.0) -> csc_matrix:
     """Matrix (n, n) of the sum of squared differences of `order` along n samples, each times its strength (n,)."""
     difference = csc_matrix(eye(n))

@@ -188,10 +188,13 @@ def clip(vertices: Floats, faces: Ints, level: Floats) -> tuple[Floats, Ints, Fl
 
 def components(faces: Ints, n_vertices: int) -> Ints:
     """Connected-component number (m,) of every face, through shared vertices."""
-    edges = directed_edges(faces)
-    graph = coo_matrix((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n_vertices, n_vertices))
-    label = connected_components(graph, directed=False)[1]
-    return label[faces[:, 0]].astype(np.int32)
+    return joined(directed_edges(faces), n_vertices)[faces[:, 0]]
+
+
+def joined(pairs: Ints, n: int) -> Ints:
+    """Connected-component number (n,) of every one of n things of which pairs (k, 2) hang together."""
+    graph = coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return connected_components(graph, directed=False)[1].astype(np.int32)
 
 
 def face_neighbours(faces: Ints) -> Ints:

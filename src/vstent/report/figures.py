@@ -65,7 +65,7 @@ def overview(scene: Scene) -> bytes:
     layers = ("lumen", "wires", "neck", "streamlines")
     shots = [Shot(title, scene.pick(layers, pane), scene.view("profile")) for pane, title in scene.panes]
     scales = {scale.id for scale in scene.scales}
-    return _sheet(scene, shots, "speed" if "speed" in scales else "")
+    return sheet(scene, shots, "speed" if "speed" in scales else "")
 
 
 def draw(layers: tuple[MeshLayer | LineLayer, ...], scene: Scene, view: View, size_px: tuple[int, int]) -> Floats:
@@ -137,14 +137,14 @@ def _anatomy(scene: Scene) -> Picture:
     titles = {"profile": "In profile", "frontal": "Frontal", "lateral": "From the left"}
     shots = [Shot(title, scene.pick(ids, BARE), scene.view(view)) for view, title in titles.items()]
     caption = "The patient's lumen (glass), the restored parent artery (sand), the sac (red) and the neck (red line)."
-    return Picture("anatomy", "The artery and its sac", caption, _sheet(scene, shots, ""))
+    return Picture("anatomy", "The artery and its sac", caption, sheet(scene, shots, ""))
 
 
 def _contour(scene: Scene) -> Picture:
     ids = ("lumen", "contour", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
     caption = "The deployed contour in the lumen, coloured by its gap to the wall of the parent artery."
-    return Picture("contour", "Where the devices lie", caption, _sheet(scene, shots, "wall_gap"))
+    return Picture("contour", "Where the devices lie", caption, sheet(scene, shots, "wall_gap"))
 
 
 def _wires(scene: Scene) -> Picture:
@@ -159,23 +159,23 @@ def _wires(scene: Scene) -> Picture:
         "The wires and the neck (red line); wires on the far side are paler. "
         "Seen from the sac, close up, the wall is taken away."
     )
-    return Picture("wires", "Wires across the neck", caption, _sheet(scene, shots, ""))
+    return Picture("wires", "Wires across the neck", caption, sheet(scene, shots, ""))
 
 
 def _streamlines(scene: Scene) -> Picture:
     ids = ("lumen", "streamlines", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes]
     caption = "Streamlines through artery and sac, coloured by speed on one scale."
-    return Picture("streamlines", "Blood flow before and after", caption, _sheet(scene, shots, "speed"))
+    return Picture("streamlines", "Blood flow before and after", caption, sheet(scene, shots, "speed"))
 
 
 def _shear(scene: Scene) -> Picture:
     shots = [Shot(title, scene.pick(("shear", "neck"), pane), scene.view("profile")) for pane, title in scene.panes]
     caption = "Wall shear stress on the lumen, on one scale."
-    return Picture("shear", "Wall shear stress before and after", caption, _sheet(scene, shots, "shear"))
+    return Picture("shear", "Wall shear stress before and after", caption, sheet(scene, shots, "shear"))
 
 
-def _sheet(scene: Scene, shots: list[Shot], scale: str) -> bytes:
+def sheet(scene: Scene, shots: list[Shot], scale: str) -> bytes:
     """Lay panels side by side, two to a row where there are four, with one colour bar and a length bar: a PNG."""
     from matplotlib.figure import Figure
 

@@ -2,7 +2,7 @@
 
 import base64
 import hashlib
-from collections.abc import Iterable
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
@@ -11,11 +11,12 @@ import numpy as np
 from markupsafe import Markup
 
 from vstent.report.definitions import HEADLINES, Definition
-from vstent.report.figures import pictures
+from vstent.report.figures import Picture, pictures
+from vstent.report.method import method_pictures
 from vstent.report.packing import pack
 from vstent.report.quantities import Change, Quantity, compare, flatten, format_change
-from vstent.report.scene import BARE, device_title, scene_of
-from vstent.report.uncertainty import uncertainty_of
+from vstent.report.scene import BARE, Scene, device_title, scene_of
+from vstent.report.uncertainty import Varied, uncertainty_of
 from vstent.stent import Deployment
 
 if TYPE_CHECKING:
@@ -36,35 +37,101 @@ def report(case: "CaseResult") -> str:
     The file asks nothing of a network (its content security policy forbids it), carries no field of a patient's record,
     and stays below 10 MB: surfaces are thinned and quantised.
     """
+    return as_html(contents_of(case))
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """All that a report holds, however it is laid out."""
+
+    name: str
+    """Of the case."""
+    metrics: dict[str, Any]
+    """Every number."""
+    scene: Scene
+    """What there is to look at."""
+    pictures: tuple[Picture, ...]
+    """In the order of the report."""
+    changes: list[Change]
+    """Numbers before and after."""
+    stents: list[dict[str, Any]]
+    """Every device: title, words, advice, quantities, facts."""
+    notes: tuple[str, ...]
+    """What was found, guessed or repaired."""
+    provenance: list[tuple[str, list[tuple[str, str]]]]
+    """Groups of lines: how this was made."""
+
+    @property
+    def devices(self) -> tuple[tuple[str, str], ...]:
+        """Name and title of every device."""
+        return self.scene.panes[1:]
+
+    @property
+    def headlines(self) -> list[Change]:
+        """The rows for the first screen: the known headlines, or the first eight where none was measured."""
+        chosen = [row for key in HEADLINES for row in self.changes if row.before.key == key]
+        return chosen or self.changes[:8]
+
+    @property
+    def vessel(self) -> list[Quantity]:
+        """The anatomy's numbers."""
+        return flatten(self.metrics.get("vessel", {}), ("vessel",))
+
+    @property
+    def uncertainty(self) -> list[Varied]:
+        """Intervals by device; empty where nothing was varied."""
+        return uncertainty_of(self.metrics, dict(self.devices))
+
+    @property
+    def definitions(self) -> list[tuple[Definition, str]]:
+        """What every number means, and its unit, by name."""
+        found = {q.key: (q.definition, q.unit) for q in flatten(self.metrics) if q.definition.meaning}
+        return sorted(found.values(), key=lambda pair: pair[0].name.casefold())
+
+
+def contents_of(case: "CaseResult") -> Contents:
+    """Return what the report of a case holds; its pictures are painted here."""
+    scene, metrics = scene_of(case), case.metrics
+    before, *after = pictures(scene)
+    return Contents(
+        name=case.name,
+        metrics=metrics,
+        scene=scene,
+        pictures=(before, *method_pictures(case, scene), *after),
+        changes=compare(metrics),
+        stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
+        notes=tuple(case.notes),
+        provenance=_provenance(case.provenance),
+    )
+
+
+def as_html(told: Contents) -> str:
+    """Lay a report out as one HTML file."""
     from jinja2 import Environment, PackageLoader
 
-    scene = scene_of(case)
-    metrics = case.metrics
-    rows = compare(metrics)
-    manifest, scene_bytes = pack(scene, _pane_notes(rows))
+    manifest, scene_bytes = pack(told.scene, _pane_notes(told.headlines))
     scripts = {"viewer": _script("viewer.js"), "start": _script("start.js")}
     environment = Environment(loader=PackageLoader("vstent.report", "assets"), autoescape=True)
-    devices = scene.panes[1:]
     return environment.get_template("report.html.j2").render(
-        name=case.name,
-        sections=_sections(case),
+        name=told.name,
+        sections=_sections(told),
         script_hashes=Markup(" ".join(_hash(script) for script in scripts.values())),
         style=Markup(asset("report.css") + asset("viewer.css")),
         **{name: Markup(script) for name, script in scripts.items()},
-        devices=devices,
+        devices=told.devices,
         change=format_change,
-        summary=_headlines(rows),
-        pictures=[_picture(picture) for picture in pictures(scene)],
-        vessel=flatten(metrics.get("vessel", {}), ("vessel",)),
-        stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
-        flow=rows,
-        flow_only=_flow_only(metrics, rows, dict(devices)),
-        uncertainty=uncertainty_of(metrics, dict(devices)),
-        other=_other(metrics),
-        notes=case.notes,
+        summary=told.headlines,
+        pictures=[_picture(picture) for picture in told.pictures],
+        vessel=told.vessel,
+        stents=told.stents,
+        flow=told.changes,
+        flow_only=_flow_only(told.metrics, told.changes, dict(told.devices)),
+        uncertainty=told.uncertainty,
+        other=_other(told.metrics),
+        notes=told.notes,
         limits=LIMITS,
-        definitions=_definitions(flatten(metrics)),
-        provenance=_provenance(case.provenance),
+        definitions=told.definitions,
+        provenance=told.provenance,
         manifest=manifest,
         scene_bytes=scene_bytes,
     )
@@ -84,32 +151,26 @@ def _hash(script: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
 
 
-def _sections(case: "CaseResult") -> list[tuple[str, str]]:
+def _sections(told: Contents) -> list[tuple[str, str]]:
     titles = {"summary": "Summary", "scene": "3-D view", "pictures": "Pictures", "anatomy": "Anatomy"}
-    if case.deployments:
+    if told.stents:
         titles["devices"] = "Devices"
-    if case.metrics.get("bare"):
+    if told.metrics.get("bare"):
         titles["flow"] = "Blood flow"
-    if any("uncertainty" in stent for stent in case.metrics.get("stents", {}).values()):
+    if told.uncertainty:
         titles["uncertainty"] = "Uncertainty"
     titles |= {"notes": "Notes and limits", "definitions": "Definitions", "provenance": "How this was made"}
     return list(titles.items())
 
 
-def _picture(picture: Any) -> dict[str, str]:
+def _picture(picture: Picture) -> dict[str, str]:
     words = {"id": picture.id, "title": picture.title, "caption": picture.caption}
     return {**words, "base64": base64.b64encode(picture.png).decode("ascii")}
 
 
-def _headlines(rows: list[Change]) -> list[Change]:
-    """Choose the rows for the first screen: the known headlines, or the first eight where none was measured."""
-    chosen = [row for key in HEADLINES for row in rows if row.before.key == key]
-    return chosen or rows[:8]
-
-
-def _pane_notes(rows: list[Change]) -> dict[str, str]:
+def _pane_notes(headlines: list[Change]) -> dict[str, str]:
     """One line per pane: the first headline, and by how much it changed."""
-    for row in _headlines(rows)[:1]:
+    for row in headlines[:1]:
         notes = {BARE: f"{row.before.name} {row.before.text}"}
         for name, after in row.after.items():
             notes[name] = f"{after.name} {after.text} ({format_change(row.before.value, after.value)})"
@@ -153,11 +214,6 @@ def _other(metrics: dict[str, Any]) -> list[Quantity]:
         for name, stent in metrics.get("stents", {}).items()
     }
     return flatten(top) + list(flatten(stents))
-
-
-def _definitions(quantities: Iterable[Quantity]) -> list[tuple[Definition, str]]:
-    found = {q.key: (q.definition, q.unit) for q in quantities if q.definition.meaning}
-    return sorted(found.values(), key=lambda pair: pair[0].name.casefold())
 
 
 def _provenance(provenance: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -36,6 +36,12 @@ def thin_lines(points: Floats, starts: Ints, values: Floats, n_points: int) -> t
     return points[chosen], new_starts, values[chosen] if len(values) else values
 
 
+def some_frames(deployment: Deployment, n_frames: int) -> Ints:
+    """Return which contours of the history (f,) stand for all of it: the first, the last, and some between."""
+    last = len(deployment.history_mm) - 1
+    return np.unique(np.linspace(0, last, min(n_frames, last + 1)).astype(int))
+
+
 def thin_frames(deployment: Deployment, landing_surface: Surface, n_frames: int) -> tuple[Floats, Floats]:
     """Return contours (f, nodes, 3) over the expansion and their wall gaps (f, nodes), the deployed one last.
 
@@ -44,7 +50,7 @@ def thin_frames(deployment: Deployment, landing_surface: Surface, n_frames: int)
     nodes = deployment.stent.nodes_mm.reshape(-1, 3)
     gaps = deployment.wall_gap_mm.ravel()
     history = deployment.history_mm.reshape(len(deployment.history_mm), -1, 3)
-    chosen = np.unique(np.linspace(0, len(history) - 1, min(n_frames, len(history))).astype(int))
+    chosen = some_frames(deployment, n_frames)
     frames = np.concatenate([history[chosen[:-1]], nodes[None]])
     kept = landing_surface.closest(nodes)[1] - gaps
     before = [np.maximum(landing_surface.closest(frame)[1] - kept, 0.0) for frame in frames[:-1]]

@@ -18,8 +18,9 @@ from vstent.kernels import curves
 from vstent.kernels.arrays import Floats
 from vstent.restore.axis import fit_axis
 from vstent.restore.bulges import Bulge, find_bulges
-from vstent.restore.landing import close_landing
-from vstent.restore.sac import cut_sac
+from vstent.restore.drawn import cut_along
+from vstent.restore.landing import Landing, close_landing
+from vstent.restore.sac import cut_sac, drawn_sac
 from vstent.restore.tubes import tubes_of
 from vstent.trace import parent_radius_mm
 from vstent.vessel import Anatomy, Aneurysm, Centerline, Vessel
@@ -32,7 +33,9 @@ PASSING: Final = 2.0
 __all__ = ["restore"]
 
 
-def restore(vessel: Vessel, *, at_mm: Floats | None = None, outlet_mm: Floats | None = None) -> Anatomy:
+def restore(
+    vessel: Vessel, *, at_mm: Floats | None = None, outlet_mm: Floats | None = None, neck_mm: Floats | None = None
+) -> Anatomy:
     """Return the anatomy of a traced vessel: parent artery, landing surface, sacs.
 
     Parameters
@@ -40,26 +43,29 @@ def restore(vessel: Vessel, *, at_mm: Floats | None = None, outlet_mm: Floats | 
     vessel : a vessel with centerlines.
     at_mm : (3,) a point near the sac wanted; all sacs otherwise.
     outlet_mm : (3,) a point near the outlet that the parent artery leads to; the widest way on otherwise.
+    neck_mm : (k, 3) a neck drawn by hand, a closed curve near the wall: what it parts from the inlet is a sac, and
+        the only one; necks are found otherwise.
 
     Raises
     ------
     InputError
-        When nothing stands out of the artery near `at_mm`.
+        When nothing stands out of the artery near `at_mm`, or `neck_mm` does not part a sac from the artery.
     VesselError
         When the vessel has no centerlines.
     """
     if not vessel.centerlines:
         raise VesselError("the vessel has no centerlines: trace it before restoring its parent artery")
-    bulges = find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
+    drawn = None if neck_mm is None else cut_along(vessel, neck_mm)
+    bulges = [drawn.bulge] if drawn else find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
     if at_mm is not None and not bulges:
         x, y, z = np.asarray(at_mm, dtype=float)
         raise InputError(f"no sac stands out of the artery near {x:.1f}, {y:.1f}, {z:.1f} mm: give a point in its dome")
     path = _parent_path(vessel, bulges, outlet_mm)
     tube = fit_axis(vessel.lumen, vessel.centerlines[path], [bulge.foot_mm for bulge in bulges])
-    landing = close_landing(vessel.lumen, tube)
+    landing = close_landing(vessel.lumen, tube, drawn.artery if drawn else None)
     side_lines = [line for k, line in enumerate(vessel.centerlines) if k != path]
-    sacs = [cut_sac(vessel, landing, side_lines, bulge) for bulge in bulges]
-    aneurysms = tuple(sorted((sac for sac in sacs if sac is not None), key=lambda sac: -sac.sac.volume_mm3))
+    sacs = [drawn_sac(vessel, landing, side_lines, drawn)] if drawn else _sacs(vessel, landing, side_lines, bulges)
+    aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
     return Anatomy(
         vessel,
         landing.axis,
@@ -69,6 +75,12 @@ def restore(vessel: Vessel, *, at_mm: Floats | None = None, outlet_mm: Floats | 
         aneurysms,
         _notes(vessel, path, aneurysms, len(bulges)),
     )
+
+
+def _sacs(vessel: Vessel, landing: Landing, side_lines: list[Centerline], bulges: list[Bulge]) -> list[Aneurysm]:
+    """The sacs of those bulges that hang on the parent artery and are not flat."""
+    cut = (cut_sac(vessel, landing, side_lines, bulge) for bulge in bulges)
+    return [sac for sac in cut if sac is not None]
 
 
 def _parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -> int:

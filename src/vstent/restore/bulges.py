@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from vstent.kernels import triangles
@@ -91,9 +89,7 @@ def _patches(lumen: Surface, is_out: Bools) -> list[Ints]:
     """Vertices of every connected patch of three faces or more where `is_out` (n,) holds."""
     edges = triangles.directed_edges(lumen.faces)
     edges = edges[is_out[edges].all(axis=1)]
-    n = len(is_out)
-    graph = coo_matrix((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    label = connected_components(graph, directed=False)[1]
+    label = triangles.joined(edges, len(is_out))
     count = np.bincount(label[is_out], minlength=label.max() + 1)
     return [np.flatnonzero(is_out & (label == k)) for k in np.flatnonzero(count >= 5)]
 

@@ -34,6 +34,8 @@ MARGIN_MM: Final = 0.3
 """The closed part reaches this far beyond."""
 PRIOR: Final = 0.02
 """Weight of the fitted circular tube beside the wall's 1: decides where there is no wall at all."""
+SAME_MM: Final = 1e-3
+"""A ray that goes on for less than this has met the same wall."""
 N_PASSES: Final = 12
 """Passes of asymmetric least squares; weights settle within 10."""
 
@@ -107,11 +109,13 @@ class Landing:
         return np.stack([map_coordinates(wrapped[..., k], place, order=1) for k in range(3)], axis=1)
 
 
-def close_landing(lumen: Surface, tube: Tube) -> Landing:
-    """Close the necks and ostia of the lumen's wall along a tube."""
+def close_landing(lumen: Surface, tube: Tube, own: Surface | None = None) -> Landing:
+    """Close the necks and ostia of the lumen's wall along a tube; with `own`, all of it that is not this wall too."""
     rho = section_rays(lumen, tube.points_mm, N_RAYS)
     radius = np.repeat(tube.radius_mm[:, None], N_RAYS, axis=1)
     has_wall = np.isfinite(rho) & (rho < 4.0 * radius)
+    if own is not None:
+        has_wall &= section_rays(own, tube.points_mm, N_RAYS) < rho + SAME_MM
     wall = np.where(has_wall, rho, radius)
     scale = float(np.median(tube.radius_mm))
     baseline = _baseline(wall, has_wall, radius, scale)

@@ -64,15 +64,20 @@ class Artery(NamedTuple):
 
         With `normals` (n, 3) the points are the lumen's wall: a wall that looks at a branch belongs to a sac beside it.
         """
-        height, sphere = self.branches.height_mm(points_mm)
-        if len(self.branches.radius_mm):
-            radius = self.branches.radius_mm[sphere]
-            height = height - BRANCH_SHARE * radius
-            if normals is not None:
-                toward = self.branches.centers_mm[sphere] - points_mm
-                facing = np.einsum("nd,nd->n", toward, normals) / np.maximum(np.linalg.norm(toward, axis=1), 1e-12)
-                height = height + FACING * radius * np.maximum(facing, 0.0)
+        height = self.above_branches_mm(points_mm, normals)
         return np.minimum(self.landing.solid.signed_distance(points_mm), height)
+
+    def above_branches_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
+        """How far points (n, 3) stand out of the branches' walls alone, likewise."""
+        height, sphere = self.branches.height_mm(points_mm)
+        if not len(self.branches.radius_mm):
+            return height
+        radius = self.branches.radius_mm[sphere]
+        if normals is None:
+            return height - BRANCH_SHARE * radius
+        toward = self.branches.centers_mm[sphere] - points_mm
+        facing = np.einsum("nd,nd->n", toward, normals) / np.maximum(np.linalg.norm(toward, axis=1), 1e-12)
+        return np.asarray(height + (FACING * np.maximum(facing, 0.0) - BRANCH_SHARE) * radius)
 
     def onto(self, points_mm: Floats) -> Floats:
         """Move points (n, 3) onto the parent artery; those at a branch stay."""
@@ -147,8 +152,8 @@ def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floa
     n = max(32, round(8 * place[-1] / low_mm))
     even = curves.interpolate(place, np.concatenate([rim_mm, rim_mm[:1]]), place[-1] * np.arange(n) / n)
     n_waves = place[-1] / (DETAIL * low_mm)
-    bend = _convex(_lowpass(_parabolas(_rise(flank, even, low_mm)), n_waves))
-    length = _lowpass(_length_to_neck(bend, REACH * low_mm, artery, lumen), n_waves)
+    bend = _convex(curves.lowpass(_parabolas(_rise(flank, even, low_mm)), n_waves))
+    length = curves.lowpass(_length_to_neck(bend, REACH * low_mm, artery, lumen), n_waves)
     where = place[:-1] * n / place[-1]
     bend, length = _between(bend.reshape(n, -1), where).reshape(-1, 3, 3), _between(length[:, None], where)
     share = np.linspace(0.0, 1.0, n_rings + 1)[:, None, None]
@@ -173,13 +178,6 @@ def _parabolas(points_mm: Floats) -> Floats:
     steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=2)
     length = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)]).T
     return np.asarray(np.linalg.pinv(length[..., None] ** np.arange(3)) @ points_mm.transpose(1, 0, 2))
-
-
-def _lowpass(values: Floats, n_waves: float) -> Floats:
-    """Values (n, ...) around a ring, without waves of which more than `n_waves` fit into it."""
-    wave = np.arange(len(values) // 2 + 1)
-    gain = 1.0 / (1.0 + (wave / n_waves) ** 4)
-    return np.fft.irfft(np.fft.rfft(values, axis=0) * gain.reshape(-1, *[1] * (values.ndim - 1)), n=len(values), axis=0)
 
 
 def _convex(bend: Floats) -> Floats:

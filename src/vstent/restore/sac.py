@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.restore.bulges import FLANK, Bulge, bulge_at
+from vstent.restore.drawn import Drawn
 from vstent.restore.landing import Landing
 from vstent.restore.neck import Artery, Flank, believed_from_mm, skirt, unblurred
 from vstent.restore.tubes import Tubes, tubes_of
@@ -41,17 +41,41 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     core = bulge_at(lumen, height_mm, height_mm > FLANK * parent_mm, bulge.dome_mm)
     if core is None:
         return None
-    most_mm = FLANK * float(np.median(landing.section_radius_mm[landing.nearest_sections(core.foot_mm)]))
-    low_mm = believed_from_mm(lumen, core.foot_mm, most_mm, vessel.blur_mm)
+    low_mm = _low_mm(vessel, landing, core)
     flank, other_loops = _flank(lumen, height_mm, low_mm, core.dome_mm, landing)
     if flank is None:
         return None
     flank = unblurred(flank, vessel.blur_mm) if vessel.blur_mm else flank
     rings = skirt(flank, artery, vessel.closed, n_rings=N_SKIRT)
+    found = _aneurysm(landing, flank, other_loops, rings)
+    is_flat = found.sac.volume_mm3 < FLAT * found.neck.area_mm2**1.5
+    return None if is_flat or _roundness(found.sac) < ROUND else found
+
+
+def _low_mm(vessel: Vessel, landing: Landing, bulge: Bulge) -> float:
+    """Height above the artery from which on a bulge's flank is believed."""
+    most_mm = FLANK * float(np.median(landing.section_radius_mm[landing.nearest_sections(bulge.foot_mm)]))
+    return believed_from_mm(vessel.lumen, bulge.foot_mm, most_mm, vessel.blur_mm)
+
+
+def drawn_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], drawn: Drawn) -> Aneurysm:
+    """Close the sac behind a neck that was drawn; side branches that leave from it are cut off along their tubes."""
+    artery = Artery(landing, _branch_tubes(side_lines, landing, drawn.bulge))
+    normals = Surface(drawn.vertices_mm, drawn.faces).vertex_normals
+    in_branch_mm = _low_mm(vessel, landing, drawn.bulge) - artery.above_branches_mm(drawn.vertices_mm, normals)
+    vertices, faces, _ = triangles.clip(drawn.vertices_mm, drawn.faces, in_branch_mm)
+    vertices, faces = triangles.part_at(vertices, faces, drawn.bulge.dome_mm)
+    loops = list(triangles.boundary_loops(vertices, faces))
+    cut = cKDTree(drawn.cut_mm)
+    rim = loops.pop(int(np.argmin([np.median(cut.query(vertices[loop])[0]) for loop in loops])))
+    rings = np.stack([vertices[rim], drawn.neck_of(vertices[rim])])
+    return _aneurysm(landing, Flank(vertices, faces, np.zeros(len(vertices)), rim), loops, rings)
+
+
+def _aneurysm(landing: Landing, flank: Flank, other_loops: list[Ints], rings: Floats) -> Aneurysm:
+    """The sac of a flank, the mouths of its branches, and its continuation, rings (n, k, 3), down to the neck."""
     neck = _neck(landing, rings[-1])
     sac = _closed_sac(flank, other_loops, rings, neck)
-    if sac.volume_mm3 < FLAT * neck.area_mm2**1.5 or _roundness(sac) < ROUND:
-        return None
     abscissa = curves.project(landing.points_mm, rings[-1])[0]
     return Aneurysm(sac, neck, rings[-1], float(abscissa.min()), float(abscissa.max()))
 
@@ -63,8 +87,7 @@ def _is_island(lumen: Surface, is_low: Bools) -> Bools:
     """
     edges = triangles.directed_edges(lumen.faces)
     edges = edges[is_low[edges].all(axis=1)]
-    graph = coo_matrix((np.ones(len(edges), dtype=bool), tuple(edges.T)), shape=(len(is_low), len(is_low)))
-    label = connected_components(graph, directed=False)[1]
+    label = triangles.joined(edges, len(is_low))
     ends = np.unique(triangles.open_edges(lumen.faces))
     return is_low & ~np.isin(label, label[ends[is_low[ends]]])
 
@@ -109,16 +132,20 @@ def _branch_tubes(lines: Sequence[Centerline], landing: Landing, bulge: Bulge) -
 def _neck(landing: Landing, rim_mm: Floats) -> Surface:
     """The landing surface inside a closed curve (k, 3) on it: rings from the curve to its middle.
 
-    The outermost ring is the curve itself, so that the sac closes without a gap. The curve runs with the sac's wall,
-    so the faces along it look into the sac.
+    The outermost ring is the curve itself, so that the sac closes without a gap; where it lies off the landing surface
+    the rings do as a membrane would. The curve runs with the sac's wall, so the faces along it look into the sac.
     """
     grid = landing.grid_of(rim_mm)
     grid[:, 1] = np.unwrap(grid[:, 1], period=landing.n_rays)
     middle = grid.mean(axis=0)
-    lift = rim_mm - landing.at_grid(grid)
-    share = np.linspace(1.0, 0.0, N_RINGS + 1)[:-1]
-    rings = [landing.at_grid(middle + f * (grid - middle)) + f * lift for f in share]
-    vertices = np.concatenate([*rings, landing.at_grid(middle[None])])
+    lift = np.fft.rfft(rim_mm - landing.at_grid(grid), axis=0)
+    wave = np.arange(len(lift))[:, None]
+    share = np.linspace(1.0, 0.0, N_RINGS + 1)
+    # A harmonic function on a disc: waves around its rim decay inwards with the power of their number.
+    rings = [
+        landing.at_grid(middle + f * (grid - middle)) + np.fft.irfft(f**wave * lift, n=len(grid), axis=0) for f in share
+    ]
+    vertices = np.concatenate([*rings[:-1], rings[-1][:1]])
     k = len(rim_mm)
     here, there = np.arange(k), (np.arange(k) + 1) % k
     faces = [np.stack([np.full(k, N_RINGS * k), (N_RINGS - 1) * k + here, (N_RINGS - 1) * k + there], axis=1)]

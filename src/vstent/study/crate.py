@@ -23,11 +23,13 @@ FORMATS: Final = {
     ".stl": "model/stl",
     ".3mf": "model/3mf",
     ".png": "image/png",
+    ".pdf": "application/pdf",
 }
 ABOUT: Final = {
     "metrics.json": "Every number, its unit in its key",
     "run.json": "Versions, input with SHA-256, settings: enough to repeat the run",
     "report.html": "The case in 3-D, before, after and change",
+    "report.pdf": "The same on paper, with the pictures",
     "vessel.vtp": "The lumen",
     "centerlines.vtp": "Centerlines, under VMTK's array names",
     "landing_surface.vtp": "The parent artery, sac and branches closed: what the device expands against",

@@ -40,11 +40,14 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
     if kept is not None:
         return kept
     whole = find_vessel(path, settings, ledger)
+    neck_mm = None if settings.neck_mm is None else np.array(settings.neck_mm, dtype=np.float64)
+    at_mm = _array(settings.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
     with ledger.stage("trim") as tell:
-        traced = trim(whole, at_mm=_array(settings.at_mm))
+        traced = trim(whole, at_mm=at_mm, upstream_mm=settings.upstream_mm, downstream_mm=settings.downstream_mm)
         tell(" ".join(traced.notes[len(whole.notes) :]))
     with ledger.stage("restore") as tell:
-        anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=_array(settings.outlet_mm))
+        outlet_mm = _array(settings.outlet_mm)
+        anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
         tell(" ".join([*anatomy.notes, *(f"Sac of {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
     return anatomy
 

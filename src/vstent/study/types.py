@@ -43,6 +43,12 @@ class Settings:
     """A point near the inlet."""
     outlet_mm: Point | None = None
     """A point near the outlet that the parent artery leads to."""
+    neck_mm: tuple[Point, ...] | None = None
+    """A neck drawn by hand: a closed curve near the wall around the sac's mouth."""
+    upstream_mm: float | None = None
+    """Length of artery to keep before the sac."""
+    downstream_mm: float | None = None
+    """Length to keep of every way beyond the sac."""
     diameter_mm: float | None = None
     """Label diameter of the devices."""
     length_mm: float | None = None

@@ -1,0 +1,54 @@
+// Trimming: how much of the artery is kept before the sac and beyond it, by handles on the parent axis.
+import { label, makeHandle } from "./handles.js";
+
+const STEP_MM = 0.5;
+const LEAST_MM = 1;
+
+export class Trimming {
+  /** @param host {chosen({upstream_mm | downstream_mm}), told(which, mm)} */
+  constructor(host) {
+    this.host = host;
+    this.handles = [this.handle("upstream_mm", "proximal", "before"), this.handle("downstream_mm", "distal", "beyond")];
+  }
+
+  /** Take the parent axis and the span of the neck on it. */
+  set(axis, neck) {
+    this.axis = axis;
+    this.middle = neck.length ? (neck[0] + neck[1]) / 2 : undefined;
+    this.kept = { upstream_mm: this.middle, downstream_mm: axis.length - this.middle };
+    this.handles.forEach((handle) => handle.say());
+  }
+
+  handle(which, kind, word) {
+    const element = makeHandle(`${kind} cut`, `Cut ${word} the sac`, {
+      pulled: (event) => this.keep(which, this.reach(which, this.axis.under(event, this.place(which)))),
+      nudged: ([right, up]) => this.keep(which, this.kept[which] + (which === "upstream_mm" ? -STEP_MM : STEP_MM) * (right + up)),
+      released: () => this.release(which),
+    });
+    const say = () => label(element, `${this.kept[which].toFixed(1)} mm ${word} the sac`);
+    return { element, say, which, point: () => this.middle !== undefined && this.axis.at(this.place(which)) };
+  }
+
+  /** Abscissa of a cut. */
+  place(which) {
+    return which === "upstream_mm" ? this.middle - this.kept[which] : this.middle + this.kept[which];
+  }
+
+  reach(which, mm) {
+    return which === "upstream_mm" ? this.middle - mm : mm - this.middle;
+  }
+
+  keep(which, mm) {
+    const most = which === "upstream_mm" ? this.middle : this.axis.length - this.middle;
+    this.kept[which] = Math.min(Math.max(mm, LEAST_MM), most);
+    this.isPulled = true;
+    this.handles.forEach((handle) => handle.which === which && handle.say());
+    this.host.told();
+  }
+
+  release(which) {
+    if (!this.isPulled) return;
+    this.isPulled = false;
+    this.host.chosen({ [which]: Number(this.kept[which].toFixed(2)) });
+  }
+}
