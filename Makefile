@@ -9,7 +9,7 @@ demo: $(VENV)/.ready
 	$(BIN)/vstent demo --out demo
 
 test: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest -m "not validation"
+	$(BIN)/python -m pytest -m "not validation" -n auto --dist loadfile
 
 validation: $(VENV)/.ready-dev
 	$(BIN)/python tools/record.py validation
