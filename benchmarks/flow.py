@@ -1,10 +1,10 @@
-"""Print how fast the lattice-Boltzmann kernel is beside the memory's bandwidth, how a flow's time grows with its cells,
-what other machines would need, and how exact Poiseuille's flow is.
+"""Print how fast the lattice-Boltzmann kernel is beside the memory's bandwidth, and how exact Poiseuille's flow.
 
 Usage: python benchmarks/flow.py [--cost] [CELL_MM ...]
 
-Seconds of the clock depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo
-is computed besides, steady, bare and with Silk and Enterprise as screens, in cells of 0.1 mm.
+Besides: how a step's time grows with its cells, and what other machines would need (computed). Seconds of the clock
+depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo is computed, steady,
+bare and with Silk and Enterprise as screens, in cells of 0.1 mm.
 """
 
 import resource
@@ -88,8 +88,8 @@ def elsewhere(of_core: float) -> None:
         "one GPU": GPU_SHARE * GPU_GB_S * 1e9 / BYTES_PER_UPDATE,
     }
     print(
-        f"\nComputed, not measured: a node of {NODE_CORES} cores like this one, {NODE_GB_S:.0f} GB/s together; a GPU of "
-        f"{GPU_GB_S:.0f} GB/s at {GPU_SHARE:.0%} of that (vstent does not run on one yet).\n"
+        f"\nComputed, not measured: a node of {NODE_CORES} cores like this one, {NODE_GB_S:.0f} GB/s together; a GPU "
+        f"of {GPU_GB_S:.0f} GB/s at {GPU_SHARE:.0%} of that (vstent does not run on one yet).\n"
     )
     print("| machine | million updates/s | demo, 0.1 mm, steady | two cycles |\n|---|---|---|---|")
     for name, rate in limits.items():

@@ -2,10 +2,10 @@
 
 Usage: python benchmarks/struts.py [--cell MM] [--foam-cell MM] [DEVICE ...]
 
-The demo's artery, cut to 9 mm on either side of the sac, is computed three ways for every device: by the embedded engine
+The demo's artery, cut to 9 mm on either side of the sac, is computed twice with every device: by the embedded engine
 with the device as a screen, and by OpenFOAM with the struts over the neck meshed (25 um cells at the struts where the
-vessel's are 0.2 mm). The two engines differ in the bare vessel already, so what is compared is what the device leaves of
-each engine's own bare value. A row is kept for every device; others' rows stay as they are.
+vessel's are 0.2 mm). The two engines differ in the bare vessel already: what is compared is what a device leaves of
+each engine's own bare value. A row is kept for every device; the rows of others stay as they are.
 """
 
 import argparse
