@@ -1,25 +1,39 @@
 """Print how fast the lattice-Boltzmann kernel is beside the memory's bandwidth, and how exact Poiseuille's flow.
 
-Usage: python benchmarks/flow.py [CELL_MM ...]
+Usage: python benchmarks/flow.py [--cost] [CELL_MM ...]
+
+Besides: how a step's time grows with its cells, and what other machines would need (computed). Seconds of the clock
+depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo is computed, steady,
+bare and with Silk and Enterprise as screens, in cells of 0.1 mm.
 """
 
+import resource
 import sys
 import time
 
 import numba
 import numpy as np
 
+import vstent
 from vstent import phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, simulate_case
+from vstent.flow import FlowCase, FlowField, FlowSettings, simulate, simulate_case
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_state import advance
+from vstent.restore import restore
 from vstent.trace import trace
+from vstent.trim import trim
 from vstent.vessel import Vessel
 
 RADIUS_MM, INFLOW_ML_S, VISCOSITY_PA_S = 2.0, 0.5, 0.004
 STEPS = 20
 BYTES_PER_UPDATE = 19 * 4 * 2
 """Read and write every population once, in place; addresses are one per segment."""
+DEMO_CELLS, STEADY_STEPS, STEPS_PER_CYCLE = 830_000, 5_200, 81_000
+"""The demo in cells of 0.1 mm: blood cells, steps of a flow that begins from a coarse one, steps of a cycle."""
+NODE_CORES, NODE_GB_S = 64, 300.0
+"""A node, and its memory's bandwidth (two sockets of eight channels, three quarters of 400 GB/s)."""
+GPU_GB_S, GPU_SHARE = 1555.0, 0.6
+"""Bandwidth of an A100 (its maker's data sheet), and the share of it that sparse lattices reach."""
 
 
 def tube(length_mm: float) -> Vessel:
@@ -44,21 +58,58 @@ def bandwidth_GB_s(n_bytes: int) -> float:
     return 2 * values.nbytes / min(times) / 1e9
 
 
-def throughput(vessel: Vessel, cell_mm: float) -> None:
+def throughput(vessel: Vessel, cell_mm: float) -> tuple[int, float, float]:
+    """Print a row; return cells, updates per second of the clock, and updates per second of one core."""
+    began = time.process_time()
     case = FlowCase(vessel, settings=FlowSettings(inflow_mL_s=INFLOW_ML_S))
     state = LatticeBoltzmann(cell_mm).init(case, None)
+    setup_s = time.process_time() - began
     advance(state, STEPS)
-    times = []
+    clock_s, core_s = [], []
     for _ in range(5):
-        began = time.perf_counter()
+        began, began_core = time.perf_counter(), time.process_time()
         advance(state, STEPS)
-        times.append(time.perf_counter() - began)
-    rate = len(state.domain.cells) * STEPS / min(times)
+        clock_s.append(time.perf_counter() - began)
+        core_s.append(time.process_time() - began_core)
+    cells = len(state.domain.cells)
+    rate, of_core = cells * STEPS / min(clock_s), cells * STEPS / min(core_s)
     limit = bandwidth_GB_s(state.populations.nbytes) * 1e9 / BYTES_PER_UPDATE
     print(
-        f"| {len(state.domain.cells)} | {state.populations.nbytes / 1e6:.0f} | {rate / 1e6:.0f} | {limit / 1e6:.0f} "
-        f"| {100 * rate / limit:.0f} % |"
+        f"| {cells} | {setup_s:.1f} | {state.populations.nbytes / 1e6:.0f} | {rate / 1e6:.0f} | {of_core / 1e6:.0f} "
+        f"| {limit / 1e6:.0f} | {100 * rate / limit:.0f} % |"
     )
+    return cells, rate, of_core
+
+
+def elsewhere(of_core: float) -> None:
+    """Print what the demo in cells of 0.1 mm would take on other machines: computed, not measured."""
+    limits = {
+        f"{NODE_CORES} cores": min(NODE_CORES * of_core, NODE_GB_S * 1e9 / BYTES_PER_UPDATE),
+        "one GPU": GPU_SHARE * GPU_GB_S * 1e9 / BYTES_PER_UPDATE,
+    }
+    print(
+        f"\nComputed, not measured: a node of {NODE_CORES} cores like this one, {NODE_GB_S:.0f} GB/s together; a GPU "
+        f"of {GPU_GB_S:.0f} GB/s at {GPU_SHARE:.0%} of that (vstent does not run on one yet).\n"
+    )
+    print("| machine | million updates/s | demo, 0.1 mm, steady | two cycles |\n|---|---|---|---|")
+    for name, rate in limits.items():
+        steady, cycles = (DEMO_CELLS * steps / rate for steps in (STEADY_STEPS, 2 * STEPS_PER_CYCLE))
+        print(f"| {name} | {rate / 1e6:.0f} | {steady:.0f} s | {cycles / 60:.1f} min |")
+
+
+def cost() -> None:
+    """Print what the demo takes, steady, bare and with both devices."""
+    anatomy = restore(trim(trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))))
+    stents = [None, *(vstent.deploy(vstent.find_design(name), anatomy).stent for name in ("silk", "enterprise"))]
+    began, began_core = time.perf_counter(), time.process_time()
+    fields = simulate(anatomy, stents, FlowSettings(cell_size_mm=0.1))
+    clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
+    print("\n| demo, 0.1 mm | cells | steps | settled | million updates/s |\n|---|---|---|---|---|")
+    for name, field in zip(("bare", "silk", "enterprise"), fields, strict=True):
+        row = (name, len(field.cells), field.steps, field.is_converged, round(field.updates_per_s / 1e6))
+        print(f"| {' | '.join(map(str, row))} |")
+    peak_GB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    print(f"\nTogether {clock_s:.0f} s, {core_s:.0f} s of processor, {peak_GB:.1f} GB at most.")
 
 
 def errors(field: FlowField, length_mm: float) -> tuple[float, float, float]:
@@ -91,11 +142,17 @@ def poiseuille(cell_mm: float, length_mm: float = 12.0) -> None:
 
 
 if __name__ == "__main__":
-    cells_mm = [float(size) for size in sys.argv[1:]] or [0.4, 0.2]
+    words = [word for word in sys.argv[1:] if word != "--cost"]
+    cells_mm = [float(size) for size in words] or [0.4, 0.2]
     print(f"{numba.get_num_threads()} threads\n")
-    print("| cells | populations MB | million updates/s | at full bandwidth | reached |\n|---|---|---|---|---|")
-    for cell_mm in (0.2, 0.12):
-        throughput(tube(30.0), cell_mm)
+    print("| cells | set-up, core s | populations MB | million updates/s | of one core | at full bandwidth | reached |")
+    print("|---|---|---|---|---|---|---|")
+    coarse, fine = (throughput(tube(30.0), cell_mm) for cell_mm in (0.2, 0.1))
+    times = (fine[0] / fine[1]) / (coarse[0] / coarse[1])
+    print(f"\n{fine[0] / coarse[0]:.1f} times the cells take {times:.1f} times as long a step.")
+    elsewhere(fine[2])
     print("\n| cells a diameter | velocity | pressure gradient | WSS | mass | seconds |\n|---|---|---|---|---|---|")
     for cell_mm in cells_mm:
         poiseuille(cell_mm)
+    if "--cost" in sys.argv:
+        cost()

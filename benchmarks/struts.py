@@ -1,0 +1,86 @@
+"""The screen beside resolved struts over the demo's neck: write `benchmarks/struts.json`, print it as a table.
+
+Usage: python benchmarks/struts.py [--cell MM] [--foam-cell MM] [DEVICE ...]
+
+The demo's artery, cut to 9 mm on either side of the sac, is computed twice with every device: by the embedded engine
+with the device as a screen, and by OpenFOAM with the struts over the neck meshed (25 um cells at the struts where the
+vessel's are 0.2 mm). The two engines differ in the bare vessel already: what is compared is what a device leaves of
+each engine's own bare value. A row is kept for every device; the rows of others stay as they are.
+"""
+
+import argparse
+import importlib
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import vstent
+from vstent import phantoms
+from vstent.flow import FlowCase, FlowField, FlowSettings, flow_case, indices, simulate_case
+from vstent.flow.types import OPENFOAM
+from vstent.restore import restore
+from vstent.trace import trace
+from vstent.vessel import Vessel
+
+TABLE = Path(__file__).with_suffix(".json")
+KEPT_MM = 9.0
+INDICES = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
+
+
+def cases(names: list[str]) -> dict[str, FlowCase]:
+    """The bare vessel and every device in it, deployed in the whole one and computed in a short one."""
+    whole = trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))
+    trimming = importlib.import_module("vstent.trim")
+    anatomy = restore(trimming.trim(whole))
+    trimming.UPSTREAM_MM = trimming.DOWNSTREAM_MM = KEPT_MM
+    short = trimming.trim(whole)
+    inflow_mL_s = flow_case(anatomy, None).inflow_mL_s
+    settings = FlowSettings(inflow_mL_s=inflow_mL_s)
+    stents = {"bare": None} | {name: vstent.deploy(vstent.find_design(name), anatomy).stent for name in names}
+    return {name: replace(flow_case(anatomy, stent, settings), vessel=short) for name, stent in stents.items()}
+
+
+def computed(case: FlowCase, start: FlowField | None, **changes: object) -> tuple[FlowField, dict[str, float]]:
+    settings = replace(case.settings, **changes)
+    began = time.perf_counter()
+    # OpenFOAM begins from any flow in this vessel; the embedded engine takes its start for the bare one.
+    field = simulate_case(replace(case, settings=settings), start=start)
+    found = indices(field, case.sac, case.ostium)
+    values = {key: round(float(found[key]), 6) for key in INDICES}
+    print(f"{settings.engine}: {field.advice} {time.perf_counter() - began:.0f} s {values}", flush=True)
+    return field, values
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("devices", nargs="*", default=["enterprise", "silk"])
+    parser.add_argument("--cell", type=float, default=0.125)
+    parser.add_argument("--foam-cell", type=float, default=0.2)
+    given = parser.parse_args()
+    rows = json.loads(TABLE.read_text()) if TABLE.exists() else {}
+    foam = {"engine": OPENFOAM, "cell_size_mm": given.foam_cell}
+    bare: tuple[FlowField, dict[str, float]] | None = None
+    for name, case in cases(given.devices).items():
+        embedded, screened = computed(case, bare[0] if bare else None, cell_size_mm=given.cell)
+        resolved = computed(case, embedded, **foam)[1]
+        if bare is None:
+            bare, bare_resolved = (embedded, screened), resolved
+            continue
+        left = {key: (screened[key] / bare[1][key], resolved[key] / bare_resolved[key]) for key in INDICES}
+        rows[name] = {
+            "screen": screened,
+            "struts": resolved,
+            "bare_embedded": bare[1],
+            "bare_openfoam": bare_resolved,
+            "left_with_screen": {key: round(one[0], 4) for key, one in left.items()},
+            "left_with_struts": {key: round(one[1], 4) for key, one in left.items()},
+            "cell_size_mm": given.cell,
+            "openfoam_cell_size_mm": given.foam_cell,
+        }
+        TABLE.write_text(json.dumps(rows, indent=2) + "\n")
+    print("\n| device | index | left, screen | left, struts | difference |\n|---|---|---|---|---|")
+    for name, row in rows.items():
+        for key in INDICES:
+            screen, struts = row["left_with_screen"][key], row["left_with_struts"][key]
+            print(f"| {name} | {key} | {screen:.3f} | {struts:.3f} | {100 * (screen / struts - 1):+.1f} % |")
