@@ -140,7 +140,11 @@ class Page {
     this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.surfaces = new Newest(
-      (answer) => this.picture.put(answer),
+      ({ manifest, buffer }) => {
+        // Where the vessel is not known yet, the surface says where to look.
+        const views = this.picture.views.length ? [] : manifest.views;
+        this.picture.put({ manifest: { ...manifest, views }, buffer });
+      },
       (problem) => this.complain(problem),
     );
     this.moments = new Newest(
