@@ -342,7 +342,10 @@ class Page {
     this.picture.moved = null;
     this.picture.setMarks([]);
     if (!this.anatomy) return;
-    if (this.step === "vessel") this.picture.setMarks([...this.openingMarks(), ...this.trimming.handles]);
+    if (this.step === "vessel") {
+      this.trimming.show(this.view.choices);
+      this.picture.setMarks([...this.openingMarks(), ...this.trimming.handles]);
+    }
     if (this.step === "sac") this.renderNeck();
     if (this.step === "deploy") this.renderDeploy();
   }

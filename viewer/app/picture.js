@@ -172,7 +172,11 @@ export class Picture {
     // One that is in hand stays where it is: it would be let go.
     const isSame = marks.length === this.drawnMarks.length && marks.every(({ element }, i) => element === this.drawnMarks[i].element);
     this.drawnMarks = marks;
-    if (!isSame) this.marks.replaceChildren(...marks.map(({ element }) => element));
+    if (!isSame) {
+      const inUse = document.activeElement;
+      this.marks.replaceChildren(...marks.map(({ element }) => element));
+      if (marks.some(({ element }) => element === inUse)) inUse.focus();
+    }
     if (this.stage) this.placeMarks();
     this.stage?.redraw();
   }
