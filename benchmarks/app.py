@@ -158,7 +158,7 @@ def main() -> None:
         folder = Path(name)
         server, client, first = start((arguments.path or phantom(folder)).resolve(), folder)
         try:
-            print(f"{'first page after the command':44} {first:6.2f} s")
+            print(f"{'first page after the command':44} {first:6.2f} s, processor {processor_s(server.pid):6.2f} s")
             case = f"/api/cases/{client.get('/api/cases')['opened']}"
             began = time.perf_counter()
             wait(client, case)
