@@ -183,6 +183,7 @@ class Page {
     this.redoButton.disabled = !view.can_redo;
     this.renderSteps();
     this.renderWork();
+    if (before?.job && !view.job) this.flowKey = undefined; // what it has found is to be fetched
     const follows = before?.job && !view.job && before.steps[this.step] === "running";
     if (before?.job && view.job && before.steps[this.step] === "running" && view.steps[this.step] !== "running") this.follow(view);
     if (follows) this.finished(before);
