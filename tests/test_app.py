@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from importlib.resources import files
@@ -311,6 +313,15 @@ def test_the_interface_is_described_and_its_page_needs_no_network(client):
     assert all(verb["summary"] for verbs in api["paths"].values() for verb in verbs.values())
     for path in ("/api/docs", "/assets/docs.js", "/", "/assets/app.css"):
         assert "https://" not in client.get(path).text
+
+
+def test_the_first_page_waits_for_nothing_that_only_results_need():
+    code = (
+        "import sys; from vstent.app import server; [server.asset(name) for name in server.ASSETS]; "
+        "print(sorted({'vstent.report', 'vstent.study', 'vstent.flow'} & set(sys.modules)))"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
 
 
 def test_the_page_was_built_from_the_sources_beside_it():

@@ -140,7 +140,11 @@ class Page {
     this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.surfaces = new Newest(
-      (answer) => this.picture.put(answer),
+      ({ manifest, buffer }) => {
+        // Where the vessel is not known yet, the surface says where to look.
+        const views = this.picture.views.length ? [] : manifest.views;
+        this.picture.put({ manifest: { ...manifest, views }, buffer });
+      },
       (problem) => this.complain(problem),
     );
     this.moments = new Newest(
@@ -179,6 +183,7 @@ class Page {
     this.redoButton.disabled = !view.can_redo;
     this.renderSteps();
     this.renderWork();
+    if (before?.job && !view.job) this.flowKey = undefined; // what it has found is to be fetched
     const follows = before?.job && !view.job && before.steps[this.step] === "running";
     if (before?.job && view.job && before.steps[this.step] === "running" && view.steps[this.step] !== "running") this.follow(view);
     if (follows) this.finished(before);
@@ -338,7 +343,10 @@ class Page {
     this.picture.moved = null;
     this.picture.setMarks([]);
     if (!this.anatomy) return;
-    if (this.step === "vessel") this.picture.setMarks([...this.openingMarks(), ...this.trimming.handles]);
+    if (this.step === "vessel") {
+      this.trimming.show(this.view.choices);
+      this.picture.setMarks([...this.openingMarks(), ...this.trimming.handles]);
+    }
     if (this.step === "sac") this.renderNeck();
     if (this.step === "deploy") this.renderDeploy();
   }

@@ -32,9 +32,17 @@ export function changeSheet(sheet, isWhole, named) {
 }
 
 function cell(words, title, value, change) {
-  const parts = [make("small", { title }, [words]), make("b", {}, [value])];
+  // The unit goes below its number where there is no room beside it.
+  const [digits, ...unit] = value.split("\u202f");
+  const parts = [make("small", { title }, [words]), make("b", {}, [digits, ...(unit.length ? [" ", make("span", { className: "unit" }, [unit.join("\u202f")])] : [])])];
   if (change) parts.push(make("em", { className: change.startsWith("−") ? "down" : "up" }, [change]));
   return make("div", {}, parts);
+}
+
+/** Two numbers with their unit said once. */
+function span(low, high) {
+  const [digits, unit] = low.split("\u202f");
+  return unit && high.endsWith(unit) ? `${digits} – ${high}` : `${low} – ${high}`;
 }
 
 /** How sure the results of a device are: the mean, what 95 % lie between, and what makes the spread. */
@@ -43,7 +51,7 @@ export function sureSheet({ title, words, rows }) {
   const cards = rows.map((row) =>
     make("div", { className: "card" }, [
       make("span", { className: "term" }, [row.name]),
-      make("div", { className: "card-cells" }, [cell("Mean", "", row.mean, ""), cell("95 % lie between", "", `${row.low} – ${row.high}`, "")]),
+      make("div", { className: "card-cells" }, [cell("Mean", "", row.mean, ""), cell("95 % lie between", "", span(row.low, row.high), "")]),
       make("p", { className: "hint" }, [cause(row.shares)]),
     ]),
   );

@@ -55,7 +55,7 @@ export class Picture {
     });
   }
 
-  /** Add layers; a layer of the same name in the same pane is replaced. */
+  /** Add layers; a layer of the same name in the same pane is replaced. Views that come along replace those there were. */
   put({ manifest, buffer }) {
     if (!this.stage) return;
     this.stage.put(manifest, buffer);
@@ -63,7 +63,7 @@ export class Picture {
     if (manifest.views?.length) {
       const isFirst = !this.views.length;
       this.views = manifest.views;
-      if (isFirst) this.look("profile", false);
+      if (isFirst) this.look(this.views[0].id, false);
     }
     this.apply();
   }
@@ -172,7 +172,11 @@ export class Picture {
     // One that is in hand stays where it is: it would be let go.
     const isSame = marks.length === this.drawnMarks.length && marks.every(({ element }, i) => element === this.drawnMarks[i].element);
     this.drawnMarks = marks;
-    if (!isSame) this.marks.replaceChildren(...marks.map(({ element }) => element));
+    if (!isSame) {
+      const inUse = document.activeElement;
+      this.marks.replaceChildren(...marks.map(({ element }) => element));
+      if (marks.some(({ element }) => element === inUse)) inUse.focus();
+    }
     if (this.stage) this.placeMarks();
     this.stage?.redraw();
   }

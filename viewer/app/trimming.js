@@ -15,8 +15,20 @@ export class Trimming {
   set(axis, neck) {
     this.axis = axis;
     this.middle = neck.length ? (neck[0] + neck[1]) / 2 : undefined;
-    this.kept = { upstream_mm: this.middle, downstream_mm: axis.length - this.middle };
-    this.handles.forEach((handle) => handle.say());
+  }
+
+  /** Lie where it was chosen, or at the ends of the artery. */
+  show(chosen) {
+    if (this.middle === undefined || this.isPulled) return;
+    this.kept = {};
+    for (const { which, say } of this.handles) {
+      this.kept[which] = Math.min(chosen[which] ?? Infinity, this.most(which));
+      say();
+    }
+  }
+
+  most(which) {
+    return which === "upstream_mm" ? this.middle : this.axis.length - this.middle;
   }
 
   handle(which, kind, word) {
@@ -39,8 +51,7 @@ export class Trimming {
   }
 
   keep(which, mm) {
-    const most = which === "upstream_mm" ? this.middle : this.axis.length - this.middle;
-    this.kept[which] = Math.min(Math.max(mm, LEAST_MM), most);
+    this.kept[which] = Math.min(Math.max(mm, LEAST_MM), this.most(which));
     this.isPulled = true;
     this.handles.forEach((handle) => handle.which === which && handle.say());
     this.host.told();

@@ -11,7 +11,7 @@ from vstent.kernels import topology, triangles
 from vstent.kernels.arrays import Floats
 from vstent.kernels.isosurface import isosurface
 from vstent.report.packing import Packer, message
-from vstent.report.scene import MeshLayer
+from vstent.report.scene import FRONTAL, MeshLayer, view_of
 from vstent.report.thinning import thin_surface
 from vstent.segment import propose
 from vstent.surface import Surface
@@ -70,12 +70,13 @@ class Scan:
         stride = max(1, int(np.ceil((self.image.voxels.size / COARSE) ** (1 / 3))))
         field = self.image.voxels[::stride, ::stride, ::stride].astype(np.float32)
         index, faces = isosurface(field, threshold)
-        layers = []
+        layers, views = [], []
         if len(faces):
             index, faces = _without_specks(index, faces)
             surface = thin_surface(Surface(self.image.to_mm(stride * index), faces), LIVE_FACES)[0]
             layers = [MeshLayer("live", "", (0.80, 0.62, 0.55), "", np.zeros(0), surface)]
-        return message(layers, threshold=threshold)
+            views = [view_of("whole", FRONTAL, surface.vertices_mm)]
+        return message(layers, views=views, threshold=threshold)
 
 
 def _without_specks(index: Floats, faces: Any) -> tuple[Floats, Any]:

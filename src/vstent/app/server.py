@@ -107,8 +107,9 @@ def _said(_: Request, error: Exception) -> JSONResponse:
 
 def asset(name: str) -> Response:
     """Return one of the page's files."""
-    package = "vstent.report" if name in SHARED else "vstent.app"
-    text = files(package).joinpath("assets", name).read_bytes()
+    folder = "report" if name in SHARED else "app"
+    # The package of the report itself is not loaded for it: that takes longer than the first page may.
+    text = files("vstent").joinpath(folder, "assets", name).read_bytes()
     return Response(text, media_type=MEDIA[Path(name).suffix])
 
 

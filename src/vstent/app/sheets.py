@@ -61,9 +61,10 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
 
 def uncertainty(metrics: dict[str, Any], titles: dict[str, str]) -> list[dict[str, Any]]:
     """Return the intervals of every device for which something was varied."""
+    ordered = {"stents": {name: metrics["stents"][name] for name in titles}}
     return [
         {"title": varied.title, "words": varied.words, "rows": [row._asdict() for row in varied.rows]}
-        for varied in uncertainty_of(metrics, titles)
+        for varied in uncertainty_of(ordered, titles)
     ]
 
 

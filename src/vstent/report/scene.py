@@ -19,6 +19,10 @@ N_INLET, N_NECK = 70, 60
 if TYPE_CHECKING:
     from vstent.study import CaseResult
 
+FRONTAL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""From the front: the patient's left is to the right, the head is up."""
+LATERAL = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+"""From the left."""
 BARE = "bare"
 """Pane of the artery without a device."""
 
@@ -296,8 +300,7 @@ def views_of(anatomy: Anatomy, deployments: dict[str, Deployment]) -> tuple[View
     if anatomy.aneurysms:
         right, up, toward = views[0].axes
         views.append(view_of("neck", np.stack([right, -toward, up]), anatomy.aneurysms[0].neck_mm, 1.3))
-    views.append(view_of("frontal", np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), whole))
-    views.append(view_of("lateral", np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), whole))
+    views += [view_of("frontal", FRONTAL, whole), view_of("lateral", LATERAL, whole)]
     return tuple(views)
 
 
