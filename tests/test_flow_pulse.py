@@ -10,7 +10,8 @@ from scipy.special import jv
 from vstent import phantoms
 from vstent.errors import InputError
 from vstent.flow import FlowCase, FlowField, FlowSettings, sampling, simulate_case
-from vstent.flow.engines.lattice_pulse import PHASES, cycle_change
+from vstent.flow.engines.lattice_pulse import cycle_change, cycles_advice
+from vstent.flow.engines.lattice_state import PHASES
 from vstent.flow.types import Waveform
 from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
 from vstent.trace import trace
@@ -65,6 +66,14 @@ def test_velocity_is_womersleys_at_every_phase(cell_size_mm: float, of_peak: flo
     peak_m_s = womersley_m_s(np.zeros(1), 0.0).max()
     print(f"Womersley, {cell_size_mm} mm: within {max(error) / peak_m_s:.2%} of the peak")  # noqa: T201
     assert max(error) < of_peak * peak_m_s
+
+
+def test_cycles_that_go_on_differing_are_told_from_those_that_become_alike() -> None:
+    assert "more cycles will not" in cycles_advice(np.array([0.094, 0.093, 0.089]), 4, is_converged=False)
+    assert "allow more cycles" in cycles_advice(np.array([0.4, 0.09]), 3, is_converged=False)
+    assert "allow more cycles" in cycles_advice(np.array([0.09]), 2, is_converged=False)
+    assert "single cycle" in cycles_advice(np.zeros(0), 1, is_converged=False)
+    assert "periodic" in cycles_advice(np.array([0.09, 0.085, 0.084]), 4, is_converged=True)
 
 
 def test_inflow_is_the_waveforms() -> None:

@@ -1,5 +1,6 @@
 """The case handed to OpenFOAM: syntax, units, watertight patches, the flow that was asked for."""
 
+import itertools
 from dataclasses import replace
 from functools import cache
 
@@ -8,14 +9,16 @@ import pytest
 
 from shapes import sphere
 from vstent import phantoms
+from vstent.device import find_design
 from vstent.errors import ReadError
 from vstent.flow import Blood, FlowCase, FlowSettings
 from vstent.flow.openfoam import FoamSetup, foam_case, named_patches
-from vstent.flow.openfoam.case import struts_near
+from vstent.flow.openfoam.case import struts_near, wires_near
 from vstent.flow.openfoam.control import fluid
 from vstent.flow.openfoam.dictionary import foam_file, parse
 from vstent.flow.types import CarreauYasuda
 from vstent.flow.waveform import OLDER_ADULT_ICA
+from vstent.stent import Stent
 from vstent.surface import Surface
 from vstent.trace import trace
 from vstent.vessel import Vessel
@@ -195,3 +198,32 @@ def test_only_wires_at_the_neck_are_meshed_each_whole() -> None:
     assert len(kept.faces) == len(near.faces)
     assert kept.volume_mm3 == pytest.approx(near.volume_mm3)
     assert kept.corners_mm[..., 2].max() < 2.0
+
+
+def test_only_the_pieces_of_wire_near_the_neck_are_left() -> None:
+    design = find_design("silk")
+    rng = np.random.default_rng(5)
+    starts = np.array([0, 40, 41, 120, 300])  # a single point is a wire too
+    points_mm = 0.25 * np.cumsum(rng.normal(size=(300, 3)), axis=0)
+    diameter_um = np.array([30.0, 50.0, 30.0, 50.0])
+    stent = Stent(design, design.sizes[0], np.zeros((2, 3, 3)), np.zeros(2), points_mm, starts, diameter_um)
+    neck = sphere(1.0)
+    near = wires_near(stent, neck, 1.0)
+    distance = neck.closest(near.wire_points_mm)[1]
+    assert distance.max() < 1.0
+    whole, left = (_pieces(one) for one in (stent, near))
+    # Every piece between two near points of one wire is kept, with its diameter, and no other.
+    inside = neck.closest(whole[:, :3])[1] < 1.0
+    both = whole[inside & (neck.closest(whole[:, 3:6])[1] < 1.0)]
+    np.testing.assert_array_equal(left, both)
+    assert 10 < len(left) < 0.5 * len(whole)
+
+
+def _pieces(stent: Stent) -> np.ndarray:
+    """Every piece of wire: both ends and the diameter."""
+    rows = []
+    for k, (begin, end) in enumerate(itertools.pairwise(stent.wire_starts)):
+        points = stent.wire_points_mm[begin:end]
+        diameter = np.full((len(points) - 1, 1), stent.wire_diameter_um[k])
+        rows.append(np.hstack([points[:-1], points[1:], diameter]))
+    return np.concatenate(rows)

@@ -1,6 +1,7 @@
 """The embedded engine for pulsatile flow: the same steps, the inflow following a waveform until cycles repeat."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from vstent.flow.engines.lattice_state import (
 from vstent.flow.types import FlowCase, FlowField, Phase
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
+
+STALLED: Final = 0.8
+"""Where a cycle's change is more than this part of the last one's, further cycles will not become alike."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,9 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
             time_s = (k + 1) * state.steps_per_check * state.scales.step_s
             inlet_mL_s = -float(flow.outflow_mL_s[0])
             phases.append(Phase(time_s, inlet_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa))
-        return field_of(state, read(state, list(state.snapshots)), outcome, _advice(state, outcome), tuple(phases))
+        changes = np.array([change for change in outcome.residual if np.isfinite(change)])
+        advice = cycles_advice(changes, len(state.history) // PHASES, is_converged=outcome.is_converged)
+        return field_of(state, read(state, list(state.snapshots)), outcome, advice, tuple(phases))
 
 
 def cycle_change(history: Floats) -> float:
@@ -68,9 +74,16 @@ def cycle_change(history: Floats) -> float:
     return float((np.sqrt(((last - before) ** 2).mean(axis=0)) / scale).max())
 
 
-def _advice(state: State, outcome: Outcome) -> str:
-    cycles, change = len(state.history) // PHASES, 100 * outcome.residual[-1]
-    said = f"Cycle {cycles} repeats the one before to within {change:.1f} %"
-    if outcome.is_converged:
+def cycles_advice(changes: Floats, cycles: int, *, is_converged: bool) -> str:
+    """Say what the changes (c,) from cycle to cycle, as fractions, mean for the result."""
+    if len(changes) == 0:
+        return "A single cycle was computed: allow two, to see whether it repeats."
+    said = f"Cycle {cycles} repeats the one before to within {100 * changes[-1]:.1f} %"
+    if is_converged:
         return f"{said}: the flow is periodic."
+    if len(changes) > 1 and changes[-1] > STALLED * changes[-2]:
+        return (
+            f"{said}, no better than that one did ({100 * changes[-2]:.1f} %): vortices differ from cycle to cycle, "
+            "and more cycles will not make them alike."
+        )
     return f"{said}, which is more than was asked for: allow more cycles, or take it as it is."

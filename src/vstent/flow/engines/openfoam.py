@@ -21,7 +21,7 @@ from vstent.flow.engines.lattice_state import PHASES
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
-from vstent.flow.openfoam.case import STRUT_REACH_MM, foam_case, struts_near
+from vstent.flow.openfoam.case import STRUT_REACH_MM, foam_case, wires_near
 from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.types import FlowCase, FlowField, Phase
@@ -160,7 +160,7 @@ class OpenFoam(AbstractEngine[State]):
 
 
 def _solids(case: FlowCase) -> Surface | None:
-    """Wires of the case's stent that span the neck, as solids."""
+    """Pieces of the stent's wires over the neck, as solids."""
     if case.stent is None and case.screen is None:
         return None
     if case.stent is None:
@@ -170,7 +170,7 @@ def _solids(case: FlowCase) -> Surface | None:
         )
     if case.ostium is None:
         raise FlowError("OpenFOAM meshes struts over the neck, and this vessel has no sac: leave the device away")
-    return struts_near(struts(case.stent), case.ostium, STRUT_REACH_MM)
+    return struts(wires_near(case.stent, case.ostium, STRUT_REACH_MM))
 
 
 def _next_end(state: State, reached: float) -> float:

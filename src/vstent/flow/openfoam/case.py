@@ -1,6 +1,6 @@
 """A flow case as OpenFOAM's case folder, in memory: relative path to text."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -10,6 +10,7 @@ from vstent.flow.openfoam.patches import Patch, named_patches, stl_text
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.types import FlowCase
 from vstent.kernels.arrays import Floats
+from vstent.stent import Stent
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
 
@@ -123,6 +124,22 @@ def _inside_mm(case: FlowCase, sections: tuple[Floats, ...]) -> Floats:
     """A point in the inlet's straight extension, off every plane of the grid."""
     inlet = case.vessel.inlet
     return np.asarray(sections[0].mean(axis=0) - inlet.normal * 0.1137 * inlet.diameter_mm)
+
+
+def wires_near(stent: Stent, ostium: Surface, reach_mm: float) -> Stent:
+    """Return a stent of which only the pieces of wire are left that lie nearer to the ostium than `reach_mm`."""
+    wire = np.repeat(np.arange(len(stent.wire_starts) - 1), np.diff(stent.wire_starts))
+    is_near = ostium.closest(stent.wire_points_mm)[1] < reach_mm
+    first = is_near & ~np.r_[False, is_near[:-1] & (wire[1:] == wire[:-1])]
+    piece, kept = np.cumsum(first) - 1, np.flatnonzero(is_near)
+    kept = kept[np.bincount(piece[kept])[piece[kept]] > 1]  # a single point is no piece
+    starts = np.r_[np.flatnonzero(np.r_[True, np.diff(piece[kept]) > 0]), len(kept)]
+    return replace(
+        stent,
+        wire_points_mm=stent.wire_points_mm[kept],
+        wire_starts=starts,
+        wire_diameter_um=stent.wire_diameter_um[wire[kept[starts[:-1]]]],
+    )
 
 
 def struts_near(struts: Surface, ostium: Surface, reach_mm: float) -> Surface:
