@@ -175,6 +175,11 @@ def whole_way(client, page, path):
     """Every step, from a dropped file to the open report."""
     drop(page, path)
     page.wait_for_selector(".step.done:nth-child(3)")
+    for title in ("Image", "Vessel", "Sac and parent"):
+        step(page, title)
+        page.wait_for_selector(".step[aria-current=step]:has-text('" + title + "')")
+        playwright.expect(page.locator(".right .sheet")).to_contain_text("mm³")
+        assert drawn(page, page.locator(".viewer-area").bounding_box()) > 0.05
     step(page, "Device")
     page.locator(".device", has_text="Silk").locator("input").uncheck()
     page.wait_for_selector(".device:has-text('Silk') input:not(:checked)")
@@ -185,7 +190,6 @@ def whole_way(client, page, path):
     step(page, "Flow")
     page.fill("#field-cell", COARSE_MM)
     page.keyboard.press("Tab")
-    page.wait_for_timeout(SECOND)
     page.get_by_role("button", name="Run the flow").click()
     page.wait_for_selector(".step.done:nth-child(7)", timeout=1200 * SECOND)
     page.wait_for_selector(".card")

@@ -76,7 +76,7 @@ def test_pictures_tell_the_way_from_the_artery_to_the_flow(told):
     names = [picture.id for picture in told.pictures]
     assert names == [
         *("anatomy", "restoration", "spheres", "first", "expansion-silk", "expansion-enterprise", "fitted"),
-        *("contour", "wires", "streamlines", "shear"),
+        *("contour", "coverage", "wires", "streamlines", "shear"),
     ]
 
 

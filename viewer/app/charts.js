@@ -63,11 +63,11 @@ export class AlongChart {
     parts.push(text(width - right, 13, width > 480 ? "along the parent artery, mm from the inlet" : "at mm from the inlet", { class: "axis-title end" }));
     if (neck?.length) {
       parts.push(svg("rect", { x: x(neck[0]), width: x(neck[1]) - x(neck[0]), y: top, height: height - top - bottom, class: "neck-zone" }));
-      parts.push(text((x(neck[0]) + x(neck[1])) / 2, top + 11, "neck", { class: "tick middle neck-word" }));
     }
     parts.push(svg("path", { d: path(axis.abscissa.map((s, i) => [x(s), y(axis.diameter[i])])), class: "line artery" }));
     if (device) parts.push(...this.device(device, x, y, height - bottom));
     if (cursor !== undefined) parts.push(svg("line", { x1: x(cursor), x2: x(cursor), y1: top, y2: height - bottom, class: "cursor" }));
+    if (neck?.length) parts.push(text((x(neck[0]) + x(neck[1])) / 2, top + 11, "neck", { class: "tick middle neck-word" }));
     this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
     this.svg.replaceChildren(...parts);
   }

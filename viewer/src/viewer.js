@@ -27,6 +27,7 @@ const LAYERS = [
   ["axis", "Parent axis"],
   ["centerlines", "Centerlines"],
   ["contour", "Device contour, by wall gap"],
+  ["coverage", "Device contour, by metal coverage"],
   ["wires", "Wires"],
   ["streamlines", "Streamlines, by speed"],
   ["shear", "Wall shear stress"],

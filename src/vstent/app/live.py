@@ -23,7 +23,7 @@ from vstent.flow import FlowField
 from vstent.io.archive import load_noun
 from vstent.kernels import clipping
 from vstent.kernels.arrays import Floats
-from vstent.measure import coverage_fractions, measure, morphology
+from vstent.measure import measure, morphology
 from vstent.report.packing import message
 from vstent.report.scene import (
     LineLayer,
@@ -34,6 +34,7 @@ from vstent.report.scene import (
     device_layers,
     device_title,
     flow_layers,
+    node_coverage,
     round_up,
     scales_of,
     view_of,
@@ -203,7 +204,7 @@ class Live:
             deployment = self.deployment(choice)
             stent, gap_mm = deployment.stent, deployment.wall_gap_mm
             key = (self.case.state.anatomy, *choice.model_dump().values())
-            measured = partial(self.remembered, ("coverage", *key), lambda: _node_coverage(stent))
+            measured = partial(self.remembered, ("coverage", *key), lambda: node_coverage(stent))
             wires = _wires(choice.name, stent, gap_mm, colour, measured)
             contour = device_layers(choice.name, deployment, self.anatomy)[0]
             layers = [wires, contour]
@@ -367,15 +368,6 @@ def _formula_coverage(stent: Stent) -> Floats:
     """Coverage (rows, columns) by the formula, from every row's diameter."""
     of_row = [coverage_fraction(stent.design, stent.size, float(d)) for d in stent.row_diameter_mm]
     return np.broadcast_to(np.array(of_row)[:, None], stent.nodes_mm.shape[:2])
-
-
-def _node_coverage(stent: Stent) -> Floats:
-    """Coverage (rows, columns) as measured on the wires in the quads around every node, smoothed over a few cells."""
-    from scipy.ndimage import uniform_filter
-
-    quads = coverage_fractions(stent)
-    smooth = uniform_filter(quads, size=(7, 7), mode=("nearest", "wrap"))
-    return np.concatenate([smooth, smooth[-1:]])
 
 
 def _center_mm(stent: Stent) -> float:

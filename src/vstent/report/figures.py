@@ -26,7 +26,7 @@ class Picture:
     """A finished picture with its words."""
 
     id: str
-    """What it shows: anatomy, contour, wires, streamlines, shear."""
+    """What it shows: anatomy, contour, coverage, wires, streamlines, shear."""
     title: str
     """One line above it."""
     caption: str
@@ -51,7 +51,7 @@ def pictures(scene: Scene) -> list[Picture]:
     """Return the pictures of a scene: anatomy always, contour and wires per device, flow where it was computed."""
     found = [_anatomy(scene)]
     if len(scene.panes) > 1:
-        found += [_contour(scene), _wires(scene)]
+        found += [_contour(scene), _coverage(scene), _wires(scene)]
     drawn = {layer.id for layer in scene.layers}
     if "streamlines" in drawn:
         found.append(_streamlines(scene))
@@ -145,6 +145,16 @@ def _contour(scene: Scene) -> Picture:
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
     caption = "The deployed contour in the lumen, coloured by its gap to the wall of the parent artery."
     return Picture("contour", "Where the devices lie", caption, sheet(scene, shots, "wall_gap"))
+
+
+def _coverage(scene: Scene) -> Picture:
+    ids = ("lumen", "coverage", "neck")
+    shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
+    caption = (
+        "Coverage map: the part of the contour that is under metal, measured on the wires and averaged over a few "
+        "pores; denser on the inside of a bend, wider on its outside."
+    )
+    return Picture("coverage", "How much metal covers the wall", caption, sheet(scene, shots, "coverage"))
 
 
 def _wires(scene: Scene) -> Picture:

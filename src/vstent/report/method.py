@@ -123,7 +123,7 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
         surface = replace(contour.surface, vertices_mm=nodes_mm)
         layer = replace(contour, surface=surface, values=gap_mm, frames_mm=None, frame_values=None)
         words = (
-            f"after {number} iterations, {100 * reached[number]:.0f} % of the nodes at rest"
+            f"after {_iterations(number)}, {100 * reached[number]:.0f} % of the nodes at rest"
             if number
             else "before the first"
         )
@@ -134,10 +134,14 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
     shown = replace(scene, scales=tuple(wide if scale is gap else scale for scale in scene.scales))
     title = f"Expansion of {dict(scene.panes)[name]}"
     caption = (
-        f"The active contour on its way to the wall of the parent artery (glass) in {len(deployment.history_mm) - 1} "
-        "iterations, coloured by the gap that is left."
+        f"The active contour on its way to the wall of the parent artery (glass) in "
+        f"{_iterations(len(deployment.history_mm) - 1)}, coloured by the gap that is left."
     )
     return Picture(f"expansion-{name}", title, caption, sheet(shown, shots, "wall_gap"))
+
+
+def _iterations(count: int) -> str:
+    return f"{count} iteration{'' if count == 1 else 's'}"
 
 
 def _fitted(scene: Scene) -> Picture:

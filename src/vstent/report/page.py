@@ -2,10 +2,11 @@
 
 import base64
 import hashlib
+import io
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from markupsafe import Markup
@@ -22,6 +23,7 @@ from vstent.stent import Deployment
 if TYPE_CHECKING:
     from vstent.study import CaseResult
 
+WEBP_QUALITY: Final = 90
 LIMITS = (
     "The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way: "
     "how an artery and a device push each other is not computed.",
@@ -165,7 +167,16 @@ def _sections(told: Contents) -> list[tuple[str, str]]:
 
 def _picture(picture: Picture) -> dict[str, str]:
     words = {"id": picture.id, "title": picture.title, "caption": picture.caption}
-    return {**words, "base64": base64.b64encode(picture.png).decode("ascii")}
+    return {**words, "base64": base64.b64encode(_webp(picture.png)).decode("ascii")}
+
+
+def _webp(png: bytes) -> bytes:
+    """Write a picture as WebP: a fifth of the bytes, and no difference to the eye."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.open(io.BytesIO(png)).convert("RGB").save(stream, "WEBP", quality=WEBP_QUALITY, method=4)
+    return stream.getvalue()
 
 
 def _pane_notes(headlines: list[Change]) -> dict[str, str]:
@@ -185,10 +196,11 @@ def _stent(name: str, deployment: Deployment, metrics: dict[str, Any]) -> dict[s
     diameters = ", ".join(f"{d:g}" for d in np.unique(stent.wire_diameter_um))
     wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
     how = "terminated" if deployment.outcome == "terminated" else "stopped at its limit"
-    steps = len(deployment.terminated_fraction)
+    count = len(deployment.terminated_fraction)
+    steps = f"{count} iteration{'s' if count > 1 else ''}"
     return {
         "title": device_title(deployment),
-        "words": f"{wires}. The contour {how} after {steps} iterations, in {deployment.seconds:.2f} s.",
+        "words": f"{wires}. The contour {how} after {steps}, in {deployment.seconds:.2f} s.",
         "advice": deployment.advice,
         "quantities": values,
         "facts": stent.design.facts,

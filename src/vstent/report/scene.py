@@ -8,8 +8,9 @@ import numpy as np
 from vstent.flow.streamlines import inlet_seeds_mm, neck_seeds_mm, streamlines
 from vstent.flow.types import FlowField
 from vstent.kernels.arrays import Floats, Ints, freeze
+from vstent.measure import coverage_fractions
 from vstent.report.thinning import thin_frames, thin_lines, thin_surface
-from vstent.stent import Deployment
+from vstent.stent import Deployment, Stent
 from vstent.surface import Surface
 from vstent.vessel import Anatomy
 
@@ -58,7 +59,7 @@ class Layer:
     """What every layer has."""
 
     id: str
-    """What it is: lumen, landing, sac, neck, axis, contour, wires, streamlines, shear."""
+    """What it is: lumen, landing, sac, neck, axis, contour, coverage, wires, streamlines, shear."""
     pane: str
     """The pane that shows it; empty: every pane."""
     colour: tuple[float, float, float]
@@ -147,7 +148,7 @@ def scene_of(case: "CaseResult") -> Scene:
     devices = tuple((name, device_title(deployment)) for name, deployment in case.deployments.items())
     layers: list[MeshLayer | LineLayer] = anatomy_layers(anatomy)
     for name, deployment in case.deployments.items():
-        layers += device_layers(name, deployment, anatomy)
+        layers += [*device_layers(name, deployment, anatomy), coverage_layer(name, deployment.stent)]
     for name, field in case.fields.items():
         layers += flow_layers(name, field, anatomy)
     return Scene(
@@ -218,6 +219,21 @@ def device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[M
         id="wires", pane=name, colour=_STEEL, points_mm=points, starts=starts, radius_mm=radius_mm, **_PLAIN
     )
     return [contour, wires]
+
+
+def coverage_layer(name: str, stent: Stent) -> MeshLayer:
+    """Return the contour coloured by how much metal is about, for the pane `name`."""
+    values = 100 * node_coverage(stent).ravel()
+    return MeshLayer(id="coverage", pane=name, colour=_STEEL, scale="coverage", values=values, surface=stent.contour)
+
+
+def node_coverage(stent: Stent) -> Floats:
+    """Coverage (rows, columns) as measured on the wires in the quads around every node, smoothed over a few cells."""
+    from scipy.ndimage import uniform_filter
+
+    quads = coverage_fractions(stent)
+    smooth = uniform_filter(quads, size=(7, 7), mode=("nearest", "wrap"))
+    return np.concatenate([smooth, smooth[-1:]])
 
 
 def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
