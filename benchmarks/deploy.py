@@ -54,7 +54,7 @@ CASES = {
 }
 SIZES = {"silk": (4.0, 20.0), "enterprise": (4.5, 22.0)}
 HEADER = (
-    "artery         device     method         iterations  terminated  outside/mm  ends/mm  gap/mm  length/mm  "
+    "artery         device     method         iterations  time/s  terminated  outside/mm  ends/mm  gap/mm  length/mm  "
     "integral  coverage  formula  stretch mean, 95 %"
 )
 
@@ -108,10 +108,11 @@ def end_gap_mm(done: Any) -> float:
 
 def row(name: str, anatomy: Anatomy, key: str, method: str, size: device.Size | None) -> str:
     """One line of the table."""
-    done = deploy(device.find_design(key), anatomy, size=size, method=method)
+    done, seconds = timed(lambda: deploy(device.find_design(key), anatomy, size=size, method=method), 1)
     found = measure(anatomy, done)
+    iterations = len(done.terminated_fraction)
     return (
-        f"{name:14} {key:10} {method:14} {len(done.terminated_fraction):10d} {done.terminated_fraction[-1]:11.4f} "
+        f"{name:14} {key:10} {method:14} {iterations:10d} {seconds:7.3f} {done.terminated_fraction[-1]:11.4f} "
         f"{found['max_outside_mm']:11.4f} {end_gap_mm(done):8.4f} {done.wall_gap_mm.max():7.4f} "
         f"{done.stent.deployed_length_mm:10.3f} {integral_mm(done.stent, anatomy):9.3f} "
         f"{found['metal_coverage_fraction']:9.4f} {found['metal_coverage_formula_fraction']:8.4f} "
@@ -156,6 +157,7 @@ def speed(anatomy: Anatomy) -> list[str]:
     _, struts_s = timed(lambda: struts(done.stent))
     ready = bed(design, size, anatomy)
     sketched, sketch_s = timed(lambda: sketch(ready, landing))
+    apart_mm = np.linalg.norm(sketched.stent.nodes_mm - done.stent.nodes_mm, axis=2)
     wall = CountingWall(landing_wall(anatomy)[0])
     run(method, Placement(design, size, landing, anatomy, wall))
     nodes_mm = course.opened.contour.nodes_mm.reshape(-1, 3)
@@ -169,8 +171,9 @@ def speed(anatomy: Anatomy) -> list[str]:
     return [
         f"{n} nodes, {len(course.terminated_fraction)} iterations: anatomy -> contour {contour_s:.3f} s, wires "
         f"{deploy_s - contour_s:.3f} s more, measures {measure_s:.3f} s, struts {struts_s:.3f} s",
-        f"landing moved: sketch {1 / sketch_s:.0f} a second ({sketched.stent.deployed_length_mm:.2f} mm long), whole "
-        f"deployment {1 / deploy_s:.0f} a second ({done.stent.deployed_length_mm:.2f} mm)",
+        f"landing moved, times a second: contour by exact closest points {1 / contour_s:.0f}, with wires "
+        f"{1 / deploy_s:.0f} ({done.stent.deployed_length_mm:.2f} mm long), sketch with wires {1 / sketch_s:.0f} "
+        f"({sketched.stent.deployed_length_mm:.2f} mm, nodes {apart_mm.mean():.3f} mm off, at most {apart_mm.max():.3f})",
         f"{wall.closest} closest points at {closest_s / n * 1e6:.2f} us (plain: "
         f"{slow_closest_s / n_few * 1e6:.0f} us, {slow_closest_s / n_few / (closest_s / n):.0f} times as long)",
         f"{wall.crossings} crossing tests at {crosses_s / n * 1e6:.2f} us (plain: "

@@ -234,19 +234,26 @@ CASES = (
 )
 
 
+@cache
+def restored(path):
+    return anatomy_of(path)
+
+
 @pytest.mark.validation
 @pytest.mark.parametrize("case", CASES)
-def test_in_real_arteries_every_node_lies_inside_and_the_ends_as_near_to_the_wall_as_the_middle(shared_data, case):
-    anatomy = anatomy_of(shared_data / case)
-    for design in (SILK, ENTERPRISE):
-        done = deploy(design, anatomy)
-        assert done.terminated_fraction[-1] >= 0.99
-        assert measure(anatomy, done)["max_outside_mm"] <= 0.002
-        # A row that has its free perimeter touches where it can, and no more is asked of it.
-        is_free = perimeters(done.stent.nodes_mm) > 0.99 * np.pi * done.stent.size.free_diameter_mm
-        gap_mm = np.where(is_free, 0.0, done.wall_gap_mm.max(axis=1))
-        assert max(gap_mm[:3].max(), gap_mm[-3:].max()) <= max(0.002, gap_mm[3:-3].max())
-        if design is SILK:
-            stretch = wire_stretches(done.stent)
-            assert abs(stretch.mean()) < 0.005
-            assert np.quantile(np.abs(stretch), 0.95) < 0.05
+@pytest.mark.parametrize("design", [SILK, ENTERPRISE], ids=["silk", "enterprise"])
+def test_in_real_arteries_every_node_lies_inside_and_the_ends_as_near_to_the_wall_as_the_middle(
+    shared_data, case, design
+):
+    anatomy = restored(shared_data / case)
+    done = deploy(design, anatomy)
+    assert done.terminated_fraction[-1] >= 0.99
+    # The landing surface is closed across sac and branches: what is not outside it is in neither.
+    assert measure(anatomy, done)["max_outside_mm"] <= 0.002
+    # A row that has its free perimeter touches where it can, and no more is asked of it.
+    is_free = perimeters(done.stent.nodes_mm) > 0.99 * np.pi * done.stent.size.free_diameter_mm
+    gap_mm = np.where(is_free, 0.0, done.wall_gap_mm.max(axis=1))
+    assert max(gap_mm[:3].max(), gap_mm[-3:].max()) <= max(0.002, gap_mm[3:-3].max())
+    stretch = wire_stretches(done.stent)
+    assert abs(stretch.mean()) < 0.005
+    assert np.quantile(np.abs(stretch), 0.95) < 0.04

@@ -1,12 +1,14 @@
 """What the first use has to compile: it is said once, and what was compiled can be kept anywhere."""
 
 import os
+import subprocess
+import sys
 
 import pytest
 from numba import njit
 
 from vstent import kernels
-from vstent.kernels import warm
+from vstent.kernels import first_use, warm
 from vstent.kernels.first_use import telling
 
 
@@ -23,6 +25,22 @@ def test_the_first_compilation_is_told_once_and_a_kept_kernel_is_not():
     with telling(lambda: said.append("again")):
         double(3)
     assert said == ["compiling"]
+
+
+def test_a_helper_begins_with_the_first_compilation_and_ends_with_the_work(monkeypatch):
+    @njit
+    def half(x):
+        return x / 2
+
+    monkeypatch.setattr(first_use, "HELP", (sys.executable, "-c", "import time; time.sleep(60)"))
+    started, begin = [], subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: started.append(begin(*a, **k)) or started[-1])
+    with telling(lambda: None, helped=True):
+        assert started == []
+        half(1)
+        half(1.0)
+        assert [helper.poll() for helper in started] == [None]
+    assert started[0].poll() is not None
 
 
 def test_the_set_up_compiles_every_kernel_of_a_deployment():

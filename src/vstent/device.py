@@ -25,7 +25,7 @@ Confidence = Literal["cited", "derived", "estimated"]
 STEEP_RAD = 0.1, 1.5
 """Angles between wire and axis that a device may have at its free diameter."""
 BEND_SAMPLES, BEND_STEPS = 12, 6
-"""Angles round half the axis (the other half mirrors it), and Newton steps, in which the spacing of rows in a bend is computed."""
+"""Angles round half the axis (the other half mirrors it), and Newton steps, for the spacing of rows in a bend."""
 STEEPEST_BEND = 0.9
 """Artery's radius over the bend's, at most: sharper ones are only sharp where the wall is folded."""
 STRAIGHTEST = 0.995

@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return int(arguments.command(arguments))
         from vstent.kernels.first_use import telling
 
-        with telling(_first_use):
+        with telling(_first_use, helped=True):
             return int(arguments.command(arguments))
     except InputError as error:
         return _fail(str(error), BAD_INPUT)
@@ -55,7 +55,7 @@ def _remedy(error: OSError) -> str:
 
 
 def _first_use() -> None:
-    said = "first use of this version: its kernels are compiled, once, which takes about a minute."
+    said = "first use of this version: its kernels are compiled, once, which takes about half a minute."
     print(f"vstent: {said}", file=sys.stderr, flush=True)
 
 

@@ -127,7 +127,7 @@ class ConstantWire(AbstractMethod):
         return self._marched(placement, opened) if self.terminate(opened) else opened
 
     def result(self, placement: Placement, opened: Opened) -> Opened:
-        """Let crossings slide until pieces of wire have their length; put nodes to the wall but where cells leave it."""
+        """Let crossings slide until pieces of wire have their length; put nodes to the wall, or off it as cells ask."""
         for _ in range(LAST_STEPS):
             if opened.contour.is_terminated.all():
                 break
@@ -143,7 +143,7 @@ class ConstantWire(AbstractMethod):
         nodes_mm = self._no_wider(state.nodes_mm, laid_mm, placement.size.free_diameter_mm)
         rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
         check_inside(placement.design, placement.size, rows_mm, placement.anatomy.axis.length_mm)
-        is_lifted = slid.lift_mm.any(axis=2)
+        is_lifted = np.any(slid.lift_mm, axis=2)
         state = replace(state, nodes_mm=nodes_mm + slid.lift_mm)
         return Opened(self.contour.classify(state, is_lifted, placement.wall), rows_mm)
 

@@ -186,7 +186,7 @@ def _keeping(net: Net, held: int) -> csc_matrix:
     line = coo_matrix((weights, (number, bends.ravel())), shape=(bends.shape[1], n))
     beside = coo_matrix((np.ones(n), (np.arange(n), net.beside.astype(int))), shape=(n, n))
     ring = beside - 2 * identity(n) + beside.T
-    along, around, off = (coo_matrix(([1.0], ([0], [k])), shape=(1, 3)) for k in range(3))
+    along, around, off = (csc_matrix(np.eye(3)[[k]]) for k in range(3))
     level = [LEVEL * kron(off_row, along), LEVEL * kron(identity(n), around), kron(mean.tocsr()[[held]], along)]
     smooth = [STIFFNESS * kron(line, along), STIFFNESS * kron(line, around), BENDING * kron(line, off)]
     return csc_matrix(vstack([*level, *smooth, BENDING * kron(ring, off)]))

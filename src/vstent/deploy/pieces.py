@@ -123,8 +123,8 @@ def _lattice(shape: Grid) -> _Lattice:
     ]
     bends = np.array(ways).transpose(1, 2, 0).reshape(3, -1)
     row, column = line * shape.row_split, column * shape.column_split
-    line, beside, both, bends = (values.astype(np.uint32, order="C") for values in (line, beside, both, bends))
-    return _Lattice(line, row, column, beside, both, bends)
+    numbers = [values.astype(np.uint32, order="C") for values in (line, beside, both, bends)]
+    return _Lattice(numbers[0], row, column, *numbers[1:])
 
 
 def _continued(nodes_mm: Floats) -> Floats:

@@ -1,30 +1,55 @@
-"""First use: tell that kernels are being compiled, where none are kept from before."""
+"""First use: tell that kernels are being compiled, where none are kept from before, and have help with it."""
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from numba.core import event
 
+HELP = (sys.executable, "-m", "vstent.kernels.warm")
+"""Compiles the kernels that are needed last, while this process compiles those that it needs now."""
+
 
 @contextmanager
-def telling(tell: Callable[[], None]) -> Iterator[None]:
-    """Have `tell` called once, when a kernel is about to be compiled for want of a kept one."""
-    with event.install_listener("numba:compile", _Once(tell)):
-        yield
+def telling(tell: Callable[[], None], *, helped: bool = False) -> Iterator[None]:
+    """Have `tell` called once, when a kernel is about to be compiled for want of a kept one.
+
+    Helped, a second process then compiles others, as far as it gets before this ends: numba takes from its cache what
+    is there by the time that it is needed, and threads of one process cannot compile at once.
+    """
+    once = _Once(tell, HELP if helped else ())
+    try:
+        with event.install_listener("numba:compile", once):
+            yield
+    finally:
+        once.stop()
 
 
 class _Once(event.Listener):
     """Tells of the first compilation."""
 
-    def __init__(self, tell: Callable[[], None]) -> None:
-        """Keep whom to tell."""
+    def __init__(self, tell: Callable[[], None], command: tuple[str, ...]) -> None:
+        """Keep whom to tell, and what to start."""
         self._tell: Callable[[], None] | None = tell
+        self._command = command
+        self._helper: subprocess.Popen[bytes] | None = None
 
     def on_start(self, event: event.Event) -> None:
         """Tell, the first time."""
         tell, self._tell = self._tell, None
-        if tell is not None:
-            tell()
+        if tell is None:
+            return
+        tell()
+        if self._command:
+            silent = subprocess.DEVNULL
+            self._helper = subprocess.Popen(self._command, stdin=silent, stdout=silent, stderr=silent)
 
     def on_end(self, event: event.Event) -> None:
         """Say nothing."""
+
+    def stop(self) -> None:
+        """End the helper, wherever it is: what it has compiled is kept."""
+        if self._helper is not None:
+            self._helper.terminate()
+            self._helper.wait()

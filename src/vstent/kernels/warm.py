@@ -6,15 +6,15 @@ from vstent.kernels import coverage, net, tree
 
 
 def warm() -> None:
-    """Call every kernel once on next to nothing; numba keeps what it compiles beside the source."""
+    """Call every kernel once on next to nothing, the last ones first; numba keeps what it compiles."""
+    row, column = np.meshgrid(np.arange(3.0), np.arange(4.0), indexing="ij")
+    nodes = np.stack([np.cos(np.pi / 2 * column), np.sin(np.pi / 2 * column), row], axis=-1)
+    _slide(nodes)
+    coverage.covered_fractions(nodes, nodes[0], nodes[1], np.full(4, 0.01), 2)
     vertices, faces = np.eye(3), np.array([[0, 1, 2]], dtype=np.int32)
     tiny = tree.build(vertices, faces)
     tree.closest_points(tiny, vertices)
     tree.segments_cross(tiny, vertices, 2 * vertices)
-    row, column = np.meshgrid(np.arange(3.0), np.arange(4.0), indexing="ij")
-    nodes = np.stack([np.cos(np.pi / 2 * column), np.sin(np.pi / 2 * column), row], axis=-1)
-    coverage.covered_fractions(nodes, nodes[0], nodes[1], np.full(4, 0.01), 2)
-    _slide(nodes)
 
 
 def _slide(nodes_mm: np.ndarray) -> None:
@@ -23,8 +23,8 @@ def _slide(nodes_mm: np.ndarray) -> None:
     around_mm = 0.5 * (np.roll(nodes_mm, -1, axis=1) - np.roll(nodes_mm, 1, axis=1))
     chart = np.concatenate([nodes_mm, np.gradient(nodes_mm, axis=0), around_mm], axis=2)
     beside, bends = np.array([1, 0, 3, 2, 5, 4]), np.array([[0], [2], [5]])
-    numbers = (values.astype(np.uint32) for values in (line, beside, ends))
-    tiny = net.Net(chart, line, column, *numbers, np.ones(2), np.zeros(3), bends.astype(np.uint32))
+    few, next_to, pieces, wires = (values.astype(np.uint32) for values in (line, beside, ends, bends))
+    tiny = net.Net(chart, line, column, few, next_to, pieces, np.ones(2), np.zeros(3), wires)
     net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1), net.Descent(1, 0.1, 0.1))
 
 
