@@ -39,6 +39,12 @@ N_LEVELS: Final = 9
 """Heights at which the flank is followed."""
 DETAIL: Final = 6.0
 """The neck follows waves along its rim longer than this many times the height from which it is extrapolated."""
+WAVES: Final = (4.0, 2.0, 1.4, 1.0, 0.7)
+"""Of those waves, so many times as many are left to a neck with hooks, one after the other until it has none."""
+HOOK_RAD: Final = np.radians(40.0)
+"""A neck that turns by more than this over half the height from which it is extrapolated has a hook there."""
+LOOSE_MM: Final = 0.15
+"""A neck that has lost its hooks lies where that took it, off the artery's wall, where this is further than that."""
 REACH: Final = 3.0
 """A flank that has not met the artery within this many times that height lies along it."""
 N_STEPS: Final = 36
@@ -52,37 +58,60 @@ FACING: Final = 3.0
 
 
 class Artery(NamedTuple):
-    """What is not sac: the parent artery and the side branches beyond it."""
+    """What is not sac: the parent artery, the arteries that pass the sac beside it, and all other branches."""
 
-    landing: Landing
-    """The parent artery."""
+    landings: tuple[Landing, ...]
+    """The parent artery, and those that part from it under the sac."""
     branches: Tubes
-    """The side branches, where they have left the parent artery and the sac."""
+    """All other branches, where they have left the parent artery and the sac."""
 
     def height_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
-        """How far points (n, 3) stand out of the parent's and the branches' walls, negative inside.
+        """How far points (n, 3) stand out of all arteries' walls, negative inside.
 
         With `normals` (n, 3) the points are the lumen's wall: a wall that looks at a branch belongs to a sac beside it.
         """
-        height = self.above_branches_mm(points_mm, normals)
-        return np.minimum(self.landing.solid.signed_distance(points_mm), height)
+        height = np.minimum(self._above(self.landings[0], points_mm), self.above_branches_mm(points_mm, normals))
+        for side in self.landings[1:]:
+            away = 0.0 if normals is None else _turned_mm(side.points_mm, side.section_radius_mm, points_mm, normals)
+            height = np.minimum(height, self._above(side, points_mm) + away)
+        return height
 
     def above_branches_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
         """How far points (n, 3) stand out of the branches' walls alone, likewise."""
         height, sphere = self.branches.height_mm(points_mm)
         if not len(self.branches.radius_mm):
             return height
-        radius = self.branches.radius_mm[sphere]
+        height = height - BRANCH_SHARE * self.branches.radius_mm[sphere]
         if normals is None:
-            return height - BRANCH_SHARE * radius
-        toward = self.branches.centers_mm[sphere] - points_mm
-        facing = np.einsum("nd,nd->n", toward, normals) / np.maximum(np.linalg.norm(toward, axis=1), 1e-12)
-        return np.asarray(height + (FACING * np.maximum(facing, 0.0) - BRANCH_SHARE) * radius)
+            return height
+        branches = self.branches.centers_mm[sphere], self.branches.radius_mm[sphere]
+        return height + _turned_mm(*branches, points_mm, normals)
 
     def onto(self, points_mm: Floats) -> Floats:
-        """Move points (n, 3) onto the parent artery; those at a branch stay."""
-        foot_mm, distance_mm, _ = self.landing.surface.closest(points_mm)
-        return np.where((self.branches.height_mm(points_mm)[0] > distance_mm)[:, None], foot_mm, points_mm)
+        """Move points (n, 3) onto the wall of the artery that they are in, or nearest to; those at a branch stay."""
+        for _ in range(len(self.landings)):
+            above = np.stack([self._above(landing, points_mm) for landing in self.landings])
+            nearest = above.argmin(axis=0)
+            moved = points_mm.copy()
+            for k, landing in enumerate(self.landings):
+                moved[nearest == k] = landing.surface.closest(points_mm[nearest == k])[0]
+            at_branch = self.branches.height_mm(points_mm)[0] <= above.min(axis=0)
+            points_mm = np.where(at_branch[:, None], points_mm, moved)
+        return points_mm
+
+    @staticmethod
+    def _above(landing: Landing, points_mm: Floats) -> Floats:
+        return landing.solid.signed_distance(points_mm)
+
+
+def _turned_mm(centers_mm: Floats, radius_mm: Floats, points_mm: Floats, normals: Floats) -> Floats:
+    """By how much walls (n, 3) that look at a branch count as further away; its centers are theirs, or a line's."""
+    if len(centers_mm) != len(points_mm):
+        nearest = cKDTree(centers_mm).query(points_mm)[1]
+        centers_mm, radius_mm = centers_mm[nearest], radius_mm[nearest]
+    toward = centers_mm - points_mm
+    facing = np.einsum("nd,nd->n", toward, normals) / np.maximum(np.linalg.norm(toward, axis=1), 1e-12)
+    return np.asarray(FACING * radius_mm * np.maximum(facing, 0.0))
 
 
 class Flank(NamedTuple):
@@ -96,6 +125,12 @@ class Flank(NamedTuple):
     """(n,) how far the vertices stand out of the artery."""
     rim: Ints
     """(k,) closed loop of vertices on the artery's side, at the lowest height that is believed."""
+
+    def levelled(self, low_mm: float) -> "Flank":
+        """The flank with heights that are `low_mm` along the whole rim, and as they were far from it."""
+        distance, nearest = cKDTree(self.vertices_mm[self.rim]).query(self.vertices_mm)
+        missing = low_mm - self.height_mm[self.rim]
+        return self._replace(height_mm=self.height_mm + missing[nearest] * np.exp(-distance / low_mm))
 
     def isoline(self, height_mm: float) -> Floats:
         """Points (j, 3) close together along the line of one height."""
@@ -154,13 +189,46 @@ def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floa
     n_waves = place[-1] / (DETAIL * low_mm)
     bend = _convex(curves.lowpass(_parabolas(_rise(flank, even, low_mm)), n_waves))
     length = curves.lowpass(_length_to_neck(bend, REACH * low_mm, artery, lumen), n_waves)
+    feet = bend[:, 0] - length[:, None] * bend[:, 1] + length[:, None] ** 2 * bend[:, 2]
     where = place[:-1] * n / place[-1]
+    neck = _nearly(artery, _between(_settled(artery, feet, low_mm, n_waves), where))
     bend, length = _between(bend.reshape(n, -1), where).reshape(-1, 3, 3), _between(length[:, None], where)
     share = np.linspace(0.0, 1.0, n_rings + 1)[:, None, None]
     down = -share * length
     # The rings begin at the rim itself and forget its distance from the parabola on the way.
     rings = bend[:, 0] + down * bend[:, 1] + down**2 * bend[:, 2] + (1 - share) * (rim_mm - bend[:, 0])
-    return np.asarray(rings + share * (artery.onto(rings[-1]) - rings[-1]))
+    return np.asarray(rings + share * (neck - rings[-1]))
+
+
+def _settled(artery: Artery, feet_mm: Floats, low_mm: float, n_waves: float) -> Floats:
+    """Points (n, 3) of a ring on the artery near those given, with no more of their waves than leave it without hooks.
+
+    Where arteries meet, and where a branch runs along the sac, neighbouring flanks may end on different walls.
+    """
+    ring = artery.onto(feet_mm)
+    for more in WAVES:
+        if _sharpest_rad(ring, 0.5 * low_mm) < HOOK_RAD:
+            break
+        ring = _nearly(artery, curves.lowpass(ring, more * n_waves))
+    return ring
+
+
+def _nearly(artery: Artery, points_mm: Floats) -> Floats:
+    """Move points (n, 3) close to the artery's wall onto it; those further off go a smaller part of the way."""
+    moved = artery.onto(points_mm) - points_mm
+    size = np.linalg.norm(moved, axis=1, keepdims=True)
+    return np.asarray(points_mm + moved / (1.0 + (size / LOOSE_MM) ** 4))
+
+
+def _sharpest_rad(ring_mm: Floats, length_mm: float) -> float:
+    """Largest turn of a closed curve (n, 3) from one piece of a given length to the next."""
+    closed = np.concatenate([ring_mm, ring_mm[:1]])
+    n = max(12, round(4.0 * float(curves.arc_length(closed)[-1]) / length_mm))
+    even = curves.resample_evenly(closed, n + 1)[:-1]
+    chord = np.roll(even, -4, axis=0) - even
+    before = np.roll(chord, 4, axis=0)
+    size = np.maximum(np.linalg.norm(chord, axis=1) * np.linalg.norm(before, axis=1), 1e-12)
+    return float(np.arccos(np.clip(np.einsum("nd,nd->n", chord, before) / size, -1.0, 1.0)).max())
 
 
 def _rise(flank: Flank, starts_mm: Floats, low_mm: float) -> Floats:

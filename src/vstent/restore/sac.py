@@ -8,11 +8,13 @@ from scipy.spatial import cKDTree
 
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.regions import region
+from vstent.restore.axis import fit_axis
 from vstent.restore.bulges import FLANK, Bulge, bulge_at
 from vstent.restore.drawn import Drawn
-from vstent.restore.landing import Landing
+from vstent.restore.landing import Landing, close_landing
 from vstent.restore.neck import Artery, Flank, believed_from_mm, skirt, unblurred
-from vstent.restore.tubes import Tubes, tubes_of
+from vstent.restore.tubes import tubes_of
 from vstent.surface import Surface
 from vstent.vessel import Aneurysm, Centerline, Vessel
 
@@ -23,6 +25,22 @@ FLAT: Final = 0.2
 ROUND: Final = 0.6
 """A shape with more than 1 / 0.6 times the surface of the sphere of its volume is a scan's debris: sacs, lobed ones
 too, have 0.7 to 0.85."""
+PASSING: Final = 2.5
+"""A branch passes under a sac that begins within this many of its radii..."""
+NEAR_MM: Final = 12.0
+"""... and is restored as the parent artery is where the sac begins within this distance..."""
+TURNED_BACK: Final = -0.5
+"""A way that turns by more than 120 degrees is none for a wall to follow."""
+EQUAL: Final = 0.6
+"""A branch thinner than this many times the parent artery leaves its wall as it is: a tube stands for it."""
+COURSE_STEP_MM: Final = 0.1
+"""Spacing of the points of such a way."""
+OWN_WALL: Final = 0.25
+"""... and beyond the last section outside the parent artery of which less than this fraction is the patient's own."""
+FEWEST_SECTIONS: Final = 8
+"""A shorter piece is no artery."""
+SETTLING: Final = 6.0
+"""The neck's border on the wall settles within this many times the height where the flank begins."""
 N_RINGS: Final = 12
 """Rings of the neck's triangles."""
 N_SKIRT: Final = 4
@@ -35,7 +53,7 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     Side branches that leave from the sac or beside it are cut off along their own tubes.
     """
     lumen = vessel.lumen
-    artery = Artery(landing, _branch_tubes(side_lines, landing, bulge))
+    artery = _artery(lumen, landing, side_lines, bulge)
     height_mm = artery.height_mm(lumen.vertices_mm, lumen.vertex_normals)
     parent_mm = landing.section_radius_mm[landing.nearest_sections(lumen.vertices_mm)]
     core = bulge_at(lumen, height_mm, height_mm > FLANK * parent_mm, bulge.dome_mm)
@@ -46,8 +64,8 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     if flank is None:
         return None
     flank = unblurred(flank, vessel.blur_mm) if vessel.blur_mm else flank
-    rings = skirt(flank, artery, vessel.closed, n_rings=N_SKIRT)
-    found = _aneurysm(landing, flank, other_loops, rings)
+    rings = skirt(flank.levelled(low_mm), artery, vessel.closed, n_rings=N_SKIRT)
+    found = _aneurysm(artery, flank, other_loops, rings)
     is_flat = found.sac.volume_mm3 < FLAT * found.neck.area_mm2**1.5
     return None if is_flat or _roundness(found.sac) < ROUND else found
 
@@ -60,7 +78,7 @@ def _low_mm(vessel: Vessel, landing: Landing, bulge: Bulge) -> float:
 
 def drawn_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], drawn: Drawn) -> Aneurysm:
     """Close the sac behind a neck that was drawn; side branches that leave from it are cut off along their tubes."""
-    artery = Artery(landing, _branch_tubes(side_lines, landing, drawn.bulge))
+    artery = _artery(vessel.lumen, landing, side_lines, drawn.bulge)
     normals = Surface(drawn.vertices_mm, drawn.faces).vertex_normals
     in_branch_mm = _low_mm(vessel, landing, drawn.bulge) - artery.above_branches_mm(drawn.vertices_mm, normals)
     vertices, faces, _ = triangles.clip(drawn.vertices_mm, drawn.faces, in_branch_mm)
@@ -69,14 +87,14 @@ def drawn_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline]
     cut = cKDTree(drawn.cut_mm)
     rim = loops.pop(int(np.argmin([np.median(cut.query(vertices[loop])[0]) for loop in loops])))
     rings = np.stack([vertices[rim], drawn.neck_of(vertices[rim])])
-    return _aneurysm(landing, Flank(vertices, faces, np.zeros(len(vertices)), rim), loops, rings)
+    return _aneurysm(artery, Flank(vertices, faces, np.zeros(len(vertices)), rim), loops, rings)
 
 
-def _aneurysm(landing: Landing, flank: Flank, other_loops: list[Ints], rings: Floats) -> Aneurysm:
+def _aneurysm(artery: Artery, flank: Flank, other_loops: list[Ints], rings: Floats) -> Aneurysm:
     """The sac of a flank, the mouths of its branches, and its continuation, rings (n, k, 3), down to the neck."""
-    neck = _neck(landing, rings[-1])
+    neck = _neck(artery, rings[-1])
     sac = _closed_sac(flank, other_loops, rings, neck)
-    abscissa = curves.project(landing.points_mm, rings[-1])[0]
+    abscissa = curves.project(artery.landings[0].points_mm, rings[-1])[0]
     return Aneurysm(sac, neck, rings[-1], float(abscissa.min()), float(abscissa.max()))
 
 
@@ -102,39 +120,137 @@ def _flank(
 ) -> tuple[Flank | None, list[Ints]]:
     """The sac's wall above a height, and its edges apart from the rim; None where it does not stand on the artery."""
     is_touching = _is_island(lumen, height_mm < low_mm)
-    height_mm = np.where(is_touching, 1.001 * low_mm, height_mm)
-    vertices, faces, below = triangles.clip(lumen.vertices_mm, lumen.faces, low_mm - height_mm)
-    faces = triangles.faces_at(vertices, faces, dome_mm)
-    used = np.unique(faces)
-    vertices, faces = triangles.compact(vertices, faces)
+    height_mm = np.where(is_touching, 2.0 * low_mm, height_mm)
+    level = _level(lumen, height_mm, low_mm)
+    placed, faces, _ = triangles.clip(np.column_stack([lumen.vertices_mm, height_mm]), lumen.faces, level)
+    placed, faces = triangles.compact(placed, triangles.faces_at(placed[:, :3], faces, dome_mm))
+    vertices, height_mm = placed[:, :3], placed[:, 3]
     loops = triangles.boundary_loops(vertices, faces)
     near = [landing.surface.closest(vertices[loop])[1].min() < low_mm + ON_ARTERY_MM for loop in loops]
     if not any(near):
         return None, []
     # The longest edge at the artery is the rim; others are the mouths of branches that leave from the sac.
     rim = near.index(True)
-    return Flank(vertices, faces, low_mm - below[used], loops[rim]), [*loops[:rim], *loops[rim + 1 :]]
+    return Flank(vertices, faces, height_mm, loops[rim]), [*loops[:rim], *loops[rim + 1 :]]
 
 
-def _branch_tubes(lines: Sequence[Centerline], landing: Landing, bulge: Bulge) -> Tubes:
-    """Tubes of the side branches beyond the parent artery, and beyond the sac where they leave from it."""
-    proper = []
+def _level(lumen: Surface, height_mm: Floats, low_mm: float) -> Floats:
+    """Level (n,), negative on the wall above a height, with a border that is short where the height hardly decides.
+
+    Where the height is off by itself the border moves by 1 / (its curvature times low_mm^2): a spike narrower than
+    the artery's uncertain wall is high goes.
+    """
+    excess = height_mm - low_mm
+    member = np.flatnonzero(_near_border(lumen, excess, SETTLING * low_mm))
+    level = -excess
+    if not len(member):
+        return level
+    number = np.full(len(height_mm), -1)
+    number[member] = np.arange(len(member))
+    faces = number[lumen.faces[(number[lumen.faces] >= 0).all(axis=1)]]
+    edge = np.zeros(len(member), dtype=bool)
+    edge[np.unique(triangles.open_edges(faces))] = True
+    gain = np.clip(excess[member], -low_mm, low_mm) / low_mm**2
+    level[member] = low_mm * region(lumen.vertices_mm[member], faces, gain, edge, low_mm)
+    return level
+
+
+def _near_border(lumen: Surface, excess: Floats, reach_mm: float) -> Bools:
+    """Tell the vertices (n,) that lie within `reach_mm` of where the excess (n,) changes sign."""
+    is_above = excess[lumen.faces] > 0
+    crossed = is_above.any(axis=1) & ~is_above.all(axis=1)
+    border = lumen.vertices_mm[np.unique(lumen.faces[crossed])]
+    if not len(border):
+        return np.zeros(len(excess), dtype=bool)
+    return np.asarray(cKDTree(border).query(lumen.vertices_mm, distance_upper_bound=reach_mm)[0]) < reach_mm
+
+
+def _artery(lumen: Surface, landing: Landing, lines: Sequence[Centerline], bulge: Bulge) -> Artery:
+    """The arteries around a sac: the parent, the branches that pass under it too, and those elsewhere or from it."""
+    landings, proper = [landing], []
+    foot = cKDTree(bulge.foot_mm)
     for line in lines:
-        in_artery = landing.solid.signed_distance(line.points_mm) < -0.5 * line.inscribed_radius_mm
+        depth = np.min([one.solid.signed_distance(line.points_mm) for one in landings], axis=0)
+        is_apart = depth > -0.5 * line.inscribed_radius_mm
         in_sac = bulge.distances_mm(line.points_mm) < 1.2 * line.inscribed_radius_mm
-        inner = np.flatnonzero(in_artery | in_sac)
-        first = inner[-1] + 1 if len(inner) else 0
-        if len(line.points_mm) - first > 1:
-            proper.append(Centerline(line.points_mm[first:], line.inscribed_radius_mm[first:]))
-    return tubes_of(proper)
+        inner = np.flatnonzero(~is_apart | in_sac)
+        is_branch = np.arange(len(line.points_mm)) > (inner[-1] if len(inner) else -1)
+        gap = np.asarray(foot.query(line.points_mm)[0])
+        passes = (is_apart & (gap < PASSING * line.inscribed_radius_mm)).any()
+        side = _beside(lumen, landing, line, bulge) if passes else None
+        if side is not None:
+            landings.append(side)
+            place, _ = curves.project(side.points_mm, line.points_mm)
+            is_branch &= (place <= 0) | (place >= curves.arc_length(side.points_mm)[-1])
+        proper += [Centerline(line.points_mm[run], line.inscribed_radius_mm[run]) for run in _runs(is_branch)]
+    return Artery(tuple(landings), tubes_of(proper))
 
 
-def _neck(landing: Landing, rim_mm: Floats) -> Surface:
-    """The landing surface inside a closed curve (k, 3) on it: rings from the curve to its middle.
+def _runs(member: Bools) -> list[slice]:
+    """Stretches of two members (n,) or more in a row."""
+    change = np.flatnonzero(np.diff(np.concatenate([[False], member, [False]]).astype(int)))
+    return [slice(first, last) for first, last in change.reshape(-1, 2) if last - first > 1]
+
+
+def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) -> Landing | None:
+    """The landing surface from a branch into the parent artery under a sac, as far as the branch is none of the sac's.
+
+    The wall between two branches, where a sac at their fork sits, is that of the way from one into the other.
+    """
+    course = _into_parent(landing, line, bulge)
+    if course is None:
+        return None
+    side = close_landing(lumen, fit_axis(lumen, course, [bulge.foot_mm]))
+    is_own = (~side.is_restored).mean(axis=1) > OWN_WALL
+    is_own &= bulge.distances_mm(side.points_mm) > 1.2 * side.section_radius_mm
+    lost = np.flatnonzero(~is_own & (landing.solid.signed_distance(side.points_mm) > 0))
+    end = lost[0] if len(lost) else len(side.points_mm)
+    if end < FEWEST_SECTIONS:
+        return None
+    return Landing(side.points_mm[:end], side.rho_mm[:end], side.is_restored[:end])
+
+
+def _into_parent(landing: Landing, line: Centerline, bulge: Bulge) -> Centerline | None:
+    """The way from a branch into the parent artery: to where the sac is, unless that turns back; None for none."""
+    depth = landing.solid.signed_distance(line.points_mm)
+    inside = np.flatnonzero(depth < -0.5 * line.inscribed_radius_mm)
+    if not len(inside):
+        return None
+    fork, radius = int(inside[-1]), float(line.inscribed_radius_mm[inside[-1]])
+    ends = np.stack([line.points_mm[fork], bulge.foot_mm.mean(axis=0)])
+    place, middle = curves.project(landing.points_mm, ends)[0]
+    beyond = line.abscissa_mm - line.abscissa_mm[fork]
+    away = np.flatnonzero((beyond > radius) & (beyond < NEAR_MM))[::-1]
+    ahead = curves.arc_length(landing.points_mm) - place
+    sense = 1 if middle > place - radius else -1
+    for side in (sense, -sense):
+        parent = np.flatnonzero((side * ahead > radius) & (side * ahead < NEAR_MM))[::side]
+        if min(len(parent), len(away)) < FEWEST_SECTIONS:
+            continue
+        if np.median(line.inscribed_radius_mm[away]) < EQUAL * np.median(landing.section_radius_mm[parent]):
+            return None
+        one, other = line.points_mm[away], landing.points_mm[parent]
+        chords = one[-1] - one[0], other[-1] - other[0]
+        if chords[0] @ chords[1] > TURNED_BACK * float(np.linalg.norm(chords[0]) * np.linalg.norm(chords[1])):
+            widths = np.concatenate([line.inscribed_radius_mm[away], landing.section_radius_mm[parent]])
+            return _evenly(np.concatenate([one, other]), widths)
+    return None
+
+
+def _evenly(points_mm: Floats, radius_mm: Floats) -> Centerline:
+    """A centerline through points (n, 3) with radii (n,), its own points evenly spaced."""
+    even = curves.resample(points_mm, COURSE_STEP_MM)
+    share = np.linspace(0.0, curves.arc_length(points_mm)[-1], len(even))
+    return Centerline(even, np.interp(share, curves.arc_length(points_mm), radius_mm))
+
+
+def _neck(artery: Artery, rim_mm: Floats) -> Surface:
+    """The arteries' wall inside a closed curve (k, 3) on it: rings from the curve to its middle.
 
     The outermost ring is the curve itself, so that the sac closes without a gap; where it lies off the landing surface
     the rings do as a membrane would. The curve runs with the sac's wall, so the faces along it look into the sac.
     """
+    landing = artery.landings[0]
     grid = landing.grid_of(rim_mm)
     grid[:, 1] = np.unwrap(grid[:, 1], period=landing.n_rays)
     middle = grid.mean(axis=0)
@@ -145,6 +261,8 @@ def _neck(landing: Landing, rim_mm: Floats) -> Surface:
     rings = [
         landing.at_grid(middle + f * (grid - middle)) + np.fft.irfft(f**wave * lift, n=len(grid), axis=0) for f in share
     ]
+    if len(artery.landings) > 1:
+        rings = [rings[0], *(artery.onto(ring) for ring in rings[1:])]
     vertices = np.concatenate([*rings[:-1], rings[-1][:1]])
     k = len(rim_mm)
     here, there = np.arange(k), (np.arange(k) + 1) % k
