@@ -328,7 +328,9 @@ def test_uncertainty_is_told_in_the_order_of_the_devices_with_its_causes():
             "shares": {"deployed_length_mm": shares},
         }
 
-    metrics = {"stents": {"enterprise": {"uncertainty": varied(12.0, 14.0)}, "silk": {"uncertainty": varied(15.0, 18.0)}}}
+    metrics = {
+        "stents": {"enterprise": {"uncertainty": varied(12.0, 14.0)}, "silk": {"uncertainty": varied(15.0, 18.0)}}
+    }
     silk, enterprise = sheets.uncertainty(metrics, {"silk": "Silk 4 x 15 mm", "enterprise": "Enterprise"})
     assert (silk["title"], enterprise["title"]) == ("Silk 4 x 15 mm", "Enterprise")
     (row,) = silk["rows"]
