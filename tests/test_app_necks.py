@@ -46,13 +46,15 @@ def test_a_pulled_handle_lies_on_the_wall_where_the_hand_is_and_what_is_far_from
 
 def test_what_is_pulled_is_drawn_onto_the_wall_as_far_as_it_is_moved(anatomy):
     lumen = anatomy.vessel.lumen
-    curve = necks.curve_of(anatomy) + [0.0, 0.0, -0.3]  # inside the artery, as where a sac's flank was continued
+    curve = necks.curve_of(anatomy) + np.array(
+        [0.0, 0.0, -0.3]
+    )  # inside the artery, as where a sac's flank was continued
     before = lumen.closest(curve)[1]
     step = len(curve) // NECK_HANDLES
     handle = int(before[::step].argmax())
     at = handle * step
     # To a place along the wall, so that its neighbours, which are taken along, would leave it.
-    hand = lumen.closest((curve[at] + [0.0, 0.6, 0.0])[None])[0][0]
+    hand = lumen.closest((curve[at] + np.array([0.0, 0.6, 0.0]))[None])[0][0]
     after = lumen.closest(necks.pulled(anatomy, curve, handle, hand))[1]
     assert before[at] > 0.15
     assert after[at] == pytest.approx(0, abs=1e-6)
