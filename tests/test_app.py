@@ -16,7 +16,7 @@ import app_case
 import report_case
 import vstent
 from vstent import phantoms
-from vstent.app import cuts
+from vstent.app import cuts, sheets
 from vstent.app.cases import STEPS
 from vstent.cli import main
 from vstent.deploy import deploy
@@ -313,6 +313,31 @@ def test_the_interface_is_described_and_its_page_needs_no_network(client):
     assert all(verb["summary"] for verbs in api["paths"].values() for verb in verbs.values())
     for path in ("/api/docs", "/assets/docs.js", "/", "/assets/app.css"):
         assert "https://" not in client.get(path).text
+
+
+def test_uncertainty_is_told_in_the_order_of_the_devices_with_its_causes():
+    def varied(low, high):
+        ends = {"mean": 0.5 * (low + high), "low": low, "high": high}
+        shares = {"landing_fraction": 0.2, "device_fraction": 0.7, "rest_fraction": 0.1}
+        ranges = {"threshold_mm": 0.0, "landing_mm": 1.0, "device_mm": 0.1, "inflow_fraction": 0.2}
+        return {
+            "samples_count": 16,
+            "failed_count": 1,
+            "ranges": ranges,
+            "intervals": {"deployed_length_mm": ends},
+            "shares": {"deployed_length_mm": shares},
+        }
+
+    metrics = {
+        "stents": {"enterprise": {"uncertainty": varied(12.0, 14.0)}, "silk": {"uncertainty": varied(15.0, 18.0)}}
+    }
+    silk, enterprise = sheets.uncertainty(metrics, {"silk": "Silk 4 x 15 mm", "enterprise": "Enterprise"})
+    assert (silk["title"], enterprise["title"]) == ("Silk 4 x 15 mm", "Enterprise")
+    (row,) = silk["rows"]
+    assert [row[key].replace("\u202f", " ") for key in ("mean", "low", "high")] == ["16.5 mm", "15.0 mm", "18.0 mm"]
+    assert [cause for cause, _ in row["shares"]] == ["device as made", "landing", "interplay"]
+    assert "16 deployments, of which 1 did not fit" in silk["words"]
+    assert sheets.uncertainty({"stents": {"silk": {}}}, {"silk": "Silk"}) == []
 
 
 def test_the_first_page_waits_for_nothing_that_only_results_need():

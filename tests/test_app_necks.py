@@ -44,6 +44,24 @@ def test_a_pulled_handle_lies_on_the_wall_where_the_hand_is_and_what_is_far_from
     assert steps.max() < 0.5 * np.linalg.norm(hand - curve[at])
 
 
+def test_what_is_pulled_is_drawn_onto_the_wall_as_far_as_it_is_moved(anatomy):
+    lumen = anatomy.vessel.lumen
+    curve = necks.curve_of(anatomy) + np.array(
+        [0.0, 0.0, -0.3]
+    )  # inside the artery, as where a sac's flank was continued
+    before = lumen.closest(curve)[1]
+    step = len(curve) // NECK_HANDLES
+    handle = int(before[::step].argmax())
+    at = handle * step
+    # To a place along the wall, so that its neighbours, which are taken along, would leave it.
+    hand = lumen.closest((curve[at] + np.array([0.0, 0.6, 0.0]))[None])[0][0]
+    after = lumen.closest(necks.pulled(anatomy, curve, handle, hand))[1]
+    assert before[at] > 0.15
+    assert after[at] == pytest.approx(0, abs=1e-6)
+    near = step // 4  # the weight is above 0.9 there
+    assert after[[at - near, (at + near) % len(curve)]].max() < 0.012
+
+
 def test_a_neck_and_lengths_make_what_depends_on_them_stale_and_reach_the_study():
     before = dependencies(State(name="x"))
     ring = tuple((float(x), float(y), 0.0) for x, y in report_case.arc(np.linspace(0, 6, 9))[:, ::2])

@@ -2,11 +2,13 @@
 
 import re
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
 
 import report_case
+from vstent.report import write_report
 from vstent.report.method import _bead_layer, _expansion, _unit_sphere
 from vstent.report.pdf import WIDTH, _Paper, _wrapped, as_pdf
 from vstent.report.scene import scene_of
@@ -58,6 +60,14 @@ def test_every_number_and_its_definition_stand_in_the_pdf(told, printed):
     for definition, _ in told.definitions:
         assert definition.name in text
     assert all(picture.title in text for picture in told.pictures)
+
+
+def test_the_pdf_is_written_where_it_is_asked_for(told, tmp_path, monkeypatch):
+    monkeypatch.setattr(import_module("vstent.report"), "contents_of", lambda _: replace(told, pictures=()))
+    write_report(report_case.case(), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    write_report(report_case.case(), tmp_path, is_printed=True)
+    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_lines_keep_inside_the_page():
