@@ -245,8 +245,9 @@ def row_spacing_mm(
 
     Where the axis bends, rows are h (1 + k cos(theta)) apart at the angle theta round it, k = curvature D / 2. Pieces
     of wire keep their length l, so that cos(alpha) = h (1 + k cos(theta)) / l and n columns fill the circumference
-    when the mean of 1 / sin(alpha) round it is n l / (pi D): h is less than in a straight artery. The joined cells of
-    a laser-cut device do not crowd outside a bend: its axis keeps its length.
+    when the mean of 1 / sin(alpha) round it is n l / (pi D): h is less than in a straight artery. The few long
+    cells of a laser-cut device cannot all do so; its rows are put as in a straight artery, from where
+    `vstent.deploy.cells` moves them.
     """
     piece_mm, angle = piece_length_mm(design, size), angle_rad(design, size, diameter_mm)
     if isinstance(design, LaserCut) or not np.any(curvature_per_mm):
