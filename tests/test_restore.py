@@ -181,11 +181,13 @@ def test_a_sac_at_a_fork_is_what_the_fork_without_it_lacks(shared_data) -> None:
     assert aneurysm.sac.volume_mm3 == pytest.approx(lacking_mm3, rel=0.01)
     # Both branches leave alike, whichever of them the parent artery follows.
     low, high = aneurysm.neck_mm.min(axis=0), aneurysm.neck_mm.max(axis=0)
-    assert low[:2] == pytest.approx(-high[:2], abs=0.25)
+    assert low[:2] == pytest.approx(-high[:2], abs=0.4)
     assert sharpest_rad(aneurysm.neck_mm) < np.radians(45)
 
 
-@pytest.mark.parametrize("name", ["bifurcation_coarse.vtp", "visc2011_metres.stl"])
+@pytest.mark.parametrize(
+    "name", ["bifurcation_coarse.vtp", pytest.param("visc2011_metres.stl", marks=pytest.mark.validation)]
+)
 def test_the_neck_of_a_real_sac_has_no_hooks(shared_data, name: str) -> None:
     from vstent.io.surfaces import read_surface
 
