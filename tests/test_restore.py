@@ -172,6 +172,39 @@ def test_a_sac_on_a_coarse_mesh_is_cut_where_its_branches_leave(shared_data) -> 
     assert aneurysm.sac.boundary_loops == ()
 
 
+def test_a_sac_at_a_fork_is_what_the_fork_without_it_lacks(shared_data) -> None:
+    from vstent.io.surfaces import read_surface
+
+    sick, healthy = (read_surface(shared_data / f"bifurcation_{name}_sac.stl")[0] for name in ("with", "without"))
+    (aneurysm,) = restore(trace(Vessel(sick))).aneurysms
+    lacking_mm3 = sick.closed.volume_mm3 - healthy.closed.volume_mm3
+    assert aneurysm.sac.volume_mm3 == pytest.approx(lacking_mm3, rel=0.01)
+    # Both branches leave alike, whichever of them the parent artery follows.
+    low, high = aneurysm.neck_mm.min(axis=0), aneurysm.neck_mm.max(axis=0)
+    assert low[:2] == pytest.approx(-high[:2], abs=0.4)
+    assert sharpest_rad(aneurysm.neck_mm) < np.radians(45)
+
+
+@pytest.mark.parametrize(
+    "name", ["bifurcation_coarse.vtp", pytest.param("visc2011_metres.stl", marks=pytest.mark.validation)]
+)
+def test_the_neck_of_a_real_sac_has_no_hooks(shared_data, name: str) -> None:
+    from vstent.io.surfaces import read_surface
+
+    lumen = repair(read_surface(shared_data / name)[0])[0]
+    (aneurysm,) = restore(trim(trace(Vessel(lumen)))).aneurysms
+    assert sharpest_rad(aneurysm.neck_mm) < np.radians(50)
+
+
+def sharpest_rad(ring_mm: np.ndarray) -> float:
+    """Largest turn of a closed curve between pieces of 0.3 mm."""
+    ring = np.concatenate([ring_mm, ring_mm[:1]])
+    even = curves.resample_evenly(ring, round(curves.arc_length(ring)[-1] / 0.3) + 1)[:-1]
+    chord = np.roll(even, -1, axis=0) - even
+    chord /= np.linalg.norm(chord, axis=1, keepdims=True)
+    return float(np.arccos(np.clip(np.einsum("nd,nd->n", chord, np.roll(chord, 1, axis=0)), -1, 1)).max())
+
+
 def _mean_direction(neck: Surface) -> np.ndarray:
     total = (neck.areas_mm2[:, None] * neck.normals).sum(axis=0)
     return total / np.linalg.norm(total)

@@ -27,6 +27,8 @@ from vstent.vessel import Anatomy, Aneurysm, Centerline, Vessel
 
 REACH_MM: Final = 10.0
 """At a fork, the parent artery goes on where the vessel is wider over this length."""
+ON_FOOT: Final = 1.5
+"""A foot, which rises to half a radius above the nearest artery, is an artery's own up to this many of its radii."""
 PASSING: Final = 2.0
 """A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
 
@@ -61,7 +63,8 @@ def restore(
         x, y, z = np.asarray(at_mm, dtype=float)
         raise InputError(f"no sac stands out of the artery near {x:.1f}, {y:.1f}, {z:.1f} mm: give a point in its dome")
     path = _parent_path(vessel, bulges, outlet_mm)
-    tube = fit_axis(vessel.lumen, vessel.centerlines[path], [bulge.foot_mm for bulge in bulges])
+    feet = [_foot_on(vessel.centerlines[path], bulge) for bulge in bulges]
+    tube = fit_axis(vessel.lumen, vessel.centerlines[path], feet)
     landing = close_landing(vessel.lumen, tube, drawn.artery if drawn else None)
     side_lines = [line for k, line in enumerate(vessel.centerlines) if k != path]
     sacs = [drawn_sac(vessel, landing, side_lines, drawn)] if drawn else _sacs(vessel, landing, side_lines, bulges)
@@ -98,6 +101,17 @@ def _reach(line: Centerline, bulge: Bulge) -> float:
     """Least distance between a centerline and the foot of a bulge, in parent radii; the wall itself is at 1."""
     radius = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
     return float((cKDTree(bulge.foot_mm).query(line.points_mm)[0] / radius).min())
+
+
+def _foot_on(line: Centerline, bulge: Bulge) -> Floats:
+    """Points (k, 3) of a bulge's foot that stand on the artery along a centerline; all where none does.
+
+    Where a branch leaves from the sac beside its neck, the foot goes around the branch's mouth too.
+    """
+    tubes = tubes_of([line])
+    height, sphere = tubes.height_mm(bulge.foot_mm)
+    on_artery = bulge.foot_mm[height < ON_FOOT * tubes.radius_mm[sphere]]
+    return on_artery if len(on_artery) else bulge.foot_mm
 
 
 def _is_wider(one: Centerline, other: Centerline) -> bool:

@@ -137,8 +137,8 @@ def _flank(
 def _level(lumen: Surface, height_mm: Floats, low_mm: float) -> Floats:
     """Level (n,), negative on the wall above a height, with a border that is short where the height hardly decides.
 
-    Where the height is off by itself the border moves by 1 / (its curvature times low_mm^2): a spike narrower than
-    the artery's uncertain wall is high goes.
+    It is shifted by the square of `low_mm` times its curvature at most, and a spike narrower than `low_mm` goes where
+    the height hardly exceeds it.
     """
     excess = height_mm - low_mm
     member = np.flatnonzero(_near_border(lumen, excess, SETTLING * low_mm))
