@@ -34,7 +34,7 @@ SIZES = {20_000: 0.325, 80_000: 0.163, 320_000: 0.0814}
 
 
 def centerlines() -> None:
-    print("| phantom | edge, mm | triangles | centerline mean, mm | max, mm | radius mean, mm | order of the radius |")
+    print("| phantom | edge, mm | triangles | centerline mean, um | max, um | radius mean, um | order of the radius |")
     print("|---|---|---|---|---|---|---|")
     for name, phantom in zip(NAMES, PHANTOMS, strict=True):
         surface, before = phantoms.phantom_surface(phantom, edge_mm=EDGE_MM), None
@@ -43,7 +43,7 @@ def centerlines() -> None:
             order = "" if before is None else f"{np.log2(before.radius_mm / e.radius_mm):.2f}"
             print(
                 f"| {name} | {edge_mm} | {len(surface.faces)} "
-                f"| {e.mean_mm:.4f} | {e.max_mm:.4f} | {e.radius_mm:.4f} | {order} |"
+                f"| {1000 * e.mean_mm:.2f} | {1000 * e.max_mm:.2f} | {1000 * e.radius_mm:.3f} | {order} |"
             )
             surface, before = halved(phantom, surface), e
 

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull
 
 from shapes import sphere
-from vstent.kernels import tree
+from vstent.kernels import medial, tree, triangles
 from vstent.surface import Surface
 
 
@@ -108,3 +110,56 @@ def test_rays_enter_no_empty_box() -> None:
     inverse = np.array([0.3, -0.8, 1e200])
     for node in np.flatnonzero(is_empty):
         assert tree._entry(np.zeros(3), inverse, ray_tree.low, ray_tree.high, node) == np.inf
+
+
+def test_inscribed_radius_equals_brute_force_over_all_bulging_triangles() -> None:
+    rng = np.random.default_rng(11)
+    ball = sphere(2.0, rings=9, sectors=14)
+    wall = Surface(ball.vertices_mm * [1.0, 1.0, 1.5] + rng.normal(0, 0.05, ball.vertices_mm.shape), ball.faces)
+    points = rng.uniform(-0.9, 0.9, (30, 3))
+    every = np.arange(len(wall.faces))
+    rise = np.stack([_rise(wall, k, (k + 1) % 3) for k in range(3)], axis=1)
+    assert rise.max() > 0.1
+    for p, found in zip(points, wall.inscribed_radius(points), strict=True):
+        feet = np.array([Surface(t, np.array([[0, 1, 2]])).closest(p[None])[0][0] for t in wall.corners_mm])
+        weight = triangles.barycentric(wall.corners_mm[every], feet)
+        bulge = 0.5 * (weight * np.roll(weight, -1, axis=1) * rise).sum(axis=1)
+        assert found == pytest.approx((np.linalg.norm(p - feet, axis=1) + bulge).min(), abs=1e-9)
+
+
+def _rise(wall: Surface, a: int, b: int) -> np.ndarray:
+    edge = wall.corners_mm[:, b] - wall.corners_mm[:, a]
+    return np.einsum("fd,fd->f", wall.smooth_normals[:, b] - wall.smooth_normals[:, a], edge)
+
+
+def test_inscribed_radius_of_a_coarse_ball_is_the_balls_own() -> None:
+    coarse, fine = (sphere(2.0, rings=n, sectors=2 * n) for n in (12, 24))
+    middle = np.zeros((1, 3))
+    errors = [abs(wall.inscribed_radius(middle)[0] - 2.0) for wall in (coarse, fine)]
+    assert errors[0] < 0.03 * abs(coarse.closest(middle)[1][0] - 2.0)
+    assert np.log2(errors[0] / errors[1]) > 3.5
+
+
+def test_a_crease_stays_a_crease() -> None:
+    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    faces = ConvexHull(corners).simplices
+    normal = np.cross(corners[faces[:, 1]] - corners[faces[:, 0]], corners[faces[:, 2]] - corners[faces[:, 0]])
+    is_outward = np.einsum("ij,ij->i", normal, corners[faces].mean(axis=1)) > 0
+    box = Surface(corners, np.where(is_outward[:, None], faces, faces[:, ::-1]))
+    points = np.random.default_rng(0).uniform(-0.9, 0.9, (20, 3))
+    np.testing.assert_allclose(box.inscribed_radius(points), 1 - np.abs(points).max(axis=1), atol=1e-12)
+
+
+def test_the_widest_sphere_of_a_section_is_that_of_linear_programming() -> None:
+    rng = np.random.default_rng(4)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, (20, 24)), axis=1)
+    slope = rng.uniform(0.9, 1.0, (20, 24, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    distance = 2.0 + rng.normal(0, 0.01, (20, 24))
+    shift = medial.widest_in_section(distance, slope, 0.0, np.full(20, 0.02))
+    reached = (distance - np.einsum("nkd,nd->nk", slope, shift)).min(axis=1)
+    for k in range(20):
+        best = linprog([0, 0, -1], np.column_stack([slope[k], np.ones(24)]), distance[k], bounds=(None, None))
+        assert reached[k] == pytest.approx(-best.fun, abs=5e-4)  # of walls 0.01 uneven
+    # What it does not gain by half of the way it leaves.
+    unmoved = medial.widest_in_section(distance, 0.4 * slope, 0.5, np.full(20, 0.02))
+    np.testing.assert_allclose(unmoved, 0.0, atol=1e-4)

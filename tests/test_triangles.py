@@ -1,6 +1,7 @@
 """Bare meshes: loops, caps, clips."""
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from vstent.kernels import triangles
 from vstent.stent import tube_faces
@@ -60,3 +61,19 @@ def test_samples_lie_on_the_surface_and_cover_it() -> None:
     gaps = np.linalg.norm(points[:, None] - probes[None], axis=2).min(axis=0)
     assert gaps.max() < 0.3 * np.sqrt(3)
     assert np.einsum("ij,ij->i", normals, points * [1, 1, 0]).min() > 0
+
+
+def test_smooth_normals_are_exact_on_any_mesh_of_a_sphere() -> None:
+    points = np.random.default_rng(1).normal(size=(60, 3))
+    points *= 3.0 / np.linalg.norm(points, axis=1, keepdims=True)
+    faces = ConvexHull(points).simplices
+    outward = np.einsum("ij,ij->i", triangles.normals(points[faces]), points[faces].mean(axis=1)) > 0
+    faces = np.where(outward[:, None], faces, faces[:, ::-1]).astype(np.int32)
+    np.testing.assert_allclose(triangles.smooth_normals(points, faces), points / 3.0, atol=1e-9)
+
+
+def test_barycentric_weights_give_the_point_back() -> None:
+    rng = np.random.default_rng(2)
+    corners, weight = rng.normal(size=(50, 3, 3)), rng.dirichlet(np.ones(3), 50)
+    points = np.einsum("nk,nkd->nd", weight, corners)
+    np.testing.assert_allclose(triangles.barycentric(corners, points), weight, atol=1e-9)

@@ -14,16 +14,19 @@ pytestmark = pytest.mark.validation
 
 @pytest.mark.parametrize("phantom", PHANTOMS, ids=NAMES)
 def test_centerlines_converge_to_the_axes(phantom: Phantom) -> None:
-    surface = phantoms.phantom_surface(phantom, edge_mm=0.6)
-    coarse, fine = (trace_errors(phantom, traced(phantom, wall)) for wall in (surface, halved(phantom, surface)))
-    print(coarse, fine, sep="\n")  # noqa: T201  # `make validation` shows it
-    assert fine.mean_mm < 0.02
-    assert fine.max_mm < 0.1
-    assert fine.radius_mm < 0.01
-    # A chord lies below its arc by the square of the edge. Spheres are sought among samples of the wall 0.4 mm apart,
-    # so their centers are off by up to 0.001 mm however fine the mesh is: that takes a tenth off the order.
-    assert np.log2(coarse.radius_mm / fine.radius_mm) > 1.8
-    assert fine.mean_mm < max(0.35 * coarse.mean_mm, 0.0015)
+    walls = [phantoms.phantom_surface(phantom, edge_mm=0.6)]
+    walls += [halved(phantom, walls[0])]
+    walls += [halved(phantom, walls[1])]
+    coarse, fine, finest = (trace_errors(phantom, traced(phantom, wall)) for wall in walls)
+    print(coarse, fine, finest, sep="\n")  # noqa: T201  # `make validation` shows it
+    assert coarse.mean_mm < 0.003
+    assert coarse.max_mm < 0.01
+    assert coarse.radius_mm < 0.003
+    assert np.log2(coarse.radius_mm / fine.radius_mm) > 1.95
+    # Of 0.0001 mm a part is the phantom's own: its axis is a polyline of steps of 0.04 mm.
+    assert np.log2(coarse.radius_mm / finest.radius_mm) / 2 > 1.95
+    assert np.log2(coarse.mean_mm / finest.mean_mm) / 2 > 1.5
+    assert finest.radius_mm < 0.0001
 
 
 @pytest.mark.parametrize("phantom", PHANTOMS, ids=NAMES)

@@ -205,7 +205,7 @@ def bifurcation(*, radius_mm: float = 1.75, daughter_radius_mm: float = 1.5, hal
     steps = 0.5 * (direction[1:] + direction[:-1]) * np.diff(abscissa)[:, None]
     right = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     radius = radius_mm + (daughter_radius_mm - radius_mm) * turned**2 * (3 - 2 * turned)
-    after = abscissa > trunk_mm - AXIS_STEP_MM
+    after = abscissa > trunk_mm - 4 * AXIS_STEP_MM  # the axis is continued backwards along its first steps
     left = Centerline(right[after] * [-1.0, 1.0, 1.0], radius[after])
     return Phantom("bifurcation", Centerline(right, radius), (left,))
 

@@ -2,12 +2,16 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
 from vstent.errors import VesselError
 from vstent.kernels import medial, tree, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
+
+CREASE_RAD: Final = np.radians(35.0)
+"""A mesh is not taken for a smooth surface where its vertices' normals lean so far from its faces'."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +46,22 @@ class Surface:
     def vertex_normals(self) -> Floats:
         """(n, 3) unit vertex normals, angle weighted."""
         return triangles.vertex_normals(self.vertices_mm, self.faces)
+
+    @cached_property
+    def smooth_normals(self) -> Floats:
+        """(m, 3, 3) unit normals, at every face's corners, of the smooth surface through the vertices.
+
+        Where a corner's normal leans from its face's by more than `CREASE_RAD` the mesh is creased: all three are the
+        face's own there.
+        """
+        normals = triangles.smooth_normals(self.vertices_mm, self.faces)[self.faces]
+        least = np.einsum("fkd,fd->fk", normals, self.normals).min(axis=1)
+        return np.where((least < np.cos(CREASE_RAD))[:, None, None], self.normals[:, None], normals)
+
+    @cached_property
+    def curved(self) -> tree.Curved:
+        """Bounding-box tree over the smooth surface through the vertices."""
+        return tree.curved(self.tree, self.smooth_normals)
 
     @property
     def area_mm2(self) -> float:
@@ -95,6 +115,14 @@ class Surface:
         """Return the closest point (n, 3), its distance (n,) in mm and its face (n,) for (n, 3) points."""
         return tree.closest_points(self.tree, points_mm)
 
+    def inscribed_radius(self, centers_mm: Floats) -> Floats:
+        """Return the radius (n,) in mm of the largest sphere about each of (n, 3) points inside the smooth surface.
+
+        A triangle is a chord: it lies inside a convex wall by the square of its edge, and a sphere that touches it is
+        too small by as much. So the wall is curved over every face as its corners' normals tell.
+        """
+        return tree.inscribed_radii(self.curved, centers_mm)
+
     def signed_distance(self, points_mm: Floats) -> Floats:
         """Return the distance (n,) in mm of (n, 3) points, negative inside; the surface must be closed."""
         return tree.signed_distances(self.tree, points_mm)
@@ -105,4 +133,8 @@ class Surface:
 
     def first_hit(self, origins_mm: Floats, directions: Floats) -> Floats:
         """Return the distance (n,) in mm along (n, 3) unit rays to the first face; inf where there is none."""
+        return self.first_hits(origins_mm, directions)[0]
+
+    def first_hits(self, origins_mm: Floats, directions: Floats) -> tuple[Floats, Ints]:
+        """Return the distance (n,) in mm along (n, 3) unit rays to the first face (inf: none), and that face (n,)."""
         return tree.first_hits(self.tree, origins_mm, directions)

@@ -19,6 +19,7 @@ from vstent.errors import VesselError
 from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
 from vstent.openings import open_ends, with_inlet
+from vstent.spheres import centered
 from vstent.surface import Surface
 from vstent.vessel import Centerline, Opening, Vessel
 
@@ -148,8 +149,8 @@ def _centerline(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Centerline
     # Voronoi vertices jitter on a scale finer than a diameter: longer waves pass. Third differences leave a bend as it
     # is where second ones would pull it inwards.
     waves = 2.0 * radius * SMOOTHED_DIAMETERS / (2 * np.pi * STEP_MM)
-    points = curves.smooth(points, _held_ends(len(points)), waves**6, order=3)
-    return Centerline(points, wall.closest(points)[1])
+    points = centered(wall, curves.smooth(points, _held_ends(len(points)), waves**6, order=3), radius)
+    return Centerline(points, wall.inscribed_radius(points))
 
 
 def _held_ends(n: int) -> Floats:

@@ -31,15 +31,38 @@ class Tree(NamedTuple):
     """(m, 7, 3) normals of the face, its edges 01, 12, 20 and its corners 0, 1, 2."""
 
 
+class Curved(NamedTuple):
+    """The tree over triangles that bulge: the smooth wall through their corners."""
+
+    flat: Tree
+    """The tree over the flat triangles, with boxes that hold the bulges."""
+    rise: Floats
+    """(m, 3) of the edges 01, 12, 20 in tree order (n_b - n_a) (b - a): an edge bulges by t (1 - t) / 2 of it."""
+
+
 def build(vertices: Floats, faces: Ints) -> Tree:
     """Build the tree over triangles (m, 3) of vertices (n, 3)."""
     corners = vertices[faces]
     order = _median_order(corners.mean(axis=1))
     corners = np.ascontiguousarray(corners[order])
     n_leaves = 1 << max(0, int(np.ceil(np.log2(max(1, -(-len(faces) // LEAF))))))
-    low, high = _boxes(corners, n_leaves)
+    low, high = _boxes(corners, n_leaves, np.zeros(len(corners)))
     pseudonormal = _pseudonormals(vertices, faces)[order]
     return Tree(corners, order, low, high, pseudonormal)
+
+
+def curved(tree: Tree, normals: Floats) -> Curved:
+    """Curve the faces of a tree by unit normals (m, 3, 3) at their corners.
+
+    Along an edge from a to b the quadratic with these normals at its ends rises t (1 - t) / 2 of (n_b - n_a) (b - a)
+    above it; over a triangle those of its edges add up.
+    """
+    ahead = [1, 2, 0]
+    normals = normals[tree.face]
+    edges = tree.corners[:, ahead] - tree.corners
+    rise = np.ascontiguousarray(np.einsum("fkd,fkd->fk", normals[:, ahead] - normals, edges))
+    low, high = _boxes(tree.corners, (len(tree.low) + 1) // 2, np.abs(rise).sum(axis=1) / 8)
+    return Curved(tree._replace(low=low, high=high), rise)
 
 
 @njit(cache=True)
@@ -93,16 +116,19 @@ def _part(key: Any, order: Any, first: int, last: int, middle: int) -> None:
 
 
 @njit(cache=True)
-def _boxes(corners: Any, n_leaves: int) -> tuple[Any, Any]:
-    """Lower and upper corner (nodes, 3) of every node's box; without triangles it lies at infinity."""
+def _boxes(corners: Any, n_leaves: int, margin: Any) -> tuple[Any, Any]:
+    """Lower and upper corner (nodes, 3) of every node's box; without triangles it lies at infinity.
+
+    The boxes hold the triangles with a margin (m,) around each.
+    """
     low = np.full((2 * n_leaves - 1, 3), np.inf)
     high = np.full((2 * n_leaves - 1, 3), -np.inf)
     for f in range(len(corners)):
         leaf = n_leaves - 1 + f // LEAF
         for k in range(3):
             for corner in range(3):
-                low[leaf, k] = min(low[leaf, k], corners[f, corner, k])
-                high[leaf, k] = max(high[leaf, k], corners[f, corner, k])
+                low[leaf, k] = min(low[leaf, k], corners[f, corner, k] - margin[f])
+                high[leaf, k] = max(high[leaf, k], corners[f, corner, k] + margin[f])
     for node in range(2 * n_leaves - 2, 0, -1):
         for k in range(3):
             low[(node - 1) // 2, k] = min(low[(node - 1) // 2, k], low[node, k])
@@ -167,6 +193,11 @@ def closest_points(tree: Tree, points: Floats) -> tuple[Floats, Floats, Ints]:
     return closest, distance, tree.face[triangle]
 
 
+def inscribed_radii(wall: Curved, points: Floats) -> Floats:
+    """Distance (n,) of points (n, 3) inside a wall to where it bulges to over its triangles."""
+    return _inscribed_all(wall.flat.corners, wall.rise, wall.flat.low, wall.flat.high, _plain(points))
+
+
 def signed_distances(tree: Tree, points: Floats) -> Floats:
     """Distance (n,) of points (n, 3) to a closed surface, negative inside."""
     points = _plain(points)
@@ -181,10 +212,14 @@ def segments_cross(tree: Tree, starts: Floats, ends: Floats) -> Bools:
     return _first_hit_all(tree.corners, tree.low, tree.high, starts, ends - starts, 1.0)[0] <= 1.0
 
 
-def first_hits(tree: Tree, origins: Floats, directions: Floats) -> Floats:
-    """Distance (n,) from origins (n, 3) along unit directions (n, 3) to the first triangle; inf where none."""
+def first_hits(tree: Tree, origins: Floats, directions: Floats) -> tuple[Floats, Ints]:
+    """Distance (n,) from origins (n, 3) along unit directions (n, 3) to the first triangle, and its face (n,).
+
+    The distance is inf where there is none.
+    """
     origins, directions = _plain(origins), _plain(directions)
-    return _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)[0]
+    distance, triangle = _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)
+    return distance, tree.face[triangle]
 
 
 def sees_inside(tree: Tree, origins: Floats, directions: Floats) -> Bools:
@@ -317,6 +352,50 @@ def _closest_all(corners: Any, low: Any, high: Any, points: Any) -> tuple[Any, A
         d2, t, f = _closest_one(corners, low, high, points[i], closest[i])
         distance[i], triangle[i], feature[i] = np.sqrt(d2), t, f
     return closest, distance, triangle, feature
+
+
+@njit(cache=True)
+def _inscribed_one(corners: Any, rise: Any, low: Any, high: Any, p: Any) -> float:
+    first_leaf = low.shape[0] // 2
+    stack = np.zeros(_STACK, dtype=np.int32)
+    bound = np.zeros(_STACK)
+    size, best = 1, np.inf
+    while size > 0:
+        size -= 1
+        node = stack[size]
+        if bound[size] >= best:
+            continue
+        if node >= first_leaf:
+            start = (node - first_leaf) * LEAF
+            for i in range(start, min(start + LEAF, corners.shape[0])):
+                t = corners[i]
+                v, w, _ = closest_on_triangle(p, t)
+                u, d2 = 1.0 - v - w, 0.0
+                for k in range(3):
+                    d2 += (p[k] - u * t[0, k] - v * t[1, k] - w * t[2, k]) ** 2
+                bulge = 0.5 * (u * v * rise[i, 0] + v * w * rise[i, 1] + w * u * rise[i, 2])
+                best = min(best, np.sqrt(d2) + bulge)
+            continue
+        left, right = 2 * node + 1, 2 * node + 2
+        d_left = np.sqrt(_box_distance2(p, low[left], high[left]))
+        d_right = np.sqrt(_box_distance2(p, low[right], high[right]))
+        if d_left < d_right:
+            left, right, d_left, d_right = right, left, d_right, d_left
+        if d_left < best:
+            stack[size], bound[size] = left, d_left
+            size += 1
+        if d_right < best:
+            stack[size], bound[size] = right, d_right
+            size += 1
+    return best
+
+
+@njit(cache=True, parallel=True)
+def _inscribed_all(corners: Any, rise: Any, low: Any, high: Any, points: Any) -> Any:
+    radius = np.zeros(points.shape[0])
+    for i in prange(points.shape[0]):
+        radius[i] = max(_inscribed_one(corners, rise, low, high, points[i]), 0.0)
+    return radius
 
 
 @njit(cache=True)

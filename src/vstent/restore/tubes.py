@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -9,6 +10,9 @@ from scipy.spatial import cKDTree
 from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.trace import SPEED_CAP, parent_radius_mm
 from vstent.vessel import Centerline
+
+N_CLASSES: Final = 16
+"""Classes of spheres of about the same radius."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,14 +32,23 @@ class Tubes:
         """Return the distance (n,) of points (n, 3) to the tubes' wall, negative inside, and each one's sphere (n,)."""
         if not len(self.centers_mm):
             return np.full(len(points_mm), np.inf), np.zeros(len(points_mm), dtype=np.int32)
-        # Sorting spheres by radius into a few classes makes the nearest wall a nearest-centre query per class.
-        order = np.argsort(self.radius_mm)
-        height, sphere = np.full(len(points_mm), np.inf), np.zeros(len(points_mm), dtype=np.int64)
-        for members in np.array_split(order, min(16, len(order))):
-            distance, nearest = cKDTree(self.centers_mm[members]).query(points_mm)
-            candidate = distance - self.radius_mm[members][nearest]
-            closer = candidate < height
-            height, sphere = np.where(closer, candidate, height), np.where(closer, members[nearest], sphere)
+        distance, sphere = cKDTree(self.centers_mm).query(points_mm)
+        own_mm = self.radius_mm[sphere]
+        height = distance - own_mm
+        # Sorting spheres by radius into a few classes makes the nearest wall a nearest-centre query per class, and only
+        # a sphere wider than the one about the nearest centre can have a nearer wall.
+        for members in np.array_split(np.argsort(-self.radius_mm), min(N_CLASSES, len(self.radius_mm))):
+            widest = float(self.radius_mm[members[0]])
+            open_ = np.flatnonzero(own_mm < widest)
+            if not len(open_):
+                continue
+            limit = max(float(height[open_].max()) + widest, 0.0)
+            distance, nearest = cKDTree(self.centers_mm[members]).query(points_mm[open_], distance_upper_bound=limit)
+            found = nearest < len(members)
+            open_, chosen = open_[found], members[nearest[found]]
+            candidate = distance[found] - self.radius_mm[chosen]
+            closer = candidate < height[open_]
+            height[open_[closer]], sphere[open_[closer]] = candidate[closer], chosen[closer]
         return height, sphere.astype(np.int32)
 
 
