@@ -159,7 +159,7 @@ def test_the_widest_sphere_of_a_section_is_that_of_linear_programming() -> None:
     reached = (distance - np.einsum("nkd,nd->nk", slope, shift)).min(axis=1)
     for k in range(20):
         best = linprog([0, 0, -1], np.column_stack([slope[k], np.ones(24)]), distance[k], bounds=(None, None))
-        assert reached[k] == pytest.approx(-best.fun, abs=5e-4)  # of walls 0.01 uneven
+        assert reached[k] == pytest.approx(-best.fun, abs=1e-4)
     # What it does not gain by half of the way it leaves.
     unmoved = medial.widest_in_section(distance, 0.4 * slope, 0.5, np.full(20, 0.02))
-    np.testing.assert_allclose(unmoved, 0.0, atol=1e-4)
+    np.testing.assert_allclose(unmoved, 0.0, atol=1e-3)

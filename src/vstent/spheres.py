@@ -43,9 +43,10 @@ def centered(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Floats:
     waves = 2.0 * radius_mm * SMOOTHED_DIAMETERS / (2 * np.pi * step_mm)
     is_held = np.ones(len(path_mm))
     is_held[[0, -1]] = 1e6
-    every = np.arange(len(path_mm))
-    some = np.union1d(every[::STRIDE], every[-1:])
-    move_mm = curves.interpolate(some, _to_widest(wall, path_mm[some], radius_mm[some]), every)
+    every = np.arange(float(len(path_mm)))
+    place = np.union1d(every[::STRIDE], every[-1:])
+    some = place.astype(np.int32)
+    move_mm = curves.interpolate(place, _to_widest(wall, path_mm[some], radius_mm[some]), every)
     move_mm[[0, -1]] = 0.0
     return np.asarray(path_mm + curves.smooth(move_mm, is_held, waves**6, order=3))
 

@@ -32,9 +32,10 @@ class Tubes:
         """Return the distance (n,) of points (n, 3) to the tubes' wall, negative inside, and each one's sphere (n,)."""
         if not len(self.centers_mm):
             return np.full(len(points_mm), np.inf), np.zeros(len(points_mm), dtype=np.int32)
-        distance, sphere = cKDTree(self.centers_mm).query(points_mm)
+        distance, nearest = cKDTree(self.centers_mm).query(points_mm)
+        sphere = np.array(nearest, dtype=np.int32)
         own_mm = self.radius_mm[sphere]
-        height = distance - own_mm
+        height = np.asarray(distance - own_mm)
         # Sorting spheres by radius into a few classes makes the nearest wall a nearest-centre query per class, and only
         # a sphere wider than the one about the nearest centre can have a nearer wall.
         for members in np.array_split(np.argsort(-self.radius_mm), min(N_CLASSES, len(self.radius_mm))):
@@ -43,13 +44,14 @@ class Tubes:
             if not len(open_):
                 continue
             limit = max(float(height[open_].max()) + widest, 0.0)
-            distance, nearest = cKDTree(self.centers_mm[members]).query(points_mm[open_], distance_upper_bound=limit)
+            query = cKDTree(self.centers_mm[members]).query(points_mm[open_], distance_upper_bound=limit)
+            distance, nearest = np.asarray(query[0]), np.asarray(query[1])
             found = nearest < len(members)
             open_, chosen = open_[found], members[nearest[found]]
             candidate = distance[found] - self.radius_mm[chosen]
             closer = candidate < height[open_]
             height[open_[closer]], sphere[open_[closer]] = candidate[closer], chosen[closer]
-        return height, sphere.astype(np.int32)
+        return height, sphere
 
 
 def tubes_of(centerlines: Sequence[Centerline]) -> Tubes:
