@@ -67,8 +67,8 @@ def test_wall_shear_stress_is_poiseuilles() -> None:
     z = field.wall.vertices_mm[:, 2]
     stress = along(field) * field.wall_shear_stress_Pa[(z > 5) & (z < 9)]
     expected = 4 * 0.004 * INFLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 3)
-    assert stress[:, 2].mean() == pytest.approx(expected, rel=0.015)
-    assert np.abs(stress[:, 2] / expected - 1).max() < 0.08
+    assert stress[:, 2].mean() == pytest.approx(expected, rel=0.01)
+    assert np.abs(stress[:, 2] / expected - 1).max() < 0.03
 
 
 @pytest.mark.parametrize("is_converged", [True, False])

@@ -283,21 +283,26 @@ def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
     return weight
 
 
-def parabolic_weights(fraction: Floats, relaxation_steps: float) -> Floats:
-    """Reflection that is exact for a parabola along the link: (l, 5) weights of a, b, c, e and g (see `lattice.defer`).
-
-    Quadratic interpolation (Lallemand and Luo 2003, J. Comput. Phys. 184, 406, eq. 10) lets blood slip by up to an
-    eighth of a squared cell times the flow's curvature: its populations carry, beside the velocity, second differences
-    and what the odd rate has still to relax (Ginzburg and d'Humieres 2003, Phys. Rev. E 68, 066614, sec. III). Both are
-    put back by the second difference, a - 2 b + e; how much of it comes with the viscosity is taken between a plane
-    channel and a tube, for read off the populations it would be wrong where a screen's force meets the wall.
-    """
+def quadratic_weights(fraction: Floats) -> Floats:
+    """Quadratic interpolated reflection (Lallemand and Luo 2003, J. Comput. Phys. 184, 406, eq. 10): (l, 5)."""
     x, zero = fraction, np.zeros_like(fraction)
     near = np.stack([x * (1 + 2 * x), 1 - 4 * x**2, zero, -x * (1 - 2 * x), zero], axis=1)
     far = np.stack([1 / (x * (2 * x + 1)), zero, (2 * x - 1) / x, zero, (1 - 2 * x) / (1 + 2 * x)], axis=1)
-    even, odd = relaxation_steps - 0.5, 1 / ODD_RATE - 0.5
+    return np.where(x[:, None] < 0.5, near, far)
+
+
+def parabolic_weights(fraction: Floats, relaxation_steps: float) -> Floats:
+    """Reflection that is exact for a parabola along the link: (l, 5) weights of a, b, c, e and g (see `lattice.defer`).
+
+    Quadratic interpolation alone lets blood slip by up to an eighth of a squared cell times the flow's curvature: its
+    populations carry, beside the velocity, second differences and what the odd rate has still to relax (Ginzburg and
+    d'Humieres 2003, Phys. Rev. E 68, 066614, sec. III). Both are put back by the second difference, a - 2 b + e; how
+    much of it comes with the viscosity is taken between a plane channel and a tube, for read off the populations it
+    would be wrong where a screen's force meets the wall.
+    """
+    x, even, odd = fraction, relaxation_steps - 0.5, 1 / ODD_RATE - 0.5
     slip = (x * (1 - x) - even * (odd + np.abs(x - 0.5))) / np.maximum(1, x * (2 * x + 1))
-    return np.where(x[:, None] < 0.5, near, far) + slip[:, None] * np.array([1.0, -2.0, 0.0, 1.0, 0.0])
+    return quadratic_weights(fraction) + slip[:, None] * np.array([1.0, -2.0, 0.0, 1.0, 0.0])
 
 
 def _imposed(case: FlowCase, domain: Domain, scales: Scales, k: int) -> Floats:
