@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from shapes import sphere
+from vstent.flow.engines.lattice_setup import ODD_RATE as VESSEL_ODD_RATE
+from vstent.flow.engines.lattice_setup import parabolic_weights
 from vstent.kernels import lattice, lattice_sampling, voxels
 
 STRIDE = 40
@@ -119,6 +121,23 @@ def test_a_screen_takes_the_momentum_of_its_law():
     tangential = velocity - normal_speed[:, None] * normal
     law = -across * tangential - ((along + quadratic * np.abs(normal_speed)) * normal_speed)[:, None] * normal
     np.testing.assert_allclose(force, law, atol=1e-6)
+
+
+@pytest.mark.parametrize("fraction", [0.02, 0.3, 0.499, 0.5, 0.7, 1.0])
+def test_a_parabola_that_is_zero_at_the_wall_is_reflected_as_itself(fraction):
+    # Steady populations of a flow along the link (Ginzburg and d'Humieres 2003): even and odd equilibrium p and e, and
+    # what relaxation changes of the even part, the slope of e, and of the odd part, h.
+    even, odd, curvature, slope = 0.2, 1 / VESSEL_ODD_RATE - 0.5, -0.3, 0.7
+    h, push = -0.5 * even * curvature, 0.5 * even * curvature
+
+    def leaving(s, sign):
+        e = slope * (s - fraction) + 0.5 * curvature * (s**2 - fraction**2)
+        return 1 + push * s + sign * e - (even - 0.5) * (slope + curvature * s) - sign * (odd - 0.5) * h
+
+    e = -slope * fraction - 0.5 * curvature * fraction**2
+    arriving = 1 - e - (even + 0.5) * slope + (odd + 0.5) * h
+    known = [leaving(0, 1), leaving(-1, 1), leaving(0, -1), leaving(-2, 1), leaving(-1, -1)]
+    assert parabolic_weights(np.array([fraction]), even + 0.5)[0] @ known == pytest.approx(arriving, abs=1e-12)
 
 
 def test_voxels_count_the_volume_of_a_sphere_and_forgive_a_doubled_face():

@@ -14,7 +14,7 @@ POINTS: Final = 64
 
 
 def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> Floats:
-    """Axial speed (n,), in an arbitrary unit, at points (n, 3) of fully developed flow through a flat section (k, 3).
+    """Axial speed (n,), over its mean, at points (n, 3) of fully developed flow through a flat section (k, 3).
 
     Laminar flow along a straight tube with this section: lap u = -1 with u = 0 on the polygon (White 2006, Viscous
     Fluid Flow, eq. 3-30), by five-point differences, linear between the grid points and zero outside.
@@ -28,7 +28,8 @@ def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> 
     shape = np.ceil(np.ptp(polygon, axis=0) / spacing).astype(int) + 5
     grid = low + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
     depth = _depth(polygon, grid)
-    speed = _beyond(_poisson(depth / spacing), depth)
+    speed = _poisson(depth / spacing)
+    speed = _beyond(speed / speed[depth > 0].mean(), depth)
     where = ((points_mm - center) @ across - low) / spacing
     return np.maximum(ndimage.map_coordinates(speed, where.T, order=1, mode="constant"), 0.0)
 

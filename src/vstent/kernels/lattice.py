@@ -480,7 +480,7 @@ def drive(
         remembered mean density, its rate of change, the outward normal (3), the area in cells, the density imposed.
     start : (k + 1,) first link of every opening in what follows.
     address : (l, 6) as in `reflect`; place : (l,) storage place of each link's cell; direction, source : (l,).
-    shape : what unit inflow speed sends back through each link.
+    shape : (l, 2) what inflow sends back through each link, over its speed and over its speed squared.
 
     Inflow: half-way reflection off a moving wall (Ladd 1994, J. Fluid Mech. 271, 285), so the flow is exact. It
     lets sound out: a density above the remembered mean is answered by the wave that leaves (Poinsot and Lele 1992,
@@ -500,7 +500,7 @@ def drive(
             openings[k, 2] += rate * (density - openings[k, 2])
             speed = openings[k, 1] - (density - openings[k, 2]) / np.sqrt(3.0)
             for n in range(first, last):
-                source[n] = shape[n] * speed
+                source[n] = (shape[n, 0] + shape[n, 1] * speed) * speed
             continue
         if openings[k, 0] == OUTFLOW:
             excess = outflow(f, address[first:last]) / openings[k, 7] - openings[k, 1]

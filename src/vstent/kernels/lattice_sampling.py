@@ -138,8 +138,9 @@ def fit_wall(index: Any, distance: Any, velocity: Any, pressure: Any, points: An
     """Wall-normal gradient of the velocity and the pressure at wall points, (m, 4).
 
     Weighted least squares over the cells within `reach` cells of each point (m, 3) with inward normal (m, 3):
-    velocity = d (a + b d + c s + e t), which is zero at the wall, quadratic away from it and linear along it, exact for
-    Poiseuille flow in a straight tube; pressure = a + b d + c s + e t. d: distance of the cell from the wall, in cells.
+    velocity = d (a + b d + c s + e t + g d^2), which is zero at the wall, cubic away from it and linear along it, exact
+    for Poiseuille flow in a straight tube; the cubic term is what a pulse bends near the wall. pressure = a + b d + c s
+    + e t. d: distance of the cell from the wall, in cells.
     """
     result = np.zeros((len(points), 4))
     for m in prange(len(points)):
@@ -149,9 +150,9 @@ def fit_wall(index: Any, distance: Any, velocity: Any, pressure: Any, points: An
         first = np.cross(normal, helper)
         first /= np.sqrt((first**2).sum())
         second = np.cross(normal, first)
-        shear, level = np.zeros((4, 4)), np.zeros((4, 4))
-        shear_right, level_right = np.zeros((4, 3)), np.zeros((4, 1))
-        base = np.zeros(4)
+        shear, level = np.zeros((5, 5)), np.zeros((4, 4))
+        shear_right, level_right = np.zeros((5, 3)), np.zeros((4, 1))
+        base = np.zeros(5)
         lowest = np.floor(p).astype(np.int64) - reach + 1
         for i in range(lowest[0], lowest[0] + 2 * reach):
             for j in range(lowest[1], lowest[1] + 2 * reach):
@@ -169,11 +170,14 @@ def fit_wall(index: Any, distance: Any, velocity: Any, pressure: Any, points: An
                     base[0], base[1] = 1.0, d
                     base[2] = x * first[0] + y * first[1] + z * first[2]
                     base[3] = x * second[0] + y * second[1] + z * second[2]
+                    base[4] = d * d
                     for a in range(4):
                         for b in range(4):
                             level[a, b] += weight * base[a] * base[b]
-                            shear[a, b] += weight * d * d * base[a] * base[b]
                         level_right[a, 0] += weight * base[a] * pressure[cell]
+                    for a in range(5):
+                        for b in range(5):
+                            shear[a, b] += weight * d * d * base[a] * base[b]
                         for axis in range(3):
                             shear_right[a, axis] += weight * d * base[a] * velocity[cell, axis]
         if level[0, 0] <= 0.0:
