@@ -96,7 +96,7 @@ def test_trace_writes_wall_openings_and_centerlines(artery: Path, tmp_path: Path
     wall, _ = read_surface(out / "vessel.vtp", units="mm")
     for line, opening in zip(lines, openings[1:], strict=True):
         np.testing.assert_allclose(line.points_mm[[0, -1]], [o["center_mm"] for o in (openings[0], opening)], atol=1e-3)
-        np.testing.assert_allclose(line.inscribed_radius_mm, wall.closest(line.points_mm)[1], atol=1e-5)
+        np.testing.assert_allclose(line.inscribed_radius_mm, wall.inscribed_radius(line.points_mm), atol=1e-4)
 
 
 def test_restore_writes_the_parent_artery_and_a_study_goes_on_from_it(
