@@ -50,6 +50,12 @@ def test_cells_leave_the_wall_outside_the_bend_and_nowhere_else():
     assert gap_mm[in_bend & (aside < 0)].max() == gap_mm.max()
 
 
+def test_gaps_of_a_bend_are_not_taken_for_those_of_a_narrow_device():
+    wide = deploy(ENTERPRISE, tube(line(40), 2.6), size=SIZE)
+    assert "outside the bend is longer" in deployed().advice
+    assert "its free diameter is 4.50 mm" in wide.advice
+
+
 def test_in_a_straight_tube_no_cell_moves():
     nodes_mm = deploy(ENTERPRISE, tube(line(40), 1.9), size=SIZE).stent.nodes_mm
     slid = pieces.slide(ENTERPRISE, SIZE, nodes_mm, len(nodes_mm) // 2)

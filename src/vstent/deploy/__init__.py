@@ -11,9 +11,9 @@ from vstent.deploy.braid import ConstantWire
 from vstent.deploy.method import AbstractMethod, Course, Placement, Progress, run
 from vstent.deploy.wall import landing_wall
 from vstent.deploy.zhong2016 import Zhong2016
-from vstent.device import Design, Size, compacted
+from vstent.device import Design, LaserCut, Size, compacted
 from vstent.errors import InputError
-from vstent.kernels.arrays import Floats
+from vstent.kernels.arrays import Bools, Floats
 from vstent.stent import Deployment, Landing, Stent
 from vstent.units import MM_PER_UM
 from vstent.vessel import Anatomy
@@ -36,6 +36,8 @@ APPOSED_GAP_MM = 0.1
 """A node is apposed when the device's outer face is nearer to the wall than this."""
 LOOSE_FRACTION = 0.05
 """Less of the device than this may stand off the wall without a word."""
+FULLY_OPEN = 0.97
+"""A row at least so wide, over the free diameter, is held back by it."""
 
 propose_landing = sizing.propose_landing
 propose_size = sizing.propose_size
@@ -89,14 +91,15 @@ def deploy(
     drawn = wires.draw(design, size, nodes_mm, wall)
     stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, drawn.points_mm, drawn.starts, drawn.diameter_um)
     contact = wall.contact(nodes_mm.reshape(-1, 3))
-    gap_mm = np.maximum(contact.distance_mm - chosen.contour.dd_mm, 0.0)
+    gap_mm = np.maximum(contact.distance_mm - chosen.contour.dd_mm, 0.0).reshape(nodes_mm.shape[:2])
+    is_at_patient = is_patient[contact.face].reshape(gap_mm.shape)
     return Deployment(
         stent=stent,
         outcome=course.outcome,
-        advice=_advice(stent, course, gap_mm[is_patient[contact.face]]),
+        advice=_advice(stent, course, gap_mm, is_at_patient),
         terminated_fraction=np.array(course.terminated_fraction),
         seconds=time.perf_counter() - began,
-        wall_gap_mm=gap_mm.reshape(nodes_mm.shape[:2]),
+        wall_gap_mm=gap_mm,
         history_mm=np.array(course.history_mm),
         energy_mm2=np.array(course.energy_mm2),
     )
@@ -110,8 +113,8 @@ def _method(method: AbstractMethod | str) -> AbstractMethod:
     return METHODS[method]()
 
 
-def _advice(stent: Stent, course: Course, gap_mm: Floats) -> str:
-    """One sentence: where the device lies, and what to do when it does not fit; gaps (n,) at the patient's own wall."""
+def _advice(stent: Stent, course: Course, gap_mm: Floats, is_at_patient: Bools) -> str:
+    """One sentence: where the device lies, what to do when it does not fit; gaps (rows, columns), and whose wall."""
     lies = (
         f"{stent.design.name} {stent.size.label} lies from {stent.proximal_abscissa_mm:.1f} to "
         f"{stent.distal_abscissa_mm:.1f} mm of the parent artery, {stent.deployed_length_mm:.1f} mm long"
@@ -119,11 +122,22 @@ def _advice(stent: Stent, course: Course, gap_mm: Floats) -> str:
     if course.outcome == "iteration_limit":
         done = course.terminated_fraction[-1]
         return f"{lies}, but only {done:.0%} of its contour reached the wall: raise the iteration limit or tau."
-    loose = float((gap_mm > APPOSED_GAP_MM).mean()) if gap_mm.size else 0.0
+    is_loose = is_at_patient & (gap_mm > APPOSED_GAP_MM)
+    loose = is_loose.sum() / max(is_at_patient.sum(), 1)
     if loose <= LOOSE_FRACTION:
         return f"{lies}, and {1 - loose:.0%} of it lies against the wall."
+    return f"{lies}, and {loose:.0%} of it stands off the wall, by up to {gap_mm[is_at_patient].max():.2f} mm: " + (
+        _remedy(stent, is_loose)
+    )
+
+
+def _remedy(stent: Stent, is_loose: Bools) -> str:
+    """Why nodes (rows, columns) stand off the wall, and what to do."""
+    free_mm = stent.size.free_diameter_mm
+    is_narrow = stent.row_diameter_mm < FULLY_OPEN * free_mm
+    if isinstance(stent.design, LaserCut) and is_loose[is_narrow].sum() > 0.5 * is_loose.sum():
+        return "its struts do not stretch, and the way outside the bend is longer; choose a device of braided wires."
     wider = any(size.diameter_mm > stent.size.diameter_mm for size in stent.design.sizes)
     return (
-        f"{lies}, and {loose:.0%} of it stands off the wall, by up to {gap_mm.max():.2f} mm: its free diameter is "
-        f"{stent.size.free_diameter_mm:.2f} mm; choose {'a wider size' if wider else 'a device that is made wider'}."
+        f"its free diameter is {free_mm:.2f} mm; choose {'a wider size' if wider else 'a device that is made wider'}."
     )
