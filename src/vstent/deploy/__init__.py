@@ -36,8 +36,6 @@ APPOSED_GAP_MM = 0.1
 """A node is apposed when the device's outer face is nearer to the wall than this."""
 LOOSE_FRACTION = 0.05
 """Less of the device than this may stand off the wall without a word."""
-FULLY_OPEN = 0.97
-"""A row at least so wide, over the free diameter, is held back by it."""
 
 propose_landing = sizing.propose_landing
 propose_size = sizing.propose_size
@@ -126,16 +124,15 @@ def _advice(stent: Stent, course: Course, gap_mm: Floats, is_at_patient: Bools) 
     loose = is_loose.sum() / max(is_at_patient.sum(), 1)
     if loose <= LOOSE_FRACTION:
         return f"{lies}, and {1 - loose:.0%} of it lies against the wall."
-    return f"{lies}, and {loose:.0%} of it stands off the wall, by up to {gap_mm[is_at_patient].max():.2f} mm: " + (
-        _remedy(stent, is_loose)
-    )
+    off = f"{loose:.0%} of it stands off the wall, by up to {gap_mm[is_at_patient].max():.2f} mm"
+    return f"{lies}, and {off}: {_remedy(stent, gap_mm, is_loose)}"
 
 
-def _remedy(stent: Stent, is_loose: Bools) -> str:
-    """Why nodes (rows, columns) stand off the wall, and what to do."""
+def _remedy(stent: Stent, gap_mm: Floats, is_loose: Bools) -> str:
+    """Why nodes stand off the wall by `gap_mm` (rows, columns), and what to do."""
     free_mm = stent.size.free_diameter_mm
-    is_narrow = stent.row_diameter_mm < FULLY_OPEN * free_mm
-    if isinstance(stent.design, LaserCut) and is_loose[is_narrow].sum() > 0.5 * is_loose.sum():
+    could_open = stent.row_diameter_mm + 2 * gap_mm.mean(axis=1) < free_mm
+    if isinstance(stent.design, LaserCut) and is_loose[could_open].sum() > 0.5 * is_loose.sum():
         return "its struts do not stretch, and the way outside the bend is longer; choose a device of braided wires."
     wider = any(size.diameter_mm > stent.size.diameter_mm for size in stent.design.sizes)
     return (
