@@ -46,9 +46,13 @@ export class Deploying {
     this.wanted = undefined;
     if (!this.isDragging) return;
     this.isDragging = false;
-    // The last sketch may still be under way: its place is the one to keep.
-    const settle = () => (this.sketches.isBusy ? setTimeout(settle, 15) : this.host.chosen(this.name, this.place.center_mm));
-    settle();
+    this.host.chosen(this.name, this.settled());
+  }
+
+  /** Where the device is let go: the last sketch may still be under way, and its place is the one to keep. */
+  async settled() {
+    while (this.sketches.isBusy) await new Promise((resolve) => setTimeout(resolve, 15));
+    return this.place.center_mm;
   }
 
   /** Whether the device in view is the one whose place is known. */

@@ -126,7 +126,7 @@ class Page {
       section: this.section,
       colour: () => this.colour,
       choice: (name) => this.view.choices.devices.find((device) => device.name === name),
-      chosen: (name, center) => this.changeDevice(name, { center_mm: Number(center.toFixed(3)) }),
+      chosen: (name, center) => this.choose(center.then((mm) => deviceWith(name, { center_mm: Number(mm.toFixed(3)) }))),
       told: (name, manifest, isWhole) => this.toldDevice(name, manifest, isWhole),
       failed: (problem) => this.complain(problem),
     });
@@ -495,9 +495,9 @@ class Page {
 
   // -- what a user does ---------------------------------------------------------------------------------------------
 
-  /** Choose; `changes` are made on what is chosen when it is their turn: one goes after the other. */
+  /** Choose; `changes`, or a promise of them, are made on what is chosen when it is their turn: one after the other. */
   choose(changes) {
-    this.changes = this.changes.then(() => this.send(changes));
+    this.changes = this.changes.then(async () => this.send(await changes));
     return this.changes;
   }
 
@@ -515,7 +515,7 @@ class Page {
   }
 
   changeDevice(name, changes) {
-    return this.choose(({ devices }) => ({ devices: devices.map((device) => (device.name === name ? { ...device, ...changes } : device)) }));
+    return this.choose(deviceWith(name, changes));
   }
 
   chooseFlow(changes) {
@@ -595,6 +595,10 @@ class Page {
   }
 }
 
+/** What changes of one device make of the choices. */
+const deviceWith = (name, changes) => ({ devices }) => ({
+  devices: devices.map((device) => (device.name === name ? { ...device, ...changes } : device)),
+});
 const SPOKEN = {
   scan: "Scan", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes",
   deploy: "Deploying", struts: "Struts of", plan: "Cost of the flow", flow: "Flow,", vary: "How sure:", measure: "Numbers", report: "Report",
