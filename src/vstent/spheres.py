@@ -84,9 +84,6 @@ def _bulge(wall: Surface, points_mm: Floats, face: Ints) -> tuple[Floats, Floats
     """How far the smooth wall lies outside of points (n, 3) of its faces (n,), and its unit normals (n, 3) there."""
     corners, normal = wall.corners_mm[face], wall.smooth_normals[face]
     weight = triangles.barycentric(corners, points_mm)
-    height = np.zeros(len(face))
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        rise = np.einsum("fd,fd->f", normal[:, b] - normal[:, a], corners[:, b] - corners[:, a])
-        height += 0.5 * weight[:, a] * weight[:, b] * rise
+    height = 0.5 * (weight * np.roll(weight, -1, axis=1) * triangles.edge_rises(corners, normal)).sum(axis=1)
     there = np.einsum("fk,fkd->fd", weight, normal)
     return height, there / np.maximum(np.linalg.norm(there, axis=1, keepdims=True), 1e-300)

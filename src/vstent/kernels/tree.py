@@ -57,10 +57,7 @@ def curved(tree: Tree, normals: Floats) -> Curved:
     Along an edge from a to b the quadratic with these normals at its ends rises t (1 - t) / 2 of (n_b - n_a) (b - a)
     above it; over a triangle those of its edges add up.
     """
-    ahead = [1, 2, 0]
-    normals = normals[tree.face]
-    edges = tree.corners[:, ahead] - tree.corners
-    rise = np.ascontiguousarray(np.einsum("fkd,fkd->fk", normals[:, ahead] - normals, edges))
+    rise = triangles.edge_rises(tree.corners, normals[tree.face])
     low, high = _boxes(tree.corners, (len(tree.low) + 1) // 2, np.abs(rise).sum(axis=1) / 8)
     return Curved(tree._replace(low=low, high=high), rise)
 
