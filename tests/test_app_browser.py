@@ -150,6 +150,7 @@ def trim_and_draw_the_neck(client, page):
     playwright.expect(area).to_contain_text("mm²")
     before = area.inner_text()
     knobs = page.locator(".handle.small .knob")
+    still(knobs.first)
     lowest = max(range(knobs.count()), key=lambda i: knobs.nth(i).bounding_box()["y"])
     drag(page, knobs.nth(lowest), 6, 12)
     page.wait_for_selector(".step.stale:nth-child(3)")
@@ -159,9 +160,14 @@ def trim_and_draw_the_neck(client, page):
     playwright.expect(area).to_have_text(before)
 
 
+def still(knob):
+    """Wait until it lies still: the view glides from step to step."""
+    knob.element_handle().wait_for_element_state("stable")
+
+
 def drag(page, what, right, down):
     knob = page.locator(what) if isinstance(what, str) else what
-    knob.wait_for(state="visible")
+    still(knob)
     box = knob.bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y)

@@ -176,6 +176,8 @@ class Page {
 
   take(view) {
     const before = this.view;
+    // An event that was on its way while a choice was answered tells of before it.
+    if (before?.id === view.id && view.revision < before.revision) return;
     this.view = view;
     document.title = `${view.name} · vstent`;
     this.caseName.textContent = view.name;
@@ -341,14 +343,22 @@ class Page {
     this.picture.setLayers(layers, (this.memory[this.step] ??= {}));
     this.picture.clicked = this.step === "sac" ? (point) => point && this.setSeed(point) : null;
     this.picture.moved = null;
-    this.picture.setMarks([]);
-    if (!this.anatomy) return;
+    this.picture.setMarks(this.anatomy ? this.marks() : []);
+    if (this.anatomy && this.step === "deploy") this.renderDeploy();
+  }
+
+  /** What lies on the scene in this step. They are laid once: a handle that is in hand must not be taken away between. */
+  marks() {
     if (this.step === "vessel") {
       this.trimming.show(this.view.choices);
-      this.picture.setMarks([...this.openingMarks(), ...this.trimming.handles]);
+      return [...this.openingMarks(), ...this.trimming.handles];
     }
-    if (this.step === "sac") this.renderNeck();
-    if (this.step === "deploy") this.renderDeploy();
+    if (this.step === "sac") {
+      const { curve_mm, handles } = this.anatomy.drawn;
+      this.neck.set(this.view.choices.neck_mm ?? curve_mm, handles);
+      return this.neck.handles;
+    }
+    return this.step === "deploy" && this.device ? [...this.deploying.handles, this.deploying.cursorMark] : [];
   }
 
   panes() {
@@ -378,12 +388,6 @@ class Page {
     });
   }
 
-  renderNeck() {
-    const { curve_mm, handles } = this.anatomy.drawn;
-    this.neck.set(this.view.choices.neck_mm ?? curve_mm, handles);
-    this.picture.setMarks(this.neck.handles);
-  }
-
   neckPlace() {
     return this.neckDrawn ? neckWords(this.neckDrawn, this.anatomy.drawn) : [];
   }
@@ -396,7 +400,6 @@ class Page {
   renderDeploy() {
     const name = this.device;
     if (!name) return;
-    this.picture.setMarks([...this.deploying.handles, this.deploying.cursorMark]);
     this.picture.moved = (event) => this.deploying.look(this.axis.under(event, null));
     const key = JSON.stringify([this.deploying.host.choice(name), this.colour, this.view.anatomy]);
     if (this.shownDevice !== key || this.deploying.name !== name || !this.measures[name]) {

@@ -169,14 +169,14 @@ export class Picture {
 
   /** Lay elements on the scene: [{element, point: () => [x, y, z]}]; they follow the camera. */
   setMarks(marks) {
-    // One that is in hand stays where it is: it would be let go.
-    const isSame = marks.length === this.drawnMarks.length && marks.every(({ element }, i) => element === this.drawnMarks[i].element);
     this.drawnMarks = marks;
-    if (!isSame) {
-      const inUse = document.activeElement;
-      this.marks.replaceChildren(...marks.map(({ element }) => element));
-      if (marks.some(({ element }) => element === inUse)) inUse.focus();
-    }
+    const elements = marks.map(({ element }) => element);
+    for (const gone of [...this.marks.children].filter((element) => !elements.includes(element))) gone.remove();
+    // One that stays is not taken out even for a moment: in hand it would be let go, in use it would lose the focus.
+    let next = this.marks.firstChild;
+    for (const element of elements)
+      if (element === next) next = next.nextSibling;
+      else this.marks.insertBefore(element, next);
     if (this.stage) this.placeMarks();
     this.stage?.redraw();
   }
@@ -202,12 +202,13 @@ export class Picture {
     const point = mark.point();
     mark.element.hidden = !point;
     if (!point) return;
-    const [x, y] = (mark.at = this.onScreen(point));
+    const [x, y, depth] = (mark.at = this.onScreen(point));
+    mark.element.style.setProperty("--nearness", Math.round(1e6 * (1 - depth)));
     mark.element.style.transform = `translate(${x}px, ${y}px)`;
     mark.element.classList.toggle("flipped", x > this.area.clientWidth - 170);
   }
 
-  /** Pixel in the first pane where a point of the world is seen. */
+  /** Pixel in the first pane where a point of the world is seen, and its depth from -1, near, to 1. */
   onScreen(point) {
     const { element } = this.panes[0];
     const camera = this.stage.camera;
@@ -215,7 +216,7 @@ export class Picture {
     camera.updateProjectionMatrix();
     camera.updateMatrixWorld();
     const seen = new Vector3(...point).project(camera);
-    return [element.offsetLeft + (0.5 + seen.x / 2) * element.offsetWidth, element.offsetTop + (0.5 - seen.y / 2) * element.offsetHeight];
+    return [element.offsetLeft + (0.5 + seen.x / 2) * element.offsetWidth, element.offsetTop + (0.5 - seen.y / 2) * element.offsetHeight, seen.z];
   }
 
   /** Where a pointer is, in pixels of the picture. */
