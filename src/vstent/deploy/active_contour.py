@@ -94,6 +94,19 @@ class State:
         off_mm = np.linalg.norm(centers_mm - self.centers_mm[rows, 0], axis=2)
         return replace(self, centers_mm=centers_mm, clearance_mm=np.maximum(self.clearance_mm[rows, 0] - off_mm, 0.0))
 
+    def near(self, points_mm: Floats, centers_mm: Floats, rows: Ints, columns: Ints) -> "State":
+        """Return points (n, 3) with fiducial points (n, 3) as a contour of one column; each is near one of the nodes.
+
+        Whether it terminated, and on what wall, is what that node, at (n,) rows and columns, did.
+        """
+        number = rows * self.nodes_mm.shape[1] + columns
+        return replace(
+            self.about(centers_mm[:, None], rows[:, None]),
+            nodes_mm=points_mm[:, None],
+            is_terminated=self.is_terminated[rows, columns][:, None],
+            contact=Contact(*(values[number] for values in self.contact)),
+        )
+
     @cached_property
     def terminated_fraction(self) -> float:
         """Part of the nodes that no longer move."""

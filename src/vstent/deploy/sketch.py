@@ -11,7 +11,7 @@ from typing import Final, final
 
 import numpy as np
 
-from vstent.deploy import pieces
+from vstent.deploy import cells, pieces
 from vstent.deploy.braid import FreeDiameter, Profile, landed_row, march
 from vstent.deploy.contour import Planes, circles, evenly_spaced, perimeters, planes
 from vstent.deploy.method import check_inside
@@ -107,7 +107,7 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
     flat = np.concatenate([wall.in_plane_mm, wall.gap_mm[..., None]], axis=2).reshape(len(wall.abscissa_mm), -1)
     laid = curves.interpolate(wall.abscissa_mm, flat, rows_mm).reshape(len(rows_mm), -1, 3)
     held = landed_row(design, size, landing)
-    slid = pieces.slide(design, size, wall.across.place(rows_mm, laid[..., :2]), held)
+    slid = pieces.slide(design, size, wall.across.place(rows_mm, laid[..., :2]), held, cells.as_drawn)
     rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), rows_mm, slid.row.mean(axis=1))
     near = np.clip(np.rint(slid.row).astype(int), 0, len(rows_mm) - 1)
     gap_mm = np.take_along_axis(laid[..., 2], near, axis=0) + np.linalg.norm(slid.lift_mm, axis=2)
