@@ -14,8 +14,7 @@ import numpy as np
 
 from vstent import device
 from vstent.deploy import METHODS, ConstantWire, deploy, propose_landing
-from vstent.deploy.braid import Profile, march
-from vstent.deploy.contour import planes
+from vstent.deploy.braid import Profile, bend, march
 from vstent.deploy.method import Placement, run
 from vstent.deploy.sketch import bed, sketch
 from vstent.deploy.wall import AbstractWall, Contact, landing_wall
@@ -93,9 +92,7 @@ def timed(work: Callable[[], Any], repeats: int = 5) -> tuple[Any, float]:
 def integral_mm(stent: Stent, anatomy: Anatomy) -> float:
     """Length that constant wires give at the diameters that the device has, where the artery bends as it does."""
     middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
-    across = planes(anatomy.axis)
-    bend = across.abscissa_mm, across.curvature_per_mm
-    profile = Profile(stent.row_abscissa_mm, stent.row_diameter_mm, bend)
+    profile = Profile(stent.row_abscissa_mm, stent.row_diameter_mm, bend(anatomy))
     return float(np.ptp(march(stent.design, stent.size, Landing(middle_mm), profile)))
 
 

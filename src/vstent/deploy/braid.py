@@ -60,11 +60,22 @@ class Profile:
 
 
 def expected_profile(design: Design, anatomy: Anatomy) -> Profile:
-    """Diameter that the contour will have where it lies against the landing surface."""
+    """Diameter that the contour will have where it lies against the landing surface, and the bends its rows heed.
+
+    Rows of a laser-cut device are put as in a straight artery: in a tight bend its cells leave the wall, and its rows
+    do not come as near together as those of a braid. From there `vstent.deploy.cells` moves them.
+    """
     offset_mm = design.wall_offset_um * MM_PER_UM
-    across = planes(anatomy.axis)
     diameter_mm = 2 * (anatomy.section_radius_mm - offset_mm)
-    return Profile(anatomy.axis.abscissa_mm, diameter_mm, (across.abscissa_mm, across.curvature_per_mm))
+    if isinstance(design, LaserCut):
+        return Profile(anatomy.axis.abscissa_mm, diameter_mm)
+    return Profile(anatomy.axis.abscissa_mm, diameter_mm, bend(anatomy))
+
+
+def bend(anatomy: Anatomy) -> tuple[Floats, Floats]:
+    """Return arc lengths (m,) and how the parent axis bends there (m,), per mm."""
+    across = planes(anatomy.axis)
+    return across.abscissa_mm, across.curvature_per_mm
 
 
 def landed_row(design: Design, size: Size, landing: Landing) -> int:
