@@ -260,9 +260,9 @@ def row_spacing_mm(
     longest = STRAIGHTEST / (1 + bend)
     cosine = np.minimum(np.cos(angle), longest)
     for _ in range(BEND_STEPS):  # Newton's; the mean grows faster than linearly with the cosine
-        steep = 1 - (cosine[..., None] * apart) ** 2
-        excess = (1 / np.sqrt(steep)).mean(axis=-1) - 1 / np.sin(angle)
-        slope = (cosine[..., None] * apart**2 / steep**1.5).mean(axis=-1)
+        width = 1 / np.sqrt(1 - (cosine[..., None] * apart) ** 2)
+        excess = width.mean(axis=-1) - 1 / np.sin(angle)
+        slope = cosine * (apart * apart * width * width * width).mean(axis=-1)
         cosine = np.clip(cosine - excess / slope, 0.0, longest)
     return piece_mm * cosine
 

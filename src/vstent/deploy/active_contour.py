@@ -1,7 +1,7 @@
 """The active contour of Zhong et al. 2016: a closed tube of nodes that grows until it meets the wall (eq. 1-7)."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final, final
 
 import numpy as np
@@ -33,6 +33,7 @@ class Stiffness:
     """Nodes around r."""
 
     @staticmethod
+    @lru_cache(maxsize=8)
     def of(contour: "ActiveContour", rows: int, columns: int) -> "Stiffness":
         """Factor I + tau K once for a grid."""
         wave = 2 - 2 * np.cos(2 * np.pi * np.arange(columns // 2 + 1) / columns)
