@@ -130,9 +130,8 @@ def _model(frame: _Frame, x: Floats) -> _Model:
     net, moves = frame.net, x.reshape(-1, 3)
     points_mm = _points_mm(net, moves, frame.laid)
     ways = TINY_MM * np.eye(3)
-    change = [_points_mm(net, moves + way, as_drawn) - _points_mm(net, moves - way, as_drawn) for way in ways]
-    change = np.stack(change, axis=1)
-    change /= 2 * TINY_MM
+    moved_mm = [_points_mm(net, moves + way, as_drawn) - _points_mm(net, moves - way, as_drawn) for way in ways]
+    change = np.stack(moved_mm, axis=1) / (2 * TINY_MM)
     strut_mm, strut_slopes = _lengths(points_mm, change, net.ends, net.bulge[net.line[net.ends[0]]])
     open_mm, open_slopes = _lengths(points_mm, change, frame.pairs, np.zeros(len(frame.free_mm)))
     ratio = open_mm / frame.free_mm

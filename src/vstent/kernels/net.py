@@ -203,7 +203,7 @@ def _diagonal(net: Any, weights: Any, inertia: float, slopes: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _stretching(net: Any, slopes: Any, waves: Any) -> Any:
-    """What pieces add to the normal matrix on moves of whole rows: blocks (l, BAND, BAND), lower, of a row and the next.
+    """Add up pieces' part of the normal matrix on moves of whole rows: (l, BAND, BAND), lower, of a row and the next.
 
     Inertia changes nothing here.
     """
