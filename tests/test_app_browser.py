@@ -228,7 +228,8 @@ def trim_and_draw_the_neck(client, page):
 
 
 def still(knob):
-    """Wait until it lies still: the view glides from step to step."""
+    """Wait until it is there and lies still: the view glides from step to step."""
+    knob.wait_for(state="visible")
     knob.element_handle().wait_for_element_state("stable")
 
 
