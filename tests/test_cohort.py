@@ -320,7 +320,7 @@ def test_slurm_jobs_that_the_queue_ends_are_asked_for_anew(scans, table, tmp_pat
 
     def ended(done, *_):
         if done == 1:
-            os.killpg(int(log.read_text()), signal.SIGKILL)
+            os.killpg(int(log.read_text().split()[-1]), signal.SIGKILL)
 
     run_cohort(left_to_do(cases, tmp_path / "out"), tmp_path / "out", Slurm(1, 400.0), ended)
     assert bare(collect(cases, tmp_path / "out")) == table
