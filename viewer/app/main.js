@@ -606,7 +606,7 @@ const deviceWith = (name, changes) => ({ devices }) => ({
   devices: devices.map((device) => (device.name === name ? { ...device, ...changes } : device)),
 });
 const SPOKEN = {
-  scan: "Scan", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes",
+  scan: "Scan", vessel: "Vessel", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes",
   deploy: "Deploying", struts: "Struts of", plan: "Cost of the flow", flow: "Flow,", vary: "How sure:", measure: "Numbers", report: "Report",
 };
 
