@@ -171,7 +171,7 @@ def speed(anatomy: Anatomy) -> list[str]:
         f"landing moved, times a second: contour by exact closest points {1 / contour_s:.0f}, with wires "
         f"{1 / deploy_s:.0f} ({done.stent.deployed_length_mm:.2f} mm long), sketch with wires {1 / sketch_s:.0f} "
         f"({sketched.stent.deployed_length_mm:.2f} mm, nodes {apart_mm.mean():.3f} to {apart_mm.max():.3f} mm off)",
-        f"of the contour's time {(wall.closest * closest_s + wall.crossings * crosses_s) / n:.3f} s are the wall's answers: "
+        f"the wall answers for {(wall.closest * closest_s + wall.crossings * crosses_s) / n:.3f} s of the contour: "
         "more processors make that part shorter, nothing but fewer questions the floor under it",
         f"{wall.closest} closest points at {closest_s / n * 1e6:.2f} us (plain: "
         f"{slow_closest_s / n_few * 1e6:.0f} us, {slow_closest_s / n_few / (closest_s / n):.0f} times as long)",
