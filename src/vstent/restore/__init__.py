@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from vstent.errors import InputError, VesselError
 from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats
-from vstent.restore.axis import fit_axis
+from vstent.restore.axis import Mouth, fit_axis
 from vstent.restore.bulges import Bulge, find_bulges
 from vstent.restore.drawn import cut_along
 from vstent.restore.landing import Landing, close_landing
@@ -65,8 +65,8 @@ def restore(
         x, y, z = np.asarray(at_mm, dtype=float)
         raise InputError(f"no sac stands out of the artery near {x:.1f}, {y:.1f}, {z:.1f} mm: give a point in its dome")
     path = _parent_path(vessel, bulges, outlet_mm)
-    feet = [_foot_on(vessel.centerlines[path], bulge) for bulge in bulges]
-    tube = fit_axis(vessel.lumen, vessel.centerlines[path], feet)
+    mouths = [Mouth(_foot_on(vessel.centerlines[path], bulge), bulge.inward) for bulge in bulges]
+    tube = fit_axis(vessel.lumen, vessel.centerlines[path], mouths)
     landing = close_landing(vessel.lumen, tube, drawn.artery if drawn else None)
     side_lines = [line for k, line in enumerate(vessel.centerlines) if k != path]
     sacs = [drawn_sac(vessel, landing, side_lines, drawn)] if drawn else _sacs(vessel, landing, side_lines, bulges)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.regions import region
-from vstent.restore.axis import fit_axis
+from vstent.restore.axis import Mouth, fit_axis
 from vstent.restore.bulges import FLANK, Bulge, bulge_at
 from vstent.restore.drawn import Drawn
 from vstent.restore.landing import Landing, close_landing
@@ -201,7 +201,7 @@ def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) ->
     course = _into_parent(landing, line, bulge)
     if course is None:
         return None
-    side = close_landing(lumen, fit_axis(lumen, course, [bulge.foot_mm]))
+    side = close_landing(lumen, fit_axis(lumen, course, [Mouth(bulge.foot_mm, bulge.inward)]))
     is_own = (~side.is_restored).mean(axis=1) > OWN_WALL
     is_own &= bulge.distances_mm(side.points_mm) > 1.2 * side.section_radius_mm
     lost = np.flatnonzero(~is_own & (landing.solid.signed_distance(side.points_mm) > 0))
