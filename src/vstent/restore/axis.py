@@ -29,7 +29,9 @@ FLARE_LENGTH: Final = 1.5
 """The artery flares into a neck over at most this many of its radii."""
 FAR_SIDE: Final = -0.2
 """A ray looks at the far side of the neck if the cosine of its angle with the sac's direction is below this."""
-SIDE_TRUST: Final = 0.25
+INTO: Final = 0.5
+"""A neck is looked for this many radii above the middle of its foot, which may lie on the artery's axis."""
+SIDE_TRUST: Final = 0.1
 """Across the way into a neck the medial line counts as this fraction of all rays of a section."""
 NECK_TRUST: Final = 10.0
 """Weight of the interpolated radius across a neck against all rays of a section."""
@@ -104,8 +106,7 @@ def _across_necks(points: Floats, radius: Floats, mouths: Sequence[Mouth]) -> _N
             continue
         typical = float(np.median(np.interp(at_foot, abscissa, radius)))
         neck = (abscissa > at_foot.min() - FLARE_LENGTH * typical) & (abscissa < at_foot.max() + FLARE_LENGTH * typical)
-        # The middle of a foot that embraces the artery lies on its axis: a point within the sac tells where that is.
-        into = foot_mm.mean(axis=0) + typical * inward - points
+        into = foot_mm.mean(axis=0) + INTO * typical * inward - points
         to_sac = np.einsum("nrd,nd->nr", directions, into)
         reach = to_sac.max(axis=1, keepdims=True)
         beside = neck[:, None] & (reach > 0.5 * typical)

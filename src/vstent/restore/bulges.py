@@ -44,9 +44,10 @@ class Bulge:
 
     @property
     def inward(self) -> Floats:
-        """(3,) unit vector from the middle of its foot into it."""
-        way = self.points_mm.mean(axis=0) - self.foot_mm.mean(axis=0)
-        return np.asarray(way / max(float(np.linalg.norm(way)), 1e-12))
+        """(3,) unit vector square to the plane of its foot, into it: a sac may hang to the side of its mouth."""
+        vector = triangles.polygon_area_vector(self.foot_mm)
+        vector *= np.sign((self.points_mm.mean(axis=0) - self.foot_mm.mean(axis=0)) @ vector)
+        return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))
 
     def distances_mm(self, points_mm: Floats) -> Floats:
         """Distance (k,) of each of (k, 3) points to the nearest vertex of the bulge."""
