@@ -184,7 +184,8 @@ def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge
             is_branch &= (place <= 0) | (place >= curves.arc_length(side.points_mm)[-1])
         proper += [Centerline(line.points_mm[run], line.inscribed_radius_mm[run]) for run in _runs(is_branch)]
     branches = tubes_of(proper)
-    return Artery(tuple(landings), branches, apart_mm(landings, branches, _low_mm(vessel, landing, bulge)))
+    along_mm = np.concatenate([np.zeros(0), *(line.abscissa_mm for line in proper)])
+    return Artery(tuple(landings), branches, apart_mm(landings, branches, along_mm, _low_mm(vessel, landing, bulge)))
 
 
 def _runs(member: Bools) -> list[slice]:
