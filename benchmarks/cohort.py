@@ -2,13 +2,17 @@
 
 Run from the repository: ``python benchmarks/cohort.py [CASES] [JOBS]`` (20 and 2; ``200 2`` is the full one). The
 phantoms and the cohort's table are kept in ``cohort-of-phantoms`` in the temporary folder: run again, it does what is
-missing.
+missing. Where Dask is installed the cohort is then done a second time by a local cluster, of whose workers one is
+killed midway, and the two tables are compared.
 """
 
+import importlib.util
 import os
+import signal
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +20,9 @@ from numpy.random import Generator
 
 from vstent import phantoms
 from vstent.cli import main
-from vstent.cohort import collect, find_cases
+from vstent.cohort import Case, collect, find_cases, left_to_do, run_cohort
+from vstent.cohort.crews import DaskCluster
+from vstent.cohort.work import Row
 from vstent.io.writers import write_stl
 from vstent.phantoms import Phantom
 from vstent.study import Settings
@@ -24,6 +30,8 @@ from vstent.study import Settings
 SEED = 7
 EDGE_MM = 0.3
 DEVICES = ("silk", "enterprise")
+COST = ("case_s", "case_cpu_s", "peak_memory_MB")
+"""What a row tells of the computer, not of the case."""
 
 
 def artery(random: Generator) -> Phantom:
@@ -65,19 +73,45 @@ def cohort(count: int, jobs: int) -> None:
     given = [str(folder / f"scans-{count}"), "--out", str(out), "--no-flow", "--units", "mm", "--jobs", str(jobs)]
     main(["batch", *given, *devices])
     settings = Settings(devices=DEVICES, flow=None, units="mm")
-    rows = collect(find_cases(folder / f"scans-{count}", settings), out)
-    done = [row for row in rows if row["outcome"] == "done"]
-    cpu_s = [row["case_cpu_s"] for row in rows[:: len(DEVICES)]]
-    print("| cases | rows done | rows failed | wall, s | CPU s a case | most | memory, MB |")
-    print("|---|---|---|---|---|---|---|")
-    peak = max(row["peak_memory_MB"] for row in rows)
-    print(
-        f"| {count} | {len(done)} | {len(rows) - len(done)} | {time.perf_counter() - began:.0f} "
-        f"| {np.mean(cpu_s):.1f} | {max(cpu_s):.1f} | {peak:.0f} |"
-    )
+    cases = find_cases(folder / f"scans-{count}", settings)
+    rows = collect(cases, out)
+    print("| cases | by | rows done | rows failed | wall, s | CPU s a case | most | memory, MB |")
+    print("|---|---|---|---|---|---|---|---|")
+    tell(f"{jobs} processes", rows, time.perf_counter() - began)
+    if importlib.util.find_spec("distributed"):
+        began, other = time.perf_counter(), by_dask(cases, folder / f"out-{count}-dask", jobs)
+        tell(f"Dask, {jobs} workers, one killed", other, time.perf_counter() - began)
+        print("The two tables are", "the same." if bare(other) == bare(rows) else "NOT the same.")
     for row in rows:
         if row["outcome"] != "done":
             print(f"{row['case']} {row['device']} {row['outcome']} {row['stage']}: {row['sentence']}")
+
+
+def tell(by: str, rows: Sequence[Row], wall_s: float) -> None:
+    done = sum(row["outcome"] == "done" for row in rows)
+    cpu_s = [row["case_cpu_s"] for row in rows[:: len(DEVICES)]]
+    peak = max(row["peak_memory_MB"] for row in rows)
+    figures = f"{done} | {len(rows) - done} | {wall_s:.0f} | {np.mean(cpu_s):.1f} | {max(cpu_s):.1f} | {peak:.0f}"
+    print(f"| {len(rows) // len(DEVICES)} | {by} | {figures} |", flush=True)
+
+
+def by_dask(cases: Sequence[Case], out: Path, jobs: int) -> list[Row]:
+    """Let a local cluster do the cohort, and kill the worker that has begun first when half of it is done."""
+    from distributed import LocalCluster
+
+    tasks = left_to_do(cases, out)
+    with LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None) as cluster:
+
+        def told(done: int, total: int, _name: str, _rows: Sequence[Row]) -> None:
+            if done == total // 2:
+                os.kill(cluster.workers[0].pid, signal.SIGKILL)
+
+        run_cohort(tasks, out, DaskCluster(cluster.scheduler_address), told)
+    return collect(cases, out)
+
+
+def bare(rows: Sequence[Row]) -> list[Row]:
+    return [{key: value for key, value in row.items() if key not in COST} for row in rows]
 
 
 if __name__ == "__main__":

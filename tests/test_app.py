@@ -103,6 +103,22 @@ def test_command_line_rest_and_python_find_the_same_numbers(client, case, artery
     assert "sandbox" in report.headers["content-security-policy"]
 
 
+def test_voxels_without_a_header_wait_for_their_number_and_size(client):
+    voxels = np.full((24, 20, 16), 10, dtype=np.uint8)
+    voxels[6:18, 6:14, 4:12] = 200
+    bare = client.post("/api/cases", json={"name": "bare voxels"}).json()["id"]
+    client.put(f"/api/cases/{bare}/input", params={"name": "scan.raw"}, content=voxels.tobytes())
+    client.post(f"/api/cases/{bare}/input/done")
+    case = f"/api/cases/{bare}"
+    view = client.get(case).json()
+    assert view["wants_grid"]
+    assert (view["job"], view["failed"]) == (None, {})
+    for spacing_mm in ([0.5, 0.25, 2.0], [0.3, 0.3, 0.3]):
+        assert not choose(client, case, spacing_mm=spacing_mm, shape=[16, 20, 24]).json()["wants_grid"]
+        told = client.get(f"{case}/image").json()
+        assert (told["shape"], told["spacing_mm"]) == ([16, 20, 24], pytest.approx(spacing_mm))
+
+
 def test_a_second_tab_cannot_undo_what_the_first_has_done(client, case):
     before = client.get(case).json()
     assert choose(client, case, inlet_mm=[1.0, 2.0, 3.0]).status_code == 200

@@ -122,6 +122,73 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         page.wait_for_function("() => document.querySelector('button[aria-label=Undo]').disabled")
 
 
+CENTER_MM = np.array([10.0, -20.0, 30.0])
+"""Middle of the scan of a ball, in LPS."""
+OFFSET_MM = np.array([6.0, -4.0, 5.0])
+"""The ball lies to the left, to the front and to the head of it."""
+LOOKS = {"Sagittal": (1, 2, "APSI", 0.5), "Coronal": (0, 2, "RLSI", 0.8), "Axial": (0, 1, "RLAP", 0.5)}
+"""World axes to the right and downwards, the letters at the left, right, top and bottom, and the pixel in mm."""
+
+
+def ball_scan(path):
+    """A bright ball in a scan whose axes run to the feet, to the right and to the back, 1.5, 0.8 and 0.5 mm apart."""
+    import SimpleITK
+
+    axes, spacing_mm, shape = np.array([[0, 0, -1], [-1, 0, 0], [0, 1, 0]]), [1.5, 0.8, 0.5], [30, 50, 70]
+    origin_mm = CENTER_MM - 0.5 * (np.array(shape) - 1) * spacing_mm @ axes
+    places_mm = np.moveaxis(np.indices(shape), 0, -1) * spacing_mm @ axes + origin_mm
+    inside = np.linalg.norm(places_mm - CENTER_MM - OFFSET_MM, axis=-1) < 8.5
+    image = SimpleITK.GetImageFromArray((200 * inside).astype(np.uint8).T)
+    image.SetSpacing(spacing_mm)
+    image.SetOrigin(origin_mm)
+    image.SetDirection(axes.T.ravel().astype(float))
+    SimpleITK.WriteImage(image, path)
+
+
+def test_slices_lie_as_a_radiologist_expects_however_the_voxels_are_stored(tmp_path):
+    ball_scan(tmp_path / "ball.nii.gz")
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        drop(page, tmp_path / "ball.nii.gz")
+        page.wait_for_selector(".step.failed")  # a ball is no vessel
+        step(page, "Image")
+        page.wait_for_selector(".slice-canvas")
+        for place, (title, (right, down, letters, pixel_mm)) in enumerate(LOOKS.items()):
+            pane = page.locator(f".slice:has-text('{title}')")
+            playwright.expect(pane).to_be_visible()
+            assert "".join(pane.locator(".slice-side").all_inner_texts()) == letters
+            box = pane.bounding_box()
+            assert (box["x"] > 500, box["y"] > 300) == [(False, False), (True, False), (False, True)][place]
+            wanted = CENTER_MM.copy()
+            wanted[[right, down]] += OFFSET_MM[[right, down]]
+            offset = OFFSET_MM[right] / pixel_mm, OFFSET_MM[down] / (pixel_mm if down == 1 else -pixel_mm)
+            page.mouse.click(*on_slice(pane.locator("canvas"), *offset))
+            page.wait_for_function("count => document.querySelectorAll('.toast').length > count", arg=place)
+            assert np.abs(np.array(chosen(client)["at_mm"]) - wanted).max() < 0.8
+        # What is drawn lies where a click finds it.
+        brightest = page.locator(".slice-canvas").last.evaluate(MIDDLE_OF_WHITE)
+        width_mm, height_mm = 50 * 0.8, 70 * 0.5
+        assert brightest == pytest.approx([0.5 + 6 / width_mm, 0.5 - 4 / height_mm], abs=0.02)
+
+
+MIDDLE_OF_WHITE = """(canvas) => {
+    const { width, height } = canvas;
+    const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
+    let [n, x, y] = [0, 0, 0];
+    for (let i = 0; i < width * height; i++) {
+        if (data[4 * i] > 128) (n++, (x += i % width), (y += Math.floor(i / width)));
+    }
+    return [(x / n + 0.5) / width, (y / n + 0.5) / height];
+}"""
+
+
+def on_slice(canvas, right, down):
+    """Where on the page lies what is so many pixels of the slice from its middle."""
+    box = canvas.bounding_box()
+    width, height = canvas.evaluate("(canvas) => [canvas.width, canvas.height]")
+    scale = min(box["width"] / width, box["height"] / height)
+    return box["x"] + box["width"] / 2 + right * scale, box["y"] + box["height"] / 2 + down * scale
+
+
 def chosen(client):
     case = client.get("/api/cases").json()["cases"][0]["id"]
     return client.get(f"/api/cases/{case}").json()["choices"]
@@ -161,7 +228,8 @@ def trim_and_draw_the_neck(client, page):
 
 
 def still(knob):
-    """Wait until it lies still: the view glides from step to step."""
+    """Wait until it is there and lies still: the view glides from step to step."""
+    knob.wait_for(state="visible")
     knob.element_handle().wait_for_element_state("stable")
 
 

@@ -14,6 +14,7 @@ from vstent import phantoms
 from vstent.cli import main
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
+from vstent.study import CACHE
 from vstent.surface import Surface
 
 
@@ -82,7 +83,7 @@ def test_the_parts_refuse_bad_input_as_the_whole_does(
 def test_trace_writes_wall_openings_and_centerlines(artery: Path, tmp_path: Path) -> None:
     out, phantom = tmp_path / "out", phantoms.demo_phantom()
     assert main(["trace", str(artery), "--out", str(out), "--units", "mm"]) == 0
-    assert sorted(file.name for file in out.iterdir()) == ["centerlines.vtp", "openings.json", "vessel.vtp"]
+    assert sorted(file.name for file in out.iterdir()) == [CACHE, "centerlines.vtp", "openings.json", "vessel.vtp"]
     openings = json.loads((out / "openings.json").read_text())["openings"]
     assert [o["role"] for o in openings] == ["inlet", "outlet_1", "outlet_2"]
     for opening in openings:

@@ -300,6 +300,33 @@ def test_a_slurm_job_asks_for_twice_the_memory_foreseen_and_holds_one_case():
     assert "--nthreads 1" in script
 
 
+QUEUE = {
+    "sbatch": 'job=$(cat "$1")\nsetsid sh -c "$job" >/dev/null 2>&1 &\necho $! >> {log}; echo "Submitted batch job $!"',
+    "scancel": "kill -9 -- -$1",
+}
+"""A queue of Slurm's commands that starts every job at once."""
+
+
+@needs_dask
+def test_slurm_jobs_that_the_queue_ends_are_asked_for_anew(scans, table, tmp_path, monkeypatch):
+    pytest.importorskip("dask_jobqueue")
+    log = tmp_path / "jobs"
+    for name, script in QUEUE.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{script.format(log=log)}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.chdir(tmp_path)
+    cases = find_cases(scans, SETTINGS)
+
+    def ended(done, *_):
+        if done == 1:
+            os.killpg(int(log.read_text().split()[-1]), signal.SIGKILL)
+
+    run_cohort(left_to_do(cases, tmp_path / "out"), tmp_path / "out", Slurm(1, 400.0), ended)
+    assert bare(collect(cases, tmp_path / "out")) == table
+    assert len(log.read_text().split()) > 1
+
+
 class Scheduler:
     """A Dask scheduler and its workers, each a process of its own."""
 

@@ -69,6 +69,23 @@ def test_every_dictionary_is_one(flavour: str, is_pulse: bool, outlets: str) -> 
     assert float(viscosity[-1]) == pytest.approx(0.004 / 1060)
 
 
+@pytest.mark.parametrize(("cell_mm", "halved"), [(0.25, 0), (0.4, 1), (0.8, 2)])
+def test_a_narrow_opening_gets_the_cells_that_keep_it_open(cell_mm: float, halved: int) -> None:
+    foam = foam_case(case(), replace(SETUP, cell_size_mm=cell_mm))
+    meshed = parse(foam.files["system/snappyHexMeshDict"])["castellatedMeshControls"]
+    level = {name: int(one["level"][1]) for name, one in meshed["refinementSurfaces"]["lumen"]["regions"].items()}
+    assert level["outlet_2"] - level["wall"] == halved
+    assert 2 * BRANCH_MM / (cell_mm / 2**halved) >= 8 > (2 * BRANCH_MM / (cell_mm / 2 ** (halved - 1)) if halved else 0)
+    assert ("before_outlet_2" in meshed["refinementRegions"]) == bool(halved)
+    if halved:
+        cylinder = parse(foam.files["system/snappyHexMeshDict"])["geometry"]["before_outlet_2"]
+        first, last = (np.array(cylinder[point][1:4], dtype=float) * 1000 for point in ("point1", "point2"))
+        opening = case().vessel.outlets[1]
+        assert np.linalg.norm(np.cross(first - opening.center_mm, last - opening.center_mm)) < 1e-6
+        assert np.linalg.norm(first - opening.center_mm) == pytest.approx(opening.diameter_mm, rel=1e-6)
+        assert (last - opening.center_mm) @ (opening.center_mm - first) > 0
+
+
 @pytest.mark.parametrize("flavour", ["com", "org"])
 def test_blood_that_thins_has_its_law_in_openfoams_words(flavour: str) -> None:
     thin = Blood(1050.0, 0.00345, CarreauYasuda())

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tubes import line, tube, with_neck
@@ -12,7 +13,7 @@ from vstent.cli import main
 from vstent.flow import FlowCase, FlowField
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
-from vstent.study import stages
+from vstent.study import Settings, restore_vessel, stages
 from vstent.study.outputs import write_anatomy
 
 
@@ -28,6 +29,20 @@ def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path)
         assert (tmp_path / f"neck{number}.vtp").stat().st_size > 500
     write_anatomy(tmp_path, artery)
     assert {file.name for file in tmp_path.glob("[sn][ae]c*.vtp")} == {"sac.vtp", "neck.vtp", "sac_mine.vtp"}
+
+
+def test_trimmed_otherwise_the_vessel_is_the_one_that_was_traced_and_the_result_the_same(tmp_path: Path) -> None:
+    artery, told = tmp_path / "artery.stl", []
+    tube = phantoms.tube(length_mm=24.0)
+    write_stl(artery, phantoms.phantom_surface(phantoms.with_sac(tube, abscissa_mm=12.0), edge_mm=0.6))
+    shorter = Settings(units="mm", upstream_mm=7.0)
+    restore_vessel(artery, tmp_path / "again", Settings(units="mm"), lambda *_: None)
+    again, _ = restore_vessel(artery, tmp_path / "again", shorter, lambda stage, *_: told.append(stage))
+    anew, _ = restore_vessel(artery, tmp_path / "anew", shorter, lambda *_: None)
+    assert list(dict.fromkeys(told)) == ["vessel", "trim", "restore"]
+    for name in ("vessel.vtp", "landing_surface.vtp", "sac.vtp", "morphology.json"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "anew" / name).read_bytes()
+    np.testing.assert_array_equal(again.landing_surface.vertices_mm, anew.landing_surface.vertices_mm)
 
 
 def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(

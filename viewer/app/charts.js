@@ -168,10 +168,17 @@ export function pulseChart({ time_s, factor }, isPulsatile, times, moment, chose
   const at = (t) => factor[Math.round((t / time_s.at(-1)) * (factor.length - 1))];
   times.forEach((t, k) => {
     const dot = svg("circle", { cx: x(t), cy: y(at(t)), r: k === moment ? 6 : 4, class: k === moment ? "dot moment now" : "dot moment", tabindex: 0, role: "button", "aria-label": `Show ${t.toFixed(2)} s` });
-    dot.addEventListener("click", () => chosen(k === moment ? undefined : k));
-    dot.addEventListener("keydown", (event) => event.key === "Enter" && chosen(k === moment ? undefined : k));
+    dot.addEventListener("keydown", (event) => event.key === "Enter" && choose(k));
     parts.push(dot);
   });
   if (moment !== undefined && times.length) parts.push(svg("line", { x1: x(times[moment]), x2: x(times[moment]), y1: top, y2: height - bottom, class: "cursor" }));
-  return svg("svg", { class: "chart small", viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "Inlet waveform" }, parts);
+  const chart = svg("svg", { class: "chart small", viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "Inlet waveform" }, parts);
+  // A click takes the nearest moment; on the one shown it goes back to the mean.
+  const choose = (k) => chosen(k === moment ? undefined : k);
+  chart.addEventListener("click", (event) => {
+    const box = chart.getBoundingClientRect();
+    const away = times.map((t) => Math.abs(x(t) - ((event.clientX - box.left) * width) / box.width));
+    if (away.length) choose(away.indexOf(Math.min(...away)));
+  });
+  return chart;
 }

@@ -81,7 +81,7 @@ class Page {
     this.view = null;
     this.anatomyKey = this.flowKey = this.scanKey = undefined;
     this.anatomy = null;
-    this.slices = null;
+    this.scan = this.slices = this.scanViews = null;
     this.measures = {};
     this.moment = this.times = this.flowPanes = this.sheets = undefined;
   }
@@ -140,10 +140,10 @@ class Page {
     this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.surfaces = new Newest(
-      ({ manifest, buffer }) => {
-        // Where the vessel is not known yet, the surface says where to look.
-        const views = this.picture.views.length ? [] : manifest.views;
-        this.picture.put({ manifest: { ...manifest, views }, buffer });
+      (answer) => {
+        this.picture.put(answer);
+        if (!this.scanViews?.length) this.scanViews = answer.manifest.views;
+        this.renderScene();
       },
       (problem) => this.complain(problem),
     );
@@ -216,7 +216,8 @@ class Page {
   /** Fetch what has changed for the picture. */
   load() {
     const { view } = this;
-    if (view.is_scan && this.step === "image" && this.scanKey !== view.id) this.loadScan();
+    const grid = JSON.stringify([view.id, view.choices.shape, view.choices.spacing_mm]);
+    if (view.is_scan && !view.wants_grid && this.step === "image" && this.scanKey !== grid) this.loadScan(grid);
     if (view.has_anatomy && this.anatomyKey !== view.anatomy) this.loadAnatomy();
     const flow = view.has_flow ? `${view.steps.flow} ${view.anatomy} ${!view.job}` : undefined;
     if (view.has_flow && !view.job && this.flowKey !== flow && ["flow", "report"].includes(this.step)) {
@@ -225,14 +226,16 @@ class Page {
     }
   }
 
-  async loadScan() {
-    this.scanKey = this.view.id;
+  async loadScan(grid) {
+    this.scanKey = grid;
+    this.scanViews = null;
     try {
       const scan = await get(`${this.path}/image`);
       this.scan = scan;
       this.slices = new Slices(this.path, (point, isLumen) => (isLumen ? this.setSeed(point) : this.tell("There is no lumen at that point: click a bright one.")), (problem) => this.complain(problem));
       this.sliceBox.replaceChildren(...this.slices.elements);
-      this.slices.show(scan, this.neckPoint());
+      this.slices.show(scan);
+      this.lookAtNeck();
       this.showThreshold(this.view.choices.threshold ?? scan.proposed_threshold);
       this.render();
     } catch (problem) {
@@ -240,10 +243,10 @@ class Page {
     }
   }
 
-  /** The middle of the neck on the parent axis, where one is known. */
-  neckPoint() {
+  /** Turn the slices to the middle of the neck, once one is known. */
+  lookAtNeck() {
     const neck = this.anatomy?.neck;
-    return neck?.length ? this.axis.at((neck[0] + neck[1]) / 2) : null;
+    if (neck?.length) this.slices?.look(this.axis.at((neck[0] + neck[1]) / 2));
   }
 
   /** The live surface and the outline at a threshold. */
@@ -256,16 +259,15 @@ class Page {
     this.anatomyKey = this.view.anatomy;
     try {
       const answer = await getBinary(`${this.path}/anatomy`);
-      const isFirst = !this.anatomy;
       this.anatomy = answer.manifest;
       this.picture.stage?.drop(({ id }) => id.startsWith("opening ") || ["lumen", "landing", "sac", "neck", "wires", "contour"].includes(id));
       this.picture.put(answer);
       this.neck.given = null; // its curve is drawn anew over the one found
-      if (isFirst) this.picture.look(VIEW[this.step], false);
       this.axis = new Axis(answer.manifest.axis, this.picture);
       this.deploying.setAxis(this.axis);
       this.trimming.set(this.axis, answer.manifest.neck);
       this.along.set({ axis: answer.manifest.axis, neck: answer.manifest.neck });
+      this.lookAtNeck();
       this.sheets = (await get(`${this.path}/numbers`));
       this.measures = {};
       this.render();
@@ -339,6 +341,7 @@ class Page {
     this.sliceBox.hidden = !isScan;
     this.frame.classList.toggle("with-slices", Boolean(isScan));
     const layers = LAYERS[this.step](this);
+    this.picture.setViews(...(isScan ? ["scan", this.scanViews] : ["vessel", this.anatomy?.views]), VIEW[this.step]);
     this.picture.setPanes(this.step === "flow" || this.step === "report" ? this.panes() : [{ id: this.device || "one", title: "" }]);
     this.picture.setLayers(layers, (this.memory[this.step] ??= {}));
     this.picture.clicked = this.step === "sac" ? (point) => point && this.setSeed(point) : null;
@@ -603,7 +606,7 @@ const deviceWith = (name, changes) => ({ devices }) => ({
   devices: devices.map((device) => (device.name === name ? { ...device, ...changes } : device)),
 });
 const SPOKEN = {
-  scan: "Scan", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes",
+  scan: "Scan", vessel: "Vessel", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes",
   deploy: "Deploying", struts: "Struts of", plan: "Cost of the flow", flow: "Flow,", vary: "How sure:", measure: "Numbers", report: "Report",
 };
 

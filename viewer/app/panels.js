@@ -10,7 +10,8 @@ function failure(page) {
 }
 
 function staleness(page) {
-  return page.view.steps[page.step] === "stale" ? [make("p", { className: "note stale" }, ["Something before this step has changed. What you see is from before the change."])] : [];
+  const words = page.step === "image" ? "The vessel that was found is of an earlier choice." : "Something before this step has changed. What you see is from before the change.";
+  return page.view.steps[page.step] === "stale" ? [make("p", { className: "note stale" }, [words])] : [];
 }
 
 /** A word where the vessel itself is out of date. */
@@ -33,6 +34,13 @@ function number(page, key, label, unit, value, changed, { placeholder = "propose
   if (min !== undefined) input.min = min;
   input.dataset.key = key;
   input.addEventListener("change", () => changed(input.value === "" ? null : Number(input.value)));
+  return make("label", { className: "field", htmlFor: `field-${key}` }, [make("span", {}, [label]), input, make("small", {}, [unit])]);
+}
+
+function words(key, label, unit, values, placeholder, changed) {
+  const input = make("input", { type: "text", value: values?.join(" ") ?? "", placeholder, id: `field-${key}` });
+  input.dataset.key = key;
+  input.addEventListener("change", () => changed(input.value));
   return make("label", { className: "field", htmlFor: `field-${key}` }, [make("span", {}, [label]), input, make("small", {}, [unit])]);
 }
 
@@ -66,13 +74,14 @@ function again(page) {
   const { steps, job, has_anatomy } = page.view;
   const isCurrent = ["image", "vessel", "sac"].every((step) => steps[step] === "done");
   if (job) return [];
-  if (isCurrent) return [];
+  if (isCurrent || page.view.wants_grid) return [];
   return [main(page, has_anatomy ? "Find the vessel again" : "Find the vessel", () => page.start("anatomy"))];
 }
 
 export const panels = {
   image(page) {
     const parts = [...title("Image", page.view.is_scan ? "The lumen is what is brighter than the threshold." : "This case began with a surface: there is no scan to look at.")];
+    if (page.view.wants_grid || page.view.choices.spacing_mm) parts.push(...grid(page));
     if (page.view.is_scan && page.scan) parts.push(...threshold(page));
     if (!page.view.is_scan) {
       parts.push(select("units", "Length unit", page.view.choices.units ?? "", [["", "guessed"], ["mm", "mm"], ["cm", "cm"], ["m", "m"]], (unit) => page.choose({ units: unit || null })));
@@ -171,6 +180,22 @@ export const panels = {
     return parts;
   },
 };
+
+/** How many and how large the voxels are, where the file has no header that tells. */
+function grid(page) {
+  const { shape, spacing_mm } = page.view.choices;
+  const chosen = (key, isFine) => (words) => {
+    const given = words.split(/[\s,;×x]+/).filter(Boolean).map(Number);
+    const three = given.length === 1 ? [given[0], given[0], given[0]] : given;
+    if (three.length === 3 && three.every(isFine)) page.choose({ [key]: three });
+    else page.tell("Give three numbers, or one for all three.", "problem");
+  };
+  return [
+    make("p", { className: "hint" }, ["These voxels have no header: it must be said how many and how large they are, the one that runs fastest first."]),
+    words("shape", "Voxels", "", shape, "256 256 256", chosen("shape", (n) => Number.isInteger(n) && n > 0)),
+    words("spacing_mm", "Spacing", "mm", spacing_mm, "0.3 0.3 0.3", chosen("spacing_mm", (mm) => mm > 0)),
+  ];
+}
 
 function threshold(page) {
   const { scan, view } = page;

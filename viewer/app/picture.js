@@ -55,22 +55,20 @@ export class Picture {
     });
   }
 
-  /** Add layers; a layer of the same name in the same pane is replaced. Views that come along replace those there were. */
+  /** Add layers; a layer of the same name in the same pane is replaced. */
   put({ manifest, buffer }) {
     if (!this.stage) return;
     this.stage.put(manifest, buffer);
     if (manifest.fade) this.stage.shared.fade = manifest.fade;
-    if (manifest.views?.length) {
-      const isFirst = !this.views.length;
-      this.views = manifest.views;
-      if (isFirst) this.look(this.views[0].id, false);
-    }
     this.apply();
   }
 
-  clear() {
-    this.views = [];
-    this.stage?.drop(() => true);
+  /** Offer the views of what is shown, a scan or a vessel; the other one than before is looked at anew. */
+  setViews(what, views, id) {
+    this.views = views || [];
+    if (what === this.seen || !this.views.length) return;
+    this.seen = what;
+    this.look(id, false);
   }
 
   setPanes(panes) {

@@ -1,9 +1,16 @@
-// Three orthogonal slices of a scan: window and level, the mask's outline, a click for the seed.
+// Three orthogonal slices of a scan, laid as a radiologist expects them: the patient's right on the left, the head on top;
+// window and level, the mask's outline, a click for the seed.
 import { make } from "../src/dom.js";
 import { numbers } from "../src/decode.js";
 import { getBinary, Newest } from "./api.js";
 
-const TITLES = ["Sagittal", "Coronal", "Axial"];
+/** By the axis of the world (to the left, to the back, to the head) that a slice is across. */
+const PLANES = [
+  { title: "Sagittal", right: [1, 1], down: [2, -1], letters: ["A", "P", "S", "I"] },
+  { title: "Coronal", right: [0, 1], down: [2, -1], letters: ["R", "L", "S", "I"] },
+  { title: "Axial", right: [0, 1], down: [1, 1], letters: ["R", "L", "A", "P"] },
+];
+const SIDES = ["left", "right", "top", "bottom"];
 
 export class Slices {
   constructor(path, seeded, failed) {
@@ -18,21 +25,22 @@ export class Slices {
 
   view(axis, failed) {
     const canvas = make("canvas", { className: "slice-canvas" });
-    const slider = make("input", { type: "range", min: 0, value: 0, ariaLabel: `${TITLES[axis]} slice` });
-    const label = make("span", { className: "slice-label" }, [TITLES[axis]]);
-    const element = make("div", { className: "slice" }, [canvas, label, slider]);
-    const view = { axis, canvas, slider, label, element, plane: null };
+    const slider = make("input", { type: "range", min: 0, value: 0 });
+    const label = make("span", { className: "slice-label" });
+    const letters = SIDES.map((side) => make("span", { className: `slice-side at-${side}` }));
+    const element = make("div", { className: "slice" }, [canvas, label, ...letters, slider]);
+    const view = { axis, canvas, slider, label, letters, element, plane: null };
     view.line = new Newest(({ manifest, buffer }) => {
       view.plane = { width: manifest.width, height: manifest.height, values: numbers(buffer, manifest.values) };
       this.paint(view);
     }, failed);
-    slider.addEventListener("input", () => this.load(view));
+    slider.addEventListener("input", () => this.turn(view));
     element.addEventListener(
       "wheel",
       (event) => {
         event.preventDefault();
         slider.value = Number(slider.value) + Math.sign(event.deltaY);
-        this.load(view);
+        this.turn(view);
       },
       { passive: false },
     );
@@ -66,22 +74,45 @@ export class Slices {
     });
   }
 
-  /** Begin with the slices through a point of the world, or the middle ones. */
-  show(scan, point) {
+  /** Begin with a scan: its middle slices. */
+  show(scan) {
     this.scan = scan;
-    const middle = point ? indexOf(scan.affine_mm, point) : scan.shape.map((n) => Math.floor(n / 2));
+    this.isTurned = false;
     const [low, high] = scan.range;
     this.window = { width: (high - low) * 0.9, level: low + (high - low) * 0.5 };
+    const across = worldAxes(scan.affine_mm);
     for (const view of this.views) {
+      view.laid = laid(across, scan.affine_mm, view.axis);
+      const { title, letters } = view.laid;
+      view.slider.ariaLabel = `${title} slice`;
+      view.letters.forEach((element, i) => (element.textContent = letters[i]));
       view.slider.max = scan.shape[view.axis] - 1;
-      view.slider.value = Math.round(middle[view.axis]);
+      // The canvases stand in the order sagittal, coronal, axial, however the voxels are stored.
+      view.element.style.order = across[view.axis] - 3;
+    }
+    this.go(scan.shape.map((n) => Math.floor(n / 2)));
+  }
+
+  /** Show the slices through a point of the world, unless somebody has turned to others. */
+  look(point) {
+    if (this.scan && !this.isTurned) this.go(indexOf(this.scan.affine_mm, point));
+  }
+
+  go(index) {
+    for (const view of this.views) {
+      view.slider.value = Math.round(index[view.axis]);
       this.load(view);
     }
   }
 
+  turn(view) {
+    this.isTurned = true;
+    this.load(view);
+  }
+
   load(view) {
     const index = Number(view.slider.value);
-    view.label.textContent = `${TITLES[view.axis]} ${index + 1} / ${this.scan.shape[view.axis]}`;
+    view.label.textContent = `${view.laid.title} ${index + 1} / ${this.scan.shape[view.axis]}`;
     view.line.ask(() => getBinary(`${this.path}/image/slice?axis=${view.axis}&index=${index}`));
   }
 
@@ -112,28 +143,48 @@ export class Slices {
       const colour = isRim ? [240, 160, 40] : [grey, grey, grey];
       image.data.set([...colour, 255], 4 * i);
     }
-    // Voxels need not be cubes: the canvas has the shape of what they show.
-    const [across, down] = this.axes(view).map((axis) => this.scan.spacing_mm[axis]);
-    const unit = Math.min(across, down);
     this.buffer.width = width;
     this.buffer.height = height;
     this.buffer.getContext("2d").putImageData(image, 0, 0);
-    view.canvas.width = Math.round((width * across) / unit);
-    view.canvas.height = Math.round((height * down) / unit);
-    view.canvas.getContext("2d").drawImage(this.buffer, 0, 0, view.canvas.width, view.canvas.height);
-    // Feet are at the bottom: the third axis of most scans points to the head.
-    view.canvas.style.transform = view.axis < 2 ? "scaleY(-1)" : "";
+    const [w, h] = this.size(view);
+    view.canvas.width = w;
+    view.canvas.height = h;
+    const context = view.canvas.getContext("2d");
+    const [a, c, e, b, d, f] = this.onCanvas(view);
+    context.setTransform(a, b, c, d, e, f);
+    context.drawImage(this.buffer, 0, 0);
+  }
+
+  /** Pixels of a canvas: voxels need not be cubes, it has the shape of what they show. */
+  size(view) {
+    const { right, down } = view.laid;
+    const unit = Math.min(this.scan.spacing_mm[right.axis], this.scan.spacing_mm[down.axis]);
+    return [right, down].map(({ axis }) => Math.round((this.scan.shape[axis] * this.scan.spacing_mm[axis]) / unit));
+  }
+
+  /** Rows [a, c, e], [b, d, f] of the map from column and row of the slice to pixels of its canvas. */
+  onCanvas(view) {
+    const { right, down } = view.laid;
+    const [columns] = this.axes(view);
+    return this.size(view).flatMap((pixels, i) => {
+      const { axis, sign } = [right, down][i];
+      const scale = (sign * pixels) / this.scan.shape[axis];
+      const begin = sign < 0 ? pixels : 0;
+      return axis === columns ? [scale, 0, begin] : [0, scale, begin];
+    });
   }
 
   /** Column and row under a pointer: the canvas is as large as its box, the picture in it keeps its shape. */
   place(view, event) {
     const box = view.canvas.getBoundingClientRect();
-    const { width, height } = view.plane;
-    const [across, down] = this.axes(view).map((axis) => this.scan.spacing_mm[axis]);
-    const scale = Math.min(box.width / (width * across), box.height / (height * down));
-    const [x, y] = [event.clientX - box.left - box.width / 2, event.clientY - box.top - box.height / 2];
-    const up = view.axis < 2 ? -1 : 1;
-    return [x / (scale * across) + (width - 1) / 2, (up * y) / (scale * down) + (height - 1) / 2];
+    const [width, height] = this.size(view);
+    const scale = Math.min(box.width / width, box.height / height);
+    const x = (event.clientX - box.left - box.width / 2) / scale + width / 2;
+    const y = (event.clientY - box.top - box.height / 2) / scale + height / 2;
+    const [a, c, e, b, d, f] = this.onCanvas(view);
+    const whole = a * d - b * c;
+    // Voxels have their middles at whole numbers, pixels at halves.
+    return [(d * (x - e) - c * (y - f)) / whole - 0.5, (a * (y - f) - b * (x - e)) / whole - 0.5];
   }
 
   valueAt(view, event) {
@@ -149,6 +200,23 @@ export class Slices {
     const a = this.scan.affine_mm;
     return [0, 1, 2].map((row) => a[4 * row] * index[0] + a[4 * row + 1] * index[1] + a[4 * row + 2] * index[2] + a[4 * row + 3]);
   }
+}
+
+/** Axis of the world that each axis of the voxels runs along, one each: the best of the six ways. */
+function worldAxes(a) {
+  const ways = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+  const along = (way) => way.reduce((sum, world, axis) => sum + Math.abs(a[4 * world + axis]) / Math.hypot(a[axis], a[4 + axis], a[8 + axis]), 0);
+  return ways.reduce((best, way) => (along(way) > along(best) ? way : best));
+}
+
+/** How the slice across an axis of the voxels is laid: its plane, and the axes and directions to the right and down. */
+function laid(across, affine, axis) {
+  const plane = PLANES[across[axis]];
+  const [right, down] = [plane.right, plane.down].map(([world, wanted]) => {
+    const voxels = across.indexOf(world);
+    return { axis: voxels, sign: wanted * (affine[4 * world + voxels] < 0 ? -1 : 1) };
+  });
+  return { ...plane, right, down };
 }
 
 /** Voxel index of a point: the affine's inverse by Cramer's rule. */

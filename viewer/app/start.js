@@ -2,7 +2,7 @@
 import { make } from "../src/dom.js";
 import { get, post, put } from "./api.js";
 
-const KINDS = "DICOM folder or ZIP · NIfTI · NRRD · MHA · STL · VTP · VTK · OBJ · PLY";
+const KINDS = "DICOM folder or ZIP · NIfTI · NRRD · MHA · RAW · STL · VTP · VTK · OBJ · PLY";
 
 export function startPage(open, complain) {
   const said = make("p", { className: "drop-said", role: "status" });

@@ -77,6 +77,7 @@ class Desk:
             "can_redo": bool(state.redo),
             "has_input": bool(state.source),
             "is_scan": bool(state.source) and not _is_surface(case),
+            "wants_grid": bool(state.source) and _wants_grid(case),
             "has_anatomy": bool(state.anatomy),
             "anatomy": state.anatomy,
             "has_report": (case.folder / "report.html").is_file(),
@@ -96,9 +97,10 @@ class Desk:
         return case
 
     def begin(self, case: Case) -> None:
-        """Everything is in: find the vessel."""
+        """Everything is in: find the vessel, unless it must first be said how many and how large the voxels are."""
         self.point(case, intake.found(case.folder))
-        self.start(case, "anatomy")
+        if not _wants_grid(case):
+            self.start(case, "anatomy")
 
     def point(self, case: Case, path: str) -> None:
         """Say where the scan or surface lies."""
@@ -161,12 +163,12 @@ class Desk:
 
         if not case.state.source or _is_surface(case):
             raise InputError("This case has no scan: it began with a surface.")
+        choices = case.state.choices
+        grid = choices.spacing_mm, choices.shape
         with self._lock:
-            if case.id not in self._scans:
-                settings = case.state.choices.settings()
-                image = read_image(case.input, spacing_mm=settings.spacing_mm, shape=settings.shape)
-                self._scans[case.id] = Scan(image)
-            return self._scans[case.id]
+            if case.id not in self._scans or self._scans[case.id][0] != grid:
+                self._scans[case.id] = grid, Scan(read_image(case.input, spacing_mm=grid[0], shape=grid[1]))
+            return self._scans[case.id][1]
 
     def surface(self, case: Case, threshold: float) -> bytes:
         """Return the surface that a threshold gives."""
@@ -294,3 +296,11 @@ def _is_surface(case: Case) -> bool:
     from vstent.io.files import is_surface_file
 
     return is_surface_file(case.input)
+
+
+def _wants_grid(case: Case) -> bool:
+    """Whether nothing says yet how many and how large the voxels are."""
+    from vstent.io.files import RAW_SUFFIXES, suffix
+
+    choices = case.state.choices
+    return suffix(case.input) in RAW_SUFFIXES and (choices.shape is None or choices.spacing_mm is None)

@@ -25,6 +25,7 @@ FIRST: Final = {"anatomy": "image", "rank": "device", "flow": "flow"}
 STAGES: Final = {
     "scan": "image",
     "segment": "image",
+    "vessel": "vessel",
     "trace": "vessel",
     "trim": "vessel",
     "anatomy": "sac",

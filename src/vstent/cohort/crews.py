@@ -134,7 +134,7 @@ class Slurm(AbstractCrew):
             When dask-jobqueue is missing.
         """
         with self.cluster() as cluster:
-            cluster.scale(jobs=self.jobs)
+            cluster.adapt(minimum_jobs=self.jobs, maximum_jobs=self.jobs)  # a job that the queue ends is asked for anew
             yield from DaskCluster(cluster.scheduler_address).do(tasks)
 
     def cluster(self) -> Any:

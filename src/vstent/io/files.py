@@ -11,7 +11,9 @@ from typing import Final
 from vstent.errors import ReadError
 
 SURFACE_SUFFIXES: Final = (".stl", ".vtp", ".vtk", ".obj", ".ply")
-IMAGE_SUFFIXES: Final = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".raw", ".raw.gz", ".dcm")
+RAW_SUFFIXES: Final = (".raw", ".raw.gz")
+"""Voxels without a header: nothing says how many or how large they are."""
+IMAGE_SUFFIXES: Final = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", *RAW_SUFFIXES, ".dcm")
 PARTIAL: Final = ".partial-"
 """How the name of a file begins while it is being written; the process follows."""
 _ONE_AT_A_TIME: Final = threading.RLock()

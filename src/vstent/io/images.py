@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 from vstent.errors import ReadError, UnitError
 from vstent.image import Image
 from vstent.io import dicom
-from vstent.io.files import IMAGE_SUFFIXES, existing, silenced, suffix
+from vstent.io.files import IMAGE_SUFFIXES, RAW_SUFFIXES, existing, silenced, suffix
 
 VOXEL_MM: Final = (0.01, 5.0)
 """Voxel edges that a scan of the head can have."""
@@ -57,7 +57,7 @@ def read_image(
     kind = suffix(path)
     if path.is_dir() or kind == ".dcm" or dicom.is_dicom(path):
         image = dicom.read_dicom(path)
-    elif kind in (".raw", ".raw.gz"):
+    elif kind in RAW_SUFFIXES:
         return _read_raw(path, spacing_mm, shape, dtype)
     elif kind in IMAGE_SUFFIXES:
         image = _read_itk(path, kind, has_spacing=spacing_mm is not None)

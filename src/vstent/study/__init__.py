@@ -15,7 +15,7 @@ from vstent.io import writers
 from vstent.measure import morphology
 from vstent.study.crate import write_crate
 from vstent.study.folder import CACHE, claiming
-from vstent.study.ledger import Ledger, anatomy_key, hash_of, refuse_missing
+from vstent.study.ledger import Ledger, hash_of
 from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
 from vstent.study.provenance import INPUT, METRICS, provenance
 from vstent.study.repeat import Record, agreement, read_record
@@ -67,7 +67,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     source = hash_of(path)
     anatomy = find_anatomy(path, source, settings, ledger)
     deployments = deploy_all(designs, anatomy, settings, ledger)
-    ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
+    ledger.settle()
     write_anatomy(out, anatomy)
     writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve())})
     for name, deployment in deployments.items():
@@ -102,8 +102,9 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) 
     InputError
         Something given cannot be used; nothing has been written.
     """
-    refuse_missing(path)
-    vessel = find_vessel(path, settings, Ledger(out / CACHE, progress))
+    ledger = Ledger(out / CACHE, progress)
+    vessel = find_vessel(path, hash_of(path), settings, ledger)
+    ledger.settle()
     write_vessel(out, vessel)
     return vessel
 
@@ -130,7 +131,7 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
     source = hash_of(path)
     anatomy = find_anatomy(path, source, settings, ledger)
     measures = morphology(anatomy)
-    ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
+    ledger.settle()
     write_anatomy(out, anatomy)
     writers.write_json(out / "morphology.json", measures)
     return anatomy, measures
@@ -157,7 +158,7 @@ def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
     anatomy = find_anatomy(path, source, settings, ledger)
-    ledger.keep("anatomy", anatomy_key(source, settings), anatomy)
+    ledger.settle()
     found = refine(out, anatomy, settings, ledger)
     writers.write_json(out / "convergence.json", {one.name: asdict(one) for one in found})
     return found

@@ -25,6 +25,7 @@ class Ledger:
     def __init__(self, folder: Path, progress: Progress) -> None:
         self.folder, self.progress = folder, progress
         self.seconds: dict[str, float] = {}
+        self._held: list[tuple[str, str, Any]] = []
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Callable[[str], None]]:
@@ -58,6 +59,16 @@ class Ledger:
         except ReadError:
             return None
         return noun
+
+    def hold(self, name: str, key: str, noun: Any) -> None:
+        """Keep a noun under a key when `settle` is called: until then something given may yet turn out unusable."""
+        self._held.append((name, key, noun))
+
+    def settle(self) -> None:
+        """Keep what is held: from here on things are written."""
+        for name, key, noun in self._held:
+            self.keep(name, key, noun)
+        self._held.clear()
 
     def keep(self, name: str, key: str, noun: Any) -> None:
         """Keep a noun under a key; what was kept under the same name before is dropped."""
@@ -94,6 +105,12 @@ def anatomy_key(source: str, settings: Settings) -> str:
     """Key of the geometry of an input: devices and flow do not change it."""
     geometry = replace(settings, devices=(), diameter_mm=None, length_mm=None, center_mm=None, flow=None, placings={})
     return key_of(source, replace(geometry, uncertainty=None))
+
+
+def vessel_key(source: str, settings: Settings) -> str:
+    """Key of the vessel of an input: where it is cut and how its sac is taken off does not change it."""
+    given = settings.units, settings.spacing_mm, settings.shape, settings.threshold, settings.at_mm, settings.inlet_mm
+    return key_of(source, "vessel", given)
 
 
 def key_of(*parts: Any) -> str:

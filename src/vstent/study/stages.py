@@ -22,7 +22,7 @@ from vstent.restore import restore
 from vstent.segment import segment
 from vstent.stent import Deployment, Landing
 from vstent.study.checkpoint import FlowCheckpoint
-from vstent.study.ledger import Ledger, anatomy_key, key_of
+from vstent.study.ledger import Ledger, anatomy_key, key_of, vessel_key
 from vstent.study.outputs import write_field
 from vstent.study.types import Placing, Point, Settings
 from vstent.trace import trace
@@ -35,11 +35,15 @@ BARE: Final = "bare"
 
 
 def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) -> Anatomy:
-    """Read, segment, repair, trace, trim and restore; what was kept of this `source` (hash) is taken as it is."""
-    kept = ledger.recall("anatomy", anatomy_key(source, settings), Anatomy)
+    """Read, segment, repair, trace, trim and restore; what was kept of this `source` (hash) is taken as it is.
+
+    What is found is held by the ledger: its `settle` keeps it.
+    """
+    key = anatomy_key(source, settings)
+    kept = ledger.recall("anatomy", key, Anatomy)
     if kept is not None:
         return kept
-    whole = find_vessel(path, settings, ledger)
+    whole = find_vessel(path, source, settings, ledger)
     neck_mm = None if settings.neck_mm is None else np.array(settings.neck_mm, dtype=np.float64)
     at_mm = _array(settings.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
     with ledger.stage("trim") as tell:
@@ -49,17 +53,23 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
         outlet_mm = _array(settings.outlet_mm)
         anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
         tell(" ".join([*anatomy.notes, *(f"Sac of {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
+    ledger.hold("anatomy", key, anatomy)
     return anatomy
 
 
-def find_vessel(path: Path, settings: Settings, ledger: Ledger) -> Vessel:
-    """Read, segment, repair and trace."""
+def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> Vessel:
+    """Read, segment, repair and trace; what was kept of this `source` (hash) is taken, what is found is held."""
+    key = vessel_key(source, settings)
+    kept = ledger.recall("vessel", key, Vessel)
+    if kept is not None:
+        return kept
     with ledger.stage("segment") as tell:
         vessel = _vessel(path, settings)
         tell(" ".join(vessel.notes))
     with ledger.stage("trace") as tell:
         traced = trace(vessel, inlet_mm=_array(settings.inlet_mm))
         tell(f"{len(traced.outlets)} outlets; inlet {traced.inlet.diameter_mm:.1f} mm wide.")
+    ledger.hold("vessel", key, traced)
     return traced
 
 

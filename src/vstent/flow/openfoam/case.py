@@ -66,7 +66,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
     files |= {
         f"system/{features}": text,
         "system/snappyHexMeshDict": mesh.snappy(
-            setup, kinds, _inside_mm(case, sections), has_neck=case.ostium is not None
+            setup, kinds, _ends(case, sections), _inside_mm(case, sections), has_neck=case.ostium is not None
         ),
         "0/U": boundary.velocity(case, setup, walls),
         "0/p": boundary.pressure(case, walls),
@@ -86,6 +86,16 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         profile = boundary.inlet_profile(case, sections[0])
         files |= {f"constant/boundaryData/inlet/{name}": text for name, text in profile.items()}
     return FoamCase(files, ("Allrun", "Allclean", "submit.slurm"), application)
+
+
+def _ends(case: FlowCase, sections: tuple[Floats, ...]) -> dict[str, mesh.End]:
+    """Where the patches of the openings lie: the extension, and as much of the vessel as the opening is wide."""
+    ends = {}
+    for one, section in zip(case.vessel.openings, sections, strict=True):
+        end_mm = section.mean(axis=0)
+        along = (end_mm - one.center_mm) / np.linalg.norm(end_mm - one.center_mm)
+        ends[one.role] = mesh.End(one.center_mm - one.diameter_mm * along, end_mm, one.diameter_mm)
+    return ends
 
 
 def _application(case: FlowCase, setup: FoamSetup) -> str:

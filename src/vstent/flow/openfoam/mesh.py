@@ -1,5 +1,7 @@
 """Dictionaries of the mesh: a block of cubes, cut to the vessel by snappyHexMesh."""
 
+from dataclasses import dataclass
+from math import ceil, log2
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,26 @@ LUMEN, ENDS, NECK, STRUTS = "lumen", "ends", "neck", "struts"
 """Surfaces in the case: the whole boundary with named regions, its flat ends, the ostium, the device."""
 NECK_REACH = 2.0
 """Distance from the neck, in cells, within which cells are halved."""
+
+
+CELLS_ACROSS_END = 8
+"""Cells that every opening is to be wide at least; with fewer, snappyHexMesh may close it."""
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """An opening and the straight piece of vessel before it."""
+
+    begin_mm: Floats
+    """(3,) on its axis, in the vessel."""
+    end_mm: Floats
+    """(3,) the opening's middle."""
+    diameter_mm: float
+    """Of the opening."""
+
+    def levels(self, cell_size_mm: float) -> int:
+        """Times that cells must be halved there."""
+        return max(0, ceil(log2(CELLS_ACROSS_END * cell_size_mm / self.diameter_mm)))
 
 
 def block_mesh(vertices_mm: Floats, cell_size_mm: float) -> str:
@@ -46,23 +68,27 @@ def feature_extract(setup: FoamSetup) -> tuple[str, str]:
     return "surfaceFeatureExtractDict", foam_file("surfaceFeatureExtractDict", entries)
 
 
-def snappy(setup: FoamSetup, patches: dict[str, str], inside_mm: Floats, *, has_neck: bool) -> str:
+def snappy(
+    setup: FoamSetup, patches: dict[str, str], ends: dict[str, End], inside_mm: Floats, *, has_neck: bool
+) -> str:
     """SnappyHexMeshDict.
 
     Parameters
     ----------
     setup : cells and layers.
     patches : ``wall`` or ``patch`` by the name of every patch.
+    ends : where the openings' patches lie, by name; those too narrow for the cells get finer ones.
     inside_mm : (3,) a point in the blood.
     has_neck : whether there is a neck to refine over.
     """
     walls = [name for name, kind in patches.items() if kind == "wall"]
+    narrow = {name: end for name, end in ends.items() if end.levels(setup.cell_size_mm)}
     entries = {
         "castellatedMesh": True,
         "snap": True,
         "addLayers": setup.layers > 0,
-        "geometry": _geometry(setup, patches, has_neck),
-        "castellatedMeshControls": _castellated(setup, patches, inside_mm, has_neck),
+        "geometry": _geometry(setup, patches, narrow, has_neck),
+        "castellatedMeshControls": _castellated(setup, patches, narrow, inside_mm, has_neck),
         "snapControls": _snap(),
         "addLayersControls": _layers(setup, walls),
         "meshQualityControls": _quality(),
@@ -72,12 +98,13 @@ def snappy(setup: FoamSetup, patches: dict[str, str], inside_mm: Floats, *, has_
     return foam_file("snappyHexMeshDict", entries)
 
 
-def _geometry(setup: FoamSetup, patches: dict[str, str], has_neck: bool) -> dict[str, Any]:
+def _geometry(setup: FoamSetup, patches: dict[str, str], narrow: dict[str, End], has_neck: bool) -> dict[str, Any]:
     def surface(name: str) -> dict[str, Any]:
         return {"type": "triSurfaceMesh", "file": f'"{name}.stl"'}
 
     regions = {name: {"name": name} for name in patches}
     result: dict[str, Any] = {LUMEN: surface(LUMEN) | {"regions": regions}}
+    result |= {_before(name): _cylinder(end) for name, end in narrow.items()}
     if has_neck:
         result[NECK] = surface(NECK)
     if setup.struts is not None:
@@ -85,11 +112,32 @@ def _geometry(setup: FoamSetup, patches: dict[str, str], has_neck: bool) -> dict
     return result
 
 
-def _castellated(setup: FoamSetup, patches: dict[str, str], inside_mm: Floats, has_neck: bool) -> dict[str, Any]:
+def _before(name: str) -> str:
+    return f"before_{name}"
+
+
+def _cylinder(end: End) -> dict[str, Any]:
+    first, second = (tuple(float(x) for x in point * M_PER_MM) for point in (end.begin_mm, end.end_mm))
+    return {
+        "type": "searchableCylinder",
+        "point1": first,
+        "point2": second,
+        "radius": 0.75 * end.diameter_mm * M_PER_MM,
+    }
+
+
+def _castellated(
+    setup: FoamSetup, patches: dict[str, str], narrow: dict[str, End], inside_mm: Floats, has_neck: bool
+) -> dict[str, Any]:
+    finer = {name: BASE_LEVEL + end.levels(setup.cell_size_mm) for name, end in narrow.items()}
     level = (BASE_LEVEL, BASE_LEVEL)
-    regions = {name: {"level": level, "patchInfo": {"type": kind}} for name, kind in patches.items()}
+    regions = {
+        name: {"level": (finer.get(name, BASE_LEVEL),) * 2, "patchInfo": {"type": kind}}
+        for name, kind in patches.items()
+    }
     surfaces: dict[str, Any] = {LUMEN: {"level": level, "regions": regions}}
     inside: dict[str, Any] = {LUMEN: {"mode": "inside", "levels": [(1e15, BASE_LEVEL)], "level": BASE_LEVEL}}
+    inside |= {_before(name): {"mode": "inside", "levels": [(1e15, n)], "level": n} for name, n in finer.items()}
     if has_neck and setup.neck_levels:
         reach_m = NECK_REACH * setup.cell_size_mm * M_PER_MM
         inside[NECK] = {"mode": "distance", "levels": [(reach_m, BASE_LEVEL + setup.neck_levels)]}
