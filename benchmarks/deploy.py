@@ -14,8 +14,7 @@ import numpy as np
 
 from vstent import device
 from vstent.deploy import METHODS, ConstantWire, deploy, propose_landing
-from vstent.deploy.braid import Profile, march
-from vstent.deploy.contour import planes
+from vstent.deploy.braid import Profile, bend, march
 from vstent.deploy.method import Placement, run
 from vstent.deploy.sketch import bed, sketch
 from vstent.deploy.wall import AbstractWall, Contact, landing_wall
@@ -93,9 +92,7 @@ def timed(work: Callable[[], Any], repeats: int = 5) -> tuple[Any, float]:
 def integral_mm(stent: Stent, anatomy: Anatomy) -> float:
     """Length that constant wires give at the diameters that the device has, where the artery bends as it does."""
     middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
-    across = planes(anatomy.axis)
-    bend = across.abscissa_mm, across.curvature_per_mm
-    profile = Profile(stent.row_abscissa_mm, stent.row_diameter_mm, bend)
+    profile = Profile(stent.row_abscissa_mm, stent.row_diameter_mm, bend(anatomy))
     return float(np.ptp(march(stent.design, stent.size, Landing(middle_mm), profile)))
 
 
@@ -174,6 +171,8 @@ def speed(anatomy: Anatomy) -> list[str]:
         f"landing moved, times a second: contour by exact closest points {1 / contour_s:.0f}, with wires "
         f"{1 / deploy_s:.0f} ({done.stent.deployed_length_mm:.2f} mm long), sketch with wires {1 / sketch_s:.0f} "
         f"({sketched.stent.deployed_length_mm:.2f} mm, nodes {apart_mm.mean():.3f} to {apart_mm.max():.3f} mm off)",
+        f"the wall answers for {(wall.closest * closest_s + wall.crossings * crosses_s) / n:.3f} s of the contour: "
+        "more processors make that part shorter, nothing but fewer questions the floor under it",
         f"{wall.closest} closest points at {closest_s / n * 1e6:.2f} us (plain: "
         f"{slow_closest_s / n_few * 1e6:.0f} us, {slow_closest_s / n_few / (closest_s / n):.0f} times as long)",
         f"{wall.crossings} crossing tests at {crosses_s / n * 1e6:.2f} us (plain: "

@@ -9,7 +9,17 @@ from scipy.optimize import brentq
 
 from tubes import arc, line, tube, with_neck
 from vstent import device
-from vstent.deploy import ActiveContour, ConstantWire, contour, deploy, pieces, propose_landing, propose_size, sizing
+from vstent.deploy import (
+    ActiveContour,
+    ConstantWire,
+    cells,
+    contour,
+    deploy,
+    pieces,
+    propose_landing,
+    propose_size,
+    sizing,
+)
 from vstent.deploy.braid import Profile, march
 from vstent.errors import LandingError
 from vstent.measure import coverage_fractions, measure, quad_areas_mm2
@@ -186,7 +196,7 @@ def test_pieces_of_wire_keep_their_length(artery):
 
 def test_on_a_regular_lattice_nothing_slides():
     nodes_mm = deployed(straight()).stent.nodes_mm
-    slid = pieces.slide(SILK, SILK_SIZE, nodes_mm, 50)
+    slid = pieces.slide(SILK, SILK_SIZE, nodes_mm, 50, cells.as_drawn)
     assert slid.nodes_mm == pytest.approx(nodes_mm, abs=1e-3)
     assert slid.row == pytest.approx(np.broadcast_to(np.arange(len(nodes_mm))[:, None], slid.row.shape), abs=0.01)
 
@@ -197,7 +207,7 @@ def test_rows_of_a_bend_tilt_and_draw_together_about_the_one_that_is_landed(held
     s = np.arange(n) * device.row_spacing_mm(SILK, SILK_SIZE, 3.7)
     flat_mm = contour.planes(bent().axis).place(s + 5.0, contour.circles(np.full(n, 1.85), 48))
     held %= n
-    row = pieces.slide(SILK, SILK_SIZE, flat_mm, held).row
+    row = pieces.slide(SILK, SILK_SIZE, flat_mm, held, cells.as_drawn).row
     assert np.ptp(row - np.arange(n)[:, None]) > 0.5
     mean = row.mean(axis=1)
     assert mean[held] == pytest.approx(held, abs=1e-9)
@@ -207,14 +217,14 @@ def test_rows_of_a_bend_tilt_and_draw_together_about_the_one_that_is_landed(held
 
 
 def test_without_sliding_pieces_of_wire_in_the_bend_would_stretch(monkeypatch):
-    monkeypatch.setattr(pieces, "slide", lambda design, size, nodes_mm, held: _unslid(nodes_mm))
+    monkeypatch.setattr(pieces, "slide", lambda design, size, nodes_mm, held, laid: _unslid(nodes_mm))
     found = stretch(deploy(SILK, bent(), size=SILK_SIZE).stent)
     assert np.quantile(np.abs(found), 0.95) > 0.08
 
 
 def _unslid(nodes_mm):
-    row = np.broadcast_to(np.arange(len(nodes_mm))[:, None], nodes_mm.shape[:2]).astype(float)
-    return pieces.Slid(nodes_mm, row, np.zeros_like(nodes_mm))
+    row, column = np.indices(nodes_mm.shape[:2]).astype(float)
+    return pieces.Slid(nodes_mm, row, column, np.zeros_like(nodes_mm))
 
 
 def test_in_an_oval_lumen_the_length_follows_the_perimeter():

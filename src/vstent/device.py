@@ -244,22 +244,25 @@ def row_spacing_mm(
     """Distance h along the axis between rows of junctions at a local diameter, at most the free one.
 
     Where the axis bends, rows are h (1 + k cos(theta)) apart at the angle theta round it, k = curvature D / 2. Pieces
-    of wire keep their length l, so that cos(alpha) = h (1 + k cos(theta)) / l and n columns fill the circumference
-    when the mean of 1 / sin(alpha) round it is n l / (pi D): h is less than in a straight artery. The few long
-    cells of a laser-cut device cannot all do so; its rows are put as in a straight artery, from where
-    `vstent.deploy.cells` moves them.
+    of wire keep their length l, so that cos(alpha) = h (1 + k cos(theta)) / l, and a column takes l sin(alpha) of the
+    circumference: n of them fill it when the mean of 1 / sin(alpha) round it is n l / (pi D). h is less than in a
+    straight artery: what columns lose outside, where wires are drawn along the axis, is more than what they gain
+    inside. This is the net of inextensible threads (Chebyshev 1878, Sur la coupe des vetements) on a torus. It asks
+    nothing but that pieces keep their length between crossings that all their wires keep, so it holds for the joined
+    struts of a laser-cut device as for a braid, as long as its cells can lie against the wall: where h (1 + k) would
+    have to exceed l in a straight artery's rows they begin to leave it outside, and the device is longer than this.
     """
     piece_mm, angle = piece_length_mm(design, size), angle_rad(design, size, diameter_mm)
-    if isinstance(design, LaserCut) or not np.any(curvature_per_mm):
+    if not np.any(curvature_per_mm):
         return piece_mm * np.cos(angle)
     bend = np.minimum(0.5 * np.abs(curvature_per_mm) * diameter_mm, STEEPEST_BEND)
     apart = 1 + np.multiply.outer(bend, np.cos(np.pi * (np.arange(BEND_SAMPLES) + 0.5) / BEND_SAMPLES))
     longest = STRAIGHTEST / (1 + bend)
     cosine = np.minimum(np.cos(angle), longest)
     for _ in range(BEND_STEPS):  # Newton's; the mean grows faster than linearly with the cosine
-        steep = 1 - (cosine[..., None] * apart) ** 2
-        excess = (1 / np.sqrt(steep)).mean(axis=-1) - 1 / np.sin(angle)
-        slope = (cosine[..., None] * apart**2 / steep**1.5).mean(axis=-1)
+        width = 1 / np.sqrt(1 - (cosine[..., None] * apart) ** 2)
+        excess = width.mean(axis=-1) - 1 / np.sin(angle)
+        slope = cosine * (apart * apart * width * width * width).mean(axis=-1)
         cosine = np.clip(cosine - excess / slope, 0.0, longest)
     return piece_mm * cosine
 

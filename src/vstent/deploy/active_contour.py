@@ -1,7 +1,7 @@
 """The active contour of Zhong et al. 2016: a closed tube of nodes that grows until it meets the wall (eq. 1-7)."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final, final
 
 import numpy as np
@@ -33,6 +33,7 @@ class Stiffness:
     """Nodes around r."""
 
     @staticmethod
+    @lru_cache(maxsize=8)
     def of(contour: "ActiveContour", rows: int, columns: int) -> "Stiffness":
         """Factor I + tau K once for a grid."""
         wave = 2 - 2 * np.cos(2 * np.pi * np.arange(columns // 2 + 1) / columns)
@@ -93,6 +94,19 @@ class State:
         """
         off_mm = np.linalg.norm(centers_mm - self.centers_mm[rows, 0], axis=2)
         return replace(self, centers_mm=centers_mm, clearance_mm=np.maximum(self.clearance_mm[rows, 0] - off_mm, 0.0))
+
+    def near(self, points_mm: Floats, centers_mm: Floats, rows: Ints, columns: Ints) -> "State":
+        """Return points (n, 3) with fiducial points (n, 3) as a contour of one column; each is near one of the nodes.
+
+        Whether it terminated, and on what wall, is what that node, at (n,) rows and columns, did.
+        """
+        number = rows * self.nodes_mm.shape[1] + columns
+        return replace(
+            self.about(centers_mm[:, None], rows[:, None]),
+            nodes_mm=points_mm[:, None],
+            is_terminated=self.is_terminated[rows, columns][:, None],
+            contact=Contact(*(values[number] for values in self.contact)),
+        )
 
     @cached_property
     def terminated_fraction(self) -> float:

@@ -1,6 +1,7 @@
 """Constant wire, the default method: rows marched along the parent axis by wires that cannot stretch."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import final
 
 import numpy as np
@@ -9,8 +10,8 @@ from vstent.deploy import pieces
 from vstent.deploy.active_contour import State
 from vstent.deploy.contour import evenly_spaced, perimeters, planes
 from vstent.deploy.method import AbstractMethod, Opened, Placement, check_inside
-from vstent.device import Design, Size, grid, row_spacing_mm
-from vstent.kernels.arrays import Bools, Floats
+from vstent.device import Design, LaserCut, Size, grid, row_spacing_mm
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.stent import Landing, row_diameters_mm
 from vstent.units import MM_PER_UM
 from vstent.vessel import Anatomy
@@ -23,6 +24,8 @@ LAST_STEPS = 5
 """Steps at most for the last nodes, once 99 % have terminated."""
 TABLE_ROWS = 501
 """Samples of the row spacing along the artery."""
+FREELY = 0.999
+"""A row this near to the free perimeter stopped there, not at the wall."""
 BEYOND_MM = 500.0
 """Rows are counted so far beyond the artery, to say by how much a device misses it."""
 
@@ -57,11 +60,22 @@ class Profile:
 
 
 def expected_profile(design: Design, anatomy: Anatomy) -> Profile:
-    """Diameter that the contour will have where it lies against the landing surface."""
+    """Diameter that the contour will have where it lies against the landing surface, and the bends its rows heed.
+
+    Rows of a laser-cut device are put as in a straight artery: in a tight bend its cells leave the wall, and its rows
+    do not come as near together as those of a braid. From there `vstent.deploy.cells` moves them.
+    """
     offset_mm = design.wall_offset_um * MM_PER_UM
-    across = planes(anatomy.axis)
     diameter_mm = 2 * (anatomy.section_radius_mm - offset_mm)
-    return Profile(anatomy.axis.abscissa_mm, diameter_mm, (across.abscissa_mm, across.curvature_per_mm))
+    if isinstance(design, LaserCut):
+        return Profile(anatomy.axis.abscissa_mm, diameter_mm)
+    return Profile(anatomy.axis.abscissa_mm, diameter_mm, bend(anatomy))
+
+
+def bend(anatomy: Anatomy) -> tuple[Floats, Floats]:
+    """Return arc lengths (m,) and how the parent axis bends there (m,), per mm."""
+    across = planes(anatomy.axis)
+    return across.abscissa_mm, across.curvature_per_mm
 
 
 def landed_row(design: Design, size: Size, landing: Landing) -> int:
@@ -132,20 +146,38 @@ class ConstantWire(AbstractMethod):
             if opened.contour.is_terminated.all():
                 break
             opened = self._grown(placement, opened)
-        rows = np.arange(len(opened.abscissa_mm))
-        held = landed_row(placement.design, placement.size, placement.landing)
-        slid = pieces.slide(placement.design, placement.size, opened.contour.nodes_mm, held)
+        design, size, rows = placement.design, placement.size, np.arange(len(opened.abscissa_mm))
+        held = landed_row(design, size, placement.landing)
+        laid = partial(self._between, placement, opened)
+        slid = pieces.slide(design, size, opened.contour.nodes_mm, held, laid)
+        rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
+        check_inside(design, size, rows_mm, placement.anatomy.axis.length_mm)
         where_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row)
         centers_mm = placement.across.middle(where_mm.ravel()).reshape(slid.nodes_mm.shape)
-        state = opened.contour.about(centers_mm, np.clip(np.rint(slid.row), 0, rows[-1]).astype(int))
+        state = opened.contour.about(centers_mm, _nearest(slid.row, len(rows)))
         everywhere = np.ones_like(state.is_terminated)
+        if isinstance(design, LaserCut):  # its cells' springs hold it to its free width
+            on_wall_mm = laid(slid.nodes_mm.reshape(-1, 3), slid.row.ravel(), slid.column.ravel())
+            state = replace(state, nodes_mm=on_wall_mm.reshape(slid.nodes_mm.shape) + slid.lift_mm)
+            return Opened(self.contour.classify(state, everywhere, placement.wall), rows_mm)
         state, laid_mm = self._laid(placement, replace(state, nodes_mm=slid.nodes_mm), everywhere)
-        nodes_mm = self._no_wider(state.nodes_mm, laid_mm, placement.size.free_diameter_mm)
-        rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
-        check_inside(placement.design, placement.size, rows_mm, placement.anatomy.axis.length_mm)
-        is_lifted = np.any(slid.lift_mm, axis=2)
-        state = replace(state, nodes_mm=nodes_mm + slid.lift_mm)
-        return Opened(self.contour.classify(state, is_lifted, placement.wall), rows_mm)
+        return Opened(replace(state, nodes_mm=self._no_wider(state.nodes_mm, laid_mm, size.free_diameter_mm)), rows_mm)
+
+    def _between(self, placement: Placement, opened: Opened, points_mm: Floats, row: Floats, column: Floats) -> Floats:
+        """Where (n, 3) points between the nodes, at fractional rows and columns (n,), lie: against the wall as they do.
+
+        What is between rows that stopped at the free diameter stays, unless it is outside.
+        """
+        contour = opened.contour
+        rows, columns = (
+            _nearest(row, contour.nodes_mm.shape[0]),
+            np.rint(column).astype(int) % contour.nodes_mm.shape[1],
+        )
+        where_mm = pieces.extrapolated(np.arange(len(opened.abscissa_mm)), opened.abscissa_mm, row)
+        state = contour.near(points_mm, placement.across.middle(where_mm), rows, columns)
+        is_narrow = perimeters(contour.nodes_mm)[rows] < FREELY * np.pi * placement.size.free_diameter_mm
+        state = replace(state, is_terminated=state.is_terminated & is_narrow[:, None])
+        return self._laid(placement, state, np.ones_like(state.is_terminated))[1].reshape(-1, 3)
 
     @staticmethod
     def _no_wider(slid_mm: Floats, laid_mm: Floats, free_mm: float) -> Floats:
@@ -213,6 +245,11 @@ class ConstantWire(AbstractMethod):
         is_off = held.ravel() & (state.contact.distance_mm > self.contour.dd_mm)
         back_mm = self.contour.relocated_mm(points_mm, np.zeros_like(is_off), state.contact)
         return state, np.where(is_off[:, None], back_mm, points_mm).reshape(state.nodes_mm.shape)
+
+
+def _nearest(row: Floats, rows: int) -> Ints:
+    """Return the row of nodes that each fractional one is nearest to."""
+    return np.clip(np.rint(row), 0, rows - 1).astype(int)
 
 
 def _interpolated(old_mm: Floats, values: Floats, new_mm: Floats) -> Floats:

@@ -12,6 +12,7 @@ none behind the wall. The springs open the device against the wall and keep its 
 as it is wide, so cells bend off the wall about as hard as they are drawn out. Levenberg's and Marquardt's steps.
 """
 
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -20,6 +21,9 @@ from scipy.sparse.linalg import spsolve
 
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.net import Net
+
+Laid = Callable[[Floats, Floats, Floats], Floats]
+"""Tells where (n, 3) points of the chart, at fractional rows (n,) and columns (n,) of it, lie on the wall itself."""
 
 SPRINGINESS: Final = 0.015
 """How much a cell that is drawn out weighs against a strut that stretches by as much."""
@@ -52,6 +56,8 @@ class _Frame(NamedTuple):
 
     net: Net
     """Joints and struts, on the wall."""
+    laid: Laid
+    """What puts them there: the chart is flat between its nodes."""
     length_mm: float
     """Length of a strut as cut."""
     pairs: Ints
@@ -76,14 +82,14 @@ class _Model(NamedTuple):
         return float(self.residual @ self.residual)
 
 
-def relax(net: Net, length_mm: float, width_mm: float, held: int) -> Floats:
+def relax(net: Net, length_mm: float, width_mm: float, held: float, laid: Laid) -> Floats:
     """Moves (c, 3) of the joints along, around and off the wall, mm.
 
     Struts are `length_mm` long, cells of the free device `width_mm` wide; in the mean, row number `held` of the joints
-    stays where it is.
+    (or what lies between two rows) stays where it is. `laid` puts joints from the chart on to the wall.
     """
     pairs, free_mm = _diagonals(net, length_mm, width_mm)
-    frame = _Frame(net, length_mm, pairs, free_mm, _keeping(net, held))
+    frame = _Frame(net, laid, length_mm, pairs, free_mm, _keeping(net, held))
     x, inertia = np.zeros(3 * len(net.line)), INERTIA
     here = _model(frame, x)
     for _ in range(STEPS):
@@ -122,10 +128,10 @@ def _is_pressed(x: Floats, downhill: Floats) -> Bools:
 
 def _model(frame: _Frame, x: Floats) -> _Model:
     net, moves = frame.net, x.reshape(-1, 3)
-    points_mm = _points_mm(net, moves)
+    points_mm = _points_mm(net, moves, frame.laid)
     ways = TINY_MM * np.eye(3)
-    change = np.stack([_points_mm(net, moves + way) - _points_mm(net, moves - way) for way in ways], axis=1)
-    change /= 2 * TINY_MM
+    moved_mm = [_points_mm(net, moves + way, as_drawn) - _points_mm(net, moves - way, as_drawn) for way in ways]
+    change = np.stack(moved_mm, axis=1) / (2 * TINY_MM)
     strut_mm, strut_slopes = _lengths(points_mm, change, net.ends, net.bulge[net.line[net.ends[0]]])
     open_mm, open_slopes = _lengths(points_mm, change, frame.pairs, np.zeros(len(frame.free_mm)))
     ratio = open_mm / frame.free_mm
@@ -135,7 +141,12 @@ def _model(frame: _Frame, x: Floats) -> _Model:
     return _Model(residual, csc_matrix(vstack([strut_slopes, open_slopes, frame.keeping])))
 
 
-def _points_mm(net: Net, moves: Floats) -> Floats:
+def as_drawn(points_mm: Floats, row: Floats, column: Floats) -> Floats:
+    """Leave points on the chart."""
+    return points_mm
+
+
+def _points_mm(net: Net, moves: Floats, laid: Laid) -> Floats:
     """Where (c, 3) the joints are."""
     rows, columns = net.chart.shape[:2]
     along = net.row + moves[:, 0] / net.spacing[0]
@@ -147,7 +158,8 @@ def _points_mm(net: Net, moves: Floats) -> Floats:
     below = (1 - right) * net.chart[i + 1, j] + right * net.chart[i + 1, beyond]
     found = (1 - down) * above + down * below
     outward = np.cross(found[:, 6:], found[:, 3:6])
-    return found[:, :3] - moves[:, 2:] * outward / np.linalg.norm(outward, axis=1, keepdims=True)
+    on_wall_mm = laid(found[:, :3], along, around)
+    return on_wall_mm - moves[:, 2:] * outward / np.linalg.norm(outward, axis=1, keepdims=True)
 
 
 def _lengths(points_mm: Floats, change: Floats, ends: Ints, bulge_mm2: Floats) -> tuple[Floats, coo_matrix]:
@@ -176,17 +188,19 @@ def _diagonals(net: Net, length_mm: float, width_mm: float) -> tuple[Ints, Float
     return pairs, np.repeat([width_mm, height_mm], [n, len(lower)])
 
 
-def _keeping(net: Net, held: int) -> csc_matrix:
+def _keeping(net: Net, held: float) -> csc_matrix:
     """Matrix (k, 3 c) of moves that are kept small: out of a row, bends, and that of the row held in the mean."""
     n, bends = len(net.line), net.bends.astype(int)
     member = coo_matrix((np.ones(n), (net.line, np.arange(n)))).tocsr()
     mean = diags(1 / np.bincount(net.line)) @ member
     off_row = identity(n) - member.T @ mean
+    lines = np.arange(mean.shape[0])
+    anchor = csc_matrix(np.maximum(1 - np.abs(lines - held), 0.0)) @ mean
     weights, number = np.repeat([1.0, -2.0, 1.0], bends.shape[1]), np.tile(np.arange(bends.shape[1]), 3)
     line = coo_matrix((weights, (number, bends.ravel())), shape=(bends.shape[1], n))
     beside = coo_matrix((np.ones(n), (np.arange(n), net.beside.astype(int))), shape=(n, n))
     ring = beside - 2 * identity(n) + beside.T
     along, around, off = (csc_matrix(np.eye(3)[[k]]) for k in range(3))
-    level = [LEVEL * kron(off_row, along), LEVEL * kron(identity(n), around), kron(mean.tocsr()[[held]], along)]
+    level = [LEVEL * kron(off_row, along), LEVEL * kron(identity(n), around), kron(anchor, along)]
     smooth = [STIFFNESS * kron(line, along), STIFFNESS * kron(line, around), BENDING * kron(line, off)]
     return csc_matrix(vstack([*level, *smooth, BENDING * kron(ring, off)]))

@@ -39,14 +39,17 @@ class Slid(NamedTuple):
     """(rows, columns, 3) nodes."""
     row: Floats
     """(rows, columns) where on the old contour every node lies, in rows."""
+    column: Floats
+    """(rows, columns) and in columns."""
     lift_mm: Floats
     """(rows, columns, 3) by how much, and where to, nodes leave the wall."""
 
 
-def slide(design: Design, size: Size, nodes_mm: Floats, held: int) -> Slid:
+def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.Laid) -> Slid:
     """Let the crossings of a device slide on its contour (rows, columns, 3); nodes between them go along.
 
-    In the mean, row number `held` of the nodes stays where it is.
+    In the mean, row number `held` of the nodes stays where it is. `laid` puts points from between the contour's nodes
+    on to the wall: joints of a laser-cut device heed it.
     """
     shape = grid(design, size)
     continued_mm = _continued(nodes_mm)
@@ -66,17 +69,17 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int) -> Slid:
         _bulge_mm2(nodes_mm[:: shape.row_split, :: shape.column_split]),
         lattice.bends,
     )
-    length_mm, held_line = piece_length_mm(design, size), round(held / shape.row_split)
+    length_mm, held_line = piece_length_mm(design, size), held / shape.row_split
     if isinstance(design, LaserCut):
         width_mm = size.free_diameter_mm * np.sin(2 * np.pi / design.n_columns)
-        moves_mm = cells.relax(pieces, length_mm, width_mm, held_line)
+        moves_mm = cells.relax(pieces, length_mm, width_mm, held_line, lambda p, row, column: laid(p, row - 1, column))
     else:
-        weights = net.Weights(length_mm, RESISTANCE, CROWDING, STIFFNESS, held_line)
+        weights = net.Weights(length_mm, RESISTANCE, CROWDING, STIFFNESS, round(held_line))
         moves_mm = np.pad(net.slide(pieces, weights, DESCENT), ((0, 0), (0, 1)))
     rows, columns, off_mm = (_spread(moves, lattice, shape) for moves in (moves_mm / [*spacing_mm, 1.0]).T)
     row, column = np.arange(shape.rows)[:, None] + rows - rows[held].mean(), np.arange(shape.columns) + columns
     lift_mm = -off_mm[..., None] * _bilinear(normals(continued_mm), row + 1, column)
-    return Slid(_bilinear(continued_mm, row + 1, column), row, lift_mm)
+    return Slid(_bilinear(continued_mm, row + 1, column), row, column, lift_mm)
 
 
 def _bulge_mm2(nodes_mm: Floats) -> Floats:

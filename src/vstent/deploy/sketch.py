@@ -11,8 +11,8 @@ from typing import Final, final
 
 import numpy as np
 
-from vstent.deploy import pieces
-from vstent.deploy.braid import FreeDiameter, Profile, landed_row, march
+from vstent.deploy import cells, pieces
+from vstent.deploy.braid import FreeDiameter, Profile, expected_profile, landed_row, march
 from vstent.deploy.contour import Planes, circles, evenly_spaced, perimeters, planes
 from vstent.deploy.method import check_inside
 from vstent.deploy.wall import AbstractWall, Contact
@@ -46,14 +46,16 @@ class Bed:
     """(k, columns, 2) where the device's contour lies on every ring, in its plane."""
     gap_mm: Floats
     """(k, columns) clearance between the device's outer face and the wall."""
+    expected: Profile
+    """What its rows heed of the axis's bends."""
     diameter_band_mm: float
     """How sure the artery's diameters are."""
 
     @cached_property
     def profile(self) -> Profile:
         """Diameter of the device's contour along the axis."""
-        bend = self.across.abscissa_mm, self.across.curvature_per_mm
-        return Profile(self.abscissa_mm, perimeters(self.in_plane_mm) / np.pi, bend)
+        diameter_mm = perimeters(self.in_plane_mm) / np.pi
+        return replace(self.expected, abscissa_mm=self.abscissa_mm, diameter_mm=diameter_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +92,7 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     nodes_mm = across.place(abscissa_mm, in_plane_mm).reshape(-1, 3)
     gap_mm = np.maximum(anatomy.landing_surface.closest(nodes_mm)[1] - dd_mm, 0.0).reshape(-1, columns)
     band_mm = anatomy.vessel.threshold_band_mm or ASSUMED_BAND_MM
-    return Bed(design, size, across, abscissa_mm, in_plane_mm, gap_mm, band_mm)
+    return Bed(design, size, across, abscissa_mm, in_plane_mm, gap_mm, expected_profile(design, anatomy), band_mm)
 
 
 def sketch(wall: Bed, landing: Landing) -> Sketch:
@@ -107,7 +109,7 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
     flat = np.concatenate([wall.in_plane_mm, wall.gap_mm[..., None]], axis=2).reshape(len(wall.abscissa_mm), -1)
     laid = curves.interpolate(wall.abscissa_mm, flat, rows_mm).reshape(len(rows_mm), -1, 3)
     held = landed_row(design, size, landing)
-    slid = pieces.slide(design, size, wall.across.place(rows_mm, laid[..., :2]), held)
+    slid = pieces.slide(design, size, wall.across.place(rows_mm, laid[..., :2]), held, cells.as_drawn)
     rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), rows_mm, slid.row.mean(axis=1))
     near = np.clip(np.rint(slid.row).astype(int), 0, len(rows_mm) - 1)
     gap_mm = np.take_along_axis(laid[..., 2], near, axis=0) + np.linalg.norm(slid.lift_mm, axis=2)

@@ -1,9 +1,11 @@
 """Wires: the axes of braided wires, woven over and under, and of laser-cut rings, drawn on the deployed contour."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates, spline_filter
+from scipy.ndimage import spline_filter1d
+from scipy.sparse import csr_matrix
 
 from vstent.deploy.contour import normals
 from vstent.deploy.wall import AbstractWall
@@ -53,26 +55,44 @@ def _kept_inside(points_mm: Floats, clearance_mm: Floats, wall: AbstractWall) ->
     return np.where(is_near[:, None], moved, points_mm)
 
 
-class _Chart:
-    """The contour as a smooth surface over (row, column), rows open and columns periodic (cubic spline)."""
+def _samples(shape: Grid, row: Floats, column: Floats) -> csr_matrix:
+    """Weights (n, k) of the k coefficients of a contour's spline at fractional rows and columns (n,) of its grid."""
+    pad = min(PAD, shape.rows - 1)
+    height, width = shape.rows + 2 * pad, shape.columns + 2 * PAD
+    (i, down), (j, right) = _knots(row + pad, height), _knots(column % shape.columns + PAD, width)
+    values = (down[:, :, None] * right[:, None]).ravel()
+    places = (i[:, :, None] * width + j[:, None]).ravel().astype(np.int32)
+    first = np.arange(0, len(values) + 1, 16, dtype=np.int32)
+    return csr_matrix((values, places, first), shape=(len(row), height * width))
 
-    def __init__(self, nodes_mm: Floats) -> None:
-        values = np.concatenate([nodes_mm, normals(nodes_mm)], axis=2)
-        pad = min(PAD, len(values) - 1)
-        before = 2 * values[:1] - values[pad:0:-1]
-        after = 2 * values[-1:] - values[-2 : -pad - 2 : -1]
-        values = np.concatenate([before, values, after])
-        values = np.concatenate([values[:, -PAD:], values, values[:, :PAD]], axis=1)
-        self._pad = pad
-        self._columns = nodes_mm.shape[1]
-        self._coefficients = [spline_filter(values[..., k], order=3, mode="mirror") for k in range(6)]
 
-    def at(self, row: Floats, column: Floats) -> tuple[Floats, Floats]:
-        """Return points (n, 3) and outward unit normals (n, 3) at fractional rows and columns (n,)."""
-        where = np.stack([row + self._pad, column % self._columns + PAD])
-        found = [map_coordinates(c, where, order=3, mode="mirror", prefilter=False) for c in self._coefficients]
-        normal = np.stack(found[3:], axis=-1)
-        return np.stack(found[:3], axis=-1), normal / np.linalg.norm(normal, axis=1, keepdims=True)
+def _knots(where: Floats, n: int) -> tuple[Ints, Floats]:
+    """Four knots (m, 4) of n about each of (m,) places and what cubic B-splines weigh there (m, 4)."""
+    first = np.floor(where).astype(int)
+    t = where - first
+    weights = [(1 - t) ** 3, (3 * t - 6) * t**2 + 4, ((3 - 3 * t) * t + 3) * t + 1, t**3]
+    return np.clip(first[:, None] + np.arange(-1, 3), 0, n - 1), np.stack(weights, axis=1) / 6
+
+
+def _spline(nodes_mm: Floats) -> Floats:
+    """Coefficients (k, 6) of the contour (rows, columns, 3) and its normals as smooth surfaces (cubic splines).
+
+    Rows are open, columns periodic.
+    """
+    values, pad = np.concatenate([nodes_mm, normals(nodes_mm)], axis=2), min(PAD, len(nodes_mm) - 1)
+    before = 2 * values[:1] - values[pad:0:-1]
+    after = 2 * values[-1:] - values[-2 : -pad - 2 : -1]
+    values = np.concatenate([before, values, after])
+    values = np.concatenate([values[:, -PAD:], values, values[:, :PAD]], axis=1)
+    for axis in (0, 1):
+        values = spline_filter1d(values, order=3, axis=axis, mode="mirror")
+    return values.reshape(-1, 6)
+
+
+def _drawn(spline: Floats, samples: csr_matrix) -> tuple[Floats, Floats]:
+    """Points (n, 3) and outward unit normals (n, 3) of a contour's spline (k, 6) at samples (n, k)."""
+    found = samples @ spline
+    return found[:, :3], found[:, 3:] / np.linalg.norm(found[:, 3:], axis=1, keepdims=True)
 
 
 def wire_diameters_um(design: Braid) -> Floats:
@@ -94,19 +114,26 @@ def _braided(design: Braid, size: Size, shape: Grid, nodes_mm: Floats) -> tuple[
     k, row = np.meshgrid(np.arange(half), np.arange(rows), indexing="ij")
     samples = max(4, int(np.ceil(piece_length_mm(design, size) / POINT_SPACING_MM)))
     fraction = np.arange((rows - 1) * samples + 1) / samples
-    chart = _Chart(nodes_mm)
+    spline = _spline(nodes_mm)
     points, depths = [], []
     for hand in (1, -1):
         partner = (k + hand * row) % half
         side = hand * (1 - 2 * (row % 2))
         height_mm = 0.25 * side * (diameter_um[k] + diameter_um[partner]) * MM_PER_UM
-        column = 2 * np.arange(half)[:, None] + hand * fraction
-        along = np.broadcast_to(fraction, column.shape)
-        base_mm, normal = chart.at((along * shape.row_split).ravel(), (column * shape.column_split).ravel())
+        base_mm, normal = _drawn(spline, _along_wires(shape, hand, samples))
         points.append(base_mm + _eased(height_mm, fraction).reshape(-1, 1) * normal)
         depths.append(np.repeat(diameter_um * MM_PER_UM, len(fraction)))
     starts = np.arange(2 * half + 1, dtype=np.int32) * len(fraction)
     return Wires(np.concatenate(points), starts, np.tile(diameter_um, 2)), np.concatenate(depths)
+
+
+@lru_cache(maxsize=8)
+def _along_wires(shape: Grid, hand: int, samples: int) -> csr_matrix:
+    """Samples along all wires of one hand of a braid, so many from each row to the next."""
+    fraction = np.arange((shape.lattice_rows - 1) * samples + 1) / samples
+    column = 2 * np.arange(shape.lattice_columns // 2)[:, None] + hand * fraction
+    along = np.broadcast_to(fraction, column.shape)
+    return _samples(shape, (along * shape.row_split).ravel(), (column * shape.column_split).ravel())
 
 
 def _eased(values: Floats, position: Floats) -> Floats:
@@ -128,7 +155,7 @@ def _laser_cut(design: LaserCut, shape: Grid, nodes_mm: Floats) -> tuple[Wires, 
     rise = _rounded_zigzag(column + ring % 2)
     along = (ring + rise) * shape.row_split
     around = np.broadcast_to(column * shape.column_split, along.shape)
-    base_mm, normal = _Chart(nodes_mm).at(along.ravel(), around.ravel())
+    base_mm, normal = _drawn(_spline(nodes_mm), _samples(shape, along.ravel(), around.ravel()))
     outward_mm = (design.wall_offset_um - 0.5 * design.strut_thickness_um) * MM_PER_UM
     starts = np.arange(rings + 1, dtype=np.int32) * len(column)
     width_um = np.full(rings, design.strut_width_um)

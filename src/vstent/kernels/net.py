@@ -202,9 +202,12 @@ def _diagonal(net: Any, weights: Any, inertia: float, slopes: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _coarse(net: Any, weights: Any, inertia: float, slopes: Any, waves: Any) -> Any:
-    """Banded Cholesky factor (n, BAND), lower form, of the normal matrix on moves of whole rows."""
-    line, damp, crowd = net.line, weights.resistance**2, weights.crowding**2
+def _stretching(net: Any, slopes: Any, waves: Any) -> Any:
+    """Add up pieces' part of the normal matrix on moves of whole rows: (l, BAND, BAND), lower, of a row and the next.
+
+    Inertia changes nothing here.
+    """
+    line = net.line
     blocks = np.zeros((int(line[-1]) + 1, _BAND, _BAND))
     g = np.zeros(_BAND)
     for p in range(len(slopes)):
@@ -212,19 +215,28 @@ def _coarse(net: Any, weights: Any, inertia: float, slopes: Any, waves: Any) -> 
         for w in range(3):
             g[w], g[3 + w] = slopes[p, 0] * waves[a, w], slopes[p, 1] * waves[a, w]
             g[6 + w], g[9 + w] = slopes[p, 2] * waves[b, w], slopes[p, 3] * waves[b, w]
+        block = blocks[line[a]]
         for i in range(_BAND):
-            for j in range(_BAND):
-                blocks[line[a], i, j] += g[i] * g[j]
+            for j in range(i + 1):
+                block[i, j] += g[i] * g[j]
+    return blocks
+
+
+@njit(cache=True, nogil=True)
+def _coarse(net: Any, weights: Any, inertia: float, stretching: Any, waves: Any) -> Any:
+    """Banded Cholesky factor (n, BAND), lower form, of the normal matrix on moves of whole rows."""
+    line, damp, crowd = net.line, weights.resistance**2, weights.crowding**2
+    blocks = stretching.copy()
     for c in range(len(line)):
-        beside = net.beside[c]
+        beside, block = net.beside[c], blocks[line[c]]
         for w in range(3):
-            for v in range(3):
+            for v in range(w + 1):
                 both = waves[c, w] * waves[c, v]
                 apart = (waves[beside, w] - waves[c, w]) * (waves[beside, v] - waves[c, v])
-                blocks[line[c], w, v] += (damp + inertia if w + v > 0 else 0.0) * both
-                blocks[line[c], 3 + w, 3 + v] += (damp + inertia) * both + crowd * apart
+                block[w, v] += (damp + inertia if w + v > 0 else 0.0) * both
+                block[3 + w, 3 + v] += (damp + inertia) * both + crowd * apart
         if line[c] == weights.held:
-            blocks[weights.held, 0, 0] += 1.0
+            block[0, 0] += 1.0
     band = np.zeros((len(blocks) * _WAVES, _BAND))
     for row in range(len(blocks)):
         for i in range(_BAND if row < len(blocks) - 1 else _WAVES):
@@ -300,10 +312,10 @@ def _downhill(net: Any, weights: Any, slopes: Any, x: Any, excess: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _step(net: Any, weights: Any, inertia: float, waves: Any, slopes: Any, residual: Any, tolerance: float) -> Any:
-    """Moves (c, 2) of a step downhill, by conjugate gradients."""
-    n = len(net.line)
-    factor, inverse = _coarse(net, weights, inertia, slopes, waves), _diagonal(net, weights, inertia, slopes)
+def _step(net: Any, weights: Any, inertia: float, coarse: Any, slopes: Any, residual: Any, tolerance: float) -> Any:
+    """Moves (c, 2) of a step downhill, by conjugate gradients; `coarse` is (factor, waves) of the coarse problem."""
+    n, (factor, waves) = len(net.line), coarse
+    inverse = _diagonal(net, weights, inertia, slopes)
     move, way, ready, image = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2))
     residual, goal, before = residual.copy(), 0.0, np.inf
     for _ in range(ROUNDS):
@@ -333,9 +345,10 @@ def _slide(net: Any, weights: Any, waves: Any, descent: Any) -> Any:
     cost = _cost(net, weights, places, x, excess)
     for _ in range(descent.steps):
         _slopes(places, net.ends, slopes)
-        residual, before = _downhill(net, weights, slopes, x, excess), cost
+        residual, before, stretching = _downhill(net, weights, slopes, x, excess), cost, _stretching(net, slopes, waves)
         while True:
-            tried = x + _step(net, weights, inertia, waves, slopes, residual, descent.tolerance)
+            coarse = _coarse(net, weights, inertia, stretching, waves), waves
+            tried = x + _step(net, weights, inertia, coarse, slopes, residual, descent.tolerance)
             _put(net, tried, places)
             cost = _cost(net, weights, places, tried, excess)
             if cost < before:

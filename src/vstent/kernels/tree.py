@@ -12,7 +12,8 @@ from numba import njit, prange
 from vstent.kernels import triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 
-LEAF: Final = 4
+LEAF: Final = 1
+"""Triangles of a leaf. Boxes cost less than triangles: with 4 a closest point takes a quarter longer."""
 _STACK: Final = 64
 
 

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from vstent.errors import InputError, VesselError
 from vstent.kernels import curves
-from vstent.kernels.arrays import Floats
-from vstent.restore.axis import fit_axis
+from vstent.kernels.arrays import Bools, Floats
+from vstent.restore.axis import Mouth, fit_axis
 from vstent.restore.bulges import Bulge, find_bulges
 from vstent.restore.drawn import cut_along
 from vstent.restore.landing import Landing, close_landing
@@ -29,6 +29,8 @@ REACH_MM: Final = 10.0
 """At a fork, the parent artery goes on where the vessel is wider over this length."""
 ON_FOOT: Final = 1.5
 """A foot, which rises to half a radius above the nearest artery, is an artery's own up to this many of its radii."""
+IN_SAC: Final = 1.2
+"""A sphere reaches into a sac whose wall is within this many of its radii."""
 PASSING: Final = 2.0
 """A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
 
@@ -63,8 +65,8 @@ def restore(
         x, y, z = np.asarray(at_mm, dtype=float)
         raise InputError(f"no sac stands out of the artery near {x:.1f}, {y:.1f}, {z:.1f} mm: give a point in its dome")
     path = _parent_path(vessel, bulges, outlet_mm)
-    feet = [_foot_on(vessel.centerlines[path], bulge) for bulge in bulges]
-    tube = fit_axis(vessel.lumen, vessel.centerlines[path], feet)
+    mouths = [Mouth(_foot_on(vessel.centerlines[path], bulge), bulge.inward) for bulge in bulges]
+    tube = fit_axis(vessel.lumen, vessel.centerlines[path], mouths)
     landing = close_landing(vessel.lumen, tube, drawn.artery if drawn else None)
     side_lines = [line for k, line in enumerate(vessel.centerlines) if k != path]
     sacs = [drawn_sac(vessel, landing, side_lines, drawn)] if drawn else _sacs(vessel, landing, side_lines, bulges)
@@ -94,7 +96,15 @@ def _parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) 
         return int(np.argmin(np.linalg.norm(ends - np.asarray(outlet_mm), axis=1)))
     reach = np.array([_reach(line, bulges[0]) if bulges else 0.0 for line in lines])
     passing = np.flatnonzero(reach <= max(PASSING, 1.25 * reach.min()))
-    return int(reduce(lambda one, other: one if _is_wider(lines[one], lines[other]) else other, passing))
+    off = [_is_off_sac(line, bulges) for line in lines]
+    return int(reduce(lambda i, k: i if _is_wider(lines[i], lines[k], off[i], off[k]) else k, passing))
+
+
+def _is_off_sac(line: Centerline, bulges: list[Bulge]) -> Bools:
+    """Tell the points (n,) of a centerline whose inscribed spheres do not reach into a sac: it makes them wide."""
+    if not bulges:
+        return np.ones(len(line.points_mm), dtype=bool)
+    return np.asarray(bulges[0].distances_mm(line.points_mm) > IN_SAC * line.inscribed_radius_mm)
 
 
 def _reach(line: Centerline, bulge: Bulge) -> float:
@@ -114,14 +124,14 @@ def _foot_on(line: Centerline, bulge: Bulge) -> Floats:
     return on_artery if len(on_artery) else bulge.foot_mm
 
 
-def _is_wider(one: Centerline, other: Centerline) -> bool:
-    """Tell whether the first of two centerlines is the wider over `REACH_MM` beyond their fork."""
-    return _width_beyond_fork(one, other) >= _width_beyond_fork(other, one)
+def _is_wider(one: Centerline, other: Centerline, one_is_off: Bools, other_is_off: Bools) -> bool:
+    """Tell whether the first of two centerlines is the wider over `REACH_MM` beyond their fork, off the sac."""
+    return _width_beyond_fork(one, other, one_is_off) >= _width_beyond_fork(other, one, other_is_off)
 
 
-def _width_beyond_fork(line: Centerline, other: Centerline) -> float:
+def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> float:
     distance = curves.project(other.points_mm, line.points_mm)[1]
-    apart = np.flatnonzero(distance > line.inscribed_radius_mm)
+    apart = np.flatnonzero((distance > line.inscribed_radius_mm) & is_off)
     fork_mm = line.abscissa_mm[apart[0]] if len(apart) else line.length_mm
     beyond = (line.abscissa_mm >= fork_mm) & (line.abscissa_mm <= fork_mm + REACH_MM)
     return float(np.median(line.inscribed_radius_mm[beyond]))

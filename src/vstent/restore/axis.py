@@ -29,6 +29,10 @@ FLARE_LENGTH: Final = 1.5
 """The artery flares into a neck over at most this many of its radii."""
 FAR_SIDE: Final = -0.2
 """A ray looks at the far side of the neck if the cosine of its angle with the sac's direction is below this."""
+INTO: Final = 0.5
+"""A neck is looked for this many radii above the middle of its foot, which may lie on the artery's axis."""
+SIDE_TRUST: Final = 0.1
+"""Across the way into a neck the medial line counts as this fraction of all rays of a section."""
 NECK_TRUST: Final = 10.0
 """Weight of the interpolated radius across a neck against all rays of a section."""
 TOLERANCE: Final = ((0.40, 1.00),) * 4 + ((0.20, 0.50),) * 4 + ((0.12, 0.35),) * 4
@@ -44,26 +48,36 @@ class Tube(NamedTuple):
     """(n,) radius."""
 
 
-def fit_axis(lumen: Surface, line: Centerline, feet_mm: Sequence[Floats] = ()) -> Tube:
+class Mouth(NamedTuple):
+    """Where a sac opens into the artery."""
+
+    foot_mm: Floats
+    """(k, 3) where its wall rises from the artery."""
+    inward: Floats
+    """(3,) unit vector into the sac."""
+
+
+def fit_axis(lumen: Surface, line: Centerline, mouths: Sequence[Mouth] = ()) -> Tube:
     """Fit the axis and radius of the artery along a centerline, blind to sacs and branches.
 
     Parameters
     ----------
     lumen : the wall.
     line : where to begin from.
-    feet_mm : (k, 3) for each sac, where its wall rises from the artery: there the radius is interpolated between the
-        healthy stations on both sides, because the wall that is left flares into the neck.
+    mouths : of each sac: there the radius is interpolated between the healthy stations on both sides, because the wall
+        that is left flares into the neck.
     """
     points = curves.resample(line.points_mm, STEP_MM)
     abscissa = curves.arc_length(points)
     parent = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
     radius = np.interp(abscissa / abscissa[-1], line.abscissa_mm / line.length_mm, parent)
     for full, none in TOLERANCE:
-        necks = _across_necks(points, radius, feet_mm)
+        necks = _across_necks(points, radius, mouths)
         rho = section_rays(lumen, points, N_RAYS)
         excess = rho / necks.radius_mm[:, None] - 1.0
-        weight = np.where(necks.is_sacward, 0.0, np.clip((none - excess) / (none - full), 0.0, 1.0))
-        points, radius = _fit(points, necks.radius_mm, np.where(weight > 0, rho, 0.0), weight, necks.trust)
+        weight = np.clip((none - excess) / (none - full), 0.0, 1.0)
+        weight = np.where(necks.is_sacward, 0.0, weight)
+        points, radius = _fit(points, necks.radius_mm, np.where(weight > 0, rho, 0.0), weight, necks, line.points_mm)
     return Tube(points, radius)
 
 
@@ -74,28 +88,36 @@ class _Necks(NamedTuple):
     """(n,) weight of that radius, in rays."""
     is_sacward: Bools
     """(n, rays) rays into a neck: only the wall on the far side says where the artery is."""
+    across: Floats
+    """(n, 2) unit vector in the section, along its two normals, square to the way into the neck; zero off necks."""
 
 
-def _across_necks(points: Floats, radius: Floats, feet_mm: Sequence[Floats]) -> _Necks:
+def _across_necks(points: Floats, radius: Floats, mouths: Sequence[Mouth]) -> _Necks:
     """Where the necks are, and what the healthy stations on both sides of them say."""
     abscissa, healthy = curves.arc_length(points), np.ones(len(points), dtype=bool)
     sacward = np.zeros((len(points), N_RAYS), dtype=bool)
+    across = np.zeros((len(points), 2))
+    frames = curves.parallel_frames(points)
     directions = section_directions(points, N_RAYS)
-    for foot_mm in feet_mm:
+    for foot_mm, inward in mouths:
         place, distance = curves.project(points, foot_mm)
         at_foot = place[distance < 3.0 * np.interp(place, abscissa, radius)]
         if not len(at_foot):
             continue
         typical = float(np.median(np.interp(at_foot, abscissa, radius)))
         neck = (abscissa > at_foot.min() - FLARE_LENGTH * typical) & (abscissa < at_foot.max() + FLARE_LENGTH * typical)
-        to_foot = np.einsum("nrd,nd->nr", directions, foot_mm.mean(axis=0) - points)
-        reach = to_foot.max(axis=1, keepdims=True)
-        sacward |= neck[:, None] & (reach > 0.5 * typical) & (to_foot > FAR_SIDE * reach)
+        into = foot_mm.mean(axis=0) + INTO * typical * inward - points
+        to_sac = np.einsum("nrd,nd->nr", directions, into)
+        reach = to_sac.max(axis=1, keepdims=True)
+        beside = neck[:, None] & (reach > 0.5 * typical)
+        sacward |= beside & (to_sac > FAR_SIDE * reach)
+        square = np.einsum("nkd,nd->nk", frames[:, :0:-1], into) * [-1.0, 1.0]
+        across = np.where(beside, square / np.maximum(np.linalg.norm(square, axis=1, keepdims=True), 1e-12), across)
         healthy &= ~neck
     if not healthy.any():
-        return _Necks(radius, np.zeros(len(points)), sacward)
+        return _Necks(radius, np.zeros(len(points)), sacward, across)
     trust = np.where(healthy, 0.0, NECK_TRUST * N_RAYS)
-    return _Necks(np.interp(abscissa, abscissa[healthy], radius[healthy]), trust, sacward)
+    return _Necks(np.interp(abscissa, abscissa[healthy], radius[healthy]), trust, sacward, across)
 
 
 def section_rays(lumen: Surface, points_mm: Floats, n_rays: int) -> Floats:
@@ -112,19 +134,30 @@ def section_directions(points_mm: Floats, n_rays: int) -> Floats:
     return np.cos(angle)[None, :, None] * frames[:, None, 1] + np.sin(angle)[None, :, None] * frames[:, None, 2]
 
 
-def _fit(points: Floats, radius: Floats, rho: Floats, weight: Floats, trust: Floats) -> tuple[Floats, Floats]:
+def _toward(line_mm: Floats, points: Floats) -> Floats:
+    """Way (n, 3) from points to the nearest ones of a polyline (k, 3)."""
+    return curves.interpolate(curves.arc_length(line_mm), line_mm, curves.project(line_mm, points)[0]) - points
+
+
+def _fit(
+    points: Floats, radius: Floats, rho: Floats, weight: Floats, necks: _Necks, medial_mm: Floats
+) -> tuple[Floats, Floats]:
     """One least-squares step: rho = r + a cos + b sin with smooth radius r and smooth axis points + a n1 + b n2.
 
-    The radius so far counts as `trust` (n,) rays.
+    Across the way into a neck the axis is drawn to the medial line (k, 3): a wall of which a wide neck has left a
+    slope is one along which a circle rolls, and the medial line bulges into the sac, but not to its side.
     """
     n, n_rays = rho.shape
     angle = 2 * np.pi * np.arange(n_rays) / n_rays
     basis = np.stack([np.ones(n_rays), np.cos(angle), np.sin(angle)])
     normal = np.einsum("ik,nk,jk->ijn", basis, weight, basis)
     right = np.einsum("ik,nk,nk->in", basis, weight, rho)
-    normal[0, 0] += trust
-    right[0] += trust * radius
+    normal[0, 0] += necks.trust
+    right[0] += necks.trust * radius
     frames = curves.parallel_frames(points)
+    aside = SIDE_TRUST * n_rays * np.einsum("nk,nkd,nd->n", necks.across, frames[:, 1:], _toward(medial_mm, points))
+    right[1:] += aside * necks.across.T
+    normal[1:, 1:] += SIDE_TRUST * n_rays * np.einsum("ni,nj->ijn", necks.across, necks.across)
     wave = WAVELENGTH * 2.0 * float(np.median(radius)) / (2 * np.pi * STEP_MM)
     stiff_radius = n_rays * wave**4 * curves.roughness(n, 2)
     stiff_axis = n_rays / 2 * wave**6 * curves.roughness(n, 3)

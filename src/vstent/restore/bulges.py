@@ -42,6 +42,13 @@ class Bulge:
         freeze(self, "foot_mm", np.float64, (-1, 3))
         freeze(self, "dome_mm", np.float64, (3,))
 
+    @property
+    def inward(self) -> Floats:
+        """(3,) unit vector square to the plane of its foot, into it: a sac may hang to the side of its mouth."""
+        vector = triangles.polygon_area_vector(self.foot_mm)
+        vector *= np.sign((self.points_mm.mean(axis=0) - self.foot_mm.mean(axis=0)) @ vector)
+        return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))
+
     def distances_mm(self, points_mm: Floats) -> Floats:
         """Distance (k,) of each of (k, 3) points to the nearest vertex of the bulge."""
         return np.asarray(cKDTree(self.points_mm).query(points_mm)[0])

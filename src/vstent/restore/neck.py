@@ -8,6 +8,7 @@ slope and curvature (a parabola over its length), and the neck is where those pa
 the one measured in the scan; a surface does not tell it.
 """
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -55,6 +56,10 @@ BRANCH_SHARE: Final = 0.15
 """A branch's own wall stands out of its tube by less than this many radii."""
 FACING: Final = 3.0
 """A wall that looks straight at a branch counts as this many of its radii further away."""
+MOUTH: Final = 0.25
+"""A branch that leaves from the sac is cut off where the wall stands out of its own by this many of its radii..."""
+ROOT: Final = 2.0
+"""... but no further than this many of them along it."""
 
 
 class Artery(NamedTuple):
@@ -64,6 +69,8 @@ class Artery(NamedTuple):
     """The parent artery, and those that part from it under the sac."""
     branches: Tubes
     """All other branches, where they have left the parent artery and the sac."""
+    apart_mm: Floats
+    """(n,) by how much the lumen's wall beside each sphere of the branches counts as further away, see `apart_mm`."""
 
     def height_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
         """How far points (n, 3) stand out of all arteries' walls, negative inside.
@@ -84,6 +91,7 @@ class Artery(NamedTuple):
         height = height - BRANCH_SHARE * self.branches.radius_mm[sphere]
         if normals is None:
             return height
+        height = height + self.apart_mm[sphere]
         branches = self.branches.centers_mm[sphere], self.branches.radius_mm[sphere]
         return height + _turned_mm(*branches, points_mm, normals)
 
@@ -102,6 +110,22 @@ class Artery(NamedTuple):
     @staticmethod
     def _above(landing: Landing, points_mm: Floats) -> Floats:
         return landing.solid.signed_distance(points_mm)
+
+
+def apart_mm(landings: Sequence[Landing], branches: Tubes, along_mm: Floats, low_mm: float) -> Floats:
+    """By how much a flank counts as further from the spheres (n,) of branches that begin apart from all arteries.
+
+    Beside an artery a flank is believed from `low_mm` on, for from there it is continued to the neck. The mouth of a
+    branch that leaves from the sac is only closed: its own wall is enough to keep off. Were `low_mm` cut off around it
+    as well, a branch up to twice as far from the neck would be one with it, or not, as the noise has it. Further along
+    than `ROOT` radii, `along_mm` (n,) from where it begins, all of a branch is cut off, however uneven its wall is.
+    """
+    if not len(branches.radius_mm):
+        return np.zeros(0)
+    radius = branches.radius_mm
+    gap_mm = np.min([one.solid.signed_distance(branches.centers_mm) for one in landings], axis=0) - radius
+    share = np.clip(gap_mm / low_mm, 0.0, 1.0) * np.clip(ROOT - along_mm / radius, 0.0, 1.0)
+    return np.asarray(np.maximum(low_mm - MOUTH * radius, 0.0) * share)
 
 
 def _turned_mm(centers_mm: Floats, radius_mm: Floats, points_mm: Floats, normals: Floats) -> Floats:

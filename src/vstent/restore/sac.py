@@ -9,11 +9,11 @@ from scipy.spatial import cKDTree
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.regions import region
-from vstent.restore.axis import fit_axis
+from vstent.restore.axis import Mouth, fit_axis
 from vstent.restore.bulges import FLANK, Bulge, bulge_at
 from vstent.restore.drawn import Drawn
 from vstent.restore.landing import Landing, close_landing
-from vstent.restore.neck import Artery, Flank, believed_from_mm, skirt, unblurred
+from vstent.restore.neck import Artery, Flank, apart_mm, believed_from_mm, skirt, unblurred
 from vstent.restore.tubes import tubes_of
 from vstent.surface import Surface
 from vstent.vessel import Aneurysm, Centerline, Vessel
@@ -53,7 +53,7 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     Side branches that leave from the sac or beside it are cut off along their own tubes.
     """
     lumen = vessel.lumen
-    artery = _artery(lumen, landing, side_lines, bulge)
+    artery = _artery(vessel, landing, side_lines, bulge)
     height_mm = artery.height_mm(lumen.vertices_mm, lumen.vertex_normals)
     parent_mm = landing.section_radius_mm[landing.nearest_sections(lumen.vertices_mm)]
     core = bulge_at(lumen, height_mm, height_mm > FLANK * parent_mm, bulge.dome_mm)
@@ -78,7 +78,7 @@ def _low_mm(vessel: Vessel, landing: Landing, bulge: Bulge) -> float:
 
 def drawn_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], drawn: Drawn) -> Aneurysm:
     """Close the sac behind a neck that was drawn; side branches that leave from it are cut off along their tubes."""
-    artery = _artery(vessel.lumen, landing, side_lines, drawn.bulge)
+    artery = _artery(vessel, landing, side_lines, drawn.bulge)
     normals = Surface(drawn.vertices_mm, drawn.faces).vertex_normals
     in_branch_mm = _low_mm(vessel, landing, drawn.bulge) - artery.above_branches_mm(drawn.vertices_mm, normals)
     vertices, faces, _ = triangles.clip(drawn.vertices_mm, drawn.faces, in_branch_mm)
@@ -165,7 +165,7 @@ def _near_border(lumen: Surface, excess: Floats, reach_mm: float) -> Bools:
     return np.asarray(cKDTree(border).query(lumen.vertices_mm, distance_upper_bound=reach_mm)[0]) < reach_mm
 
 
-def _artery(lumen: Surface, landing: Landing, lines: Sequence[Centerline], bulge: Bulge) -> Artery:
+def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge: Bulge) -> Artery:
     """The arteries around a sac: the parent, the branches that pass under it too, and those elsewhere or from it."""
     landings, proper = [landing], []
     foot = cKDTree(bulge.foot_mm)
@@ -177,13 +177,15 @@ def _artery(lumen: Surface, landing: Landing, lines: Sequence[Centerline], bulge
         is_branch = np.arange(len(line.points_mm)) > (inner[-1] if len(inner) else -1)
         gap = np.asarray(foot.query(line.points_mm)[0])
         passes = (is_apart & (gap < PASSING * line.inscribed_radius_mm)).any()
-        side = _beside(lumen, landing, line, bulge) if passes else None
+        side = _beside(vessel.lumen, landing, line, bulge) if passes else None
         if side is not None:
             landings.append(side)
             place, _ = curves.project(side.points_mm, line.points_mm)
             is_branch &= (place <= 0) | (place >= curves.arc_length(side.points_mm)[-1])
         proper += [Centerline(line.points_mm[run], line.inscribed_radius_mm[run]) for run in _runs(is_branch)]
-    return Artery(tuple(landings), tubes_of(proper))
+    branches = tubes_of(proper)
+    along_mm = np.concatenate([np.zeros(0), *(line.abscissa_mm for line in proper)])
+    return Artery(tuple(landings), branches, apart_mm(landings, branches, along_mm, _low_mm(vessel, landing, bulge)))
 
 
 def _runs(member: Bools) -> list[slice]:
@@ -200,7 +202,7 @@ def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) ->
     course = _into_parent(landing, line, bulge)
     if course is None:
         return None
-    side = close_landing(lumen, fit_axis(lumen, course, [bulge.foot_mm]))
+    side = close_landing(lumen, fit_axis(lumen, course, [Mouth(bulge.foot_mm, bulge.inward)]))
     is_own = (~side.is_restored).mean(axis=1) > OWN_WALL
     is_own &= bulge.distances_mm(side.points_mm) > 1.2 * side.section_radius_mm
     lost = np.flatnonzero(~is_own & (landing.solid.signed_distance(side.points_mm) > 0))
