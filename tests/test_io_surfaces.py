@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -210,3 +213,11 @@ def test_damaged_surfaces_are_read_or_refused_but_never_crash(sound_files, tmp_p
         assert np.isfinite(answer.vertices_mm).all()
     else:
         assert "\n" not in answer
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not count a process's seconds")
+@pytest.mark.parametrize(("busy", "lives"), [("while True: pass", False), ("time.sleep(1.6)", True)])
+def test_a_reader_has_so_much_of_the_processor_and_may_wait_for_it(busy: str, lives: bool) -> None:
+    begin = "import time\nfrom vstent.io import vtk_child\nvtk_child.SECONDS = 1.0\nvtk_child._limit(0)\n"
+    ended = subprocess.run([sys.executable, "-c", begin + busy], check=False, timeout=60)
+    assert (ended.returncode == 0) == lives

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from contextlib import suppress
+from math import ceil
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +21,10 @@ from vstent.io.polydata import triangles_of
 from vstent.kernels.arrays import Floats, Ints
 
 SECONDS: Final = 8.0
+"""Of the processor: on a machine that has much else to do a sound file must not pass for a damaged one."""
 SECONDS_PER_BYTE: Final = 1e-6
+PATIENCE: Final = 1.0 if sys.platform == "win32" else 10.0
+"""Seconds of the clock for each of them; Windows counts no others."""
 MEMORY_BYTES: Final = 2_000_000_000
 MEMORY_PER_BYTE: Final = 40
 DISK_FULL: Final = 28
@@ -39,7 +43,7 @@ def read_apart(path: Path) -> tuple[Floats, Ints] | None:
             subprocess.run(
                 command,
                 env=_environment(),
-                timeout=SECONDS + SECONDS_PER_BYTE * size,
+                timeout=PATIENCE * _seconds(size),
                 check=True,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
@@ -61,13 +65,19 @@ def _environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in (root, others) if p)}
 
 
-def _limit_memory(size: int) -> None:
-    with suppress(ImportError):  # Windows has no such limit
+def _seconds(size: int) -> float:
+    return SECONDS + SECONDS_PER_BYTE * size
+
+
+def _limit(size: int) -> None:
+    """Bound this process's memory and processor time."""
+    with suppress(ImportError):  # Windows has no such limits
         import resource
 
-        limit = MEMORY_BYTES + MEMORY_PER_BYTE * size
-        with suppress(ValueError, OSError):
-            resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        memory, seconds = MEMORY_BYTES + MEMORY_PER_BYTE * size, ceil(_seconds(size))
+        for what, most in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds)):
+            with suppress(ValueError, OSError):
+                resource.setrlimit(what, (most, most))
 
 
 def _reader(kind: str) -> Any:
@@ -132,7 +142,7 @@ def _polygons(data: Any) -> Any:
 
 def main(path: Path, result: Path) -> int:
     """Read a file and save its vertices and faces; 1 when there is nothing to save."""
-    _limit_memory(path.stat().st_size)
+    _limit(path.stat().st_size)
     reader = _reader(suffix(path))
     reader.SetFileName(str(path))
     faults = _faults()
