@@ -58,7 +58,7 @@ def test_an_openfoam_case_of_a_studied_case_has_its_device_over_the_neck(studied
     assert "--ntasks=2" in (out / "submit.slurm").read_text()
     assert not (out / ".vstent").exists()
     geometry = parse((out / "system" / "snappyHexMeshDict").read_text())["geometry"]
-    assert set(geometry) == {"lumen", "neck", "struts"}
+    assert set(geometry) == {"lumen", "neck", "struts", "before_outlet_2"}  # the branch is narrow
     whole = Surface(*read_apart(studied / "stents" / "enterprise" / "struts.stl"))
     near = Surface(*read_apart(out / "constant" / "triSurface" / "struts.stl"))
     assert 0 < near.area_mm2 * 1e6 <= whole.area_mm2 * 1.0001

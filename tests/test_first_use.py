@@ -59,6 +59,20 @@ def test_the_set_up_compiles_every_kernel_of_a_deployment():
     assert said == []
 
 
+def test_the_set_up_compiles_what_takes_a_flows_time_so_that_all_processes_run_the_same_code():
+    from vstent import phantoms
+    from vstent.flow import FlowCase, FlowSettings, simulate_case
+    from vstent.kernels import lattice
+    from vstent.trace import trace
+    from vstent.vessel import Vessel
+
+    warm.warm()
+    (ready,) = lattice.update.signatures
+    vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.5)))
+    simulate_case(FlowCase(vessel, settings=FlowSettings(inflow_mL_s=1.0, cell_size_mm=0.4, max_steps=10)))
+    assert lattice.update.signatures == [ready]
+
+
 @pytest.mark.parametrize(("writable", "is_moved"), [(True, False), (False, True)])
 def test_where_no_cache_can_be_written_kernels_are_kept_with_temporary_files(monkeypatch, writable, is_moved):
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)

@@ -1,8 +1,12 @@
-"""Compile the kernels of a deployment ahead of its first use: ``python -m vstent.kernels.warm``, in the set-up."""
+"""Compile kernels ahead of their first use: ``python -m vstent.kernels.warm``, in the set-up.
+
+Those of a deployment, and the one that takes a flow's time: in the process that has compiled it, numba runs another
+machine code than it keeps, a quarter slower and different in the last bits from that of every later process.
+"""
 
 import numpy as np
 
-from vstent.kernels import coverage, net, tree
+from vstent.kernels import coverage, lattice, net, tree
 
 
 def warm() -> None:
@@ -15,6 +19,7 @@ def warm() -> None:
     tiny = tree.build(vertices, faces)
     tree.closest_points(tiny, vertices)
     tree.segments_cross(tiny, vertices, 2 * vertices)
+    _stream()
 
 
 def _slide(nodes_mm: np.ndarray) -> None:
@@ -26,6 +31,24 @@ def _slide(nodes_mm: np.ndarray) -> None:
     few, next_to, pieces, wires = (values.astype(np.uint32) for values in (line, beside, ends, bends))
     tiny = net.Net(chart, line, column, few, next_to, pieces, np.ones(2), np.zeros(3), wires)
     net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1), net.Descent(1, 0.1, 0.1))
+
+
+def _stream() -> None:
+    """Update one cell at rest, with every argument of the type that a flow has."""
+    stride = lattice.LANES
+    lattice.update(
+        np.zeros(20 * stride, np.float32),
+        stride * np.arange(19, dtype=np.int32)[None],
+        np.ones(1, np.int32),
+        np.float32(1.0),
+        np.zeros(4, np.float32),
+        np.full(1, np.inf, np.float32),
+        np.float32(1.0),
+        np.zeros(2, np.int32),
+        np.zeros(0, np.int32),
+        np.zeros((0, 6), np.float32),
+        1,
+    )
 
 
 if __name__ == "__main__":
