@@ -22,7 +22,7 @@ from vstent import phantoms
 from vstent.cli import main
 from vstent.cohort import Case, collect, find_cases, left_to_do, run_cohort
 from vstent.cohort.crews import DaskCluster
-from vstent.cohort.work import Row
+from vstent.cohort.work import COST, Row
 from vstent.io.writers import write_stl
 from vstent.phantoms import Phantom
 from vstent.study import Settings
@@ -30,8 +30,6 @@ from vstent.study import Settings
 SEED = 7
 EDGE_MM = 0.3
 DEVICES = ("silk", "enterprise")
-COST = ("case_s", "case_cpu_s", "peak_memory_MB")
-"""What a row tells of the computer, not of the case."""
 
 
 def artery(random: Generator) -> Phantom:

@@ -31,7 +31,7 @@ from vstent.cohort import (
     run_cohort,
 )
 from vstent.cohort.estimate import START_CPU_S
-from vstent.cohort.work import flat_metrics, read_row, row_path, work
+from vstent.cohort.work import COST, flat_metrics, read_row, row_path, work
 from vstent.errors import InputError, ReadError, VstentError
 from vstent.io.tables import write_parquet
 from vstent.io.writers import write_stl
@@ -40,8 +40,6 @@ from vstent.report.cohort import modified_z_scores
 from vstent.study import Settings
 from vstent.study import run as run_study
 
-COST = ("case_s", "case_cpu_s", "peak_memory_MB")
-"""Columns that no two runs agree on."""
 SETTINGS = Settings(devices=("silk", "enterprise"), flow=None, units="mm")
 
 needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="Dask is not installed")

@@ -142,7 +142,8 @@ class Page {
     this.surfaces = new Newest(
       (answer) => {
         this.picture.put(answer);
-        if (!this.scanViews?.length) this.scanViews = answer.manifest.views;
+        if (this.scanViews?.length) return;
+        this.scanViews = answer.manifest.views;
         this.renderScene();
       },
       (problem) => this.complain(problem),

@@ -18,6 +18,8 @@ from vstent.study import Progress, Settings, restore_vessel, run
 Row = dict[str, Any]
 """One case with one device: names to values."""
 
+COST: Final = ("case_s", "case_cpu_s", "peak_memory_MB")
+"""Columns that no two runs agree on: they tell of the computer, not of the case."""
 DONE: Final = "done"
 FAILED: Final = "failed"
 """The input cannot be used, or a flow cannot be computed: doing it again changes nothing."""
@@ -72,11 +74,8 @@ def work(task: Task) -> None:
             run(task.case.path, task.folder / "study", replace(task.case.settings, devices=done), _Watch())
         if not task.keeps_files:
             shutil.rmtree(task.folder / "study", ignore_errors=True)
-        cost = {
-            "case_s": time.perf_counter() - began,
-            "case_cpu_s": time.process_time() - cpu,
-            "peak_memory_MB": peak_memory_MB(),
-        }
+        spent = time.perf_counter() - began, time.process_time() - cpu, peak_memory_MB()
+        cost = dict(zip(COST, spent, strict=True))
         for device, row in rows.items():
             write_row(task, device, row | cost)
 
