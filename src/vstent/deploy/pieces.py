@@ -16,7 +16,7 @@ import numpy as np
 from vstent.deploy import cells
 from vstent.deploy.contour import normals
 from vstent.device import Design, Grid, LaserCut, Size, grid, piece_length_mm
-from vstent.kernels import net
+from vstent.kernels import curves, net
 from vstent.kernels.arrays import Floats, Ints
 
 RESISTANCE: Final = 0.01
@@ -55,7 +55,7 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.L
     continued_mm = _continued(nodes_mm)
     along_mm = np.gradient(continued_mm, axis=0)
     around_mm = 0.5 * (np.roll(continued_mm, -1, axis=1) - np.roll(continued_mm, 1, axis=1))
-    spacing_mm = np.array([np.median(np.linalg.norm(side, axis=2)) for side in (along_mm, around_mm)])
+    spacing_mm = np.array([np.median(curves.lengths(side)) for side in (along_mm, around_mm)])
     chart = np.concatenate([continued_mm, along_mm / spacing_mm[0], around_mm / spacing_mm[1]], axis=2)
     lattice = _lattice(shape)
     pieces = net.Net(

@@ -12,6 +12,11 @@ from scipy.spatial import cKDTree
 from vstent.kernels.arrays import Floats
 
 
+def lengths(vectors: Floats) -> Floats:
+    """Lengths (...) of vectors (..., d): several times as fast as numpy's norm where d is small."""
+    return np.asarray(np.sqrt(np.einsum("...k,...k->...", vectors, vectors)))
+
+
 def arc_length(points: Floats) -> Floats:
     """Cumulative length (n,) of a polyline (n, 3), starting at 0."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
