@@ -1,7 +1,8 @@
 """How stiff the cells of a laser-cut device are: its struts as elastic beams, welded together where they meet.
 
 Run from the repository, offline, seconds: ``python benchmarks/offline/cell_frame.py``. What comes out is kept beside
-it in ``cell_frame.json``, beside which ``tests/test_deploy_cells.py`` holds `vstent.deploy.cells`. Nothing of vstent's deployment is used, only the catalogue's strut sections and angles.
+it in ``cell_frame.json``, beside which ``tests/test_deploy_cells.py`` holds `vstent.deploy.cells`.
+Nothing of vstent's deployment is used, only the catalogue's strut sections and angles.
 
 The model. The free device is a frame in space: every strut is an arc on the cylinder, cut into straight beams of Euler
 and Bernoulli with the strut's rectangular section (bending both ways, torsion, stretching; Przemieniecki 1968, Theory

@@ -33,7 +33,8 @@ An estimate, five times what struts as elastic beams resist with (``benchmarks/o
 holds to the wall lies flat in bends: gaps of 0.2, 0.9, 1.4 and 1.8 mm where they are of 20, 14, 10 and 7 mm. Enterprise
 does flatten in bends (Krischek et al. 2011, Minim Invas Neurosurg 54:21), but by how much hangs on how it is let go: in
 a tube of 3.5 mm bent by 7 mm pulling the catheter back leaves a crescent outside, pushing and pulling hardly any
-(Heller and Malek 2011, J NeuroIntervent Surg 3:340). What holds it to the wall then is friction. This is a device well let go.
+(Heller and Malek 2011, J NeuroIntervent Surg 3:340). What holds it to the wall then is friction. This is a device that
+was let go well.
 """
 LEVEL: Final = 0.01
 """How much a joint that leaves its row weighs against a strut that stretches by as much."""

@@ -51,6 +51,7 @@ def parallel_frames(points: Floats) -> Floats:
     Double reflection (Wang, Juettler, Zheng and Liu 2008, ACM Trans. Graph. 27(1):2, table I).
     """
     tangent = tangents(points)
+    points = np.array(points, dtype=np.float64)  # numba compiles a kernel anew for arrays that may not be written
     return np.asarray(_transported(points, tangent, any_perpendicular(tangent[0])))
 
 
