@@ -1,9 +1,9 @@
 """Run the heavy validation or the benchmarks and keep what came out for the pages of the documentation.
 
-Run from the repository: ``python tools/record.py validation [PYTEST OPTION ...]``, or ``python tools/record.py benchmark
-["SCRIPT WORD ..." ...]``. Every test module and every script has a section of its own, `docs/recorded/KIND/NAME.rst`, which
-says when, on which commit and on which machine; what is not run keeps the section that it has. They are committed with
-the change that they measure.
+Run from the repository: ``python tools/record.py validation [PYTEST OPTION ...]`` or ``python tools/record.py
+benchmark ["SCRIPT WORD ..." ...]``. Every test module and every script has a section of its own,
+`docs/recorded/KIND/NAME.rst`, which says when, on which commit and on which machine; what is not run keeps the section
+that it has. They are committed with the change that they measure.
 """
 
 import os
