@@ -31,7 +31,7 @@ BENDING: Final = 0.06
 An estimate, five times what struts as elastic beams resist with (``benchmarks/offline/cell_frame.py``: for Enterprise
 0.0117 along lines of struts and next to nothing round the device). With that a device that nothing but its springs
 holds to the wall lies flat in bends: gaps of 0.2, 0.9, 1.4 and 1.8 mm where they are of 20, 14, 10 and 7 mm. Enterprise
-does flatten in bends (Krischek et al. 2011, Minim Invas Neurosurg 54:21), but by how much hangs on how it is let go: in
+does flatten in bends (Ebrahimi et al. 2007, AJNR 28:823), but by how much hangs on how it is let go: in
 a tube of 3.5 mm bent by 7 mm pulling the catheter back leaves a crescent outside, pushing and pulling hardly any
 (Heller and Malek 2011, J NeuroIntervent Surg 3:340). What holds it to the wall then is friction. This is a device that
 was let go well.
@@ -104,7 +104,7 @@ def springiness(cut: Cut) -> float:
     A strut of width b, length L and angle alpha to the axis is welded to joints that do not turn, b / sin(2 alpha) of
     it is part of them, and what is left, l, bends like a beam clamped at both ends: moved sideways it resists with
     12 E I / l^3, stretched with E A / L. Shared out among widths and heights of cells, which a strut that turns changes
-    by twice its ends' moves, that is the square root of L b^2 / (2 l^3). A frame of elastic beams has the same to 1 %
+    by twice its ends' moves, that is the square root of L b^2 / (2 l^3). A frame of elastic beams has the same to 2 %
     (``benchmarks/offline/cell_frame.py``).
     """
     sine = 0.5 * cut.width_mm / cut.length_mm
