@@ -89,6 +89,13 @@ class Surface:
         centers = [triangles.polygon_centroid(self.vertices_mm[loop]) for loop in self.boundary_loops]
         return np.array(centers, dtype=np.float64).reshape(-1, 3)
 
+    @property
+    def n_rings(self) -> int:
+        """Ways round through what is inside that come back to where they began: 0 for a tree (the genus)."""
+        n_used, n_open = len(np.unique(self.faces)), sum(len(loop) for loop in self.boundary_loops)
+        n_edges = (3 * len(self.faces) + n_open) // 2
+        return (2 - len(self.boundary_loops) - n_used + n_edges - len(self.faces)) // 2
+
     @cached_property
     def closed(self) -> "Surface":
         """The surface with every boundary loop capped."""
