@@ -4,8 +4,8 @@ Where two walls come nearer to each other than the scan resolves, its surface jo
 centerline may slip through it. A way through a stenosis goes straight on, and one into a branch follows the branch; a
 way through a window turns off one artery, crosses, and turns into another, and both arteries go on beside it as if it
 were not there. A communicating artery has that shape too, but the arteries it joins lie further apart than their radii.
-Where no centerline slips through, a window still makes a ring of the lumen: rings are walked round in search of it. On a
-ring one of both may be a sac that touches an artery.
+Where no centerline slips through, a window still makes a ring of the lumen: rings are walked round in search of it. A
+sac may touch an artery too.
 """
 
 from dataclasses import replace
@@ -140,7 +140,9 @@ def _contact_at(points: Floats, radius: Floats, waist: int, spheres: Medial) -> 
     contact = Contact(points[waist], float(radius[waist]), before, after, across / np.linalg.norm(across))
     if contact.radius_mm > WAIST * contact.artery_mm or not TOGETHER < contact.apart < APART:
         return None
-    passes = [_angle(side.direction, across) > TURN_RAD and _goes_on(spheres, side, points[waist]) for side in (before, after)]
+    passes = [
+        _angle(side.direction, across) > TURN_RAD and _goes_on(spheres, side, points[waist]) for side in (before, after)
+    ]
     if all(passes):
         return contact
     return _at_sac(contact, passes) if contact.radius_mm <= radius.min() else None
@@ -245,7 +247,9 @@ def _ring(lumen: Surface, contact: Contact) -> Bools | None:
     """
     points = np.concatenate([lumen.vertices_mm, contact.center_mm[None]])
     half_way = contact.before.height_mm(points) - contact.after.height_mm(points)
-    rings = [_ring_at(lumen, contact, level) for level in (half_way - half_way[-1], (points - points[-1]) @ contact.across)]
+    rings = [
+        _ring_at(lumen, contact, level) for level in (half_way - half_way[-1], (points - points[-1]) @ contact.across)
+    ]
     reach_mm, ring = min(rings, key=lambda ring: ring[0])
     return ring if reach_mm < REACH * contact.artery_mm else None
 
@@ -253,7 +257,7 @@ def _ring(lumen: Surface, contact: Contact) -> Bools | None:
 def _ring_at(lumen: Surface, contact: Contact, level: Floats) -> tuple[float, Bools]:
     """The faces (m,) at level 0 that hang together with those nearest to the window, and how far they reach from it."""
     is_after = (level > 0)[lumen.faces]
-    ring = is_after.any(axis=1) & ~is_after.all(axis=1)
+    ring = np.asarray(is_after.any(axis=1) & ~is_after.all(axis=1))
     cut = np.flatnonzero(ring)
     if not len(cut):
         return np.inf, ring

@@ -51,15 +51,15 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
     VesselError
         When fewer than two ends are found, or an outlet cannot be reached from the inlet.
     """
-    vessel, spheres = (vessel, vessel.lumen.medial) if vessel.openings else open_ends(vessel)
+    vessel = vessel if vessel.openings else open_ends(vessel)
     if inlet_mm is not None:
         vessel = with_inlet(vessel, np.asarray(inlet_mm, dtype=np.float64))
-    ways = _ways(vessel, spheres)
+    ways = _ways(vessel)
     for _ in range(MOST_CONTACTS):
         parted = _parted(ways, holds_inlet=inlet_mm is not None)
         if parted is None:
             break
-        ways = _ways(parted, parted.lumen.medial)
+        ways = _ways(replace(parted, lumen=parted.lumen.with_medial(ways.vessel.lumen.medial)))
     lumen, graph = ways.vessel.lumen, ways.graph
     lines = tuple(_centerline(lumen, graph.points[path], graph.radius[path]) for path in ways.paths)
     return replace(ways.vessel, centerlines=lines)
@@ -84,9 +84,9 @@ class _Ways(NamedTuple):
         return [medial.path_to(self.before, outlet) for outlet in range(n - len(self.vessel.outlets), n)]
 
 
-def _ways(vessel: Vessel, spheres: medial.Medial) -> _Ways:
+def _ways(vessel: Vessel) -> _Ways:
     """The shortest paths, to every outlet that can be reached."""
-    vessel, graph = _reachable(vessel, _graph(vessel, spheres))
+    vessel, graph = _reachable(vessel, _graph(vessel))
     free = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
     return _shortest(vessel, graph, _radius_cap(graph, free.paths))
 
@@ -117,11 +117,11 @@ def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
     return np.asarray(percentile_filter(radius_mm, PARENT_PERCENTILE, size=size, mode="nearest"))
 
 
-def _graph(vessel: Vessel, spheres: medial.Medial) -> medial.Medial:
+def _graph(vessel: Vessel) -> medial.Medial:
     """Join the openings to the medial graph; they are its last vertices, in their order."""
     ends = np.array([opening.center_mm for opening in vessel.openings])
     reach = np.array([0.25 * opening.diameter_mm for opening in vessel.openings])
-    return medial.with_terminals(spheres, ends, reach)
+    return medial.with_terminals(vessel.lumen.medial, ends, reach)
 
 
 def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Medial]:

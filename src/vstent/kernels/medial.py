@@ -145,17 +145,23 @@ def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Med
     if len(ends):
         unsure |= kept & (cKDTree(ends).query(every.points)[0] < 3.0 * every.radius)
     kept[unsure] = sees_inside(closed, every.points[unsure], -offset[unsure, 0])
-    inside = keep(every, kept)
-    # Two walls nearer than the samples are no obstacle to the diagram: steps through them are taken out.
-    is_through = segments_cross(closed, *np.moveaxis(inside.points[inside.edges], 1, 0))
-    return _largest(inside._replace(edges=inside.edges[~is_through]))
+    return _passable(keep(every, kept), closed)
 
 
 def within(medial: Medial, closed: Tree) -> Medial:
     """The connected part of most spheres whose centres lie inside a closed surface."""
     askew = np.array([0.756, 0.539, 0.371])  # a ray along no axis grazes no row of triangles
     inside = sees_inside(closed, medial.points, np.broadcast_to(askew, medial.points.shape))
-    return _largest(keep(medial, inside))
+    return _passable(keep(medial, inside), closed)
+
+
+def _passable(medial: Medial, closed: Tree) -> Medial:
+    """The connected part of most spheres, without the steps through a closed surface.
+
+    Two walls nearer to each other than the samples are no obstacle to the diagram.
+    """
+    is_through = segments_cross(closed, *np.moveaxis(medial.points[medial.edges], 1, 0))
+    return _largest(medial._replace(edges=medial.edges[~is_through]))
 
 
 def _largest(medial: Medial) -> Medial:
