@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 from scipy.spatial import cKDTree
 
 from vstent.kernels import curves, triangles
@@ -21,8 +22,10 @@ from vstent.openings import still_open
 from vstent.surface import Surface
 from vstent.vessel import Vessel
 
-STEP_MM: Final = 0.05
+STEP_MM: Final = 0.1
 """Paths are looked at in steps of this length."""
+THROAT_MM: Final = 0.5
+"""A window is narrower than all that lies nearer than half of this on the way."""
 WAIST: Final = 0.85
 """The inscribed sphere of a window is narrower than this fraction of those of both arteries..."""
 SMALL: Final = 0.4
@@ -122,8 +125,7 @@ def find_contact(lumen: Surface, spheres: Medial, way: Ints) -> Contact | None:
     place = curves.arc_length(spheres.points[way])
     points = curves.interpolate(place, spheres.points[way], np.arange(0.0, place[-1], STEP_MM))
     radius = lumen.inscribed_radius(points)
-    inner = np.arange(1, len(points) - 1)
-    waists = inner[(radius[inner] <= radius[inner - 1]) & (radius[inner] < radius[inner + 1])]
+    waists = np.flatnonzero(radius == minimum_filter1d(radius, round(THROAT_MM / STEP_MM)))
     found = (_contact_at(points, radius, int(i), spheres) for i in waists[np.argsort(radius[waists])])
     return next((contact for contact in found if contact is not None), None)
 
