@@ -220,6 +220,19 @@ def test_motion_mirror_and_order_of_the_triangles_do_not_matter(fork: Vessel, se
     assert wide_mm < 0.01
 
 
+def test_outlets_keep_their_numbers_when_turned_and_equal_ones_cannot() -> None:
+    whole = phantoms.bifurcation()
+    left = replace(whole.branches[0], inscribed_radius_mm=0.97 * whole.branches[0].inscribed_radius_mm)
+    lumen = phantoms.phantom_surface(replace(whole, branches=(left,)), edge_mm=0.4)
+    for seed in range(3):
+        turn = Rotation.random(random_state=seed).as_matrix()
+        order = np.random.default_rng(seed).permutation(len(lumen.vertices_mm))
+        moved = Surface(lumen.vertices_mm[order] @ turn.T, np.argsort(order)[lumen.faces])
+        assert [round(float((o.center_mm @ turn)[0])) for o in open_ends(Vessel(moved)).outlets] == [9, -9]
+    half = Rotation.from_euler("z", np.pi).as_matrix()  # about the trunk: the truth itself has no first daughter
+    np.testing.assert_allclose(whole.branches[0].points_mm[-1], half @ whole.parent.points_mm[-1], atol=1e-9)
+
+
 def test_a_finer_mesh_gives_the_same_centerlines(fork: Vessel) -> None:
     finer = trace(Vessel(phantoms.phantom_surface(phantoms.bifurcation(), edge_mm=0.15)), inlet_mm=fork.inlet.center_mm)
     far_mm, wide_mm = _differences(finer, fork)
