@@ -1,4 +1,4 @@
-"""Pages that are made, not written: the devices of the catalogue, and what every fault of the tests' list gets."""
+"""Pages that are made, not written: the devices, what every fault of the tests' list gets, what was recorded."""
 
 import contextlib
 import io
@@ -21,8 +21,15 @@ def setup(app: Any) -> dict[str, bool]:
 def write() -> None:
     """Write all pages."""
     GENERATED.mkdir(exist_ok=True)
-    for name, text in (("devices", devices()), ("faults", faults())):
+    pages = {"devices": devices(), "faults": faults()}
+    for name, text in (pages | {kind: recorded(kind) for kind in ("validation", "performance")}).items():
         (GENERATED / f"{name}.inc").write_text(text, encoding="utf-8")
+
+
+def recorded(kind: str) -> str:
+    """Return the sections that `tools/record.py` has kept of this kind."""
+    sections = sorted((GENERATED.parent / "recorded" / kind).glob("*.rst"))
+    return "\n\n".join(section.read_text(encoding="utf-8") for section in sections)
 
 
 def table(titles: list[str], rows: list[list[str]], widths: str = "auto") -> str:

@@ -1,4 +1,4 @@
-"""Refinement: observed order and extrapolation, on exact series and on a tube."""
+"""Refinement: observed order, extrapolation and scatter, on exact series and on a tube."""
 
 import json
 from pathlib import Path
@@ -9,6 +9,7 @@ import pytest
 from vstent import phantoms
 from vstent.cli import main
 from vstent.flow.convergence import RATIO, SAFETY, observed
+from vstent.flow.positions import Scatter, scatter
 from vstent.io.writers import write_stl
 
 
@@ -34,7 +35,11 @@ def test_a_chance_order_does_not_shrink_the_uncertainty():
     assert found.extrapolated == pytest.approx(1.101 + 0.001)
 
 
-def test_the_command_compares_three_grids_and_three_time_steps(
+def test_scatter_is_half_the_range_over_the_mean():
+    assert scatter((1.0, 4.0, 1.0)) == Scatter((1.0, 4.0, 1.0), 2.0, 0.75)
+
+
+def test_the_command_compares_three_grids_time_steps_and_positions(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     radius_mm, length_mm, inflow_mL_s = 2.0, 16.0, 0.5
@@ -51,3 +56,7 @@ def test_the_command_compares_three_grids_and_three_time_steps(
         of_grid, of_step = (found[name]["quantities"][key] for name in ("cell_size_mm", "lattice_speed"))
         assert of_grid["values"][2] == pytest.approx(value, rel=0.03)
         assert np.ptp(of_step["values"]) < 0.01 * value
+        lying = found["grid_position"][key]
+        assert lying["values"][0] == of_grid["values"][1]
+        assert lying["mean"] == pytest.approx(value, rel=0.03)
+        assert lying["uncertainty_fraction"] < 0.02

@@ -81,6 +81,28 @@ def test_a_narrow_place_inside_is_computed_with_a_shorter_time_step(monkeypatch)
     assert field.outlets_mL_s.sum() == pytest.approx(field.inlet_mL_s, rel=0.02)
 
 
+def test_a_guess_that_diverges_is_done_without(monkeypatch):
+    case = case_of(cell_size_mm=0.4, inflow_mL_s=1.0, tolerance=0.02)
+    monkeypatch.setattr(LatticeBoltzmann, "coarsening", None)
+    wanted = simulate_case(case)
+    monkeypatch.setattr(LatticeBoltzmann, "coarsening", 1.5)
+    monkeypatch.setattr("vstent.flow.MIN_CELLS", 100)
+    monkeypatch.setattr("vstent.flow.domain.MIN_CELLS", 100)
+    tried = []
+    real = LatticeBoltzmann.init
+
+    def ill_guessed(engine, case, start):
+        state = real(engine, case, start)
+        tried.append(engine.cell_size_mm)
+        if engine.cell_size_mm > 0.5:
+            state.populations[:] = np.nan
+        return state
+
+    monkeypatch.setattr(LatticeBoltzmann, "init", ill_guessed)
+    np.testing.assert_array_equal(simulate_case(case).velocity_m_s, wanted.velocity_m_s)
+    assert tried == pytest.approx([0.6, 0.6, 0.6, 0.4])
+
+
 def test_the_last_good_check_is_told_with_time_speed_and_place():
     case = case_of(cell_size_mm=0.4, inflow_mL_s=1.0)
     engine = LatticeBoltzmann(0.4)

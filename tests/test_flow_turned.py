@@ -1,6 +1,5 @@
 """Blood does not know how the grid lies: a bend turned against the lattice carries the same flow."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vstent import phantoms
 from vstent.flow import FlowCase, FlowField, FlowSettings, sampling, simulate_case
-from vstent.surface import Surface
+from vstent.flow.positions import turned
 from vstent.trace import trace
 from vstent.vessel import Vessel
 
@@ -24,16 +23,9 @@ def bend() -> Vessel:
     return trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.3)))
 
 
-def turned(vessel: Vessel, turn: Rotation) -> Vessel:
-    matrix = turn.as_matrix()
-    lumen = Surface(vessel.lumen.vertices_mm @ matrix.T, vessel.lumen.faces)
-    openings = tuple(replace(o, center_mm=matrix @ o.center_mm, normal=matrix @ o.normal) for o in vessel.openings)
-    return replace(vessel, lumen=lumen, openings=openings, centerlines=())
-
-
 def flow(turn: Rotation, cell_size_mm: float) -> FlowField:
     settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=cell_size_mm, tolerance=0.005)
-    return simulate_case(FlowCase(turned(bend(), turn), settings=settings))
+    return simulate_case(turned(FlowCase(bend(), settings=settings), turn))
 
 
 def on_section(field: FlowField, turn: Rotation, part: float) -> np.ndarray:

@@ -1,11 +1,14 @@
-"""Run the heavy validation or the benchmarks and keep what came out as a page of the documentation.
+"""Run the heavy validation or the benchmarks and keep what came out for the pages of the documentation.
 
-Run from the repository: ``python tools/record.py validation [PYTEST OPTION ...]`` or ``... benchmark [SCRIPT ...]``.
-The page says when, on which commit and on which machine; it is committed with the change that it measures.
+Run from the repository: ``python tools/record.py validation [PYTEST OPTION ...]`` or ``python tools/record.py
+benchmark ["SCRIPT WORD ..." ...]``. Every test module and every script has a section of its own,
+`docs/recorded/KIND/NAME.rst`, which says when, on which commit and on which machine; what is not run keeps the section
+that it has. They are committed with the change that they measure.
 """
 
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -47,41 +50,55 @@ def literal(text: str) -> str:
     return "".join(["\n.. code-block:: text\n\n", *(f"   {line}\n" for line in text.rstrip().splitlines()), "\n"])
 
 
+def keep(kind: str, name: str, command: str, body: str) -> None:
+    """Write the section of a test module or a script."""
+    folder = PAGES / kind
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.rst").write_text(f"{name}\n{'-' * len(name)}\n\n{circumstances(command)}{body}", "utf-8")
+
+
 def validation(options: list[str]) -> int:
-    """Run the tests marked validation; write one row for each, and what it printed."""
+    """Run the tests marked validation; for every module, write one row a test, and what it printed."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
         given = ["-m", "pytest", "-m", "validation", "-rP", f"--junitxml={report}", "-o", "junit_logging=system-out"]
         code = subprocess.run([sys.executable, *given, *options], cwd=ROOT, check=False).returncode
         cases = list(ET.parse(report).getroot().iter("testcase"))
-    rows = ["\n.. list-table::\n   :header-rows: 1\n\n   * - test\n     - result\n     - seconds\n"]
-    words = []
+    modules: dict[str, list[ET.Element]] = {}
     for case in cases:
-        name = f"{case.get('classname', '').removeprefix('tests.')}: {case.get('name')}".replace("\\", "\\\\")
-        failed = case.find("failure") is not None or case.find("error") is not None
-        result = "failed" if failed else "skipped" if case.find("skipped") is not None else "passed"
-        rows.append(f"   * - ``{name}``\n     - {result}\n     - {float(case.get('time', 0)):.1f}\n")
-        said = "\n".join(
-            line for line in (case.findtext("system-out") or "").splitlines() if not line.startswith("---")
-        )
-        if said.strip():
-            words.append(f"``{name}``\n{literal(said.strip()[:LONGEST])}")
-    head = circumstances(" ".join(["make validation", *options]))
-    (PAGES / "validation.rst").write_text(head + "".join(rows) + "\nWhat they print:\n\n" + "\n".join(words), "utf-8")
+        modules.setdefault(case.get("classname", "").removeprefix("tests."), []).append(case)
+    for name, found in modules.items():
+        keep("validation", name, " ".join(["make validation", *options]), _results(found))
     return code
 
 
-def benchmark(names: list[str]) -> int:
-    """Run the benchmarks and keep what each prints."""
-    scripts = [ROOT / name for name in names] or sorted((ROOT / "benchmarks").glob("*.py"))
-    page, worst = [circumstances(" ".join(["make benchmark", *names]))], 0
-    for script in scripts:
-        done = subprocess.run([sys.executable, script], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
+def _results(cases: list[ET.Element]) -> str:
+    """Table of the tests of a module, and what they printed."""
+    rows = [".. list-table::\n   :header-rows: 1\n\n   * - test\n     - result\n     - seconds\n"]
+    words = []
+    for case in cases:
+        name = (case.get("name") or "").replace("\\", "\\\\")
+        failed = case.find("failure") is not None or case.find("error") is not None
+        result = "failed" if failed else "skipped" if case.find("skipped") is not None else "passed"
+        rows.append(f"   * - ``{name}``\n     - {result}\n     - {float(case.get('time', 0)):.1f}\n")
+        lines = (case.findtext("system-out") or "").splitlines()
+        said = "\n".join(line for line in lines if not line.startswith("---")).strip()
+        if said:
+            words.append(f"``{name}``\n{literal(said[:LONGEST])}")
+    return "".join(rows) + ("\nWhat they print:\n\n" + "\n".join(words) if words else "")
+
+
+def benchmark(commands: list[str]) -> int:
+    """Run the benchmarks, each given as a script with its words, and keep what each prints."""
+    worst = 0
+    for command in commands or sorted(f"benchmarks/{script.name}" for script in (ROOT / "benchmarks").glob("*.py")):
+        script, *words = shlex.split(command)
+        given = [sys.executable, script, *words]
+        done = subprocess.run(given, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
         print(done.stdout, flush=True)
         worst = max(worst, abs(done.returncode))
-        ended = "" if done.returncode == 0 else f" (ended with {done.returncode})"
-        page.append(f"``{script.relative_to(ROOT)}``{ended}\n{literal(done.stdout)}")
-    (PAGES / "performance.rst").write_text("\n".join(page), "utf-8")
+        ended = "" if done.returncode == 0 else f"Ended with {done.returncode}.\n"
+        keep("performance", Path(script).stem, f"python {command}", ended + literal(done.stdout))
     return worst
 
 

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from vstent.device import Design
 from vstent.flow.convergence import Refinement
+from vstent.flow.positions import POSITIONS, Scatter
 from vstent.rank import Ranking
 from vstent.vessel import Opening
 
@@ -200,6 +201,17 @@ def convergence_table(found: Refinement) -> Table:
         values = [quantity.text for value in one.values for quantity in flatten({key: value})]
         name = flatten({key: 0.0})[0].name
         table.add_row(name, *values, order, _cell(one.extrapolated), f"{one.uncertainty_fraction:.1%}")
+    return table
+
+
+def positions_table(found: Mapping[str, Scatter]) -> Table:
+    """Table of the same flow in several positions on the grid: every quantity in each, mean and half the range."""
+    from vstent.report.quantities import flatten
+
+    table = Table("position on the grid", *POSITIONS, "mean", "±")
+    for key, one in found.items():
+        values = [flatten({key: value})[0].text for value in (*one.values, one.mean)]
+        table.add_row(flatten({key: 0.0})[0].name, *values, f"{one.uncertainty_fraction:.1%}")
     return table
 
 

@@ -24,7 +24,9 @@ def add(commands: options.Commands) -> None:
     flow = options.add_flow(parser)
     flow.add_argument("--steady", action="store_true", help="at the mean inflow, not pulsing (the default)")
     flow.add_argument(
-        "--convergence", action="store_true", help="the bare flow on three grids and with three time steps, compared"
+        "--convergence",
+        action="store_true",
+        help="the bare flow on three grids, with three time steps and turned three ways on the grid, compared",
     )
     parser.set_defaults(command=_flow)
 
@@ -56,9 +58,9 @@ def _compute(path: Path, out: Path, settings: "Settings", console: "Console") ->
 
 
 def _converge(path: Path, out: Path, settings: "Settings", console: "Console") -> "list[Table]":
-    from vstent.console import convergence_table
+    from vstent.console import convergence_table, positions_table
     from vstent.study import refine_flow
 
     with console.live():
         found = refine_flow(path, out, settings, console.progress)
-    return [convergence_table(one) for one in found]
+    return [*map(convergence_table, found.refinements), positions_table(found.positions)]

@@ -1,7 +1,7 @@
 """Blood flow, before and after: `simulate` an anatomy with and without stents, or one case at a time."""
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,6 +41,9 @@ __all__ = [
 
 COARSE_SHARE = 0.12
 """Part of the whole time that each coarse run takes, for the progress."""
+
+CALMER_TRIES = 2
+"""Times that a run which diverged is tried again with a shorter time step."""
 
 OnProgress = Callable[[Progress], None]
 
@@ -164,13 +167,14 @@ class _Runs:
     checkpoint: Checkpoint | None
 
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
-        """Compute a flow, from a guess unless it is under way."""
+        """Compute a flow, from a guess unless it is under way, or the coarse grid is too coarse for one."""
         cell_size_mm = default_cell_size_mm(case)
         bookmark = self._bookmark("answer")
         guess = start
         if bookmark is None or bookmark.saved is None:
             steady = replace(case, settings=replace(case.settings, waveform=None))
-            guess = self._guess(steady, start, cell_size_mm)
+            with suppress(DivergenceError):
+                guess = self._guess(steady, start, cell_size_mm)
         progress = self._part(_coarse_runs(self.engine, case, start) * COARSE_SHARE, 1.0)
         return self._run(self.engine(cell_size_mm, self.folder), case, guess, progress, bookmark)
 
@@ -210,14 +214,15 @@ class _Runs:
         progress: OnProgress | None,
         bookmark: Bookmark | None,
     ) -> FlowField:
-        try:
-            return run(engine, case, start=start, progress=progress, bookmark=bookmark)
-        except DivergenceError:
-            calmer = engine.calmer(case)
-            if calmer is None:
-                raise
-            anew = None if bookmark is None else replace(bookmark, saved=None)
-            return run(engine, calmer, start=start, progress=progress, bookmark=anew)
+        for _ in range(CALMER_TRIES):
+            try:
+                return run(engine, case, start=start, progress=progress, bookmark=bookmark)
+            except DivergenceError:
+                calmer = engine.calmer(case)
+                if calmer is None:
+                    raise
+                case, bookmark = calmer, None if bookmark is None else replace(bookmark, saved=None)
+        return run(engine, case, start=start, progress=progress, bookmark=bookmark)
 
     def _bookmark(self, name: str) -> Bookmark | None:
         checkpoint = self.checkpoint

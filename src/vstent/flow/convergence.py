@@ -1,4 +1,4 @@
-"""How much a flow's numbers depend on the grid and on the time step: three of each, observed order, extrapolation."""
+"""How much a flow's numbers depend on the grid, on the time step and on how the vessel lies: three of each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,21 +9,14 @@ import numpy as np
 
 from vstent.flow import engine_class, simulate_case
 from vstent.flow.domain import default_cell_size_mm
-from vstent.flow.indices import indices
+from vstent.flow.indices import QUANTITIES, indices
+from vstent.flow.positions import Scatter, positions
 from vstent.flow.types import FlowCase, FlowField, FlowSettings
 
 RATIO: Final = 2**0.5
 """From one grid, or time step, to the next finer one."""
 TOLERANCE: Final = 0.002
 """Flows settle to within this, so that the grid's part of a difference is not hidden."""
-QUANTITIES: Final = (
-    "neck_inflow_mL_s",
-    "mean_sac_velocity_m_s",
-    "mean_sac_wss_Pa",
-    "mean_wss_Pa",
-    "pressure_drop_Pa",
-)
-"""Indices that are followed, as far as the vessel has them."""
 SAFETY: Final = 1.25
 """Factor on the difference to the extrapolated value (Roache 1994, J. Fluids Eng. 116, 405: three grids)."""
 ORDERS: Final = (0.5, 2.0)
@@ -57,6 +50,16 @@ class Refinement:
     """By the name of the index."""
 
 
+@dataclass(frozen=True)
+class Sensitivity:
+    """What a flow's numbers depend on that is not physics."""
+
+    refinements: tuple[Refinement, ...]
+    """The cells first, then what else the engine can make smaller."""
+    positions: dict[str, Scatter]
+    """The same flow with the vessel lying otherwise on the grid, by the name of the index."""
+
+
 def observed(values: tuple[float, float, float], ratio: float = RATIO) -> Convergence:
     """Order, extrapolated value and uncertainty from values on three grids, each `ratio` finer than the one before."""
     coarse, middle, fine = values
@@ -75,12 +78,12 @@ def convergence(
     *,
     folder: Path | None = None,
     told: Callable[[float, str], None] = lambda fraction, sentence: None,
-) -> tuple[Refinement, ...]:
-    """Compute a flow on three grids and, on the middle one, with each other size of the engine's made smaller twice.
+) -> Sensitivity:
+    """Compute a flow on three grids; on the middle one, with all other sizes made smaller twice and in other positions.
 
     Parameters
     ----------
-    case : its cell size is the finest.
+    case : without a stent; its cell size is the finest.
     folder : where the engine may keep files of its own, a folder in it for every flow.
     told : told of every flow computed, with the fraction of all that is done.
 
@@ -90,11 +93,12 @@ def convergence(
         When a flow cannot be computed.
     """
     cell_size, *others = engine_class(case.settings).refined_by
-    runs = _Runs(case, folder, told, 3 + 2 * len(others), [])
+    runs = _Runs(case, folder, told, 3 + 2 * len(others) + 2, [])
     settings = replace(case.settings, tolerance=min(TOLERANCE, case.settings.tolerance))
     grids = runs.refine(cell_size, RATIO**2 * default_cell_size_mm(case), settings, None)
     middle, known = replace(settings, cell_size_mm=grids.sizes[1]), runs.done[1]
-    return grids, *(runs.refine(name, getattr(settings, name), middle, known) for name in others)
+    further = (runs.refine(name, getattr(settings, name), middle, known) for name in others)
+    return Sensitivity((grids, *further), runs.turn(middle, known))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +120,15 @@ class _Runs:
             start = fields[-1] if fields else None
             fields.append(self._flow(_changed(settings, name, size), f"{name}-{size:.4g}", start))
         return Refinement(name, sizes, _compared(self.case, fields))
+
+    def turn(self, settings: FlowSettings, known: FlowField) -> dict[str, Scatter]:
+        """Lay the vessel on the grid in other ways; `known` is the flow as it lies."""
+        before = len(self.done)
+
+        def told(fraction: float, sentence: str) -> None:
+            self.told((before + fraction * (self.count - before)) / self.count, sentence)
+
+        return positions(replace(self.case, settings=settings), known=known, folder=self.folder, told=told)
 
     def _flow(self, settings: FlowSettings, name: str, start: FlowField | None) -> FlowField:
         case, own = replace(self.case, settings=settings), None if self.folder is None else self.folder / name

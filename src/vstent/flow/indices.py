@@ -1,5 +1,7 @@
 """Numbers that a flow is judged by, and their change when a stent is in."""
 
+from typing import Final
+
 import numpy as np
 
 from vstent.flow import sampling
@@ -18,6 +20,14 @@ FAST_M_S = 0.08
 """Blood faster than this in a sac counts as its jet (design.md section 5)."""
 NEAR_MM = 10.0
 """The parent wall is the wall within this distance of the neck (Cebral et al. 2011, AJNR 32, 145)."""
+QUANTITIES: Final = (
+    "neck_inflow_mL_s",
+    "mean_sac_velocity_m_s",
+    "mean_sac_wss_Pa",
+    "mean_wss_Pa",
+    "pressure_drop_Pa",
+)
+"""Indices that are followed from grid to grid, as far as the vessel has them."""
 
 
 def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None = None) -> dict[str, float]:

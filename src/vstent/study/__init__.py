@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vstent.device import find_design
-from vstent.flow.convergence import Refinement
+from vstent.flow.convergence import Sensitivity
 from vstent.io import writers
 from vstent.measure import morphology
 from vstent.study.crate import write_crate
@@ -138,8 +138,8 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
 
 
 @claiming
-def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Refinement, ...]:
-    """Compute the flow without a device on three grids and three time steps; write ``convergence.json``.
+def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> Sensitivity:
+    """Compute the flow without a device on three grids, time steps and positions; write ``convergence.json``.
 
     Parameters
     ----------
@@ -160,5 +160,7 @@ def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -
     anatomy = find_anatomy(path, source, settings, ledger)
     ledger.settle()
     found = refine(out, anatomy, settings, ledger)
-    writers.write_json(out / "convergence.json", {one.name: asdict(one) for one in found})
+    kept = {one.name: asdict(one) for one in found.refinements}
+    kept["grid_position"] = {key: asdict(one) for key, one in found.positions.items()}
+    writers.write_json(out / "convergence.json", kept)
     return found

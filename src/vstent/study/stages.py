@@ -11,7 +11,7 @@ import numpy as np
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_size
 from vstent.flow import FlowField, FlowSettings, compare, flow_case, foretell_cost, indices, ostium, simulate_case
-from vstent.flow.convergence import Refinement, convergence
+from vstent.flow.convergence import Sensitivity, convergence
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
@@ -149,8 +149,8 @@ def compute_flows(
     return fields
 
 
-def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> tuple[Refinement, ...]:
-    """Compute the flow without a device on three grids and, where the engine has time steps, with three of them."""
+def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Sensitivity:
+    """Compute the flow without a device on three grids, with three time steps and in three positions on the grid."""
     flow = settings.flow or FlowSettings()
     _plan(anatomy, flow, ledger)
     with ledger.stage("convergence") as tell:
