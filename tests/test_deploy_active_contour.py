@@ -1,6 +1,9 @@
 """The paper's contour, eq. (1-7), against its definitions and against brute force."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -186,3 +189,20 @@ def test_weights_that_blow_up_are_refused(artery):
     method = ActiveContour(k1=1e308, tau=1e10)
     with pytest.raises(InputError, match="ran away in iteration 1"), np.errstate(all="ignore"):
         relax(method, start(artery, method, 0.8), TreeWall(artery.landing_surface))
+
+
+def test_the_energy_wakes_no_threads_whose_number_would_change_its_last_bits():
+    """They would spin beside the threads that ask the wall, too."""
+    work = (
+        "import numpy as np; from types import SimpleNamespace as S; from vstent.deploy import ActiveContour;"
+        "r = np.random.default_rng(0);"
+        "s = S(nodes_mm=r.normal(size=(400, 48, 3)), contact=S(distance_mm=np.zeros(1)));"
+        "print(ActiveContour(a1=1, a2=0, a3=0, a4=0, a5=0).energy_mm2(s).hex())"
+    )
+    energies = [
+        subprocess.run(
+            [sys.executable, "-c", work], env=os.environ | {"OPENBLAS_NUM_THREADS": n}, capture_output=True, check=True
+        ).stdout
+        for n in ("1", "2")
+    ]
+    assert energies[0] == energies[1]

@@ -1,6 +1,8 @@
 """Laser-cut cells: their struts keep their length, on the wall where they can and off it where they cannot."""
 
+import json
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from vstent.deploy.sketch import bed, sketch
 from vstent.device import grid, row_spacing_mm
 from vstent.measure import measure, wire_stretches
 
+FRAMES = json.loads((Path(__file__).parents[1] / "benchmarks" / "offline" / "cell_frame.json").read_text())
 ENTERPRISE = device.find_design("enterprise")
 SIZE = device.find_size(ENTERPRISE, diameter_mm=4.5, length_mm=22)
 BEND_MM = 7.0
@@ -97,9 +100,20 @@ def asked(monkeypatch):
     return seen[0]
 
 
-def framed(net, length_mm, width_mm, held, laid):
-    pairs, free_mm = cells._diagonals(net, length_mm, width_mm)
-    return cells._Frame(net, laid, length_mm, pairs, free_mm, cells._keeping(net, held))
+def framed(net, cut, held, laid):
+    pairs, free_mm = cells._diagonals(net, cut.length_mm, cut.width_mm)
+    return cells._Frame(net, laid, cut.length_mm, cells.springiness(cut), pairs, free_mm, cells._keeping(net, held))
+
+
+@pytest.mark.parametrize("key", FRAMES)
+def test_cells_are_as_springy_as_a_frame_of_elastic_struts(key):
+    """Its beams are an independent model; lines of struts resist being lifted with less than is asked for here."""
+    design = device.find_design(key)
+    size = design.sizes[-1]
+    width_mm = size.free_diameter_mm * np.sin(2 * np.pi / design.n_columns)
+    cut = cells.Cut(device.piece_length_mm(design, size), width_mm, 1e-3 * design.strut_width_um)
+    assert cells.springiness(cut) == pytest.approx(FRAMES[key]["spring"], rel=0.02)
+    assert FRAMES[key]["bending"] < cells.BENDING
 
 
 def test_the_joints_lie_where_an_independent_minimiser_puts_them(monkeypatch):

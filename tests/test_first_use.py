@@ -1,15 +1,17 @@
 """What the first use has to compile: it is said once, and what was compiled can be kept anywhere."""
 
+import importlib
 import os
 import subprocess
 import sys
+import threading
 
 import pytest
 from numba import njit
 
 from vstent import kernels
 from vstent.kernels import first_use, warm
-from vstent.kernels.first_use import telling
+from vstent.kernels.first_use import kept, telling
 
 
 def test_the_first_compilation_is_told_once_and_a_kept_kernel_is_not():
@@ -43,6 +45,63 @@ def test_a_helper_begins_with_the_first_compilation_and_ends_with_the_work(monke
     assert started[0].poll() is not None
 
 
+KERNEL = """
+from numba import njit
+
+@njit(cache=True)
+def third(x):
+    return x / 3
+"""
+
+
+def test_what_is_not_kept_another_process_compiles_and_this_one_takes_from_the_cache(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "kernel_of_a_test.py").write_text(KERNEL)
+    third = importlib.import_module("kernel_of_a_test").third
+
+    def call():
+        third(2.0)
+
+    work = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import kernel_of_a_test as k; k.third(2.0)"
+    kept(call, (sys.executable, "-c", work))
+    assert third.signatures == []
+    said = []
+    with telling(lambda: said.append("compiling")):
+        call()
+        kept(call, ("this", "is", "not", "run"))
+    assert said == []
+    assert sum(third.stats.cache_hits.values()) == 1
+
+
+def test_while_one_thread_takes_kernels_from_the_cache_others_may_compile():
+    @njit
+    def quarter(x):
+        return x / 4
+
+    def other():
+        thread = threading.Thread(target=quarter, args=(1.0,))
+        thread.start()
+        thread.join()
+
+    kept(other, ("this", "is", "not", "run"))
+    assert len(quarter.signatures) == 1
+
+
+@pytest.mark.validation
+def test_after_a_bare_installation_the_first_flow_has_the_bits_of_all_later_ones(tmp_path):
+    work = (
+        "from vstent import phantoms; from vstent.flow import FlowCase, FlowSettings, simulate_case;"
+        "from vstent.trace import trace; from vstent.vessel import Vessel; import hashlib;"
+        "v = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.5)));"
+        "s = FlowSettings(inflow_mL_s=1.0, cell_size_mm=0.4, max_steps=200);"
+        "print(hashlib.sha256(simulate_case(FlowCase(v, settings=s)).velocity_m_s.tobytes()).hexdigest())"
+    )
+    fresh = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_NUM_THREADS": "1"}
+    first, second = (subprocess.run([sys.executable, "-c", work], env=fresh, capture_output=True) for _ in range(2))
+    assert first.returncode == second.returncode == 0
+    assert first.stdout == second.stdout
+
+
 def test_the_set_up_compiles_every_kernel_of_a_deployment():
     from tubes import line, tube
     from vstent import device
@@ -67,10 +126,13 @@ def test_the_set_up_compiles_what_takes_a_flows_time_so_that_all_processes_run_t
     from vstent.vessel import Vessel
 
     warm.warm()
-    (ready,) = lattice.update.signatures
+    kernels_ready = {kernel: kernel.signatures for kernel in (lattice.update, lattice.reflect, lattice.defer)}
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.5)))
-    simulate_case(FlowCase(vessel, settings=FlowSettings(inflow_mL_s=1.0, cell_size_mm=0.4, max_steps=10)))
-    assert lattice.update.signatures == [ready]
+    said = []
+    with telling(lambda: said.append("compiling")):
+        simulate_case(FlowCase(vessel, settings=FlowSettings(inflow_mL_s=1.0, cell_size_mm=0.4, max_steps=10)))
+    assert said == []
+    assert {kernel: kernel.signatures for kernel in kernels_ready} == kernels_ready
 
 
 @pytest.mark.parametrize(("writable", "is_moved"), [(True, False), (False, True)])

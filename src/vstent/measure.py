@@ -1,6 +1,7 @@
 """Measure: the aneurysm's morphology, and how a deployed device lies on the wall."""
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -159,8 +160,12 @@ def _density(anatomy: Anatomy, stent: Stent) -> Measures:
 
 def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
     """Tell for (n, 3) points on the device whether the landing surface next to them closes the largest aneurysm."""
-    to_neck_mm = anatomy.aneurysms[0].neck.closest(points_mm)[1]
-    return to_neck_mm <= anatomy.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM
+    neck = anatomy.aneurysms[0].neck
+    at_most_mm = anatomy.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM
+    low_mm, high_mm = neck.vertices_mm.min(axis=0), neck.vertices_mm.max(axis=0)
+    is_over = curves.lengths(points_mm - np.clip(points_mm, low_mm, high_mm)) <= at_most_mm
+    is_over[is_over] = neck.closest(points_mm[is_over])[1] <= at_most_mm[is_over]
+    return is_over
 
 
 def wire_stretches(stent: Stent) -> Floats:
@@ -182,6 +187,7 @@ def _stretch(stent: Stent) -> Measures:
     }
 
 
+@lru_cache(maxsize=8)
 def branch_abscissas_mm(anatomy: Anatomy) -> Floats:
     """Where on the parent axis (b,) the centerlines of other outlets leave the parent artery."""
     axis, left_mm = anatomy.axis, []

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from vstent.device import Design, Size
+from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.surface import Surface
 
@@ -47,7 +48,7 @@ class Stent:
         freeze(self, "wire_starts", np.int32, (-1,))
         freeze(self, "wire_diameter_um", np.float64, (len(self.wire_starts) - 1,))
 
-    @property
+    @cached_property
     def contour(self) -> Surface:
         """The contour as triangles, normals outward; vertex (row, column) is number row * columns + column."""
         rows, columns = self.nodes_mm.shape[:2]
@@ -108,14 +109,14 @@ def row_diameters_mm(nodes_mm: Floats) -> Floats:
     columns = nodes_mm.shape[1]
     center_mm = nodes_mm.mean(axis=1)
     # The direction of the device is taken over about one diameter: centers of rows wobble.
-    radius_mm = np.linalg.norm(around_mm, axis=2).sum(axis=1).mean() / (2 * np.pi)
+    radius_mm = curves.lengths(around_mm).sum(axis=1).mean() / (2 * np.pi)
     step_mm = np.linalg.norm(np.diff(center_mm, axis=0), axis=1).mean()
     reach, row = max(1, round(radius_mm / step_mm)), np.arange(len(center_mm))
     ahead = center_mm[np.minimum(row + reach, row[-1])] - center_mm[np.maximum(row - reach, 0)]
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     across_mm = around_mm - np.einsum("ijk,ik->ij", around_mm, ahead)[..., None] * ahead[:, None]
     # A regular polygon is shorter than its circle by (pi/n) / sin(pi/n).
-    return np.linalg.norm(across_mm, axis=2).sum(axis=1) / (columns * np.sin(np.pi / columns))
+    return curves.lengths(across_mm).sum(axis=1) / (columns * np.sin(np.pi / columns))
 
 
 def tube_faces(rows: int, columns: int) -> Ints:

@@ -9,6 +9,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from vstent.deploy.contour import normals
 from vstent.deploy.wall import ON_WALL_MM, AbstractWall, Contact
+from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 SAFELY: Final = 1 - 1e-9
@@ -92,7 +93,7 @@ class State:
 
         The clearance falls off from there no faster than one moves away.
         """
-        off_mm = np.linalg.norm(centers_mm - self.centers_mm[rows, 0], axis=2)
+        off_mm = curves.lengths(centers_mm - self.centers_mm[rows, 0])
         return replace(self, centers_mm=centers_mm, clearance_mm=np.maximum(self.clearance_mm[rows, 0] - off_mm, 0.0))
 
     def near(self, points_mm: Floats, centers_mm: Floats, rows: Ints, columns: Ints) -> "State":
@@ -194,7 +195,8 @@ class ActiveContour:
             (self.a4, bent),
             (2 * self.a5, twisted),
         )
-        internal = sum(weight * float(np.vdot(d, d)) for weight, d in terms)
+        # No product of vectors: that of numpy wakes threads that then spin, and its last bits depend on how many.
+        internal = sum(weight * float((d * d).sum()) for weight, d in terms)
         distance_mm = state.contact.distance_mm
         return internal + float((self.k1 * distance_mm**2 + 2 * self.k2 * distance_mm).sum())
 
@@ -238,7 +240,7 @@ def _is_outside(state: State, asked: Bools, distance_mm: Floats, wall: AbstractW
     centers_mm, points_mm = state.centers_mm.reshape(-1, 3)[asked], state.nodes_mm.reshape(-1, 3)[asked]
     clearance_mm = SAFELY * state.clearance_mm.ravel()[asked]
     way_mm = points_mm - centers_mm
-    length_mm = np.linalg.norm(way_mm, axis=1)
+    length_mm = curves.lengths(way_mm)
     is_open = clearance_mm + SAFELY * distance_mm < length_mm
     along = (way_mm / np.maximum(length_mm, ON_WALL_MM)[:, None])[is_open]
     starts_mm = centers_mm[is_open] + clearance_mm[is_open, None] * along

@@ -4,12 +4,12 @@ Struts do not stretch: outside a bend, cells are drawn out as far as their strut
 leave the wall for a shorter way. Joints move along, around and off the wall until they have least
 
     sum over struts of (length - length as cut)^2
-    +  sum over cells of (springiness times (width - free width^2 / width) / 2)^2, and the same of their heights
+    +  sum over cells of (springiness times (width - free width))^2, and the same of their heights
     +  sum over joints of (bending times the second difference of how far they and their neighbours are off the wall)^2
     +  terms that keep rows level, and what joints on a line of struts do alike,
 
-none behind the wall. The springs open the device against the wall and keep its cells from closing; a strut is as thick
-as it is wide, so cells bend off the wall about as hard as they are drawn out. Levenberg's and Marquardt's steps.
+none behind the wall. The springs open the device against the wall and are those of struts that bend between the joints
+that they are welded to (`springiness`). Levenberg's and Marquardt's steps.
 """
 
 from collections.abc import Callable
@@ -25,13 +25,16 @@ from vstent.kernels.net import Net
 Laid = Callable[[Floats, Floats, Floats], Floats]
 """Tells where (n, 3) points of the chart, at fractional rows (n,) and columns (n,) of it, lie on the wall itself."""
 
-SPRINGINESS: Final = 0.015
-"""How much a cell that is drawn out weighs against a strut that stretches by as much."""
 BENDING: Final = 0.06
 """How much joints that leave the wall otherwise than their neighbours weigh against a strut that stretches by as much.
 
-An estimate. Without it a device in a bend of 7 mm folds up, gaps reach most of its radius; as much as a cell's spring
-leaves 0.6 mm, four times as much 0.2 mm, and more than that gives gaps up for struts that stretch.
+An estimate, five times what struts as elastic beams resist with (``benchmarks/offline/cell_frame.py``: for Enterprise
+0.0117 along lines of struts and next to nothing round the device). With that a device that nothing but its springs
+holds to the wall lies flat in bends: gaps of 0.2, 0.9, 1.4 and 1.8 mm where they are of 20, 14, 10 and 7 mm. Enterprise
+does flatten in bends (Ebrahimi et al. 2007, AJNR 28:823), but by how much hangs on how it is let go: in
+a tube of 3.5 mm bent by 7 mm pulling the catheter back leaves a crescent outside, pushing and pulling hardly any
+(Heller and Malek 2011, J NeuroIntervent Surg 3:340). What holds it to the wall then is friction. This is a device that
+was let go well.
 """
 LEVEL: Final = 0.01
 """How much a joint that leaves its row weighs against a strut that stretches by as much."""
@@ -60,6 +63,8 @@ class _Frame(NamedTuple):
     """What puts them there: the chart is flat between its nodes."""
     length_mm: float
     """Length of a strut as cut."""
+    springiness: float
+    """How much a cell that is drawn out weighs against a strut that stretches by as much."""
     pairs: Ints
     """(2, k) joints at both ends of every cell's width and height."""
     free_mm: Floats
@@ -82,14 +87,39 @@ class _Model(NamedTuple):
         return float(self.residual @ self.residual)
 
 
-def relax(net: Net, length_mm: float, width_mm: float, held: float, laid: Laid) -> Floats:
+class Cut(NamedTuple):
+    """How a device is cut."""
+
+    length_mm: float
+    """Length of a strut, from joint to joint."""
+    width_mm: float
+    """Width of a cell of the free device."""
+    strut_mm: float
+    """Width of a strut along the wall."""
+
+
+def springiness(cut: Cut) -> float:
+    """How much a cell that is drawn out weighs against a strut that stretches by as much.
+
+    A strut of width b, length L and angle alpha to the axis is welded to joints that do not turn, b / sin(2 alpha) of
+    it is part of them, and what is left, l, bends like a beam clamped at both ends: moved sideways it resists with
+    12 E I / l^3, stretched with E A / L. Shared out among widths and heights of cells, which a strut that turns changes
+    by twice its ends' moves, that is the square root of L b^2 / (2 l^3). A frame of elastic beams has the same to 2 %
+    (``benchmarks/offline/cell_frame.py``).
+    """
+    sine = 0.5 * cut.width_mm / cut.length_mm
+    bending_mm = cut.length_mm - cut.strut_mm / (2 * sine * np.sqrt(1 - sine**2))
+    return float(cut.strut_mm * np.sqrt(0.5 * cut.length_mm / bending_mm**3))
+
+
+def relax(net: Net, cut: Cut, held: float, laid: Laid) -> Floats:
     """Moves (c, 3) of the joints along, around and off the wall, mm.
 
-    Struts are `length_mm` long, cells of the free device `width_mm` wide; in the mean, row number `held` of the joints
-    (or what lies between two rows) stays where it is. `laid` puts joints from the chart on to the wall.
+    In the mean, row number `held` of the joints (or what lies between two rows) stays where it is. `laid` puts joints
+    from the chart on to the wall.
     """
-    pairs, free_mm = _diagonals(net, length_mm, width_mm)
-    frame = _Frame(net, laid, length_mm, pairs, free_mm, _keeping(net, held))
+    pairs, free_mm = _diagonals(net, cut.length_mm, cut.width_mm)
+    frame = _Frame(net, laid, cut.length_mm, springiness(cut), pairs, free_mm, _keeping(net, held))
     x, inertia = np.zeros(3 * len(net.line)), INERTIA
     here = _model(frame, x)
     for _ in range(STEPS):
@@ -134,11 +164,9 @@ def _model(frame: _Frame, x: Floats) -> _Model:
     change = np.stack(moved_mm, axis=1) / (2 * TINY_MM)
     strut_mm, strut_slopes = _lengths(points_mm, change, net.ends, net.bulge[net.line[net.ends[0]]])
     open_mm, open_slopes = _lengths(points_mm, change, frame.pairs, np.zeros(len(frame.free_mm)))
-    ratio = open_mm / frame.free_mm
-    spring = 0.5 * SPRINGINESS * frame.free_mm * (ratio - 1 / ratio)
-    open_slopes = diags(0.5 * SPRINGINESS * (1 + 1 / ratio**2)) @ open_slopes
+    spring = frame.springiness * (open_mm - frame.free_mm)
     residual = np.concatenate([strut_mm - frame.length_mm, spring, frame.keeping @ x])
-    return _Model(residual, csc_matrix(vstack([strut_slopes, open_slopes, frame.keeping])))
+    return _Model(residual, csc_matrix(vstack([strut_slopes, frame.springiness * open_slopes, frame.keeping])))
 
 
 def as_drawn(points_mm: Floats, row: Floats, column: Floats) -> Floats:

@@ -121,7 +121,7 @@ def perimeters(nodes: Floats) -> Floats:
     """
     m, ahead = nodes.shape[1], np.roll(nodes, -1, axis=1)
     bend = nodes + ahead - np.roll(nodes, 1, axis=1) - np.roll(ahead, -1, axis=1)
-    chord = np.maximum(np.linalg.norm(ahead - nodes, axis=2), 1e-300)
+    chord = np.maximum(curves.lengths(ahead - nodes), 1e-300)
     length = (chord + (bend**2).sum(axis=2) / (96 * chord)).sum(axis=1)
     half = np.pi / m
     circle = 2 * np.sin(half) + (np.cos(half) - np.cos(3 * half)) ** 2 / (48 * np.sin(half))
@@ -136,7 +136,7 @@ def evenly_spaced(nodes: Floats) -> Floats:
     n, m = nodes.shape[:2]
     closed = np.concatenate([nodes, nodes[:, :1]], axis=1)
     arc = np.zeros((n, m + 1))
-    np.cumsum(np.linalg.norm(np.diff(closed, axis=1), axis=2), axis=1, out=arc[:, 1:])
+    np.cumsum(curves.lengths(np.diff(closed, axis=1)), axis=1, out=arc[:, 1:])
     arc *= m / arc[:, -1:]
     wanted = (np.arange(m) + (arc[:, :m] - np.arange(m)).mean(axis=1, keepdims=True)) % m
     row = np.arange(n)[:, None]
@@ -155,4 +155,4 @@ def normals(nodes_mm: Floats) -> Floats:
     along = np.gradient(nodes_mm, axis=0)
     around = np.roll(nodes_mm, -1, axis=1) - np.roll(nodes_mm, 1, axis=1)
     normal = np.cross(around, along)
-    return normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-300)
+    return normal / np.maximum(curves.lengths(normal), 1e-300)[..., None]

@@ -16,8 +16,9 @@ import numpy as np
 from vstent.deploy import cells
 from vstent.deploy.contour import normals
 from vstent.device import Design, Grid, LaserCut, Size, grid, piece_length_mm
-from vstent.kernels import net
+from vstent.kernels import curves, net
 from vstent.kernels.arrays import Floats, Ints
+from vstent.units import MM_PER_UM
 
 RESISTANCE: Final = 0.01
 """How much a crossing that slides out of its row weighs against a piece of wire that stretches by as much."""
@@ -55,7 +56,7 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.L
     continued_mm = _continued(nodes_mm)
     along_mm = np.gradient(continued_mm, axis=0)
     around_mm = 0.5 * (np.roll(continued_mm, -1, axis=1) - np.roll(continued_mm, 1, axis=1))
-    spacing_mm = np.array([np.median(np.linalg.norm(side, axis=2)) for side in (along_mm, around_mm)])
+    spacing_mm = np.array([np.median(curves.lengths(side)) for side in (along_mm, around_mm)])
     chart = np.concatenate([continued_mm, along_mm / spacing_mm[0], around_mm / spacing_mm[1]], axis=2)
     lattice = _lattice(shape)
     pieces = net.Net(
@@ -72,7 +73,8 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.L
     length_mm, held_line = piece_length_mm(design, size), held / shape.row_split
     if isinstance(design, LaserCut):
         width_mm = size.free_diameter_mm * np.sin(2 * np.pi / design.n_columns)
-        moves_mm = cells.relax(pieces, length_mm, width_mm, held_line, lambda p, row, column: laid(p, row - 1, column))
+        cut = cells.Cut(length_mm, width_mm, design.strut_width_um * MM_PER_UM)
+        moves_mm = cells.relax(pieces, cut, held_line, lambda p, row, column: laid(p, row - 1, column))
     else:
         weights = net.Weights(length_mm, RESISTANCE, CROWDING, STIFFNESS, round(held_line))
         moves_mm = np.pad(net.slide(pieces, weights, DESCENT), ((0, 0), (0, 1)))

@@ -46,7 +46,7 @@ class Contact(NamedTuple):
     def inward(self, points_mm: Floats) -> Floats:
         """Return unit directions (n, 3) from the wall to points; the wall's own normal, reversed, for points on it."""
         away = points_mm - self.closest_mm
-        length = np.linalg.norm(away, axis=1)
+        length = curves.lengths(away)
         is_on_wall = length < ON_WALL_MM
         away = away / np.where(is_on_wall, 1.0, length)[:, None]
         away[is_on_wall] = -self.normal[is_on_wall]

@@ -10,6 +10,7 @@ from scipy.sparse import csr_matrix
 from vstent.deploy.contour import normals
 from vstent.deploy.wall import AbstractWall
 from vstent.device import Braid, Design, Grid, LaserCut, Size, grid, piece_length_mm
+from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import MM_PER_UM
 
@@ -92,7 +93,7 @@ def _spline(nodes_mm: Floats) -> Floats:
 def _drawn(spline: Floats, samples: csr_matrix) -> tuple[Floats, Floats]:
     """Points (n, 3) and outward unit normals (n, 3) of a contour's spline (k, 6) at samples (n, k)."""
     found = samples @ spline
-    return found[:, :3], found[:, 3:] / np.linalg.norm(found[:, 3:], axis=1, keepdims=True)
+    return found[:, :3], found[:, 3:] / curves.lengths(found[:, 3:])[:, None]
 
 
 def wire_diameters_um(design: Braid) -> Floats:

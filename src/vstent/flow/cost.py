@@ -13,6 +13,7 @@ from vstent.flow.domain import INLET_EXTENSION, OUTLET_EXTENSION, default_cell_s
 from vstent.flow.engines.lattice_state import PHASES, steps_per_phase
 from vstent.flow.types import FlowCase
 from vstent.kernels import lattice
+from vstent.kernels.warm import keep_flow
 
 BYTES_PER_CELL = 600
 """Peak memory per blood cell (measured on 0.3 to 0.8 million cells: 300 to build and step, 130 for the last checks; the
@@ -110,6 +111,7 @@ def _steps(case: FlowCase, cell_size_mm: float) -> int:
 @cache
 def block_rate() -> float:
     """Cell updates per second in a block of blood without walls, measured with the threads that will be used."""
+    keep_flow()
     length, threads = np.full(BLOCK_ROWS, 64, np.int32), numba.get_num_threads()
     stride = int(length.sum())
     address = (64 * np.arange(BLOCK_ROWS)[:, None] + stride * np.arange(19)).astype(np.int32)

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from scipy.spatial import cKDTree
 
 from vstent.kernels.arrays import Floats
 
@@ -23,17 +22,75 @@ def covered_fractions(nodes: Floats, starts: Floats, ends: Floats, radius: Float
     are tested against the segments nearby, all projected onto the quad's plane.
     """
     rows, columns = nodes.shape[:2]
-    home = np.asarray(cKDTree(nodes.reshape(-1, 3)).query(0.5 * (starts + ends))[1])
+    nodes = np.array(nodes, order="C")  # a copy: what may not be written would be compiled anew
+    home = homes(nodes, 0.5 * (starts + ends))
     order = np.argsort(home, kind="stable")
     first = np.searchsorted(home[order], np.arange(rows * columns + 1)).astype(np.int32)
     return _fractions(
-        np.array(nodes, order="C"),  # a copy: what may not be written would be compiled anew
+        nodes,
         np.ascontiguousarray(starts[order]),
         np.ascontiguousarray(ends[order]),
         np.ascontiguousarray(radius[order]),
         first,
         samples,
     )
+
+
+@njit(cache=True)
+def homes(nodes: Any, points: Any) -> Any:
+    """Nearest node (n,) of a grid (rows, columns, 3), its number, to points (n, 3) that follow on each other.
+
+    It is sought downhill from that of the point before, and among all where the next point is too far for that.
+    """
+    columns = nodes.shape[1]
+    home = np.zeros(len(points), dtype=np.int32)
+    row, column = 0, 0
+    for p in range(len(points)):
+        jump2, reach2 = 0.0, 0.0
+        for k in range(3):
+            jump2 += (points[p, k] - points[p - 1, k]) ** 2 if p > 0 else 0.0
+            reach2 += (nodes[row, (column + 1) % columns, k] - nodes[row, column, k]) ** 2
+        if p == 0 or jump2 > reach2:
+            row, column = _nearest(nodes, points[p])
+        row, column = _downhill(nodes, points[p], row, column)
+        home[p] = row * columns + column
+    return home
+
+
+@njit(cache=True)
+def _away2(nodes: Any, point: Any, row: int, column: int) -> float:
+    total = 0.0
+    for k in range(3):
+        total += (nodes[row, column, k] - point[k]) ** 2
+    return total
+
+
+@njit(cache=True)
+def _nearest(nodes: Any, point: Any) -> tuple[int, int]:
+    best, at = np.inf, (0, 0)
+    for row in range(nodes.shape[0]):
+        for column in range(nodes.shape[1]):
+            away2 = _away2(nodes, point, row, column)
+            if away2 < best:
+                best, at = away2, (row, column)
+    return at
+
+
+@njit(cache=True)
+def _downhill(nodes: Any, point: Any, row: int, column: int) -> tuple[int, int]:
+    """Go to the nearest of the nodes around as long as one is nearer."""
+    rows, columns = nodes.shape[0], nodes.shape[1]
+    best = _away2(nodes, point, row, column)
+    while True:
+        here = row, column
+        for i in range(max(here[0] - 1, 0), min(here[0] + 2, rows)):
+            for step in range(-1, 2):
+                j = (here[1] + step) % columns
+                away2 = _away2(nodes, point, i, j)
+                if away2 < best:
+                    best, row, column = away2, i, j
+        if (row, column) == here:
+            return row, column
 
 
 @njit(cache=True)

@@ -2,7 +2,8 @@
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from numba.core import event
@@ -24,6 +25,38 @@ def telling(tell: Callable[[], None], *, helped: bool = False) -> Iterator[None]
             yield
     finally:
         once.stop()
+
+
+def kept(call: Callable[[], None], command: Sequence[str]) -> None:
+    """See that the kernels which `call` runs are those of numba's cache: what it lacks another process compiles.
+
+    `command` is that process. Where its work cannot be kept, this process compiles at the next call.
+    """
+    try:
+        with event.install_listener("numba:compile", _Refusal()):
+            call()
+    except _Unkept:
+        subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+
+
+class _Unkept(Exception):
+    """Numba is about to compile."""
+
+
+class _Refusal(event.Listener):
+    """Keeps this thread from compiling."""
+
+    def __init__(self) -> None:
+        """Remember the thread."""
+        self._thread = threading.get_ident()
+
+    def on_start(self, event: event.Event) -> None:
+        """Refuse."""
+        if threading.get_ident() == self._thread:
+            raise _Unkept
+
+    def on_end(self, event: event.Event) -> None:
+        """Say nothing."""
 
 
 class _Once(event.Listener):

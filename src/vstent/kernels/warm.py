@@ -1,25 +1,56 @@
 """Compile kernels ahead of their first use: ``python -m vstent.kernels.warm``, in the set-up.
 
-Those of a deployment, and the one that takes a flow's time: in the process that has compiled it, numba runs another
-machine code than it keeps, a quarter slower and different in the last bits from that of every later process.
+All that take time to compile. A process that has compiled a flow's kernels itself runs other machine code than numba
+keeps of them, slower and different in the last bits from that of every later process: `keep_flow`.
 """
+
+import sys
+from functools import cache
 
 import numpy as np
 
-from vstent.kernels import coverage, lattice, net, tree
+from vstent.kernels import coverage, curves, lattice, lattice_sampling, medial, net, raster, tree, triangles, voxels
+from vstent.kernels.first_use import kept
 
 
 def warm() -> None:
     """Call every kernel once on next to nothing, the last ones first; numba keeps what it compiles."""
     row, column = np.meshgrid(np.arange(3.0), np.arange(4.0), indexing="ij")
     nodes = np.stack([np.cos(np.pi / 2 * column), np.sin(np.pi / 2 * column), row], axis=-1)
+    flow()
     _slide(nodes)
     coverage.covered_fractions(nodes, nodes[0], nodes[1], np.full(4, 0.01), 2)
+    _search()
+    _paint()
+    curves.parallel_frames(np.eye(3))
+    medial.widest_in_section(np.ones((1, 2)), np.ones((1, 2, 2)), 1.0, np.ones(1))
+
+
+@cache
+def keep_flow() -> None:
+    """See that a flow runs the machine code that every process runs: if need be another one compiles it."""
+    kept(flow, (sys.executable, "-c", "from vstent.kernels.warm import flow; flow()"))
+
+
+def _search() -> None:
+    """Ask a triangle what an artery is asked; a surface's faces may not be written."""
     vertices, faces = np.eye(3), np.array([[0, 1, 2]], dtype=np.int32)
+    faces.setflags(write=False)
     tiny = tree.build(vertices, faces)
     tree.closest_points(tiny, vertices)
     tree.segments_cross(tiny, vertices, 2 * vertices)
-    _stream()
+    tree.inscribed_radii(tree.curved(tiny, triangles.smooth_normals(vertices, faces)[faces]), vertices)
+
+
+def _paint() -> None:
+    """Paint a triangle and a wire, as the pictures of a report are."""
+    screen, faces = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]), np.array([[0, 1, 2]], dtype=np.int32)
+    faces.setflags(write=False)
+    depth, image, sums = np.full((2, 2), np.inf), np.zeros((2, 2, 3)), np.zeros((2, 2, 4))
+    raster.paint_triangles(screen, screen, faces, depth, image)
+    raster.paint_wires(screen, np.array([0, 3], dtype=np.int32), np.ones(1), 1.0, screen, depth, image)
+    raster.veil_triangles(screen, screen, np.ones(1), faces, depth, sums, depth)
+    raster.resolve(image, sums, depth, 1)
 
 
 def _slide(nodes_mm: np.ndarray) -> None:
@@ -33,11 +64,12 @@ def _slide(nodes_mm: np.ndarray) -> None:
     net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1), net.Descent(1, 0.1, 0.1))
 
 
-def _stream() -> None:
-    """Update one cell at rest, with every argument of the type that a flow has."""
+def flow() -> None:
+    """Call every kernel of a flow on one cell at rest, with every argument of the type that a flow has."""
     stride = lattice.LANES
+    f, none = np.zeros(20 * stride, np.float32), np.zeros(0, np.int32)
     lattice.update(
-        np.zeros(20 * stride, np.float32),
+        f,
         stride * np.arange(19, dtype=np.int32)[None],
         np.ones(1, np.int32),
         np.float32(1.0),
@@ -45,10 +77,20 @@ def _stream() -> None:
         np.full(1, np.inf, np.float32),
         np.float32(1.0),
         np.zeros(2, np.int32),
-        np.zeros(0, np.int32),
+        none,
         np.zeros((0, 6), np.float32),
         1,
     )
+    links, weight, source = np.zeros((0, 6), np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+    lattice.drive(f, stride, np.zeros((0, 9)), np.zeros(1, np.int32), links, none, none, np.zeros((0, 2)), source)
+    lattice.reflect(f, links, weight, source, none, source, True)
+    lattice.swap(f, none, none)
+    lattice.defer(f, links, np.zeros((0, 5), np.float32), source, np.float32(1.0))
+    lattice.balance(f, links, none, none, none, source, np.float32(1.0))
+    lattice.moments(f, stride, none)
+    index, numbers, points = np.zeros((2, 2, 2), np.int32), np.zeros(1), np.zeros((0, 3))
+    lattice_sampling.fit_wall(index, numbers, np.zeros((1, 3)), numbers, points, points, 1)
+    voxels.fill(np.zeros((0, 3, 3)), (1, 1, 1))
 
 
 if __name__ == "__main__":

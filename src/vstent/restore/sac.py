@@ -13,7 +13,7 @@ from vstent.restore.axis import Mouth, fit_axis
 from vstent.restore.bulges import FLANK, Bulge, bulge_at
 from vstent.restore.drawn import Drawn
 from vstent.restore.landing import Landing, close_landing
-from vstent.restore.neck import Artery, Flank, apart_mm, believed_from_mm, skirt, unblurred
+from vstent.restore.neck import Artery, Flank, apart_mm, believed_from_mm, calmed, skirt, unblurred
 from vstent.restore.tubes import tubes_of
 from vstent.surface import Surface
 from vstent.vessel import Aneurysm, Centerline, Vessel
@@ -63,6 +63,7 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     flank, other_loops = _flank(lumen, height_mm, low_mm, core.dome_mm, landing)
     if flank is None:
         return None
+    flank = calmed(flank)
     flank = unblurred(flank, vessel.blur_mm) if vessel.blur_mm else flank
     rings = skirt(flank.levelled(low_mm), artery, vessel.closed, n_rings=N_SKIRT)
     found = _aneurysm(artery, flank, other_loops, rings)
@@ -172,8 +173,7 @@ def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge
     for line in lines:
         depth = np.min([one.solid.signed_distance(line.points_mm) for one in landings], axis=0)
         is_apart = depth > -0.5 * line.inscribed_radius_mm
-        in_sac = bulge.distances_mm(line.points_mm) < 1.2 * line.inscribed_radius_mm
-        inner = np.flatnonzero(~is_apart | in_sac)
+        inner = np.flatnonzero(~is_apart | bulge.holds(line))
         is_branch = np.arange(len(line.points_mm)) > (inner[-1] if len(inner) else -1)
         gap = np.asarray(foot.query(line.points_mm)[0])
         passes = (is_apart & (gap < PASSING * line.inscribed_radius_mm)).any()
@@ -204,7 +204,7 @@ def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) ->
         return None
     side = close_landing(lumen, fit_axis(lumen, course, [Mouth(bulge.foot_mm, bulge.inward)]))
     is_own = (~side.is_restored).mean(axis=1) > OWN_WALL
-    is_own &= bulge.distances_mm(side.points_mm) > 1.2 * side.section_radius_mm
+    is_own &= ~bulge.holds(line)[cKDTree(line.points_mm).query(side.points_mm)[1]]
     lost = np.flatnonzero(~is_own & (landing.solid.signed_distance(side.points_mm) > 0))
     end = lost[0] if len(lost) else len(side.points_mm)
     if end < FEWEST_SECTIONS:

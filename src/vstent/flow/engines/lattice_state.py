@@ -32,6 +32,7 @@ from vstent.flow.types import FlowCase, FlowField, Phase, Waveform
 from vstent.flow.wall_stress import wall_stress
 from vstent.kernels import lattice, lattice_sampling
 from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.warm import keep_flow
 from vstent.units import M_PER_MM
 
 DEFER_PAIRS = 8
@@ -110,6 +111,7 @@ class State:
 
 def build(case: FlowCase, scales: Scales, steps_per_check: int, *, start: FlowField | None, kept: int) -> State:
     """Build grid, storage and coefficients; begin at rest or from a field on any grid; `kept` checks are remembered."""
+    keep_flow()
     domain = domains.build(case.vessel, scales.cell_m / M_PER_MM)
     is_end = in_extensions(case, domain)
     addressing = address(domain, is_end)
