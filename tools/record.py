@@ -78,14 +78,19 @@ def _results(cases: list[ET.Element]) -> str:
     words = []
     for case in cases:
         name = (case.get("name") or "").replace("\\", "\\\\")
-        failed = case.find("failure") is not None or case.find("error") is not None
-        result = "failed" if failed else "skipped" if case.find("skipped") is not None else "passed"
-        rows.append(f"   * - ``{name}``\n     - {result}\n     - {float(case.get('time', 0)):.1f}\n")
+        rows.append(f"   * - ``{name}``\n     - {_result(case)}\n     - {float(case.get('time', 0)):.1f}\n")
         lines = (case.findtext("system-out") or "").splitlines()
         said = "\n".join(line for line in lines if not line.startswith("---")).strip()
         if said:
             words.append(f"``{name}``\n{literal(said[:LONGEST])}")
     return "".join(rows) + ("\nWhat they print:\n\n" + "\n".join(words) if words else "")
+
+
+def _result(case: ET.Element) -> str:
+    skipped = case.find("skipped")
+    if skipped is not None:
+        return f"not held: {skipped.get('message')}" if skipped.get("type") == "pytest.xfail" else "skipped"
+    return "passed" if case.find("failure") is None and case.find("error") is None else "failed"
 
 
 def benchmark(commands: list[str]) -> int:
