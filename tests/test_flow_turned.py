@@ -58,5 +58,5 @@ def test_a_turned_bend_carries_the_same_flow() -> None:
 @pytest.mark.validation
 @pytest.mark.parametrize("turn", [DIAGONAL, Rotation.from_euler("x", 45, degrees=True)], ids=["diagonal", "x"])
 def test_what_turning_changes_vanishes_with_the_cells(turn: Rotation) -> None:
-    coarse, fine = np.array(differences(turn, 0.28)), np.array(differences(turn, 0.2))
-    assert np.log(coarse.sum() / fine.sum()) / np.log(0.28 / 0.2) > 1.0
+    coarse, fine = np.array(differences(turn, 0.2)), np.array(differences(turn, 0.14))
+    assert np.log(coarse.sum() / fine.sum()) / np.log(0.2 / 0.14) > 1.4
