@@ -3,16 +3,14 @@
 import numpy as np
 import pytest
 
-from vstent import phantoms
 from vstent.io.surfaces import read_surface
-from vstent.kernels import smoothing, triangles
-from vstent.phantoms import tube, with_sac
+from vstent.kernels import smoothing
 from vstent.repair import repair
 from vstent.restore import _width_beyond_fork, restore
-from vstent.restore.axis import Tube, _fit, _Necks
+from vstent.restore.axis import _fit, _Necks
 from vstent.restore.bulges import Bulge
-from vstent.restore.landing import Landing, close_landing
-from vstent.restore.neck import MOUTH, UNTOLD_EDGES, Flank, apart_mm, believed_from_mm, calmed
+from vstent.restore.landing import Landing
+from vstent.restore.neck import MOUTH, apart_mm
 from vstent.restore.tubes import Tubes
 from vstent.surface import Surface
 from vstent.trace import trace
@@ -99,45 +97,6 @@ def test_a_sphere_is_in_a_sac_where_it_or_its_neighbours_touch_the_sacs_wall() -
     for nearest, held in ((1.0, s < 0.99), (1.15, s < 0)):  # in the sac until it is a branch; beside it all the way
         line = Centerline(np.stack([0 * s, 0 * s, (nearest + 0.2 * s)], axis=1), np.ones(len(s)))
         np.testing.assert_array_equal(sac.holds(line), held)
-
-
-def _off_mm(dome: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(dome, axis=1) - 3.0
-
-
-def test_the_flank_loses_the_noise_of_its_vertices_and_keeps_its_shape() -> None:
-    ball = phantoms.phantom_surface(with_sac(tube(length_mm=20.0), abscissa_mm=10, width_mm=6.0, neck_mm=3.0))
-    center_mm = np.array([0.0, np.ptp(ball.vertices_mm[:, 1]) - 5.0, 10.0])
-    vertices, faces, _ = triangles.clip(ball.vertices_mm - center_mm, ball.faces, 1.0 - ball.vertices_mm[:, 1] + 3.0)
-    dome = Surface(*triangles.compact(vertices, faces))
-    assert np.abs(_off_mm(dome.vertices_mm)).max() < 0.01
-    rim = dome.boundary_loops[0]
-    flank = Flank(dome.vertices_mm, dome.faces, np.zeros(len(dome.vertices_mm)), rim)
-    assert np.abs(_off_mm(calmed(flank).vertices_mm)).max() < 0.015
-    noisy = flank._replace(vertices_mm=_shaken(dome, "white", 1).vertices_mm)
-    before, after = (_off_mm(one.vertices_mm) for one in (noisy, calmed(noisy)))
-    assert after.std() < 0.55 * before.std()
-    assert abs(after.mean() - before.mean()) < 0.005
-
-
-def test_noise_does_not_raise_the_height_from_which_a_flank_is_believed() -> None:
-    wall = phantoms.phantom_surface(tube(length_mm=20.0), edge_mm=0.25)
-    foot_mm = np.array([[0.0, 2.0, 10.0]])
-    still_mm = believed_from_mm(wall, foot_mm, 3.0, None)
-    assert still_mm == pytest.approx(UNTOLD_EDGES * 0.25, rel=0.03)
-    assert believed_from_mm(_shaken(wall, "white", 1), foot_mm, 3.0, None) == pytest.approx(still_mm, rel=0.02)
-
-
-def test_a_single_vertex_that_stands_out_is_no_mouth() -> None:
-    z = np.arange(0.0, 20.1, 0.25)
-    axis = Tube(np.stack([0 * z, 0 * z, z], axis=1), np.full(len(z), 1.0))
-    wall = phantoms.phantom_surface(tube(length_mm=20.0, radius_mm=1.0), edge_mm=0.2)
-    out_mm = np.zeros(len(wall.vertices_mm))
-    out_mm[::97] = 0.35
-    spiked = Surface(wall.vertices_mm + out_mm[:, None] * wall.vertex_normals, wall.faces)
-    inner = slice(8, -8)  # a ray from the ends leaves through the opening
-    shape = (len(z), -1)
-    assert not close_landing(spiked, axis).is_restored.reshape(shape)[inner].any()
 
 
 def test_a_sac_hangs_square_to_its_foot_wherever_its_dome_is() -> None:

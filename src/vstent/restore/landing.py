@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 from scipy.linalg import solveh_banded
-from scipy.ndimage import binary_dilation, binary_propagation, map_coordinates, median_filter
+from scipy.ndimage import binary_dilation, binary_propagation, map_coordinates
 from scipy.sparse import csc_matrix, diags, eye, kron
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
@@ -36,9 +36,6 @@ PRIOR: Final = 0.02
 """Weight of the fitted circular tube beside the wall's 1: decides where there is no wall at all."""
 SAME_MM: Final = 1e-3
 """A ray that goes on for less than this has met the same wall."""
-GRAIN: Final = 5
-"""The wall is judged by its median over so many sections and rays: a baseline under single ones would be the noise's
-lower edge, and noise of a flare's height would join the whole wall to the mouths on it."""
 N_PASSES: Final = 12
 """Passes of asymmetric least squares; weights settle within 10."""
 
@@ -121,19 +118,11 @@ def close_landing(lumen: Surface, tube: Tube, own: Surface | None = None) -> Lan
         has_wall &= section_rays(own, tube.points_mm, N_RAYS) < rho + SAME_MM
     wall = np.where(has_wall, rho, radius)
     scale = float(np.median(tube.radius_mm))
-    seen = _median(wall)
-    baseline = _baseline(seen, has_wall, radius, scale)
-    out = (seen - baseline) / radius
+    baseline = _baseline(wall, has_wall, radius, scale)
+    out = (wall - baseline) / radius
     is_out = binary_propagation(_around(out > OUT), mask=_around(~has_wall | (out > FLARE)))
     restored = _core(_dilated(is_out | _around(~has_wall), scale))
     return Landing(tube.points_mm, _closed(wall, restored, baseline, scale), restored)
-
-
-def _median(wall: Floats) -> Floats:
-    """Median of `GRAIN` sections and rays around each; the rays go round."""
-    beside = GRAIN // 2
-    round_ = np.pad(wall, ((0, 0), (beside, beside)), mode="wrap")
-    return np.asarray(median_filter(round_, GRAIN, mode="nearest")[:, beside:-beside])
 
 
 def _baseline(wall: Floats, has_wall: Bools, radius: Floats, scale_mm: float) -> Floats:

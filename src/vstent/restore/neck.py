@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import ndtr, ndtri
 
-from vstent.kernels import curves, smoothing
+from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints
 from vstent.restore.landing import Landing
 from vstent.restore.tubes import Tubes
@@ -30,11 +30,6 @@ UNTOLD_MM: Final = 0.5
 reconstruction and smoothing of the mesh together..."""
 UNTOLD_EDGES: Final = 2.2
 """... nor lower than this many edges: an iso-surface has edges of 0.9 voxel, and a scan is blurred by about a voxel."""
-SMOOTHING_STEPS: Final = 6
-PASS_BAND: Final = 0.1
-MOST_MOVES: Final = 3.0
-"""A vertex of the flank is moved by no more than so many times the median of all vertices' moves: twice the standard
-deviation of noise."""
 DEEPEST: Final = 0.45
 """The artery's share in the flank's intensity is taken for no more than this."""
 BAND: Final = 3.0
@@ -181,8 +176,7 @@ class Flank(NamedTuple):
 def believed_from_mm(lumen: Surface, foot_mm: Floats, most_mm: float, blur_mm: float | None) -> float:
     """Height from which on the flank around a bulge's foot (k, 3) is free of blur; no more than `most_mm`."""
     near = np.asarray(cKDTree(foot_mm).query(lumen.vertices_mm, distance_upper_bound=most_mm)[0]) < most_mm
-    faces = lumen.faces[near[lumen.faces].any(axis=1)]
-    corners = _without_noise(lumen.vertices_mm, faces)[faces]  # noise makes edges longer
+    corners = lumen.corners_mm[near[lumen.faces].any(axis=1)]
     edge_mm = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
     if blur_mm is None:
         return min(max(UNTOLD_MM, UNTOLD_EDGES * edge_mm), most_mm)
@@ -199,23 +193,6 @@ def unblurred(flank: Flank, blur_mm: float) -> Flank:
     share = np.minimum(ndtr(-flank.height_mm / blur_mm), DEEPEST)
     normals = Surface(flank.vertices_mm, flank.faces).vertex_normals
     return flank._replace(vertices_mm=flank.vertices_mm - (blur_mm * ndtri(0.5 + share))[:, None] * normals)
-
-
-def _without_noise(vertices_mm: Floats, faces: Ints) -> Floats:
-    return smoothing.taubin(vertices_mm, faces, iterations=SMOOTHING_STEPS, pass_band=PASS_BAND)
-
-
-def calmed(flank: Flank) -> Flank:
-    """The flank without the noise of single vertices: it would be magnified on the way down to the neck.
-
-    Each vertex goes along its normal by what Taubin's filter takes off, but no further than noise does: on a wall
-    without any that is next to nothing. The crevice below the rim has no part in it.
-    """
-    smooth = _without_noise(flank.vertices_mm, flank.faces)
-    normals = Surface(flank.vertices_mm, flank.faces).vertex_normals
-    move_mm = np.einsum("nd,nd->n", smooth - flank.vertices_mm, normals)
-    most_mm = MOST_MOVES * float(np.median(np.abs(move_mm)))
-    return flank._replace(vertices_mm=flank.vertices_mm + np.clip(move_mm, -most_mm, most_mm)[:, None] * normals)
 
 
 def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floats:

@@ -13,7 +13,7 @@ from vstent.restore.axis import Mouth, fit_axis
 from vstent.restore.bulges import FLANK, Bulge, bulge_at
 from vstent.restore.drawn import Drawn
 from vstent.restore.landing import Landing, close_landing
-from vstent.restore.neck import Artery, Flank, apart_mm, believed_from_mm, calmed, skirt, unblurred
+from vstent.restore.neck import Artery, Flank, apart_mm, believed_from_mm, skirt, unblurred
 from vstent.restore.tubes import tubes_of
 from vstent.surface import Surface
 from vstent.vessel import Aneurysm, Centerline, Vessel
@@ -63,7 +63,6 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     flank, other_loops = _flank(lumen, height_mm, low_mm, core.dome_mm, landing)
     if flank is None:
         return None
-    flank = calmed(flank)
     flank = unblurred(flank, vessel.blur_mm) if vessel.blur_mm else flank
     rings = skirt(flank.levelled(low_mm), artery, vessel.closed, n_rings=N_SKIRT)
     found = _aneurysm(artery, flank, other_loops, rings)
