@@ -29,6 +29,8 @@ REACH_MM: Final = 10.0
 """At a fork, the parent artery goes on where the vessel is wider over this length."""
 ON_FOOT: Final = 1.5
 """A foot, which rises to half a radius above the nearest artery, is an artery's own up to this many of its radii."""
+IN_SAC: Final = 1.2
+"""A sphere reaches into a sac whose wall is within this many of its radii."""
 PASSING: Final = 2.0
 """A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
 
@@ -102,7 +104,7 @@ def _is_off_sac(line: Centerline, bulges: list[Bulge]) -> Bools:
     """Tell the points (n,) of a centerline whose inscribed spheres do not reach into a sac: it makes them wide."""
     if not bulges:
         return np.ones(len(line.points_mm), dtype=bool)
-    return ~bulges[0].holds(line)
+    return np.asarray(bulges[0].distances_mm(line.points_mm) > IN_SAC * line.inscribed_radius_mm)
 
 
 def _reach(line: Centerline, bulge: Bulge) -> float:

@@ -4,14 +4,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import binary_propagation
 from scipy.spatial import cKDTree
 
 from vstent.kernels import triangles
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 from vstent.restore.tubes import Tubes
 from vstent.surface import Surface
-from vstent.vessel import Centerline
 
 FLANK: Final = 0.5
 """A bulge is where the wall stands out by more than this many parent radii."""
@@ -24,10 +22,6 @@ WIDTH: Final = 1.0
 
 LENGTH: Final = 3.5
 """A sac stands out by less than this many of its own widths; what is longer is a branch that ends blind."""
-TOUCHED: Final = 1.08
-"""A sphere touches a bulge's wall within this many of its radii, and is in it..."""
-IN_REACH: Final = 1.2
-"""... as those are before and after it along a line that reach it within this many."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +52,6 @@ class Bulge:
     def distances_mm(self, points_mm: Floats) -> Floats:
         """Distance (k,) of each of (k, 3) points to the nearest vertex of the bulge."""
         return np.asarray(cKDTree(self.points_mm).query(points_mm)[0])
-
-    def holds(self, line: Centerline) -> Bools:
-        """Tell which inscribed spheres (n,) of a line are in the bulge.
-
-        One that is touches its wall. A branch that passes beside or under it comes near its wall, how near is a matter
-        of noise, but its spheres touch the branch's own.
-        """
-        reach = self.distances_mm(line.points_mm) / line.inscribed_radius_mm
-        return np.asarray(binary_propagation(reach < TOUCHED, mask=reach < IN_REACH))
 
 
 def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> list[Bulge]:

@@ -172,7 +172,8 @@ def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge
     for line in lines:
         depth = np.min([one.solid.signed_distance(line.points_mm) for one in landings], axis=0)
         is_apart = depth > -0.5 * line.inscribed_radius_mm
-        inner = np.flatnonzero(~is_apart | bulge.holds(line))
+        in_sac = bulge.distances_mm(line.points_mm) < 1.2 * line.inscribed_radius_mm
+        inner = np.flatnonzero(~is_apart | in_sac)
         is_branch = np.arange(len(line.points_mm)) > (inner[-1] if len(inner) else -1)
         gap = np.asarray(foot.query(line.points_mm)[0])
         passes = (is_apart & (gap < PASSING * line.inscribed_radius_mm)).any()
@@ -203,7 +204,7 @@ def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) ->
         return None
     side = close_landing(lumen, fit_axis(lumen, course, [Mouth(bulge.foot_mm, bulge.inward)]))
     is_own = (~side.is_restored).mean(axis=1) > OWN_WALL
-    is_own &= ~bulge.holds(line)[cKDTree(line.points_mm).query(side.points_mm)[1]]
+    is_own &= bulge.distances_mm(side.points_mm) > 1.2 * side.section_radius_mm
     lost = np.flatnonzero(~is_own & (landing.solid.signed_distance(side.points_mm) > 0))
     end = lost[0] if len(lost) else len(side.points_mm)
     if end < FEWEST_SECTIONS:
