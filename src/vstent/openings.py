@@ -34,8 +34,8 @@ ARM_RADIUS_MM: Final = 0.5
 """Thinner blind arms are left closed: no flow worth computing leaves through them."""
 
 
-def open_ends(vessel: Vessel) -> Vessel:
-    """Return the vessel with its ends cut open and listed.
+def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
+    """Return the vessel with its ends cut open and listed, and its inscribed spheres.
 
     The widest end is the inlet; the outlets are numbered by width.
 
@@ -48,8 +48,10 @@ def open_ends(vessel: Vessel) -> Vessel:
     notes = [f"{n_caps} flat caps were taken off to open the vessel."] if n_caps else []
     if not len(lumen.faces):
         raise VesselError("the surface has flat sides only, and no round wall between them: it is not a vessel's")
+    spheres = lumen.medial
     lumen, n_arms = _with_open_arms(lumen)
     if n_arms:
+        spheres = medial.within(spheres, lumen.closed.tree)
         notes.append(f"{n_arms} arms that end blind were cut open square to their axis.")
     loops = lumen.boundary_loops
     if len(loops) < 2:
@@ -60,7 +62,7 @@ def open_ends(vessel: Vessel) -> Vessel:
     found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
     widest = max(found, key=lambda opening: opening.area_mm2)
     openings = _named(widest, found)
-    return replace(vessel, lumen=lumen, openings=openings, centerlines=(), notes=(*vessel.notes, *notes))
+    return replace(vessel, lumen=lumen, openings=openings, centerlines=(), notes=(*vessel.notes, *notes)), spheres
 
 
 def with_inlet(vessel: Vessel, inlet_mm: Floats) -> Vessel:
@@ -135,9 +137,7 @@ def _with_open_arms(lumen: Surface) -> tuple[Surface, int]:
         # A cut makes one end more; one that takes an end off has run into another artery.
         if opened is not None and len(opened.boundary_loops) > len(lumen.boundary_loops):
             lumen, n_cut = opened, n_cut + 1
-    if not n_cut:
-        return lumen, 0
-    return Surface(*triangles.largest_part(lumen.vertices_mm, lumen.faces)).with_medial(graph), n_cut
+    return (Surface(*triangles.largest_part(lumen.vertices_mm, lumen.faces)) if n_cut else lumen), n_cut
 
 
 def _is_blind(graph: medial.Medial, path: Ints) -> bool:

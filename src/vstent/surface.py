@@ -9,7 +9,6 @@ import numpy as np
 from vstent.errors import VesselError
 from vstent.kernels import medial, tree, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
-from vstent.kernels.medial import Medial
 
 CREASE_RAD: Final = np.radians(35.0)
 """A mesh is not taken for a smooth surface where its vertices' normals lean so far from its faces'."""
@@ -90,13 +89,6 @@ class Surface:
         centers = [triangles.polygon_centroid(self.vertices_mm[loop]) for loop in self.boundary_loops]
         return np.array(centers, dtype=np.float64).reshape(-1, 3)
 
-    @property
-    def n_rings(self) -> int:
-        """Ways round through what is inside that come back to where they began: 0 for a tree (the genus)."""
-        n_used, n_open = len(np.unique(self.faces)), sum(len(loop) for loop in self.boundary_loops)
-        n_edges = (3 * len(self.faces) + n_open) // 2
-        return (2 - len(self.boundary_loops) - n_used + n_edges - len(self.faces)) // 2
-
     @cached_property
     def closed(self) -> "Surface":
         """The surface with every boundary loop capped."""
@@ -118,14 +110,6 @@ class Surface:
                 "the surface encloses no room for blood: it is flat, or a splinter; give the vessel's wall"
             )
         return found
-
-    def with_medial(self, whole: Medial) -> "Surface":
-        """Return the surface, a part of a larger one whose medial graph is known: its own is cut out of that."""
-        known = Surface(self.vertices_mm, self.faces)
-        found = medial.within(whole, known.closed.tree)
-        if len(found.points):
-            known.__dict__["medial"] = found  # where the cached property would keep it
-        return known
 
     def closest(self, points_mm: Floats) -> tuple[Floats, Floats, Ints]:
         """Return the closest point (n, 3), its distance (n,) in mm and its face (n,) for (n, 3) points."""

@@ -8,13 +8,13 @@ at `SPEED_CAP` times the radius that the artery has on both sides, so that a sac
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from scipy.ndimage import percentile_filter
 from scipy.spatial import cKDTree
 
-from vstent.contacts import find_contact, find_rings, part, part_ring
+from vstent.contacts import find_contact, part
 from vstent.errors import VesselError
 from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
@@ -51,60 +51,31 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
     VesselError
         When fewer than two ends are found, or an outlet cannot be reached from the inlet.
     """
-    vessel = vessel if vessel.openings else open_ends(vessel)
+    vessel, spheres = (vessel, vessel.lumen.medial) if vessel.openings else open_ends(vessel)
     if inlet_mm is not None:
         vessel = with_inlet(vessel, np.asarray(inlet_mm, dtype=np.float64))
-    ways = _ways(vessel)
+    vessel, graph, paths = _paths(vessel, spheres)
     for _ in range(MOST_CONTACTS):
-        parted = _parted(ways, holds_inlet=inlet_mm is not None)
+        parted = _parted(vessel, graph, paths, holds_inlet=inlet_mm is not None)
         if parted is None:
             break
-        ways = _ways(replace(parted, lumen=parted.lumen.with_medial(ways.vessel.lumen.medial)))
-    lumen, graph = ways.vessel.lumen, ways.graph
-    lines = tuple(_centerline(lumen, graph.points[path], graph.radius[path]) for path in ways.paths)
-    return replace(ways.vessel, centerlines=lines)
+        vessel, graph, paths = _paths(parted, parted.lumen.medial)
+    lines = tuple(_centerline(vessel.lumen, graph.points[path], graph.radius[path]) for path in paths)
+    return replace(vessel, centerlines=lines)
 
 
-class _Ways(NamedTuple):
-    """The shortest paths through a vessel."""
-
-    vessel: Vessel
-    """With the outlets that can be reached."""
-    graph: medial.Medial
-    """Its n spheres; the last are its openings, in their order."""
-    cost: Floats
-    """(n,) what it costs to come there from the inlet."""
-    before: Ints
-    """(n,) the sphere before, on the way there; below 0 for the inlet."""
-
-    @property
-    def paths(self) -> list[Ints]:
-        """Spheres from the inlet to each outlet."""
-        n = len(self.cost)
-        return [medial.path_to(self.before, outlet) for outlet in range(n - len(self.vessel.outlets), n)]
+def _paths(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.Medial, list[Ints]]:
+    """The vessel with the outlets that can be reached, the medial graph, and the path to each of them."""
+    vessel, graph = _reachable(vessel, _graph(vessel, spheres))
+    paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
+    return vessel, graph, _shortest(vessel, graph, _radius_cap(graph, paths))
 
 
-def _ways(vessel: Vessel) -> _Ways:
-    """The shortest paths, to every outlet that can be reached."""
-    vessel, graph = _reachable(vessel, _graph(vessel))
-    free = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
-    return _shortest(vessel, graph, _radius_cap(graph, free.paths))
-
-
-def _parted(ways: _Ways, *, holds_inlet: bool) -> Vessel | None:
-    """The vessel without the first contact that a path or a ring slips through; None where there is none."""
-    vessel, graph = ways.vessel, ways.graph
-    for way in ways.paths:
-        contact = find_contact(vessel.lumen, graph, way)
-        parted = None if contact is None else part(vessel, contact, holds_inlet=holds_inlet)
-        if parted is not None:
-            return parted
-    for ring in find_rings(vessel.lumen, graph, ways.cost, ways.before):
-        contact = find_contact(vessel.lumen, graph, ring)
-        parted = None if contact is None else part_ring(vessel, contact)
-        if parted is not None:
-            return parted
-    return None
+def _parted(vessel: Vessel, graph: medial.Medial, paths: list[Ints], *, holds_inlet: bool) -> Vessel | None:
+    """The vessel without the first contact that a path slips through; None where there is none to be parted."""
+    contacts = (find_contact(graph.points[path], graph.radius[path], graph) for path in paths)
+    parted = (part(vessel, contact, holds_inlet=holds_inlet) for contact in contacts if contact is not None)
+    return next((one for one in parted if one is not None), None)
 
 
 def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
@@ -117,11 +88,11 @@ def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
     return np.asarray(percentile_filter(radius_mm, PARENT_PERCENTILE, size=size, mode="nearest"))
 
 
-def _graph(vessel: Vessel) -> medial.Medial:
+def _graph(vessel: Vessel, spheres: medial.Medial) -> medial.Medial:
     """Join the openings to the medial graph; they are its last vertices, in their order."""
     ends = np.array([opening.center_mm for opening in vessel.openings])
     reach = np.array([0.25 * opening.diameter_mm for opening in vessel.openings])
-    return medial.with_terminals(vessel.lumen.medial, ends, reach)
+    return medial.with_terminals(spheres, ends, reach)
 
 
 def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Medial]:
@@ -154,10 +125,12 @@ def _radius_cap(graph: medial.Medial, paths: Sequence[Ints]) -> Floats:
     return SPEED_CAP * np.concatenate(parents)[nearest]
 
 
-def _shortest(vessel: Vessel, graph: medial.Medial, radius_cap: Floats) -> _Ways:
-    """The shortest paths from the inlet, at the speed of the radius, capped (n,)."""
-    inlet = len(graph.points) - len(vessel.openings)
-    return _Ways(vessel, graph, *medial.shortest_paths(medial.cost_graph(graph, radius_cap), inlet))
+def _shortest(vessel: Vessel, graph: medial.Medial, radius_cap: Floats) -> list[Ints]:
+    """Path from the inlet to each outlet, as vertices of the graph."""
+    n_outlets = len(vessel.outlets)
+    inlet = len(graph.points) - n_outlets - 1
+    _, before = medial.shortest_paths(medial.cost_graph(graph, radius_cap), inlet)
+    return [medial.path_to(before, outlet) for outlet in range(inlet + 1, inlet + 1 + n_outlets)]
 
 
 def _unreachable(inlet: Opening, outlet: Opening) -> str:

@@ -83,7 +83,6 @@ def trim(
     note = f"Trimmed to {kept.upstream_mm:.4g} mm of vessel before the sac and {kept.downstream_mm:.4g} mm beyond it, "
     note += "cut square."
     notes = (*vessel.notes, note, *_left_out(lumen, bulges[1:]))
-    lumen = lumen.with_medial(vessel.lumen.medial)
     return trace(replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=notes), inlet_mm=inlet_mm)
 
 

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import Delaunay, cKDTree
 
 from vstent.kernels.arrays import Bools, Floats, Ints
-from vstent.kernels.tree import Tree, sees_inside, segments_cross
+from vstent.kernels.tree import Tree, sees_inside
 
 SHORTER: Final = 0.93
 """Steps towards the widest sphere of a section become shorter by this factor..."""
@@ -104,29 +104,6 @@ def path_to(before: Ints, end: int) -> Ints:
     return np.array(path[::-1], dtype=np.int32)
 
 
-def meetings(medial: Medial, cost: Floats, before: Ints, back: float) -> tuple[Ints, Ints]:
-    """Edges (k, 2) where two ways of a shortest-path tree meet that came apart, and whence (k, 2) they came.
-
-    `cost` (n,) and `before` (n,) are the tree's. The spheres passed at `back` less cost than an edge's ends, whence the
-    ways came, do not overlap.
-    """
-    a, b = medial.edges.T
-    edges = medial.edges[np.isfinite(cost[a]) & np.isfinite(cost[b]) & (before[a] != b) & (before[b] != a)]
-    goal, whence = cost[edges] - back, np.array(edges)
-    while (is_short := (cost[whence] > goal) & (before[whence] >= 0)).any():
-        whence[is_short] = before[whence[is_short]]
-    gap = np.linalg.norm(np.diff(medial.points[whence], axis=1)[:, 0], axis=1)
-    is_apart = gap > medial.radius[whence].sum(axis=1)
-    return edges[is_apart], whence[is_apart]
-
-
-def ring_through(before: Ints, edge: Ints) -> Ints:
-    """Vertices of the closed way along a shortest-path tree and back through an edge (2,) that is not in it."""
-    there, back = path_to(before, int(edge[0])), path_to(before, int(edge[1]))
-    n_same = int(np.isin(there, back).sum())
-    return np.concatenate([there[n_same - 1 :], back[: n_same - 1 : -1]])
-
-
 def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Medial:
     """The medial graph inside a surface, from samples (n, 3) of its wall with outward normals (n, 3).
 
@@ -145,23 +122,14 @@ def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Med
     if len(ends):
         unsure |= kept & (cKDTree(ends).query(every.points)[0] < 3.0 * every.radius)
     kept[unsure] = sees_inside(closed, every.points[unsure], -offset[unsure, 0])
-    return _passable(keep(every, kept), closed)
+    return _largest(keep(every, kept))
 
 
 def within(medial: Medial, closed: Tree) -> Medial:
     """The connected part of most spheres whose centres lie inside a closed surface."""
     askew = np.array([0.756, 0.539, 0.371])  # a ray along no axis grazes no row of triangles
     inside = sees_inside(closed, medial.points, np.broadcast_to(askew, medial.points.shape))
-    return _passable(keep(medial, inside), closed)
-
-
-def _passable(medial: Medial, closed: Tree) -> Medial:
-    """The connected part of most spheres, without the steps through a closed surface.
-
-    Two walls nearer to each other than the samples are no obstacle to the diagram.
-    """
-    is_through = segments_cross(closed, *np.moveaxis(medial.points[medial.edges], 1, 0))
-    return _largest(medial._replace(edges=medial.edges[~is_through]))
+    return _largest(keep(medial, inside))
 
 
 def _largest(medial: Medial) -> Medial:
