@@ -22,7 +22,7 @@ from vstent.trace import trace
 from vstent.trim import trim
 from vstent.vessel import Anatomy, Vessel
 
-IN_BRIEF = ("wide on the inside of a bend", "beside a branch")
+IN_BRIEF = ("wide on the inside of a bend", "beside a branch", "neck of 2 diameters", "tall")
 """Those that the default suite tries."""
 SCANS_IN_BRIEF = (("demo", 0.28),)
 NECK_TOLERANCE = {0.15: 0.05, 0.28: 0.05, 0.4: 0.08}
