@@ -10,7 +10,7 @@ import numpy as np
 from vstent.flow import engine_class, simulate_case
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.indices import QUANTITIES, indices
-from vstent.flow.positions import Scatter, positions
+from vstent.flow.positions import POSITIONS, Scatter, scatter, turned
 from vstent.flow.types import FlowCase, FlowField, FlowSettings
 
 RATIO: Final = 2**0.5
@@ -83,7 +83,7 @@ def convergence(
 
     Parameters
     ----------
-    case : without a stent; its cell size is the finest.
+    case : its cell size is the finest.
     folder : where the engine may keep files of its own, a folder in it for every flow.
     told : told of every flow computed, with the fraction of all that is done.
 
@@ -93,7 +93,7 @@ def convergence(
         When a flow cannot be computed.
     """
     cell_size, *others = engine_class(case.settings).refined_by
-    runs = _Runs(case, folder, told, 3 + 2 * len(others) + 2, [])
+    runs = _Runs(case, folder, told, 3 + 2 * len(others) + len(POSITIONS) - 1, [])
     settings = replace(case.settings, tolerance=min(TOLERANCE, case.settings.tolerance))
     grids = runs.refine(cell_size, RATIO**2 * default_cell_size_mm(case), settings, None)
     middle, known = replace(settings, cell_size_mm=grids.sizes[1]), runs.done[1]
@@ -118,20 +118,21 @@ class _Runs:
         fields = [] if known is None else [known]
         for size in sizes[len(fields) :]:
             start = fields[-1] if fields else None
-            fields.append(self._flow(_changed(settings, name, size), f"{name}-{size:.4g}", start))
+            case = replace(self.case, settings=_changed(settings, name, size))
+            fields.append(self._flow(case, f"{name}-{size:.4g}", start))
         return Refinement(name, sizes, _compared(self.case, fields))
 
     def turn(self, settings: FlowSettings, known: FlowField) -> dict[str, Scatter]:
         """Lay the vessel on the grid in other ways; `known` is the flow as it lies."""
-        before = len(self.done)
+        case = replace(self.case, settings=settings)
+        found = [indices(known, case.sac, case.ostium)]
+        for name, turn in list(POSITIONS.items())[1:]:
+            lying = turned(case, turn)
+            found.append(indices(self._flow(lying, name.replace(" ", "-"), None), lying.sac, lying.ostium))
+        return {key: scatter(tuple(float(one[key]) for one in found)) for key in QUANTITIES if key in found[0]}
 
-        def told(fraction: float, sentence: str) -> None:
-            self.told((before + fraction * (self.count - before)) / self.count, sentence)
-
-        return positions(replace(self.case, settings=settings), known=known, folder=self.folder, told=told)
-
-    def _flow(self, settings: FlowSettings, name: str, start: FlowField | None) -> FlowField:
-        case, own = replace(self.case, settings=settings), None if self.folder is None else self.folder / name
+    def _flow(self, case: FlowCase, name: str, start: FlowField | None) -> FlowField:
+        own = None if self.folder is None else self.folder / name
         # A stented flow takes its start for the bare one.
         field = simulate_case(case, start=start if case.screen is None else None, folder=own)
         self.done.append(field)

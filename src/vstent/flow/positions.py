@@ -1,16 +1,12 @@
 """How much a flow's numbers depend on how the vessel lies on the grid: as it lies, and turned two ways."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vstent.flow import simulate_case
-from vstent.flow.indices import QUANTITIES, indices
-from vstent.flow.types import FlowCase, FlowField
+from vstent.flow.types import FlowCase
 from vstent.kernels.arrays import Floats
 from vstent.surface import Surface
 from vstent.vessel import Vessel
@@ -41,53 +37,18 @@ def scatter(values: tuple[float, ...]) -> Scatter:
     return Scatter(values, mean, float(np.ptp(values)) / 2 / max(abs(mean), 1e-300))
 
 
-def positions(
-    case: FlowCase,
-    *,
-    known: FlowField | None = None,
-    folder: Path | None = None,
-    told: Callable[[float, str], None] = lambda fraction, sentence: None,
-) -> dict[str, Scatter]:
-    """Compute a flow with the vessel in every position on the grid, and compare the indices.
-
-    They differ by its error, which a sac beyond bends can magnify: grids that agree in one position may be wrong
-    together.
-
-    Parameters
-    ----------
-    case : without a stent.
-    known : this flow as it lies, where it is there already.
-    folder : where the engine may keep files of its own, a folder in it for every flow.
-    told : told of every flow computed, with the fraction of all that is done.
-
-    Raises
-    ------
-    FlowError
-        When a flow cannot be computed.
-    """
-    found = []
-    for k, (name, turn) in enumerate(POSITIONS.items()):
-        lying = turned(case, turn)
-        own = None if folder is None else folder / name.replace(" ", "-")
-        field = known if k == 0 and known is not None else simulate_case(lying, folder=own)
-        found.append(indices(field, lying.sac, lying.ostium))
-        told(
-            (k + 1) / len(POSITIONS), f"{name}: {len(field.cells)} cells, {field.steps} steps in {field.seconds:.0f} s."
-        )
-    keys = [key for key in QUANTITIES if key in found[0]]
-    return {key: scatter(tuple(float(one[key]) for one in found)) for key in keys}
-
-
 def turned(case: FlowCase, turn: Rotation) -> FlowCase:
-    """Return a case without a stent with its vessel turned about the origin: the same flow, on other cells."""
+    """Return a case with all that it holds turned about the origin: the same flow, on other cells."""
     matrix = turn.as_matrix()
+    screen, stent = case.screen, case.stent
     return replace(
         case,
         vessel=_vessel(case.vessel, matrix),
         sac=None if case.sac is None else _surface(case.sac, matrix),
         ostium=None if case.ostium is None else _surface(case.ostium, matrix),
-        screen=None,
-        stent=None,
+        screen=screen and replace(screen, points_mm=screen.points_mm @ matrix.T, normals=screen.normals @ matrix.T),
+        stent=stent
+        and replace(stent, nodes_mm=stent.nodes_mm @ matrix.T, wire_points_mm=stent.wire_points_mm @ matrix.T),
     )
 
 
