@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import ellipe
 
 from vstent.kernels import curves
 
@@ -16,6 +17,17 @@ def test_arc_length_converges_at_second_order() -> None:
     errors = [abs(curves.arc_length(helix(n))[-1] - exact) for n in (100, 200, 400)]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert np.all((orders > 1.9) & (orders < 2.1))
+
+
+def test_closed_rows_are_as_long_as_the_ellipse_through_them_at_fourth_order() -> None:
+    exact = 4 * 3 * ellipe(1 - (2 / 3) ** 2)
+    errors = []
+    for n in (12, 24, 48):
+        t = 2 * np.pi * np.arange(n) / n
+        ellipse = np.stack([3 * np.cos(t), 2 * np.sin(t), 0 * t], axis=1)
+        errors.append(np.abs(curves.closed_lengths(np.stack([ellipse, ellipse[:, [1, 2, 0]]])) - exact).max())
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all((orders > 3.9) & (orders < 4.5))
 
 
 def test_frames_are_orthonormal_and_turn_with_the_known_torsion() -> None:

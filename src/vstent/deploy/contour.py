@@ -119,10 +119,8 @@ def perimeters(nodes: Floats) -> Floats:
     An arc is longer than its chord by 8/3 of the squared height over it, per chord; four points in a row show the
     height. What that leaves of a circle is put back.
     """
-    m, ahead = nodes.shape[1], np.roll(nodes, -1, axis=1)
-    bend = nodes + ahead - np.roll(nodes, 1, axis=1) - np.roll(ahead, -1, axis=1)
-    chord = np.maximum(curves.lengths(ahead - nodes), 1e-300)
-    length = (chord + (bend**2).sum(axis=2) / (96 * chord)).sum(axis=1)
+    m = nodes.shape[1]
+    length = curves.closed_lengths(nodes)
     half = np.pi / m
     circle = 2 * np.sin(half) + (np.cos(half) - np.cos(3 * half)) ** 2 / (48 * np.sin(half))
     return length * 2 * half / circle

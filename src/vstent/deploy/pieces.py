@@ -28,7 +28,7 @@ The least that keeps every cell open in tight siphons.
 """
 STIFFNESS: Final = 0.1
 """How much a wire that bends otherwise weighs against a piece of wire that stretches by as much."""
-DESCENT: Final = net.Descent(steps=9, gain=0.03, tolerance=0.1)
+DESCENT: Final = net.Descent(steps=8, gain=0.03, tolerance=0.2)
 """When the crossings have gone far enough."""
 
 

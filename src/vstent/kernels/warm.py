@@ -23,6 +23,7 @@ def warm() -> None:
     _search()
     _paint()
     curves.parallel_frames(np.eye(3))
+    curves.closed_lengths(nodes)
     medial.widest_in_section(np.ones((1, 2)), np.ones((1, 2, 2)), 1.0, np.ones(1))
 
 
