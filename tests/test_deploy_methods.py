@@ -256,4 +256,4 @@ def test_in_real_arteries_every_node_lies_inside_and_the_ends_as_near_to_the_wal
     assert max(gap_mm[:3].max(), gap_mm[-3:].max()) <= max(0.002, gap_mm[3:-3].max())
     stretch = wire_stretches(done.stent)
     assert abs(stretch.mean()) < 0.005
-    assert np.quantile(np.abs(stretch), 0.95) < (0.04 if design is SILK else 0.02)
+    assert np.quantile(np.abs(stretch), 0.95) < (0.04 if design is SILK else 0.03)
