@@ -97,6 +97,13 @@ def test_a_plane_cuts_off_what_hangs_below_the_neck_plane():
     assert found["sac_volume_mm3"] == pytest.approx(np.pi * (r + h) ** 2 * (3 * r - (r + h)) / 3, rel=2e-3)
 
 
+def test_a_piece_of_a_section_is_no_neck():
+    sac = spherical_sac(3.0, 2.0)
+    for wider, is_told in ((1.05, True), (1.06, False)):  # squared: more and less than 0.9 of the neck
+        anatomy = replace(tube(line(32), 1.9), aneurysms=(replace(sac, neck_mm=wider * sac.neck_mm * [1, 1, 0]),))
+        assert ("neck_plane_area_mm2" in morphology(anatomy)) is is_told
+
+
 def test_every_further_sac_is_measured_beside_its_own_neck():
     artery_of_sacs = tube(line(60), np.linspace(2, 1.4, 301))
     large = replace(spherical_sac(3.0, 2.0), proximal_abscissa_mm=13.0, distal_abscissa_mm=17.0)

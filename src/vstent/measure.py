@@ -24,6 +24,8 @@ Morphology = dict[str, float | str | Measures]
 
 NECK_TOLERANCE_MM: Final = 0.02
 """The neck's triangles lie on the landing surface to within this: they are other triangles than its own."""
+PARTED: Final = 0.9
+"""A section by the neck plane of less than so much of the neck is a piece: the artery's wall rises through it."""
 FEWEST_AXIS_POINTS: Final = 9
 """A shorter axis is too short to tell how it bends."""
 BENT: Final = 0.1
@@ -219,9 +221,10 @@ def morphology(anatomy: Anatomy) -> Morphology:
     diameter in the aspect ratio is twice the mean distance from its center to its rim. Volume and area are those of
     the sac, closed across the neck, which is curved like the artery's wall. Most of the literature cuts a sac by a
     plane instead (Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355): the sac beyond the neck plane, which goes
-    through the neck's center square to its vector area, and its section by it stand beside. Curvature and torsion are
-    those of the parent axis (Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141), of a quartic through one
-    diameter of it to both sides; that much is left out at its ends.
+    through the neck's center square to its vector area, and its section by it stand beside; the section is left out
+    where the artery's wall rises through the plane and parts it. Curvature and torsion are those of the parent axis
+    (Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141), of a quartic through one diameter of it to both sides;
+    that much is left out at its ends.
     """
     found: Morphology = {**_parent(anatomy)}
     if anatomy.vessel.threshold_band_mm > 0:
@@ -273,7 +276,7 @@ def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
     neck_mean_mm = float(2 * np.linalg.norm(rim_mm - center_mm, axis=1).mean())
     width_mm = _widths_mm(rim_mm, normal)
     plane_area_mm2, plane_volume_mm3 = _beyond(aneurysm.sac, center_mm, normal)
-    return {
+    found: Measures = {
         "sac_volume_mm3": abs(aneurysm.sac.volume_mm3),
         "sac_area_mm2": aneurysm.sac.area_mm2 - aneurysm.neck.area_mm2,
         "sac_height_mm": height_mm,
@@ -281,7 +284,6 @@ def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
         "sac_max_diameter_mm": _diameter_mm(dome_mm),
         "sac_plane_volume_mm3": plane_volume_mm3,
         "neck_area_mm2": neck_area_mm2,
-        "neck_plane_area_mm2": plane_area_mm2,
         "neck_surface_area_mm2": aneurysm.neck.area_mm2,
         "neck_perimeter_mm": triangles.perimeter(rim_mm),
         "neck_min_diameter_mm": float(width_mm.min()),
@@ -289,6 +291,9 @@ def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
         "aspect_ratio": height_mm / neck_mean_mm,
         "size_ratio": reach_mm / parent_diameter_mm,
     }
+    if plane_area_mm2 > PARTED * neck_area_mm2:
+        found["neck_plane_area_mm2"] = plane_area_mm2
+    return found
 
 
 def _beyond(sac: Surface, center_mm: Floats, normal: Floats) -> tuple[float, float]:

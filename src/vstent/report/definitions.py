@@ -39,7 +39,9 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "sac_max_diameter_mm": Definition("Sac diameter, largest", "Largest distance between two points of the sac."),
     "neck_area_mm2": Definition("Neck area", "Area of the neck curve projected on its own mean plane."),
     "neck_plane_area_mm2": Definition(
-        "Neck area, plane cut", "Area of the sac's largest section by the neck plane.", _RAGHAVAN
+        "Neck area, plane cut",
+        "Area of the sac's largest section by the neck plane; left out where the artery's wall parts that section.",
+        _RAGHAVAN,
     ),
     "neck_surface_area_mm2": Definition("Neck surface", "Area of the restored wall that closes the neck."),
     "neck_perimeter_mm": Definition("Neck perimeter", "Length of the neck curve."),
