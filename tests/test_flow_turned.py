@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tubes import line, tube
 from vstent import phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, sampling, simulate_case
+from vstent.deploy import deploy
+from vstent.device import find_design
+from vstent.flow import FlowCase, FlowField, FlowSettings, flow_case, sampling, simulate_case
 from vstent.flow.positions import turned
 from vstent.trace import trace
 from vstent.vessel import Vessel
@@ -47,6 +50,21 @@ def differences(turn: Rotation, cell_size_mm: float) -> tuple[float, float]:
     )
     gap = np.sqrt(((one - two) ** 2).mean(axis=0)) / np.linalg.norm(one, axis=1).max()
     return float(gap[2]), float(np.hypot(gap[0], gap[1]))
+
+
+def test_a_turned_device_lies_in_the_turned_artery_as_before() -> None:
+    anatomy = tube(line(26), 1.9)
+    case = flow_case(anatomy, deploy(find_design("silk"), anatomy).stent)
+    other = turned(case, DIAGONAL)
+    for way in (
+        lambda c: c.screen.points_mm,
+        lambda c: c.screen.points_mm + c.screen.normals,
+        lambda c: c.stent.nodes_mm.reshape(-1, 3),
+        lambda c: c.stent.wire_points_mm,
+    ):
+        far_mm = [c.vessel.lumen.signed_distance(way(c)[::50]) for c in (case, other)]
+        np.testing.assert_allclose(*far_mm, atol=1e-9)
+        np.testing.assert_allclose(way(case) @ DIAGONAL.as_matrix().T, way(other), atol=1e-9)
 
 
 def test_a_turned_bend_carries_the_same_flow() -> None:
