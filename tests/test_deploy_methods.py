@@ -12,9 +12,12 @@ from vstent.deploy import ActiveContour, ConstantWire, Zhong2016, deploy
 from vstent.deploy.contour import perimeters
 from vstent.deploy.wall import inner_face
 from vstent.errors import DeviceError, InputError, LandingError
+from vstent.io.images import read_image
+from vstent.io.surfaces import read_surface
 from vstent.measure import measure, wire_stretches
 from vstent.repair import repair
 from vstent.restore import restore
+from vstent.segment import segment
 from vstent.stent import Landing
 from vstent.surface import Surface
 from vstent.trace import trace
@@ -204,11 +207,11 @@ def test_a_second_device_lands_on_the_inner_face_of_the_first_where_they_overlap
 
 
 def anatomy_of(path, outlet_mm=None):
-    from vstent.io.surfaces import read_surface
-
-    lumen, _ = repair(read_surface(path)[0])
-    vessel = trim(trace(Vessel(lumen)))
-    return restore(vessel, outlet_mm=outlet_mm)
+    if path.name.endswith(".raw.gz"):  # the scan of 256 voxels cubed, whose edge is not stored
+        vessel = segment(read_image(path, spacing_mm=0.43, shape=(256, 256, 256)))
+    else:
+        vessel = Vessel(repair(read_surface(path)[0])[0])
+    return restore(trim(trace(vessel)), outlet_mm=outlet_mm)
 
 
 @pytest.mark.validation
@@ -231,6 +234,7 @@ CASES = (
     "bifurcation_with_sac.stl",
     "bifurcation_coarse.vtp",
     "siphon_dirty.stl",
+    "philips_3dra_256.raw.gz",
 )
 
 
@@ -250,8 +254,10 @@ def test_in_real_arteries_every_node_lies_inside_and_the_ends_as_near_to_the_wal
     assert done.terminated_fraction[-1] >= 0.99
     # The landing surface is closed across sac and branches: what is not outside it is in neither.
     assert measure(anatomy, done)["max_outside_mm"] <= 0.002
-    # A row that has its free perimeter touches where it can, and no more is asked of it.
-    is_free = perimeters(done.stent.nodes_mm) > 0.99 * np.pi * done.stent.size.free_diameter_mm
+    # A row that has its free perimeter, or whose artery is wider, touches where it can, and no more is asked of it.
+    free_mm, axis = done.stent.size.free_diameter_mm, anatomy.axis
+    artery_mm = 2 * np.interp(done.stent.row_abscissa_mm, axis.abscissa_mm, anatomy.section_radius_mm)
+    is_free = (perimeters(done.stent.nodes_mm) > 0.99 * np.pi * free_mm) | (artery_mm > free_mm)
     gap_mm = np.where(is_free, 0.0, done.wall_gap_mm.max(axis=1))
     assert max(gap_mm[:3].max(), gap_mm[-3:].max()) <= max(0.002, gap_mm[3:-3].max())
     stretch = wire_stretches(done.stent)
