@@ -3,9 +3,9 @@
 Usage: python benchmarks/struts.py [--cell MM] [--foam-cell MM] [DEVICE ...]
 
 The demo's artery, cut to 9 mm on either side of the sac, is computed twice with every device: by the embedded engine
-with the device as a screen, and by OpenFOAM with the struts over the neck meshed (25 um cells at the struts where the
-vessel's are 0.2 mm). The two engines differ in the bare vessel already: what is compared is what a device leaves of
-each engine's own bare value. A row is kept for every device; the rows of others stay as they are.
+with the device as a screen, and by OpenFOAM with the struts over the neck meshed, two cells or more across each. The
+two engines differ in the bare vessel already: what a device leaves of each engine's own bare value stands beside. A row
+is kept for every device; the rows of others stay as they are.
 """
 
 import argparse
@@ -79,8 +79,9 @@ if __name__ == "__main__":
             "openfoam_cell_size_mm": given.foam_cell,
         }
         TABLE.write_text(json.dumps(rows, indent=2) + "\n")
-    print("\n| device | index | left, screen | left, struts | difference |\n|---|---|---|---|---|")
+    print("\n| device | index | screen | struts | difference | left, screen | left, struts |\n" + 7 * "|---" + "|")
     for name, row in rows.items():
         for key in INDICES:
-            screen, struts = row["left_with_screen"][key], row["left_with_struts"][key]
-            print(f"| {name} | {key} | {screen:.3f} | {struts:.3f} | {100 * (screen / struts - 1):+.1f} % |")
+            screen, struts = row["screen"][key], row["struts"][key]
+            left = f"{row['left_with_screen'][key]:.3f} | {row['left_with_struts'][key]:.3f}"
+            print(f"| {name} | {key} | {screen:.4g} | {struts:.4g} | {100 * (screen / struts - 1):+.1f} % | {left} |")

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from shapes import sphere
+from tubes import line, tube
 from vstent import phantoms
+from vstent.deploy import deploy
 from vstent.device import find_design
 from vstent.errors import ReadError
 from vstent.flow import Blood, FlowCase, FlowSettings
@@ -19,6 +21,7 @@ from vstent.flow.openfoam.dictionary import foam_file, parse
 from vstent.flow.types import CarreauYasuda
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.stent import Stent
+from vstent.struts import struts
 from vstent.surface import Surface
 from vstent.trace import trace
 from vstent.vessel import Vessel
@@ -244,3 +247,13 @@ def _pieces(stent: Stent) -> np.ndarray:
         diameter = np.full((len(points) - 1, 1), stent.wire_diameter_um[k])
         rows.append(np.hstack([points[:-1], points[1:], diameter]))
     return np.concatenate(rows)
+
+
+@pytest.mark.parametrize(("name", "across_mm"), [("silk", (0.030, 0.050)), ("enterprise", (0.078, 0.078))])
+def test_two_cells_lie_across_a_strut_and_no_more_than_twice_as_many(name: str, across_mm: tuple[float, float]) -> None:
+    anatomy = tube(line(26), 1.9)
+    setup = FoamSetup(0.25, struts=struts(deploy(find_design(name), anatomy).stent))
+    cell_mm = 0.25 / 2**setup.levels_at_struts
+    assert across_mm[0] / 5 < cell_mm < across_mm[1] / 2
+    assert replace(setup, strut_levels=1).levels_at_struts == 1
+    assert FoamSetup(0.25).levels_at_struts == 0

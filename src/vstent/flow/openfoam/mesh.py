@@ -142,7 +142,7 @@ def _castellated(
         reach_m = NECK_REACH * setup.cell_size_mm * M_PER_MM
         inside[NECK] = {"mode": "distance", "levels": [(reach_m, BASE_LEVEL + setup.neck_levels)]}
     if setup.struts is not None:
-        finest = BASE_LEVEL + setup.strut_levels
+        finest = BASE_LEVEL + setup.levels_at_struts
         surfaces[STRUTS] = {"level": (finest, finest), "patchInfo": {"type": "wall"}}
     point = tuple(float(x) for x in inside_mm * M_PER_MM)
     return {

@@ -1,5 +1,6 @@
 """How an OpenFOAM case is to be set up."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -10,6 +11,8 @@ Flavour: TypeAlias = Literal["com", "org"]
 
 BASE_LEVEL = 2
 """Times that snappyHexMesh halves the background's cells to the vessel's: the background is this much coarser."""
+ACROSS = 2.0
+"""Cells across a strut. With one, the wires of a braid let half as much blood again into the demo's sac."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,11 +27,19 @@ class FoamSetup:
     """Layers of flat cells along the wall."""
     neck_levels: int = 1
     """Times that cells near the neck are halved."""
-    strut_levels: int = 3
-    """Times that cells at the struts are halved."""
+    strut_levels: int | None = None
+    """Times that cells at the struts are halved; None: until at least `ACROSS` lie across one."""
     processes: int = 1
     """Parts that the mesh is cut into, each for a process of its own."""
     iterations: int = 1000
     """Most iterations of a steady flow."""
     struts: Surface | None = None
     """The device's solids (closed, in mm), meshed where they span the neck; None: the bare vessel."""
+
+    @property
+    def levels_at_struts(self) -> int:
+        """Times that cells at the struts are halved: a long solid is four times its volume over its area thick."""
+        if self.strut_levels is not None or self.struts is None:
+            return self.strut_levels or 0
+        thickness_mm = 4 * abs(self.struts.volume_mm3) / self.struts.area_mm2
+        return max(0, math.ceil(math.log2(ACROSS * self.cell_size_mm / thickness_mm)))
