@@ -1,10 +1,12 @@
 """Arteries with a glued sac of known neck and volume: tests assert what is found of them, the benchmark prints it."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
 from vstent import phantoms
+from vstent.io.surfaces import read_surface
 from vstent.kernels import curves
 from vstent.phantoms import Phantom, Scanner, torus_arc, tube, with_bleb, with_branch, with_sac
 from vstent.restore import restore
@@ -65,3 +67,30 @@ def relative_errors(anatomy: Anatomy, phantom: phantoms.Phantom) -> tuple[np.nda
     rings = anatomy.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
     wall = phantoms.tube_implicit_mm(phantom.parent, rings)[0]
     return anatomy.section_radius_mm[inner] / true_mm - 1, np.abs(wall)
+
+
+def beside_the_fork_without_sac(data: Path, side: float) -> tuple[Anatomy, Anatomy, np.ndarray, np.ndarray]:
+    """The idealised fork with its sac and without it, restored into one branch (+1 or -1 along x).
+
+    Also the errors of the section's radius (sections,), relative, and the distances of the landing surface (n,), mm.
+    """
+    sick, healthy = (
+        restore(
+            trace(Vessel(read_surface(data / f"bifurcation_{name}_sac.stl")[0])),
+            outlet_mm=np.array([7.5 * side, 0, 10]),
+        )
+        for name in ("with", "without")
+    )
+    axis = sick.axis
+    inner = (axis.abscissa_mm > 1.5) & (axis.abscissa_mm < axis.length_mm - 1.5)
+    place = curves.project(healthy.axis.points_mm, axis.points_mm[inner])[0]
+    radius_mm = np.interp(place, healthy.axis.abscissa_mm, healthy.section_radius_mm)
+    rings_mm = sick.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
+    distance_mm = healthy.landing_surface.closest(rings_mm)[1]
+    return sick, healthy, sick.section_radius_mm[inner] / radius_mm - 1, distance_mm
+
+
+def moved_mm(anatomy: Anatomy) -> float:
+    """Largest distance from the lumen of what the landing surface keeps of it."""
+    own_mm = anatomy.landing_surface.vertices_mm[~anatomy.is_restored]
+    return float(anatomy.vessel.lumen.closest(own_mm)[1].max())

@@ -7,7 +7,15 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from sac_truth import GLUED, X, anatomy_of, relative_errors, scanned_anatomy_of
+from sac_truth import (
+    GLUED,
+    X,
+    anatomy_of,
+    beside_the_fork_without_sac,
+    moved_mm,
+    relative_errors,
+    scanned_anatomy_of,
+)
 from vstent import phantoms
 from vstent.errors import InputError
 from vstent.kernels import curves
@@ -340,24 +348,10 @@ def test_the_real_sac_is_that_of_aneurisk_web(shared_data) -> None:
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_the_idealised_bifurcation_is_restored_to_the_one_without_its_sac(shared_data, side: float) -> None:
-    from vstent.io.surfaces import read_surface
-
-    sick, healthy = (
-        restore(
-            trace(Vessel(read_surface(shared_data / f"bifurcation_{name}_sac.stl")[0])),
-            outlet_mm=np.array([7.5 * side, 0.0, 10.0]),
-        )
-        for name in ("with", "without")
-    )
+    sick, healthy, radius, distance_mm = beside_the_fork_without_sac(shared_data, side)
     assert len(sick.aneurysms) == 1
     assert healthy.aneurysms == ()
-    axis = sick.axis
-    inner = (axis.abscissa_mm > 1.5) & (axis.abscissa_mm < axis.length_mm - 1.5)
-    place = curves.project(healthy.axis.points_mm, axis.points_mm[inner])[0]
-    radius = np.interp(place, healthy.axis.abscissa_mm, healthy.section_radius_mm)
-    assert np.abs(sick.section_radius_mm[inner] / radius - 1).mean() < 0.01
-    rings = sick.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
-    distance_mm = healthy.landing_surface.closest(rings)[1]
+    assert np.abs(radius).mean() < 0.01
     assert np.quantile(distance_mm, 0.95) < 0.1
     assert distance_mm.max() < 0.2
 
@@ -368,5 +362,4 @@ def test_a_real_healthy_artery_stays_as_it_is(shared_data, name: str) -> None:
 
     anatomy = restore(trace(Vessel(read_surface(shared_data / name)[0])))
     assert anatomy.aneurysms == ()
-    own = anatomy.landing_surface.vertices_mm[~anatomy.is_restored]
-    assert anatomy.vessel.lumen.closest(own)[1].max() < 0.05
+    assert moved_mm(anatomy) < 0.05
