@@ -390,3 +390,39 @@ def test_with_flow_all_ways_in_agree_too(tmp_path):
         by_rest = client.get(f"{case}/files/metrics.json").json()
     assert main(["run", str(path), "--out", str(tmp_path / "cli"), "--device", "silk", "--cell-size", "0.35"]) == 0
     assert by_rest == json.loads((tmp_path / "cli" / "metrics.json").read_text())
+
+
+FIRST_REQUESTS = """
+import socket, sys, threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+import httpx, uvicorn
+from vstent.app.cases import Store
+from vstent.app.desk import Desk
+from vstent.app.server import create
+
+importing = set()
+def heard(event, values):
+    if event == "import" and values[0].startswith("vstent."):
+        importing.add(threading.get_ident())
+listener = socket.create_server(("127.0.0.1", 0))
+host = f"127.0.0.1:{listener.getsockname()[1]}"
+guard = create(Desk(Store(Path(sys.argv[1]))), token="t", hosts=(host,))
+server = uvicorn.Server(uvicorn.Config(guard, log_level="error"))
+sys.addaudithook(heard)
+thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+thread.start()
+def asked(path):
+    return httpx.get(f"http://{host}{path}", headers={"authorization": "Bearer t"}, timeout=60).status_code
+with ThreadPoolExecutor(9) as pool:
+    print(set(pool.map(asked, 3 * ["/api/waveform", "/api/catalogue", "/api/cases"])), len(importing))
+server.should_exit = True
+thread.join()
+"""
+
+
+def test_the_first_requests_wait_for_one_thread_that_loads(tmp_path):
+    """Threads that import a package and a module of it at once may get a half of it: a page then had answers of 500."""
+    given = [sys.executable, "-c", FIRST_REQUESTS, str(tmp_path)]
+    found = subprocess.run(given, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "{200} 1"

@@ -61,7 +61,8 @@ def validation(options: list[str]) -> int:
     """Run the tests marked validation; for every module, write one row a test, and what it printed."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
-        given = ["-m", "pytest", "-m", "validation", "-rP", f"--junitxml={report}", "-o", "junit_logging=system-out"]
+        given = ["-m", "pytest", "-m", "validation", "-rP", f"--junitxml={report}"]
+        given += ["-o", "junit_logging=system-out", "-o", "junit_family=xunit1"]
         code = subprocess.run([sys.executable, *given, *options], cwd=ROOT, check=False).returncode
         cases = list(ET.parse(report).getroot().iter("testcase"))
     modules: dict[str, list[ET.Element]] = {}

@@ -26,6 +26,7 @@ class Desk:
         self._lives: dict[str, Any] = {}
         self._scans: dict[str, Any] = {}
         self._lock = threading.Lock()
+        self._loading = threading.Lock()
         self._to_begin: tuple[Case, Path] | None = None
 
     # -- cases ---------------------------------------------------------------------------------------------------------
@@ -200,15 +201,23 @@ class Desk:
         return found
 
     def warm(self) -> None:
-        """Load what the first click will need, while the page is being looked at."""
+        """Begin what was given at the shell; load what the first click will need, while the page is being looked at."""
+        self.load()
         if self._to_begin is not None:
             case, path = self._to_begin
             self.point(case, str(path))
             self.start(case, "anatomy")
-        from vstent.app import live  # noqa: F401
-        from vstent.device import catalogue
+        devices()
 
-        catalogue()
+    def load(self) -> None:
+        """Load all that answers need, before the first: a second one waits.
+
+        Two threads that import a package and a module of it at once may be given modules that are not whole.
+        """
+        with self._loading:
+            from vstent import demo, device_schema, study, uncertainty  # noqa: F401
+            from vstent.app import live, scans, sheets  # noqa: F401
+            from vstent.flow import waveform  # noqa: F401
 
     def close(self) -> None:
         """Stop everything; cases remember what there was to do."""

@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import FastAPI, Query, Request
+from fastapi import APIRouter, Depends, FastAPI, Query, Request
 from fastapi.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from pydantic import Field
 
@@ -89,10 +89,12 @@ def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
     )
     app.add_exception_handler(VstentError, _said)
     _add_page(app)
-    _add_cases(app, desk)
-    _add_input(app, desk)
-    _add_jobs(app, desk)
-    _add_scenes(app, desk)
+    api = APIRouter(dependencies=[Depends(desk.load)])
+    _add_cases(api, desk)
+    _add_input(api, desk)
+    _add_jobs(api, desk)
+    _add_scenes(api, desk)
+    app.include_router(api)
     return Guard(app, token=token, hosts=hosts)
 
 
@@ -128,49 +130,49 @@ def _add_page(app: FastAPI) -> None:
             raise ReadError("There is no such file.")
         return asset(name)
 
-    @app.get("/api/catalogue", summary="Devices and their sizes")
+
+def _add_cases(api: APIRouter, desk: Desk) -> None:
+    @api.get("/api/catalogue", summary="Devices and their sizes")
     def catalogue() -> list[dict[str, Any]]:
         return desks.devices()
 
-
-def _add_cases(app: FastAPI, desk: Desk) -> None:
-    @app.get("/api/cases", summary="All cases, the latest first")
+    @api.get("/api/cases", summary="All cases, the latest first")
     def cases() -> dict[str, Any]:
         return {"cases": desk.listed(), "opened": desk.opened}
 
-    @app.post("/api/cases", status_code=201, summary="Make a case")
+    @api.post("/api/cases", status_code=201, summary="Make a case")
     def create_case(wanted: NewCase) -> dict[str, Any]:
         return desk.view(desk.store.create(wanted.name))
 
-    @app.post("/api/demo", status_code=201, summary="Make a case of a synthetic scan")
+    @api.post("/api/demo", status_code=201, summary="Make a case of a synthetic scan")
     def demo() -> dict[str, Any]:
         return desk.view(desk.demo())
 
-    @app.get("/api/cases/{case_id}", summary="What is chosen and done; an interrupted job goes on")
+    @api.get("/api/cases/{case_id}", summary="What is chosen and done; an interrupted job goes on")
     def case(case_id: str) -> dict[str, Any]:
         found = desk.store.get(case_id)
         desk.resume(found)
         return desk.view(found)
 
-    @app.put("/api/cases/{case_id}/choices", summary="Choose; 409 where the case was changed elsewhere")
+    @api.put("/api/cases/{case_id}/choices", summary="Choose; 409 where the case was changed elsewhere")
     def choose(case_id: str, change: Change) -> dict[str, Any]:
         found = desk.store.get(case_id)
         found.change(change.revision, change.choices)
         return desk.view(found)
 
-    @app.post("/api/cases/{case_id}/undo", summary="Take the last change back")
+    @api.post("/api/cases/{case_id}/undo", summary="Take the last change back")
     def undo(case_id: str, seen: Seen) -> dict[str, Any]:
         found = desk.store.get(case_id)
         found.step_back(seen.revision)
         return desk.view(found)
 
-    @app.post("/api/cases/{case_id}/redo", summary="Make the change taken back again")
+    @api.post("/api/cases/{case_id}/redo", summary="Make the change taken back again")
     def redo(case_id: str, seen: Seen) -> dict[str, Any]:
         found = desk.store.get(case_id)
         found.step_back(seen.revision, forward=True)
         return desk.view(found)
 
-    @app.get("/api/cases/{case_id}/events", summary="The same, again whenever it changes (server-sent events)")
+    @api.get("/api/cases/{case_id}/events", summary="The same, again whenever it changes (server-sent events)")
     async def events(case_id: str) -> StreamingResponse:
         found = await asyncio.to_thread(desk.store.get, case_id)
         return StreamingResponse(_stream(desk, found), media_type="text/event-stream")
@@ -191,8 +193,8 @@ async def _stream(desk: Desk, case: Any) -> AsyncIterator[str]:
         case.leave(event)
 
 
-def _add_input(app: FastAPI, desk: Desk) -> None:
-    @app.put("/api/cases/{case_id}/input", summary="Bring in a volume, a surface, a DICOM slice, or a ZIP of them")
+def _add_input(api: APIRouter, desk: Desk) -> None:
+    @api.put("/api/cases/{case_id}/input", summary="Bring in a volume, a surface, a DICOM slice, or a ZIP of them")
     async def bring(case_id: str, request: Request, name: Annotated[str, Query(max_length=300)]) -> dict[str, Any]:
         found = await asyncio.to_thread(desk.store.get, case_id)
         partial = await asyncio.to_thread(desks.begin_upload, found, name)
@@ -205,47 +207,47 @@ def _add_input(app: FastAPI, desk: Desk) -> None:
             partial.unlink(missing_ok=True)
         return {"taken": True}
 
-    @app.post("/api/cases/{case_id}/input/done", summary="All files are in: find the vessel")
+    @api.post("/api/cases/{case_id}/input/done", summary="All files are in: find the vessel")
     def done(case_id: str) -> dict[str, Any]:
         found = desk.store.get(case_id)
         desk.begin(found)
         return desk.view(found)
 
-    @app.get("/api/cases/{case_id}/image", summary="Shape, spacing, range and proposed threshold of the scan")
+    @api.get("/api/cases/{case_id}/image", summary="Shape, spacing, range and proposed threshold of the scan")
     def image(case_id: str) -> dict[str, Any]:
         return desk.scan(desk.store.get(case_id)).told()
 
-    @app.get("/api/cases/{case_id}/image/slice", summary="One slice of the scan (binary)")
+    @api.get("/api/cases/{case_id}/image/slice", summary="One slice of the scan (binary)")
     def one_slice(case_id: str, axis: Annotated[int, Query(ge=0, le=2)], index: int) -> Response:
         return Response(desk.scan(desk.store.get(case_id)).slice(axis, index), media_type=BINARY)
 
-    @app.get("/api/cases/{case_id}/image/surface", summary="The surface that a threshold gives (binary)")
+    @api.get("/api/cases/{case_id}/image/surface", summary="The surface that a threshold gives (binary)")
     def surface(case_id: str, threshold: float) -> Response:
         return Response(desk.surface(desk.store.get(case_id), threshold), media_type=BINARY)
 
 
-def _add_jobs(app: FastAPI, desk: Desk) -> None:
-    @app.post("/api/cases/{case_id}/jobs/{kind}", status_code=202, summary="Start a long stage")
+def _add_jobs(api: APIRouter, desk: Desk) -> None:
+    @api.post("/api/cases/{case_id}/jobs/{kind}", status_code=202, summary="Start a long stage")
     def start(case_id: str, kind: Literal["anatomy", "rank", "flow"]) -> dict[str, Any]:
         found = desk.store.get(case_id)
         desk.start(found, kind)
         return desk.view(found)
 
-    @app.delete("/api/cases/{case_id}/jobs", summary="Stop it at once; what was finished is kept")
+    @api.delete("/api/cases/{case_id}/jobs", summary="Stop it at once; what was finished is kept")
     def stop(case_id: str) -> dict[str, Any]:
         found = desk.store.get(case_id)
         desk.jobs.stop(found)
         return desk.view(found)
 
-    @app.get("/api/cases/{case_id}/ranking", summary="The sizes of the chosen devices, ranked")
+    @api.get("/api/cases/{case_id}/ranking", summary="The sizes of the chosen devices, ranked")
     def ranking(case_id: str) -> dict[str, Any]:
         return desks.ranking(desk.store.get(case_id))
 
-    @app.get("/api/cases/{case_id}/numbers", summary="Every number found, with unit and definition")
+    @api.get("/api/cases/{case_id}/numbers", summary="Every number found, with unit and definition")
     def numbers(case_id: str) -> dict[str, Any]:
         return desk.numbers(desk.store.get(case_id))
 
-    @app.get("/api/cases/{case_id}/files/{name}", summary="What a study has written")
+    @api.get("/api/cases/{case_id}/files/{name}", summary="What a study has written")
     def one_file(case_id: str, name: Literal["metrics.json", "run.json", "report.html", "report.pdf"]) -> Response:
         path = desk.store.get(case_id).folder / name
         if not path.is_file():
@@ -254,36 +256,36 @@ def _add_jobs(app: FastAPI, desk: Desk) -> None:
         return FileResponse(path, headers=headers)
 
 
-def _add_scenes(app: FastAPI, desk: Desk) -> None:
-    @app.get("/api/cases/{case_id}/anatomy", summary="Vessel, sac, neck and parent artery (binary)")
+def _add_scenes(api: APIRouter, desk: Desk) -> None:
+    @api.get("/api/cases/{case_id}/anatomy", summary="Vessel, sac, neck and parent artery (binary)")
     def anatomy(case_id: str) -> Response:
         return Response(desk.live(desk.store.get(case_id)).anatomy_message(), media_type=BINARY)
 
-    @app.post("/api/cases/{case_id}/neck", summary="A neck with a handle pulled, and its area, at once (binary)")
+    @api.post("/api/cases/{case_id}/neck", summary="A neck with a handle pulled, and its area, at once (binary)")
     def neck(case_id: str, wanted: NeckWanted) -> Response:
         return Response(desk.neck(desk.store.get(case_id), *wanted.model_dump().values()), media_type=BINARY)
 
-    @app.post("/api/cases/{case_id}/sketch", summary="Where a device would lie, at once (binary)")
+    @api.post("/api/cases/{case_id}/sketch", summary="Where a device would lie, at once (binary)")
     def sketch(case_id: str, wanted: SketchWanted) -> Response:
         live = desk.live(desk.store.get(case_id))
         landing = desks.landing(wanted.abscissa_mm, wanted.anchor)
         return Response(live.sketch_message(wanted.device, landing, wanted.colour), media_type=BINARY)
 
-    @app.post("/api/cases/{case_id}/deployment", summary="A device deployed, with its expansion and numbers (binary)")
+    @api.post("/api/cases/{case_id}/deployment", summary="A device deployed, with its expansion and numbers (binary)")
     def deployment(case_id: str, wanted: SketchWanted) -> Response:
         found = desk.store.get(case_id)
         answer = desk.live(found).deployment_message(wanted.device, wanted.colour)
         desk.note_deployed(found, wanted.device)
         return Response(answer, media_type=BINARY)
 
-    @app.get("/api/cases/{case_id}/section", summary="What a plane across the parent axis cuts")
+    @api.get("/api/cases/{case_id}/section", summary="What a plane across the parent axis cuts")
     def section(case_id: str, abscissa_mm: float, device: str | None = None) -> dict[str, Any]:
         return desk.live(desk.store.get(case_id)).section(device, abscissa_mm)
 
-    @app.get("/api/cases/{case_id}/flow", summary="Wall shear stress, streamlines and a cut, on one scale (binary)")
+    @api.get("/api/cases/{case_id}/flow", summary="Wall shear stress, streamlines and a cut, on one scale (binary)")
     def flow(case_id: str, moment: Annotated[int | None, Query(ge=0)] = None) -> Response:
         return Response(desk.live(desk.store.get(case_id)).flow_message(moment), media_type=BINARY)
 
-    @app.get("/api/waveform", summary="The pulse of the internal carotid: flow over mean flow")
+    @api.get("/api/waveform", summary="The pulse of the internal carotid: flow over mean flow")
     def waveform() -> dict[str, Any]:
         return desks.pulse()
