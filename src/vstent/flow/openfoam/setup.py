@@ -12,7 +12,7 @@ Flavour: TypeAlias = Literal["com", "org"]
 BASE_LEVEL = 2
 """Times that snappyHexMesh halves the background's cells to the vessel's: the background is this much coarser."""
 ACROSS = 2.0
-"""Cells across a strut. With one, the wires of a braid let half as much blood again into the demo's sac."""
+"""Cells across a strut. With one, a braid let 19 % more blood through the demo's neck than with two."""
 
 
 @dataclass(frozen=True, eq=False)
