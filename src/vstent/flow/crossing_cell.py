@@ -152,7 +152,7 @@ class _Grid:
     def __init__(self, wires: Wires, is_blood: Bools) -> None:
         self._shape, self._is_blood = wires.shape, is_blood
         self._stride = int(np.prod(wires.shape))
-        self._f = np.zeros(19 * self._stride + lattice.LANES, np.float32)
+        self._f = np.zeros(19 * self._stride + lattice.COUNT, np.float32)
         cells = np.argwhere(is_blood)
         self._place = self._number(cells)
         self._address(cells)
@@ -193,7 +193,8 @@ class _Grid:
         out, back = q * self._stride, lattice.OPPOSITE[q] * self._stride
         rows = [back + at, back + before, out + at, out + after, back + further, out + before]
         self._links = np.stack(rows, axis=1).astype(np.int32)
-        self._weight, self._correction = weight.astype(np.float32), correction.astype(np.float32)
+        *self._paths, self._weight = lattice.paths(self._links, weight)
+        self._correction = correction.astype(np.float32)
         self._source = np.zeros(len(q), np.float32)
 
     def advance(self, force: Floats) -> None:
@@ -204,9 +205,9 @@ class _Grid:
         relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
-            for address, is_even in ((self._even, True), (self._odd, False)):
+            for address, path in zip((self._even, self._odd), self._paths, strict=True):
                 lattice.update(self._f, address, self._length, *relaxation, *no_screen, 1)
-                lattice.reflect(self._f, self._links, self._weight, self._source, *nothing, is_even)
+                lattice.reflect(self._f, path, self._weight, self._source, *nothing)
             if pair % DEFER_PAIRS == 0:
                 lattice.defer(self._f, self._links, self._correction, self._source, np.float32(DEFER_PART))
 

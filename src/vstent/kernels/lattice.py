@@ -3,7 +3,7 @@
 Storage. Populations are shifted by their rest weights (f - w) and lie in one flat array: population q of storage place
 i is at q * stride + i. Storage places are the fluid cells *and* their solid neighbours, row by row along z, so that a
 *segment* (a run of fluid cells along z) and each of its 18 neighbouring runs are contiguous: one address per segment
-and population replaces one per cell, and every loop is a plain vector loop.
+and population replaces one per cell, and eight cells are worked on at once (`vstent.kernels.lanes`).
 
 Update in place (the AA pattern; Bailey, Myre, Walsh, Lilja and Saar 2009, ICPP, 550). Even step: a cell reads its own
 populations and writes the collided ones back, each at the place of its opposite. Odd step: it reads where its
@@ -19,8 +19,11 @@ from typing import Any, Final
 
 import numpy as np
 from numba import njit, prange
+from numpy.typing import NDArray
 
-from vstent.kernels.arrays import Ints
+from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.collision import collided, collided_screened, departure, moments_of, resist
+from vstent.kernels.lanes import COUNT, gather, load, root, scatter, store
 
 VELOCITIES: Final[Ints] = np.array(
     [[0, 0, 0]]
@@ -39,107 +42,21 @@ OPPOSITE: Final = np.array([0] + [q + 1 if q % 2 else q - 1 for q in range(1, 19
 """(19,) number of the opposite velocity."""
 AXIAL: Final = 6
 """Number of the last velocity along an axis; those after it are diagonal."""
-LANES: Final = 8
-"""Cells worked on at once: segments are read in whole multiples, so the array ends in that many spare places."""
 PRESSURE, INFLOW, OUTFLOW = 0.0, 1.0, 2.0
 """What can be imposed at an opening (see `drive`)."""
 SLOWLY: Final = 0.1
 """Part of the way that an outlet's pressure goes in a step pair; at once, it would chase its own answer."""
 SEGMENT: Final = 128
-"""Longest segment, in cells; a literal, so that the compiler sees the stride of the buffer."""
+"""Longest segment, in cells."""
 
-_REST, _AXIS, _DIAGONAL = np.float32(1 / 3), np.float32(1 / 18), np.float32(1 / 36)
-_HALF, _ONE, _THREE_HALVES = np.float32(0.5), np.float32(1.0), np.float32(1.5)
-_TWO, _THREE, _FOUR_AND_HALF = np.float32(2.0), np.float32(3.0), np.float32(4.5)
+_ZERO, _ONE, _THREE_HALVES, _TWO = (np.float32(x) for x in (0.0, 1.0, 1.5, 2.0))
 _U = np.uint64
-
-
-@njit(cache=True, inline="always")
-def _relax_pair(f: Any, a: int, b: int, k: int, even: float, odd: float, kept: float) -> None:
-    """Give the populations a and b = opposite of a their collided values, swapped, from their even and odd parts.
-
-    `even` is the whole even part, `odd` the equilibrium's odd part with its share of the force, `kept` how much of the
-    departure from it is kept.
-    """
-    odd += kept * (_HALF * (f[a * SEGMENT + k] - f[b * SEGMENT + k]) - odd)
-    f[a * SEGMENT + k] = even - odd
-    f[b * SEGMENT + k] = even + odd
-
-
-@njit(cache=True, inline="always")
-def _sums(f: Any, k: int) -> tuple[Any, ...]:
-    """Density deviation, momentum (3) and momentum flux xx, yy, zz, xy, xz, yz of cell k of the buffer."""
-    s1, s2, s3 = (
-        f[1 * SEGMENT + k] + f[2 * SEGMENT + k],
-        f[3 * SEGMENT + k] + f[4 * SEGMENT + k],
-        f[5 * SEGMENT + k] + f[6 * SEGMENT + k],
-    )
-    s4, s5 = f[7 * SEGMENT + k] + f[8 * SEGMENT + k], f[9 * SEGMENT + k] + f[10 * SEGMENT + k]
-    s6, s7 = f[11 * SEGMENT + k] + f[12 * SEGMENT + k], f[13 * SEGMENT + k] + f[14 * SEGMENT + k]
-    s8, s9 = f[15 * SEGMENT + k] + f[16 * SEGMENT + k], f[17 * SEGMENT + k] + f[18 * SEGMENT + k]
-    d1, d2, d3 = (
-        f[1 * SEGMENT + k] - f[2 * SEGMENT + k],
-        f[3 * SEGMENT + k] - f[4 * SEGMENT + k],
-        f[5 * SEGMENT + k] - f[6 * SEGMENT + k],
-    )
-    d4, d5 = f[7 * SEGMENT + k] - f[8 * SEGMENT + k], f[9 * SEGMENT + k] - f[10 * SEGMENT + k]
-    d6, d7 = f[11 * SEGMENT + k] - f[12 * SEGMENT + k], f[13 * SEGMENT + k] - f[14 * SEGMENT + k]
-    d8, d9 = f[15 * SEGMENT + k] - f[16 * SEGMENT + k], f[17 * SEGMENT + k] - f[18 * SEGMENT + k]
-    xx, yy, zz = s1 + s4 + s5 + s6 + s7, s2 + s4 + s5 + s8 + s9, s3 + s6 + s7 + s8 + s9
-    return (
-        f[k] + s1 + s2 + s3 + s4 + s5 + s6 + s7 + s8 + s9,
-        d1 + d4 + d5 + d6 + d7,
-        d2 + d4 - d5 + d8 + d9,
-        d3 + d6 - d7 + d8 - d9,
-        xx,
-        yy,
-        zz,
-        s4 - s5,
-        s6 - s7,
-        s8 - s9,
-    )
-
-
-@njit(cache=True, inline="always")
-def _relax(
-    f: Any,
-    k: int,
-    density: float,
-    ux: float,
-    uy: float,
-    uz: float,
-    xx: float,
-    yy: float,
-    zz: float,
-    xy: float,
-    xz: float,
-    yz: float,
-    fx: float,
-    fy: float,
-    fz: float,
-    kept: float,
-) -> None:
-    """Write the 19 collided populations from density, velocity, second moments (u u and stress) and force."""
-    isotropic = density - _THREE_HALVES * (xx + yy + zz)
-    wx, wy, wz = _THREE_HALVES * ux * ux, _THREE_HALVES * uy * uy, _THREE_HALVES * uz * uz
-    f[k] = _REST * (isotropic + _REST * (wx + wy + wz))
-    a2, d2, a1, d1 = _AXIS * _FOUR_AND_HALF, _DIAGONAL * _FOUR_AND_HALF, _AXIS * _THREE, _DIAGONAL * _THREE
-    ax, ay, az = ux + fx, uy + fy, uz + fz
-    _relax_pair(f, 1, 2, k, _AXIS * (isotropic - wy - wz) + a2 * xx, a1 * ax, kept)
-    _relax_pair(f, 3, 4, k, _AXIS * (isotropic - wx - wz) + a2 * yy, a1 * ay, kept)
-    _relax_pair(f, 5, 6, k, _AXIS * (isotropic - wx - wy) + a2 * zz, a1 * az, kept)
-    in_xy, in_xz, in_yz = _DIAGONAL * (isotropic + wz), _DIAGONAL * (isotropic + wy), _DIAGONAL * (isotropic + wx)
-    _relax_pair(f, 7, 8, k, in_xy + d2 * (xx + yy + xy + xy), d1 * (ax + ay), kept)
-    _relax_pair(f, 9, 10, k, in_xy + d2 * (xx + yy - xy - xy), d1 * (ax - ay), kept)
-    _relax_pair(f, 11, 12, k, in_xz + d2 * (xx + zz + xz + xz), d1 * (ax + az), kept)
-    _relax_pair(f, 13, 14, k, in_xz + d2 * (xx + zz - xz - xz), d1 * (ax - az), kept)
-    _relax_pair(f, 15, 16, k, in_yz + d2 * (yy + zz + yz + yz), d1 * (ay + az), kept)
-    _relax_pair(f, 17, 18, k, in_yz + d2 * (yy + zz - yz - yz), d1 * (ay - az), kept)
+_WIDE = SEGMENT + COUNT
 
 
 @njit(cache=True, inline="always")
 def _even(q: int, density: float, ux: float, uy: float, uz: float) -> float:
-    """Even part of the equilibrium of population q over its weight (see `_collide`)."""
+    """Even part of the equilibrium of population q over its weight (see `vstent.kernels.collision`)."""
     cx, cy, cz = VELOCITIES[q, 0], VELOCITIES[q, 1], VELOCITIES[q, 2]
     along = cx * ux + cy * uy + cz * uz
     beside = (1 - cx * cx) * ux * ux + (1 - cy * cy) * uy * uy + (1 - cz * cz) * uz * uz
@@ -147,153 +64,78 @@ def _even(q: int, density: float, ux: float, uy: float, uz: float) -> float:
     return density + 4.5 * along * along - 1.5 * (ux * ux + uy * uy + uz * uz) + part * beside
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _kept(ux: float, uy: float, uz: float, time: float, limit: float) -> float:
-    """Part of the stress kept: by the blood's relaxation time, or that of blood at the largest cell Reynolds number."""
-    return _ONE - _ONE / max(time, _HALF + _THREE / limit * np.sqrt(ux * ux + uy * uy + uz * uz))
-
-
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _thin(f: Any, n: int, time: float, law: Any, times: Any) -> None:
-    """Relaxation times of n cells whose blood thins with the shear rate, from the stress that they hold.
+def _thin(f: Any, address: Any, s: int, n: int, time: float, law: Any, times: Any) -> None:
+    """Relaxation times of a segment of n cells whose blood thins with the shear rate, from the stress that they hold.
 
     Strain rate = 1.5 / time of the second moments' departure from equilibrium (Boyd, Buick and Green 2006, J. Phys. A
     39, 14241, eq. 9), which depends on the time sought: three rounds from blood at rest.
     """
+    for k in range(0, n, COUNT):
+        _, u, flux = moments_of(gather(f, address, s, k))
+        xx, yy, zz, xy, xz, yz = departure(flux, u)
+        store(times, k, root(_TWO * (xx * xx + yy * yy + zz * zz + _TWO * (xy * xy + xz * xz + yz * yz))))
     for k in range(n):
-        _, ux, uy, uz, pxx, pyy, pzz, pxy, pxz, pyz = _sums(f, k)
-        qxx, qyy, qzz = pxx - ux * ux, pyy - uy * uy, pzz - uz * uz
-        trace = (qxx + qyy + qzz) * _REST
-        qxx, qyy, qzz = qxx - trace, qyy - trace, qzz - trace
-        qxy, qxz, qyz = pxy - ux * uy, pxz - ux * uz, pyz - uy * uz
-        size = np.sqrt(_TWO * (qxx * qxx + qyy * qyy + qzz * qzz + _TWO * (qxy * qxy + qxz * qxz + qyz * qyz)))
-        found = time + law[0]
+        size, found = times[k], time + law[0]
         for _ in range(3):
             rate = _THREE_HALVES * size / found
             found = time + law[0] * (_ONE + (law[1] * rate) ** law[2]) ** law[3]
         times[k] = found
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _collide(f: Any, n: int, times: Any, limit: float, odd_rate: float) -> None:
-    """Collide n cells of the buffer f (19 * SEGMENT) and swap opposite populations.
-
-    Regularised: of the even part only the stress survives (Latt and Chopard 2006, Math. Comput. Simul. 72:165, eq 12),
-    without its trace, which only carries sound. The odd part has its own rate (Ginzburg, Verhaeghe and d'Humieres 2008,
-    Commun. Comput. Phys. 3, 427). Equilibrium of incompressible flow (He and Luo 1997, J. Stat. Phys. 88, 927, eq. 20):
-    the steady state is free of divergence, whatever the lattice speed. Its fourth moments are those that its second
-    ones ask for, <xxyy> = density / 9 + (ux ux + uy uy) / 3 (Bauer and Ruede 2018, arXiv:1803.04937, sec. 3): the usual
-    one of D3Q19 lacks uz uz / 6 there, which makes a round jet a cross.
-    """
-    kept_odd, zero = _ONE - odd_rate, np.float32(0.0)
-    for k in range(n):
-        density, ux, uy, uz, pxx, pyy, pzz, pxy, pxz, pyz = _sums(f, k)
-        keep = _kept(ux, uy, uz, times[k], limit)
-        qxx, qyy, qzz = pxx - ux * ux, pyy - uy * uy, pzz - uz * uz
-        trace = (qxx + qyy + qzz) * _REST
-        _relax(
-            f,
-            k,
-            density,
-            ux,
-            uy,
-            uz,
-            ux * ux + keep * (qxx - trace),
-            uy * uy + keep * (qyy - trace),
-            uz * uz + keep * (qzz - trace),
-            ux * uy + keep * (pxy - ux * uy),
-            ux * uz + keep * (pxz - ux * uz),
-            uy * uz + keep * (pyz - uy * uz),
-            zero,
-            zero,
-            zero,
-            kept_odd,
-        )
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _resist(entry: Any, ux: float, uy: float, uz: float) -> tuple[float, float, float]:
-    """Half-force velocity u inside a screen, from the velocity u* without it: u = u* + F(u) / 2.
-
-    `entry` holds the unit normal (3), the linear resistance along it and across it, and the quadratic one along it, all
-    per cell and time step: F = -(across u_t + (along + quadratic |u_n|) u_n n). Solved exactly: no stability limit.
-    """
-    nx, ny, nz, along, across, quadratic = entry[0], entry[1], entry[2], entry[3], entry[4], entry[5]
-    normal = ux * nx + uy * ny + uz * nz
-    linear = _ONE + _HALF * along
-    root = np.sqrt(linear * linear + _TWO * quadratic * abs(normal))
-    kept = _ONE / (_ONE + _HALF * across)
-    extra = _TWO * normal / (linear + root) - kept * normal
-    return kept * ux + extra * nx, kept * uy + extra * ny, kept * uz + extra * nz
+@njit(cache=True, error_model="numpy")
+def _eight(f: Any, address: Any, s: int, k: int, settings: Any, target: Any, places: Any, row: int, at: int) -> None:
+    """Collide eight cells of segment s, from its cell k on, into `target` at places[row] + at."""
+    times, limit, odd_rate, screen, is_screened = settings
+    held, time = gather(f, address, s, k), load(times, k)
+    if is_screened:
+        normal = load(screen, k), load(screen, k + _WIDE), load(screen, k + 2 * _WIDE)
+        entry = load(screen, k + 3 * _WIDE), load(screen, k + 4 * _WIDE), load(screen, k + 5 * _WIDE)
+        scatter(target, places, row, at, collided_screened(held, time, limit, odd_rate, normal, entry))
+    else:
+        scatter(target, places, row, at, collided(held, time, limit, odd_rate))
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _collide_screened(
-    f: Any, g: Any, n: int, times: Any, limit: float, odd_rate: float, place: Any, entries: Any
+def _update_some(
+    f: Any,
+    address: Any,
+    length: Any,
+    relaxation: Any,
+    screen_start: Any,
+    screen_place: Any,
+    screen: Any,
+    segments: Any,
 ) -> None:
-    """As `_collide`, where the cells `place` of the segment carry the resistances `entries` (see `_resist`).
-
-    The force of Guo, Zheng and Shi 2002 (Phys. Rev. E 65, 046308, eq. 19 and 20): velocity with half the force, and the
-    force's first and second moment with the factors 1 - rate / 2. `g` is a buffer (6 * SEGMENT) for velocity and force.
-    """
-    kept_odd, half_odd = _ONE - odd_rate, (_ONE - _HALF * odd_rate) / odd_rate
-    for k in range(n):
-        _, ux, uy, uz, _, _, _, _, _, _ = _sums(f, k)
-        g[k], g[SEGMENT + k], g[2 * SEGMENT + k] = ux, uy, uz
-        g[3 * SEGMENT + k] = g[4 * SEGMENT + k] = g[5 * SEGMENT + k] = np.float32(0.0)
-    for e in range(len(place)):
-        k = place[e]
-        ux, uy, uz = g[k], g[SEGMENT + k], g[2 * SEGMENT + k]
-        vx, vy, vz = _resist(entries[e], ux, uy, uz)
-        g[k], g[SEGMENT + k], g[2 * SEGMENT + k] = vx, vy, vz
-        g[3 * SEGMENT + k], g[4 * SEGMENT + k], g[5 * SEGMENT + k] = (
-            _TWO * (vx - ux),
-            _TWO * (vy - uy),
-            _TWO * (vz - uz),
-        )
-    for k in range(n):
-        density, _, _, _, pxx, pyy, pzz, pxy, pxz, pyz = _sums(f, k)
-        ux, uy, uz = g[k], g[SEGMENT + k], g[2 * SEGMENT + k]
-        fx, fy, fz = g[3 * SEGMENT + k], g[4 * SEGMENT + k], g[5 * SEGMENT + k]
-        keep = _kept(ux, uy, uz, times[k], limit)
-        half = _HALF + _HALF * keep
-        qxx, qyy, qzz = pxx - ux * ux, pyy - uy * uy, pzz - uz * uz
-        trace = (qxx + qyy + qzz) * _REST
-        _relax(
-            f,
-            k,
-            density,
-            ux,
-            uy,
-            uz,
-            ux * ux + keep * (qxx - trace) + half * _TWO * ux * fx,
-            uy * uy + keep * (qyy - trace) + half * _TWO * uy * fy,
-            uz * uz + keep * (qzz - trace) + half * _TWO * uz * fz,
-            ux * uy + keep * (pxy - ux * uy) + half * (ux * fy + uy * fx),
-            ux * uz + keep * (pxz - ux * uz) + half * (ux * fz + uz * fx),
-            uy * uz + keep * (pyz - uy * uz) + half * (uy * fz + uz * fy),
-            half_odd * fx,
-            half_odd * fy,
-            half_odd * fz,
-            kept_odd,
-        )
-
-
-# Plain loops over unsigned places become vectors; cut into lanes by hand they were six times slower.
-@njit(cache=True, fastmath=True, inline="always")
-def _load(f: Any, address: Any, n: int, buffer: Any) -> None:
-    for q in range(19):
-        source, target = _U(address[q]), _U(q * SEGMENT)
-        for k in range(_U(n)):
-            buffer[target + k] = f[source + k]
-
-
-@njit(cache=True, fastmath=True, inline="always")
-def _store(buffer: Any, address: Any, n: int, f: Any) -> None:
-    for q in range(19):
-        source, target = _U(q * SEGMENT), _U(address[q])
-        for k in range(_U(n)):
-            f[target + k] = buffer[source + k]
+    """Do what `update` does to the segments from the first to the last, which is left out."""
+    time, law, limit, odd_rate = relaxation
+    few = np.zeros(19 * COUNT, np.float32)
+    places = COUNT * np.arange(19, dtype=np.int32).reshape(1, 19)
+    resistance = np.zeros(6 * _WIDE, np.float32)
+    times = np.full(_WIDE, time)
+    for s in range(segments[0], segments[1]):
+        cells = length[s]
+        if law[0] > 0.0:
+            _thin(f, address, s, cells, time, law, times)
+        begin, end = screen_start[s], screen_start[s + 1]
+        for e in range(begin, end):
+            for k in range(6):
+                resistance[k * _WIDE + screen_place[e]] = screen[e, k]
+        settings = times, limit[s], odd_rate, resistance, end > begin
+        # The last eight cells are read before the others are written and written after them: whole vectors only.
+        last = max(0, cells - COUNT)
+        _eight(f, address, s, last, settings, few, places, 0, 0)
+        for k in range(0, last, COUNT):
+            _eight(f, address, s, k, settings, f, address, s, k)
+        if cells >= COUNT:
+            scatter(f, address, s, last, gather(few, places, 0, 0))
+        else:
+            for q in range(19):
+                for k in range(cells):
+                    f[address[s, q] + k] = few[COUNT * q + k]
+        for e in range(begin, end):
+            for k in range(6):
+                resistance[k * _WIDE + screen_place[e]] = _ZERO
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
@@ -314,7 +156,7 @@ def update(
 
     Parameters
     ----------
-    f : (19 * stride + LANES,) float32 populations, in place.
+    f : (19 * stride + COUNT,) float32 populations, in place; short segments are read beyond their end.
     address : (segments, 19) int32, where the populations of each segment begin: its own in an even step, its
         neighbours' in an odd one.
     length : (segments,) int32 cells of each segment, at most SEGMENT.
@@ -324,49 +166,51 @@ def update(
     limit : (segments,) float32 largest cell Reynolds number, speed over viscosity: faster blood is made that thick.
     odd_rate : float32 relaxation rate of the odd part.
     screen_start : (segments + 1,) int32 first screen entry of every segment.
-    screen_place, screen : (e,) int32 place within the segment and (e, 6) float32 resistance (see `_resist`).
+    screen_place, screen : (e,) int32 place within the segment and (e, 6) float32 resistance (see `resist`).
     threads : number of chunks.
     """
-    n = length.size
+    n, relaxation = length.size, (time, law, limit, odd_rate)
     for chunk in prange(threads):
-        buffer = np.zeros(19 * SEGMENT, np.float32)
-        extra = np.zeros(6 * SEGMENT, np.float32)
-        times = np.full(SEGMENT, time)
-        for s in range(n * chunk // threads, n * (chunk + 1) // threads):
-            lanes = (length[s] + LANES - 1) // LANES * LANES
-            _load(f, address[s], lanes, buffer)
-            if law[0] > 0.0:
-                _thin(buffer, lanes, time, law, times)
-            begin, end = screen_start[s], screen_start[s + 1]
-            if begin == end:
-                _collide(buffer, lanes, times, limit[s], odd_rate)
-            else:
-                _collide_screened(
-                    buffer, extra, lanes, times, limit[s], odd_rate, screen_place[begin:end], screen[begin:end]
-                )
-            _store(buffer, address[s], length[s], f)
+        segments = n * chunk // threads, n * (chunk + 1) // threads
+        _update_some(f, address, length, relaxation, screen_start, screen_place, screen, segments)
 
 
 @njit(cache=True, parallel=True, fastmath=True)
-def reflect(f: Any, address: Any, weight: Any, source: Any, place: Any, refill: Any, after_even: bool) -> None:
-    """Send back what crosses a wall or an opening: a weighted sum of three populations, and a source.
+def reflect(f: Any, path: Any, weight: Any, source: Any, place: Any, refill: Any) -> None:
+    """Send back what crosses a wall or an opening: a weighted sum of two populations, and a source.
 
     Parameters
     ----------
-    address : (links, 6) int32 places of, after an even step: what leaves along the link (a), what left the cell behind
-        (b), what leaves against the link (c), the mailbox (d); then (see `defer`) what left the second cell behind (e)
-        and what leaves the cell behind against the link (g). After an odd step a and d, b and c, e and g change roles.
-    weight : (links, 3) float32; source : (links,) float32.
+    path : (links, 3) two places read and the one written, of this kind of step (see `paths`).
+    weight : (links, 2) float32; source : (links,) float32.
     place, refill : (w,) int32 and float32: what is added to the rest populations of these places.
     """
-    for k in prange(len(address)):
-        a, b, c, d = _U(address[k, 0]), _U(address[k, 1]), _U(address[k, 2]), _U(address[k, 3])
-        if after_even:
-            f[d] = weight[k, 0] * f[a] + weight[k, 1] * f[b] + weight[k, 2] * f[c] + source[k]
-        else:
-            f[a] = weight[k, 0] * f[d] + weight[k, 1] * f[c] + weight[k, 2] * f[b] + source[k]
+    for k in prange(len(path)):
+        first, second, target = _U(path[k, 0]), _U(path[k, 1]), _U(path[k, 2])
+        f[target] = weight[k, 0] * f[first] + weight[k, 1] * f[second] + source[k]
     for w in prange(len(place)):
         f[_U(place[w])] += refill[w]
+
+
+def paths(address: Ints, weight: Floats) -> tuple[Ints, Ints, NDArray[np.float32]]:
+    """Prepare `reflect` for links whose reflection needs at most two populations.
+
+    Parameters
+    ----------
+    address : (links, 6) places of, after an even step: what leaves along the link (a), what left the cell behind (b),
+        what leaves against the link (c), the mailbox (d); then (see `defer`) what left the second cell behind (e) and
+        what leaves the cell behind against the link (g). After an odd step a and d, b and c, e and g change roles.
+    weight : (links, 3) of a, b and c; b's or c's is zero.
+
+    Returns
+    -------
+    The paths (links, 3) after an even and after an odd step, and their weights (links, 2).
+    """
+    needs_c = weight[:, 2] != 0
+    after_even = np.where(needs_c[:, None], address[:, (0, 2, 3)], address[:, (0, 1, 3)])
+    after_odd = np.where(needs_c[:, None], address[:, (3, 1, 0)], address[:, (3, 2, 0)])
+    both = np.column_stack([weight[:, 0], np.where(needs_c, weight[:, 2], weight[:, 1])])
+    return after_even, after_odd, both.astype(np.float32)
 
 
 @njit(cache=True, parallel=True, fastmath=True)
@@ -378,7 +222,7 @@ def defer(f: Any, address: Any, correction: Any, source: Any, part: float) -> No
 
     Parameters
     ----------
-    address : (links, 6) as in `reflect`; correction : (links, 5) float32 weights of a, b, c, e and g.
+    address : (links, 6) as in `paths`; correction : (links, 5) float32 weights of a, b, c, e and g.
     """
     for k in prange(len(address)):
         a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
@@ -438,10 +282,12 @@ def set_equilibrium(f: Any, stride: int, places: Any, density: Any, velocity: An
 
 @njit(cache=True)
 def resisted(velocity: Any, entries: Any) -> Any:
-    """Half-force velocity (e, 3) of screened cells from their momentum (e, 3) and entries (e, 6) (see `_resist`)."""
+    """Half-force velocity (e, 3) of screened cells from their momentum (e, 3) and entries (e, 6) (see `resist`)."""
     result = np.zeros_like(velocity)
     for e in range(len(entries)):
-        result[e, 0], result[e, 1], result[e, 2] = _resist(entries[e], velocity[e, 0], velocity[e, 1], velocity[e, 2])
+        normal, entry = entries[e, :3], entries[e, 3:]
+        u, _ = resist(normal, entry, (velocity[e, 0], velocity[e, 1], velocity[e, 2]))
+        result[e, 0], result[e, 1], result[e, 2] = u
     return result
 
 
@@ -493,7 +339,7 @@ def drive(
     openings : (k, 9) what is imposed (`PRESSURE`, `INFLOW` or `OUTFLOW`), the density deviation or speed wanted, the
         remembered mean density, its rate of change, the outward normal (3), the area in cells, the density imposed.
     start : (k + 1,) first link of every opening in what follows.
-    address : (l, 6) as in `reflect`; place : (l,) storage place of each link's cell; direction, source : (l,).
+    address : (l, 6) as in `paths`; place : (l,) storage place of each link's cell; direction, source : (l,).
     shape : (l, 2) what inflow sends back through each link, over its speed and over its speed squared.
 
     Inflow: half-way reflection off a moving wall (Ladd 1994, J. Fluid Mech. 271, 285), so the flow is exact. It

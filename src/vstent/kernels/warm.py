@@ -67,7 +67,7 @@ def _slide(nodes_mm: np.ndarray) -> None:
 
 def flow() -> None:
     """Call every kernel of a flow on one cell at rest, with every argument of the type that a flow has."""
-    stride = lattice.LANES
+    stride = lattice.COUNT
     f, none = np.zeros(20 * stride, np.float32), np.zeros(0, np.int32)
     lattice.update(
         f,
@@ -82,9 +82,9 @@ def flow() -> None:
         np.zeros((0, 6), np.float32),
         1,
     )
-    links, weight, source = np.zeros((0, 6), np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+    links, source = np.zeros((0, 6), np.int32), np.zeros(0, np.float32)
     lattice.drive(f, stride, np.zeros((0, 9)), np.zeros(1, np.int32), links, none, none, np.zeros((0, 2)), source)
-    lattice.reflect(f, links, weight, source, none, source, True)
+    lattice.reflect(f, np.zeros((0, 3), np.int32), np.zeros((0, 2), np.float32), source, none, source)
     lattice.swap(f, none, none)
     lattice.defer(f, links, np.zeros((0, 5), np.float32), source, np.float32(1.0))
     lattice.balance(f, links, none, none, none, source, np.float32(1.0))

@@ -42,7 +42,7 @@ class Addressing:
     odd_address: Ints
     """(s, 19) the same in an odd step."""
     link_address: Ints
-    """(l, 6) see `lattice.reflect`."""
+    """(l, 6) see `lattice.paths`."""
     link_has_one: NDArray[np.bool_]
     """(l,) the cell behind the link's cell is blood."""
     link_has_two: NDArray[np.bool_]
@@ -102,9 +102,13 @@ class Links:
     """Coefficients of everything that is sent back, openings first, then the wall; sources change in place."""
 
     address: Ints
-    """(l, 6) see `lattice.reflect`."""
+    """(l, 6) see `lattice.paths`."""
+    even_path: Ints
+    """(l, 3) see `lattice.reflect`, after an even step."""
+    odd_path: Ints
+    """(l, 3) the same after an odd step."""
     weight: NDArray[np.float32]
-    """(l, 3) see `lattice.reflect`."""
+    """(l, 2) see `lattice.reflect`."""
     correction: NDArray[np.float32]
     """(l, 5) see `lattice.defer`."""
     source: NDArray[np.float32]
@@ -208,7 +212,7 @@ def _cut(first: Ints, length: Ints) -> tuple[Ints, Ints]:
 def _link_addresses(
     domain: Domain, number: Ints, inside: NDArray[np.bool_], stride: int
 ) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Addresses (l, 6) of `lattice.reflect`, and whether one and whether two blood cells lie behind the link's cell."""
+    """Addresses (l, 6) of `lattice.paths`, and whether one and whether two blood cells lie behind the link's cell."""
     q = domain.link_direction
     p = lattice.OPPOSITE[q]
     cell, c = domain.cells[domain.link_cell], lattice.VELOCITIES[q]
@@ -254,7 +258,7 @@ def build_links(case: FlowCase, domain: Domain, addressing: Addressing, scales: 
     opening_links = order[: start[-1]]
     return Links(
         addressing.link_address[order],
-        weight.astype(np.float32),
+        *lattice.paths(addressing.link_address[order], weight),
         correction.astype(np.float32),
         np.zeros(len(order), dtype=np.float32),
         openings,

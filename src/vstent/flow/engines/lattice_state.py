@@ -94,7 +94,7 @@ class State:
     limit: NDArray[np.float32]
     """(s,) largest cell Reynolds number in every segment."""
     populations: NDArray[np.float32]
-    """(19 * stride + LANES,) shifted populations."""
+    """(19 * stride + lattice.COUNT,) shifted populations."""
     wanted: Floats
     """(k,) speed wanted at every opening at mean flow (see `lattice.drive`)."""
     steps_per_check: int
@@ -126,7 +126,7 @@ def build(case: FlowCase, scales: Scales, steps_per_check: int, *, start: FlowFi
         _probe(case, domain),
         build_refill(domain, addressing),
         np.where(is_end, CELL_REYNOLDS_AT_END, np.inf)[addressing.first_cell].astype(np.float32),
-        np.zeros(19 * addressing.stride + lattice.LANES, dtype=np.float32),
+        np.zeros(19 * addressing.stride + lattice.COUNT, dtype=np.float32),
         links.openings[:, 1].copy(),
         steps_per_check,
         deque(maxlen=kept),
@@ -231,7 +231,7 @@ def advance(state: State, steps: int) -> None:
             links.shape,
             opening_source,
         )
-        for address_of, is_even in ((a.even_address, True), (a.odd_address, False)):
+        for address_of, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):
             lattice.update(
                 f,
                 address_of,
@@ -242,7 +242,7 @@ def advance(state: State, steps: int) -> None:
                 screen.entry,
                 threads,
             )
-            lattice.reflect(f, links.address, links.weight, links.source, refill.place, refill.refill, is_even)
+            lattice.reflect(f, path, links.weight, links.source, refill.place, refill.refill)
             lattice.swap(f, *a.swap_address)
         if (first_pair + pair) % DEFER_PAIRS == 0:
             part = np.float32(DEFER_PART)

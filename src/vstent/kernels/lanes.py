@@ -1,0 +1,197 @@
+"""Eight single-precision numbers at once, as a type of numba's: what a processor's vector register holds.
+
+A loop that the compiler turns into vector instructions itself pays for the cells that no whole vector holds, at both
+ends of every run of them; a few dozen cells long, they are most of the time. Whole vectors are named here instead.
+Arithmetic is numba's fast one: sums may be reordered, products and sums fused.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic, models, overload, register_model
+
+COUNT: Final = 8
+"""Numbers in one."""
+_FLOAT: Final = ir.FloatType()
+_VECTOR: Final = ir.VectorType(_FLOAT, COUNT)
+_FAST: Final = ("fast",)
+
+
+class Lanes(types.Type):  # type: ignore[misc]
+    """Eight numbers."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Lanes")
+
+
+LANES: Final = Lanes()
+
+
+@register_model(Lanes)  # type: ignore[untyped-decorator]
+class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _VECTOR)
+
+
+def _widened(builder: Any, kind: Any, value: Any) -> Any:
+    """Eight times the same number, unless it is eight numbers already."""
+    if kind == LANES:
+        return value
+    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    order = ir.Constant(ir.VectorType(ir.IntType(32), COUNT), [0] * COUNT)
+    return builder.shuffle_vector(one, ir.Constant(_VECTOR, ir.Undefined), order)
+
+
+def _is_pair(a: Any, b: Any) -> bool:
+    return LANES in (a, b) and {a, b} <= {LANES, types.float32}
+
+
+def _arithmetic(operation: Callable[..., Any], instruction: str) -> None:
+    """Let numba apply an operator to two Lanes, or to one and a number."""
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def apply(_: Any, a: Any, b: Any) -> Any:
+        def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            pair = [_widened(builder, *one) for one in zip(signature.args, arguments, strict=True)]
+            return getattr(builder, instruction)(*pair, flags=_FAST)
+
+        return LANES(a, b), generate
+
+    @overload(operation)  # type: ignore[untyped-decorator]
+    def chosen(a: Any, b: Any) -> Any:
+        def on_lanes(a: Any, b: Any) -> Any:
+            return apply(a, b)
+
+        return on_lanes if _is_pair(a, b) else None
+
+
+for _operation, _instruction in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
+    _arithmetic(_operation, _instruction)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _larger(_: Any, a: Any, b: Any) -> Any:
+
+    def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        x, y = (_widened(builder, *one) for one in zip(signature.args, arguments, strict=True))
+        return builder.select(builder.fcmp_ordered(">", x, y), x, y)
+
+    return LANES(a, b), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _root(_: Any, a: Any) -> Any:
+
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{COUNT}f32"), arguments)
+
+    return LANES(a), generate
+
+
+def larger(a: Any, b: Any) -> Any:
+    """Return the larger of two, number by number; numbers may be Lanes or float32."""
+    return np.maximum(a, b)
+
+
+@overload(larger)  # type: ignore[untyped-decorator]
+def _larger_chosen(a: Any, b: Any) -> Any:
+    def of_lanes(a: Any, b: Any) -> Any:
+        return _larger(a, b)
+
+    def of_numbers(a: Any, b: Any) -> Any:
+        return max(a, b)
+
+    return of_lanes if _is_pair(a, b) else of_numbers
+
+
+def root(a: Any) -> Any:
+    """Return the square root, number by number, of Lanes or float32."""
+    return np.sqrt(a)
+
+
+@overload(root)  # type: ignore[untyped-decorator]
+def _root_chosen(a: Any) -> Any:
+    def of_lanes(a: Any) -> Any:
+        return _root(a)
+
+    def of_number(a: Any) -> Any:
+        return np.sqrt(a)
+
+    return of_lanes if a == LANES else of_number
+
+
+def _at(context: Any, builder: Any, array: Any, value: Any, place: Any) -> Any:
+    """Pointer to eight numbers of an array from a place on."""
+    data = context.make_array(array)(context, builder, value).data
+    return builder.bitcast(builder.gep(data, [place]), _VECTOR.as_pointer())
+
+
+def _row(context: Any, builder: Any, array: Any, value: Any, row: Any) -> Any:
+    """Pointer to the first entry of a row of an array (n, k) that is contiguous."""
+    held = context.make_array(array)(context, builder, value)
+    width = builder.extract_value(held.shape, 1)
+    return builder.gep(held.data, [builder.mul(row, width)])
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def load(_: Any, array: Any, place: Any) -> Any:
+    """Return the eight numbers of a float32 array (n,) from a place on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load(_at(context, builder, signature.args[0], *arguments), align=4)
+
+    return LANES(array, types.intp), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def gather(_: Any, array: Any, address: Any, row: Any, offset: Any) -> Any:
+    """Return eight numbers of a float32 array (n,) from each address[row, q] + offset on, q = 0 to 18, as a tuple."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        values, addresses, at, beyond = arguments
+        entry = _row(context, builder, signature.args[1], addresses, at)
+        loaded = []
+        for q in range(19):
+            start = builder.sext(builder.load(builder.gep(entry, [cgutils.intp_t(q)])), cgutils.intp_t)
+            pointer = _at(context, builder, signature.args[0], values, builder.add(start, beyond))
+            loaded.append(builder.load(pointer, align=4))
+        return cgutils.pack_array(builder, loaded)
+
+    return types.UniTuple(LANES, 19)(array, address, types.intp, types.intp), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def scatter(_: Any, array: Any, address: Any, row: Any, offset: Any, lanes: Any) -> Any:
+    """Write a tuple of Lanes to where `gather` reads them."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        values, addresses, at, beyond, written = arguments
+        entry = _row(context, builder, signature.args[1], addresses, at)
+        for q, one in enumerate(cgutils.unpack_tuple(builder, written)):
+            start = builder.sext(builder.load(builder.gep(entry, [cgutils.intp_t(q)])), cgutils.intp_t)
+            pointer = _at(context, builder, signature.args[0], values, builder.add(start, beyond))
+            builder.store(one, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, address, types.intp, types.intp, lanes), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def store(_: Any, array: Any, place: Any, lanes: Any) -> Any:
+    """Write eight numbers to a float32 array (n,) from a place on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.store(arguments[2], _at(context, builder, signature.args[0], *arguments[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, lanes), generate
