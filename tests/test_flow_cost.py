@@ -71,7 +71,7 @@ def test_a_narrow_place_inside_is_computed_with_a_shorter_time_step(monkeypatch)
 
     def ill_guessed(engine, case, start):
         tried.append(case.settings.lattice_speed)
-        faster = replace(case.settings, lattice_speed=12 * case.settings.lattice_speed)
+        faster = replace(case.settings, lattice_speed=8 * case.settings.lattice_speed)
         return real(engine, replace(case, settings=faster), start)
 
     monkeypatch.setattr(LatticeBoltzmann, "init", ill_guessed)
