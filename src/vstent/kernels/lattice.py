@@ -67,7 +67,7 @@ def even_part(q: int, density: float, ux: float, uy: float, uz: float) -> float:
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _thin(f: Any, address: Any, s: int, n: int, time: float, law: Any, times: Any) -> None:
-    """Relaxation times of a segment of n cells whose blood thins with the shear rate, from the stress that they hold."""
+    """Relaxation times of a segment of n cells whose blood thins with the shear rate, from the stress they hold."""
     for k in range(0, n, COUNT):
         store(times, k, stress_size(gather(f, address, s, k)))
     for k in range(n):
