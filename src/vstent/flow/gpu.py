@@ -1,5 +1,7 @@
 """Whether a flow can be computed on a GPU: where it is asked for, never required."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Final
 
@@ -43,6 +45,24 @@ def require_gpu() -> None:
         "the flow cannot be computed on a GPU, for no NVIDIA GPU with its driver is found on this machine: see what "
         f"nvidia-smi lists, {ELSE}"
     )
+
+
+@contextmanager
+def told() -> Iterator[None]:
+    """Make a sentence of what a GPU, its driver or its compiler refuse.
+
+    Raises
+    ------
+    FlowError
+        With their own first words.
+    """
+    try:
+        yield
+    except Exception as error:  # each of them raises its own
+        words = next(iter(str(error).splitlines()), type(error).__name__)
+        raise FlowError(
+            f"the GPU did not compute the flow ({words}): see what nvidia-smi says of it, {ELSE}"
+        ) from error
 
 
 def free_gpu_bytes() -> float:

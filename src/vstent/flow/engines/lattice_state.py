@@ -29,7 +29,7 @@ from vstent.flow.engines.lattice_setup import (
     build_screen,
     in_extensions,
 )
-from vstent.flow.gpu import require_gpu
+from vstent.flow.gpu import require_gpu, told
 from vstent.flow.types import FlowCase, FlowField, Phase, Waveform
 from vstent.flow.wall_stress import wall_stress
 from vstent.kernels import lattice, lattice_sampling
@@ -225,7 +225,8 @@ def advance(state: State, steps: int) -> None:
     factor = state.case.settings.inflow_factor(np.float64(state.scales.step_s) * middle)
     first_pair = state.steps % state.steps_per_check // 2
     if state.case.settings.device_gpu:
-        _device(state).advance(factor, first_pair)
+        with told():
+            _device(state).advance(factor, first_pair)
     else:
         _advance_here(state, factor, first_pair)
     state.steps += steps
