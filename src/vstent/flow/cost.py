@@ -121,9 +121,13 @@ def _steps(case: FlowCase, cell_size_mm: float) -> int:
     return steps_per_phase(case, cell_size_mm, None) * PHASES * settings.max_cycles
 
 
-@cache
 def block_rate(*, on_gpu: bool = False) -> float:
-    """Cell updates per second in a block of blood without walls, measured on what it will be computed with."""
+    """Cell updates per second in a block of blood without walls, measured once on what it will be computed with."""
+    return _measured_rate(on_gpu)
+
+
+@cache
+def _measured_rate(on_gpu: bool) -> float:
     keep_flow()
     length, threads = np.full(BLOCK_ROWS, 64, np.int32), numba.get_num_threads()
     stride = int(length.sum())

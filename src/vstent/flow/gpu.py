@@ -65,6 +65,18 @@ def told() -> Iterator[None]:
         ) from error
 
 
+def gpu_name() -> str:
+    """Name of the GPU that flows are computed on; "none" where there is none."""
+    try:
+        require_gpu()
+    except FlowError:
+        return "none"
+    from numba import cuda
+
+    name = cuda.get_current_device().name
+    return name.decode() if isinstance(name, bytes) else str(name)
+
+
 def free_gpu_bytes() -> float:
     """Memory of the GPU that can be had."""
     from numba import cuda
