@@ -135,6 +135,17 @@ def test_what_is_left_to_go_is_foretold_from_an_exponential_approach():
     assert fraction_left(history[:4]) == np.inf
 
 
+@pytest.mark.parametrize("period", [7.0, 13.0, 23.0])
+def test_what_is_left_of_a_swing_is_neither_missed_nor_mistaken(period: float) -> None:
+    """A change of means passes through zero at every turn: what is left then looks like nothing, or like the whole."""
+    time = np.arange(120.0)
+    history = (3.0 + 0.1 * np.exp(-time / 17) * np.cos(2 * np.pi * time / period))[:, None]
+    left = 0.1 / 3.0 * np.exp(-time / 17)
+    found = np.array([fraction_left(history[:n]) for n in range(60, 120)])
+    assert (found > 0.5 * left[59:-1]).all()
+    assert (found < 12 * left[59:-1]).all()
+
+
 class Halving(AbstractEngine[list]):
     """An engine whose residual halves at every check; `ends` makes its third step misbehave."""
 

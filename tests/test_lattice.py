@@ -6,7 +6,7 @@ import pytest
 from shapes import sphere
 from vstent.flow.engines.lattice_setup import ODD_RATE as VESSEL_ODD_RATE
 from vstent.flow.engines.lattice_setup import parabolic_weights
-from vstent.kernels import lattice, lattice_sampling, voxels
+from vstent.kernels import lanes, lattice, lattice_sampling, voxels
 
 STRIDE = 40
 RATE, ODD_RATE, NO_LIMIT = 1.6, 0.7, 1e9
@@ -16,7 +16,7 @@ NO_SCREEN = (np.zeros(2, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.f
 def populations(seed=0):
     """Random shifted populations of one segment of STRIDE cells."""
     small = np.random.default_rng(seed).normal(scale=0.01, size=(19, STRIDE)).astype(np.float32)
-    return np.concatenate([small.ravel(), np.zeros(lattice.COUNT, np.float32)])
+    return np.concatenate([small.ravel(), np.zeros(lanes.COUNT, np.float32)])
 
 
 def even_step(f, screen=NO_SCREEN, limit=NO_LIMIT, law=(0, 0, 0, 0)):
@@ -25,7 +25,7 @@ def even_step(f, screen=NO_SCREEN, limit=NO_LIMIT, law=(0, 0, 0, 0)):
     address = (np.arange(19) * STRIDE)[None].astype(np.int32)
     relaxation = np.float32(1 / RATE), np.float32(law), np.float32([limit]), np.float32(ODD_RATE)
     lattice.update(result, address, np.array([STRIDE], np.int32), *relaxation, *screen, 1)
-    return result[: -lattice.COUNT].reshape(19, STRIDE)[lattice.OPPOSITE]
+    return result[: -lanes.COUNT].reshape(19, STRIDE)[lattice.OPPOSITE]
 
 
 def momentum(f):
@@ -44,7 +44,7 @@ def test_the_velocity_set_is_isotropic_to_fourth_order():
 
 def test_a_collision_keeps_mass_and_momentum():
     f = populations()
-    before, after = f[: -lattice.COUNT].reshape(19, STRIDE), even_step(f)
+    before, after = f[: -lanes.COUNT].reshape(19, STRIDE), even_step(f)
     np.testing.assert_allclose(after.sum(axis=0), before.sum(axis=0), atol=2e-7)
     np.testing.assert_allclose(momentum(after), momentum(before), atol=2e-7)
     assert np.abs(after - before).max() > 1e-3
@@ -81,7 +81,7 @@ def assert_fourth_moments_are_asked_for_by_the_second(f):
 
 def test_a_collision_relaxes_the_stress_at_its_rate_and_its_moments_are_of_no_direction():
     f = populations(1)
-    before, after = f[: -lattice.COUNT].reshape(19, STRIDE).astype(float), even_step(f).astype(float)
+    before, after = f[: -lanes.COUNT].reshape(19, STRIDE).astype(float), even_step(f).astype(float)
     np.testing.assert_allclose(stress(after), (1 - RATE) * stress(before), atol=1e-6)
     _, second, _ = moments(after)
     trace = after.sum(axis=0) + (momentum(after) ** 2).sum(axis=1)
@@ -101,15 +101,15 @@ def skewness(f):
 
 def test_a_collision_relaxes_third_moments_to_what_a_lattice_with_more_velocities_would_do():
     f = populations(6)
-    before, after = f[: -lattice.COUNT].reshape(19, STRIDE).astype(float), even_step(f).astype(float)
+    before, after = f[: -lanes.COUNT].reshape(19, STRIDE).astype(float), even_step(f).astype(float)
     np.testing.assert_allclose(skewness(after), (1 - ODD_RATE) * skewness(before), atol=1e-7)
 
 
 def test_the_equilibrium_is_what_a_collision_keeps():
     density, velocity = np.linspace(-0.1, 0.1, STRIDE), np.random.default_rng(2).normal(scale=0.05, size=(STRIDE, 3))
-    f = np.zeros(19 * STRIDE + lattice.COUNT, np.float32)
+    f = np.zeros(19 * STRIDE + lanes.COUNT, np.float32)
     lattice.set_equilibrium(f, STRIDE, np.arange(STRIDE), density, velocity)
-    begun = f[: -lattice.COUNT].reshape(19, STRIDE)
+    begun = f[: -lanes.COUNT].reshape(19, STRIDE)
     np.testing.assert_allclose(even_step(f), begun, atol=2e-7)
     np.testing.assert_allclose(momentum(begun), velocity, atol=2e-7)
     assert_fourth_moments_are_asked_for_by_the_second(begun)
@@ -118,7 +118,7 @@ def test_the_equilibrium_is_what_a_collision_keeps():
 @pytest.mark.parametrize("is_screened", [False, True])
 def test_fast_blood_is_as_thick_as_the_cell_reynolds_number_allows(is_screened):
     f, limit = populations(4), 1.0
-    before = f[: -lattice.COUNT].reshape(19, STRIDE).astype(float)
+    before = f[: -lanes.COUNT].reshape(19, STRIDE).astype(float)
     screen = screen_of((0, 0, 1), 0, 0) if is_screened else NO_SCREEN
     after = even_step(f, screen, limit).astype(float)
     viscosity = np.maximum((1 / RATE - 0.5) / 3, np.linalg.norm(momentum(before), axis=1) / limit)
@@ -130,7 +130,7 @@ def test_fast_blood_is_as_thick_as_the_cell_reynolds_number_allows(is_screened):
 @pytest.mark.parametrize("is_screened", [False, True])
 def test_thinning_blood_relaxes_at_the_time_of_its_own_shear_rate(is_screened):
     f, law = populations(5), np.array([0.4, 30.0, 1.25, -0.624])
-    before = f[: -lattice.COUNT].reshape(19, STRIDE).astype(float)
+    before = f[: -lanes.COUNT].reshape(19, STRIDE).astype(float)
     after = even_step(f, screen_of((0, 0, 1), 0, 0) if is_screened else NO_SCREEN, law=law).astype(float)
     size = np.sqrt(2 * (stress(before) ** 2).sum(axis=(1, 2)))
     time = np.full(STRIDE, 1 / RATE + law[0])
@@ -154,7 +154,7 @@ def test_a_screen_without_resistance_collides_as_none():
 def test_a_screen_takes_the_momentum_of_its_law():
     f = populations(3)
     normal, along, across, quadratic = np.array([0.6, 0.0, 0.8]), 0.7, 0.3, 5.0
-    start = momentum(f[: -lattice.COUNT].reshape(19, STRIDE))
+    start = momentum(f[: -lanes.COUNT].reshape(19, STRIDE))
     force = momentum(even_step(f, screen_of(normal, along, across, quadratic))) - start
     velocity = start + 0.5 * force
     normal_speed = velocity @ normal

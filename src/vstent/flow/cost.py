@@ -14,7 +14,7 @@ from vstent.flow.domain import INLET_EXTENSION, OUTLET_EXTENSION, default_cell_s
 from vstent.flow.engines.lattice_state import PHASES, steps_per_phase
 from vstent.flow.gpu import free_gpu_bytes
 from vstent.flow.types import FlowCase
-from vstent.kernels import lattice
+from vstent.kernels import lanes, lattice
 from vstent.kernels.warm import keep_flow
 
 BYTES_PER_CELL = 600
@@ -132,7 +132,7 @@ def _measured_rate(on_gpu: bool) -> float:
     length, threads = np.full(BLOCK_ROWS, 64, np.int32), numba.get_num_threads()
     stride = int(length.sum())
     address = (64 * np.arange(BLOCK_ROWS)[:, None] + stride * np.arange(19)).astype(np.int32)
-    f = np.zeros(19 * stride + lattice.COUNT, np.float32)
+    f = np.zeros(19 * stride + lanes.COUNT, np.float32)
     nothing = np.zeros(BLOCK_ROWS + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
     limit = np.full(BLOCK_ROWS, np.inf, np.float32)
     relaxation = np.float32(0.6), np.zeros(4, np.float32), limit, np.float32(0.7)

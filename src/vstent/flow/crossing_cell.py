@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.flow.engines.lattice_setup import linear_weights, quadratic_weights
-from vstent.kernels import lattice
+from vstent.kernels import lanes, lattice
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 RELAXATION_STEPS = 1.0
@@ -152,7 +152,7 @@ class _Grid:
     def __init__(self, wires: Wires, is_blood: Bools) -> None:
         self._shape, self._is_blood = wires.shape, is_blood
         self._stride = int(np.prod(wires.shape))
-        self._f = np.zeros(19 * self._stride + lattice.COUNT, np.float32)
+        self._f = np.zeros(19 * self._stride + lanes.COUNT, np.float32)
         cells = np.argwhere(is_blood)
         self._place = self._number(cells)
         self._address(cells)

@@ -22,7 +22,7 @@ _VECTOR: Final = ir.VectorType(_FLOAT, COUNT)
 _FAST: Final = ("fast",)
 
 
-class Lanes(types.Type):  # type: ignore[misc]
+class Lanes(types.Type):
     """Eight numbers."""
 
     def __init__(self) -> None:
@@ -32,8 +32,8 @@ class Lanes(types.Type):  # type: ignore[misc]
 LANES: Final = Lanes()
 
 
-@register_model(Lanes)  # type: ignore[untyped-decorator]
-class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
+@register_model(Lanes)
+class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _VECTOR)
 
@@ -54,7 +54,7 @@ def _is_pair(a: Any, b: Any) -> bool:
 def _arithmetic(operation: Callable[..., Any], instruction: str) -> None:
     """Let numba apply an operator to two Lanes, or to one and a number."""
 
-    @intrinsic  # type: ignore[untyped-decorator]
+    @intrinsic
     def apply(_: Any, a: Any, b: Any) -> Any:
         def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             pair = [_widened(builder, *one) for one in zip(signature.args, arguments, strict=True)]
@@ -62,7 +62,7 @@ def _arithmetic(operation: Callable[..., Any], instruction: str) -> None:
 
         return LANES(a, b), generate
 
-    @overload(operation)  # type: ignore[untyped-decorator]
+    @overload(operation)
     def chosen(a: Any, b: Any) -> Any:
         def on_lanes(a: Any, b: Any) -> Any:
             return apply(a, b)
@@ -79,7 +79,7 @@ for _operation, _instruction in (
     _arithmetic(_operation, _instruction)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _larger(_: Any, a: Any, b: Any) -> Any:
 
     def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -89,7 +89,7 @@ def _larger(_: Any, a: Any, b: Any) -> Any:
     return LANES(a, b), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _root(_: Any, a: Any) -> Any:
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
@@ -104,7 +104,7 @@ def larger(a: Any, b: Any) -> Any:
     return np.maximum(a, b)
 
 
-@overload(larger)  # type: ignore[untyped-decorator]
+@overload(larger)
 def _larger_chosen(a: Any, b: Any) -> Any:
     def of_lanes(a: Any, b: Any) -> Any:
         return _larger(a, b)
@@ -120,7 +120,7 @@ def root(a: Any) -> Any:
     return np.sqrt(a)
 
 
-@overload(root)  # type: ignore[untyped-decorator]
+@overload(root)
 def _root_chosen(a: Any) -> Any:
     def of_lanes(a: Any) -> Any:
         return _root(a)
@@ -144,7 +144,7 @@ def _row(context: Any, builder: Any, array: Any, value: Any, row: Any) -> Any:
     return builder.gep(held.data, [builder.mul(row, width)])
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def load(_: Any, array: Any, place: Any) -> Any:
     """Return the eight numbers of a float32 array (n,) from a place on."""
 
@@ -154,7 +154,7 @@ def load(_: Any, array: Any, place: Any) -> Any:
     return LANES(array, types.intp), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def gather(_: Any, array: Any, address: Any, row: Any, offset: Any) -> Any:
     """Return eight numbers of a float32 array (n,) from each address[row, q] + offset on, q = 0 to 18, as a tuple."""
 
@@ -168,10 +168,10 @@ def gather(_: Any, array: Any, address: Any, row: Any, offset: Any) -> Any:
             loaded.append(builder.load(pointer, align=4))
         return cgutils.pack_array(builder, loaded)
 
-    return types.UniTuple(LANES, 19)(array, address, types.intp, types.intp), generate
+    return types.containers.UniTuple(LANES, 19)(array, address, types.intp, types.intp), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def scatter(_: Any, array: Any, address: Any, row: Any, offset: Any, lanes: Any) -> Any:
     """Write a tuple of Lanes to where `gather` reads them."""
 
@@ -187,7 +187,7 @@ def scatter(_: Any, array: Any, address: Any, row: Any, offset: Any, lanes: Any)
     return types.void(array, address, types.intp, types.intp, lanes), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def store(_: Any, array: Any, place: Any, lanes: Any) -> Any:
     """Write eight numbers to a float32 array (n,) from a place on."""
 

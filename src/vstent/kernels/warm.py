@@ -9,7 +9,19 @@ from functools import cache
 
 import numpy as np
 
-from vstent.kernels import coverage, curves, lattice, lattice_sampling, medial, net, raster, tree, triangles, voxels
+from vstent.kernels import (
+    coverage,
+    curves,
+    lanes,
+    lattice,
+    lattice_sampling,
+    medial,
+    net,
+    raster,
+    tree,
+    triangles,
+    voxels,
+)
 from vstent.kernels.first_use import kept
 
 
@@ -67,7 +79,7 @@ def _slide(nodes_mm: np.ndarray) -> None:
 
 def flow() -> None:
     """Call every kernel of a flow on one cell at rest, with every argument of the type that a flow has."""
-    stride = lattice.COUNT
+    stride = lanes.COUNT
     f, none = np.zeros(20 * stride, np.float32), np.zeros(0, np.int32)
     lattice.update(
         f,

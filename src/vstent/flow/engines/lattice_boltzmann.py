@@ -106,19 +106,21 @@ def _steps_per_check(case: FlowCase, scales: Scales) -> int:
 def fraction_left(history: Floats) -> float:
     """Largest fraction that any column of a history (checks, quantities) has left to go; nan when one is not finite.
 
-    The last quarter of the checks is compared with the quarter before: if the change goes on shrinking as it does from
-    each quarter to the next, a geometric series is left.
+    What a quantity ranged over in the last third of the checks is compared with the third before: if it goes on
+    shrinking so from each third to the next, a geometric series is left. Of a quantity that swings as it settles, the
+    range tells how much; the change of its mean would pass through zero and tell nothing.
     """
     if not np.isfinite(history[-1]).all():
         return float("nan")
-    window = len(history) // 4
+    window = (len(history) - 1) // 3
     if window < 3:
         return float("inf")
-    means = [history[len(history) - (k + 1) * window : len(history) - k * window].mean(axis=0) for k in range(3)]
+    last, before = (
+        np.ptp(history[len(history) - 1 - (k + 1) * window : len(history) - k * window], axis=0) for k in range(2)
+    )
     scale = np.maximum(np.abs(history[-1]), 1e-12)
-    change, before = np.abs(means[0] - means[1]), np.abs(means[1] - means[2])
-    shrinking = np.clip(change / np.maximum(before, 1e-30), 0.3, 0.9)
-    return float((change / scale * shrinking / (1 - shrinking)).max())
+    shrinking = np.clip(last / np.maximum(before, 1e-30), 0.3, 0.9)
+    return float((last / scale * shrinking / (1 - shrinking)).max())
 
 
 def _advice(state: State, outcome: Outcome) -> str:

@@ -32,7 +32,7 @@ from vstent.flow.engines.lattice_setup import (
 from vstent.flow.gpu import require_gpu, told
 from vstent.flow.types import FlowCase, FlowField, Phase, Waveform
 from vstent.flow.wall_stress import wall_stress
-from vstent.kernels import lattice, lattice_sampling
+from vstent.kernels import lanes, lattice, lattice_sampling
 from vstent.kernels.arrays import Floats, Ints
 from vstent.kernels.warm import keep_flow
 from vstent.units import M_PER_MM
@@ -102,7 +102,7 @@ class State:
     limit: NDArray[np.float32]
     """(s,) largest cell Reynolds number in every segment."""
     populations: NDArray[np.float32]
-    """(19 * stride + lattice.COUNT,) shifted populations."""
+    """(19 * stride + lanes.COUNT,) shifted populations."""
     wanted: Floats
     """(k,) speed wanted at every opening at mean flow (see `lattice.drive`)."""
     steps_per_check: int
@@ -138,7 +138,7 @@ def build(case: FlowCase, scales: Scales, steps_per_check: int, *, start: FlowFi
         _probe(case, domain),
         build_refill(domain, addressing),
         np.where(is_end, CELL_REYNOLDS_AT_END, np.inf)[addressing.first_cell].astype(np.float32),
-        np.zeros(19 * addressing.stride + lattice.COUNT, dtype=np.float32),
+        np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
         links.openings[:, 1].copy(),
         steps_per_check,
         deque(maxlen=kept),
