@@ -1,5 +1,6 @@
 """The flow on a GPU: on numba's simulator, where there is none, as on the processor; and refused in words."""
 
+import json
 import os
 import pickle
 import subprocess
@@ -18,9 +19,12 @@ from vstent.flow import Blood, FlowCase, FlowSettings, Screen, domain, engine_cl
 from vstent.flow import gpu as gpus
 from vstent.flow.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
 from vstent.flow.engines import lattice_state
+from vstent.flow.engines.lattice_checkpoint import pack
 from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
 from vstent.flow.types import CarreauYasuda, Waveform
 from vstent.kernels import lattice
+from vstent.study import Settings, repeat
+from vstent.study.provenance import machine, provenance
 
 CELL_MM, RADIUS_MM, LENGTH_MM = 0.4, 0.8, 2.4
 SETTLED_PAIRS = 3 * lattice_state.DEFER_PAIRS
@@ -34,19 +38,14 @@ from dataclasses import replace
 from pathlib import Path
 import numpy as np
 from vstent.flow.engines.lattice_checkpoint import pack
-from vstent.flow.engines.lattice_state import _read_here, advance
+from vstent.flow.engines.lattice_state import _read_here, step
 
 state = pickle.loads(Path(sys.argv[1]).read_bytes())
 state.case = replace(state.case, settings=replace(state.case.settings, device_gpu=True))
-advance(state, 2)
-pack(state)
-state.device = None  # it is stopped and goes on from what was saved
-advance(state, 4)
-moment, outflow = state.device.read()
+step(state)
 saved = pack(state)
-np.testing.assert_array_equal(moment, _read_here(state)[0])
-names = "populations", "source", "openings", "refill"
-np.savez(sys.argv[2], moment=moment, outflow=outflow, **{name: saved[name] for name in names})
+np.testing.assert_array_equal(state.device.read()[0], _read_here(state)[0])
+np.savez(sys.argv[2], **saved)
 """
 
 
@@ -81,6 +80,7 @@ def everything() -> lattice_state.State:
     somewhere = a.place[::40]
     state.addressing = replace(a, swap_address=np.stack([a.stride + somewhere, 2 * a.stride + somewhere]))
     state.limit[::2] = 1.0
+    state.steps_per_check = 2 * SETTLED_PAIRS + 4
     return state
 
 
@@ -93,20 +93,16 @@ def test_a_gpu_makes_the_steps_that_a_processor_makes(tmp_path: Path, monkeypatc
     command = [sys.executable, "-W", "error", "-c", ON_GPU, str(tmp_path / "state"), str(tmp_path / "found.npz")]
     ran = subprocess.run(command, env=simulated, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
-    lattice_state.advance(state, 6)
-    moment, outflow = lattice_state._read_here(state)
-    wanted = {
-        "populations": state.populations,
-        "source": state.links.source,
-        "refill": state.refill.refill,
-        "moment": moment,
-        "outflow": outflow,
-    } | {f"openings {k}": state.links.openings[:, k] for k in (1, 2, 8)}
+    lattice_state.step(state)
+    wanted = pack(state)
     with np.load(tmp_path / "found.npz") as archive:
         found = dict(archive)
-    found |= {f"openings {k}": found["openings"][:, k] for k in (1, 2, 8)}
-    for name, values in wanted.items():
-        np.testing.assert_allclose(found[name], values, rtol=0, atol=ROUNDING * np.abs(values).max(), err_msg=name)
+    assert found["steps"] == wanted["steps"] == state.steps_per_check
+    for saved in (found, wanted):  # an opening's columns are of different sizes
+        saved |= {f"opening's {k}": column for k, column in enumerate(saved.pop("openings").T)}
+    for name in wanted.keys() - {"loop_seconds"}:
+        most = np.abs(wanted[name]).max()
+        np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=ROUNDING * most, err_msg=name)
 
 
 ASKED = FlowSettings(cell_size_mm=0.2, device_gpu=True)
@@ -173,3 +169,17 @@ def test_nobody_who_did_not_ask_for_a_gpu_loads_what_it_takes() -> None:
     code = "import sys, vstent.flow.engines.lattice_state, vstent.flow.cost; sys.exit('numba.cuda' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     assert numba.config.ENABLE_CUDASIM == 0
+
+
+def test_a_record_keeps_that_a_run_was_on_a_gpu_and_on_which(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = sys.modules["vstent.study.provenance"]  # its function goes by the same name
+    with monkeypatch.context() as on_gpu:
+        on_gpu.setattr(module, "gpu_name", lambda: "A100")
+        told = provenance(Path("a.stl"), "0", Settings(flow=ASKED), {})
+    assert told["machine"]["gpu"] == "A100"
+    again = repeat._settings(json.loads(json.dumps(told["settings"])))
+    assert again.flow is not None
+    assert again.flow.device_gpu
+    monkeypatch.setattr(gpus, "find_spec", lambda name: None)
+    assert "gpu (machine): A100 then, none now" in repeat._differences(told, again)
+    assert "gpu" not in machine(Settings())
