@@ -19,6 +19,7 @@ BLOOD = Blood(density_kg_m3=1056.0, viscosity_Pa_s=0.0035)
 INFLOW_ML_S = 5.20624
 INLET_MM, CONE_MM, THROAT_MM, WIDE_RADIUS_MM, RADIUS_MM = 4.0, 22.685, 40.0, 6.0, 2.0
 AROUND, EDGE_MM = 96, 0.5
+BEHIND_THE_STEP_MM = (8.0, 16.0, 24.0, 32.0, 60.0, 80.0)
 BEYOND = 0.03
 """How far outside the spread of the five a velocity may be, as a fraction of the section's peak."""
 
@@ -116,16 +117,39 @@ def test_a_round_jet_stays_round() -> None:
     assert np.abs(on_axes - on_diagonals).max() < 0.06 * field.speed_m_s.max()
 
 
+@pytest.fixture(scope="module")
+def jet() -> FlowField:
+    """The whole nozzle in cells of a third of a millimetre, 12 across the throat."""
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=1 / 3)
+    return simulate_case(FlowCase(nozzle(95.0), settings=settings))
+
+
 @pytest.mark.validation
-@pytest.mark.xfail(strict=True, reason="with 8 cells across the throat the jet breaks down before 60 mm")
-def test_the_jet_is_inside_the_spread_of_the_experiments(experiments: list[dict[str, np.ndarray]]) -> None:
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.5)
-    field = simulate_case(FlowCase(nozzle(95.0), settings=settings))
-    print(f"\n{len(field.cells)} cells, {field.steps} steps, {field.seconds:.0f} s: {field.advice}")  # noqa: T201
+def test_the_axis_of_the_jet_is_inside_the_spread_of_the_experiments(
+    jet: FlowField, experiments: list[dict[str, np.ndarray]]
+) -> None:
+    print(f"\n{len(jet.cells)} cells, {jet.steps} steps, {jet.seconds:.0f} s: {jet.advice}")  # noqa: T201
     worst = []
-    for z_mm in (-20.0, -8.0, 0.0, 8.0, 16.0, 24.0, 32.0, 60.0, 80.0):
-        profile, axis = outside(field, experiments, z_mm)
+    for z_mm in (-20.0, -8.0, 0.0, *BEHIND_THE_STEP_MM):
+        profile, axis = outside(jet, experiments, z_mm)
         worst.append(axis)
         print(f"z {z_mm:5.0f} mm: outside the spread by {profile:.1%} of the peak (profile), {axis:.1%} (axis)")  # noqa: T201
-    assert field.outlets_mL_s[0] == pytest.approx(field.inlet_mL_s, rel=1e-3)
+    assert jet.outlets_mL_s[0] == pytest.approx(jet.inlet_mL_s, rel=1e-3)
     assert max(worst) < BEYOND
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("z_mm", [-20.0, -8.0, 0.0])
+def test_the_profiles_up_to_the_step_are_inside_the_spread(
+    jet: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: float
+) -> None:
+    assert outside(jet, experiments, z_mm)[0] < BEYOND
+
+
+@pytest.mark.validation
+@pytest.mark.xfail(strict=True, reason="walls interpolated at the sharp lip turn the jet by half a degree")
+@pytest.mark.parametrize("z_mm", BEHIND_THE_STEP_MM)
+def test_the_profiles_behind_the_step_are_inside_the_spread(
+    jet: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: float
+) -> None:
+    assert outside(jet, experiments, z_mm)[0] < BEYOND

@@ -42,6 +42,20 @@ def test_the_velocity_set_is_isotropic_to_fourth_order():
     np.testing.assert_array_equal(c[lattice.OPPOSITE], -c)
 
 
+@pytest.mark.parametrize("cells", [1, 5, 8, 13, 16, 39])
+def test_a_segment_of_any_length_collides_as_its_cells_do_alone_and_no_other_is_touched(cells):
+    """Eight cells are worked on at once; none of them twice, and the next row is not written to."""
+    f = populations(7)
+    address = (np.arange(19) * STRIDE)[None].astype(np.int32)
+    relaxation = np.float32(1 / RATE), np.zeros(4, np.float32), np.float32([NO_LIMIT]), np.float32(ODD_RATE)
+    together = f.copy()
+    lattice.update(together, address, np.array([cells], np.int32), *relaxation, *NO_SCREEN, 1)
+    alone = f.copy()
+    for cell in range(cells):
+        lattice.update(alone, address + np.int32(cell), np.ones(1, np.int32), *relaxation, *NO_SCREEN, 1)
+    np.testing.assert_array_equal(together, alone)
+
+
 def test_a_collision_keeps_mass_and_momentum():
     f = populations()
     before, after = f[: -lanes.COUNT].reshape(19, STRIDE), even_step(f)

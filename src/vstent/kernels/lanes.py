@@ -81,7 +81,6 @@ for _operation, _instruction in (
 
 @intrinsic
 def _larger(_: Any, a: Any, b: Any) -> Any:
-
     def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         x, y = (_widened(builder, *one) for one in zip(signature.args, arguments, strict=True))
         return builder.select(builder.fcmp_ordered(">", x, y), x, y)
@@ -91,7 +90,6 @@ def _larger(_: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def _root(_: Any, a: Any) -> Any:
-
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
         return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{COUNT}f32"), arguments)
@@ -137,11 +135,14 @@ def _at(context: Any, builder: Any, array: Any, value: Any, place: Any) -> Any:
     return builder.bitcast(builder.gep(data, [place]), _VECTOR.as_pointer())
 
 
-def _row(context: Any, builder: Any, array: Any, value: Any, row: Any) -> Any:
-    """Pointer to the first entry of a row of an array (n, k) that is contiguous."""
-    held = context.make_array(array)(context, builder, value)
-    width = builder.extract_value(held.shape, 1)
-    return builder.gep(held.data, [builder.mul(row, width)])
+def _runs(context: Any, builder: Any, signature: Any, arguments: Any) -> list[Any]:
+    """Pointers to eight numbers of an array (n,) from each address[row, q] + offset on, q = 0 to 18."""
+    array, addresses, row, offset = arguments[:4]
+    held = context.make_array(signature.args[1])(context, builder, addresses)
+    entry = builder.gep(held.data, [builder.mul(row, builder.extract_value(held.shape, 1))])
+    starts = [builder.load(builder.gep(entry, [cgutils.intp_t(q)])) for q in range(19)]
+    places = [builder.add(builder.sext(start, cgutils.intp_t), offset) for start in starts]
+    return [_at(context, builder, signature.args[0], array, place) for place in places]
 
 
 @intrinsic
@@ -156,18 +157,17 @@ def load(_: Any, array: Any, place: Any) -> Any:
 
 @intrinsic
 def gather(_: Any, array: Any, address: Any, row: Any, offset: Any) -> Any:
-    """Return eight numbers of a float32 array (n,) from each address[row, q] + offset on, q = 0 to 18, as a tuple."""
+    """Return eight numbers of a float32 array (n,) from each address[row, q] + offset on, q = 0 to 18, as a tuple.
+
+    Rows of addresses must be contiguous.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        values, addresses, at, beyond = arguments
-        entry = _row(context, builder, signature.args[1], addresses, at)
-        loaded = []
-        for q in range(19):
-            start = builder.sext(builder.load(builder.gep(entry, [cgutils.intp_t(q)])), cgutils.intp_t)
-            pointer = _at(context, builder, signature.args[0], values, builder.add(start, beyond))
-            loaded.append(builder.load(pointer, align=4))
-        return cgutils.pack_array(builder, loaded)
+        runs = _runs(context, builder, signature, arguments)
+        return cgutils.pack_array(builder, [builder.load(run, align=4) for run in runs])
 
+    if address.layout != "C":
+        return None
     return types.containers.UniTuple(LANES, 19)(array, address, types.intp, types.intp), generate
 
 
@@ -176,14 +176,13 @@ def scatter(_: Any, array: Any, address: Any, row: Any, offset: Any, lanes: Any)
     """Write a tuple of Lanes to where `gather` reads them."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        values, addresses, at, beyond, written = arguments
-        entry = _row(context, builder, signature.args[1], addresses, at)
-        for q, one in enumerate(cgutils.unpack_tuple(builder, written)):
-            start = builder.sext(builder.load(builder.gep(entry, [cgutils.intp_t(q)])), cgutils.intp_t)
-            pointer = _at(context, builder, signature.args[0], values, builder.add(start, beyond))
-            builder.store(one, pointer, align=4)
+        runs = _runs(context, builder, signature, arguments)
+        for run, one in zip(runs, cgutils.unpack_tuple(builder, arguments[4]), strict=True):
+            builder.store(one, run, align=4)
         return context.get_dummy_value()
 
+    if address.layout != "C":
+        return None
     return types.void(array, address, types.intp, types.intp, lanes), generate
 
 
