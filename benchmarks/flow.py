@@ -93,7 +93,7 @@ def elsewhere(of_core: float) -> None:
     }
     print(
         f"\nComputed, not measured: a node of {NODE_CORES} cores like this one, {NODE_GB_S:.0f} GB/s together; a GPU "
-        f"of {GPU_GB_S:.0f} GB/s at {GPU_SHARE:.0%} of that (vstent does not run on one yet).\n"
+        f"of {GPU_GB_S:.0f} GB/s at {GPU_SHARE:.0%} of that (`benchmarks/gpu.py` measures it where there is one).\n"
     )
     print("| machine | million updates/s | demo, 0.1 mm, bare, steady | two cycles |\n|---|---|---|---|")
     for name, rate in limits.items():

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest import mock
 
 import numpy as np
 import pydicom
@@ -291,6 +292,12 @@ def named(folder: Path) -> list[str]:
     return ["trace", str(path), "--out", str(folder / "Fälle 2026" / "Müller's 'case'"), "--units", "mm"]
 
 
+def on_gpu(folder: Path) -> list[str]:
+    """Compute the artery's flow on a GPU."""
+    write_stl(folder / "artery.stl", artery())
+    return ["flow", str(folder / "artery.stl"), "--out", "OUT", "--device-gpu"]
+
+
 def into_a_file(folder: Path) -> list[str]:
     """Trace into a path that is a file."""
     write_stl(folder / "artery.stl", artery())
@@ -363,6 +370,13 @@ def full_disk(_: Path) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@contextlib.contextmanager
+def no_gpu(_: Path) -> Iterator[None]:
+    """Hide what it takes to use a GPU, where it is installed."""
+    with mock.patch("vstent.flow.gpu.find_spec", return_value=None):
+        yield
 
 
 @contextlib.contextmanager
@@ -626,6 +640,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(MACHINE, "link that leads to itself", linked, INPUT, "does not exist"),
     Fault(MACHINE, "case folder below a file", into_a_file, FAILED, "give another --out"),
     Fault(MACHINE, "case folder that another run works in", run(), FAILED, "is in use by process", claimed),
+    Fault(MACHINE, "GPU asked for where there is none", on_gpu, FAILED, "without --device-gpu", no_gpu),
     Fault(MACHINE, "disk full", run(), FAILED, "make room", full_disk),
     Fault(MACHINE, "kept stages that unpack to 16 GB", bombed_cache, DONE, "", is_heavy=True),
 )

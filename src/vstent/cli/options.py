@@ -103,6 +103,7 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         "--engine", default="lattice_boltzmann", metavar="NAME", help="openfoam, or a plug-in that computes the flow"
     )
     flow.add_argument("-j", "--processes", type=_jobs, default=1, metavar="N", help="processes for OpenFOAM (1)")
+    flow.add_argument("--device-gpu", action="store_true", help="compute the flow on an NVIDIA GPU (the extra gpu)")
     flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
     return flow
 
@@ -235,7 +236,10 @@ def given_devices(arguments: argparse.Namespace) -> tuple[str, ...]:
 def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
     """Collect what was said of the flow."""
     from vstent.flow import FlowSettings
+    from vstent.flow.gpu import require_gpu
 
+    if arguments.device_gpu:
+        require_gpu()  # before anything else is computed
     return FlowSettings(
         inflow_mL_s=arguments.flow_rate,
         blood=_blood(arguments),
@@ -244,6 +248,7 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
         cell_size_mm=arguments.cell_size,
         engine=arguments.engine,
         processes=arguments.processes,
+        device_gpu=arguments.device_gpu,
     )
 
 

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 from vstent import plugins
+from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
@@ -144,7 +145,19 @@ def engine_class(settings: FlowSettings) -> type[AbstractEngine[Any]]:
     ------
     PluginError
         When there is none.
+    FlowError
+        When it is to run on a GPU and does not.
     """
+    engine = _engine_of(settings)
+    if settings.device_gpu and not engine.runs_on_gpu:
+        raise FlowError(
+            f"the engine {settings.engine} does not compute on a GPU: leave out --device-gpu (device_gpu), or take "
+            f"{LATTICE}"
+        )
+    return engine
+
+
+def _engine_of(settings: FlowSettings) -> type[AbstractEngine[Any]]:
     from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
     from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
     from vstent.flow.engines.openfoam import OpenFoam

@@ -1,5 +1,6 @@
 """What a flow will cost, told before it is spent; what does not fit in the memory is refused."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from vstent.errors import FlowError
 from vstent.flow.domain import INLET_EXTENSION, OUTLET_EXTENSION, default_cell_size_mm
 from vstent.flow.engines.lattice_state import PHASES, steps_per_phase
+from vstent.flow.gpu import free_gpu_bytes
 from vstent.flow.types import FlowCase
 from vstent.kernels import lanes, lattice
 from vstent.kernels.warm import keep_flow
@@ -22,6 +24,8 @@ BYTES_PER_PHASE_AND_CELL = 32
 """Memory for every kept phase of a cycle and its cell."""
 BYTES_PER_GRID_POINT = 6
 """Memory per point of the box around the vessel (3 measured)."""
+GPU_BYTES_PER_CELL = 320
+"""Memory of a GPU per blood cell (sums of its arrays: 302 on 31,000 cells of the demo, 214 on 169,000)."""
 BYTES_AT_LEAST = 4.5e8
 """Memory of the program itself, its compiled kernels and one surface."""
 WHOLE_OVER_BLOCK = 1.3
@@ -60,11 +64,12 @@ def estimate(case: FlowCase) -> Cost:
     cell_size_mm = default_cell_size_mm(case)
     cells, memory_bytes = _size(case, cell_size_mm)
     steps = _steps(case, cell_size_mm)
-    return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, cells * steps / block_rate() * WHOLE_OVER_BLOCK)
+    seconds = cells * steps / block_rate(on_gpu=case.settings.device_gpu) * WHOLE_OVER_BLOCK
+    return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds)
 
 
-def refuse_too_large(case: FlowCase, free_bytes: float | None = None) -> None:
-    """Refuse a flow that does not fit in the free memory.
+def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes: float | None = None) -> None:
+    """Refuse a flow that does not fit in the free memory, or in the GPU's where it is to run on one.
 
     Raises
     ------
@@ -72,16 +77,24 @@ def refuse_too_large(case: FlowCase, free_bytes: float | None = None) -> None:
         Naming the cell size that would fit.
     """
     free_bytes = free_memory_bytes() if free_bytes is None else free_bytes
+    _refuse(case, lambda cell_mm: _size(case, cell_mm)[1], free_bytes, "memory")
+    if case.settings.device_gpu:
+        gpu_bytes = free_gpu_bytes() if gpu_bytes is None else gpu_bytes
+        _refuse(case, lambda cell_mm: GPU_BYTES_PER_CELL * _size(case, cell_mm)[0], gpu_bytes, "the GPU's memory")
+
+
+def _refuse(case: FlowCase, needed_bytes: Callable[[float], float], free_bytes: float, of: str) -> None:
+    """Refuse a flow that needs more than is free, by the cell size, of some memory."""
     cell_size_mm = default_cell_size_mm(case)
-    cells, memory_bytes = _size(case, cell_size_mm)
-    if memory_bytes <= free_bytes:
+    if needed_bytes(cell_size_mm) <= free_bytes:
         return
     fitting_mm = cell_size_mm
-    while _size(case, fitting_mm)[1] > free_bytes and fitting_mm < 1e3 * cell_size_mm:
+    while needed_bytes(fitting_mm) > free_bytes and fitting_mm < 1e3 * cell_size_mm:
         fitting_mm *= MARGIN
     raise FlowError(
-        f"the flow on {cells / 1e6:.3g} million cells of {cell_size_mm:.3g} mm needs {memory_bytes / 1e9:.2g} GB, but "
-        f"{free_bytes / 1e9:.2g} GB of memory are free: set a cell size of {fitting_mm:.2g} mm"
+        f"the flow on {_size(case, cell_size_mm)[0] / 1e6:.3g} million cells of {cell_size_mm:.3g} mm needs "
+        f"{needed_bytes(cell_size_mm) / 1e9:.2g} GB, but {free_bytes / 1e9:.2g} GB of {of} are free: set a cell size "
+        f"of {fitting_mm:.2g} mm"
     )
 
 
@@ -108,9 +121,13 @@ def _steps(case: FlowCase, cell_size_mm: float) -> int:
     return steps_per_phase(case, cell_size_mm, None) * PHASES * settings.max_cycles
 
 
+def block_rate(*, on_gpu: bool = False) -> float:
+    """Cell updates per second in a block of blood without walls, measured once on what it will be computed with."""
+    return _measured_rate(on_gpu)
+
+
 @cache
-def block_rate() -> float:
-    """Cell updates per second in a block of blood without walls, measured with the threads that will be used."""
+def _measured_rate(on_gpu: bool) -> float:
     keep_flow()
     length, threads = np.full(BLOCK_ROWS, 64, np.int32), numba.get_num_threads()
     stride = int(length.sum())
@@ -119,6 +136,10 @@ def block_rate() -> float:
     nothing = np.zeros(BLOCK_ROWS + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
     limit = np.full(BLOCK_ROWS, np.inf, np.float32)
     relaxation = np.float32(0.6), np.zeros(4, np.float32), limit, np.float32(0.7)
+    if on_gpu:
+        from vstent.flow.engines.lattice_gpu import seconds_of_update
+
+        return stride / seconds_of_update(f, address, length, relaxation, nothing)
     times: list[float] = []
     for _ in range(4):
         began = perf_counter()

@@ -120,6 +120,8 @@ class FlowSettings:
     """What computes the flow: ``lattice_boltzmann``, ``openfoam``, or the name of a plug-in (`vstent.plugins`)."""
     processes: int = 1
     """Processes on this machine, for OpenFOAM."""
+    device_gpu: bool = False
+    """Whether vstent's own engine computes on a GPU (the extra ``gpu``): results differ in the last bits."""
 
     def inflow_factor(self, time_s: Floats) -> Floats:
         """Inflow over mean inflow at times (t,)."""

@@ -5,6 +5,7 @@ ends of every run of them; a few dozen cells long, they are most of the time. Wh
 Arithmetic is numba's fast one: sums may be reordered, products and sums fused.
 """
 
+import math
 import operator
 from collections.abc import Callable
 from typing import Any, Final
@@ -123,7 +124,7 @@ def _root_chosen(a: Any) -> Any:
         return _root(a)
 
     def of_number(a: Any) -> Any:
-        return np.sqrt(a)
+        return math.sqrt(a)  # unlike numpy's it is there on a GPU too
 
     return of_lanes if a == LANES else of_number
 

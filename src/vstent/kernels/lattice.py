@@ -22,8 +22,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from vstent.kernels.arrays import Floats, Ints
-from vstent.kernels.collision import collided, collided_screened, departure, moments_of, resist
-from vstent.kernels.lanes import COUNT, gather, load, root, scatter, store
+from vstent.kernels.collision import collided, collided_screened, resist, stress_size, thinned
+from vstent.kernels.lanes import COUNT, gather, load, scatter, store
 
 VELOCITIES: Final[Ints] = np.array(
     [[0, 0, 0]]
@@ -49,13 +49,14 @@ SLOWLY: Final = 0.1
 SEGMENT: Final = 128
 """Longest segment, in cells."""
 
-_ZERO, _ONE, _THREE_HALVES, _TWO = (np.float32(x) for x in (0.0, 1.0, 1.5, 2.0))
+_ZERO = np.float32(0.0)
+_ROOT_THREE: Final = float(np.sqrt(3.0))
 _U = np.uint64
 _WIDE = SEGMENT + COUNT
 
 
 @njit(cache=True, inline="always")
-def _even(q: int, density: float, ux: float, uy: float, uz: float) -> float:
+def even_part(q: int, density: float, ux: float, uy: float, uz: float) -> float:
     """Even part of the equilibrium of population q over its weight (see `vstent.kernels.collision`)."""
     cx, cy, cz = VELOCITIES[q, 0], VELOCITIES[q, 1], VELOCITIES[q, 2]
     along = cx * ux + cy * uy + cz * uz
@@ -66,21 +67,11 @@ def _even(q: int, density: float, ux: float, uy: float, uz: float) -> float:
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _thin(f: Any, address: Any, s: int, n: int, time: float, law: Any, times: Any) -> None:
-    """Relaxation times of a segment of n cells whose blood thins with the shear rate, from the stress that they hold.
-
-    Strain rate = 1.5 / time of the second moments' departure from equilibrium (Boyd, Buick and Green 2006, J. Phys. A
-    39, 14241, eq. 9), which depends on the time sought: three rounds from blood at rest.
-    """
+    """Relaxation times of a segment of n cells whose blood thins with the shear rate, from the stress they hold."""
     for k in range(0, n, COUNT):
-        _, u, flux = moments_of(gather(f, address, s, k))
-        xx, yy, zz, xy, xz, yz = departure(flux, u)
-        store(times, k, root(_TWO * (xx * xx + yy * yy + zz * zz + _TWO * (xy * xy + xz * xz + yz * yz))))
+        store(times, k, stress_size(gather(f, address, s, k)))
     for k in range(n):
-        size, found = times[k], time + law[0]
-        for _ in range(3):
-            rate = _THREE_HALVES * size / found
-            found = time + law[0] * (_ONE + (law[1] * rate) ** law[2]) ** law[3]
-        times[k] = found
+        times[k] = thinned(times[k], time, law)
 
 
 @njit(cache=True, error_model="numpy")
@@ -277,7 +268,7 @@ def set_equilibrium(f: Any, stride: int, places: Any, density: Any, velocity: An
         ux, uy, uz = velocity[i, 0], velocity[i, 1], velocity[i, 2]
         for q in range(19):
             along = VELOCITIES[q, 0] * ux + VELOCITIES[q, 1] * uy + VELOCITIES[q, 2] * uz
-            f[q * stride + places[i]] = WEIGHTS[q] * (_even(q, density[i], ux, uy, uz) + 3.0 * along)
+            f[q * stride + places[i]] = WEIGHTS[q] * (even_part(q, density[i], ux, uy, uz) + 3.0 * along)
 
 
 @njit(cache=True)
@@ -292,7 +283,8 @@ def resisted(velocity: Any, entries: Any) -> Any:
 
 
 @njit(cache=True, inline="always")
-def _velocity(f: Any, stride: int, place: int) -> tuple[float, float, float]:
+def velocity_at(f: Any, stride: int, place: int) -> tuple[float, float, float]:
+    """Momentum of the populations of a storage place, all being at home."""
     ux = uy = uz = 0.0
     for q in range(1, 19):
         population = f[q * stride + place]
@@ -300,6 +292,35 @@ def _velocity(f: Any, stride: int, place: int) -> tuple[float, float, float]:
         uy += VELOCITIES[q, 1] * population
         uz += VELOCITIES[q, 2] * population
     return ux, uy, uz
+
+
+@njit(cache=True, forceinline=True)
+def inflow_speed(opening: Any, density: float) -> float:
+    """Speed that inflow answers a mean density with; `opening` (9,) as in `drive`, what it remembers changes."""
+    # Against a high resistance the flow itself waits for the mean: forget faster the higher the pressure.
+    resistance = abs(density) / max(abs(opening[1]), 1e-6)
+    rate = min(1.0, opening[3] * (1.0 + resistance / _ROOT_THREE))
+    opening[2] += rate * (density - opening[2])
+    speed: float = opening[1] - (density - opening[2]) / _ROOT_THREE
+    return speed
+
+
+@njit(cache=True, forceinline=True)
+def outlet_density(opening: Any, flow: float) -> float:
+    """Density deviation that an outlet answers a flow through it with; what `opening` (9,) remembers changes."""
+    excess = flow / opening[7] - opening[1]
+    opening[2] += opening[3] * excess
+    opening[8] += SLOWLY * (opening[2] + _ROOT_THREE * excess - opening[8])
+    density: float = opening[8]
+    return density
+
+
+@njit(cache=True, forceinline=True)
+def outlet_source(f: Any, stride: int, place: int, q: int, opening: Any, density: float) -> float:
+    """What an outlet (9,) of this density deviation sends back along velocity q at a storage place."""
+    ux, uy, uz = velocity_at(f, stride, place)
+    inward = max(0.0, -(ux * opening[4] + uy * opening[5] + uz * opening[6]))
+    return 2.0 * WEIGHTS[q] * even_part(q, density - 1.5 * inward * inward, ux, uy, uz)
 
 
 @njit(cache=True)
@@ -350,25 +371,14 @@ def drive(
     that leaves would, about a mean that moves until no excess is left.
     """
     for k in range(len(openings)):
-        first, last = start[k], start[k + 1]
-        density = openings[k, 1]
-        if openings[k, 0] == INFLOW:
-            density = _density(f, stride, place[first:last])
-            # Against a high resistance the flow itself waits for the mean: forget faster the higher the pressure.
-            resistance = abs(density) / max(abs(openings[k, 1]), 1e-6)
-            rate = min(1.0, openings[k, 3] * (1.0 + resistance / np.sqrt(3.0)))
-            openings[k, 2] += rate * (density - openings[k, 2])
-            speed = openings[k, 1] - (density - openings[k, 2]) / np.sqrt(3.0)
+        opening, first, last = openings[k], start[k], start[k + 1]
+        if opening[0] == INFLOW:
+            speed = inflow_speed(opening, _density(f, stride, place[first:last]))
             for n in range(first, last):
                 source[n] = (shape[n, 0] + shape[n, 1] * speed) * speed
             continue
-        if openings[k, 0] == OUTFLOW:
-            excess = outflow(f, address[first:last]) / openings[k, 7] - openings[k, 1]
-            openings[k, 2] += openings[k, 3] * excess
-            openings[k, 8] += SLOWLY * (openings[k, 2] + np.sqrt(3.0) * excess - openings[k, 8])
-            density = openings[k, 8]
+        density = opening[1]
+        if opening[0] == OUTFLOW:
+            density = outlet_density(opening, outflow(f, address[first:last]))
         for n in range(first, last):
-            q = direction[n]
-            ux, uy, uz = _velocity(f, stride, place[n])
-            inward = max(0.0, -(ux * openings[k, 4] + uy * openings[k, 5] + uz * openings[k, 6]))
-            source[n] = 2.0 * WEIGHTS[q] * _even(q, density - 1.5 * inward * inward, ux, uy, uz)
+            source[n] = outlet_source(f, stride, place[n], direction[n], opening, density)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from vstent.device import find_design
+from vstent.flow.gpu import gpu_name
 from vstent.study.ledger import key_of
 from vstent.study.types import Settings
 
@@ -21,7 +22,7 @@ def provenance(path: Path, source: str, settings: Settings, seconds: Mapping[str
     """Return versions, machine, devices, input with its hash `source`, settings, and the seconds of every stage."""
     return {
         "versions": versions(),
-        "machine": machine(),
+        "machine": machine(settings),
         "devices": devices_of(settings.devices),
         "input": {"name": "DICOM folder" if path.is_dir() else path.name, "sha256": source},
         "settings": asdict(settings),
@@ -35,9 +36,10 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
 
 
-def machine() -> dict[str, str]:
+def machine(settings: Settings) -> dict[str, str]:
     """Return what of the machine can change the last bits of a number."""
-    return {"system": platform.system(), "processor": platform.machine()}
+    uses_gpu = settings.flow is not None and settings.flow.device_gpu
+    return {"system": platform.system(), "processor": platform.machine()} | ({"gpu": gpu_name()} if uses_gpu else {})
 
 
 def devices_of(names: Iterable[str]) -> dict[str, str]:

@@ -83,7 +83,7 @@ def _settings(told: Mapping[str, Any]) -> Settings:
 
 
 def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]:
-    now = {"versions": versions(), "machine": machine(), "devices": devices_of(settings.devices)}
+    now = {"versions": versions(), "machine": machine(settings), "devices": devices_of(settings.devices)}
     return tuple(
         f"{name.replace('_', ' ')} ({part}): {told.get(part, {}).get(name, MISSING)} then, {value} now"
         for part, values in now.items()

@@ -82,6 +82,8 @@ class AbstractEngine(ABC, Generic[State]):
     """Cells of a first guess by the same engine over those of the answer; None: it finds its own way from the start."""
     refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm",)
     """Settings that the result converges with as they become smaller; the cell size is the first."""
+    runs_on_gpu: ClassVar[bool] = False
+    """Whether it heeds ``device_gpu``; where it does not, it is not asked."""
 
     def cost(self, case: FlowCase) -> str:
         """Say in a sentence what a flow will cost.

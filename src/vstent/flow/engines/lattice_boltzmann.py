@@ -11,6 +11,7 @@ from vstent.flow.engines.lattice_checkpoint import pack, unpack
 from vstent.flow.engines.lattice_setup import Scales
 from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, peak_speed_m_s, read, step
 from vstent.flow.engines.lattice_trouble import trouble
+from vstent.flow.gpu import require_gpu
 from vstent.flow.types import FlowCase, FlowField
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
@@ -37,9 +38,12 @@ class AbstractLattice(AbstractEngine[State]):
 
     coarsening: ClassVar[float | None] = 2.0
     refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm", "lattice_speed")
+    runs_on_gpu: ClassVar[bool] = True
 
     def cost(self, case: FlowCase) -> str:
         """Say how many cells and steps, how much memory and time."""
+        if case.settings.device_gpu:
+            require_gpu()
         refuse_too_large(case)
         return str(estimate(case))
 

@@ -13,6 +13,8 @@ from vstent.units import M_PER_MM
 
 def pack(state: State) -> Saved:
     """All of a run that its case and grid do not say."""
+    if state.device is not None:
+        state.device.fetch(state)
     snapshots = state.snapshots
     n = len(state.domain.cells)
     return {

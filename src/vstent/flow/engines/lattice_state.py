@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import ceil
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
@@ -28,12 +29,16 @@ from vstent.flow.engines.lattice_setup import (
     build_screen,
     in_extensions,
 )
+from vstent.flow.gpu import require_gpu, told
 from vstent.flow.types import FlowCase, FlowField, Phase, Waveform
 from vstent.flow.wall_stress import wall_stress
 from vstent.kernels import lanes, lattice, lattice_sampling
 from vstent.kernels.arrays import Floats, Ints
 from vstent.kernels.warm import keep_flow
 from vstent.units import M_PER_MM
+
+if TYPE_CHECKING:
+    from vstent.flow.engines.lattice_gpu import Device
 
 DEFER_PAIRS = 8
 """Step pairs between updates of what is deferred."""
@@ -73,7 +78,10 @@ class Snapshot:
 
 @dataclass(eq=False)
 class State:
-    """A run under way; the populations and the links' sources change in place."""
+    """A run under way; the populations and the links' sources change in place.
+
+    On a GPU they change there: what is here is what they were when the run went there, or was last saved.
+    """
 
     case: FlowCase
     """What is computed."""
@@ -107,10 +115,14 @@ class State:
     """Monitored quantities at every check."""
     loop_seconds: float = 0.0
     """Time spent in the time steps."""
+    device: "Device | None" = None
+    """The run on a GPU, once it is there."""
 
 
 def build(case: FlowCase, scales: Scales, steps_per_check: int, *, start: FlowField | None, kept: int) -> State:
     """Build grid, storage and coefficients; begin at rest or from a field on any grid; `kept` checks are remembered."""
+    if case.settings.device_gpu:
+        require_gpu()
     keep_flow()
     domain = domains.build(case.vessel, scales.cell_m / M_PER_MM)
     is_end = in_extensions(case, domain)
@@ -209,15 +221,34 @@ def _slice_steps(state: State) -> int:
 
 def advance(state: State, steps: int) -> None:
     """Make an even number of time steps, in pairs."""
+    middle = state.steps + 1 + np.arange(0, steps, 2)
+    factor = state.case.settings.inflow_factor(np.float64(state.scales.step_s) * middle)
+    first_pair = state.steps % state.steps_per_check // 2
+    if state.case.settings.device_gpu:
+        with told():
+            _device(state).advance(factor, first_pair)
+    else:
+        _advance_here(state, factor, first_pair)
+    state.steps += steps
+
+
+def _device(state: State) -> "Device":
+    """Return the run on the GPU; the first time, put it there."""
+    from vstent.flow.engines.lattice_gpu import Device
+
+    if state.device is None:
+        state.device = Device(state)
+    return state.device
+
+
+def _advance_here(state: State, factor: Floats, first_pair: int) -> None:
+    """Make a pair of steps for every factor (pairs,) of the mean flow; the first is that pair since a check."""
     f, links, refill = state.populations, state.links, state.refill
     a, screen = state.addressing, state.screen
     threads = numba.get_num_threads()
     scales = state.scales
     relaxation = np.float32(scales.relaxation_steps), scales.thinning, state.limit, np.float32(ODD_RATE)
     opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
-    middle = state.steps + 1 + np.arange(0, steps, 2)
-    factor = state.case.settings.inflow_factor(np.float64(scales.step_s) * middle)
-    first_pair = state.steps % state.steps_per_check // 2
     for pair in range(len(factor)):
         links.openings[:, 1] = state.wanted * factor[pair]
         lattice.drive(
@@ -248,18 +279,23 @@ def advance(state: State, steps: int) -> None:
             part = np.float32(DEFER_PART)
             lattice.defer(f, links.address[wall], links.correction[wall], links.source[wall], part)
             lattice.balance(f, links.address[wall], refill.link_group, refill.count, refill.member, refill.refill, part)
-    state.steps += steps
 
 
 def _snapshot(state: State) -> Snapshot:
-    moment = lattice.moments(state.populations, state.addressing.stride, state.addressing.place).astype(np.float32)
+    moment, outflow = _read_here(state) if state.device is None else state.device.read()
     velocity = np.ascontiguousarray(moment[:, 1:])
     if len(state.screen.cell):
         velocity[state.screen.cell] = lattice.resisted(velocity[state.screen.cell], state.screen.entry)
-    links = state.links
+    return Snapshot(velocity, moment[:, 0], outflow)
+
+
+def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
+    """Density deviation and momentum (n, 4) of every cell, and the flow out (k,) through every opening."""
+    f, links = state.populations, state.links
+    moment = lattice.moments(f, state.addressing.stride, state.addressing.place).astype(np.float32)
     ends = range(len(links.start) - 1)
-    outflow = [lattice.outflow(state.populations, links.address[links.start[k] : links.start[k + 1]]) for k in ends]
-    return Snapshot(velocity, moment[:, 0], np.array(outflow))
+    outflow = [lattice.outflow(f, links.address[links.start[k] : links.start[k + 1]]) for k in ends]
+    return moment, np.array(outflow)
 
 
 def _monitor(state: State, now: Snapshot) -> Floats:

@@ -1,0 +1,84 @@
+"""Whether a flow can be computed on a GPU: where it is asked for, never required."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import Final
+
+from vstent.errors import FlowError
+
+PACKAGE: Final = "numba_cuda"
+"""Compiles kernels for a GPU; an extra."""
+ELSE: Final = "or compute on the processor, without --device-gpu (device_gpu)"
+"""What can be done in any case."""
+
+
+def require_gpu() -> None:
+    """See that there is a GPU and what it takes to use it.
+
+    Raises
+    ------
+    FlowError
+        Naming what is missing, and how to get it.
+    """
+    import numba
+
+    if find_spec(PACKAGE) is None and not numba.config.ENABLE_CUDASIM:
+        raise FlowError(
+            "the flow cannot be computed on a GPU, for numba-cuda is not installed: give pip install 'vstent[gpu]', "
+            f"{ELSE}"
+        )
+    try:
+        from numba import cuda
+
+        if cuda.is_available():
+            return
+        complaint = cuda.cuda_error()
+    except (ImportError, OSError, RuntimeError):  # a library of CUDA's that cannot be loaded
+        complaint = None
+    if complaint is None:
+        raise FlowError(
+            "the flow cannot be computed on this GPU, for CUDA's compiler is not installed: give "
+            f"pip install 'numba-cuda[cu12]' (cu13 with a driver from 580 on), {ELSE}"
+        )
+    raise FlowError(
+        "the flow cannot be computed on a GPU, for no NVIDIA GPU with its driver is found on this machine: see what "
+        f"nvidia-smi lists, {ELSE}"
+    )
+
+
+@contextmanager
+def told() -> Iterator[None]:
+    """Make a sentence of what a GPU, its driver or its compiler refuse.
+
+    Raises
+    ------
+    FlowError
+        With their own first words.
+    """
+    try:
+        yield
+    except Exception as error:  # each of them raises its own
+        words = next(iter(str(error).splitlines()), type(error).__name__)
+        raise FlowError(
+            f"the GPU did not compute the flow ({words}): see what nvidia-smi says of it, {ELSE}"
+        ) from error
+
+
+def gpu_name() -> str:
+    """Name of the GPU that flows are computed on; "none" where there is none."""
+    try:
+        require_gpu()
+    except FlowError:
+        return "none"
+    from numba import cuda
+
+    name = cuda.get_current_device().name
+    return name.decode() if isinstance(name, bytes) else str(name)
+
+
+def free_gpu_bytes() -> float:
+    """Memory of the GPU that can be had."""
+    from numba import cuda
+
+    return float(cuda.current_context().get_memory_info()[0])
