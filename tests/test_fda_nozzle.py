@@ -120,7 +120,7 @@ def test_a_round_jet_stays_round() -> None:
 @pytest.fixture(scope="module")
 def jet() -> FlowField:
     """The whole nozzle in cells of a third of a millimetre, 12 across the throat."""
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=1 / 3)
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=1 / 3, max_steps=60_000)
     return simulate_case(FlowCase(nozzle(95.0), settings=settings))
 
 

@@ -26,7 +26,7 @@ CHECKS_AVERAGED = 8
 """Checks whose mean is the result where the flow does not settle."""
 
 
-SLOWER: Final = 0.4
+SLOWER: Final = 0.3
 """A run that diverged is tried once more with a time step so much shorter."""
 
 
