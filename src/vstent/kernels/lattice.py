@@ -147,7 +147,7 @@ def update(
 
     Parameters
     ----------
-    f : (19 * stride + COUNT,) float32 populations, in place; short segments are read beyond their end.
+    f : (19 * stride + COUNT,) float32 populations, in place; they may be read up to COUNT - 1 places beyond a segment.
     address : (segments, 19) int32, where the populations of each segment begin: its own in an even step, its
         neighbours' in an odd one.
     length : (segments,) int32 cells of each segment, at most SEGMENT.
