@@ -106,12 +106,12 @@ def test_a_screen_without_resistance_changes_nothing() -> None:
 
 def test_a_screen_costs_the_pressure_of_its_law() -> None:
     resistance, slow_mL_s = 4000.0, 0.3  # so slow that evening out the profile and back costs nothing beside it
-    settings = replace(SETTINGS, cell_size_mm=0.25, inflow_mL_s=slow_mL_s)
+    settings = replace(SETTINGS, cell_size_mm=0.18, inflow_mL_s=slow_mL_s)  # 0.19 to 0.25: 0 to 4 % too little
     field = simulate_case(FlowCase(tube(), screen=disc(resistance), settings=settings))
     before, after = sampling.values_at(field, np.array([[0, 0, 3.0], [0, 0, 11.0]]))[1][:: int(along(field))]
     gradient = 8 * 0.004 * slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 4)
     mean_speed = slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 2)
-    assert before - after - gradient * 8e-3 == pytest.approx(resistance * mean_speed, rel=0.02)
+    assert before - after - gradient * 8e-3 == pytest.approx(resistance * mean_speed, rel=0.01)
 
 
 @pytest.mark.parametrize("outlets", ["murray", "zero_pressure"])

@@ -11,11 +11,13 @@ from vstent import device
 from vstent.errors import FlowError
 from vstent.flow import Blood, FlowCase, FlowSettings, domain, screen
 from vstent.flow.engines import AbstractEngine, run
-from vstent.flow.engines.lattice_boltzmann import fraction_left
+from vstent.flow.engines.lattice_boltzmann import field_left, fraction_left
 from vstent.flow.profile import developed_profile
 from vstent.flow.screen import CROSSING_PER_SOLIDITY, crossing_factor, drag_per_length, inertial_loss, on_grid
 from vstent.flow.wall_stress import wall_stress
 from vstent.stent import Stent
+from vstent.surface import Surface
+from vstent.vessel import Opening, Vessel
 
 DIAMETER_MM, LENGTH_MM, N_WIRES = 4.0, 10.0, 48
 
@@ -126,6 +128,45 @@ def test_the_grid_of_a_tube_has_its_volume_its_ends_and_exact_wall_distances():
     assert len(grid.septum_cell) == 0
 
 
+def duct(section_mm: list[tuple[float, float]], length_mm: float = 6.0) -> Vessel:
+    """A prism along z over a polygon, counterclockwise; blood enters at its low end."""
+    corners = np.array(section_mm)
+    sides = np.roll(corners, -1, axis=0) - corners
+    ring = np.concatenate(
+        [a + np.linspace(0, 1, 8, endpoint=False)[:, None] * b for a, b in zip(corners, sides, strict=True)]
+    )
+    n, z = len(ring), np.array([0.0, length_mm])
+    vertices = np.column_stack([np.tile(ring, (2, 1)), np.repeat(z, n)])
+    low, next_low = np.arange(n), np.roll(np.arange(n), -1)
+    faces = np.concatenate([np.stack(x, 1) for x in ((low, next_low, next_low + n), (low, next_low + n, low + n))])
+    x, y = ring.T
+    twice = x * np.roll(y, -1) - np.roll(x, -1) * y
+    area = 0.5 * twice.sum()
+    center = [((v + np.roll(v, -1)) * twice).sum() / (6 * area) for v in (x, y)]
+    ends = [
+        Opening([*center, h], [0, 0, s], area, role)
+        for h, s, role in zip(z, (-1, 1), ("inlet", "outlet_1"), strict=True)
+    ]
+    return Vessel(Surface(vertices, faces.astype(np.int32)), tuple(ends))
+
+
+def test_a_corner_that_a_link_clips_parts_nothing_but_a_wall_thinner_than_a_cell_does() -> None:
+    """Blood sent back at the lip of the FDA's nozzle by 13 such links turned its jet."""
+    step = duct([(0, 0), (4, 0), (4, 2), (2.1, 2), (2.1, 4), (0, 4)])
+    assert len(domain.build(step, 0.25).septum_cell) == 0
+    tip = np.array([2.5, 2.03])
+    wedge = duct([(0, 0), (4, 0), (4, 1.73), (2.5, 2.03), (4, 2.33), (4, 4), (0, 4)])
+    grid = domain.build(wedge, 0.25)
+    start = grid.centers_mm[grid.septum_cell]
+    end = start + 0.25 * domain.VELOCITIES[grid.septum_direction]
+    offset = np.stack([start, end])[..., :2] - tip
+    beyond = np.abs(offset[..., 1]) - 0.2 * offset[..., 0]  # beyond the wall on either side: positive in the blood
+    assert len(start) > 50
+    assert (beyond > 0).all()
+    assert (offset[0, :, 1] * offset[1, :, 1] < 0).all()
+    assert (offset[..., 0].max(axis=0) > 0).all()
+
+
 def test_what_is_left_to_go_is_foretold_from_an_exponential_approach():
     time = np.arange(80.0)
     history = np.stack([3.0 + np.exp(-time / 17), np.full(80, 2.0)], axis=1)
@@ -144,6 +185,22 @@ def test_what_is_left_of_a_swing_is_neither_missed_nor_mistaken(period: float) -
     found = np.array([fraction_left(history[:n]) for n in range(60, 120)])
     assert (found > 0.5 * left[59:-1]).all()
     assert (found < 12 * left[59:-1]).all()
+
+
+def test_what_a_field_has_left_is_told_where_its_mean_speed_turns() -> None:
+    """Speed falls fast in one half and rises slowly in the other: where the mean turns, it tells nothing."""
+    time = np.arange(200.0)
+    fields = np.zeros((200, 2, 3), np.float32)
+    fields[:, 0, 0] = 1 + 0.2 * np.exp(-time / 5)
+    fields[:, 1, 1] = 1 - 0.15 * np.exp(-time / 20)
+    mean = np.linalg.norm(fields, axis=2).mean(axis=1)
+    left = np.linalg.norm(fields[-1] - fields, axis=(1, 2)) / np.linalg.norm(fields, axis=(1, 2))
+    turn = 4 + int(np.argmin(mean))
+    assert fraction_left(mean[: turn + 1, None]) < 0.001 < 0.05 < left[turn]
+    found = np.array([field_left(fields[max(0, n - 6) : n + 1]) for n in range(200)])
+    assert (found[turn:100] > 0.4 * left[turn:100]).all()
+    np.testing.assert_allclose(found[turn + 20 : 80], left[turn + 20 : 80], rtol=0.02)
+    assert np.isinf(found[:6]).all()
 
 
 class Halving(AbstractEngine[list]):

@@ -7,6 +7,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
+import numpy as np
+
 from vstent import plugins
 from vstent.errors import FlowError
 from vstent.flow import sampling
@@ -195,7 +197,8 @@ class _Runs:
         """First guess for the fine grid, from coarse ones; only `start` where the coarse grid would be too coarse.
 
         Where a bare flow is known, the coarse grid only has to say what the screen changes (the correction scheme of
-        multigrid, Brandt 1977, Math. Comput. 31, 333).
+        multigrid, Brandt 1977, Math. Comput. 31, 333). What the grids differ by in the bare flow is scaled by what the
+        screen leaves of the speed: in a sac nearly at rest it would be more than the flow itself.
         """
         if self.engine.coarsening is None:
             return start
@@ -208,9 +211,11 @@ class _Runs:
         bare = self._coarse(replace(case, screen=None, stent=None), coarse_mm, start, "bare guess", 0)
         stented = self._coarse(case, coarse_mm, bare, "stented guess", 1)
         before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))
+        speed_before, speed_after = (np.linalg.norm(values[0], axis=1, keepdims=True) for values in (before, after))
+        left = np.clip(speed_after / np.maximum(speed_before, 1e-9), 0.0, 1.0)
         return replace(
             start,
-            velocity_m_s=start.velocity_m_s + after[0] - before[0],
+            velocity_m_s=after[0] + left * (start.velocity_m_s - before[0]),
             pressure_Pa=start.pressure_Pa + after[1] - before[1],
         )
 

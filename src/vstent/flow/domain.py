@@ -22,6 +22,9 @@ MIN_CELLS = 2_000
 """Fewer cells than this are no vessel."""
 WALL = 0
 """Patch number of the wall; opening k has k + 1."""
+BACK_TO_BACK = -0.5
+"""Largest cosine between the normals of two walls that part two blood cells: a corner that a link clips parts nothing,
+and blood sent back there turns a jet that leaves its edge (13 links, 3 % of the peak in the FDA's nozzle)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +229,12 @@ def _septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, ce
     cell, direction = np.nonzero(candidate)
     starts = origin_mm + cells[cell] * cell_size_mm
     crosses = surface.crosses(starts, starts + VELOCITIES[direction] * cell_size_mm)
-    return cell[crosses].astype(np.int32), direction[crosses].astype(np.int32)
+    cell, direction, starts = cell[crosses], direction[crosses], starts[crosses]
+    step_mm = VELOCITIES[direction] * cell_size_mm
+    along = step_mm / np.linalg.norm(step_mm, axis=1)[:, None]
+    this_side, that_side = surface.first_hits(starts, along)[1], surface.first_hits(starts + step_mm, -along)[1]
+    parts = np.einsum("ij,ij->i", surface.normals[this_side], surface.normals[that_side]) < BACK_TO_BACK
+    return cell[parts].astype(np.int32), direction[parts].astype(np.int32)
 
 
 def cells_inside(surface: Surface, centers_mm: Floats, cell_size_mm: float) -> Ints:

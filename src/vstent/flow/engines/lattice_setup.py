@@ -18,7 +18,7 @@ ODD_RATE = 0.7
 CELL_REYNOLDS_AT_END = 25.0
 """Largest speed x cell / viscosity in the openings' extensions, whose ends are where fast blood becomes unstable first
 (30 to 50 were seen to fail): faster blood is made thicker there. In the vessel there is no limit."""
-REFILL_BLOCK = 4
+REFILL_BLOCK = 2
 """Edge, in cells, of the blocks within which the walls' losses are made up."""
 SOUND_MEMORY = 0.002
 """Rate per step pair at which the inlet forgets the pressure that it takes for the mean, in steady flow. In pulsatile
