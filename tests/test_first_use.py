@@ -126,7 +126,7 @@ def test_the_set_up_compiles_what_takes_a_flows_time_so_that_all_processes_run_t
     from vstent.vessel import Vessel
 
     warm.warm()
-    kernels_ready = {kernel: kernel.signatures for kernel in (lattice.update, lattice.reflect, lattice.defer)}
+    kernels_ready = {kernel: kernel.signatures for kernel in (lattice.update, lattice.defer)}
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.5)))
     said = []
     with telling(lambda: said.append("compiling")):

@@ -4,13 +4,19 @@ import numpy as np
 import pytest
 
 from shapes import sphere
+from vstent import phantoms
+from vstent.flow import FlowCase, FlowSettings
+from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_setup import ODD_RATE as VESSEL_ODD_RATE
 from vstent.flow.engines.lattice_setup import parabolic_weights
 from vstent.kernels import lanes, lattice, lattice_sampling, voxels
+from vstent.trace import trace
+from vstent.vessel import Vessel
 
 STRIDE = 40
 RATE, ODD_RATE, NO_LIMIT = 1.6, 0.7, 1e9
-NO_SCREEN = (np.zeros(2, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
+NO_SCREEN = lattice.no_screen(1)
+NOTHING_SENT_BACK = lattice.NO_LINKS, np.array([[0, 0, 0], [1, 0, 0]], np.int32), 1
 
 
 def populations(seed=0):
@@ -24,7 +30,7 @@ def even_step(f, screen=NO_SCREEN, limit=NO_LIMIT, law=(0, 0, 0, 0)):
     result = f.copy()
     address = (np.arange(19) * STRIDE)[None].astype(np.int32)
     relaxation = np.float32(1 / RATE), np.float32(law), np.float32([limit]), np.float32(ODD_RATE)
-    lattice.update(result, address, np.array([STRIDE], np.int32), *relaxation, *screen, 1)
+    lattice.update(result, address, np.array([STRIDE], np.int32), relaxation, screen, *NOTHING_SENT_BACK)
     return result[: -lanes.COUNT].reshape(19, STRIDE)[lattice.OPPOSITE]
 
 
@@ -49,11 +55,37 @@ def test_a_segment_of_any_length_collides_as_its_cells_do_alone_and_no_other_is_
     address = (np.arange(19) * STRIDE)[None].astype(np.int32)
     relaxation = np.float32(1 / RATE), np.zeros(4, np.float32), np.float32([NO_LIMIT]), np.float32(ODD_RATE)
     together = f.copy()
-    lattice.update(together, address, np.array([cells], np.int32), *relaxation, *NO_SCREEN, 1)
+    lattice.update(together, address, np.array([cells], np.int32), relaxation, NO_SCREEN, *NOTHING_SENT_BACK)
     alone = f.copy()
+    one = np.ones(1, np.int32)
     for cell in range(cells):
-        lattice.update(alone, address + np.int32(cell), np.ones(1, np.int32), *relaxation, *NO_SCREEN, 1)
+        lattice.update(alone, address + np.int32(cell), one, relaxation, NO_SCREEN, *NOTHING_SENT_BACK)
     np.testing.assert_array_equal(together, alone)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5, 64])
+def test_a_band_is_reflected_when_all_that_its_links_need_has_been_updated(threads):
+    """Whatever the bands and whoever does them: as if every cell were updated first. A bend has links of all kinds."""
+    arc = phantoms.torus_arc(bend_radius_mm=5.0, angle_rad=1.0, radius_mm=2.0)
+    case = FlowCase(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), settings=FlowSettings(inflow_mL_s=3.0))
+    state = LatticeBoltzmann(0.3).init(case, None)
+    rng = np.random.default_rng(5)
+    state.populations[:] = 0.01 * rng.normal(size=state.populations.size)
+    state.refill.refill[:] = 0.01 * rng.normal(size=state.refill.refill.size)
+    links, a, screen, refill = state.links, state.addressing, state.screen, state.refill
+    relaxation = np.float32(0.6), np.zeros(4, np.float32), state.limit, np.float32(ODD_RATE)
+    assert len(state.bands) > 20
+    assert np.array_equal(state.bands[-1], [len(a.length), len(links.source), len(refill.refill)])
+    found = []
+    for bands, workers in ((state.bands, threads), (state.bands[[0, -1]], 1)):
+        f = state.populations.copy()
+        for address, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):
+            back = path, links.weight, links.source, refill.place, refill.refill
+            lattice.update(
+                f, address, a.length, relaxation, (screen.start, screen.place, screen.entry), back, bands, workers
+            )
+        found.append(f)
+    np.testing.assert_array_equal(*found)
 
 
 def test_a_collision_keeps_mass_and_momentum():

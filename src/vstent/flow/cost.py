@@ -32,6 +32,8 @@ WHOLE_OVER_BLOCK = 1.3
 """Time of a flow over that of its steps in a block of blood: walls, openings, checks, the first guess (measured)."""
 BLOCK_ROWS = 4096
 """Rows of the block that the rate is measured on."""
+BLOCK_BAND = 16
+"""Rows of each of its bands."""
 MARGIN = 1.05
 """The cell size that is said to fit leaves this much room."""
 
@@ -133,17 +135,19 @@ def _measured_rate(on_gpu: bool) -> float:
     stride = int(length.sum())
     address = (64 * np.arange(BLOCK_ROWS)[:, None] + stride * np.arange(19)).astype(np.int32)
     f = np.zeros(19 * stride + lanes.COUNT, np.float32)
-    nothing = np.zeros(BLOCK_ROWS + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
+    nothing = lattice.no_screen(BLOCK_ROWS)
     limit = np.full(BLOCK_ROWS, np.inf, np.float32)
     relaxation = np.float32(0.6), np.zeros(4, np.float32), limit, np.float32(0.7)
     if on_gpu:
         from vstent.flow.engines.lattice_gpu import seconds_of_update
 
         return stride / seconds_of_update(f, address, length, relaxation, nothing)
+    rows = np.arange(0, BLOCK_ROWS + 1, BLOCK_BAND, dtype=np.int32)
+    bands = np.column_stack([rows, np.zeros((len(rows), 2), np.int32)])
     times: list[float] = []
     for _ in range(4):
         began = perf_counter()
-        lattice.update(f, address, length, *relaxation, *nothing, threads)
+        lattice.update(f, address, length, relaxation, nothing, lattice.NO_LINKS, bands, threads)
         times.append(perf_counter() - began)
     return stride / min(times)
 

@@ -8,7 +8,6 @@ of it is known without looking at their surface: in steady flow it is the gradie
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vstent.flow.engines.lattice_setup import linear_weights, quadratic_weights
 from vstent.kernels import lanes, lattice
@@ -199,15 +198,15 @@ class _Grid:
 
     def advance(self, force: Floats) -> None:
         """Make `CHECK_PAIRS` step pairs, the force given as a kick between them."""
-        nothing: tuple[NDArray[np.int32], NDArray[np.float32]] = np.zeros(0, np.int32), np.zeros(0, np.float32)
-        no_screen = np.zeros(len(self._length) + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
-        limit = np.full(len(self._length), np.inf, np.float32)
+        segments, no_screen = len(self._length), lattice.no_screen(len(self._length))
+        limit = np.full(segments, np.inf, np.float32)
         relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
+        back = self._weight, self._source, *lattice.NO_LINKS[3:]
+        bands = np.array([[0, 0, 0], [segments, len(self._source), 0]], np.int32)
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
             for address, path in zip((self._even, self._odd), self._paths, strict=True):
-                lattice.update(self._f, address, self._length, *relaxation, *no_screen, 1)
-                lattice.reflect(self._f, path, self._weight, self._source, *nothing)
+                lattice.update(self._f, address, self._length, relaxation, no_screen, (path, *back), bands, 1)
             if pair % DEFER_PAIRS == 0:
                 lattice.defer(self._f, self._links, self._correction, self._source, np.float32(DEFER_PART))
 

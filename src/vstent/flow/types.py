@@ -110,7 +110,8 @@ class FlowSettings:
     cell_budget: float = 480_000.0
     """Most cells of the vessel, where no cell size is given."""
     tolerance: float = 0.01
-    """Converged when every monitored quantity has less than this fraction of itself left to go."""
+    """Converged when every monitored quantity has less than this fraction of itself left to go, and the sac's velocity
+    less than twice that (root mean square)."""
     max_steps: int = 24_000
     """Most time steps on the fine grid."""
     lattice_speed: float = 0.15

@@ -9,8 +9,8 @@ Update in place (the AA pattern; Bailey, Myre, Walsh, Lilja and Saar 2009, ICPP,
 populations and writes the collided ones back, each at the place of its opposite. Odd step: it reads where its
 neighbours have left them and writes to the same places. After an odd step every population is at home again.
 
-A link that leaves the fluid ends at a solid neighbour, whose storage place serves as the link's mailbox: `reflect` puts
-there (before an odd step) or takes from there (after it) what a wall or an opening sends back.
+A link that leaves the fluid ends at a solid neighbour, whose storage place serves as the link's mailbox: what a wall or
+an opening sends back is put there (before an odd step) or taken from there (after it).
 
 Populations are numbered 0 rest, then in opposite pairs (1, 2), (3, 4), ... (17, 18).
 """
@@ -89,30 +89,21 @@ def _eight(f: Any, address: Any, s: int, k: int, settings: Any, target: Any, pla
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _update_some(
-    f: Any,
-    address: Any,
-    length: Any,
-    relaxation: Any,
-    screen_start: Any,
-    screen_place: Any,
-    screen: Any,
-    segments: Any,
+    f: Any, address: Any, length: Any, relaxation: Any, screen: Any, scratch: Any, begin: int, end: int
 ) -> None:
-    """Do what `update` does to the segments from the first to the last, which is left out."""
+    """Do what `update` does to the segments from `begin` on, before `end`."""
     time, law, limit, odd_rate = relaxation
-    few = np.zeros(19 * COUNT, np.float32)
-    places = COUNT * np.arange(19, dtype=np.int32).reshape(1, 19)
-    resistance = np.zeros(6 * _WIDE, np.float32)
-    times = np.full(_WIDE, time)
-    for s in range(segments[0], segments[1]):
+    screen_start, screen_place, entry = screen
+    few, places, resistance, times = scratch
+    for s in range(begin, end):
         cells = length[s]
         if law[0] > 0.0:
             _thin(f, address, s, cells, time, law, times)
-        begin, end = screen_start[s], screen_start[s + 1]
-        for e in range(begin, end):
+        first, last_entry = screen_start[s], screen_start[s + 1]
+        for e in range(first, last_entry):
             for k in range(6):
-                resistance[k * _WIDE + screen_place[e]] = screen[e, k]
-        settings = times, limit[s], odd_rate, resistance, end > begin
+                resistance[k * _WIDE + screen_place[e]] = entry[e, k]
+        settings = times, limit[s], odd_rate, resistance, last_entry > first
         # The last eight cells are read before the others are written and written after them: whole vectors only.
         last = max(0, cells - COUNT)
         _eight(f, address, s, last, settings, few, places, 0, 0)
@@ -124,26 +115,36 @@ def _update_some(
             for q in range(19):
                 for k in range(cells):
                     f[address[s, q] + k] = few[COUNT * q + k]
-        for e in range(begin, end):
+        for e in range(first, last_entry):
             for k in range(6):
                 resistance[k * _WIDE + screen_place[e]] = _ZERO
 
 
+@njit(cache=True, fastmath=True)
+def _reflect_some(f: Any, links: Any, begin: int, end: int) -> None:
+    """Send back what crosses the links from `begin` on, before `end`: a weighted sum of two and a source."""
+    path, weight, source, _, _ = links
+    for k in range(begin, end):
+        first, second, target = _U(path[k, 0]), _U(path[k, 1]), _U(path[k, 2])
+        f[target] = weight[k, 0] * f[first] + weight[k, 1] * f[second] + source[k]
+
+
+@njit(cache=True, fastmath=True)
+def _refill_some(f: Any, links: Any, begin: int, end: int) -> None:
+    """Add to the rest populations of wall cells what walls lose there."""
+    _, _, _, place, refill = links
+    for w in range(begin, end):
+        f[_U(place[w])] += refill[w]
+
+
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def update(
-    f: Any,
-    address: Any,
-    length: Any,
-    time: float,
-    law: Any,
-    limit: Any,
-    odd_rate: float,
-    screen_start: Any,
-    screen_place: Any,
-    screen: Any,
-    threads: int,
+    f: Any, address: Any, length: Any, relaxation: Any, screen: Any, links: Any, bands: Any, threads: int
 ) -> None:
-    """Collide and stream every segment once.
+    """Collide and stream every segment once, and send back what crosses a wall or an opening.
+
+    A band of cells is reflected as soon as the bands beside it are updated, while it is still in the processor's cache:
+    links fetch as much memory as cells do. Only bands at the ends of a thread's share wait for the other threads.
 
     Parameters
     ----------
@@ -151,40 +152,58 @@ def update(
     address : (segments, 19) int32, where the populations of each segment begin: its own in an even step, its
         neighbours' in an odd one.
     length : (segments,) int32 cells of each segment, at most SEGMENT.
-    time : float32 relaxation time of the stress, at high shear.
-    law : (4,) float32 what blood at rest has more of it, the time by which shear rates count, and the exponents a and
-        (n - 1) / a of Carreau and Yasuda's law; the first is 0 where the viscosity is the same everywhere.
-    limit : (segments,) float32 largest cell Reynolds number, speed over viscosity: faster blood is made that thick.
-    odd_rate : float32 relaxation rate of the odd part.
-    screen_start : (segments + 1,) int32 first screen entry of every segment.
-    screen_place, screen : (e,) int32 place within the segment and (e, 6) float32 resistance (see `resist`).
+    relaxation : float32 relaxation time of the stress, at high shear; (4,) float32 what blood at rest has more of it,
+        the time by which shear rates count, and the exponents a and (n - 1) / a of Carreau and Yasuda's law, the first
+        being 0 where the viscosity is the same everywhere; (segments,) float32 largest cell Reynolds number, speed over
+        viscosity: faster blood is made that thick; float32 relaxation rate of the odd part.
+    screen : (segments + 1,) int32 first screen entry of every segment; (e,) int32 place within the segment; (e, 6)
+        float32 resistance (see `resist`).
+    links : (l, 3) two places read and the one written, of this kind of step (see `paths`); (l, 2) float32 weights;
+        (l,) float32 sources; (w,) int32 rest populations to which (w,) float32 is added.
+    bands : (bands + 1, 3) first segment, link and rest population of every band, and of what would follow the last. A
+        link needs no cells but those of its own band and the two beside it; links before the first band's need any.
     threads : number of chunks.
     """
-    n, relaxation = length.size, (time, law, limit, odd_rate)
+    count, rows = len(bands) - 1, bands[len(bands) - 1, 0]
+    begin = np.full(threads + 1, count)
+    for chunk in range(threads):
+        begin[chunk] = np.searchsorted(bands[:, 0], rows * chunk // threads)
     for chunk in prange(threads):
-        segments = n * chunk // threads, n * (chunk + 1) // threads
-        _update_some(f, address, length, relaxation, screen_start, screen_place, screen, segments)
+        few, places = np.zeros(19 * COUNT, np.float32), COUNT * np.arange(19, dtype=np.int32).reshape(1, 19)
+        scratch = few, places, np.zeros(6 * _WIDE, np.float32), np.full(_WIDE, relaxation[0])
+        first, last = begin[chunk], begin[chunk + 1]
+        for band in range(first, last):
+            _update_some(f, address, length, relaxation, screen, scratch, bands[band, 0], bands[band + 1, 0])
+            _refill_some(f, links, bands[band, 2], bands[band + 1, 2])
+            if band > first + 1:
+                _reflect_some(f, links, bands[band - 1, 1], bands[band, 1])
+    anywhere = bands[0, 1]
+    for chunk in prange(threads):
+        first, last = begin[chunk], begin[chunk + 1]
+        _reflect_some(f, links, anywhere * chunk // threads, anywhere * (chunk + 1) // threads)
+        if last > first:
+            _reflect_some(f, links, bands[first, 1], bands[first + 1, 1])
+        if last > first + 1:
+            _reflect_some(f, links, bands[last - 1, 1], bands[last, 1])
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def reflect(f: Any, path: Any, weight: Any, source: Any, place: Any, refill: Any) -> None:
-    """Send back what crosses a wall or an opening: a weighted sum of two populations, and a source.
+NO_LINKS: Final = (
+    np.zeros((0, 3), np.int32),
+    np.zeros((0, 2), np.float32),
+    np.zeros(0, np.float32),
+    np.zeros(0, np.int32),
+    np.zeros(0, np.float32),
+)
+"""What `update` takes for links where there are none."""
 
-    Parameters
-    ----------
-    path : (links, 3) two places read and the one written, of this kind of step (see `paths`).
-    weight : (links, 2) float32; source : (links,) float32.
-    place, refill : (w,) int32 and float32: what is added to the rest populations of these places.
-    """
-    for k in prange(len(path)):
-        first, second, target = _U(path[k, 0]), _U(path[k, 1]), _U(path[k, 2])
-        f[target] = weight[k, 0] * f[first] + weight[k, 1] * f[second] + source[k]
-    for w in prange(len(place)):
-        f[_U(place[w])] += refill[w]
+
+def no_screen(segments: int) -> tuple[Ints, Ints, NDArray[np.float32]]:
+    """Return what `update` takes for the screen where there is none."""
+    return np.zeros(segments + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
 
 
 def paths(address: Ints, weight: Floats) -> tuple[Ints, Ints, NDArray[np.float32]]:
-    """Prepare `reflect` for links whose reflection needs at most two populations.
+    """Prepare `update` for links whose reflection needs at most two populations.
 
     Parameters
     ----------
@@ -201,7 +220,7 @@ def paths(address: Ints, weight: Floats) -> tuple[Ints, Ints, NDArray[np.float32
     after_even = np.where(needs_c[:, None], address[:, (0, 2, 3)], address[:, (0, 1, 3)])
     after_odd = np.where(needs_c[:, None], address[:, (3, 1, 0)], address[:, (3, 2, 0)])
     both = np.column_stack([weight[:, 0], np.where(needs_c, weight[:, 2], weight[:, 1])])
-    return after_even, after_odd, both.astype(np.float32)
+    return np.ascontiguousarray(after_even), np.ascontiguousarray(after_odd), both.astype(np.float32)
 
 
 @njit(cache=True, parallel=True, fastmath=True)

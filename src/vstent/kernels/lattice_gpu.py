@@ -96,7 +96,7 @@ def update(
 
 @cuda.jit(cache=True)
 def reflect(f: Any, path: Any, weight: Any, source: Any, place: Any, refill: Any) -> None:
-    """Send back what crosses a wall or an opening, and refill (see `lattice.reflect`)."""
+    """Send back what crosses a wall or an opening, and refill (see `lattice.update`)."""
     k = cuda.grid(1)
     if k < source.size:
         first, second, target = _U(path[k, 0]), _U(path[k, 1]), _U(path[k, 2])

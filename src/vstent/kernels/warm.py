@@ -85,18 +85,14 @@ def flow() -> None:
         f,
         stride * np.arange(19, dtype=np.int32)[None],
         np.ones(1, np.int32),
-        np.float32(1.0),
-        np.zeros(4, np.float32),
-        np.full(1, np.inf, np.float32),
-        np.float32(1.0),
-        np.zeros(2, np.int32),
-        none,
-        np.zeros((0, 6), np.float32),
+        (np.float32(1.0), np.zeros(4, np.float32), np.full(1, np.inf, np.float32), np.float32(1.0)),
+        lattice.no_screen(1),
+        lattice.NO_LINKS,
+        np.array([[0, 0, 0], [1, 0, 0]], np.int32),
         1,
     )
     links, source = np.zeros((0, 6), np.int32), np.zeros(0, np.float32)
     lattice.drive(f, stride, np.zeros((0, 9)), np.zeros(1, np.int32), links, none, none, np.zeros((0, 2)), source)
-    lattice.reflect(f, np.zeros((0, 3), np.int32), np.zeros((0, 2), np.float32), source, none, source)
     lattice.swap(f, none, none)
     lattice.defer(f, links, np.zeros((0, 5), np.float32), source, np.float32(1.0))
     lattice.balance(f, links, none, none, none, source, np.float32(1.0))

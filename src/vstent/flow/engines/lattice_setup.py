@@ -104,11 +104,11 @@ class Links:
     address: Ints
     """(l, 6) see `lattice.paths`."""
     even_path: Ints
-    """(l, 3) see `lattice.reflect`, after an even step."""
+    """(l, 3) see `lattice.update`, after an even step."""
     odd_path: Ints
     """(l, 3) the same after an odd step."""
     weight: NDArray[np.float32]
-    """(l, 2) see `lattice.reflect`."""
+    """(l, 2) see `lattice.update`."""
     correction: NDArray[np.float32]
     """(l, 5) see `lattice.defer`."""
     source: NDArray[np.float32]
@@ -270,10 +270,25 @@ def build_links(case: FlowCase, domain: Domain, addressing: Addressing, scales: 
 
 
 def _link_order(domain: Domain) -> Ints:
-    """Openings first, in order, by cell within each; then the wall, by direction so that each address runs on."""
+    """Openings first, in order, by cell within each; then the wall, by layer, and by direction within it.
+
+    So each address runs on, and what is done with a layer finds it in the processor's cache.
+    """
     is_wall = domain.link_patch == 0
     patch = np.where(is_wall, len(domain.sections) + 1, domain.link_patch)
-    return np.lexsort((domain.link_cell, np.where(is_wall, domain.link_direction, 0), patch))
+    layer = domain.cells[domain.link_cell, 0]
+    return np.lexsort((domain.link_cell, *(np.where(is_wall, key, 0) for key in (domain.link_direction, layer)), patch))
+
+
+def build_bands(domain: Domain, addressing: Addressing, links: Links) -> Ints:
+    """Bands (b + 1, 3) of `lattice.update`: the layers of cells across the first axis of the grid."""
+    cell = domain.link_cell[_link_order(domain)][links.start[-1] :]
+    layer = domain.cells[:, 0]
+    edges = np.arange(layer.min(), layer.max() + 2)
+    keys = layer[addressing.first_cell], layer[cell], layer[np.unique(cell)]
+    bands = np.stack([np.searchsorted(key, edges) for key in keys], axis=1)
+    bands[:, 1] += links.start[-1]
+    return bands.astype(np.int32)
 
 
 def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:

@@ -24,6 +24,7 @@ from vstent.flow.engines.lattice_setup import (
     Scales,
     ScreenEntries,
     address,
+    build_bands,
     build_links,
     build_refill,
     build_screen,
@@ -99,6 +100,8 @@ class State:
     """Monitored quantities."""
     refill: Refill
     """What the walls lose."""
+    bands: Ints
+    """(b + 1, 3) see `lattice.update`."""
     limit: NDArray[np.float32]
     """(s,) largest cell Reynolds number in every segment."""
     populations: NDArray[np.float32]
@@ -137,6 +140,7 @@ def build(case: FlowCase, scales: Scales, steps_per_check: int, *, start: FlowFi
         build_screen(case, domain, addressing, scales),
         _probe(case, domain),
         build_refill(domain, addressing),
+        build_bands(domain, addressing, links),
         np.where(is_end, CELL_REYNOLDS_AT_END, np.inf)[addressing.first_cell].astype(np.float32),
         np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
         links.openings[:, 1].copy(),
@@ -248,6 +252,8 @@ def _advance_here(state: State, factor: Floats, first_pair: int) -> None:
     threads = numba.get_num_threads()
     scales = state.scales
     relaxation = np.float32(scales.relaxation_steps), scales.thinning, state.limit, np.float32(ODD_RATE)
+    resistance = screen.start, screen.place, screen.entry
+    back = links.weight, links.source, refill.place, refill.refill
     opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
     for pair in range(len(factor)):
         links.openings[:, 1] = state.wanted * factor[pair]
@@ -263,17 +269,7 @@ def _advance_here(state: State, factor: Floats, first_pair: int) -> None:
             opening_source,
         )
         for address_of, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):
-            lattice.update(
-                f,
-                address_of,
-                a.length,
-                *relaxation,
-                screen.start,
-                screen.place,
-                screen.entry,
-                threads,
-            )
-            lattice.reflect(f, path, links.weight, links.source, refill.place, refill.refill)
+            lattice.update(f, address_of, a.length, relaxation, resistance, (path, *back), state.bands, threads)
             lattice.swap(f, *a.swap_address)
         if (first_pair + pair) % DEFER_PAIRS == 0:
             part = np.float32(DEFER_PART)
