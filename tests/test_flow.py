@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
-from vstent import phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, sampling, simulate_case
-from vstent.flow.engines import Outcome
+from vstent import flow, phantoms
+from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, domain, sampling, simulate_case
+from vstent.flow.engines import AbstractEngine, Outcome, run
 from vstent.flow.engines.lattice_boltzmann import CHECKS_AVERAGED, LatticeBoltzmann
 from vstent.kernels import lattice
 from vstent.trace import trace
@@ -112,6 +113,27 @@ def test_a_screen_costs_the_pressure_of_its_law() -> None:
     gradient = 8 * 0.004 * slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 4)
     mean_speed = slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 2)
     assert before - after - gradient * 8e-3 == pytest.approx(resistance * mean_speed, rel=0.01)
+
+
+def test_a_guess_has_a_guess_as_long_as_grids_hold_the_vessel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bare from the coarsest up; behind a screen every grid first says what the screen changes there."""
+    for module in (flow, domain):
+        monkeypatch.setattr(module, "MIN_CELLS", 20)
+    seen: list[tuple[float, bool, float | None]] = []
+
+    def telling(engine: AbstractEngine[Any], case: FlowCase, **more: Any) -> FlowField:
+        start = more["start"]
+        seen.append((engine.cell_size_mm, case.screen is not None, None if start is None else start.cell_size_mm))
+        return run(engine, case, **more)
+
+    monkeypatch.setattr(flow, "run", telling)
+    settings = replace(SETTINGS, cell_size_mm=0.25, max_steps=40)
+    bare = simulate_case(FlowCase(tube(), settings=settings))
+    assert seen == [(1.0, False, None), (0.5, False, 1.0), (0.25, False, 0.5)]
+    seen.clear()
+    simulate_case(FlowCase(tube(), screen=disc(100.0), settings=settings), start=bare)
+    coarsest = [(1.0, False, 0.5), (1.0, True, 1.0)]
+    assert seen == [(0.5, False, 0.25), *coarsest, (0.5, True, 0.5), (0.25, True, 0.25)]
 
 
 @pytest.mark.parametrize("outlets", ["murray", "zero_pressure"])

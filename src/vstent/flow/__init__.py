@@ -188,13 +188,12 @@ class _Runs:
         guess = start
         if bookmark is None or bookmark.saved is None:
             steady = replace(case, settings=replace(case.settings, waveform=None))
-            with suppress(DivergenceError):
-                guess = self._guess(steady, start, cell_size_mm)
+            guess = self._guess(steady, start, cell_size_mm)
         progress = self._part(_coarse_runs(self.engine, case, start) * COARSE_SHARE, 1.0)
         return self._run(self.engine(cell_size_mm, self.folder), case, guess, progress, bookmark)
 
-    def _guess(self, case: FlowCase, start: FlowField | None, cell_size_mm: float) -> FlowField | None:
-        """First guess for the fine grid, from coarse ones; only `start` where the coarse grid would be too coarse.
+    def _guess(self, case: FlowCase, start: FlowField | None, cell_size_mm: float, depth: int = 0) -> FlowField | None:
+        """First guess for a grid, from coarser ones; only `start` where the next would be too coarse, or diverges.
 
         Where a bare flow is known, the coarse grid only has to say what the screen changes (the correction scheme of
         multigrid, Brandt 1977, Math. Comput. 31, 333). What the grids differ by in the bare flow is scaled by what the
@@ -206,23 +205,24 @@ class _Runs:
         is_tiny = abs(case.vessel.closed.volume_mm3) < 4 * MIN_CELLS * coarse_mm**3
         if is_tiny or (start is not None and case.screen is None):
             return start
-        if start is None:
-            return self._coarse(case, coarse_mm, None, "guess", 0)
-        bare = self._coarse(replace(case, screen=None, stent=None), coarse_mm, start, "bare guess", 0)
-        stented = self._coarse(case, coarse_mm, bare, "stented guess", 1)
-        before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))
-        speed_before, speed_after = (np.linalg.norm(values[0], axis=1, keepdims=True) for values in (before, after))
-        left = np.clip(speed_after / np.maximum(speed_before, 1e-9), 0.0, 1.0)
-        return replace(
-            start,
-            velocity_m_s=after[0] + left * (start.velocity_m_s - before[0]),
-            pressure_Pa=start.pressure_Pa + after[1] - before[1],
-        )
+        with suppress(DivergenceError):
+            if start is None:
+                return self._coarse(case, coarse_mm, None, "guess", 0, depth)
+            bare = self._coarse(replace(case, screen=None, stent=None), coarse_mm, start, "bare guess", 0, depth)
+            return _corrected(start, bare, self._coarse(case, coarse_mm, bare, "stented guess", 1, depth))
+        return start
 
-    def _coarse(self, case: FlowCase, cell_size_mm: float, start: FlowField | None, name: str, rank: int) -> FlowField:
+    def _coarse(
+        self, case: FlowCase, cell_size_mm: float, start: FlowField | None, name: str, rank: int, depth: int
+    ) -> FlowField:
+        """Compute a guess, itself from a coarser one; what is deeper than the first grid takes no time to speak of."""
+        name = depth * "coarser " + name
         engine = engine_class(case.settings)(cell_size_mm, self.folder / name)
-        progress = self._part(rank * COARSE_SHARE, (rank + 1) * COARSE_SHARE)
-        return self._run(engine, case, start, progress, self._bookmark(name))
+        progress = self._part(rank * COARSE_SHARE, (rank + 1) * COARSE_SHARE) if depth == 0 else None
+        bookmark = self._bookmark(name)
+        if bookmark is None or bookmark.saved is None:
+            start = self._guess(case, start, cell_size_mm, depth + 1)
+        return self._run(engine, case, start, progress, bookmark)
 
     def _run(
         self,
@@ -261,6 +261,18 @@ class _Runs:
             whole(Progress(fraction, now.residual, seconds_left))
 
         return report
+
+
+def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowField:
+    """A bare flow, changed by what a screen changes on a coarser grid."""
+    before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))
+    speed_before, speed_after = (np.linalg.norm(values[0], axis=1, keepdims=True) for values in (before, after))
+    left = np.clip(speed_after / np.maximum(speed_before, 1e-9), 0.0, 1.0)
+    return replace(
+        start,
+        velocity_m_s=after[0] + left * (start.velocity_m_s - before[0]),
+        pressure_Pa=start.pressure_Pa + after[1] - before[1],
+    )
 
 
 def _coarse_runs(engine: type[AbstractEngine[Any]], case: FlowCase, start: FlowField | None) -> int:
