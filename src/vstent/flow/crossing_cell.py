@@ -198,15 +198,15 @@ class _Grid:
 
     def advance(self, force: Floats) -> None:
         """Make `CHECK_PAIRS` step pairs, the force given as a kick between them."""
-        segments, no_screen = len(self._length), lattice.no_screen(len(self._length))
+        segments = len(self._length)
         limit = np.full(segments, np.inf, np.float32)
         relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
-        back = self._weight, self._source, *lattice.NO_LINKS[3:]
+        screen, back = lattice.no_screen(segments), (self._weight, self._source, *lattice.NO_LINKS[3:])
         bands = np.array([[0, 0, 0], [segments, len(self._source), 0]], np.int32)
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
             for address, path in zip((self._even, self._odd), self._paths, strict=True):
-                lattice.update(self._f, address, self._length, relaxation, no_screen, (path, *back), bands, 1)
+                lattice.update(self._f, address, self._length, relaxation, screen, (path, *back), bands, 1)
             if pair % DEFER_PAIRS == 0:
                 lattice.defer(self._f, self._links, self._correction, self._source, np.float32(DEFER_PART))
 

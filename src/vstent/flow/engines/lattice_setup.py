@@ -392,9 +392,7 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
     """The case's screen in lattice units."""
     segments = len(addressing.length)
     if case.screen is None:
-        return ScreenEntries(
-            np.zeros(segments + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32), np.zeros(0, np.int32)
-        )
+        return ScreenEntries(*lattice.no_screen(segments), np.zeros(0, np.int32))
     spread = on_grid(case.screen, domain.index, domain.origin_mm, domain.cell_size_mm)
     per_step = scales.step_s / case.blood.density_kg_m3
     entry = np.column_stack(
