@@ -1,28 +1,32 @@
 """Print how fast the lattice-Boltzmann kernel is beside the memory's bandwidth, and how exact Poiseuille's flow.
 
-Usage: python benchmarks/flow.py [--cost] [CELL_MM ...]
+Usage: python benchmarks/flow.py [--cost] [--close-up] [CELL_MM ...] [SURFACE]
 
 Besides: how a step's time grows with its cells, and what other machines would need (computed). Seconds of the clock
-depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo is computed, steady,
-bare and with Silk and Enterprise as screens, in cells of 0.1 mm.
+depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo, or the artery of a
+surface file, is computed, steady, bare and with Silk and Enterprise as screens, in cells of 0.1 mm; with ``--close-up``
+they are so fine in the sac and near it only.
 """
 
 import resource
 import sys
 import time
+from pathlib import Path
 
 import numba
 import numpy as np
 
 import vstent
 from vstent import phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, simulate, simulate_case
+from vstent.flow import FlowCase, FlowField, FlowSettings, flow_case, indices, simulate, simulate_case
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_state import advance
+from vstent.io.surfaces import read_surface
+from vstent.repair import repair
 from vstent.restore import restore
 from vstent.trace import trace
 from vstent.trim import trim
-from vstent.vessel import Vessel
+from vstent.vessel import Anatomy, Vessel
 
 RADIUS_MM, INFLOW_ML_S, VISCOSITY_PA_S = 2.0, 0.5, 0.004
 STEPS = 20
@@ -101,17 +105,31 @@ def elsewhere(of_core: float) -> None:
         print(f"| {name} | {rate / 1e6:.0f} | {steady:.0f} s | {cycles / 60:.1f} min |")
 
 
-def cost() -> None:
-    """Print what the demo takes, steady, bare and with both devices."""
-    anatomy = restore(trim(trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))))
+def anatomy_of(surface: Path | None) -> Anatomy:
+    if surface is None:
+        return restore(trim(trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))))
+    lumen, _ = repair(read_surface(surface)[0])
+    return restore(trim(trace(Vessel(lumen))))
+
+
+def cost(surface: Path | None, *, close_up: bool) -> None:
+    """Print what an artery takes, steady, bare and with both devices."""
+    anatomy = anatomy_of(surface)
     stents = [None, *(vstent.deploy(vstent.find_design(name), anatomy).stent for name in ("silk", "enterprise"))]
+    settings = FlowSettings(cell_size_mm=0.1, close_up=close_up)
     began, began_core = time.perf_counter(), time.process_time()
-    fields = simulate(anatomy, stents, FlowSettings(cell_size_mm=0.1))
+    fields = simulate(anatomy, stents, settings)
     clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
-    print("\n| demo, 0.1 mm | cells | steps | settled | million updates/s |\n|---|---|---|---|---|")
-    for name, field in zip(("bare", "silk", "enterprise"), fields, strict=True):
-        row = (name, len(field.cells), field.steps, field.is_converged, round(field.updates_per_s / 1e6))
-        print(f"| {' | '.join(map(str, row))} |")
+    name = "demo" if surface is None else surface.stem
+    print(f"\n{name}, cells of 0.1 mm{' in the sac and near it' if close_up else ''}:\n")
+    print("| flow | cells | steps | settled | million updates/s | neck inflow mL/s | sac velocity mm/s | its WSS Pa |")
+    print("|---|---|---|---|---|---|---|---|")
+    case = flow_case(anatomy, None, settings)
+    for flow, field in zip(("bare", "silk", "enterprise"), fields, strict=True):
+        found = indices(field, case.sac, case.ostium)
+        row = (flow, len(field.cells), field.steps, field.is_converged, round(field.updates_per_s / 1e6))
+        values = f"{found['neck_inflow_mL_s']:.4f} | {1e3 * found['mean_sac_velocity_m_s']:.2f}"
+        print(f"| {' | '.join(map(str, row))} | {values} | {found['mean_sac_wss_Pa']:.4f} |")
     peak_GB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     print(f"\nTogether {clock_s:.0f} s, {core_s:.0f} s of processor, {peak_GB:.1f} GB at most.")
 
@@ -146,7 +164,8 @@ def poiseuille(cell_mm: float, length_mm: float = 12.0) -> None:
 
 
 if __name__ == "__main__":
-    words = [word for word in sys.argv[1:] if word != "--cost"]
+    words = [word for word in sys.argv[1:] if not word.startswith("--") and not Path(word).is_file()]
+    surface = next((Path(word) for word in sys.argv[1:] if Path(word).is_file()), None)
     cells_mm = [float(size) for size in words] or [0.4, 0.2]
     print(f"{numba.get_num_threads()} threads\n")
     print("| cells | set-up, core s | populations MB | million updates/s | of one core | at full bandwidth | reached |")
@@ -159,4 +178,4 @@ if __name__ == "__main__":
     for cell_mm in cells_mm:
         poiseuille(cell_mm)
     if "--cost" in sys.argv:
-        cost()
+        cost(surface, close_up="--close-up" in sys.argv)

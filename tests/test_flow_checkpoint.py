@@ -3,17 +3,20 @@
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from shapes import sphere
 from vstent import phantoms
 from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, engines, simulate_case
 from vstent.flow.engines import lattice_state
 from vstent.flow.types import Waveform
 from vstent.study.checkpoint import FlowCheckpoint
+from vstent.surface import Surface
 from vstent.trace import trace
 from vstent.vessel import Vessel
 
@@ -48,7 +51,7 @@ class Stopping(FlowCheckpoint):
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("kind", ["steady", "pulsatile", "stented"])
+@pytest.mark.parametrize("kind", ["steady", "pulsatile", "stented", "close-up"])
 @pytest.mark.parametrize("saves", [2, 9])
 def test_a_stopped_flow_goes_on_to_the_same_bits(
     kind: str, saves: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -61,6 +64,9 @@ def test_a_stopped_flow_goes_on_to_the_same_bits(
     if kind == "stented":
         start = simulate_case(case)
         case = FlowCase(vessel(), screen=screen(), settings=SETTINGS)
+    if kind == "close-up":
+        sac = Surface(sphere(1.0).vertices_mm + np.array([0.0, 0.0, 5.0]), sphere(1.0).faces)
+        case = FlowCase(vessel(), sac=sac, settings=replace(SETTINGS, cell_size_mm=0.2, close_up=True))
     whole = simulate_case(case, start=start)
     stopping = Stopping(tmp_path, "flow", "key")
     stopping.last = saves

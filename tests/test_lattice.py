@@ -7,7 +7,7 @@ from shapes import sphere
 from vstent import phantoms
 from vstent.flow import FlowCase, FlowSettings
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
-from vstent.flow.engines.lattice_setup import ODD_RATE as VESSEL_ODD_RATE
+from vstent.flow.engines.lattice_scales import ODD_RATE as VESSEL_ODD_RATE
 from vstent.flow.engines.lattice_setup import parabolic_weights
 from vstent.kernels import lanes, lattice, lattice_sampling, voxels
 from vstent.trace import trace

@@ -11,9 +11,9 @@ import pytest
 
 from vstent import phantoms
 from vstent.flow import FlowCase, FlowField, FlowSettings, flow_case, indices, sampling, simulate_case
-from vstent.flow.domain import cells_inside
 from vstent.flow.engines import run
 from vstent.flow.engines.openfoam import OpenFoam
+from vstent.flow.sampling import cells_inside
 from vstent.io.surfaces import read_surface
 from vstent.repair import repair
 from vstent.restore import restore

@@ -103,6 +103,11 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         "--engine", default="lattice_boltzmann", metavar="NAME", help="openfoam, or a plug-in that computes the flow"
     )
     flow.add_argument("-j", "--processes", type=_jobs, default=1, metavar="N", help="processes for OpenFOAM (1)")
+    flow.add_argument(
+        "--close-up",
+        action="store_true",
+        help="cells of that size only in the sac and near it, twice as wide elsewhere",
+    )
     flow.add_argument("--device-gpu", action="store_true", help="compute the flow on an NVIDIA GPU (the extra gpu)")
     flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
     return flow
@@ -246,6 +251,7 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
         waveform=_waveform(arguments.pulsatile),
         outlets=arguments.outlets,
         cell_size_mm=arguments.cell_size,
+        close_up=arguments.close_up,
         engine=arguments.engine,
         processes=arguments.processes,
         device_gpu=arguments.device_gpu,

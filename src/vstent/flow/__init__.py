@@ -12,6 +12,7 @@ import numpy as np
 from vstent import plugins
 from vstent.errors import FlowError
 from vstent.flow import sampling
+from vstent.flow.close_up import WIDTH, require_sac
 from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
 from vstent.flow.indices import compare, indices
@@ -44,6 +45,9 @@ __all__ = [
 
 COARSE_SHARE = 0.12
 """Part of the whole time that each coarse run takes, for the progress."""
+
+OUTER_SHARE = 0.35
+"""Part of the whole time that the flow around a close-up takes, for the progress."""
 
 CALMER_TRIES = 2
 """Times that a run which diverged is tried again with a shorter time step."""
@@ -148,9 +152,14 @@ def engine_class(settings: FlowSettings) -> type[AbstractEngine[Any]]:
     PluginError
         When there is none.
     FlowError
-        When it is to run on a GPU and does not.
+        When it is to run on a GPU or in a close-up and does not.
     """
     engine = _engine_of(settings)
+    if settings.close_up and not engine.closes_up:
+        what = f"the engine {settings.engine}" if settings.waveform is None else "a pulse"
+        raise FlowError(
+            f"{what} is not computed in a close-up: leave out --close-up (close_up), or take {LATTICE} in steady flow"
+        )
     if settings.device_gpu and not engine.runs_on_gpu:
         raise FlowError(
             f"the engine {settings.engine} does not compute on a GPU: leave out --device-gpu (device_gpu), or take "
@@ -184,6 +193,8 @@ class _Runs:
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
         """Compute a flow, from a guess unless it is under way, or the coarse grid is too coarse for one."""
         cell_size_mm = default_cell_size_mm(case)
+        if case.settings.close_up:
+            return self._close_up(case, start, cell_size_mm)
         bookmark = self._bookmark("answer")
         guess = start
         if bookmark is None or bookmark.saved is None:
@@ -191,6 +202,13 @@ class _Runs:
             guess = self._guess(steady, start, cell_size_mm)
         progress = self._part(_coarse_runs(self.engine, case, start) * COARSE_SHARE, 1.0)
         return self._run(self.engine(cell_size_mm, self.folder), case, guess, progress, bookmark)
+
+    def _close_up(self, case: FlowCase, start: FlowField | None, cell_size_mm: float) -> FlowField:
+        """Compute the vessel on wide cells, and then the sac and its neck on fine ones in it."""
+        require_sac(case)
+        outer = self._coarse(case, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
+        engine = self.engine(cell_size_mm, self.folder, outer)
+        return self._run(engine, case, outer, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))
 
     def _guess(self, case: FlowCase, start: FlowField | None, cell_size_mm: float, depth: int = 0) -> FlowField | None:
         """First guess for a grid, from coarser ones; only `start` where the next would be too coarse, or diverges.
@@ -205,20 +223,28 @@ class _Runs:
         is_tiny = abs(case.vessel.closed.volume_mm3) < 4 * MIN_CELLS * coarse_mm**3
         if is_tiny or (start is not None and case.screen is None):
             return start
+        first, second = (
+            self._part(rank * COARSE_SHARE, (rank + 1) * COARSE_SHARE) if depth == 0 else None for rank in range(2)
+        )
         with suppress(DivergenceError):
             if start is None:
-                return self._coarse(case, coarse_mm, None, "guess", 0, depth)
-            bare = self._coarse(replace(case, screen=None, stent=None), coarse_mm, start, "bare guess", 0, depth)
-            return _corrected(start, bare, self._coarse(case, coarse_mm, bare, "stented guess", 1, depth))
+                return self._coarse(case, coarse_mm, None, "guess", first, depth)
+            bare = self._coarse(replace(case, screen=None, stent=None), coarse_mm, start, "bare guess", first, depth)
+            return _corrected(start, bare, self._coarse(case, coarse_mm, bare, "stented guess", second, depth))
         return start
 
     def _coarse(
-        self, case: FlowCase, cell_size_mm: float, start: FlowField | None, name: str, rank: int, depth: int
+        self,
+        case: FlowCase,
+        cell_size_mm: float,
+        start: FlowField | None,
+        name: str,
+        progress: OnProgress | None,
+        depth: int = 0,
     ) -> FlowField:
-        """Compute a guess, itself from a coarser one; what is deeper than the first grid takes no time to speak of."""
+        """Compute a flow on wider cells, itself from a guess; one deeper than the first takes no time to speak of."""
         name = depth * "coarser " + name
         engine = engine_class(case.settings)(cell_size_mm, self.folder / name)
-        progress = self._part(rank * COARSE_SHARE, (rank + 1) * COARSE_SHARE) if depth == 0 else None
         bookmark = self._bookmark(name)
         if bookmark is None or bookmark.saved is None:
             start = self._guess(case, start, cell_size_mm, depth + 1)

@@ -9,7 +9,7 @@ from scipy import ndimage
 from vstent.errors import FlowError
 from vstent.flow.types import FlowCase
 from vstent.kernels import triangles, voxels
-from vstent.kernels.arrays import Floats, Ints, freeze
+from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 from vstent.kernels.lattice import VELOCITIES
 from vstent.surface import Surface
 from vstent.vessel import Opening, Vessel
@@ -22,6 +22,8 @@ MIN_CELLS = 2_000
 """Fewer cells than this are no vessel."""
 WALL = 0
 """Patch number of the wall; opening k has k + 1."""
+BEYOND = -1
+"""Patch number of blood outside a window."""
 BACK_TO_BACK = -0.5
 """Largest cosine between the normals of two walls that part two blood cells: a corner that a link clips parts nothing,
 and blood sent back there turns a jet that leaves its edge (13 links, 3 % of the peak in the FDA's nozzle)."""
@@ -44,7 +46,7 @@ class Domain:
     link_fraction: Floats
     """(l,) where it meets the surface, as a fraction of the link."""
     link_patch: Ints
-    """(l,) what it meets: 0 the wall, k + 1 opening k."""
+    """(l,) what it meets: 0 the wall, k + 1 opening k; in a part of a vessel, more where blood goes on beyond it."""
     septum_cell: Ints
     """(s,) blood cell on one side of a wall thinner than a cell, whose neighbour is blood too."""
     septum_direction: Ints
@@ -80,6 +82,16 @@ class Domain:
         return self.surface.closest(self.centers_mm)[1]
 
 
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A part of the space to look for blood in."""
+
+    origin_mm: Floats
+    """(3,) centre of the cell (0, 0, 0)."""
+    mask: Bools
+    """(i, j, k) cells that belong to it; none at the border."""
+
+
 def default_cell_size_mm(case: FlowCase) -> float:
     """Edge of a cell: as set; else `cells_per_diameter` across the vessel's mean diameter, within the cell budget."""
     settings = case.settings
@@ -91,8 +103,8 @@ def default_cell_size_mm(case: FlowCase) -> float:
     return max(by_diameter, by_budget)
 
 
-def build(vessel: Vessel, cell_size_mm: float) -> Domain:
-    """Put the blood of a vessel on a grid.
+def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> Domain:
+    """Put the blood of a vessel on a grid, all of it or what is connected in a window.
 
     Raises
     ------
@@ -100,12 +112,12 @@ def build(vessel: Vessel, cell_size_mm: float) -> Domain:
         When no blood connects to the inlet, or far too few cells do.
     """
     surface, face_patch, sections = extend(vessel)
-    low = surface.vertices_mm.min(axis=0)
-    # An odd offset keeps grid lines off the vertices and edges of analytic shapes.
-    origin_mm = low - cell_size_mm * (2.0 + np.array([0.1327, 0.2171, 0.1733]))
-    shape = np.ceil((surface.vertices_mm.max(axis=0) - origin_mm) / cell_size_mm).astype(int) + 3
-    inside = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, (int(shape[0]), int(shape[1]), int(shape[2])))
-    inside = _connected(inside, vessel, sections[0], origin_mm, cell_size_mm)
+    origin_mm, shape = _box(surface, cell_size_mm) if window is None else (window.origin_mm, window.mask.shape)
+    filled = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, shape)
+    if window is None:
+        inside = _connected(filled, vessel, sections[0], origin_mm, cell_size_mm)
+    else:
+        inside = _largest(filled & window.mask)
     cells = np.argwhere(inside).astype(np.int32)
     if len(cells) < MIN_CELLS:
         raise FlowError(
@@ -115,9 +127,24 @@ def build(vessel: Vessel, cell_size_mm: float) -> Domain:
     index = np.full(inside.shape, -1, dtype=np.int32)
     index[inside] = np.arange(len(cells), dtype=np.int32)
     neighbour = np.stack([index[tuple((cells + c).T)] for c in VELOCITIES], axis=1)
-    links = _links(surface, face_patch, neighbour, cells, origin_mm, cell_size_mm)
+    is_beyond = filled & ~inside & (window is not None)
+    links = _links(surface, face_patch, neighbour, cells, is_beyond, origin_mm, cell_size_mm)
     septa = _septa(surface, neighbour, cells, origin_mm, cell_size_mm)
     return Domain(cell_size_mm, origin_mm, cells, *links, *septa, surface, sections)
+
+
+def _box(surface: Surface, cell_size_mm: float) -> tuple[Floats, tuple[int, int, int]]:
+    """Centre (3,) of the first cell, and the number of cells along each axis, of a grid around a surface."""
+    # An odd offset keeps grid lines off the vertices and edges of analytic shapes.
+    origin_mm = surface.vertices_mm.min(axis=0) - cell_size_mm * (2.0 + np.array([0.1327, 0.2171, 0.1733]))
+    shape = np.ceil((surface.vertices_mm.max(axis=0) - origin_mm) / cell_size_mm).astype(int) + 3
+    return origin_mm, (int(shape[0]), int(shape[1]), int(shape[2]))
+
+
+def _largest(inside: Bools) -> Bools:
+    """Keep the largest connected part."""
+    label, _ = ndimage.label(inside)
+    return np.asarray(label == 1 + np.bincount(label.ravel())[1:].argmax())
 
 
 def _place(opening: Opening) -> str:
@@ -206,7 +233,13 @@ def _strip(inner: Ints, outer: Ints) -> Ints:
 
 
 def _links(
-    surface: Surface, face_patch: Ints, neighbour: Ints, cells: Ints, origin_mm: Floats, cell_size_mm: float
+    surface: Surface,
+    face_patch: Ints,
+    neighbour: Ints,
+    cells: Ints,
+    is_beyond: Bools,
+    origin_mm: Floats,
+    cell_size_mm: float,
 ) -> tuple[Ints, Ints, Floats, Ints]:
     """Links that leave the blood: their cell, direction, fraction to the surface and patch."""
     cell, direction = np.nonzero(neighbour < 0)
@@ -217,7 +250,8 @@ def _links(
     is_missed = fraction > 1.0
     fraction = np.clip(np.where(is_missed, 0.5, fraction), 1e-3, 1.0)
     _, _, face = surface.closest(starts + fraction[:, None] * step_mm)
-    patch = np.where(is_missed, WALL, face_patch[face])
+    goes_on = is_beyond[tuple((cells[cell] + VELOCITIES[direction]).T)]
+    patch = np.where(is_missed, np.where(goes_on, BEYOND, WALL), face_patch[face])
     return cell.astype(np.int32), direction.astype(np.int32), fraction, patch.astype(np.int32)
 
 
@@ -235,18 +269,3 @@ def _septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, ce
     this_side, that_side = surface.first_hits(starts, along)[1], surface.first_hits(starts + step_mm, -along)[1]
     parts = np.einsum("ij,ij->i", surface.normals[this_side], surface.normals[that_side]) < BACK_TO_BACK
     return cell[parts].astype(np.int32), direction[parts].astype(np.int32)
-
-
-def cells_inside(surface: Surface, centers_mm: Floats, cell_size_mm: float) -> Ints:
-    """Numbers of the cell centres (n, 3) that lie inside a closed surface."""
-    low = surface.vertices_mm.min(axis=0) - cell_size_mm
-    near = np.flatnonzero(
-        ((centers_mm >= low) & (centers_mm <= surface.vertices_mm.max(axis=0) + cell_size_mm)).all(axis=1)
-    )
-    if len(near) == 0:
-        return near.astype(np.int32)
-    origin_mm = centers_mm[near].min(axis=0) - cell_size_mm
-    place = np.rint((centers_mm[near] - origin_mm) / cell_size_mm).astype(int)
-    shape = place.max(axis=0) + 2
-    inside = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, (int(shape[0]), int(shape[1]), int(shape[2])))
-    return near[inside[tuple(place.T)]].astype(np.int32)

@@ -5,7 +5,6 @@ from typing import Final
 import numpy as np
 
 from vstent.flow import sampling
-from vstent.flow.domain import cells_inside
 from vstent.flow.types import FlowField
 from vstent.kernels import lattice_sampling
 from vstent.kernels.arrays import Bools, Floats
@@ -91,7 +90,7 @@ def _of_ostium(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, flo
 
 
 def _of_sac(field: FlowField, sac: Surface) -> dict[str, float]:
-    cells = cells_inside(sac, field.centers_mm, field.cell_size_mm)
+    cells = sampling.cells_inside(sac, field.centers_mm, field.cell_size_mm)
     speed_m_s = field.speed_m_s[cells]
     # Cells cut by the sac's wall count as a whole or not at all: integrals are scaled to the true volume.
     volume_mm3 = abs(sac.volume_mm3)

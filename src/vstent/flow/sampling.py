@@ -3,8 +3,8 @@
 import numpy as np
 
 from vstent.flow.types import FlowField
-from vstent.kernels import lattice_sampling
-from vstent.kernels.arrays import Floats
+from vstent.kernels import lattice_sampling, voxels
+from vstent.kernels.arrays import Floats, Ints
 from vstent.surface import Surface
 
 
@@ -33,3 +33,18 @@ def _quartered(corners: Floats) -> Floats:
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
     return np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+
+
+def cells_inside(surface: Surface, centers_mm: Floats, cell_size_mm: float) -> Ints:
+    """Numbers of the cell centres (n, 3) that lie inside a closed surface."""
+    low = surface.vertices_mm.min(axis=0) - cell_size_mm
+    near = np.flatnonzero(
+        ((centers_mm >= low) & (centers_mm <= surface.vertices_mm.max(axis=0) + cell_size_mm)).all(axis=1)
+    )
+    if len(near) == 0:
+        return near.astype(np.int32)
+    origin_mm = centers_mm[near].min(axis=0) - cell_size_mm
+    place = np.rint((centers_mm[near] - origin_mm) / cell_size_mm).astype(int)
+    shape = place.max(axis=0) + 2
+    inside = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, (int(shape[0]), int(shape[1]), int(shape[2])))
+    return near[inside[tuple(place.T)]].astype(np.int32)

@@ -380,7 +380,8 @@ def drive(
         remembered mean density, its rate of change, the outward normal (3), the area in cells, the density imposed.
     start : (k + 1,) first link of every opening in what follows.
     address : (l, 6) as in `paths`; place : (l,) storage place of each link's cell; direction, source : (l,).
-    shape : (l, 2) what inflow sends back through each link, over its speed and over its speed squared.
+    shape : (l, 2) what inflow sends back through each link, over its speed and over its speed squared; of what an
+        outlet imposes, how much more its density is at each link than the outlet's.
 
     Inflow: half-way reflection off a moving wall (Ladd 1994, J. Fluid Mech. 271, 285), so the flow is exact. It
     lets sound out: a density above the remembered mean is answered by the wave that leaves (Poinsot and Lele 1992,
@@ -400,4 +401,4 @@ def drive(
         if opening[0] == OUTFLOW:
             density = outlet_density(opening, outflow(f, address[first:last]))
         for n in range(first, last):
-            source[n] = outlet_source(f, stride, place[n], direction[n], opening, density)
+            source[n] = outlet_source(f, stride, place[n], direction[n], opening, density + shape[n, 0])

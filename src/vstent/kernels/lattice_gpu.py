@@ -238,4 +238,4 @@ def drive(
         if kind == INFLOW:
             source[n] = (shape[n, 0] + shape[n, 1] * answer) * answer
         else:
-            source[n] = outlet_source(f, stride, place[n], direction[n], opening, answer)
+            source[n] = outlet_source(f, stride, place[n], direction[n], opening, answer + shape[n, 0])

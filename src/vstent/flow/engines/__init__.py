@@ -78,10 +78,16 @@ class AbstractEngine(ABC, Generic[State]):
     """The engine's own folder for this one run, not there yet: what it writes lies there, and what lies there of the
     same run it may go on from. None: it is asked to do without."""
 
+    outer: FlowField | None = None
+    """The flow all over, on wider cells, where only the close-up of the sac is to be computed; None: the whole vessel
+    is."""
+
     coarsening: ClassVar[float | None] = None
     """Cells of a first guess by the same engine over those of the answer; None: it finds its own way from the start."""
     refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm",)
     """Settings that the result converges with as they become smaller; the cell size is the first."""
+    closes_up: ClassVar[bool] = False
+    """Whether it can be given an `outer` flow."""
     runs_on_gpu: ClassVar[bool] = False
     """Whether it heeds ``device_gpu``; where it does not, it is not asked."""
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vstent.flow.cost import estimate, refuse_too_large
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.engines.lattice_checkpoint import pack, unpack
-from vstent.flow.engines.lattice_setup import Scales
+from vstent.flow.engines.lattice_scales import Scales
 from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, peak_speed_m_s, read, step
 from vstent.flow.engines.lattice_trouble import trouble
 from vstent.flow.gpu import require_gpu
@@ -43,6 +43,7 @@ class AbstractLattice(AbstractEngine[State]):
 
     coarsening: ClassVar[float | None] = 2.0
     refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm", "lattice_speed")
+    closes_up: ClassVar[bool] = True
     runs_on_gpu: ClassVar[bool] = True
 
     def cost(self, case: FlowCase) -> str:
@@ -62,7 +63,7 @@ class AbstractLattice(AbstractEngine[State]):
 
     def resume(self, case: FlowCase, saved: Saved) -> State:
         """Build the run anew and put it where it was."""
-        return unpack(case, self.cell_size_mm, saved)
+        return unpack(case, self.cell_size_mm, saved, self.outer)
 
     def step(self, state: State) -> State:
         """Advance towards the next check."""
@@ -82,7 +83,8 @@ class LatticeBoltzmann(AbstractLattice):
         """Choose the time step so that the fastest blood moves `lattice_speed` cells a step."""
         cell_m = self.cell_size_mm * M_PER_MM
         scales = Scales(cell_m, case.settings.lattice_speed * cell_m / peak_speed_m_s(case, start), case.blood)
-        return build(case, scales, _steps_per_check(case, scales), start=start, kept=CHECKS_AVERAGED)
+        steps = _steps_per_check(case, scales)
+        return build(case, scales, steps, outer=self.outer, start=start, kept=CHECKS_AVERAGED)
 
     def terminate(self, state: State) -> float | None:
         """Fraction that the monitored quantities have left to go, the worst of the last checks."""

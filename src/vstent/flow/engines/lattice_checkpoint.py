@@ -5,9 +5,9 @@ from collections import deque
 import numpy as np
 
 from vstent.flow.engines import Saved
-from vstent.flow.engines.lattice_setup import Scales
+from vstent.flow.engines.lattice_scales import Scales
 from vstent.flow.engines.lattice_state import Snapshot, State, build
-from vstent.flow.types import FlowCase
+from vstent.flow.types import FlowCase, FlowField
 from vstent.units import M_PER_MM
 
 
@@ -34,10 +34,10 @@ def pack(state: State) -> Saved:
     }
 
 
-def unpack(case: FlowCase, cell_size_mm: float, saved: Saved) -> State:
+def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, outer: FlowField | None) -> State:
     """Build the run of a case anew and put it where it was."""
     scales = Scales(cell_size_mm * M_PER_MM, float(saved["step_s"]), case.blood)
-    state = build(case, scales, int(saved["steps_per_check"]), start=None, kept=int(saved["kept"]))
+    state = build(case, scales, int(saved["steps_per_check"]), outer=outer, start=None, kept=int(saved["kept"]))
     state.populations[:] = saved["populations"]
     state.links.source[:] = saved["source"]
     state.links.openings[:] = saved["openings"]

@@ -10,7 +10,7 @@ import numpy as np
 from numba import cuda
 from numpy.typing import NDArray
 
-from vstent.flow.engines.lattice_setup import ODD_RATE
+from vstent.flow.engines.lattice_scales import ODD_RATE
 from vstent.flow.engines.lattice_state import DEFER_PAIRS, DEFER_PART, State
 from vstent.kernels import lattice_gpu
 from vstent.kernels.arrays import Floats, Ints

@@ -1,13 +1,13 @@
 """The embedded engine for pulsatile flow: the same steps, the inflow following a waveform until cycles repeat."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
 from vstent.flow.engines import Outcome
 from vstent.flow.engines.lattice_boltzmann import AbstractLattice
-from vstent.flow.engines.lattice_setup import Scales
+from vstent.flow.engines.lattice_scales import Scales
 from vstent.flow.engines.lattice_state import (
     PHASES,
     State,
@@ -30,12 +30,14 @@ STALLED: Final = 0.8
 class PulsatileLatticeBoltzmann(AbstractLattice):
     """The sparse D3Q19 engine with a waveform at the inlet."""
 
+    closes_up: ClassVar[bool] = False
+
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Choose a time step that divides the cycle and keeps the fastest blood below `lattice_speed` cells a step."""
         steps = steps_per_phase(case, self.cell_size_mm, start)
         phase_s = waveform_of(case).period_s / PHASES
         scales = Scales(self.cell_size_mm * M_PER_MM, phase_s / steps, case.blood)
-        return build(case, scales, steps, start=start, kept=PHASES)
+        return build(case, scales, steps, outer=None, start=start, kept=PHASES)
 
     def terminate(self, state: State) -> float | None:
         """Relative change of the monitored quantities from the last cycle but one to the last; inf within a cycle."""

@@ -5,24 +5,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vstent.flow.close_up import CloseUp
 from vstent.flow.domain import Domain
-from vstent.flow.profile import developed_profile
+from vstent.flow.engines.lattice_ends import Ends
+from vstent.flow.engines.lattice_scales import ODD_RATE, Scales
 from vstent.flow.screen import on_grid
-from vstent.flow.types import Blood, FlowCase
+from vstent.flow.types import FlowCase
 from vstent.kernels import lattice, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints
-from vstent.units import M3_PER_ML
 
-ODD_RATE = 0.7
-"""Relaxation rate of the odd part: lower is more isotropic, higher is more stable and leaks less."""
 CELL_REYNOLDS_AT_END = 25.0
 """Largest speed x cell / viscosity in the openings' extensions, whose ends are where fast blood becomes unstable first
 (30 to 50 were seen to fail): faster blood is made thicker there. In the vessel there is no limit."""
 REFILL_BLOCK = 2
 """Edge, in cells, of the blocks within which the walls' losses are made up."""
-SOUND_MEMORY = 0.002
-"""Rate per step pair at which the inlet forgets the pressure that it takes for the mean, in steady flow. In pulsatile
-flow it takes every new pressure for the mean at once (1): the flow is the waveform's, whatever answers it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,55 +47,15 @@ class Addressing:
     """(2, t) see `lattice.swap`."""
 
 
-@dataclass(frozen=True)
-class Scales:
-    """Lattice units of one grid and time step."""
-
-    cell_m: float
-    """Edge of a cell."""
-    step_s: float
-    """Time step."""
-    blood: Blood
-    """The fluid."""
-
-    @property
-    def speed_m_s(self) -> float:
-        """One cell per time step."""
-        return self.cell_m / self.step_s
-
-    @property
-    def pressure_Pa(self) -> float:
-        """Pressure of unit density deviation: rho c^2 / 3."""
-        return self.blood.density_kg_m3 * self.speed_m_s**2 / 3
-
-    @property
-    def flow_mL_s(self) -> float:
-        """One cell volume per time step."""
-        return self.cell_m**3 / self.step_s / M3_PER_ML
-
-    @property
-    def viscosity(self) -> float:
-        """Kinematic viscosity, in squared cells per time step."""
-        return self.blood.kinematic_viscosity_m2_s * self.step_s / self.cell_m**2
-
-    @property
-    def thinning(self) -> NDArray[np.float32]:
-        """(4,) the blood's law in lattice units (see `lattice.update`)."""
-        law = self.blood.thinning
-        if law is None:
-            return np.zeros(4, np.float32)
-        more = (law.rest_viscosity_Pa_s - self.blood.viscosity_Pa_s) / self.blood.viscosity_Pa_s
-        return np.array([3 * self.viscosity * more, law.time_s / self.step_s, law.a, (law.n - 1) / law.a], np.float32)
-
-    @property
-    def relaxation_steps(self) -> float:
-        """Relaxation time of the stress, in time steps."""
-        return 3 * self.viscosity + 0.5
-
-
 @dataclass(frozen=True, eq=False)
 class Links:
-    """Coefficients of everything that is sent back, openings first, then the wall; sources change in place."""
+    """Coefficients of everything that is sent back, ends first, then the wall; sources change in place.
+
+    The ends are the openings, and in a close-up the cuts beyond which the blood goes on.
+    """
+
+    patch: Ints
+    """(k,) patch of every end (see `Domain.link_patch`)."""
 
     address: Ints
     """(l, 6) see `lattice.paths`."""
@@ -239,24 +195,31 @@ def _swap_addresses(domain: Domain, number: Ints, stride: int) -> Ints:
     return np.stack([lattice.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
 
 
-def build_links(case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales) -> Links:
-    """Interpolated reflection at the wall, imposed flow or pressure at the openings."""
+def build_links(
+    case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales, close_up: CloseUp | None
+) -> Links:
+    """Interpolated reflection at the wall, imposed flow or pressure at the ends."""
     order = _link_order(domain)
     patch = domain.link_patch[order]
-    start = np.searchsorted(patch[: int((patch > 0).sum())], np.arange(1, len(domain.sections) + 2)).astype(np.int32)
+    patches = np.unique(patch[patch > 0])
+    of_ends = patch[: int((patch > 0).sum())]
+    start: Ints = np.asarray(np.searchsorted(of_ends, np.r_[patches, patches[-1] + 1]), dtype=np.int32)
     fraction = domain.link_fraction[order]
     weight = linear_weights(fraction, addressing.link_has_one[order])
     correction = parabolic_weights(fraction, scales.relaxation_steps)
     correction[:, :3] -= weight
     correction[~addressing.link_has_two[order]] = 0.0
-    shape = np.zeros((start[-1], 2))
-    openings = np.array([_imposed(case, domain, scales, k) for k in range(len(domain.sections))])
-    is_inlet = slice(start[0], start[1])
     weight[: start[-1]], correction[: start[-1]] = (-1.0, 0.0, 0.0), 0.0
-    weight[is_inlet] = (1.0, 0.0, 0.0)
-    shape[is_inlet] = _unit_inflow(case, domain, order[is_inlet]) * [openings[0, 7], 1.0]
+    shape, openings = np.zeros((start[-1], 2)), np.zeros((len(patches), 9))
+    ends = Ends(case, domain, scales, close_up)
+    for k, number in enumerate(patches):
+        of_end = slice(start[k], start[k + 1])
+        openings[k], shape[of_end] = ends.imposed(int(number), order[of_end])
+        if openings[k, 0] == lattice.INFLOW:
+            weight[of_end] = (1.0, 0.0, 0.0)
     opening_links = order[: start[-1]]
     return Links(
+        patches,
         addressing.link_address[order],
         *lattice.paths(addressing.link_address[order], weight),
         correction.astype(np.float32),
@@ -270,12 +233,12 @@ def build_links(case: FlowCase, domain: Domain, addressing: Addressing, scales: 
 
 
 def _link_order(domain: Domain) -> Ints:
-    """Openings first, in order, by cell within each; then the wall, by layer, and by direction within it.
+    """Ends first, in order, by cell within each; then the wall, by layer, and by direction within it.
 
     So each address runs on, and what is done with a layer finds it in the processor's cache.
     """
     is_wall = domain.link_patch == 0
-    patch = np.where(is_wall, len(domain.sections) + 1, domain.link_patch)
+    patch = np.where(is_wall, domain.link_patch.max() + 1, domain.link_patch)
     layer = domain.cells[domain.link_cell, 0]
     return np.lexsort((domain.link_cell, *(np.where(is_wall, key, 0) for key in (domain.link_direction, layer)), patch))
 
@@ -324,50 +287,6 @@ def parabolic_weights(fraction: Floats, relaxation_steps: float) -> Floats:
     x, even, odd = fraction, relaxation_steps - 0.5, 1 / ODD_RATE - 0.5
     slip = (x * (1 - x) - even * (odd + np.abs(x - 0.5))) / np.maximum(1, x * (2 * x + 1))
     return quadratic_weights(fraction) + slip[:, None] * np.array([1.0, -2.0, 0.0, 1.0, 0.0])
-
-
-def _imposed(case: FlowCase, domain: Domain, scales: Scales, k: int) -> Floats:
-    """Row (9,) of `lattice.drive` for opening k."""
-    opening = case.vessel.openings[k]
-    outflow_mL_s = _outflow_mL_s(case, k)
-    kind = lattice.INFLOW if k == 0 else lattice.PRESSURE if outflow_mL_s is None else lattice.OUTFLOW
-    speed = (case.inflow_mL_s if k == 0 else outflow_mL_s or 0.0) / opening.area_mm2 / scales.speed_m_s
-    # Outlets, critically damped: the blood that the pressure moves is a column about as long as the grid.
-    outlet_rate = 0.25 / float(np.ptp(domain.cells, axis=0).max())
-    inlet_rate = SOUND_MEMORY if case.settings.waveform is None else 1.0
-    rate = inlet_rate if k == 0 else outlet_rate
-    return np.array([kind, speed, 0.0, rate, *opening.normal, opening.area_mm2 / domain.cell_size_mm**2, 0.0])
-
-
-def _outflow_mL_s(case: FlowCase, k: int) -> float | None:
-    """Murray's share of the inflow for opening k; None where pressure is imposed: the widest outlet takes the rest."""
-    cubes = np.array([outlet.diameter_mm**3 for outlet in case.vessel.outlets])
-    if case.settings.outlets == "zero_pressure" or k in (0, 1 + int(np.argmax(cubes))):
-        return None
-    return float(case.inflow_mL_s * cubes[k - 1] / cubes.sum())
-
-
-def _unit_inflow(case: FlowCase, domain: Domain, links: Ints) -> Floats:
-    """What each link of the inlet sends back, (l, 2): for one cell volume per time step, and besides for speed squared.
-
-    Links at the rim meet the wall instead of the inlet: what they would send is made up for near the rim, for a
-    profile scaled up as a whole would be too fast on the axis, and keep so for tens of diameters. The second column
-    takes out what the odd rate has to relax across the profile: it would push blood towards the axis.
-    """
-    normal = case.vessel.inlet.normal
-    q = domain.link_direction[links]
-    c, weight = lattice.VELOCITIES[q], lattice.WEIGHTS[q]
-    along = c @ normal
-    halfway_mm = domain.origin_mm + (domain.cells[domain.link_cell[links]] + 0.5 * c) * domain.cell_size_mm
-    inner, speed, outer = (
-        developed_profile(domain.sections[0], normal, halfway_mm + part * c * domain.cell_size_mm)
-        for part in (-0.5, 0.0, 0.5)
-    )
-    sent = 6 * weight * along * speed * domain.cell_size_mm**2 / case.vessel.inlet.area_mm2
-    pushed = (2 / ODD_RATE - 1) * weight * (4.5 * along**2 - 1.5) * (outer**2 - inner**2)
-    rim = np.where(speed > 0, weight * along * (1 - speed / speed.max()), 0.0)
-    rim /= rim.sum()
-    return np.stack([sent + (1 - sent.sum()) * rim, pushed - pushed.sum() * rim], axis=1)
 
 
 def build_refill(domain: Domain, addressing: Addressing) -> Refill:

@@ -12,16 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.errors import FlowError
+from vstent.flow import close_up as close_ups
 from vstent.flow import domain as domains
 from vstent.flow import sampling
+from vstent.flow.close_up import CloseUp
 from vstent.flow.engines import Outcome
+from vstent.flow.engines.lattice_scales import ODD_RATE, Scales
 from vstent.flow.engines.lattice_setup import (
     CELL_REYNOLDS_AT_END,
-    ODD_RATE,
     Addressing,
     Links,
     Refill,
-    Scales,
     ScreenEntries,
     address,
     build_bands,
@@ -74,7 +75,7 @@ class Snapshot:
     density: NDArray[np.float32]
     """(n,) deviation of every cell."""
     outflow: Floats
-    """(k,) through every opening."""
+    """(k,) through every end."""
 
 
 @dataclass(eq=False)
@@ -86,6 +87,8 @@ class State:
 
     case: FlowCase
     """What is computed."""
+    close_up: CloseUp | None
+    """What of it is computed, and what surrounds that; None: all of it."""
     domain: domains.Domain
     """The grid."""
     addressing: Addressing
@@ -122,17 +125,34 @@ class State:
     """The run on a GPU, once it is there."""
 
 
-def build(case: FlowCase, scales: Scales, steps_per_check: int, *, start: FlowField | None, kept: int) -> State:
-    """Build grid, storage and coefficients; begin at rest or from a field on any grid; `kept` checks are remembered."""
+def build(
+    case: FlowCase,
+    scales: Scales,
+    steps_per_check: int,
+    *,
+    outer: FlowField | None,
+    start: FlowField | None,
+    kept: int,
+) -> State:
+    """Build grid, storage and coefficients; begin at rest or from a field on any grid; `kept` checks are remembered.
+
+    In an `outer` flow only the close-up is computed.
+    """
     if case.settings.device_gpu:
         require_gpu()
     keep_flow()
-    domain = domains.build(case.vessel, scales.cell_m / M_PER_MM)
+    cell_size_mm = scales.cell_m / M_PER_MM
+    if outer is None:
+        close_up, domain = None, domains.build(case.vessel, cell_size_mm)
+    else:
+        close_up = close_ups.close_up(case, outer)
+        domain = close_ups.build(case, cell_size_mm, close_up)
     is_end = in_extensions(case, domain)
     addressing = address(domain, is_end)
-    links = build_links(case, domain, addressing, scales)
+    links = build_links(case, domain, addressing, scales, close_up)
     state = State(
         case,
+        close_up,
         domain,
         addressing,
         scales,
@@ -184,7 +204,7 @@ def waveform_of(case: FlowCase) -> Waveform:
 def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
     if case.sac is None or case.ostium is None:
         return Probe(np.arange(len(domain.cells), dtype=np.int32), np.zeros((0, 3)), np.zeros((0, 3)))
-    cells = domains.cells_inside(case.sac, domain.centers_mm, domain.cell_size_mm)
+    cells = sampling.cells_inside(case.sac, domain.centers_mm, domain.cell_size_mm)
     points_mm, area_mm2 = sampling.surface_samples(case.ostium, domain.cell_size_mm)
     return Probe(cells, (points_mm - domain.origin_mm) / domain.cell_size_mm, area_mm2)
 
@@ -199,8 +219,9 @@ def _begin_from(state: State, start: FlowField) -> None:
         velocity / state.scales.speed_m_s,
     )
     links = state.links
-    at_inlet = links.place[links.start[0] : links.start[1]]
-    links.openings[0, 2] = lattice.moments(state.populations, state.addressing.stride, at_inlet)[:, 0].mean()
+    for k in np.flatnonzero(links.openings[:, 0] == lattice.INFLOW):
+        at_inlet = links.place[links.start[k] : links.start[k + 1]]
+        links.openings[k, 2] = lattice.moments(state.populations, state.addressing.stride, at_inlet)[:, 0].mean()
 
 
 def step(state: State) -> None:
@@ -297,7 +318,8 @@ def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
 def _monitor(state: State, now: Snapshot) -> Floats:
     """Mean speed of the sac, pressure and mean speed of the vessel, neck inflow: what convergence is judged by."""
     speed = np.linalg.norm(now.velocity, axis=1)
-    inlet = state.domain.link_cell[state.domain.link_patch == 1]
+    first_inflow = state.links.patch[np.argmax(state.links.openings[:, 0] == lattice.INFLOW)]
+    inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
     values = [speed[state.probe.cells].mean(), now.density[inlet].mean(), speed.mean()]
     if len(state.probe.ostium_points):
         index = state.domain.index
@@ -319,7 +341,7 @@ class Reading:
     wall_pressure_Pa: Floats
     """(v,)."""
     outflow_mL_s: Floats
-    """(k,) through every opening."""
+    """(k,) through every opening; nan where a close-up does not reach it."""
 
 
 def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
@@ -330,7 +352,10 @@ def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     stress_Pa, wall_pressure_Pa = wall_stress(
         domain, velocity_m_s, pressure_Pa, lumen=state.case.vessel.lumen, blood=state.case.blood
     )
-    outflow_mL_s = np.mean([one.outflow for one in snapshots], axis=0) * scales.flow_mL_s
+    outflow_mL_s = np.full(len(state.case.vessel.openings), np.nan)
+    is_opening = state.links.patch <= len(outflow_mL_s)
+    through = np.mean([one.outflow for one in snapshots], axis=0) * scales.flow_mL_s
+    outflow_mL_s[state.links.patch[is_opening] - 1] = through[is_opening]
     return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, outflow_mL_s)
 
 
@@ -338,7 +363,7 @@ def field_of(state: State, flow: Reading, outcome: Outcome, advice: str, phases:
     """Put a flow together with how it was reached."""
     domain, vessel = state.domain, state.case.vessel
     section_Pa = np.array([_section_pressure_Pa(state, flow.pressure_Pa, k) for k in range(len(vessel.openings))])
-    return FlowField(
+    field = FlowField(
         cells=domain.cells,
         origin_mm=domain.origin_mm,
         cell_size_mm=domain.cell_size_mm,
@@ -360,6 +385,7 @@ def field_of(state: State, flow: Reading, outcome: Outcome, advice: str, phases:
         updates_per_s=len(domain.cells) * state.steps / state.loop_seconds,
         phases=phases,
     )
+    return field if state.close_up is None else close_ups.assembled(state.close_up, field)
 
 
 def _section_pressure_Pa(state: State, pressure_Pa: Floats, k: int) -> float:

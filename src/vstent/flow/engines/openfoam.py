@@ -14,6 +14,7 @@ import numpy as np
 
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
+from vstent.flow import sampling
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.engines.lattice_boltzmann import CHECKS_AGREEING, CHECKS_AVERAGED, fraction_left
 from vstent.flow.engines.lattice_pulse import cycle_change
@@ -103,7 +104,7 @@ class OpenFoam(AbstractEngine[State]):
         domain = domains.build(case.vessel, self.grid_size_mm or self.cell_size_mm)
         sac = np.arange(len(domain.cells), dtype=np.int32)
         if case.sac is not None:
-            sac = domains.cells_inside(case.sac, domain.centers_mm, domain.cell_size_mm).astype(np.int32)
+            sac = sampling.cells_inside(case.sac, domain.centers_mm, domain.cell_size_mm).astype(np.int32)
         across = bridge(case, domain, self.folder)
         kept: deque[Snapshot] = deque(maxlen=PHASES if case.settings.waveform else CHECKS_AVERAGED)
         return State(case, setup, found, foam.application, self.folder, domain, across, sac, kept)

@@ -1,0 +1,160 @@
+"""What the embedded engine imposes where its grid ends: at the openings, and where a close-up is cut off."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vstent.flow import sampling
+from vstent.flow.close_up import CloseUp
+from vstent.flow.domain import Domain
+from vstent.flow.engines.lattice_scales import ODD_RATE, Scales
+from vstent.flow.profile import developed_profile
+from vstent.flow.types import FlowCase
+from vstent.kernels import lattice
+from vstent.kernels.arrays import Floats, Ints
+
+SOUND_MEMORY = 0.002
+"""Rate per step pair at which the inlet forgets the pressure that it takes for the mean, in steady flow. In pulsatile
+flow it takes every new pressure for the mean at once (1): the flow is the waveform's, whatever answers it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """The ends of a grid, by their patch."""
+
+    case: FlowCase
+    """What is computed."""
+    domain: Domain
+    """The grid."""
+    scales: Scales
+    """Its units."""
+    close_up: CloseUp | None
+    """What surrounds it, if anything does."""
+
+    def imposed(self, patch: int, links: Ints) -> tuple[Floats, Floats]:
+        """Row (9,) of `lattice.drive` for an end, and what it sends back through each of its links, (l, 2)."""
+        openings = self.case.vessel.openings
+        if self.close_up is None or patch <= len(openings):
+            return self._opening(patch - 1, links)
+        flow = float(self.close_up.inflow_mL_s[patch - len(openings) - 1]) / self.scales.flow_mL_s
+        return self._entry(flow, links) if flow > 0 else self._exit(-flow, links)
+
+    def _opening(self, k: int, links: Ints) -> tuple[Floats, Floats]:
+        opening = self.case.vessel.openings[k]
+        outflow_mL_s = _outflow_mL_s(self.case, k)
+        kind = lattice.INFLOW if k == 0 else lattice.PRESSURE if outflow_mL_s is None else lattice.OUTFLOW
+        flow_mL_s = self.case.inflow_mL_s if k == 0 else outflow_mL_s or 0.0
+        speed = flow_mL_s / opening.area_mm2 / self.scales.speed_m_s
+        area = opening.area_mm2 / self.domain.cell_size_mm**2
+        row = np.array([kind, speed, 0.0, self._rate(kind), *opening.normal, area, 0.0])
+        if k > 0:
+            return row, np.zeros((len(links), 2))
+        return row, _unit_inflow(self.case, self.domain, links) * [area, 1.0]
+
+    def _rate(self, kind: float) -> float:
+        """Rate at which an end changes what it remembers."""
+        if kind == lattice.INFLOW:
+            return SOUND_MEMORY if self.case.settings.waveform is None else 1.0
+        # Critically damped: the blood that the pressure moves is a column about as long as the grid.
+        return 0.25 / float(np.ptp(self.domain.cells, axis=0).max())
+
+    def _entry(self, flow: float, links: Ints) -> tuple[Floats, Floats]:
+        """A cut through which blood enters, at the velocity of the flow outside, scaled to what passes there."""
+        normal, area = self._section(links)
+        q, c, _ = self._along(links)
+        inner, at, outer = (self._velocity(links, part) for part in (0.25, 0.5, 0.75))
+        sent = -6 * lattice.WEIGHTS[q] * (c * at).sum(axis=1)
+        per_speed = flow / sent.sum() / (flow / area)
+        pushing = _pushed(q, per_speed * inner, per_speed * outer)
+        row = np.array([lattice.INFLOW, flow / area, 0.0, self._rate(lattice.INFLOW), *normal, area, 0.0])
+        return row, np.stack([per_speed * sent, pushing - pushing.mean()], axis=1)
+
+    def _exit(self, flow: float, links: Ints) -> tuple[Floats, Floats]:
+        """A cut through which blood leaves, at the pressure of the flow outside.
+
+        As a whole that is raised until what leaves is what passes there; where most leaves, the rest does.
+        """
+        normal, area = self._section(links)
+        _, _, at_mm = self._along(links, 0.5)
+        density = sampling.values_at(self._outside.outer, at_mm)[1] / self.scales.pressure_Pa
+        inward = np.maximum(0.0, -self._velocity(links, 0.5) @ normal)
+        density += 1.5 * inward**2  # what `lattice.outlet_source` takes off again
+        mean = float(density.mean())
+        kind = lattice.PRESSURE if self._takes_the_rest(flow) else lattice.OUTFLOW
+        wanted = mean if kind == lattice.PRESSURE else flow / area
+        row = np.array([kind, wanted, mean, self._rate(kind), *normal, area, mean])
+        return row, np.stack([density - mean, np.zeros(len(links))], axis=1)
+
+    @property
+    def _outside(self) -> CloseUp:
+        assert self.close_up is not None
+        return self.close_up
+
+    def _takes_the_rest(self, flow: float) -> bool:
+        """Tell whether no more leaves anywhere else, at a cut or an outlet."""
+        outside = self._outside
+        within = [k for k in range(len(self.case.vessel.outlets)) if (self.domain.link_patch == k + 2).any()]
+        most_mL_s = float(np.concatenate([-outside.inflow_mL_s, outside.outer.outlets_mL_s[within]]).max())
+        return flow * self.scales.flow_mL_s >= most_mL_s * (1 - 1e-9)
+
+    def _along(self, links: Ints, part: float = 0.0) -> tuple[Ints, Ints, Floats]:
+        """Direction (l,) and lattice velocity (l, 3) of links, and the point (l, 3) on each that part of its way."""
+        q = self.domain.link_direction[links]
+        c = lattice.VELOCITIES[q]
+        cell = self.domain.cells[self.domain.link_cell[links]]
+        return q, c, self.domain.origin_mm + (cell + part * c) * self.domain.cell_size_mm
+
+    def _velocity(self, links: Ints, part: float) -> Floats:
+        """Velocity (l, 3) of the flow outside, in lattice units, that part of the way along links."""
+        at_mm = self._along(links, part)[2]
+        return self._outside.velocity_m_s(at_mm, self.domain.surface) / self.scales.speed_m_s
+
+    def _section(self, links: Ints) -> tuple[Floats, float]:
+        """Outward normal (3,) of a cut and its area in cells: the sum of the cells' faces in it."""
+        q, c, _ = self._along(links)
+        faces = c[q <= lattice.AXIAL].sum(axis=0)
+        area = float(np.linalg.norm(faces))
+        return faces / area, area
+
+
+def _outflow_mL_s(case: FlowCase, k: int) -> float | None:
+    """Murray's share of the inflow for opening k; None where pressure is imposed: the widest outlet takes the rest."""
+    cubes = np.array([outlet.diameter_mm**3 for outlet in case.vessel.outlets])
+    if case.settings.outlets == "zero_pressure" or k in (0, 1 + int(np.argmax(cubes))):
+        return None
+    return float(case.inflow_mL_s * cubes[k - 1] / cubes.sum())
+
+
+def _unit_inflow(case: FlowCase, domain: Domain, links: Ints) -> Floats:
+    """What each link of the inlet sends back, (l, 2): for one cell volume per time step, and besides for speed squared.
+
+    Links at the rim meet the wall instead of the inlet: what they would send is made up for near the rim, for a
+    profile scaled up as a whole would be too fast on the axis, and keep so for tens of diameters.
+    """
+    normal = case.vessel.inlet.normal
+    q = domain.link_direction[links]
+    c, weight = lattice.VELOCITIES[q], lattice.WEIGHTS[q]
+    along = c @ normal
+    halfway_mm = domain.origin_mm + (domain.cells[domain.link_cell[links]] + 0.5 * c) * domain.cell_size_mm
+    inner, speed, outer = (
+        developed_profile(domain.sections[0], normal, halfway_mm + part * c * domain.cell_size_mm)
+        for part in (-0.5, 0.0, 0.5)
+    )
+    sent = 6 * weight * along * speed * domain.cell_size_mm**2 / case.vessel.inlet.area_mm2
+    pushed = _pushed(q, inner[:, None] * normal, outer[:, None] * normal)
+    rim = np.where(speed > 0, weight * along * (1 - speed / speed.max()), 0.0)
+    rim /= rim.sum()
+    return np.stack([sent + (1 - sent.sum()) * rim, pushed - pushed.sum() * rim], axis=1)
+
+
+def _pushed(direction: Ints, inner: Floats, outer: Floats) -> Floats:
+    """What the odd rate would push across a profile of velocities (l, 3) behind and ahead of each link's middle.
+
+    Sent back through the links, it is taken out: it would push blood towards the axis.
+    """
+    c, weight = lattice.VELOCITIES[direction], lattice.WEIGHTS[direction]
+
+    def squared(u: Floats) -> Floats:
+        return np.asarray(4.5 * (c * u).sum(axis=1) ** 2 - 1.5 * (u**2).sum(axis=1))
+
+    return (2 / ODD_RATE - 1) * weight * (squared(outer) - squared(inner))

@@ -1,0 +1,164 @@
+"""A close-up computes the sac and its neck on fine cells, in a flow computed on wide ones."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_matrix
+
+from shapes import sphere
+from tubes import arc, line, tube
+from vstent import phantoms
+from vstent.errors import FlowError
+from vstent.flow import FlowCase, FlowField, FlowSettings, domain, flow_case, indices, simulate_case
+from vstent.flow import close_up as close_ups
+from vstent.flow.cost import estimate
+from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
+from vstent.flow.types import OPENFOAM
+from vstent.flow.waveform import OLDER_ADULT_ICA
+from vstent.restore import restore
+from vstent.surface import Surface
+from vstent.trace import trace
+from vstent.trim import trim
+from vstent.vessel import Anatomy, Vessel
+
+RADIUS_MM, INFLOW_ML_S = 2.0, 1.0
+MEAN_M_S = INFLOW_ML_S / (np.pi * RADIUS_MM**2)
+
+
+def ball(center_mm: tuple[float, float, float], radius_mm: float = 1.0) -> Surface:
+    """Stands for a sac: what a close-up is of."""
+    whole = sphere(radius_mm)
+    return Surface(whole.vertices_mm + np.array(center_mm), whole.faces)
+
+
+@cache
+def demo() -> Anatomy:
+    return restore(trim(trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.3)))))
+
+
+@cache
+def of_tube() -> FlowField:
+    vessel = tube(line(40.0), RADIUS_MM).vessel
+    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.2, close_up=True, tolerance=2e-3)
+    return simulate_case(FlowCase(vessel, sac=ball((0.0, 0.0, 24.0)), settings=settings))
+
+
+@cache
+def outer_of_demo() -> tuple[FlowCase, FlowField]:
+    case = flow_case(demo(), None, FlowSettings(cell_size_mm=0.5))
+    return case, simulate_case(case)
+
+
+def test_a_close_up_of_poiseuille_flow_is_poiseuille_flow() -> None:
+    field = of_tube()
+    x, y, z = field.centers_mm.T
+    exact = 2 * MEAN_M_S * (1 - (x**2 + y**2) / RADIUS_MM**2)
+    within = (z > 15) & (z < 27)
+    error = (field.velocity_m_s - exact[:, None] * [0, 0, 1])[within] / (2 * MEAN_M_S)
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.01
+    fall_Pa_m = -np.polyfit(z[within] * 1e-3, field.pressure_Pa[within], 1)[0]
+    assert fall_Pa_m == pytest.approx(8 * 0.004 * MEAN_M_S / (RADIUS_MM * 1e-3) ** 2, rel=0.01)
+    height = field.wall.vertices_mm[:, 2]
+    middle = (height > 16) & (height < 26)
+    stress_Pa = field.wall_shear_stress_Pa[middle, 2].mean()
+    assert stress_Pa == pytest.approx(4 * 0.004 * MEAN_M_S / (RADIUS_MM * 1e-3), rel=0.02)
+
+
+def test_the_flow_goes_on_across_the_cuts() -> None:
+    field = of_tube()
+    z = field.centers_mm[:, 2]
+    on_axis = np.hypot(*field.centers_mm[:, :2].T) < 0.3
+    fit = np.polyfit(z[on_axis & (z > 2) & (z < 38)], field.pressure_Pa[on_axis & (z > 2) & (z < 38)], 1)
+    for cut_mm, inwards in ((24 - 1 - 3 * 2 * RADIUS_MM, 1), (24 + 1 + 2 * RADIUS_MM, -1)):
+        near = on_axis & (np.abs(z - cut_mm) < 2)
+        assert np.abs(field.pressure_Pa[near] - np.polyval(fit, z[near])).max() < 0.02 * abs(fit[0]) * 40
+        fine = near & (inwards * (z - cut_mm) > 1.0)
+        assert np.abs(field.velocity_m_s[fine, 2] - 2 * MEAN_M_S).max() < 0.02 * 2 * MEAN_M_S
+
+
+def test_every_place_has_one_cell() -> None:
+    field = of_tube()
+    assert len(np.unique(field.cells, axis=0)) == len(field.cells)
+    assert (np.lexsort(field.cells.T[::-1]) == np.arange(len(field.cells))).all()
+    whole = domain.build(tube(line(40.0), RADIUS_MM).vessel, 0.2)
+    assert len(field.cells) == pytest.approx(len(whole.cells), rel=1e-2)
+
+
+def test_through_every_cut_passes_what_the_openings_beyond_it_take() -> None:
+    case, outer = outer_of_demo()
+    settings = replace(case.settings, cell_size_mm=0.25, close_up=True)
+    engine = LatticeBoltzmann(0.25, None, outer)
+    state = engine.init(replace(case, settings=settings), outer)
+    close_up = close_ups.close_up(case, outer)
+    assert close_up.inflow_mL_s.sum() == pytest.approx(0, abs=1e-3 * outer.inlet_mL_s)
+    assert (np.sort(close_up.inflow_mL_s) == np.sort([outer.inlet_mL_s, *-outer.outlets_mL_s])).all()
+    while state.steps < 3000:
+        state = engine.step(state)
+    inflow_mL_s = -state.snapshots[-1].outflow * state.scales.flow_mL_s
+    order = state.links.patch - len(case.vessel.openings) - 1
+    assert inflow_mL_s == pytest.approx(close_up.inflow_mL_s[order], abs=0.003 * outer.inlet_mL_s)
+    assert inflow_mL_s.sum() == pytest.approx(0, abs=0.002 * outer.inlet_mL_s)
+
+
+def test_an_artery_that_only_passes_by_is_not_in_the_close_up() -> None:
+    path = arc(2.4, np.pi, straight_mm=14.0)
+    case = FlowCase(tube(path, 1.9).vessel, sac=ball((0.0, 0.0, -9.0)), settings=FlowSettings(cell_size_mm=0.38))
+    outer = simulate_case(replace(case, settings=replace(case.settings, max_steps=240)))
+    close_up = close_ups.close_up(case, outer)
+    passing = outer.centers_mm[:, 0] > 2.4
+    beside = passing & (np.linalg.norm(outer.centers_mm - [0, 0, -9.0], axis=1) < 4.0)
+    assert beside.sum() > 100
+    assert (close_up.part[passing] >= 0).all()
+    fine = close_ups.build(case, 0.19, close_up)
+    assert fine.centers_mm[:, 0].max() < 2.4
+    assert fine.centers_mm[:, 2].min() < -14.0  # upstream it reaches the inlet's extension
+    assert fine.centers_mm[:, 2].max() < -9.0 + 1.0 + 3.8 + 2 * 0.38
+
+
+def test_a_recess_that_leads_nowhere_belongs_to_the_close_up() -> None:
+    chain = csr_matrix((np.ones(5), ([0, 1, 2, 3, 2], [1, 2, 3, 4, 5])), shape=(6, 6))
+    is_beyond = np.array([True, False, False, False, True, True])
+    part, inflow_mL_s = close_ups._parts(chain, is_beyond, np.array([0, 4]), np.array([2.0, -1.5]))
+    assert part.tolist() == [0, -1, -1, -1, 1, -1]
+    assert inflow_mL_s.tolist() == [2.0, -1.5]
+
+
+def test_a_vessel_that_is_all_near_is_computed_as_a_whole() -> None:
+    long = Surface(sphere(1.0).vertices_mm * [1.0, 1.0, 7.0] + [0.0, 0.0, 6.0], sphere(1.0).faces)
+    settings = FlowSettings(cell_size_mm=0.4, max_steps=240)
+    case = FlowCase(tube(line(8.0), RADIUS_MM).vessel, sac=long, settings=settings)
+    near = close_ups.build(case, 0.2, close_ups.close_up(case, simulate_case(case)))
+    whole = domain.build(case.vessel, 0.2)
+    assert len(near.cells) == pytest.approx(len(whole.cells), rel=1e-2)
+    assert np.unique(near.link_patch).tolist() == [0, 1, 2]
+
+
+def test_the_cells_foretold_are_enough_and_not_far_too_many() -> None:
+    case, outer = outer_of_demo()
+    wanted = replace(case, settings=replace(case.settings, cell_size_mm=0.25, close_up=True))
+    made = len(close_ups.build(wanted, 0.25, close_ups.close_up(case, outer)).cells)
+    assert made < estimate(wanted).cells < 1.25 * made
+    whole = estimate(replace(wanted, settings=replace(wanted.settings, close_up=False)))
+    assert estimate(wanted).seconds < 0.75 * whole.seconds
+
+
+def test_no_close_up_without_a_sac_or_of_what_has_none() -> None:
+    bare = FlowCase(tube(line(8.0), 2.0).vessel, settings=FlowSettings(cell_size_mm=0.3, close_up=True))
+    with pytest.raises(FlowError, match="this vessel has none: leave out --close-up"):
+        simulate_case(bare)
+    for changes, said in (({"waveform": OLDER_ADULT_ICA}, "a pulse"), ({"engine": OPENFOAM}, "the engine openfoam")):
+        with pytest.raises(FlowError, match=f"{said} is not computed in a close-up"):
+            simulate_case(replace(bare, settings=replace(bare.settings, **changes)))
+
+
+@pytest.mark.validation
+def test_a_close_up_of_the_demo_is_what_fine_cells_all_over_give() -> None:
+    case = flow_case(demo(), None, FlowSettings(cell_size_mm=0.14))
+    whole, near = (
+        indices(simulate_case(replace(case, settings=replace(case.settings, close_up=close_up))), case.sac, case.ostium)
+        for close_up in (False, True)
+    )
+    for key in ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa"):
+        assert near[key] == pytest.approx(whole[key], rel=0.03), key
