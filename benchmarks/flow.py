@@ -1,11 +1,11 @@
 """Print how fast the lattice-Boltzmann kernel is beside the memory's bandwidth, and how exact Poiseuille's flow.
 
-Usage: python benchmarks/flow.py [--cost] [--close-up] [CELL_MM ...] [SURFACE]
+Usage: python benchmarks/flow.py [--cost [SURFACE]] [CELL_MM ...]
 
 Besides: how a step's time grows with its cells, and what other machines would need (computed). Seconds of the clock
-depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo, or the artery of a
-surface file, is computed, steady, bare and with Silk and Enterprise as screens, in cells of 0.1 mm; with ``--close-up``
-they are so fine in the sac and near it only.
+depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo is computed, steady,
+bare and with Silk and Enterprise as screens, in cells of 0.1 mm, all over and then in the sac and near it only
+(`FlowSettings.close_up`); with a surface file that artery, in the latter way alone.
 """
 
 import resource
@@ -178,4 +178,5 @@ if __name__ == "__main__":
     for cell_mm in cells_mm:
         poiseuille(cell_mm)
     if "--cost" in sys.argv:
-        cost(surface, close_up="--close-up" in sys.argv)
+        for close_up in (False, True) if surface is None else (True,):
+            cost(surface, close_up=close_up)

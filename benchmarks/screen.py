@@ -5,9 +5,9 @@ Usage: python benchmarks/screen.py [--quick]
 Every row is a periodic cell of two families of wires, one lying on the other, with blood driven straight through (see
 `vstent.flow.crossing_cell`). `crossing_factor` is the viscous resistance over the sum of two rows of such wires, each
 computed alike; `row_over_law` is such a row's over that of Tamada and Fujikawa (1957): what the grid gets wrong.
-`inertial_loss` is what is left over rho U^2 / 2 at the wire Reynolds number. `slip_over_spacing` is how far behind the
-middle of the wires a flow along them seems to come to rest (negative: before it), over the spacing; `slip_law` is what
-the screen's tangential resistance makes of it.
+`inertial_loss` is what is left over rho U^2 / 2 at the wire Reynolds number. `passing_over_spacing` is the speed of
+blood behind the wires over the shear rate of blood that flows along them before, over the spacing; `passing_law` is
+what the screen's tangential resistance makes of it.
 """
 
 import json
@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vstent.flow.crossing_cell import VISCOSITY, Wires, crossing_wires, flow_through, row_of_wires
-from vstent.flow.screen import TANGENTIAL_SHARE, drag_per_length, inertial_loss
+from vstent.flow.crossing_cell import VISCOSITY, Wires, crossing_wires, flow_through, passing, row_of_wires
+from vstent.flow.screen import crossing_factor, drag_per_length, inertial_loss, tangential_share
 
 TABLE = Path(__file__).with_suffix(".json")
-CELLS = ((24, 24, 4), (34, 34, 4), (36, 36, 6), (48, 28, 4), (48, 28, 6))
+CELLS = ((24, 24, 4), (34, 34, 4), (36, 36, 6), (44, 44, 4), (48, 28, 4), (48, 28, 6), (54, 54, 2.5))
 """Cells of the box across and along the stent, and the wire's diameter."""
 REYNOLDS = (1.0, 2.0)
 """Wire Reynolds numbers beside creeping flow."""
@@ -39,21 +39,13 @@ def row_law(diameter: float, spacing: float) -> float:
     return VISCOSITY * float(drag_per_length(np.float64(diameter), np.float64(spacing))) / spacing
 
 
-def slip(wires: Wires) -> float:
-    """Slip length at the middle of the wires, in cells: the parabola of a flow along them, extended to there."""
-    height = wires.shape[2]
-    speed = flow_through(wires, np.array([CREEPING, 0.0, 0.0])).velocity[..., 0].mean(axis=(0, 1))
-    from_far = (np.arange(height) - 0.5 * height) % height - 0.5 * height
-    far = np.abs(from_far) < 0.25 * height
-    highest = (speed + 0.5 * CREEPING / VISCOSITY * from_far**2)[far].mean()
-    at_wires = highest - 0.5 * CREEPING / VISCOSITY * (0.5 * height) ** 2
-    return float(at_wires / (0.5 * CREEPING / VISCOSITY * height))
-
-
 def row(across: int, along: int, diameter: float) -> dict[str, float | list[float]]:
     spacing = along * across / float(np.hypot(along, across))
     height = max(44, round(1.3 * spacing))
     wires = crossing_wires(across, along, height, diameter)
+    tall = crossing_wires(across, along, 2 * round(min(1.8 * spacing, 60.0)), diameter)
+    ratio = np.float64(diameter / spacing)
+    normal_law = 2 * row_law(diameter, spacing) * float(crossing_factor(ratio, np.float64(1.0)))
     viscous, slow = resistance(wires, CREEPING)
     of_row = resistance(row_of_wires(round(spacing), height, diameter), CREEPING)[0] / row_law(diameter, round(spacing))
     losses, reached = [], []
@@ -69,8 +61,8 @@ def row(across: int, along: int, diameter: float) -> dict[str, float | list[floa
         "cells_per_wire": diameter,
         "row_over_law": of_row,
         "crossing_factor": viscous / (2 * row_law(diameter, spacing)) / of_row,
-        "slip_over_spacing": slip(wires) / spacing,
-        "slip_law": 2 * VISCOSITY / (TANGENTIAL_SHARE * viscous / of_row) / spacing,
+        "passing_over_spacing": passing(tall, CREEPING) / spacing,
+        "passing_law": VISCOSITY / (tangential_share(ratio) * normal_law) / spacing,
         "wire_reynolds": reached,
         "inertial_loss": losses,
         "inertial_loss_law": float(inertial_loss(np.float64(open_fraction))),

@@ -1,26 +1,30 @@
 """The screen beside resolved struts over the demo's neck: write `benchmarks/struts.json`, print it as a table.
 
-Usage: python benchmarks/struts.py [--cell MM] [--foam-cell MM] [DEVICE ...]
+Usage: python benchmarks/struts.py [--cell MM] [--foam-cell MM] [--across CELLS] [--cases FOLDER] [DEVICE ...]
 
 The demo's artery, cut to 9 mm on either side of the sac, is computed twice with every device: by the embedded engine
-with the device as a screen, and by OpenFOAM with the struts over the neck meshed, two cells or more across each. The
-two engines differ in the bare vessel already: what a device leaves of each engine's own bare value stands beside. A row
-is kept for every device; the rows of others stay as they are.
+with the device as a screen, and by OpenFOAM with the struts over the neck meshed, at least so many cells across each.
+Both have only the part of the device within 1 mm of the neck: what lies on the artery's wall before it slows the blood
+there, and takes a fifth to a third off the sac's velocity besides. The two engines differ in the bare vessel already:
+what a device leaves of each engine's own bare value stands beside. A row is kept for every device; the rows of others
+stay as they are. With --cases, OpenFOAM's cases stay in that folder, and one that is there already is gone on with.
 """
 
 import argparse
-import importlib
 import json
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import vstent
 from vstent import phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, flow_case, indices, simulate_case
+from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, flow_case, indices, simulate_case
+from vstent.flow.openfoam import setup
+from vstent.flow.openfoam.case import STRUT_REACH_MM
 from vstent.flow.types import OPENFOAM
 from vstent.restore import restore
 from vstent.trace import trace
+from vstent.trim import trim
 from vstent.vessel import Vessel
 
 TABLE = Path(__file__).with_suffix(".json")
@@ -31,21 +35,32 @@ INDICES = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
 def cases(names: list[str]) -> dict[str, FlowCase]:
     """The bare vessel and every device in it, deployed in the whole one and computed in a short one."""
     whole = trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))
-    trimming = importlib.import_module("vstent.trim")
-    anatomy = restore(trimming.trim(whole))
-    trimming.UPSTREAM_MM = trimming.DOWNSTREAM_MM = KEPT_MM
-    short = trimming.trim(whole)
+    anatomy = restore(trim(whole))
+    short = trim(whole, upstream_mm=KEPT_MM, downstream_mm=KEPT_MM)
     inflow_mL_s = flow_case(anatomy, None).inflow_mL_s
     settings = FlowSettings(inflow_mL_s=inflow_mL_s)
     stents = {"bare": None} | {name: vstent.deploy(vstent.find_design(name), anatomy).stent for name in names}
-    return {name: replace(flow_case(anatomy, stent, settings), vessel=short) for name, stent in stents.items()}
+    return {
+        name: near_neck(replace(flow_case(anatomy, stent, settings), vessel=short)) for name, stent in stents.items()
+    }
 
 
-def computed(case: FlowCase, start: FlowField | None, **changes: object) -> tuple[FlowField, dict[str, float]]:
+def near_neck(case: FlowCase) -> FlowCase:
+    """The screen only where OpenFOAM meshes struts."""
+    if case.screen is None or case.ostium is None:
+        return case
+    screen = case.screen
+    chosen = case.ostium.closest(screen.points_mm)[1] < STRUT_REACH_MM
+    return replace(case, screen=Screen(**{one.name: getattr(screen, one.name)[chosen] for one in fields(screen)}))
+
+
+def computed(
+    case: FlowCase, start: FlowField | None, folder: Path | None = None, **changes: object
+) -> tuple[FlowField, dict[str, float]]:
     settings = replace(case.settings, **changes)
     began = time.perf_counter()
     # OpenFOAM begins from any flow in this vessel; the embedded engine takes its start for the bare one.
-    field = simulate_case(replace(case, settings=settings), start=start)
+    field = simulate_case(replace(case, settings=settings), start=start, folder=folder)
     found = indices(field, case.sac, case.ostium)
     values = {key: round(float(found[key]), 6) for key in INDICES}
     print(f"{settings.engine}: {field.advice} {time.perf_counter() - began:.0f} s {values}", flush=True)
@@ -57,13 +72,17 @@ if __name__ == "__main__":
     parser.add_argument("devices", nargs="*", default=["enterprise", "silk"])
     parser.add_argument("--cell", type=float, default=0.125)
     parser.add_argument("--foam-cell", type=float, default=0.2)
+    parser.add_argument("--across", type=float, default=setup.ACROSS)
+    parser.add_argument("--cases", type=Path)
     given = parser.parse_args()
+    setup.ACROSS = given.across
     rows = json.loads(TABLE.read_text()) if TABLE.exists() else {}
     foam = {"engine": OPENFOAM, "cell_size_mm": given.foam_cell}
     bare: tuple[FlowField, dict[str, float]] | None = None
     for name, case in cases(given.devices).items():
         embedded, screened = computed(case, bare[0] if bare else None, cell_size_mm=given.cell)
-        resolved = computed(case, embedded, **foam)[1]
+        folder = None if given.cases is None else given.cases / name
+        resolved = computed(case, embedded, folder, **foam)[1]
         if bare is None:
             bare, bare_resolved = (embedded, screened), resolved
             continue
@@ -77,6 +96,7 @@ if __name__ == "__main__":
             "left_with_struts": {key: round(one[1], 4) for key, one in left.items()},
             "cell_size_mm": given.cell,
             "openfoam_cell_size_mm": given.foam_cell,
+            "openfoam_cells_across": given.across,
         }
         TABLE.write_text(json.dumps(rows, indent=2) + "\n")
     print("\n| device | index | screen | struts | difference | left, screen | left, struts |\n" + 7 * "|---" + "|")

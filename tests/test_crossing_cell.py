@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vstent.flow.crossing_cell import VISCOSITY, Wires, crossing_wires, flow_through, row_of_wires
+from vstent.flow.crossing_cell import VISCOSITY, Wires, crossing_wires, flow_through, passing, row_of_wires
 from vstent.flow.screen import drag_per_length
 
 DIAMETER = 6
@@ -45,3 +45,23 @@ def test_crossing_wires_close_on_themselves_and_hold_their_volume() -> None:
     # nothing is made or lost: what goes up through one level goes up through all
     through = flow.velocity[..., 2].sum(axis=(0, 1))
     np.testing.assert_allclose(through, through.mean(), rtol=0.02)
+
+
+def test_opposed_flow_between_nothing_is_the_parabola_of_each_side() -> None:
+    height, force = 40, 1e-6
+    nothing = Wires((4, 4, height), (), (), 1.0)
+    speed = flow_through(nothing, np.array([force, 0.0, 0.0]), is_opposed=True).velocity[..., 0].mean(axis=(0, 1))
+    z = np.arange(height) - 0.5 * height
+    exact = 0.5 * force / VISCOSITY * z * (0.5 * height - np.abs(z))
+    np.testing.assert_allclose(speed, exact, atol=3e-3 * exact.max())
+
+
+def test_no_shear_passes_wires_that_touch() -> None:
+    assert abs(passing(row_of_wires(6, 40, 6.0), 1e-6)) < 0.03 * 6
+
+
+def test_the_shear_that_passes_does_not_hang_on_how_far_the_next_wires_are() -> None:
+    spacing = 20 * 2**-0.5
+    near, far = (passing(crossing_wires(20, 20, height, 1.4), 1e-6) / spacing for height in (40, 56))
+    assert 0.02 < near < 0.06
+    assert far == pytest.approx(near, abs=0.005)

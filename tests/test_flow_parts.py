@@ -13,7 +13,15 @@ from vstent.flow import Blood, FlowCase, FlowSettings, domain, screen
 from vstent.flow.engines import AbstractEngine, run
 from vstent.flow.engines.lattice_boltzmann import field_left, fraction_left
 from vstent.flow.profile import developed_profile
-from vstent.flow.screen import CROSSING_PER_SOLIDITY, crossing_factor, drag_per_length, inertial_loss, on_grid
+from vstent.flow.screen import (
+    CROSSING_PER_SOLIDITY,
+    crossing_factor,
+    drag_per_length,
+    inertial_loss,
+    on_grid,
+    tangential_share,
+    thick_resistance_Pa_s_m,
+)
 from vstent.flow.wall_stress import wall_stress
 from vstent.stent import Stent
 from vstent.surface import Surface
@@ -65,7 +73,8 @@ def test_the_screen_of_a_braid_resists_as_its_closed_form(degrees, expected):
     law *= crossing_factor(0.03, spacing_mm)
     assert found.mean() == pytest.approx(law, rel=0.02)
     assert found.std() < 0.03 * law
-    np.testing.assert_allclose(made.tangential_resistance_Pa_s_m, 0.5 * made.normal_resistance_Pa_s_m)
+    share = made.tangential_resistance_Pa_s_m[middle] / found
+    assert share.mean() == pytest.approx(tangential_share(0.03 / spacing_mm), rel=0.02)
     assert made.area_mm2.sum() == pytest.approx(np.pi * DIAMETER_MM * LENGTH_MM, rel=0.005)
 
 
@@ -78,11 +87,43 @@ def test_crossing_wires_resist_as_the_kept_table_of_resolved_ones():
     assert crossing_factor(0.0, 1.0) == 1
 
 
+def test_as_much_shear_passes_a_screen_as_the_kept_table_of_resolved_wires():
+    table = json.loads((Path(__file__).parents[1] / "benchmarks" / "screen.json").read_text())
+    for row in table:
+        solidity = np.float64(row["diameter_over_spacing"])
+        normal_s_over_mu = 2 * drag_per_length(solidity, 1.0) * crossing_factor(solidity, 1.0)
+        law = 1 / (tangential_share(solidity) * normal_s_over_mu)
+        assert law == pytest.approx(row["passing_over_spacing"], abs=0.006)
+
+
+@pytest.mark.parametrize("cell_size_mm", [0.3, 0.15, 0.02])
+@pytest.mark.parametrize("resistance_Pa_s_m", [20.0, 800.0])
+def test_as_much_shear_passes_on_every_grid(cell_size_mm, resistance_Pa_s_m):
+    """Speeds of layers of cells, in plane shear above the screen, by finite differences."""
+    made = thick_resistance_Pa_s_m(np.array([resistance_Pa_s_m]), 0.004, cell_size_mm)[0]
+    brake = made * cell_size_mm * 1e-3 / 0.004
+    passing_mm = []
+    for part in (np.arange(200) + 0.5) / 200:
+        layers = 12
+        matrix = np.zeros((layers, layers))
+        for k in range(layers):
+            for beside in (k - 1, k + 1):
+                if 0 <= beside < layers:
+                    matrix[k, k] += 1
+                    matrix[k, beside] -= 1
+        matrix[5, 5] += (1 - part) * brake
+        matrix[6, 6] += part * brake
+        drive = np.zeros(layers)
+        drive[-1] = cell_size_mm  # the stress of a unit shear rate
+        passing_mm.append(np.linalg.solve(matrix, drive)[0])
+    assert np.mean(passing_mm) == pytest.approx(0.004 / resistance_Pa_s_m * 1e3, rel=0.2)
+
+
 def test_thicker_wires_resist_more_and_none_of_it_is_lost_inside_the_blood():
     thin, thick = (screen(braid(np.radians(65), um), Blood()) for um in (30.0, 50.0))
     assert (thick.normal_resistance_Pa_s_m > thin.normal_resistance_Pa_s_m).all()
     index = np.arange(31 * 31 * 61, dtype=np.int32).reshape(31, 31, 61)
-    spread = on_grid(thin, index, np.array([-3.0, -3.0, -1.0]), 0.2)
+    spread = on_grid(thin, 0.004, index, np.array([-3.0, -3.0, -1.0]), 0.2)
     total = (spread.along_Pa_s_m2 * 0.2**3 * 1e-3).sum()
     assert total == pytest.approx((thin.normal_resistance_Pa_s_m * thin.area_mm2).sum(), rel=1e-9)
     np.testing.assert_allclose(np.linalg.norm(spread.normal, axis=1), 1.0)

@@ -25,7 +25,7 @@ CHECK_PAIRS = 50
 """Step pairs between looks at whether the flow has settled."""
 SETTLED = 3e-4
 """Change of the mean velocity between looks at which it has."""
-MAX_CHECKS = 150
+MAX_CHECKS = 600
 """Most looks."""
 
 
@@ -77,8 +77,11 @@ def row_of_wires(spacing: int, height: int, diameter: float) -> Wires:
     return Wires((4, spacing, height), ((0.0, 0.5 * spacing, 0.5 * height),), ((1.0, 0.0, 0.0),), 0.5 * diameter)
 
 
-def flow_through(wires: Wires, force: Floats) -> CellFlow:
+def flow_through(wires: Wires, force: Floats, *, is_opposed: bool = False) -> CellFlow:
     """Steady flow under a body force (3,) per cell volume, mass of a cell and step; with inertia.
+
+    Where `is_opposed`, the force below the middle of the box's height is against that above, so that flows of opposite
+    direction meet at wires there.
 
     Raises
     ------
@@ -86,17 +89,40 @@ def flow_through(wires: Wires, force: Floats) -> CellFlow:
         When it does not settle.
     """
     is_blood = _blood(wires)
-    grid = _Grid(wires, is_blood)
+    height = np.arange(wires.shape[2]) - 0.5 * wires.shape[2]
+    side = np.where(height % wires.shape[2] == 0.5 * wires.shape[2], 0.0, np.sign(height)) if is_opposed else 1.0
+    grid = _Grid(wires, is_blood, np.broadcast_to(side, is_blood.shape))
     force = np.asarray(force, dtype=np.float64)
-    before = np.zeros(3)
+    before = np.zeros((wires.shape[2], 3))
     for _ in range(MAX_CHECKS):
         grid.advance(force)
         velocity = grid.velocity(force)
-        mean = velocity.mean(axis=(0, 1, 2))
+        mean = velocity.mean(axis=(0, 1))
         if np.abs(mean - before).max() < SETTLED * np.abs(mean).max():
-            return CellFlow(velocity, force * is_blood.size, is_blood)
+            return CellFlow(velocity, force * float(np.sum(side * np.ones(is_blood.shape))), is_blood)
         before = mean
     raise ValueError(f"the flow through the cell {wires.shape} has not settled: use a smaller force")
+
+
+def passing(wires: Wires, force: float) -> float:
+    """Speed of blood behind the wires over the shear rate of blood before them, in cells: what of a shear passes.
+
+    Blood that flows alike on both sides comes to rest, extended from afar, so far behind the wires' middle; blood that
+    flows to and fro, so far; a shear on one side is half of each. The flow is along the first axis, the force small.
+    """
+    height = wires.shape[2]
+    from_wires = np.arange(height) - 0.5 * height
+    curve = 0.5 * force / VISCOSITY * from_wires**2
+    behind = []
+    for is_opposed in (False, True):
+        speed = (
+            flow_through(wires, np.array([force, 0.0, 0.0]), is_opposed=is_opposed).velocity[..., 0].mean(axis=(0, 1))
+        )
+        low, high = (1 / 6, 1 / 3) if is_opposed else (1 / 4, 1 / 2)
+        far = (from_wires > low * height) & (from_wires < high * height)
+        shear, at_wires = np.polyfit(from_wires[far], (speed + curve)[far], 1)
+        behind.append(at_wires / shear)
+    return float(0.5 * (behind[0] - behind[1]))
 
 
 def _blood(wires: Wires) -> Bools:
@@ -117,8 +143,8 @@ def _blood(wires: Wires) -> Bools:
 def _images(wires: Wires) -> tuple[Floats, Floats]:
     """Points and directions of every wire that can touch the box: those of the boxes around."""
     shifts = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * wires.shape
-    points = (np.array(wires.points)[:, None] + shifts).reshape(-1, 3)
-    return points, np.repeat(np.array(wires.directions), len(shifts), axis=0)
+    points = (np.reshape(wires.points, (-1, 1, 3)) + shifts).reshape(-1, 3)
+    return points, np.repeat(np.reshape(wires.directions, (-1, 3)), len(shifts), axis=0)
 
 
 def _signed_distance(wires: Wires, at: Ints) -> Floats:
@@ -148,8 +174,9 @@ def _fractions(wires: Wires, cells: Ints, steps: Ints) -> Floats:
 class _Grid:
     """The populations of a periodic box and their addresses (see `vstent.kernels.lattice`)."""
 
-    def __init__(self, wires: Wires, is_blood: Bools) -> None:
+    def __init__(self, wires: Wires, is_blood: Bools, side: Floats) -> None:
         self._shape, self._is_blood = wires.shape, is_blood
+        self._push = np.where(is_blood, side, 0.0).ravel()
         self._stride = int(np.prod(wires.shape))
         self._f = np.zeros(19 * self._stride + lanes.COUNT, np.float32)
         cells = np.argwhere(is_blood)
@@ -213,10 +240,11 @@ class _Grid:
     def _kick(self, impulse: Floats) -> None:
         kick = 3 * lattice.WEIGHTS * (lattice.VELOCITIES @ impulse)
         populations = self._f[: 19 * self._stride].reshape(19, -1)
-        populations += (kick[:, None] * self._is_blood.ravel()).astype(np.float32)
+        populations += (kick[:, None] * self._push).astype(np.float32)
 
     def velocity(self, force: Floats) -> Floats:
         """Velocity (i, j, k, 3) in the middle between two kicks."""
         result = np.zeros((self._stride, 3))
-        result[self._place] = lattice.moments(self._f, self._stride, self._place)[:, 1:] + force
+        result[self._place] = lattice.moments(self._f, self._stride, self._place)[:, 1:]
+        result += self._push[:, None] * force
         return result.reshape(*self._shape, 3)

@@ -11,13 +11,17 @@ from vstent.flow.types import Blood, Screen
 from vstent.kernels import lattice_sampling
 from vstent.kernels.arrays import Floats, Ints
 from vstent.stent import Stent
+from vstent.surface import Surface
 from vstent.units import M_PER_MM, MM_PER_UM
 
-TANGENTIAL_SHARE = 0.5
-"""Tangential over normal resistance: slender rods drag half as much along themselves (design.md section 5)."""
-CROSSING_PER_SOLIDITY = 0.88
+SHARE_OF_THIN, SHARE_PER_SOLIDITY = 0.95, 4.9
+"""Normal over tangential resistance where wires are thin, and how it falls with wire diameter over spacing: what of a
+shear passes resolved crossing cells at d / s = 0.066 to 0.166 (`benchmarks/screen.py`, `screen.json`)."""
+LEAST_SHARE = 0.02
+"""Least normal over tangential resistance: from d / s = 0.19 on, no shear passes."""
+CROSSING_PER_SOLIDITY = 0.9
 """How much crossing families resist more than their sum, per wire diameter over spacing: the mean of resolved crossing
-cells at d / s = 0.16 to 0.25 and 45 and 60 degrees, each 0.72 to 1.04 (`benchmarks/screen.py`, `screen.json`)."""
+cells at d / s = 0.13 to 0.25 and 45 and 60 degrees, each 0.72 to 1.04 (`benchmarks/screen.py`, `screen.json`)."""
 SMOOTHING_PORES = 1.5
 """Radius of the neighbourhood in which wire length per area is measured, in mean wire spacings."""
 SAMPLE_REACHES = 0.2
@@ -41,6 +45,16 @@ def drag_per_length(diameter: Floats, spacing: Floats) -> Floats:
 def crossing_factor(diameter: Floats, spacing: Floats) -> Floats:
     """How much two crossing families resist, over the sum of two rows; 1 where wires are far apart."""
     return 1 + CROSSING_PER_SOLIDITY * np.minimum(diameter / spacing, 0.5)
+
+
+def tangential_share(solidity: Floats) -> Floats:
+    """Tangential over normal resistance of crossing wires, by their diameter over their spacing.
+
+    A slender rod alone drags half as much along itself (design.md section 5), and crossing ones three quarters as much
+    along their plane. But there each lies in the lee of others, and the two layers have a height: the denser they are,
+    the less of the shear on one side reaches the blood on the other.
+    """
+    return 1 / np.maximum(SHARE_OF_THIN - SHARE_PER_SOLIDITY * solidity, LEAST_SHARE)
 
 
 def inertial_loss(open_fraction: Floats) -> Floats:
@@ -73,15 +87,17 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     sample_mm, sample_mm2 = sampling.surface_samples(contour, SAMPLE_REACHES * reach_mm)
     area_mm2 = _kernel(tree, sample_mm, reach_mm) @ np.linalg.norm(sample_mm2, axis=1)
     spacing_mm = 2 * area_mm2 / np.maximum(weight @ length_mm, 1e-9 * area_mm2)
-    per_m = np.zeros(len(nodes_mm))
+    normal_per_m, tangential_per_m = np.zeros(len(nodes_mm)), np.zeros(len(nodes_mm))
     covered = np.zeros(len(nodes_mm))
     for size_mm in np.unique(diameter_mm):
         family = weight @ np.where(diameter_mm == size_mm, length_mm, 0.0) / area_mm2
-        per_m += family / M_PER_MM * drag_per_length(size_mm, spacing_mm) * crossing_factor(size_mm, spacing_mm)
+        per_m = family / M_PER_MM * drag_per_length(size_mm, spacing_mm) * crossing_factor(size_mm, spacing_mm)
+        normal_per_m += per_m
+        tangential_per_m += per_m * tangential_share(size_mm / spacing_mm)
         covered += 0.5 * family * size_mm
-    normal_Pa_s_m = blood.viscosity_Pa_s * per_m
+    resistance_Pa_s_m = blood.viscosity_Pa_s * np.stack([normal_per_m, tangential_per_m], axis=1)
     loss = inertial_loss((1 - np.minimum(covered, 0.6)) ** 2)
-    return _sampled(contour.vertices_mm, contour.faces, contour.vertex_normals, normal_Pa_s_m, loss)
+    return _sampled(contour, resistance_Pa_s_m, loss)
 
 
 def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
@@ -105,22 +121,22 @@ def _kernel(nodes: cKDTree, points_mm: Floats, reach_mm: float) -> csr_matrix:
     return csr_matrix(((1 - (near.data / reach_mm) ** 2) ** 2, (near.row, near.col)), shape=near.shape)
 
 
-def _sampled(vertices_mm: Floats, faces: Ints, normals: Floats, normal_Pa_s_m: Floats, loss: Floats) -> Screen:
+def _sampled(sheet: Surface, resistance_Pa_s_m: Floats, loss: Floats) -> Screen:
     """Sample a triangulated sheet so densely that no grid cell can slip between the samples."""
-    corners = vertices_mm[faces]
+    corners, faces = sheet.corners_mm, sheet.faces
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     split = np.maximum(np.ceil(longest / SAMPLE_MM).astype(int), 1)
     parts = []
     for n in np.unique(split):
         chosen = np.flatnonzero(split == n)
         barycentric = _sub_centroids(int(n))
-        columns = (vertices_mm, normals, normal_Pa_s_m[:, None], loss[:, None])
+        columns = (sheet.vertices_mm, sheet.vertex_normals, resistance_Pa_s_m, loss[:, None])
         values = [np.einsum("bk,fkd->fbd", barycentric, column[faces[chosen]]) for column in columns]
         area = np.repeat(np.linalg.norm(np.cross(*_edges(corners[chosen])), axis=1) / 2 / n**2, n**2)
         parts.append([value.reshape(-1, value.shape[-1]) for value in values] + [area[:, None]])
     point, normal, resistance, inertial, area = (np.concatenate(column) for column in zip(*parts, strict=True))
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    return Screen(point, normal, area[:, 0], resistance[:, 0], TANGENTIAL_SHARE * resistance[:, 0], inertial[:, 0])
+    return Screen(point, normal, area[:, 0], resistance[:, 0], resistance[:, 1], inertial[:, 0])
 
 
 def _edges(corners: Floats) -> tuple[Floats, Floats]:
@@ -139,6 +155,17 @@ def _sub_centroids(n: int) -> Floats:
     return np.column_stack([1 - uv.sum(axis=1), uv])
 
 
+def thick_resistance_Pa_s_m(thin_Pa_s_m: Floats, viscosity_Pa_s: float, cell_size_mm: float) -> Floats:
+    """Tangential resistance (p,) that lets as much shear pass two layers of cells as a thin one (p,) does.
+
+    Of a shear on one side, mu / R passes a thin sheet of resistance R. Shared among the two layers beside it in parts a
+    and 1 - a it brakes twice: (mu / R) / (1 + a (1 - a) R h / mu) passes; the mean of a (1 - a) is 1 / 6.
+    """
+    passes_mm = viscosity_Pa_s / np.maximum(thin_Pa_s_m, 1e-9) / M_PER_MM
+    of_cells_mm = 0.5 * (passes_mm + np.sqrt(passes_mm**2 + 4 * passes_mm * cell_size_mm / 6))
+    return np.where(thin_Pa_s_m > 0, viscosity_Pa_s / (of_cells_mm * M_PER_MM), 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class GridResistance:
     """A screen spread over the grid cells beside it."""
@@ -155,13 +182,17 @@ class GridResistance:
     """(e,) pressure gradient along the normal over rho u_n^2."""
 
 
-def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float) -> GridResistance:
+def on_grid(
+    screen: Screen, viscosity_Pa_s: float, index: Ints, origin_mm: Floats, cell_size_mm: float
+) -> GridResistance:
     """Share every sample's resistance among the eight cells around it, trilinearly; what falls outside is void.
 
-    So a cell at the rim resists as its neighbours do, where the screen goes on over the wall beyond the neck.
+    So a cell at the rim resists as its neighbours do, where the screen goes on over the wall beyond the neck. The
+    tangential resistance is made less, so that as much shear passes the cells as would pass the screen itself.
 
     Parameters
     ----------
+    viscosity_Pa_s : the blood's.
     index : (i, j, k) cell number at every grid point, -1 outside.
     """
     cells, weights = lattice_sampling.stencils(index, (screen.points_mm - origin_mm) / cell_size_mm)
@@ -183,6 +214,6 @@ def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float)
         found[kept].astype(np.int32),
         (normal / length)[kept],
         along[kept],
-        gathered(screen.tangential_resistance_Pa_s_m)[kept],
+        gathered(thick_resistance_Pa_s_m(screen.tangential_resistance_Pa_s_m, viscosity_Pa_s, cell_size_mm))[kept],
         0.5 * gathered(screen.inertial_loss)[kept],
     )

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from vstent.flow.close_up import CloseUp
 from vstent.flow.domain import Domain
@@ -17,6 +18,8 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 CELL_REYNOLDS_AT_END = 25.0
 """Largest speed x cell / viscosity in the openings' extensions, whose ends are where fast blood becomes unstable first
 (30 to 50 were seen to fail): faster blood is made thicker there. In the vessel there is no limit."""
+CUT_CELLS = 6
+"""Cells at the cuts of a close-up that count as such an extension."""
 REFILL_BLOCK = 2
 """Edge, in cells, of the blocks within which the walls' losses are made up."""
 
@@ -121,6 +124,14 @@ def in_extensions(case: FlowCase, domain: Domain) -> Bools:
         beside_mm = np.linalg.norm(offset - ahead_mm[:, None] * opening.normal, axis=1)
         result |= (ahead_mm > 0) & (ahead_mm < length_mm) & (beside_mm < opening.diameter_mm)
     return result
+
+
+def at_cuts(case: FlowCase, domain: Domain) -> Bools:
+    """Whether every cell (n,) of a close-up lies beside a cut."""
+    cut = np.zeros(domain.cells.max(axis=0) + 2, dtype=bool)
+    cut[tuple(domain.cells[domain.link_cell[domain.link_patch > len(case.vessel.openings)]].T)] = True
+    near = ndimage.binary_dilation(cut, ndimage.generate_binary_structure(3, 3), CUT_CELLS) if cut.any() else cut
+    return np.asarray(near[tuple(domain.cells.T)])
 
 
 def address(domain: Domain, is_end: Bools) -> Addressing:
@@ -312,7 +323,8 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
     segments = len(addressing.length)
     if case.screen is None:
         return ScreenEntries(*lattice.no_screen(segments), np.zeros(0, np.int32))
-    spread = on_grid(case.screen, domain.index, domain.origin_mm, domain.cell_size_mm)
+    viscosity_Pa_s = case.blood.viscosity_Pa_s
+    spread = on_grid(case.screen, viscosity_Pa_s, domain.index, domain.origin_mm, domain.cell_size_mm)
     per_step = scales.step_s / case.blood.density_kg_m3
     entry = np.column_stack(
         [

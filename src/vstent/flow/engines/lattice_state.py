@@ -25,6 +25,7 @@ from vstent.flow.engines.lattice_setup import (
     Refill,
     ScreenEntries,
     address,
+    at_cuts,
     build_bands,
     build_links,
     build_refill,
@@ -147,7 +148,7 @@ def build(
     else:
         close_up = close_ups.close_up(case, outer)
         domain = close_ups.build(case, cell_size_mm, close_up)
-    is_end = in_extensions(case, domain)
+    is_end = in_extensions(case, domain) | at_cuts(case, domain)
     addressing = address(domain, is_end)
     links = build_links(case, domain, addressing, scales, close_up)
     state = State(

@@ -39,14 +39,16 @@ def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
             f"the time step is too long, for that is {speed[fastest]:.2g} cells a step; halve the lattice speed "
             f"({state.case.settings.lattice_speed:.3g})"
         )
-    coming_back = [k for k in range(1, len(last.outflow)) if _backflow(state, last, k) > FAST * speed[fastest]]
+    openings = range(1, len(state.case.vessel.openings))
+    coming_back = [k for k in openings if _backflow(state, last, k) > FAST * speed[fastest]]
     if coming_back:
         role = state.case.vessel.openings[coming_back[0]].role
         return f"blood comes back through {role}; cut the vessel further from there, or share the outflow (murray)"
+    otherwise = "" if state.close_up is None else ", or leave out --close-up (close_up)"
     cell_reynolds = speed[fastest] / state.scales.viscosity
     return (
         f"the grid is too coarse for it (speed x cell / viscosity = {cell_reynolds:.0f}, in the openings' extensions "
-        f"at most {CELL_REYNOLDS_AT_END:.0f}); set a cell size of {0.7 * state.domain.cell_size_mm:.2g} mm"
+        f"at most {CELL_REYNOLDS_AT_END:.0f}); set a cell size of {0.7 * state.domain.cell_size_mm:.2g} mm{otherwise}"
     )
 
 
