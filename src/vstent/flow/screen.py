@@ -16,12 +16,12 @@ from vstent.units import M_PER_MM, MM_PER_UM
 
 SHARE_OF_THIN, SHARE_PER_SOLIDITY = 0.95, 4.9
 """Normal over tangential resistance where wires are thin, and how it falls with wire diameter over spacing: what of a
-shear passes resolved crossing cells at d / s = 0.066 to 0.166 (`benchmarks/screen.py`, `screen.json`)."""
+shear passes resolved crossing cells at d / s = 0.065 to 0.166 (`benchmarks/screen.py`, `screen.json`)."""
 LEAST_SHARE = 0.02
 """Least normal over tangential resistance: from d / s = 0.19 on, no shear passes."""
-CROSSING_PER_SOLIDITY = 0.9
+CROSSING_PER_SOLIDITY = 0.85
 """How much crossing families resist more than their sum, per wire diameter over spacing: the mean of resolved crossing
-cells at d / s = 0.13 to 0.25 and 45 and 60 degrees, each 0.72 to 1.04 (`benchmarks/screen.py`, `screen.json`)."""
+cells at d / s = 0.065 to 0.25 and 45 and 60 degrees, each 0.55 to 1.04 (`benchmarks/screen.py`, `screen.json`)."""
 SMOOTHING_PORES = 1.5
 """Radius of the neighbourhood in which wire length per area is measured, in mean wire spacings."""
 SAMPLE_REACHES = 0.2
