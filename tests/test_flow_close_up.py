@@ -160,5 +160,5 @@ def test_a_close_up_of_the_demo_is_what_fine_cells_all_over_give() -> None:
         indices(simulate_case(replace(case, settings=replace(case.settings, close_up=close_up))), case.sac, case.ostium)
         for close_up in (False, True)
     )
-    for key in ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa"):
-        assert near[key] == pytest.approx(whole[key], rel=0.03), key
+    for key, most in (("neck_inflow_mL_s", 0.03), ("mean_sac_velocity_m_s", 0.03), ("mean_sac_wss_Pa", 0.05)):
+        assert near[key] == pytest.approx(whole[key], rel=most), key
