@@ -91,7 +91,8 @@ def flow_through(wires: Wires, force: Floats, *, is_opposed: bool = False) -> Ce
     is_blood = _blood(wires)
     height = np.arange(wires.shape[2]) - 0.5 * wires.shape[2]
     side = np.where(height % wires.shape[2] == 0.5 * wires.shape[2], 0.0, np.sign(height)) if is_opposed else 1.0
-    grid = _Grid(wires, is_blood, np.broadcast_to(side, is_blood.shape))
+    side = np.broadcast_to(side, is_blood.shape)
+    grid = _Grid(wires, is_blood, side)
     force = np.asarray(force, dtype=np.float64)
     before = np.zeros((wires.shape[2], 3))
     for _ in range(MAX_CHECKS):
@@ -99,7 +100,7 @@ def flow_through(wires: Wires, force: Floats, *, is_opposed: bool = False) -> Ce
         velocity = grid.velocity(force)
         mean = velocity.mean(axis=(0, 1))
         if np.abs(mean - before).max() < SETTLED * np.abs(mean).max():
-            return CellFlow(velocity, force * float(np.sum(side * np.ones(is_blood.shape))), is_blood)
+            return CellFlow(velocity, force * side.sum(), is_blood)
         before = mean
     raise ValueError(f"the flow through the cell {wires.shape} has not settled: use a smaller force")
 

@@ -106,7 +106,7 @@ class FlowSettings:
     cell_size_mm: float | None = None
     """Edge of a grid cell; None: `cells_per_diameter` across the vessel, but no more than `cell_budget` cells."""
     close_up: bool = False
-    """Whether cells are of that size only in the sac and within a diameter of it, and twice as wide elsewhere."""
+    """Whether cells are of that size only in the sac and near it (`vstent.flow.close_up`), twice as wide elsewhere."""
     cells_per_diameter: float = 29.0
     """Cells across the vessel's mean (hydraulic) diameter 4 V / A, where no cell size is given."""
     cell_budget: float = 480_000.0
