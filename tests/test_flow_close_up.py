@@ -57,7 +57,7 @@ def test_a_close_up_of_poiseuille_flow_is_poiseuille_flow() -> None:
     exact = 2 * MEAN_M_S * (1 - (x**2 + y**2) / RADIUS_MM**2)
     within = (z > 15) & (z < 27)
     error = (field.velocity_m_s - exact[:, None] * [0, 0, 1])[within] / (2 * MEAN_M_S)
-    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.01
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.002
     fall_Pa_m = -np.polyfit(z[within] * 1e-3, field.pressure_Pa[within], 1)[0]
     assert fall_Pa_m == pytest.approx(8 * 0.004 * MEAN_M_S / (RADIUS_MM * 1e-3) ** 2, rel=0.01)
     height = field.wall.vertices_mm[:, 2]
@@ -69,13 +69,15 @@ def test_a_close_up_of_poiseuille_flow_is_poiseuille_flow() -> None:
 def test_the_flow_goes_on_across_the_cuts() -> None:
     field = of_tube()
     z = field.centers_mm[:, 2]
-    on_axis = np.hypot(*field.centers_mm[:, :2].T) < 0.3
+    radius_mm = np.hypot(*field.centers_mm[:, :2].T)
+    on_axis = radius_mm < 0.3
+    exact = 2 * MEAN_M_S * (1 - (radius_mm / RADIUS_MM) ** 2)
     fit = np.polyfit(z[on_axis & (z > 2) & (z < 38)], field.pressure_Pa[on_axis & (z > 2) & (z < 38)], 1)
     for cut_mm, inwards in ((24 - 1 - 3 * 2 * RADIUS_MM, 1), (24 + 1 + 2 * RADIUS_MM, -1)):
         near = on_axis & (np.abs(z - cut_mm) < 2)
         assert np.abs(field.pressure_Pa[near] - np.polyval(fit, z[near])).max() < 0.02 * abs(fit[0]) * 40
         fine = near & (inwards * (z - cut_mm) > 1.0)
-        assert np.abs(field.velocity_m_s[fine, 2] - 2 * MEAN_M_S).max() < 0.02 * 2 * MEAN_M_S
+        assert np.abs(field.velocity_m_s[fine, 2] - exact[fine]).max() < 0.01 * 2 * MEAN_M_S
 
 
 def test_every_place_has_one_cell() -> None:

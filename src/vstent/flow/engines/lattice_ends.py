@@ -47,9 +47,16 @@ class Ends:
         speed = flow_mL_s / opening.area_mm2 / self.scales.speed_m_s
         area = opening.area_mm2 / self.domain.cell_size_mm**2
         row = np.array([kind, speed, 0.0, self._rate(kind), *opening.normal, area, 0.0])
-        if k > 0:
-            return row, np.zeros((len(links), 2))
-        return row, _unit_inflow(self.case, self.domain, links) * [area, 1.0]
+        return row, self._developed(links, area) if k == 0 else np.zeros((len(links), 2))
+
+    def _developed(self, links: Ints, area: float) -> Floats:
+        """What links of the inlet send back, (l, 2): developed flow."""
+        normal, section_mm = self.case.vessel.inlet.normal, self.domain.sections[0]
+        inner, at, outer = (
+            -developed_profile(section_mm, normal, self._along(links, part)[2])[:, None] * normal
+            for part in (0.0, 0.5, 1.0)
+        )
+        return _sent(self._along(links)[0], normal, area, inner, at, outer)
 
     def _rate(self, kind: float) -> float:
         """Rate at which an end changes what it remembers."""
@@ -59,15 +66,18 @@ class Ends:
         return 0.25 / float(np.ptp(self.domain.cells, axis=0).max())
 
     def _entry(self, flow: float, links: Ints) -> tuple[Floats, Floats]:
-        """A cut through which blood enters, at the velocity of the flow outside, scaled to what passes there."""
+        """A cut through which blood enters, at the velocity of the flow outside, made up to what passes there.
+
+        Linear between wide cells, that is short by h^2 / 12 of its Laplacian, over a developed profile alike: what
+        lacks is added all over, for added in proportion it would be too fast on the axis.
+        """
         normal, area = self._section(links)
         q, c, _ = self._along(links)
-        inner, at, outer = (self._velocity(links, part) for part in (0.25, 0.5, 0.75))
-        sent = -6 * lattice.WEIGHTS[q] * (c * at).sum(axis=1)
-        per_speed = flow / sent.sum() / (flow / area)
-        pushing = _pushed(q, per_speed * inner, per_speed * outer)
+        velocity = np.stack([self._velocity(links, part) for part in (0.0, 0.5, 1.0)]) * area / flow
+        passing = -(c * velocity[1])[q <= lattice.AXIAL].sum()
+        velocity -= (1 - passing / area) * normal
         row = np.array([lattice.INFLOW, flow / area, 0.0, self._rate(lattice.INFLOW), *normal, area, 0.0])
-        return row, np.stack([per_speed * sent, pushing - pushing.mean()], axis=1)
+        return row, _sent(q, normal, area, *velocity)
 
     def _exit(self, flow: float, links: Ints) -> tuple[Floats, Floats]:
         """A cut through which blood leaves, at the pressure of the flow outside.
@@ -125,30 +135,30 @@ def _outflow_mL_s(case: FlowCase, k: int) -> float | None:
     return float(case.inflow_mL_s * cubes[k - 1] / cubes.sum())
 
 
-def _unit_inflow(case: FlowCase, domain: Domain, links: Ints) -> Floats:
-    """What each link of the inlet sends back, (l, 2): for one cell volume per time step, and besides for speed squared.
+def _sent(direction: Ints, normal: Floats, area: float, inner: Floats, at: Floats, outer: Floats) -> Floats:
+    """What links of an entry send back, (l, 2): for its mean speed, and besides for that squared.
 
-    Links at the rim meet the wall instead of the inlet: what they would send is made up for near the rim, for a
+    Links at the rim meet the wall instead of the entry: what they would send is made up for near the rim, for a
     profile scaled up as a whole would be too fast on the axis, and keep so for tens of diameters.
+
+    Parameters
+    ----------
+    direction : (l,) of each link.
+    normal : (3,) outwards.
+    area : of the entry, in faces of cells.
+    inner, at, outer : (l, 3) velocity where each link begins, half-way, and where it ends, over the mean speed.
     """
-    normal = case.vessel.inlet.normal
-    q = domain.link_direction[links]
-    c, weight = lattice.VELOCITIES[q], lattice.WEIGHTS[q]
-    along = c @ normal
-    halfway_mm = domain.origin_mm + (domain.cells[domain.link_cell[links]] + 0.5 * c) * domain.cell_size_mm
-    inner, speed, outer = (
-        developed_profile(domain.sections[0], normal, halfway_mm + part * c * domain.cell_size_mm)
-        for part in (-0.5, 0.0, 0.5)
-    )
-    sent = 6 * weight * along * speed * domain.cell_size_mm**2 / case.vessel.inlet.area_mm2
-    pushed = _pushed(q, inner[:, None] * normal, outer[:, None] * normal)
-    rim = np.where(speed > 0, weight * along * (1 - speed / speed.max()), 0.0)
+    c, weight = lattice.VELOCITIES[direction], lattice.WEIGHTS[direction]
+    sent = -6 * weight * (c * at).sum(axis=1)
+    pushed = _pushed(direction, inner, outer)
+    speed = -(at @ normal)
+    rim = np.where(speed > 0, weight * np.maximum(c @ normal, 0.0) * (1 - speed / speed.max()), 0.0)
     rim /= rim.sum()
-    return np.stack([sent + (1 - sent.sum()) * rim, pushed - pushed.sum() * rim], axis=1)
+    return np.stack([sent + (area - sent.sum()) * rim, pushed - pushed.sum() * rim], axis=1)
 
 
 def _pushed(direction: Ints, inner: Floats, outer: Floats) -> Floats:
-    """What the odd rate would push across a profile of velocities (l, 3) behind and ahead of each link's middle.
+    """What the odd rate would push across a profile of velocities (l, 3) where each link begins and ends.
 
     Sent back through the links, it is taken out: it would push blood towards the axis.
     """
