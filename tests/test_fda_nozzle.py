@@ -11,7 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from axisymmetric import axial_speed
+from vstent.errors import FlowError
 from vstent.flow import Blood, FlowCase, FlowField, FlowSettings, sampling, simulate_case
+from vstent.flow.openfoam import program
 from vstent.surface import Surface
 from vstent.vessel import Opening, Vessel
 
@@ -23,14 +26,19 @@ BEHIND_THE_STEP_MM = (8.0, 16.0, 24.0, 32.0, 60.0, 80.0)
 BEYOND = 0.03
 """How far outside the spread of the five a velocity may be, as a fraction of the section's peak."""
 ROUND_BEYOND, LEANING_BEYOND = 0.045, 0.1
-"""The same behind the step, of the mean around the axis (which neither cells nor time steps change) and of one profile:
-there the jet leaves the axis by 0.06 degrees, 0.1 mm at the end, and its edge is steep."""
+"""The same behind the step, of the mean around the axis (an axisymmetric solution leaves the spread as far) and of one
+profile: there the jet leaves the axis by 0.06 degrees, 0.1 mm at the end, and its edge is steep."""
+
+
+def narrowing(end_mm: float) -> list[tuple[float, float]]:
+    """Inlet tube, cone and throat up to z = `end_mm`: (z, r) of the wall."""
+    knots = [(-THROAT_MM - CONE_MM - INLET_MM, WIDE_RADIUS_MM), (-THROAT_MM - CONE_MM, WIDE_RADIUS_MM)]
+    return [*knots, (-THROAT_MM, RADIUS_MM), (end_mm, RADIUS_MM)]
 
 
 def nozzle(end_mm: float) -> Vessel:
-    """Inlet tube, cone, throat and what follows up to z = `end_mm`: the wide tube behind the step where that is > 0."""
-    knots = [(-THROAT_MM - CONE_MM - INLET_MM, WIDE_RADIUS_MM), (-THROAT_MM - CONE_MM, WIDE_RADIUS_MM)]
-    knots += [(-THROAT_MM, RADIUS_MM), (min(end_mm, 0.0), RADIUS_MM)]
+    """The narrowing and what follows up to z = `end_mm`: the wide tube behind the step where that is > 0."""
+    knots = narrowing(min(end_mm, 0.0))
     if end_mm > 0:
         knots += [(0.0, WIDE_RADIUS_MM), (end_mm, WIDE_RADIUS_MM)]
     profile = np.concatenate([_cut(a, b) for a, b in pairwise(knots)] + [[knots[-1]]])
@@ -87,20 +95,27 @@ def spread(experiments: list[dict[str, np.ndarray]], name: str, at: np.ndarray) 
     return np.min(values, axis=0), np.max(values, axis=0)
 
 
+def radii_mm(z_mm: float) -> np.ndarray:
+    """Where a profile is compared, (37,) from side to side."""
+    return np.linspace(-0.9, 0.9, 37) * (RADIUS_MM if z_mm <= 0 else WIDE_RADIUS_MM)
+
+
+def beyond(speed: np.ndarray, experiments: list[dict[str, np.ndarray]], z_mm: float) -> np.ndarray:
+    """How far a profile (37,) at z is outside the spread (37,), as fractions of the measured peak."""
+    low, high = spread(experiments, f"profile-axial-velocity-at-z {1e-3 * z_mm:.5f}", 1e-3 * radii_mm(z_mm))
+    return np.maximum(np.maximum(low - speed, speed - high), 0.0) / high.max()
+
+
 def outside(field: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: float) -> tuple[float, float, float]:
     """How far the profile along x at z, the mean around the axis and the speed on it are outside the spread.
 
     As fractions of the measured peak.
     """
-    r_mm = np.linspace(-0.9, 0.9, 37) * (RADIUS_MM if z_mm <= 0 else WIDE_RADIUS_MM)
+    r_mm = radii_mm(z_mm)
     angle = np.pi / 12 * np.arange(24)
     ring = [r_mm[:, None] * np.cos(angle), r_mm[:, None] * np.sin(angle), np.full((37, 24), z_mm)]
     speed = sampling.values_at(field, np.stack(ring, axis=-1).reshape(-1, 3))[0][:, 2].reshape(37, 24)
-    low, high = spread(experiments, f"profile-axial-velocity-at-z {1e-3 * z_mm:.5f}", 1e-3 * r_mm)
-    along_x, around = (
-        np.maximum(np.maximum(low - found, found - high), 0.0) / high.max()
-        for found in (speed[:, 0], speed.mean(axis=1))
-    )
+    along_x, around = (beyond(found, experiments, z_mm) for found in (speed[:, 0], speed.mean(axis=1)))
     middle = 18
     return float(along_x.max()), float(around.max()), float(along_x[middle])
 
@@ -168,6 +183,24 @@ def test_the_profiles_behind_the_step_are_nearly_inside_the_spread(
     profile, around, _ = outside(jet, experiments, z_mm)
     assert around < ROUND_BEYOND
     assert profile < LEANING_BEYOND
+
+
+@pytest.mark.validation
+def test_an_axisymmetric_solution_leaves_the_spread_as_far(
+    experiments: list[dict[str, np.ndarray]], tmp_path: Path
+) -> None:
+    """The nominal nozzle's flow itself is outside by more than 3 % of the peak, whoever computes it."""
+    try:
+        program.find()
+    except FlowError as error:
+        pytest.skip(str(error))
+    wide = 95.0, WIDE_RADIUS_MM
+    speed = axial_speed(tmp_path, narrowing(0.0), wide, INFLOW_ML_S, BLOOD, edge_mm=0.2)
+    found = []
+    for z_mm in BEHIND_THE_STEP_MM:
+        found.append(beyond(speed(np.full(37, z_mm), radii_mm(z_mm)), experiments, z_mm).max())
+        print(f"z {z_mm:5.0f} mm: outside the spread by {found[-1]:.1%} of the peak")  # noqa: T201
+    assert BEYOND < max(found) < ROUND_BEYOND
 
 
 @pytest.mark.validation

@@ -135,6 +135,30 @@ def test_the_set_up_compiles_what_takes_a_flows_time_so_that_all_processes_run_t
     assert {kernel: kernel.signatures for kernel in kernels_ready} == kernels_ready
 
 
+def test_a_kernel_is_compiled_anew_when_a_function_in_another_file_that_it_calls_has_changed(tmp_path):
+    package = tmp_path / "kernels"
+    package.mkdir()
+    (package / "outer.py").write_text(
+        "from inner import part\nfrom numba import njit\n\n@njit(cache=True)\ndef whole():\n    return part()\n"
+    )
+    call = (
+        f"import vstent.kernels as k; k._forget_outdated(k.Path({str(package)!r})); import outer; print(outer.whole())"
+    )
+    own = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    answers = []
+    for value in (1, 1, 2):
+        (package / "inner.py").write_text(f"from numba import njit\n\n@njit\ndef part():\n    return {value}\n")
+        done = subprocess.run(
+            [sys.executable, "-c", call],
+            env=own | {"PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1"},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        answers.append((int(done.stdout), len(list((package / "__pycache__").glob("*.nbc")))))
+    assert answers == [(1, 1), (1, 1), (2, 1)]
+
+
 @pytest.mark.parametrize(("writable", "is_moved"), [(True, False), (False, True)])
 def test_where_no_cache_can_be_written_kernels_are_kept_with_temporary_files(monkeypatch, writable, is_moved):
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)

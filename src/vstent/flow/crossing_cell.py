@@ -60,14 +60,15 @@ class CellFlow:
         return self.velocity.mean(axis=(0, 1, 2))
 
 
-def crossing_wires(across: int, along: int, height: int, diameter: float) -> Wires:
-    """Two families of wires on the diagonals of a box of along x across x height cells, one lying on the other.
+def crossing_wires(across: int, along: int, height: int, diameter: float, apart: float = 1.0) -> Wires:
+    """Two families of wires on the diagonals of a box of along x across x height cells.
 
-    Their angle to the first axis is atan(across / along), their spacing along * across / hypot(along, across).
+    Their angle to the first axis is atan(across / along), their spacing along * across / hypot(along, across). Their
+    axes lie so many diameters `apart`: one family on the other, or, with 0, both in one plane. Woven wires do either.
     """
     length = float(np.hypot(along, across))
     up, down = (along / length, across / length, 0.0), (along / length, -across / length, 0.0)
-    middle, shift = 0.5 * height, 0.5 * diameter
+    middle, shift = 0.5 * height, 0.5 * apart * diameter
     points = ((0.0, 0.0, middle - shift), (0.0, 0.0, middle + shift))
     return Wires((along, across, height), points, (up, down), 0.5 * diameter)
 
@@ -77,11 +78,8 @@ def row_of_wires(spacing: int, height: int, diameter: float) -> Wires:
     return Wires((4, spacing, height), ((0.0, 0.5 * spacing, 0.5 * height),), ((1.0, 0.0, 0.0),), 0.5 * diameter)
 
 
-def flow_through(wires: Wires, force: Floats, *, is_opposed: bool = False) -> CellFlow:
+def flow_through(wires: Wires, force: Floats) -> CellFlow:
     """Steady flow under a body force (3,) per cell volume, mass of a cell and step; with inertia.
-
-    Where `is_opposed`, the force below the middle of the box's height is against that above, so that flows of opposite
-    direction meet at wires there.
 
     Raises
     ------
@@ -89,10 +87,7 @@ def flow_through(wires: Wires, force: Floats, *, is_opposed: bool = False) -> Ce
         When it does not settle.
     """
     is_blood = _blood(wires)
-    height = np.arange(wires.shape[2]) - 0.5 * wires.shape[2]
-    side = np.where(height % wires.shape[2] == 0.5 * wires.shape[2], 0.0, np.sign(height)) if is_opposed else 1.0
-    side = np.broadcast_to(side, is_blood.shape)
-    grid = _Grid(wires, is_blood, side)
+    grid = _Grid(wires, is_blood)
     force = np.asarray(force, dtype=np.float64)
     before = np.zeros((wires.shape[2], 3))
     for _ in range(MAX_CHECKS):
@@ -100,30 +95,22 @@ def flow_through(wires: Wires, force: Floats, *, is_opposed: bool = False) -> Ce
         velocity = grid.velocity(force)
         mean = velocity.mean(axis=(0, 1))
         if np.abs(mean - before).max() < SETTLED * np.abs(mean).max():
-            return CellFlow(velocity, force * side.sum(), is_blood)
+            return CellFlow(velocity, force * np.prod(wires.shape), is_blood)
         before = mean
     raise ValueError(f"the flow through the cell {wires.shape} has not settled: use a smaller force")
 
 
-def passing(wires: Wires, force: float) -> float:
-    """Speed of blood behind the wires over the shear rate of blood before them, in cells: what of a shear passes.
+def sheet_speed(flow: CellFlow, force: Floats) -> float:
+    """Speed along the first axis in a thin sheet that takes as much of blood passing at an angle as the wires do.
 
-    Blood that flows alike on both sides comes to rest, extended from afar, so far behind the wires' middle; blood that
-    flows to and fro, so far; a shear on one side is half of each. The flow is along the first axis, the force small.
+    Between sheets a height h apart, which blood crosses at speed w, a body force F makes it faster: steady advection
+    and diffusion, w u' = F + nu u'', have u = u_0 + (F / w) (z - h (e^(w z / nu) - 1) / (e^(w h / nu) - 1)). The mean
+    of it gives u_0, negative where the wires hold up more than a sheet could.
     """
-    height = wires.shape[2]
-    from_wires = np.arange(height) - 0.5 * height
-    curve = 0.5 * force / VISCOSITY * from_wires**2
-    behind = []
-    for is_opposed in (False, True):
-        speed = (
-            flow_through(wires, np.array([force, 0.0, 0.0]), is_opposed=is_opposed).velocity[..., 0].mean(axis=(0, 1))
-        )
-        low, high = (1 / 6, 1 / 3) if is_opposed else (1 / 4, 1 / 2)
-        far = (from_wires > low * height) & (from_wires < high * height)
-        shear, at_wires = np.polyfit(from_wires[far], (speed + curve)[far], 1)
-        behind.append(at_wires / shear)
-    return float(0.5 * (behind[0] - behind[1]))
+    height = flow.velocity.shape[2]
+    mean, _, through = flow.superficial_velocity
+    crossing = through * height / VISCOSITY
+    return float(mean - force[0] * height / through * (0.5 - 1 / crossing + 1 / np.expm1(crossing)))
 
 
 def _blood(wires: Wires) -> Bools:
@@ -175,9 +162,8 @@ def _fractions(wires: Wires, cells: Ints, steps: Ints) -> Floats:
 class _Grid:
     """The populations of a periodic box and their addresses (see `vstent.kernels.lattice`)."""
 
-    def __init__(self, wires: Wires, is_blood: Bools, side: Floats) -> None:
+    def __init__(self, wires: Wires, is_blood: Bools) -> None:
         self._shape, self._is_blood = wires.shape, is_blood
-        self._push = np.where(is_blood, side, 0.0).ravel()
         self._stride = int(np.prod(wires.shape))
         self._f = np.zeros(19 * self._stride + lanes.COUNT, np.float32)
         cells = np.argwhere(is_blood)
@@ -241,11 +227,11 @@ class _Grid:
     def _kick(self, impulse: Floats) -> None:
         kick = 3 * lattice.WEIGHTS * (lattice.VELOCITIES @ impulse)
         populations = self._f[: 19 * self._stride].reshape(19, -1)
-        populations += (kick[:, None] * self._push).astype(np.float32)
+        populations += (kick[:, None] * self._is_blood.ravel()).astype(np.float32)
 
     def velocity(self, force: Floats) -> Floats:
         """Velocity (i, j, k, 3) in the middle between two kicks."""
         result = np.zeros((self._stride, 3))
         result[self._place] = lattice.moments(self._f, self._stride, self._place)[:, 1:]
-        result += self._push[:, None] * force
+        result += self._is_blood.ravel()[:, None] * force
         return result.reshape(*self._shape, 3)

@@ -14,14 +14,19 @@ from vstent.stent import Stent
 from vstent.surface import Surface
 from vstent.units import M_PER_MM, MM_PER_UM
 
-SHARE_OF_THIN, SHARE_PER_SOLIDITY = 0.95, 4.9
-"""Normal over tangential resistance where wires are thin, and how it falls with wire diameter over spacing: what of a
-shear passes resolved crossing cells at d / s = 0.065 to 0.166 (`benchmarks/screen.py`, `screen.json`)."""
+SHARE_FALL, SHARE_PER_SOLIDITY = 0.08, 5.9
+"""How much less normal over tangential resistance is than that of slender rods, and how it falls with wire diameter
+over spacing: what resolved crossing cells take of blood that passes at an angle, at d / s = 0.065 to 0.24 and 30 to 60
+degrees, the mean of wires one on the other and in one plane (`benchmarks/screen.py`, `screen.json`)."""
 LEAST_SHARE = 0.02
-"""Least normal over tangential resistance: from d / s = 0.19 on, no shear passes."""
-CROSSING_PER_SOLIDITY = 0.85
+"""Least normal over tangential resistance."""
+INERTIAL_LOSS, SPARSEST = 0.35, 0.065
+"""K of the pressure drop K rho |u| u_n / 2 where blood passes at an angle at a wire Reynolds number of a half: the mean
+of resolved crossing cells with d / s below 0.15, the least of which is the other (`benchmarks/screen.py`,
+`screen.json`). Denser ones take half as much, beside a viscous resistance that makes either a few per cent."""
+CROSSING_PER_SOLIDITY = 0.89
 """How much crossing families resist more than their sum, per wire diameter over spacing: the mean of resolved crossing
-cells at d / s = 0.065 to 0.25 and 45 and 60 degrees, each 0.55 to 1.04 (`benchmarks/screen.py`, `screen.json`)."""
+cells at d / s = 0.065 to 0.24 and 30 to 60 degrees, each 0.48 to 1.04 (`benchmarks/screen.py`, `screen.json`)."""
 SMOOTHING_PORES = 1.5
 """Radius of the neighbourhood in which wire length per area is measured, in mean wire spacings."""
 SAMPLE_REACHES = 0.2
@@ -47,23 +52,27 @@ def crossing_factor(diameter: Floats, spacing: Floats) -> Floats:
     return 1 + CROSSING_PER_SOLIDITY * np.minimum(diameter / spacing, 0.5)
 
 
-def tangential_share(solidity: Floats) -> Floats:
-    """Tangential over normal resistance of crossing wires, by their diameter over their spacing.
+def tangential_share(solidity: Floats, lengthwise: Floats) -> Floats:
+    """Tangential over normal resistance of crossing wires to blood that passes along the artery.
 
-    A slender rod alone drags half as much along itself (design.md section 5), and crossing ones three quarters as much
-    along their plane. But there each lies in the lee of others, and the two layers have a height: the denser they are,
-    the less of the shear on one side reaches the blood on the other.
+    A slender rod drags half as much along itself as across (design.md section 5). But each lies in the lee of others,
+    and the two layers have a height: the denser they are, the less of its way along the artery blood keeps.
+
+    Parameters
+    ----------
+    solidity : wire diameter over spacing.
+    lengthwise : mean squared cosine of the wires' angle to the artery.
     """
-    return 1 / np.maximum(SHARE_OF_THIN - SHARE_PER_SOLIDITY * solidity, LEAST_SHARE)
+    return 1 / np.maximum(1 / (1 - 0.5 * lengthwise) - SHARE_FALL - SHARE_PER_SOLIDITY * solidity, LEAST_SHARE)
 
 
-def inertial_loss(open_fraction: Floats) -> Floats:
-    """Loss coefficient K of K rho U^2 / 2 of a wire screen with this open area fraction.
+def inertial_loss(solidity: Floats) -> Floats:
+    """Loss coefficient K of K rho |u| u_n / 2, by wire diameter over spacing; fewer wires than calibrated on take less.
 
-    K = 1.3 (1 - f) + (1 / f - 1)^2, the part that stays at high Reynolds number and is added to the viscous one at low
-    (Idelchik 2007, Handbook of Hydraulic Resistance, diagram 8-6).
+    A wire drags by the whole velocity at it, which past a neck is several times the one through it. Along the screen
+    half as much is lost: wires that cross at right angles have half their length across the flow (see `resist`).
     """
-    return 1.3 * (1 - open_fraction) + (1 / open_fraction - 1) ** 2
+    return INERTIAL_LOSS * np.minimum(solidity / SPARSEST, 1.0)
 
 
 def screen(stent: Stent, blood: Blood) -> Screen:
@@ -78,7 +87,8 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     ValueError
         When the stent has no wires.
     """
-    points_mm, length_mm, diameter_mm = _pieces(stent)
+    points_mm, along_mm, diameter_mm = _pieces(stent)
+    length_mm = np.linalg.norm(along_mm, axis=1)
     contour = stent.contour
     nodes_mm = contour.vertices_mm
     reach_mm = SMOOTHING_PORES * 2 * contour.area_mm2 / length_mm.sum()
@@ -87,21 +97,29 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     sample_mm, sample_mm2 = sampling.surface_samples(contour, SAMPLE_REACHES * reach_mm)
     area_mm2 = _kernel(tree, sample_mm, reach_mm) @ np.linalg.norm(sample_mm2, axis=1)
     spacing_mm = 2 * area_mm2 / np.maximum(weight @ length_mm, 1e-9 * area_mm2)
-    normal_per_m, tangential_per_m = np.zeros(len(nodes_mm)), np.zeros(len(nodes_mm))
-    covered = np.zeros(len(nodes_mm))
+    wire_mm = np.maximum(weight @ length_mm, 1e-300)
+    lengthwise = weight @ (length_mm * _lengthwise(stent, points_mm, along_mm)) / wire_mm
+    solidity = weight @ (length_mm * diameter_mm) / wire_mm / spacing_mm
+    normal_per_m = np.zeros(len(nodes_mm))
     for size_mm in np.unique(diameter_mm):
         family = weight @ np.where(diameter_mm == size_mm, length_mm, 0.0) / area_mm2
-        per_m = family / M_PER_MM * drag_per_length(size_mm, spacing_mm) * crossing_factor(size_mm, spacing_mm)
-        normal_per_m += per_m
-        tangential_per_m += per_m * tangential_share(size_mm / spacing_mm)
-        covered += 0.5 * family * size_mm
-    resistance_Pa_s_m = blood.viscosity_Pa_s * np.stack([normal_per_m, tangential_per_m], axis=1)
-    loss = inertial_loss((1 - np.minimum(covered, 0.6)) ** 2)
-    return _sampled(contour, resistance_Pa_s_m, loss)
+        per_m = family / M_PER_MM * drag_per_length(size_mm, spacing_mm)
+        normal_per_m += per_m * crossing_factor(size_mm, spacing_mm)
+    normal_Pa_s_m = blood.viscosity_Pa_s * normal_per_m
+    resistance_Pa_s_m = np.stack([normal_Pa_s_m, normal_Pa_s_m * tangential_share(solidity, lengthwise)], axis=1)
+    return _sampled(contour, resistance_Pa_s_m, inertial_loss(solidity))
+
+
+def _lengthwise(stent: Stent, points_mm: Floats, along_mm: Floats) -> Floats:
+    """Squared cosine (p,) of the angle of pieces of wire at points (p, 3) to the device's length there."""
+    length_mm = np.gradient(stent.nodes_mm, axis=0).reshape(-1, 3)
+    nearest = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(points_mm)[1]
+    size_mm2 = (length_mm[nearest] ** 2).sum(axis=1) * (along_mm**2).sum(axis=1)
+    return np.asarray((length_mm[nearest] * along_mm).sum(axis=1) ** 2 / size_mm2)
 
 
 def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
-    """Wires cut into pieces of at most `PIECE_MM`: midpoints (p, 3), lengths (p,) and diameters (p,), mm."""
+    """Wires cut into pieces of at most `PIECE_MM`: midpoints (p, 3), ways along them (p, 3) and diameters (p,), mm."""
     starts = stent.wire_starts
     wire = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     inner = np.flatnonzero(wire[1:] == wire[:-1])
@@ -112,7 +130,7 @@ def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
     rank = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
     part = ((rank + 0.5) / count[owner])[:, None]
     diameter = stent.wire_diameter_um[wire[inner]] * MM_PER_UM
-    return a[owner] + part * (b - a)[owner], (length / count)[owner], diameter[owner]
+    return a[owner] + part * (b - a)[owner], ((b - a) / count[:, None])[owner], diameter[owner]
 
 
 def _kernel(nodes: cKDTree, points_mm: Floats, reach_mm: float) -> csr_matrix:
@@ -179,7 +197,7 @@ class GridResistance:
     across_Pa_s_m2: Floats
     """(e,) resistance across it."""
     inertial_per_m: Floats
-    """(e,) pressure gradient along the normal over rho u_n^2."""
+    """(e,) pressure gradient along the normal over rho |u| u_n."""
 
 
 def on_grid(

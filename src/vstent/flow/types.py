@@ -146,7 +146,7 @@ class Screen:
     tangential_resistance_Pa_s_m: Floats
     """(p,) shear stress per tangential velocity, Pa/(m/s)."""
     inertial_loss: Floats
-    """(p,) K of the pressure drop K rho u_n^2 / 2."""
+    """(p,) K of the pressure drop K rho |u| u_n / 2, and of the shear stress K rho |u| u_t / 4."""
 
     def __post_init__(self) -> None:
         freeze(self, "points_mm", np.float64, (-1, 3))

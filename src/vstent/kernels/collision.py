@@ -158,14 +158,23 @@ def resist(normal: Any, entry: Any, u: Any) -> tuple[Any, Any]:
     """Half-force velocity u inside a screen, and the force, from the velocity u* without it: u = u* + F(u) / 2.
 
     `entry` holds the linear resistance along the unit normal and across it, and the quadratic one along it, all
-    per cell and time step: F = -(across u_t + (along + quadratic |u_n|) u_n n). Solved exactly: no stability limit.
+    per cell and time step: F = -(across + quadratic |u| / 2) u_t - (along + quadratic |u|) u_n n, for wires that cross
+    at right angles are dragged half as much along their plane. Solved at once but for |u|, which is found in two rounds
+    from what the linear resistances leave: no stability limit.
     """
     through = u[0] * normal[0] + u[1] * normal[1] + u[2] * normal[2]
-    linear = _ONE + _HALF * entry[0]
-    kept = _ONE / (_ONE + _HALF * entry[1])
-    size = larger(through, _ZERO - through)
-    extra = _TWO * through / (linear + root(linear * linear + _TWO * entry[2] * size)) - kept * through
-    v = kept * u[0] + extra * normal[0], kept * u[1] + extra * normal[1], kept * u[2] + extra * normal[2]
+    across = larger(u[0] * u[0] + u[1] * u[1] + u[2] * u[2] - through * through, _ZERO)
+    keep_along, keep_across = _ONE / (_ONE + _HALF * entry[0]), _ONE / (_ONE + _HALF * entry[1])
+    for _ in range(2):
+        size = root(keep_across * keep_across * across + keep_along * keep_along * through * through)
+        keep_along = _ONE / (_ONE + _HALF * (entry[0] + entry[2] * size))
+        keep_across = _ONE / (_ONE + _HALF * (entry[1] + _HALF * entry[2] * size))
+    extra = (keep_along - keep_across) * through
+    v = (
+        keep_across * u[0] + extra * normal[0],
+        keep_across * u[1] + extra * normal[1],
+        keep_across * u[2] + extra * normal[2],
+    )
     return v, (_TWO * (v[0] - u[0]), _TWO * (v[1] - u[1]), _TWO * (v[2] - u[2]))
 
 
