@@ -96,8 +96,8 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     weight = _kernel(tree, points_mm, reach_mm)
     sample_mm, sample_mm2 = sampling.surface_samples(contour, SAMPLE_REACHES * reach_mm)
     area_mm2 = _kernel(tree, sample_mm, reach_mm) @ np.linalg.norm(sample_mm2, axis=1)
-    spacing_mm = 2 * area_mm2 / np.maximum(weight @ length_mm, 1e-9 * area_mm2)
-    wire_mm = np.maximum(weight @ length_mm, 1e-300)
+    wire_mm = np.maximum(weight @ length_mm, 1e-9 * area_mm2)
+    spacing_mm = 2 * area_mm2 / wire_mm
     lengthwise = weight @ (length_mm * _lengthwise(stent, points_mm, along_mm)) / wire_mm
     solidity = weight @ (length_mm * diameter_mm) / wire_mm / spacing_mm
     normal_per_m = np.zeros(len(nodes_mm))
