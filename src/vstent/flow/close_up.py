@@ -53,6 +53,20 @@ class CloseUp:
         beyond = np.flatnonzero(self.part >= 0)
         return cKDTree(self.outer.centers_mm[beyond]), self.part[beyond]
 
+    @cached_property
+    def _sharpened_m_s(self) -> Floats:
+        """Velocity (n, 3) of the outer cells, linear between which the velocity is right in the mean.
+
+        Linear interpolation is short by h^2 t (1 - t) / 2 of the second derivative, a twelfth of h^2 in the mean.
+        """
+        outer = self.outer
+        speed, curve = outer.velocity_m_s, np.zeros((len(outer.cells), 3))
+        for step in np.eye(3, dtype=np.int32):
+            ahead, behind = (outer.index[tuple((outer.cells + sign * step).T)] for sign in (1, -1))
+            inner = (ahead >= 0) & (behind >= 0)
+            curve[inner] += speed[ahead[inner]] + speed[behind[inner]] - 2 * speed[inner]
+        return np.asarray(speed - curve / 12)
+
     def part_at(self, points_mm: Floats) -> Ints:
         """Part (m,) of the vessel beyond that points (m, 3) lie in."""
         tree, part = self._tree_beyond
@@ -63,7 +77,7 @@ class CloseUp:
         outer = self.outer
         cells, weights = lattice_sampling.stencils(outer.index, (points_mm - outer.origin_mm) / outer.cell_size_mm)
         share = np.where(cells >= 0, weights, 0.0)
-        result = np.einsum("mk,mkd->md", share, outer.velocity_m_s[cells])
+        result = np.einsum("mk,mkd->md", share, self._sharpened_m_s[cells])
         beside = np.flatnonzero((cells < 0).any(axis=1))
         of, place = np.unique(cells[beside], return_inverse=True)
         depth_mm = np.maximum(surface.closest(outer.centers_mm[of])[1], 0.1 * outer.cell_size_mm)

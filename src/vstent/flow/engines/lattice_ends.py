@@ -66,18 +66,11 @@ class Ends:
         return 0.25 / float(np.ptp(self.domain.cells, axis=0).max())
 
     def _entry(self, flow: float, links: Ints) -> tuple[Floats, Floats]:
-        """A cut through which blood enters, at the velocity of the flow outside, made up to what passes there.
-
-        Linear between wide cells, that is short by h^2 / 12 of its Laplacian, over a developed profile alike: what
-        lacks is added all over, for added in proportion it would be too fast on the axis.
-        """
+        """A cut through which blood enters, at the velocity of the flow outside, made up to what passes there."""
         normal, area = self._section(links)
-        q, c, _ = self._along(links)
-        velocity = np.stack([self._velocity(links, part) for part in (0.0, 0.5, 1.0)]) * area / flow
-        passing = -(c * velocity[1])[q <= lattice.AXIAL].sum()
-        velocity -= (1 - passing / area) * normal
+        inner, at, outer = (self._velocity(links, part) * area / flow for part in (0.0, 0.5, 1.0))
         row = np.array([lattice.INFLOW, flow / area, 0.0, self._rate(lattice.INFLOW), *normal, area, 0.0])
-        return row, _sent(q, normal, area, *velocity)
+        return row, _sent(self._along(links)[0], normal, area, inner, at, outer)
 
     def _exit(self, flow: float, links: Ints) -> tuple[Floats, Floats]:
         """A cut through which blood leaves, at the pressure of the flow outside.
