@@ -4,6 +4,7 @@ Hariharan et al. 2011, J. Biomech. Eng. 133, 041002; sudden expansion, z = 0 whe
 """
 
 import re
+import shutil
 import zipfile
 from itertools import pairwise
 from pathlib import Path
@@ -12,9 +13,7 @@ import numpy as np
 import pytest
 
 from axisymmetric import axial_speed
-from vstent.errors import FlowError
 from vstent.flow import Blood, FlowCase, FlowField, FlowSettings, sampling, simulate_case
-from vstent.flow.openfoam import program
 from vstent.surface import Surface
 from vstent.vessel import Opening, Vessel
 
@@ -186,14 +185,11 @@ def test_the_profiles_behind_the_step_are_nearly_inside_the_spread(
 
 
 @pytest.mark.validation
+@pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")
 def test_an_axisymmetric_solution_leaves_the_spread_as_far(
     experiments: list[dict[str, np.ndarray]], tmp_path: Path
 ) -> None:
     """The nominal nozzle's flow itself is outside by more than 3 % of the peak, whoever computes it."""
-    try:
-        program.find()
-    except FlowError as error:
-        pytest.skip(str(error))
     wide = 95.0, WIDE_RADIUS_MM
     speed = axial_speed(tmp_path, narrowing(0.0), wide, INFLOW_ML_S, BLOOD, edge_mm=0.2)
     found = []

@@ -95,7 +95,7 @@ def flow_through(wires: Wires, force: Floats) -> CellFlow:
         velocity = grid.velocity(force)
         mean = velocity.mean(axis=(0, 1))
         if np.abs(mean - before).max() < SETTLED * np.abs(mean).max():
-            return CellFlow(velocity, force * np.prod(wires.shape), is_blood)
+            return CellFlow(velocity, force * is_blood.size, is_blood)
         before = mean
     raise ValueError(f"the flow through the cell {wires.shape} has not settled: use a smaller force")
 
@@ -131,8 +131,8 @@ def _blood(wires: Wires) -> Bools:
 def _images(wires: Wires) -> tuple[Floats, Floats]:
     """Points and directions of every wire that can touch the box: those of the boxes around."""
     shifts = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * wires.shape
-    points = (np.reshape(wires.points, (-1, 1, 3)) + shifts).reshape(-1, 3)
-    return points, np.repeat(np.reshape(wires.directions, (-1, 3)), len(shifts), axis=0)
+    points = (np.array(wires.points)[:, None] + shifts).reshape(-1, 3)
+    return points, np.repeat(np.array(wires.directions), len(shifts), axis=0)
 
 
 def _signed_distance(wires: Wires, at: Ints) -> Floats:
@@ -232,6 +232,5 @@ class _Grid:
     def velocity(self, force: Floats) -> Floats:
         """Velocity (i, j, k, 3) in the middle between two kicks."""
         result = np.zeros((self._stride, 3))
-        result[self._place] = lattice.moments(self._f, self._stride, self._place)[:, 1:]
-        result += self._is_blood.ravel()[:, None] * force
+        result[self._place] = lattice.moments(self._f, self._stride, self._place)[:, 1:] + force
         return result.reshape(*self._shape, 3)

@@ -98,7 +98,7 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     area_mm2 = _kernel(tree, sample_mm, reach_mm) @ np.linalg.norm(sample_mm2, axis=1)
     wire_mm = np.maximum(weight @ length_mm, 1e-9 * area_mm2)
     spacing_mm = 2 * area_mm2 / wire_mm
-    lengthwise = weight @ (length_mm * _lengthwise(stent, points_mm, along_mm)) / wire_mm
+    lengthwise = weight @ (length_mm * _lengthwise(stent, tree, points_mm, along_mm)) / wire_mm
     solidity = weight @ (length_mm * diameter_mm) / wire_mm / spacing_mm
     normal_per_m = np.zeros(len(nodes_mm))
     for size_mm in np.unique(diameter_mm):
@@ -110,10 +110,10 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     return _sampled(contour, resistance_Pa_s_m, inertial_loss(solidity))
 
 
-def _lengthwise(stent: Stent, points_mm: Floats, along_mm: Floats) -> Floats:
+def _lengthwise(stent: Stent, nodes: cKDTree, points_mm: Floats, along_mm: Floats) -> Floats:
     """Squared cosine (p,) of the angle of pieces of wire at points (p, 3) to the device's length there."""
     length_mm = np.gradient(stent.nodes_mm, axis=0).reshape(-1, 3)
-    nearest = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(points_mm)[1]
+    nearest = nodes.query(points_mm)[1]
     size_mm2 = (length_mm[nearest] ** 2).sum(axis=1) * (along_mm**2).sum(axis=1)
     return np.asarray((length_mm[nearest] * along_mm).sum(axis=1) ** 2 / size_mm2)
 

@@ -51,12 +51,10 @@ class Ends:
 
     def _developed(self, links: Ints, area: float) -> Floats:
         """What links of the inlet send back, (l, 2): developed flow."""
-        normal, section_mm = self.case.vessel.inlet.normal, self.domain.sections[0]
-        inner, at, outer = (
-            -developed_profile(section_mm, normal, self._along(links, part)[2])[:, None] * normal
-            for part in (0.0, 0.5, 1.0)
-        )
-        return _sent(self._along(links)[0], normal, area, inner, at, outer)
+        normal = self.case.vessel.inlet.normal
+        places_mm = np.concatenate([self._along(links, part)[2] for part in (0.0, 0.5, 1.0)])
+        speed = developed_profile(self.domain.sections[0], normal, places_mm)
+        return _sent(self.domain.link_direction[links], normal, area, *(-speed.reshape(3, -1, 1) * normal))
 
     def _rate(self, kind: float) -> float:
         """Rate at which an end changes what it remembers."""
@@ -70,7 +68,7 @@ class Ends:
         normal, area = self._section(links)
         inner, at, outer = (self._velocity(links, part) * area / flow for part in (0.0, 0.5, 1.0))
         row = np.array([lattice.INFLOW, flow / area, 0.0, self._rate(lattice.INFLOW), *normal, area, 0.0])
-        return row, _sent(self._along(links)[0], normal, area, inner, at, outer)
+        return row, _sent(self.domain.link_direction[links], normal, area, inner, at, outer)
 
     def _exit(self, flow: float, links: Ints) -> tuple[Floats, Floats]:
         """A cut through which blood leaves, at the pressure of the flow outside.
