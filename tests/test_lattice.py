@@ -10,6 +10,7 @@ from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_scales import ODD_RATE as VESSEL_ODD_RATE
 from vstent.flow.engines.lattice_setup import parabolic_weights
 from vstent.kernels import lanes, lattice, lattice_sampling, voxels
+from vstent.kernels.collision import squared_reach
 from vstent.trace import trace
 from vstent.vessel import Vessel
 
@@ -186,9 +187,9 @@ def test_thinning_blood_relaxes_at_the_time_of_its_own_shear_rate(is_screened):
     np.testing.assert_allclose(stress(after), (1 - 1 / time)[:, None, None] * stress(before), atol=2e-4)
 
 
-def screen_of(normal, along, across, quadratic=0.0):
+def screen_of(normal, along, across, quadratic=0.0, spread=0.0):
     """The same resistance in every cell of the segment."""
-    entry = np.array([*normal, along, across, quadratic], np.float32)
+    entry = np.array([*normal, along, across, quadratic, spread], np.float32)
     return np.array([0, STRIDE], np.int32), np.arange(STRIDE, dtype=np.int32), np.tile(entry, (STRIDE, 1))
 
 
@@ -199,18 +200,37 @@ def test_a_screen_without_resistance_collides_as_none():
 
 def test_a_screen_takes_the_momentum_of_its_law():
     f = populations(3)
-    normal, along, across, quadratic = np.array([0.6, 0.0, 0.8]), 0.7, 0.3, 5.0
+    normal, along, across, quadratic, spread = np.array([0.6, 0.0, 0.8]), 0.7, 0.3, 5.0, 0.05
     start = momentum(f[: -lanes.COUNT].reshape(19, STRIDE))
-    force = momentum(even_step(f, screen_of(normal, along, across, quadratic))) - start
+    force = momentum(even_step(f, screen_of(normal, along, across, quadratic, spread))) - start
     velocity = start + 0.5 * force
     normal_speed = velocity @ normal
     tangential = velocity - normal_speed[:, None] * normal
-    size = np.linalg.norm(velocity, axis=1)
+    viscosity, stands_out = (1 / RATE - 0.5) / 3, 0.25 - (1 / ODD_RATE - 0.5) * (1 / RATE - 0.5)
+    fourth, sixth = (normal**4).sum(), (normal**6).sum()
+    stir = viscosity + 0.5 * np.abs(normal_speed)
+    shared = 2 / (1 + np.sqrt(1 + 4 * spread / stir))
+    size, part = np.linalg.norm(velocity, axis=1), shared
+    for _ in range(20):
+        thin = across + 0.5 * quadratic * size
+        part = shared / (1 + stands_out * (3 - 8 * fourth + 6 * sixth) * shared * thin / stir)
+        size = np.hypot(normal_speed, part * np.linalg.norm(tangential, axis=1))
     law = -((along + quadratic * size) * normal_speed)[:, None] * normal
-    law -= (across + 0.5 * quadratic * size)[:, None] * tangential
+    law -= (part * (across + 0.5 * quadratic * size))[:, None] * tangential
     np.testing.assert_allclose(force, law, atol=5e-3 * np.abs(law).max())
-    linear = momentum(even_step(f, screen_of(normal, along, across))) - start
-    assert np.abs(force - linear).max() > 0.2 * np.abs(law).max()
+    linear = momentum(even_step(f, screen_of(normal, along, across, spread=spread))) - start
+    assert np.abs(force - linear).max() > 0.1 * np.abs(law).max()
+    at_once = momentum(even_step(f, screen_of(normal, along, across, quadratic))) - start
+    assert np.abs(force - at_once).max() > 0.02 * np.abs(law).max()
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (0.5, 0.5, 0.5**0.5), (3**-0.5,) * 3])
+def test_links_reach_as_far_along_a_normal_as_their_moments_say(normal):
+    n = np.array(normal)
+    along = lattice.VELOCITIES @ n
+    beside = (lattice.VELOCITIES**2).sum(axis=1) - along**2  # the squares along both tangents
+    expected = (lattice.WEIGHTS * along**4 * beside).sum() / (lattice.WEIGHTS * along**2 * beside).sum()
+    assert squared_reach(tuple(np.float32(n))) == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize("fraction", [0.02, 0.3, 0.499, 0.5, 0.7, 1.0])

@@ -173,17 +173,6 @@ def _sub_centroids(n: int) -> Floats:
     return np.column_stack([1 - uv.sum(axis=1), uv])
 
 
-def thick_resistance_Pa_s_m(thin_Pa_s_m: Floats, viscosity_Pa_s: float, cell_size_mm: float) -> Floats:
-    """Tangential resistance (p,) that lets as much shear pass two layers of cells as a thin one (p,) does.
-
-    Of a shear on one side, mu / R passes a thin sheet of resistance R. Shared among the two layers beside it in parts a
-    and 1 - a it brakes twice: (mu / R) / (1 + a (1 - a) R h / mu) passes; the mean of a (1 - a) is 1 / 6.
-    """
-    passes_mm = viscosity_Pa_s / np.maximum(thin_Pa_s_m, 1e-9) / M_PER_MM
-    of_cells_mm = 0.5 * (passes_mm + np.sqrt(passes_mm**2 + 4 * passes_mm * cell_size_mm / 6))
-    return np.where(thin_Pa_s_m > 0, viscosity_Pa_s / (of_cells_mm * M_PER_MM), 0.0)
-
-
 @dataclass(frozen=True, eq=False)
 class GridResistance:
     """A screen spread over the grid cells beside it."""
@@ -196,24 +185,23 @@ class GridResistance:
     """(e,) resistance along the normal per volume: pressure gradient per velocity."""
     across_Pa_s_m2: Floats
     """(e,) resistance across it."""
+    spread_Pa_s_m: Floats
+    """(e,) what of the screen's resistance across it acts twice, in layers of cells (see `of_thin_sheet`)."""
     inertial_per_m: Floats
     """(e,) pressure gradient along the normal over rho |u| u_n."""
 
 
-def on_grid(
-    screen: Screen, viscosity_Pa_s: float, index: Ints, origin_mm: Floats, cell_size_mm: float
-) -> GridResistance:
+def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float) -> GridResistance:
     """Share every sample's resistance among the eight cells around it, trilinearly; what falls outside is void.
 
-    So a cell at the rim resists as its neighbours do, where the screen goes on over the wall beyond the neck. The
-    tangential resistance is made less, so that as much shear passes the cells as would pass the screen itself.
+    So a cell at the rim resists as its neighbours do, where the screen goes on over the wall beyond the neck.
 
     Parameters
     ----------
-    viscosity_Pa_s : the blood's.
     index : (i, j, k) cell number at every grid point, -1 outside.
     """
-    cells, weights = lattice_sampling.stencils(index, (screen.points_mm - origin_mm) / cell_size_mm)
+    at = (screen.points_mm - origin_mm) / cell_size_mm
+    cells, weights = lattice_sampling.stencils(index, at)
     share = np.where(cells >= 0, weights, 0.0)
     is_used = share > 0
     cell, owner = cells[is_used], np.broadcast_to(np.arange(len(cells))[:, None], cells.shape)[is_used]
@@ -226,12 +214,25 @@ def on_grid(
     # The normals of one sheet agree nearly; signs may differ where two sheets meet in a cell, but only n n^T counts.
     normal = np.stack([gathered(component) for component in screen.normals.T], axis=1)
     length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    along = gathered(screen.normal_resistance_Pa_s_m)
+    along, across_Pa_s_m = gathered(screen.normal_resistance_Pa_s_m), screen.tangential_resistance_Pa_s_m
+    across, twice = gathered(across_Pa_s_m), _twice(at, screen.normals)
     kept = along > 0
     return GridResistance(
         found[kept].astype(np.int32),
         (normal / length)[kept],
         along[kept],
-        gathered(thick_resistance_Pa_s_m(screen.tangential_resistance_Pa_s_m, viscosity_Pa_s, cell_size_mm))[kept],
+        across[kept],
+        (gathered(twice * across_Pa_s_m**2) / np.maximum(across, 1e-300))[kept],
         0.5 * gathered(screen.inertial_loss)[kept],
+    )
+
+
+def _twice(at: Floats, normals: Floats) -> Floats:
+    """Sum (p,) over pairs of cells about points (p, 3) of their trilinear weights and their way along the normals."""
+    part = at - np.floor(at)
+    corners = np.indices((2, 2, 2)).reshape(3, -1).T
+    weight = np.where(corners == 1, part[:, None], 1 - part[:, None]).prod(axis=2)
+    height = normals @ corners.T
+    return np.asarray(
+        sum(weight[:, a] * weight[:, b] * np.abs(height[:, a] - height[:, b]) for a in range(8) for b in range(a))
     )

@@ -22,8 +22,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from vstent.kernels.arrays import Floats, Ints
-from vstent.kernels.collision import collided, collided_screened, resist, stress_size, thinned
-from vstent.kernels.lanes import COUNT, gather, load, scatter, store
+from vstent.kernels.collision import collided, collided_screened, rates, resist, stress_size, thinned
+from vstent.kernels.lanes import COUNT, fetch, gather, load, scatter, store
 
 VELOCITIES: Final[Ints] = np.array(
     [[0, 0, 0]]
@@ -48,6 +48,11 @@ SLOWLY: Final = 0.1
 """Part of the way that an outlet's pressure goes in a step pair; at once, it would chase its own answer."""
 SEGMENT: Final = 128
 """Longest segment, in cells."""
+AHEAD: Final = 2
+"""Segments by which their populations are fetched before they are needed."""
+
+ENTRY: Final = 7
+"""Numbers that say what a cell of a screen resists (see `resist`): the unit normal and four of the resistance."""
 
 _ZERO = np.float32(0.0)
 _ROOT_THREE: Final = float(np.sqrt(3.0))
@@ -81,7 +86,8 @@ def _eight(f: Any, address: Any, s: int, k: int, settings: Any, target: Any, pla
     held, time = gather(f, address, s, k), load(times, k)
     if is_screened:
         normal = load(screen, k), load(screen, k + _WIDE), load(screen, k + 2 * _WIDE)
-        entry = load(screen, k + 3 * _WIDE), load(screen, k + 4 * _WIDE), load(screen, k + 5 * _WIDE)
+        linear = load(screen, k + 3 * _WIDE), load(screen, k + 4 * _WIDE)
+        entry = *linear, load(screen, k + 5 * _WIDE), load(screen, k + 6 * _WIDE)
         scatter(target, places, row, at, collided_screened(held, time, limit, odd_rate, normal, entry))
     else:
         scatter(target, places, row, at, collided(held, time, limit, odd_rate))
@@ -97,11 +103,13 @@ def _update_some(
     few, places, resistance, times = scratch
     for s in range(begin, end):
         cells = length[s]
+        if s + AHEAD < end:
+            fetch(f, address, s + AHEAD, length[s + AHEAD])
         if law[0] > 0.0:
             _thin(f, address, s, cells, time, law, times)
         first, last_entry = screen_start[s], screen_start[s + 1]
         for e in range(first, last_entry):
-            for k in range(6):
+            for k in range(ENTRY):
                 resistance[k * _WIDE + screen_place[e]] = entry[e, k]
         settings = times, limit[s], odd_rate, resistance, last_entry > first
         # The last eight cells are read before the others are written and written after them: whole vectors only.
@@ -116,7 +124,7 @@ def _update_some(
                 for k in range(cells):
                     f[address[s, q] + k] = few[COUNT * q + k]
         for e in range(first, last_entry):
-            for k in range(6):
+            for k in range(ENTRY):
                 resistance[k * _WIDE + screen_place[e]] = _ZERO
 
 
@@ -156,8 +164,8 @@ def update(
         the time by which shear rates count, and the exponents a and (n - 1) / a of Carreau and Yasuda's law, the first
         being 0 where the viscosity is the same everywhere; (segments,) float32 largest cell Reynolds number, speed over
         viscosity: faster blood is made that thick; float32 relaxation rate of the odd part.
-    screen : (segments + 1,) int32 first screen entry of every segment; (e,) int32 place within the segment; (e, 6)
-        float32 resistance (see `resist`).
+    screen : (segments + 1,) int32 first screen entry of every segment; (e,) int32 place within the segment; (e,
+        ENTRY) float32 unit normal and resistance (see `resist`).
     links : (l, 3) two places read and the one written, of this kind of step (see `paths`); (l, 2) float32 weights;
         (l,) float32 sources; (w,) int32 rest populations to which (w,) float32 is added.
     bands : (bands + 1, 3) first segment, link and rest population of every band, and of what would follow the last. A
@@ -170,7 +178,7 @@ def update(
         begin[chunk] = np.searchsorted(bands[:, 0], rows * chunk // threads)
     for chunk in prange(threads):
         few, places = np.zeros(19 * COUNT, np.float32), COUNT * np.arange(19, dtype=np.int32).reshape(1, 19)
-        scratch = few, places, np.zeros(6 * _WIDE, np.float32), np.full(_WIDE, relaxation[0])
+        scratch = few, places, np.zeros(ENTRY * _WIDE, np.float32), np.full(_WIDE, relaxation[0])
         first, last = begin[chunk], begin[chunk + 1]
         for band in range(first, last):
             _update_some(f, address, length, relaxation, screen, scratch, bands[band, 0], bands[band + 1, 0])
@@ -199,7 +207,7 @@ NO_LINKS: Final = (
 
 def no_screen(segments: int) -> tuple[Ints, Ints, NDArray[np.float32]]:
     """Return what `update` takes for the screen where there is none."""
-    return np.zeros(segments + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
+    return np.zeros(segments + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, ENTRY), np.float32)
 
 
 def paths(address: Ints, weight: Floats) -> tuple[Ints, Ints, NDArray[np.float32]]:
@@ -291,12 +299,12 @@ def set_equilibrium(f: Any, stride: int, places: Any, density: Any, velocity: An
 
 
 @njit(cache=True)
-def resisted(velocity: Any, entries: Any) -> Any:
-    """Half-force velocity (e, 3) of screened cells from their momentum (e, 3) and entries (e, 6) (see `resist`)."""
+def resisted(velocity: Any, entries: Any, time: float, odd_rate: float) -> Any:
+    """Half-force velocity (e, 3) of screened cells from their momentum (e, 3) and entries (e, ENTRY) (see `resist`)."""
     result = np.zeros_like(velocity)
     for e in range(len(entries)):
         normal, entry = entries[e, :3], entries[e, 3:]
-        u, _ = resist(normal, entry, (velocity[e, 0], velocity[e, 1], velocity[e, 2]))
+        u, _ = resist(normal, entry, (velocity[e, 0], velocity[e, 1], velocity[e, 2]), rates(time, odd_rate))
         result[e, 0], result[e, 1], result[e, 2] = u
     return result
 

@@ -88,7 +88,7 @@ def update(
         new = collided(held, time, limit[s], odd_rate)
     else:
         normal = screen[e, 0], screen[e, 1], screen[e, 2]
-        entry = screen[e, 3], screen[e, 4], screen[e, 5]
+        entry = screen[e, 3], screen[e, 4], screen[e, 5], screen[e, 6]
         new = collided_screened(held, time, limit[s], odd_rate, normal, entry)
     for q in range(19):
         f[_U(address[s, q] + k)] = new[q]

@@ -109,7 +109,7 @@ class ScreenEntries:
     place: Ints
     """(e,) place within the segment."""
     entry: NDArray[np.float32]
-    """(e, 6)."""
+    """(e, `lattice.ENTRY`)."""
     cell: Ints
     """(e,) cell."""
 
@@ -323,8 +323,7 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
     segments = len(addressing.length)
     if case.screen is None:
         return ScreenEntries(*lattice.no_screen(segments), np.zeros(0, np.int32))
-    viscosity_Pa_s = case.blood.viscosity_Pa_s
-    spread = on_grid(case.screen, viscosity_Pa_s, domain.index, domain.origin_mm, domain.cell_size_mm)
+    spread = on_grid(case.screen, domain.index, domain.origin_mm, domain.cell_size_mm)
     per_step = scales.step_s / case.blood.density_kg_m3
     entry = np.column_stack(
         [
@@ -332,6 +331,7 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
             spread.along_Pa_s_m2 * per_step,
             spread.across_Pa_s_m2 * per_step,
             spread.inertial_per_m * scales.cell_m,
+            spread.spread_Pa_s_m / (case.blood.density_kg_m3 * scales.speed_m_s),
         ]
     )
     segment = np.searchsorted(addressing.first_cell, spread.cell, side="right") - 1

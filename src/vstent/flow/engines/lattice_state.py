@@ -303,7 +303,8 @@ def _snapshot(state: State) -> Snapshot:
     moment, outflow = _read_here(state) if state.device is None else state.device.read()
     velocity = np.ascontiguousarray(moment[:, 1:])
     if len(state.screen.cell):
-        velocity[state.screen.cell] = lattice.resisted(velocity[state.screen.cell], state.screen.entry)
+        rates = np.float32(state.scales.relaxation_steps), np.float32(ODD_RATE)
+        velocity[state.screen.cell] = lattice.resisted(velocity[state.screen.cell], state.screen.entry, *rates)
     return Snapshot(velocity, moment[:, 0], outflow)
 
 
