@@ -50,7 +50,6 @@ SEGMENT: Final = 128
 """Longest segment, in cells."""
 AHEAD: Final = 2
 """Segments by which their populations are fetched before they are needed."""
-
 ENTRY: Final = 7
 """Numbers that say what a cell of a screen resists (see `resist`): the unit normal and four of the resistance."""
 
