@@ -39,7 +39,8 @@ wheel-check: $(VENV)/.ready
 clean:
 	rm -rf $(VENV) demo docs/_build docs/examples docs/generated
 
-$(VENV)/.ready: pyproject.toml
+# Kernels that a test process compiles itself are other machine code than those kept, so changed ones are compiled before.
+$(VENV)/.ready: pyproject.toml $(wildcard src/vstent/kernels/*.py)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "vstent needs Python 3.11 or newer: install it, then give PYTHON=/path/to/python3"; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' || \
