@@ -200,7 +200,7 @@ def test_a_screen_without_resistance_collides_as_none():
 
 def test_a_screen_takes_the_momentum_of_its_law():
     f = populations(3)
-    normal, along, across, quadratic, spread = np.array([0.6, 0.0, 0.8]), 0.7, 0.3, 5.0, 0.05
+    normal, along, across, quadratic, spread = np.array([0.6, 0.0, 0.8]), 0.7, 0.3, 6.5, 0.05
     start = momentum(f[: -lanes.COUNT].reshape(19, STRIDE))
     force = momentum(even_step(f, screen_of(normal, along, across, quadratic, spread))) - start
     velocity = start + 0.5 * force
@@ -219,7 +219,7 @@ def test_a_screen_takes_the_momentum_of_its_law():
     law -= (part * (across + 0.5 * quadratic * size))[:, None] * tangential
     np.testing.assert_allclose(force, law, atol=5e-3 * np.abs(law).max())
     linear = momentum(even_step(f, screen_of(normal, along, across, spread=spread))) - start
-    assert np.abs(force - linear).max() > 0.1 * np.abs(law).max()
+    assert np.abs(force - linear).max() > 0.2 * np.abs(law).max()
     at_once = momentum(even_step(f, screen_of(normal, along, across, quadratic))) - start
     assert np.abs(force - at_once).max() > 0.02 * np.abs(law).max()
 
