@@ -57,7 +57,7 @@ def screen() -> Screen:
 
 
 def everything() -> lattice_state.State:
-    """A run with all that kernels know: pulse, screen, thinning blood, thickened blood, each kind of opening, septa.
+    """A run with all that kernels know: pulse, moments, screen, thinning, thickened blood, each kind of opening, septa.
 
     The outlet's links are shared by a pressure and an outflow; populations are swapped at places of no meaning.
     """
@@ -75,8 +75,11 @@ def everything() -> lattice_state.State:
     openings = links.openings[[0, 1, 1]]
     openings[2, :2], openings[1:, 7] = (lattice.OUTFLOW, -0.5 * openings[0, 1]), 0.5 * openings[1, 7]
     start = np.array([*links.start[:2], links.start[1:].mean(), links.start[2]], np.int32)
-    state.links = replace(links, openings=openings, start=start)
-    state.wanted = openings[:, 1].copy()
+    swing = np.array([1.0, 0.8, 1.2])  # what a close-up imposes in the course of a cycle
+    wanted = openings[:, 1].copy()
+    course = 0.1 * swing[:, None] * np.abs(wanted).max() * [1.0, 0.0, 1.0]
+    shape = swing[:, None, None] * links.shape
+    state.links = replace(links, openings=openings, start=start, wanted=wanted, course=course, shape=shape)
     somewhere = a.place[::40]
     state.addressing = replace(a, swap_address=np.stack([a.stride + somewhere, 2 * a.stride + somewhere]))
     state.limit[::2] = 1.0

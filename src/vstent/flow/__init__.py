@@ -156,9 +156,9 @@ def engine_class(settings: FlowSettings) -> type[AbstractEngine[Any]]:
     """
     engine = _engine_of(settings)
     if settings.close_up and not engine.closes_up:
-        what = f"the engine {settings.engine}" if settings.waveform is None else "a pulse"
         raise FlowError(
-            f"{what} is not computed in a close-up: leave out --close-up (close_up), or take {LATTICE} in steady flow"
+            f"the engine {settings.engine} does not compute a close-up: leave out --close-up (close_up), or take "
+            f"{LATTICE}"
         )
     if settings.device_gpu and not engine.runs_on_gpu:
         raise FlowError(
@@ -198,8 +198,7 @@ class _Runs:
         bookmark = self._bookmark("answer")
         guess = start
         if bookmark is None or bookmark.saved is None:
-            steady = replace(case, settings=replace(case.settings, waveform=None))
-            guess = self._guess(steady, start, cell_size_mm)
+            guess = self._guess(case, start, cell_size_mm)
         progress = self._part(_coarse_runs(self.engine, case, start) * COARSE_SHARE, 1.0)
         return self._run(self.engine(cell_size_mm, self.folder), case, guess, progress, bookmark)
 
@@ -290,7 +289,10 @@ class _Runs:
 
 
 def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowField:
-    """A bare flow, changed by what a screen changes on a coarser grid."""
+    """A bare flow, changed by what a screen changes on a coarser grid; of a pulse, its mean and its end."""
+    pulses = all(field.phases for field in (start, bare, stented))
+    last = start.phases[-1:] if pulses else ()
+    ends = [_corrected(*(field.at_phase(field.phases[-1]) for field in (start, bare, stented))) for _ in last]
     before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))
     speed_before, speed_after = (np.linalg.norm(values[0], axis=1, keepdims=True) for values in (before, after))
     left = np.clip(speed_after / np.maximum(speed_before, 1e-9), 0.0, 1.0)
@@ -298,6 +300,10 @@ def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowFie
         start,
         velocity_m_s=after[0] + left * (start.velocity_m_s - before[0]),
         pressure_Pa=start.pressure_Pa + after[1] - before[1],
+        phases=tuple(
+            replace(phase, velocity_m_s=end.velocity_m_s, pressure_Pa=end.pressure_Pa)
+            for phase, end in zip(last, ends, strict=True)
+        ),
     )
 
 

@@ -20,7 +20,7 @@ from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow import sampling
 from vstent.flow.domain import BEYOND, Domain, Window
-from vstent.flow.types import FlowCase, FlowField
+from vstent.flow.types import FlowCase, FlowField, Phase
 from vstent.kernels import lattice_sampling
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.lattice import VELOCITIES
@@ -45,8 +45,19 @@ class CloseUp:
     """(n,) way through the blood from each of its cells out of the close-up."""
     part: Ints
     """(n,) part of the vessel beyond, by the cut that leads there; -1 within the close-up."""
-    inflow_mL_s: Floats
-    """(p,) flow from each part into the close-up."""
+    part_of_opening: Ints
+    """(k,) the part that ends at each opening; -1 where that is within."""
+
+    @cached_property
+    def inflow_mL_s(self) -> Floats:
+        """(p,) flow from each part into the close-up."""
+        through_mL_s = np.r_[self.outer.inlet_mL_s, -self.outer.outlets_mL_s]
+        leads_out = self.part_of_opening >= 0
+        return np.bincount(self.part_of_opening[leads_out], through_mL_s[leads_out]).astype(np.float64)
+
+    def at_phase(self, phase: Phase) -> "CloseUp":
+        """The same in the flow at a moment of the cycle."""
+        return replace(self, outer=self.outer.at_phase(phase))
 
     @cached_property
     def _tree_beyond(self) -> tuple[cKDTree, Ints]:
@@ -114,16 +125,14 @@ def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
     distance_mm = dijkstra(graph, directed=False, indices=sac, min_only=True)
     diameter_mm = _mean_diameter_mm(case)
     ends = _cells_at_ends(case, outer)
-    flows_mL_s = np.r_[outer.inlet_mL_s, -outer.outlets_mL_s]
-    is_beyond = distance_mm > DOWNSTREAM_DIAMETERS * diameter_mm
-    part, inflow_mL_s = _parts(graph, is_beyond, ends, flows_mL_s)
-    is_upstream = np.isin(part, np.flatnonzero(inflow_mL_s > 0))
-    is_beyond = (part >= 0) & ~(is_upstream & (distance_mm <= UPSTREAM_DIAMETERS * diameter_mm))
-    part, inflow_mL_s = _parts(graph, is_beyond, ends, flows_mL_s)
+    whole_mm = np.full(len(distance_mm), np.inf)
+    part = _parts(graph, distance_mm > DOWNSTREAM_DIAMETERS * diameter_mm, ends)
+    near = CloseUp(outer, whole_mm, part, part[ends])
+    is_upstream = np.isin(part, np.flatnonzero(near.inflow_mL_s > 0))
+    part = _parts(graph, (part >= 0) & ~(is_upstream & (distance_mm <= UPSTREAM_DIAMETERS * diameter_mm)), ends)
     beyond = np.flatnonzero(part >= 0)
-    whole_mm = np.full(len(part), np.inf)
     depth_mm = dijkstra(graph, directed=False, indices=beyond, min_only=True) if len(beyond) else whole_mm
-    return CloseUp(outer, depth_mm, part, inflow_mL_s)
+    return CloseUp(outer, depth_mm, part, part[ends])
 
 
 def volume_mm3(case: FlowCase) -> float:
@@ -150,18 +159,16 @@ def _cells_at_ends(case: FlowCase, outer: FlowField) -> Ints:
     return np.asarray(cKDTree(outer.centers_mm).query([section.mean(axis=0) for section in sections])[1])
 
 
-def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints, flows_mL_s: Floats) -> tuple[Ints, Floats]:
-    """Parts (n,) that cells beyond fall into, -1 for those within, and the flow (p,) from each part inwards.
+def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints) -> Ints:
+    """Parts (n,) that cells beyond fall into, -1 for those within.
 
-    A recess that leads to none of the `ends` (k,), through which the flows (k,) come in, is no part beyond.
+    A recess that leads to none of the `ends` (k,) is no part beyond.
     """
     beyond = np.flatnonzero(is_beyond)
     part = np.full(len(is_beyond), -1, dtype=np.int32)
     part[beyond] = connected_components(graph[beyond][:, beyond], directed=False)[1]
-    leads_out = part[ends] >= 0
-    through, number = np.unique(part[ends][leads_out], return_inverse=True)
-    inflow_mL_s = np.bincount(number, flows_mL_s[leads_out], len(through)).astype(np.float64)
-    return np.where(np.isin(part, through), np.searchsorted(through, part), -1).astype(np.int32), inflow_mL_s
+    through = np.unique(part[ends][part[ends] >= 0])
+    return np.where(np.isin(part, through), np.searchsorted(through, part), -1).astype(np.int32)
 
 
 def _neighbours(field: FlowField) -> csr_matrix:
@@ -215,18 +222,31 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
     children = (WIDTH * beyond[:, None] + np.indices((WIDTH,) * 3).reshape(3, -1).T).reshape(-1, 3)
     corner_mm = outer.origin_mm - 0.5 * (outer.cell_size_mm - inner.cell_size_mm)
     shift = np.rint((inner.origin_mm - corner_mm) / inner.cell_size_mm).astype(np.int32)
-    velocity_m_s, pressure_Pa = sampling.values_at(outer, corner_mm + children * inner.cell_size_mm)
     cells = np.concatenate([inner.cells + shift, children])
     order = np.lexsort(cells.T[::-1])
     is_fine = _is_well_within(chosen, inner.wall)
+
+    def joined(fine: Phase | FlowField, wide: FlowField) -> tuple[Floats, Floats, Floats]:
+        """Velocity and pressure in all cells and stress on the wall, at a moment."""
+        around = sampling.values_at(wide, corner_mm + children * inner.cell_size_mm)
+        within = fine.velocity_m_s, fine.pressure_Pa
+        velocity_m_s, pressure_Pa = (np.concatenate(pair)[order] for pair in zip(within, around, strict=True))
+        stress_Pa = np.where(is_fine[:, None], fine.wall_shear_stress_Pa, wide.wall_shear_stress_Pa)
+        return velocity_m_s, pressure_Pa, stress_Pa
+
+    velocity_m_s, pressure_Pa, stress_Pa = joined(inner, outer)
     return replace(
         inner,
         cells=cells[order],
         origin_mm=corner_mm,
-        velocity_m_s=np.concatenate([inner.velocity_m_s, velocity_m_s])[order],
-        pressure_Pa=np.concatenate([inner.pressure_Pa, pressure_Pa])[order],
-        wall_shear_stress_Pa=np.where(is_fine[:, None], inner.wall_shear_stress_Pa, outer.wall_shear_stress_Pa),
+        velocity_m_s=velocity_m_s,
+        pressure_Pa=pressure_Pa,
+        wall_shear_stress_Pa=stress_Pa,
         wall_pressure_Pa=np.where(is_fine, inner.wall_pressure_Pa, outer.wall_pressure_Pa),
+        phases=tuple(
+            Phase(fine.time_s, wide.inlet_mL_s, wide.outlets_mL_s, *joined(fine, outer.at_phase(wide)))
+            for fine, wide in zip(inner.phases, outer.phases, strict=True)
+        ),
         inlet_mL_s=outer.inlet_mL_s,
         outlets_mL_s=outer.outlets_mL_s,
         inlet_pressure_Pa=outer.inlet_pressure_Pa,

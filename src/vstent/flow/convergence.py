@@ -94,7 +94,10 @@ def convergence(
     """
     cell_size, *others = engine_class(case.settings).refined_by
     runs = _Runs(case, folder, told, 3 + 2 * len(others) + len(POSITIONS) - 1, [])
-    settings = replace(case.settings, tolerance=min(TOLERANCE, case.settings.tolerance))
+    given = case.settings
+    settings = replace(
+        given, tolerance=min(TOLERANCE, given.tolerance), cycle_tolerance=min(TOLERANCE, given.cycle_tolerance)
+    )
     grids = runs.refine(cell_size, RATIO**2 * default_cell_size_mm(case), settings, None)
     middle, known = replace(settings, cell_size_mm=grids.sizes[1]), runs.done[1]
     further = (runs.refine(name, getattr(settings, name), middle, known) for name in others)

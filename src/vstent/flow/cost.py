@@ -24,7 +24,7 @@ rest is what other flows of the same study keep)."""
 BYTES_PER_CELL_OF_RESULT = 130
 """Memory per cell that is only filled in from the wide ones around a close-up (measured on 0.5 million cells)."""
 BYTES_PER_PHASE_AND_CELL = 32
-"""Memory for every kept phase of a cycle and its cell."""
+"""Memory for every kept phase of a cycle and its cell, computed or only filled in."""
 BYTES_PER_GRID_POINT = 6
 """Memory per point of the box around the vessel (3 measured)."""
 GPU_BYTES_PER_CELL = 320
@@ -115,14 +115,14 @@ def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     widest = max(opening.diameter_mm for opening in vessel.openings)
     box_mm3 = float(np.prod(np.ptp(vessel.lumen.vertices_mm, axis=0) + 2 * widest))
     phases = 0 if case.settings.waveform is None else PHASES
-    per_cell = BYTES_PER_CELL + phases * BYTES_PER_PHASE_AND_CELL
     whole = volume_mm3 / cell_size_mm**3
-    box_bytes = box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT
+    of_all = (
+        BYTES_AT_LEAST + box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT + whole * phases * BYTES_PER_PHASE_AND_CELL
+    )
     if not case.settings.close_up:
-        return whole, BYTES_AT_LEAST + whole * per_cell + box_bytes
+        return whole, of_all + whole * BYTES_PER_CELL
     cells = close_up.volume_mm3(case) / cell_size_mm**3
-    result_bytes = BYTES_PER_CELL_OF_RESULT * (whole - cells)
-    return cells, BYTES_AT_LEAST + cells * per_cell + result_bytes + box_bytes
+    return cells, of_all + cells * BYTES_PER_CELL + (whole - cells) * BYTES_PER_CELL_OF_RESULT
 
 
 def _wide_cells(case: FlowCase, cell_size_mm: float) -> float:

@@ -217,12 +217,13 @@ class _Grid:
         relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
         screen, back = lattice.no_screen(segments), (self._weight, self._source, *lattice.NO_LINKS[3:])
         bands = np.array([[0, 0, 0], [segments, len(self._source), 0]], np.int32)
+        lost = np.empty_like(self._source)  # made up for nowhere here
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
             for address, path in zip((self._even, self._odd), self._paths, strict=True):
                 lattice.update(self._f, address, self._length, relaxation, screen, (path, *back), bands, 1)
             if pair % DEFER_PAIRS == 0:
-                lattice.defer(self._f, self._links, self._correction, self._source, np.float32(DEFER_PART))
+                lattice.defer(self._f, self._links, self._correction, self._source, lost, np.float32(DEFER_PART))
 
     def _kick(self, impulse: Floats) -> None:
         kick = 3 * lattice.WEIGHTS * (lattice.VELOCITIES @ impulse)

@@ -126,6 +126,11 @@ class FlowSettings:
     device_gpu: bool = False
     """Whether vstent's own engine computes on a GPU (the extra ``gpu``): results differ in the last bits."""
 
+    @property
+    def settled_below(self) -> float:
+        """What the residual has to fall below."""
+        return self.tolerance if self.waveform is None else self.cycle_tolerance
+
     def inflow_factor(self, time_s: Floats) -> Floats:
         """Inflow over mean inflow at times (t,)."""
         return np.ones(len(time_s)) if self.waveform is None else self.waveform.factor(time_s)
@@ -197,6 +202,8 @@ class Phase:
     """Time since the waveform's beginning."""
     inlet_mL_s: float
     """Flow in through the inlet."""
+    outlets_mL_s: Floats
+    """(k,) flow out through each outlet."""
     velocity_m_s: Floats
     """(n, 3) velocity at the cell centres."""
     pressure_Pa: Floats
@@ -205,6 +212,7 @@ class Phase:
     """(v, 3) at the lumen's vertices."""
 
     def __post_init__(self) -> None:
+        freeze(self, "outlets_mL_s", np.float64, (-1,))
         freeze(self, "velocity_m_s", np.float32, (-1, 3))
         freeze(self, "pressure_Pa", np.float32, (len(self.velocity_m_s),))
         freeze(self, "wall_shear_stress_Pa", np.float32, (-1, 3))
@@ -307,5 +315,6 @@ class FlowField:
             pressure_Pa=phase.pressure_Pa,
             wall_shear_stress_Pa=phase.wall_shear_stress_Pa,
             inlet_mL_s=phase.inlet_mL_s,
+            outlets_mL_s=phase.outlets_mL_s,
             phases=(),
         )

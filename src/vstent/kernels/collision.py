@@ -1,6 +1,6 @@
-"""What one collision does to the 19 populations of a cell: arithmetic alone, for one cell or for eight at once.
+"""What one collision does to the 19 populations of a cell: arithmetic alone, for one cell or for as many as Lanes hold.
 
-Every number may be a float32 or eight of them (`vstent.kernels.lanes`). Populations are shifted by their rest weights
+Every number may be a float32 or `vstent.kernels.lanes`. Populations are shifted by their rest weights
 and numbered as in `vstent.kernels.lattice`.
 
 Regularised: of the even part only the stress survives (Latt and Chopard 2006, Math. Comput. Simul. 72:165, eq 12),
@@ -143,7 +143,7 @@ def stress_size(f: Any) -> Any:
 
 @njit(cache=True, forceinline=True, fastmath=True, error_model="numpy")
 def thinned(size: Any, time: Any, law: Any) -> Any:
-    """Relaxation time of blood that thins with the shear rate, from its `stress_size`; one number, never eight.
+    """Relaxation time of blood that thins with the shear rate, from its `stress_size`; one number, never Lanes.
 
     Strain rate = 1.5 / time of the second moments' departure from equilibrium (Boyd, Buick and Green 2006, J. Phys. A
     39, 14241, eq. 9), which depends on the time sought: three rounds from blood at rest. `law` as in `lattice.update`.

@@ -1,4 +1,4 @@
-"""Eight single-precision numbers at once, as a type of numba's: what a processor's vector register holds.
+"""Eight or sixteen single-precision numbers at once, as a type of numba's: what a processor's vector register holds.
 
 A loop that the compiler turns into vector instructions itself pays for the cells that no whole vector holds, at both
 ends of every run of them; a few dozen cells long, they are most of the time. Whole vectors are named here instead.
@@ -12,10 +12,11 @@ from typing import Any, Final
 
 import numpy as np
 from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
 from numba.core import cgutils, types
 from numba.extending import intrinsic, models, overload, register_model
 
-COUNT: Final = 8
+COUNT: Final = 16 if get_host_cpu_features().get("avx512f") else 8
 """Numbers in one."""
 _FLOAT: Final = ir.FloatType()
 _VECTOR: Final = ir.VectorType(_FLOAT, COUNT)
@@ -25,7 +26,7 @@ _LINE: Final = 16
 
 
 class Lanes(types.Type):
-    """Eight numbers."""
+    """So many numbers."""
 
     def __init__(self) -> None:
         super().__init__(name="Lanes")
@@ -41,7 +42,7 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def _widened(builder: Any, kind: Any, value: Any) -> Any:
-    """Eight times the same number, unless it is eight numbers already."""
+    """The same number in every place, unless it is Lanes already."""
     if kind == LANES:
         return value
     one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
@@ -132,13 +133,13 @@ def _root_chosen(a: Any) -> Any:
 
 
 def _at(context: Any, builder: Any, array: Any, value: Any, place: Any) -> Any:
-    """Pointer to eight numbers of an array from a place on."""
+    """Pointer to the numbers of an array from a place on."""
     data = context.make_array(array)(context, builder, value).data
     return builder.bitcast(builder.gep(data, [place]), _VECTOR.as_pointer())
 
 
 def _runs(context: Any, builder: Any, signature: Any, arguments: Any) -> list[Any]:
-    """Pointers to eight numbers of an array (n,) from each address[row, q] + offset on, q = 0 to 18."""
+    """Pointers to the numbers of an array (n,) from each address[row, q] + offset on, q = 0 to 18."""
     array, addresses, row, offset = arguments[:4]
     held = context.make_array(signature.args[1])(context, builder, addresses)
     entry = builder.gep(held.data, [builder.mul(row, builder.extract_value(held.shape, 1))])
@@ -174,7 +175,7 @@ def fetch(_: Any, array: Any, address: Any, row: Any, count: Any) -> Any:
 
 @intrinsic
 def load(_: Any, array: Any, place: Any) -> Any:
-    """Return the eight numbers of a float32 array (n,) from a place on."""
+    """Return the numbers of a float32 array (n,) from a place on."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_at(context, builder, signature.args[0], *arguments), align=4)
@@ -184,7 +185,7 @@ def load(_: Any, array: Any, place: Any) -> Any:
 
 @intrinsic
 def gather(_: Any, array: Any, address: Any, row: Any, offset: Any) -> Any:
-    """Return eight numbers of a float32 array (n,) from each address[row, q] + offset on, q = 0 to 18, as a tuple.
+    """Return Lanes of a float32 array (n,) from each address[row, q] + offset on, q = 0 to 18, as a tuple.
 
     Rows of addresses must be contiguous.
     """
@@ -215,7 +216,7 @@ def scatter(_: Any, array: Any, address: Any, row: Any, offset: Any, lanes: Any)
 
 @intrinsic
 def store(_: Any, array: Any, place: Any, lanes: Any) -> Any:
-    """Write eight numbers to a float32 array (n,) from a place on."""
+    """Write Lanes to a float32 array (n,) from a place on."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         builder.store(arguments[2], _at(context, builder, signature.args[0], *arguments[:2]), align=4)

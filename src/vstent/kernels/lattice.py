@@ -3,7 +3,7 @@
 Storage. Populations are shifted by their rest weights (f - w) and lie in one flat array: population q of storage place
 i is at q * stride + i. Storage places are the fluid cells *and* their solid neighbours, row by row along z, so that a
 *segment* (a run of fluid cells along z) and each of its 18 neighbouring runs are contiguous: one address per segment
-and population replaces one per cell, and eight cells are worked on at once (`vstent.kernels.lanes`).
+and population replaces one per cell, and eight or sixteen are worked on at once (`vstent.kernels.lanes`).
 
 Update in place (the AA pattern; Bailey, Myre, Walsh, Lilja and Saar 2009, ICPP, 550). Even step: a cell reads its own
 populations and writes the collided ones back, each at the place of its opposite. Odd step: it reads where its
@@ -79,8 +79,8 @@ def _thin(f: Any, address: Any, s: int, n: int, time: float, law: Any, times: An
 
 
 @njit(cache=True, error_model="numpy")
-def _eight(f: Any, address: Any, s: int, k: int, settings: Any, target: Any, places: Any, row: int, at: int) -> None:
-    """Collide eight cells of segment s, from its cell k on, into `target` at places[row] + at."""
+def _some(f: Any, address: Any, s: int, k: int, settings: Any, target: Any, places: Any, row: int, at: int) -> None:
+    """Collide so many cells as Lanes hold of segment s, from its cell k on, into `target` at places[row] + at."""
     times, limit, odd_rate, screen, is_screened = settings
     held, time = gather(f, address, s, k), load(times, k)
     if is_screened:
@@ -111,11 +111,11 @@ def _update_some(
             for k in range(ENTRY):
                 resistance[k * _WIDE + screen_place[e]] = entry[e, k]
         settings = times, limit[s], odd_rate, resistance, last_entry > first
-        # The last eight cells are read before the others are written and written after them: whole vectors only.
+        # The last cells are read before the others are written and written after them: whole vectors only.
         last = max(0, cells - COUNT)
-        _eight(f, address, s, last, settings, few, places, 0, 0)
+        _some(f, address, s, last, settings, few, places, 0, 0)
         for k in range(0, last, COUNT):
-            _eight(f, address, s, k, settings, f, address, s, k)
+            _some(f, address, s, k, settings, f, address, s, k)
         if cells >= COUNT:
             scatter(f, address, s, last, gather(few, places, 0, 0))
         else:
@@ -230,8 +230,19 @@ def paths(address: Ints, weight: Floats) -> tuple[Ints, Ints, NDArray[np.float32
     return np.ascontiguousarray(after_even), np.ascontiguousarray(after_odd), both.astype(np.float32)
 
 
+@njit(cache=True, fastmath=True, forceinline=True)
+def defer_link(k: int, f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
+    """Do what `defer` does to its link k."""
+    a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
+    e, g = _U(address[k, 5]), _U(address[k, 4])
+    lost[k] = f[a] - f[_U(address[k, 0])]
+    wanted = correction[k, 0] * f[a] + correction[k, 1] * f[b] + correction[k, 2] * f[c]
+    wanted += correction[k, 3] * f[e] + correction[k, 4] * f[g]
+    source[k] += part * (wanted - source[k])
+
+
 @njit(cache=True, parallel=True, fastmath=True)
-def defer(f: Any, address: Any, correction: Any, source: Any, part: float) -> None:
+def defer(f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
     """Move the walls' sources towards the difference between quadratic and linear interpolation (populations at home).
 
     Quadratic reflection itself can be unstable; as a correction that lags behind it is not, and the steady state is the
@@ -240,29 +251,36 @@ def defer(f: Any, address: Any, correction: Any, source: Any, part: float) -> No
     Parameters
     ----------
     address : (links, 6) as in `paths`; correction : (links, 5) float32 weights of a, b, c, e and g.
+    lost : (links,) float32, set to what each link loses.
     """
     for k in prange(len(address)):
-        a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
-        e, g = _U(address[k, 5]), _U(address[k, 4])
-        wanted = correction[k, 0] * f[a] + correction[k, 1] * f[b] + correction[k, 2] * f[c]
-        wanted += correction[k, 3] * f[e] + correction[k, 4] * f[g]
-        source[k] += part * (wanted - source[k])
+        defer_link(k, f, address, correction, source, lost, part)
 
 
-@njit(cache=True)
-def balance(f: Any, address: Any, group: Any, count: Any, member: Any, refill: Any, part: float) -> None:
-    """Move the refill towards what the interpolated walls lose, spread over groups of wall cells (populations at home).
+@njit(cache=True, forceinline=True)
+def balance_group(g: int, lost: Any, groups: Any, refill: Any, part: float) -> None:
+    """Do what `balance` does to its group g."""
+    link_start, link, member_start, member = groups
+    total = 0.0
+    for k in range(link_start[g], link_start[g + 1]):
+        total += float(lost[link[k]])
+    share = total / (member_start[g + 1] - member_start[g])
+    for m in range(member_start[g], member_start[g + 1]):
+        w = member[m]
+        refill[w] += part * (share - refill[w])
+
+
+@njit(cache=True, parallel=True)
+def balance(lost: Any, groups: Any, refill: Any, part: float) -> None:
+    """Move the refill (w,) towards what the interpolated walls lose, spread over groups of wall cells.
 
     Parameters
     ----------
-    address : (links, 6) of the walls; group : (links,) group of each link's cell.
-    count : (groups,) wall cells of each group; member : (w,) group of each wall cell; refill : (w,).
+    lost : (links,) what each link of the walls loses (see `defer`).
+    groups : (g + 1,) first link of every group, and (links,) the links, group by group; then the same of wall cells.
     """
-    lost = np.zeros(len(count))
-    for k in range(len(address)):
-        lost[group[k]] += float(f[address[k, 3]]) - float(f[address[k, 0]])
-    for w in range(len(member)):
-        refill[w] += part * (lost[member[w]] / count[member[w]] - refill[w])
+    for g in prange(len(groups[0]) - 1):
+        balance_group(g, lost, groups, refill, part)
 
 
 @njit(cache=True)
@@ -349,6 +367,14 @@ def outlet_source(f: Any, stride: int, place: int, q: int, opening: Any, density
     return 2.0 * WEIGHTS[q] * even_part(q, density - 1.5 * inward * inward, ux, uy, uz)
 
 
+@njit(cache=True, forceinline=True)
+def between(shape: Any, n: int, moment: Any) -> tuple[float, float]:
+    """Shape of link n between two moments of a cycle (see `drive`)."""
+    now, following, part = int(moment[0]), int(moment[1]), moment[2]
+    first, second = shape[now, n], shape[following, n]
+    return first[0] + part * (second[0] - first[0]), first[1] + part * (second[1] - first[1])
+
+
 @njit(cache=True)
 def _density(f: Any, stride: int, places: Any) -> float:
     total = 0.0
@@ -377,6 +403,7 @@ def drive(
     place: Any,
     direction: Any,
     shape: Any,
+    moment: Any,
     source: Any,
 ) -> None:
     """Set what every opening sends back during the next two steps (all populations being at home).
@@ -387,8 +414,9 @@ def drive(
         remembered mean density, its rate of change, the outward normal (3), the area in cells, the density imposed.
     start : (k + 1,) first link of every opening in what follows.
     address : (l, 6) as in `paths`; place : (l,) storage place of each link's cell; direction, source : (l,).
-    shape : (l, 2) what inflow sends back through each link, over its speed and over its speed squared; of what an
-        outlet imposes, how much more its density is at each link than the outlet's.
+    shape : (m, l, 2) what inflow sends back through each link, over its speed and over its speed squared; of what an
+        outlet imposes, how much more its density is at each link than the outlet's; at m moments of a cycle.
+    moment : (3,) the two of them between which these steps lie, and which part of the way.
 
     Inflow: half-way reflection off a moving wall (Ladd 1994, J. Fluid Mech. 271, 285), so the flow is exact. It
     lets sound out: a density above the remembered mean is answered by the wave that leaves (Poinsot and Lele 1992,
@@ -402,10 +430,13 @@ def drive(
         if opening[0] == INFLOW:
             speed = inflow_speed(opening, _density(f, stride, place[first:last]))
             for n in range(first, last):
-                source[n] = (shape[n, 0] + shape[n, 1] * speed) * speed
+                linear, squared = between(shape, n, moment)
+                source[n] = (linear + squared * speed) * speed
             continue
         density = opening[1]
         if opening[0] == OUTFLOW:
             density = outlet_density(opening, outflow(f, address[first:last]))
         for n in range(first, last):
-            source[n] = outlet_source(f, stride, place[n], direction[n], opening, density + shape[n, 0])
+            source[n] = outlet_source(
+                f, stride, place[n], direction[n], opening, density + between(shape, n, moment)[0]
+            )

@@ -13,7 +13,17 @@ import numpy as np
 from numba import cuda, njit
 
 from vstent.kernels.collision import collided, collided_screened, stress_size, thinned
-from vstent.kernels.lattice import INFLOW, OUTFLOW, inflow_speed, outlet_density, outlet_source, velocity_at
+from vstent.kernels.lattice import (
+    INFLOW,
+    OUTFLOW,
+    balance_group,
+    between,
+    defer_link,
+    inflow_speed,
+    outlet_density,
+    outlet_source,
+    velocity_at,
+)
 
 THREADS: Final = 128
 """Threads of a block."""
@@ -117,38 +127,19 @@ def swap(f: Any, pairs: Any) -> None:
 
 
 @cuda.jit(cache=True)
-def defer(f: Any, address: Any, correction: Any, source: Any, part: float) -> None:
+def defer(f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
     """Move the walls' sources towards quadratic interpolation (see `lattice.defer`)."""
     k = cuda.grid(1)
-    if k >= source.size:
-        return
-    a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
-    e, g = _U(address[k, 5]), _U(address[k, 4])
-    wanted = correction[k, 0] * f[a] + correction[k, 1] * f[b] + correction[k, 2] * f[c]
-    wanted += correction[k, 3] * f[e] + correction[k, 4] * f[g]
-    source[k] += part * (wanted - source[k])
+    if k < source.size:
+        defer_link(k, f, address, correction, source, lost, part)
 
 
 @cuda.jit(cache=True)
-def balance(f: Any, link_start: Any, crossing: Any, member_start: Any, member: Any, refill: Any, part: float) -> None:
-    """Move the refill towards what the walls lose, a thread for every group of wall cells (see `lattice.balance`).
-
-    Parameters
-    ----------
-    link_start : (groups + 1,) first link of every group; crossing : (links, 2) places of what comes back and of what
-        leaves along each of them.
-    member_start : (groups + 1,) first wall cell of every group; member : (w,) wall cells, group by group.
-    """
+def balance(lost: Any, groups: Any, refill: Any, part: float) -> None:
+    """Move the refill towards what the walls lose, a thread for every group of wall cells (see `lattice.balance`)."""
     g = cuda.grid(1)
-    if g + 1 >= member_start.size:
-        return
-    lost = 0.0
-    for k in range(link_start[g], link_start[g + 1]):
-        lost += float(f[_U(crossing[k, 0])]) - float(f[_U(crossing[k, 1])])
-    share = lost / (member_start[g + 1] - member_start[g])
-    for m in range(member_start[g], member_start[g + 1]):
-        w = member[m]
-        refill[w] += part * (share - refill[w])
+    if g + 1 < groups[0].size:
+        balance_group(g, lost, groups, refill, part)
 
 
 @cuda.jit(cache=True)
@@ -192,22 +183,21 @@ def drive(
     f: Any,
     stride: int,
     openings: Any,
-    wanted: Any,
     start: Any,
     address: Any,
     place: Any,
     direction: Any,
     shape: Any,
     source: Any,
-    factor: Any,
+    wanted: Any,
+    moments: Any,
     pair: int,
 ) -> None:
     """Set what every opening sends back during the next two steps, a block each (see `lattice.drive`).
 
     Parameters
     ----------
-    wanted : (k,) speed wanted of every opening at mean flow; factor : (pairs,) flow over mean flow, of which `pair`
-        counts.
+    wanted : (pairs, k) speed or density wanted at every opening; moments : (pairs, 3); the row `pair` counts.
     """
     k, t = cuda.blockIdx.x, cuda.threadIdx.x
     opening, first, last = openings[k], start[k], start[k + 1]
@@ -225,7 +215,7 @@ def drive(
     cuda.syncthreads()
     if t == 0:
         total = _sum(parts)
-        opening[1] = wanted[k] * factor[pair]
+        opening[1] = wanted[pair, k]
         if kind == INFLOW:
             parts[0] = inflow_speed(opening, total / (last - first))
         elif kind == OUTFLOW:
@@ -235,7 +225,8 @@ def drive(
     cuda.syncthreads()
     answer = parts[0]
     for n in range(first + t, last, THREADS):
+        linear, squared = between(shape, n, moments[pair])
         if kind == INFLOW:
-            source[n] = (shape[n, 0] + shape[n, 1] * answer) * answer
+            source[n] = (linear + squared * answer) * answer
         else:
-            source[n] = outlet_source(f, stride, place[n], direction[n], opening, answer + shape[n, 0])
+            source[n] = outlet_source(f, stride, place[n], direction[n], opening, answer + linear)

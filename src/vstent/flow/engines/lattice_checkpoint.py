@@ -23,7 +23,7 @@ def pack(state: State) -> Saved:
         "kept": np.array(snapshots.maxlen or 0),
         "steps": np.array(state.steps),
         "loop_seconds": np.array(state.loop_seconds),
-        "populations": state.populations,
+        "populations": state.populations[: 19 * state.addressing.stride],
         "source": state.links.source,
         "openings": state.links.openings,
         "refill": state.refill.refill,
@@ -38,7 +38,7 @@ def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, outer: FlowField |
     """Build the run of a case anew and put it where it was."""
     scales = Scales(cell_size_mm * M_PER_MM, float(saved["step_s"]), case.blood)
     state = build(case, scales, int(saved["steps_per_check"]), outer=outer, start=None, kept=int(saved["kept"]))
-    state.populations[:] = saved["populations"]
+    state.populations[: 19 * state.addressing.stride] = saved["populations"]
     state.links.source[:] = saved["source"]
     state.links.openings[:] = saved["openings"]
     state.refill.refill[:] = saved["refill"]

@@ -1,5 +1,6 @@
 """What the embedded engine imposes where its grid ends: at the openings, and where a close-up is cut off."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,10 @@ SOUND_MEMORY = 0.002
 flow it takes every new pressure for the mean at once (1): the flow is the waveform's, whatever answers it."""
 
 
+STILL = 0.05
+"""Part of its mean flow below which an entry takes the velocity of the mean, for what little passes has no profile."""
+
+
 @dataclass(frozen=True, eq=False)
 class Ends:
     """The ends of a grid, by their patch."""
@@ -31,13 +36,34 @@ class Ends:
     close_up: CloseUp | None
     """What surrounds it, if anything does."""
 
-    def imposed(self, patch: int, links: Ints) -> tuple[Floats, Floats]:
-        """Row (9,) of `lattice.drive` for an end, and what it sends back through each of its links, (l, 2)."""
-        openings = self.case.vessel.openings
-        if self.close_up is None or patch <= len(openings):
+    def imposed(self, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats, Floats, Floats]:
+        """What is imposed at ends of these patches (k,), each with its links.
+
+        Returns
+        -------
+        Rows (k, 9) of `lattice.drive`, what is wanted (k,) at mean flow, what is besides (m, k) at the moments of the
+        flow outside, and shapes (m, l, 2) at these.
+        """
+        usual, shape = self._at(self.close_up, patches, links)
+        wanted = usual[:, 1].copy()
+        phases = () if self.close_up is None else self.close_up.outer.phases
+        if not phases:
+            return usual, wanted, np.zeros((1, len(patches))), shape[None]
+        moments = [self._at(self._outside.at_phase(phase), patches, links) for phase in phases]
+        factor = self.case.settings.inflow_factor(np.array([phase.time_s for phase in phases]))
+        course = np.stack([rows[:, 1] for rows, _ in moments]) - factor[:, None] * wanted
+        return usual, wanted, course, np.stack([shape for _, shape in moments])
+
+    def _at(self, now: CloseUp | None, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats]:
+        """Rows (k, 9) of `lattice.drive`, and what is sent back through all links, (l, 2), at a moment."""
+        ends = [self._end(now, int(patch), of_end) for patch, of_end in zip(patches, links, strict=True)]
+        return np.stack([row for row, _ in ends]), np.concatenate([shape for _, shape in ends])
+
+    def _end(self, now: CloseUp | None, patch: int, links: Ints) -> tuple[Floats, Floats]:
+        part = patch - 1 - len(self.case.vessel.openings)
+        if now is None or part < 0:
             return self._opening(patch - 1, links)
-        flow = float(self.close_up.inflow_mL_s[patch - len(openings) - 1]) / self.scales.flow_mL_s
-        return self._entry(flow, links) if flow > 0 else self._exit(-flow, links)
+        return self._entry(now, part, links) if self._outside.inflow_mL_s[part] > 0 else self._exit(now, part, links)
 
     def _opening(self, k: int, links: Ints) -> tuple[Floats, Floats]:
         opening = self.case.vessel.openings[k]
@@ -63,40 +89,42 @@ class Ends:
         # Critically damped: the blood that the pressure moves is a column about as long as the grid.
         return 0.25 / float(np.ptp(self.domain.cells, axis=0).max())
 
-    def _entry(self, flow: float, links: Ints) -> tuple[Floats, Floats]:
+    def _entry(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
         """A cut through which blood enters, at the velocity of the flow outside, made up to what passes there."""
         normal, area = self._section(links)
-        inner, at, outer = (self._velocity(links, part) * area / flow for part in (0.0, 0.5, 1.0))
-        row = np.array([lattice.INFLOW, flow / area, 0.0, self._rate(lattice.INFLOW), *normal, area, 0.0])
-        return row, _sent(self.domain.link_direction[links], normal, area, inner, at, outer)
+        shown = now if now.inflow_mL_s[part] > STILL * self._outside.inflow_mL_s[part] else self._outside
+        mean = shown.inflow_mL_s[part] / self.scales.flow_mL_s / area
+        profile = (self._velocity(shown, links, way) / mean for way in (0.0, 0.5, 1.0))
+        speed = now.inflow_mL_s[part] / self.scales.flow_mL_s / area
+        row = np.array([lattice.INFLOW, speed, 0.0, self._rate(lattice.INFLOW), *normal, area, 0.0])
+        return row, _sent(self.domain.link_direction[links], normal, area, *profile)
 
-    def _exit(self, flow: float, links: Ints) -> tuple[Floats, Floats]:
+    def _exit(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
         """A cut through which blood leaves, at the pressure of the flow outside.
 
         As a whole that is raised until what leaves is what passes there; where most leaves, the rest does.
         """
         normal, area = self._section(links)
         _, _, at_mm = self._along(links, 0.5)
-        density = sampling.values_at(self._outside.outer, at_mm)[1] / self.scales.pressure_Pa
-        inward = np.maximum(0.0, -self._velocity(links, 0.5) @ normal)
+        density = sampling.values_at(now.outer, at_mm)[1] / self.scales.pressure_Pa
+        inward = np.maximum(0.0, -self._velocity(now, links, 0.5) @ normal)
         density += 1.5 * inward**2  # what `lattice.outlet_source` takes off again
-        mean = float(density.mean())
-        kind = lattice.PRESSURE if self._takes_the_rest(flow) else lattice.OUTFLOW
-        wanted = mean if kind == lattice.PRESSURE else flow / area
-        row = np.array([kind, wanted, mean, self._rate(kind), *normal, area, mean])
-        return row, np.stack([density - mean, np.zeros(len(links))], axis=1)
+        kind = lattice.PRESSURE if self._takes_the_rest(part) else lattice.OUTFLOW
+        speed = -now.inflow_mL_s[part] / self.scales.flow_mL_s / area
+        row = np.array([kind, speed if kind == lattice.OUTFLOW else 0.0, 0.0, self._rate(kind), *normal, area, 0.0])
+        return row, np.stack([density, np.zeros(len(links))], axis=1)
 
     @property
     def _outside(self) -> CloseUp:
         assert self.close_up is not None
         return self.close_up
 
-    def _takes_the_rest(self, flow: float) -> bool:
+    def _takes_the_rest(self, part: int) -> bool:
         """Tell whether no more leaves anywhere else, at a cut or an outlet."""
         outside = self._outside
         within = [k for k in range(len(self.case.vessel.outlets)) if (self.domain.link_patch == k + 2).any()]
         most_mL_s = float(np.concatenate([-outside.inflow_mL_s, outside.outer.outlets_mL_s[within]]).max())
-        return flow * self.scales.flow_mL_s >= most_mL_s * (1 - 1e-9)
+        return bool(-outside.inflow_mL_s[part] >= most_mL_s * (1 - 1e-9))
 
     def _along(self, links: Ints, part: float = 0.0) -> tuple[Ints, Ints, Floats]:
         """Direction (l,) and lattice velocity (l, 3) of links, and the point (l, 3) on each that part of its way."""
@@ -105,10 +133,10 @@ class Ends:
         cell = self.domain.cells[self.domain.link_cell[links]]
         return q, c, self.domain.origin_mm + (cell + part * c) * self.domain.cell_size_mm
 
-    def _velocity(self, links: Ints, part: float) -> Floats:
+    def _velocity(self, now: CloseUp, links: Ints, part: float) -> Floats:
         """Velocity (l, 3) of the flow outside, in lattice units, that part of the way along links."""
         at_mm = self._along(links, part)[2]
-        return self._outside.velocity_m_s(at_mm, self.domain.surface) / self.scales.speed_m_s
+        return now.velocity_m_s(at_mm, self.domain.surface) / self.scales.speed_m_s
 
     def _section(self, links: Ints) -> tuple[Floats, float]:
         """Outward normal (3,) of a cut and its area in cells: the sum of the cells' faces in it."""

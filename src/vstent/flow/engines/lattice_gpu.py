@@ -45,7 +45,6 @@ class Device:
             f,
             a.stride,
             self._openings,
-            put(state.wanted),
             start,
             address,
             put(links.place),
@@ -69,11 +68,11 @@ class Device:
             partial(_launch, lattice_gpu.outflow, len(links.openings) * THREADS, f, start, address, self._outflow),
         )
 
-    def advance(self, factor: Floats, first_pair: int) -> None:
-        """Make a pair of steps for every factor (pairs,) of the mean flow; the first is that pair since a check."""
-        factors = put(factor)
-        for pair in range(len(factor)):
-            self._drive(factors, pair)
+    def advance(self, wanted: Floats, moments: Floats, first_pair: int) -> None:
+        """Make pairs of steps with what `lattice_state.imposed` returns; the first is that pair since a check."""
+        imposed = put(wanted), put(moments)
+        for pair in range(len(wanted)):
+            self._drive(*imposed, pair)
             for kernel in self._steps:
                 kernel()
             if (first_pair + pair) % DEFER_PAIRS == 0:
@@ -127,32 +126,13 @@ def _cells_of(length: Ints) -> tuple[Any, Any]:
 
 def _settling(state: State, f: Any, source: Any, refill: Any) -> tuple[partial[None], ...]:
     """What is done every few pairs: the deferred correction of the walls, and the balance of what they lose."""
-    links, groups = state.links, state.refill
+    links, walls = state.links, state.refill
     of_wall = slice(int(links.start[-1]), None)
     address = links.address[of_wall]
-    order, link_start = _grouped(groups.link_group, len(groups.count))
-    member, member_start = _grouped(groups.member, len(groups.count))
-    correction, crossing = put(links.correction[of_wall]), put(address[order][:, (3, 0)])
-    defer = partial(_launch, lattice_gpu.defer, len(address), f, put(address), correction, source[of_wall], PART)
-    balance = partial(
-        _launch,
-        lattice_gpu.balance,
-        len(groups.count),
-        f,
-        put(link_start),
-        crossing,
-        put(member_start),
-        put(member),
-        refill,
-        PART,
-    )
+    correction, lost, groups = put(links.correction[of_wall]), put(walls.lost), tuple(map(put, walls.groups))
+    defer = partial(_launch, lattice_gpu.defer, len(address), f, put(address), correction, source[of_wall], lost, PART)
+    balance = partial(_launch, lattice_gpu.balance, len(walls.groups[0]) - 1, lost, groups, refill, PART)
     return defer, balance
-
-
-def _grouped(group: Ints, count: int) -> tuple[Ints, Ints]:
-    """Order (n,) of things by their group (n,), and where each group begins in it (count + 1,)."""
-    order = np.argsort(group, kind="stable")
-    return order.astype(np.int32), np.searchsorted(group[order], np.arange(count + 1)).astype(np.int32)
 
 
 def put(array: NDArray[Any]) -> Any:

@@ -1,7 +1,7 @@
 """The embedded engine for pulsatile flow: the same steps, the inflow following a waveform until cycles repeat."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -30,14 +30,12 @@ STALLED: Final = 0.8
 class PulsatileLatticeBoltzmann(AbstractLattice):
     """The sparse D3Q19 engine with a waveform at the inlet."""
 
-    closes_up: ClassVar[bool] = False
-
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Choose a time step that divides the cycle and keeps the fastest blood below `lattice_speed` cells a step."""
         steps = steps_per_phase(case, self.cell_size_mm, start)
         phase_s = waveform_of(case).period_s / PHASES
         scales = Scales(self.cell_size_mm * M_PER_MM, phase_s / steps, case.blood)
-        return build(case, scales, steps, outer=None, start=start, kept=PHASES)
+        return build(case, scales, steps, outer=self.outer, start=start, kept=PHASES)
 
     def terminate(self, state: State) -> float | None:
         """Relative change of the monitored quantities from the last cycle but one to the last; inf within a cycle."""
@@ -53,8 +51,8 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
         for k, snapshot in enumerate(state.snapshots):
             flow = read(state, [snapshot])
             time_s = (k + 1) * state.steps_per_check * state.scales.step_s
-            inlet_mL_s = -float(flow.outflow_mL_s[0])
-            phases.append(Phase(time_s, inlet_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa))
+            through_mL_s = -float(flow.outflow_mL_s[0]), flow.outflow_mL_s[1:]
+            phases.append(Phase(time_s, *through_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa))
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])
         advice = cycles_advice(changes, len(state.history) // PHASES, is_converged=outcome.is_converged)
         return field_of(state, read(state, list(state.snapshots)), outcome, advice, tuple(phases))

@@ -80,8 +80,12 @@ class Links:
     """(o,) storage place of every opening link."""
     direction: Ints
     """(o,) lattice velocity of every opening link."""
+    wanted: Floats
+    """(k,) speed wanted at every end at mean flow."""
+    course: Floats
+    """(m, k) what is wanted there besides, speed or density, at equal times of a cycle."""
     shape: Floats
-    """(o, 2) what inflow of unit speed sends back, linear and quadratic in the speed."""
+    """(m, o, 2) see `lattice.drive`, at the same times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +94,10 @@ class Refill:
 
     place: Ints
     """(w,) storage place of every wall cell."""
-    member: Ints
-    """(w,) its group: wall cells of a block of `REFILL_BLOCK` cells."""
-    count: Ints
-    """(g,) wall cells of every group."""
-    link_group: Ints
-    """(l,) group of every wall link's cell."""
+    groups: tuple[Ints, Ints, Ints, Ints]
+    """See `lattice.balance`; a group is the wall cells of a block of `REFILL_BLOCK` cells."""
+    lost: NDArray[np.float32]
+    """(l,) see `lattice.defer`."""
     refill: NDArray[np.float32]
     """(w,) added in every step."""
 
@@ -221,14 +223,10 @@ def build_links(
     correction[:, :3] -= weight
     correction[~addressing.link_has_two[order]] = 0.0
     weight[: start[-1]], correction[: start[-1]] = (-1.0, 0.0, 0.0), 0.0
-    shape, openings = np.zeros((start[-1], 2)), np.zeros((len(patches), 9))
-    ends = Ends(case, domain, scales, close_up)
-    for k, number in enumerate(patches):
-        of_end = slice(start[k], start[k + 1])
-        openings[k], shape[of_end] = ends.imposed(int(number), order[of_end])
-        if openings[k, 0] == lattice.INFLOW:
-            weight[of_end] = (1.0, 0.0, 0.0)
     opening_links = order[: start[-1]]
+    ends = Ends(case, domain, scales, close_up)
+    openings, wanted, course, shape = ends.imposed(patches, np.split(opening_links, start[1:-1]))
+    weight[: start[-1]][np.repeat(openings[:, 0] == lattice.INFLOW, np.diff(start))] = (1.0, 0.0, 0.0)
     return Links(
         patches,
         addressing.link_address[order],
@@ -239,6 +237,8 @@ def build_links(
         start,
         addressing.place[domain.link_cell[opening_links]],
         domain.link_direction[opening_links],
+        wanted,
+        course,
         shape,
     )
 
@@ -305,17 +305,17 @@ def build_refill(domain: Domain, addressing: Addressing) -> Refill:
     order = _link_order(domain)
     cell = domain.link_cell[order][domain.link_patch[order] == 0]
     wall_cell, of_link = np.unique(cell, return_inverse=True)
-    _, member, count = np.unique(
-        domain.cells[wall_cell] // REFILL_BLOCK, axis=0, return_inverse=True, return_counts=True
-    )
-    member = member.ravel().astype(np.int32)
-    return Refill(
-        addressing.place[wall_cell],
-        member,
-        count.astype(np.int32),
-        member[of_link],
-        np.zeros(len(wall_cell), np.float32),
-    )
+    group = np.unique(domain.cells[wall_cell] // REFILL_BLOCK, axis=0, return_inverse=True)[1].ravel()
+    groups = *_grouped(group[of_link]), *_grouped(group)
+    lost, refill = (np.zeros(n, np.float32) for n in (len(of_link), len(wall_cell)))
+    return Refill(addressing.place[wall_cell], groups, lost, refill)
+
+
+def _grouped(group: Ints) -> tuple[Ints, Ints]:
+    """Where each of the g groups begins (g + 1,) in the order (n,) of things by their group (n,), and that order."""
+    order = np.argsort(group, kind="stable")
+    starts = np.searchsorted(group[order], np.arange(group.max(initial=-1) + 2))
+    return starts.astype(np.int32), order.astype(np.int32)
 
 
 def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales) -> ScreenEntries:

@@ -110,8 +110,6 @@ class State:
     """(s,) largest cell Reynolds number in every segment."""
     populations: NDArray[np.float32]
     """(19 * stride + lanes.COUNT,) shifted populations."""
-    wanted: Floats
-    """(k,) speed wanted at every opening at mean flow (see `lattice.drive`)."""
     steps_per_check: int
     """Time steps between checks, even."""
     snapshots: deque[Snapshot]
@@ -164,7 +162,6 @@ def build(
         build_bands(domain, addressing, links),
         np.where(is_end, CELL_REYNOLDS_AT_END, np.inf)[addressing.first_cell].astype(np.float32),
         np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
-        links.openings[:, 1].copy(),
         steps_per_check,
         deque(maxlen=kept),
     )
@@ -211,7 +208,10 @@ def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
 
 
 def _begin_from(state: State, start: FlowField) -> None:
-    velocity, pressure = sampling.values_at(start, state.domain.centers_mm)
+    """Begin from a flow; a pulse from the end of another's cycle, where there is one."""
+    pulses = state.case.settings.waveform is not None and start.phases
+    moment = start.at_phase(start.phases[-1]) if pulses else start
+    velocity, pressure = sampling.values_at(moment, state.domain.centers_mm)
     lattice.set_equilibrium(
         state.populations,
         state.addressing.stride,
@@ -247,15 +247,26 @@ def _slice_steps(state: State) -> int:
 
 def advance(state: State, steps: int) -> None:
     """Make an even number of time steps, in pairs."""
-    middle = state.steps + 1 + np.arange(0, steps, 2)
-    factor = state.case.settings.inflow_factor(np.float64(state.scales.step_s) * middle)
+    wanted, moments = imposed(state, state.steps + 1 + np.arange(0, steps, 2))
     first_pair = state.steps % state.steps_per_check // 2
     if state.case.settings.device_gpu:
         with told():
-            _device(state).advance(factor, first_pair)
+            _device(state).advance(wanted, moments, first_pair)
     else:
-        _advance_here(state, factor, first_pair)
+        _advance_here(state, wanted, moments, first_pair)
     state.steps += steps
+
+
+def imposed(state: State, steps: Ints) -> tuple[Floats, Floats]:
+    """What is wanted (t, k) at every end at steps (t,), and their moments (t, 3), see `lattice.drive`."""
+    links = state.links
+    count = len(links.course)
+    place = steps / state.steps_per_check - 1  # the first moment is the first check
+    now, part = np.divmod(place, 1)
+    moments = np.column_stack([now % count, (now + 1) % count, part])
+    before, after = (links.course[moments[:, k].astype(int)] for k in range(2))
+    factor = state.case.settings.inflow_factor(np.float64(state.scales.step_s) * steps)
+    return factor[:, None] * links.wanted + before + part[:, None] * (after - before), moments
 
 
 def _device(state: State) -> "Device":
@@ -267,8 +278,8 @@ def _device(state: State) -> "Device":
     return state.device
 
 
-def _advance_here(state: State, factor: Floats, first_pair: int) -> None:
-    """Make a pair of steps for every factor (pairs,) of the mean flow; the first is that pair since a check."""
+def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int) -> None:
+    """Make pairs of steps with what `imposed` returns; the first is that pair since a check."""
     f, links, refill = state.populations, state.links, state.refill
     a, screen = state.addressing, state.screen
     threads = numba.get_num_threads()
@@ -277,8 +288,8 @@ def _advance_here(state: State, factor: Floats, first_pair: int) -> None:
     resistance = screen.start, screen.place, screen.entry
     back = links.weight, links.source, refill.place, refill.refill
     opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
-    for pair in range(len(factor)):
-        links.openings[:, 1] = state.wanted * factor[pair]
+    for pair in range(len(wanted)):
+        links.openings[:, 1] = wanted[pair]
         lattice.drive(
             f,
             a.stride,
@@ -288,6 +299,7 @@ def _advance_here(state: State, factor: Floats, first_pair: int) -> None:
             links.place,
             links.direction,
             links.shape,
+            moments[pair],
             opening_source,
         )
         for address_of, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):
@@ -295,8 +307,8 @@ def _advance_here(state: State, factor: Floats, first_pair: int) -> None:
             lattice.swap(f, *a.swap_address)
         if (first_pair + pair) % DEFER_PAIRS == 0:
             part = np.float32(DEFER_PART)
-            lattice.defer(f, links.address[wall], links.correction[wall], links.source[wall], part)
-            lattice.balance(f, links.address[wall], refill.link_group, refill.count, refill.member, refill.refill, part)
+            lattice.defer(f, links.address[wall], links.correction[wall], links.source[wall], refill.lost, part)
+            lattice.balance(refill.lost, refill.groups, refill.refill, part)
 
 
 def _snapshot(state: State) -> Snapshot:

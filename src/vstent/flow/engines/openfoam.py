@@ -233,8 +233,8 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
 
 
 def _phase(one: Snapshot) -> Phase:
-    inlet_mL_s = -float(one.outflow_mL_s[0])
-    return Phase(float(one.time), inlet_mL_s, one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa)
+    inlet_mL_s, outlets_mL_s = -float(one.outflow_mL_s[0]), one.outflow_mL_s[1:]
+    return Phase(float(one.time), inlet_mL_s, outlets_mL_s, one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa)
 
 
 def _section_pressure_Pa(state: State, pressure_Pa: Floats, k: int) -> float:
