@@ -31,15 +31,16 @@ from vstent.vessel import Opening, Vessel
 DIAMETER_MM, LENGTH_MM, N_WIRES = 4.0, 10.0, 48
 
 
-def braid(angle_rad, wire_um=30.0):
-    """A straight tube of helices, half of them left-handed, on a contour of rows and columns."""
+def braid(angle_rad, wire_um=30.0, outside_mm=0.0):
+    """A straight tube of helices, half of them left-handed, so far outside a contour of rows and columns."""
     z = np.linspace(0, LENGTH_MM, 400)
     turn = 2 * np.tan(angle_rad) * z / DIAMETER_MM
     wires = []
     for k in range(N_WIRES):
         hand, start = (1 if k % 2 else -1), 4 * np.pi * (k // 2) / N_WIRES
         phase = hand * turn + start
-        wires.append(0.5 * DIAMETER_MM * np.stack([np.cos(phase), np.sin(phase), 2 * z / DIAMETER_MM], axis=1))
+        radius_mm = 0.5 * DIAMETER_MM + outside_mm
+        wires.append(np.stack([radius_mm * np.cos(phase), radius_mm * np.sin(phase), z], axis=1))
     angle = 2 * np.pi * np.arange(48) / 48
     rows = np.linspace(0, LENGTH_MM, 50)
     ring = 0.5 * DIAMETER_MM * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
@@ -85,6 +86,14 @@ def test_the_screen_of_a_braid_resists_as_its_closed_form(degrees, expected):
 def resolved():
     """The kept table of resolved crossing wires."""
     return json.loads((Path(__file__).parents[1] / "benchmarks" / "screen.json").read_text())
+
+
+def test_a_screen_lies_where_the_wires_are():
+    outside_mm = 0.08
+    made = screen(braid(np.radians(65), outside_mm=outside_mm), Blood())
+    radius_mm = np.hypot(*made.points_mm[:, :2].T)
+    assert radius_mm.mean() == pytest.approx(0.5 * DIAMETER_MM + outside_mm, abs=0.003)
+    assert made.area_mm2.sum() == pytest.approx(np.pi * (DIAMETER_MM + 2 * outside_mm) * LENGTH_MM, rel=0.005)
 
 
 def test_crossing_wires_resist_as_resolved_ones(resolved):

@@ -78,9 +78,10 @@ def inertial_loss(solidity: Floats) -> Floats:
 def screen(stent: Stent, blood: Blood) -> Screen:
     """Spread the drag of a deployed stent's wires over the surface that they span.
 
-    At every node of the contour the wire length per area, lambda, is measured over a neighbourhood of a few pores; two
-    crossing families then lie s = 2 / lambda apart, and every piece of wire resists as in a row of that spacing. So one
-    law serves braids, laser-cut cells and their mixtures of diameters, wherever bends have opened or closed them.
+    That surface is the contour, moved to where the wires' axes are: laser-cut struts lie on its outside. At every node
+    of it the wire length per area, lambda, is measured over a neighbourhood of a few pores; two crossing families then
+    lie s = 2 / lambda apart, and every piece of wire resists as in a row of that spacing. So one law serves braids,
+    laser-cut cells and their mixtures of diameters, wherever bends have opened or closed them.
 
     Raises
     ------
@@ -89,12 +90,12 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     """
     points_mm, along_mm, diameter_mm = _pieces(stent)
     length_mm = np.linalg.norm(along_mm, axis=1)
-    contour = stent.contour
-    nodes_mm = contour.vertices_mm
-    reach_mm = SMOOTHING_PORES * 2 * contour.area_mm2 / length_mm.sum()
+    reach_mm = SMOOTHING_PORES * 2 * stent.contour.area_mm2 / length_mm.sum()
+    sheet = _sheet(stent.contour, points_mm, length_mm, reach_mm)
+    nodes_mm = sheet.vertices_mm
     tree = cKDTree(nodes_mm)
     weight = _kernel(tree, points_mm, reach_mm)
-    sample_mm, sample_mm2 = sampling.surface_samples(contour, SAMPLE_REACHES * reach_mm)
+    sample_mm, sample_mm2 = sampling.surface_samples(sheet, SAMPLE_REACHES * reach_mm)
     area_mm2 = _kernel(tree, sample_mm, reach_mm) @ np.linalg.norm(sample_mm2, axis=1)
     wire_mm = np.maximum(weight @ length_mm, 1e-9 * area_mm2)
     spacing_mm = 2 * area_mm2 / wire_mm
@@ -107,7 +108,16 @@ def screen(stent: Stent, blood: Blood) -> Screen:
         normal_per_m += per_m * crossing_factor(size_mm, spacing_mm)
     normal_Pa_s_m = blood.viscosity_Pa_s * normal_per_m
     resistance_Pa_s_m = np.stack([normal_Pa_s_m, normal_Pa_s_m * tangential_share(solidity, lengthwise)], axis=1)
-    return _sampled(contour, resistance_Pa_s_m, inertial_loss(solidity))
+    return _sampled(sheet, resistance_Pa_s_m, inertial_loss(solidity))
+
+
+def _sheet(contour: Surface, points_mm: Floats, length_mm: Floats, reach_mm: float) -> Surface:
+    """The contour, moved along its normals to the mean height of the wires near, of pieces (p,) at points (p, 3)."""
+    below_mm, _, face = contour.closest(points_mm)
+    height_mm = np.einsum("pd,pd->p", points_mm - below_mm, contour.normals[face])
+    weight = _kernel(cKDTree(contour.vertices_mm), points_mm, reach_mm)
+    mean_mm = weight @ (length_mm * height_mm) / np.maximum(weight @ length_mm, 1e-300)
+    return Surface(contour.vertices_mm + mean_mm[:, None] * contour.vertex_normals, contour.faces)
 
 
 def _lengthwise(stent: Stent, nodes: cKDTree, points_mm: Floats, along_mm: Floats) -> Floats:
