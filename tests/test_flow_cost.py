@@ -11,7 +11,7 @@ from vstent.flow import FlowCase, FlowSettings, domain, simulate_case
 from vstent.flow.cost import block_rate, estimate, free_memory_bytes, refuse_too_large
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
-from vstent.flow.engines.lattice_state import PHASES
+from vstent.flow.types import PHASES
 from vstent.flow.waveform import OLDER_ADULT_ICA
 
 SETTINGS = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.2)

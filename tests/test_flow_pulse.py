@@ -10,8 +10,7 @@ from vstent import phantoms
 from vstent.errors import InputError
 from vstent.flow import FlowCase, FlowField, FlowSettings, sampling, simulate_case
 from vstent.flow.engines.lattice_pulse import cycle_change, cycles_advice
-from vstent.flow.engines.lattice_state import PHASES
-from vstent.flow.types import Waveform
+from vstent.flow.types import PHASES, Waveform
 from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
 from vstent.trace import trace
 from vstent.vessel import Vessel

@@ -12,9 +12,9 @@ import numpy as np
 from vstent.errors import FlowError
 from vstent.flow import close_up
 from vstent.flow.domain import INLET_EXTENSION, OUTLET_EXTENSION, default_cell_size_mm
-from vstent.flow.engines.lattice_state import PHASES, steps_per_phase
+from vstent.flow.engines.lattice_state import steps_per_phase
 from vstent.flow.gpu import free_gpu_bytes
-from vstent.flow.types import FlowCase
+from vstent.flow.types import PHASES, FlowCase
 from vstent.kernels import lanes, lattice
 from vstent.kernels.warm import keep_flow
 

@@ -194,6 +194,10 @@ MEAN_INLET_SPEED_M_S = 0.27
 """Mean speed in an internal carotid artery (design.md section 5)."""
 
 
+PHASES = 20
+"""Moments at which a cycle is kept."""
+
+
 @dataclass(frozen=True, eq=False)
 class Phase:
     """A moment of a pulsatile flow."""

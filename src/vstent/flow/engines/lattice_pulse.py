@@ -9,7 +9,6 @@ from vstent.flow.engines import Outcome
 from vstent.flow.engines.lattice_boltzmann import AbstractLattice
 from vstent.flow.engines.lattice_scales import Scales
 from vstent.flow.engines.lattice_state import (
-    PHASES,
     State,
     build,
     field_of,
@@ -18,7 +17,7 @@ from vstent.flow.engines.lattice_state import (
     steps_per_phase,
     waveform_of,
 )
-from vstent.flow.types import FlowCase, FlowField, Phase
+from vstent.flow.types import PHASES, FlowCase, FlowField, Phase
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 

@@ -33,7 +33,7 @@ from vstent.flow.engines.lattice_setup import (
     in_extensions,
 )
 from vstent.flow.gpu import require_gpu, told
-from vstent.flow.types import FlowCase, FlowField, Phase, Waveform
+from vstent.flow.types import PHASES, FlowCase, FlowField, Phase, Waveform
 from vstent.flow.wall_stress import wall_stress
 from vstent.kernels import lanes, lattice, lattice_sampling
 from vstent.kernels.arrays import Floats, Ints
@@ -49,10 +49,6 @@ DEFER_PART = 0.15
 """Part of the way that each update goes."""
 SLICE_UPDATES = 2e8
 """Cell updates between looks at the clock: a few seconds of one core."""
-
-
-PHASES = 20
-"""Times at which a cycle is kept."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,14 +18,13 @@ from vstent.flow import sampling
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.engines.lattice_boltzmann import CHECKS_AGREEING, CHECKS_AVERAGED, fraction_left
 from vstent.flow.engines.lattice_pulse import cycle_change
-from vstent.flow.engines.lattice_state import PHASES
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
 from vstent.flow.openfoam.case import STRUT_REACH_MM, foam_case, wires_near
 from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.setup import FoamSetup
-from vstent.flow.types import FlowCase, FlowField, Phase
+from vstent.flow.types import PHASES, FlowCase, FlowField, Phase
 from vstent.kernels.arrays import Floats, Ints
 from vstent.struts import struts
 from vstent.surface import Surface

@@ -8,11 +8,9 @@ import numpy as np
 from vstent.flow.openfoam.dictionary import foam_file
 from vstent.flow.openfoam.mesh import NECK
 from vstent.flow.openfoam.setup import FoamSetup
-from vstent.flow.types import Blood, FlowCase
+from vstent.flow.types import PHASES, Blood, FlowCase
 from vstent.kernels.arrays import Floats
 
-PHASES: Final = 20
-"""Times at which a cycle is written."""
 MAX_COURANT: Final = 2.0
 """Largest Courant number of a transient flow: implicit steps may pass 1 where cells are flat or small."""
 FIELD_LIBRARY: Final = ['"libfieldFunctionObjects.so"']
