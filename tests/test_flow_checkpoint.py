@@ -51,7 +51,7 @@ class Stopping(FlowCheckpoint):
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("kind", ["steady", "pulsatile", "stented", "close-up"])
+@pytest.mark.parametrize("kind", ["steady", "pulsatile", "stented", "close-up", "pulsatile close-up"])
 @pytest.mark.parametrize("saves", [2, 9])
 def test_a_stopped_flow_goes_on_to_the_same_bits(
     kind: str, saves: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -59,14 +59,15 @@ def test_a_stopped_flow_goes_on_to_the_same_bits(
     monkeypatch.setattr(engines, "SAVE_EVERY_S", 0.0)
     monkeypatch.setattr(engines, "SAVE_SHARE", np.inf)
     monkeypatch.setattr(lattice_state, "SLICE_UPDATES", 5e5)  # stops between checks too
-    case = FlowCase(vessel(), settings=PULSE if kind == "pulsatile" else SETTINGS)
+    settings = PULSE if "pulsatile" in kind else SETTINGS
+    case = FlowCase(vessel(), settings=settings)
     start = None
     if kind == "stented":
         start = simulate_case(case)
-        case = FlowCase(vessel(), screen=screen(), settings=SETTINGS)
-    if kind == "close-up":
+        case = replace(case, screen=screen())
+    if "close-up" in kind:
         sac = Surface(sphere(1.0).vertices_mm + np.array([0.0, 0.0, 5.0]), sphere(1.0).faces)
-        case = FlowCase(vessel(), sac=sac, settings=replace(SETTINGS, cell_size_mm=0.2, close_up=True))
+        case = replace(case, sac=sac, settings=replace(settings, cell_size_mm=0.2, close_up=True))
     whole = simulate_case(case, start=start)
     stopping = Stopping(tmp_path, "flow", "key")
     stopping.last = saves

@@ -19,7 +19,8 @@ from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
 from vstent.flow.screen import screen
 from vstent.flow.streamlines import Streamlines, streamlines
-from vstent.flow.types import LATTICE, OPENFOAM, Blood, FlowCase, FlowField, FlowSettings, Screen
+from vstent.flow.types import LATTICE, OPENFOAM, Blood, FlowCase, FlowField, FlowSettings, Phase, Screen
+from vstent.kernels.arrays import Floats
 from vstent.stent import Stent
 from vstent.vessel import Anatomy
 
@@ -290,21 +291,22 @@ class _Runs:
 
 def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowField:
     """A bare flow, changed by what a screen changes on a coarser grid; of a pulse, its mean and its end."""
-    pulses = all(field.phases for field in (start, bare, stented))
-    last = start.phases[-1:] if pulses else ()
-    ends = [_corrected(*(field.at_phase(field.phases[-1]) for field in (start, bare, stented))) for _ in last]
+    fields = start, bare, stented
+    velocity_m_s, pressure_Pa = _changed(*fields)
+    phases: tuple[Phase, ...] = ()
+    if all(field.phases for field in fields):
+        end_m_s, end_Pa = _changed(*(field.at_phase(field.phases[-1]) for field in fields))
+        phases = (replace(start.phases[-1], velocity_m_s=end_m_s, pressure_Pa=end_Pa),)
+    return replace(start, velocity_m_s=velocity_m_s, pressure_Pa=pressure_Pa, phases=phases)
+
+
+def _changed(start: FlowField, bare: FlowField, stented: FlowField) -> tuple[Floats, Floats]:
+    """Velocity and pressure of a flow, changed by what differs between two on a coarser grid."""
     before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))
     speed_before, speed_after = (np.linalg.norm(values[0], axis=1, keepdims=True) for values in (before, after))
     left = np.clip(speed_after / np.maximum(speed_before, 1e-9), 0.0, 1.0)
-    return replace(
-        start,
-        velocity_m_s=after[0] + left * (start.velocity_m_s - before[0]),
-        pressure_Pa=start.pressure_Pa + after[1] - before[1],
-        phases=tuple(
-            replace(phase, velocity_m_s=end.velocity_m_s, pressure_Pa=end.pressure_Pa)
-            for phase, end in zip(last, ends, strict=True)
-        ),
-    )
+    velocity_m_s = after[0] + left * (start.velocity_m_s - before[0])
+    return velocity_m_s, start.pressure_Pa + after[1] - before[1]
 
 
 def _coarse_runs(engine: type[AbstractEngine[Any]], case: FlowCase, start: FlowField | None) -> int:
