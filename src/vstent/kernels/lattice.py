@@ -394,29 +394,19 @@ def outflow(f: Any, address: Any) -> float:
 
 
 @njit(cache=True)
-def drive(
-    f: Any,
-    stride: int,
-    openings: Any,
-    start: Any,
-    address: Any,
-    place: Any,
-    direction: Any,
-    shape: Any,
-    moment: Any,
-    source: Any,
-) -> None:
+def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: Any) -> None:
     """Set what every opening sends back during the next two steps (all populations being at home).
 
     Parameters
     ----------
     openings : (k, 9) what is imposed (`PRESSURE`, `INFLOW` or `OUTFLOW`), the density deviation or speed wanted, the
         remembered mean density, its rate of change, the outward normal (3), the area in cells, the density imposed.
-    start : (k + 1,) first link of every opening in what follows.
-    address : (l, 6) as in `paths`; place : (l,) storage place of each link's cell; direction, source : (l,).
-    shape : (m, l, 2) what inflow sends back through each link, over its speed and over its speed squared; of what an
-        outlet imposes, how much more its density is at each link than the outlet's; at m moments of a cycle.
+    links : (k + 1,) first link of every opening in what follows; (l, 6) addresses as in `paths`; (l,) storage place of
+        each link's cell; (l,) its direction; (m, l, 2) its shape at m moments of a cycle: what inflow sends back
+        through it, over its speed and over its speed squared; of what an outlet imposes, how much more its density is
+        there than the outlet's.
     moment : (3,) the two of them between which these steps lie, and which part of the way.
+    source : (l,).
 
     Inflow: half-way reflection off a moving wall (Ladd 1994, J. Fluid Mech. 271, 285), so the flow is exact. It
     lets sound out: a density above the remembered mean is answered by the wave that leaves (Poinsot and Lele 1992,
@@ -425,6 +415,7 @@ def drive(
     imposed, which bounds the energy that enters. Outflow: the pressure that answers the excess of speed as the wave
     that leaves would, about a mean that moves until no excess is left.
     """
+    start, address, place, direction, shape = links
     for k in range(len(openings)):
         opening, first, last = openings[k], start[k], start[k + 1]
         if opening[0] == INFLOW:

@@ -183,11 +183,7 @@ def drive(
     f: Any,
     stride: int,
     openings: Any,
-    start: Any,
-    address: Any,
-    place: Any,
-    direction: Any,
-    shape: Any,
+    links: Any,
     source: Any,
     wanted: Any,
     moments: Any,
@@ -199,6 +195,7 @@ def drive(
     ----------
     wanted : (pairs, k) speed or density wanted at every opening; moments : (pairs, 3); the row `pair` counts.
     """
+    start, address, place, direction, shape = links
     k, t = cuda.blockIdx.x, cuda.threadIdx.x
     opening, first, last = openings[k], start[k], start[k + 1]
     kind = opening[0]

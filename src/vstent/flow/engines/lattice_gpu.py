@@ -38,20 +38,9 @@ class Device:
         update = (*_cells_of(a.length), *relaxation, put(screen.start), put(screen.place), put(screen.entry))
         reflect = put(links.weight), self._source, put(state.refill.place), self._refill
         address = put(links.address[: links.start[-1]])
-        self._drive = partial(
-            _launch,
-            lattice_gpu.drive,
-            len(links.openings) * THREADS,
-            f,
-            a.stride,
-            self._openings,
-            start,
-            address,
-            put(links.place),
-            put(links.direction),
-            put(links.shape),
-            self._source,
-        )
+        of_openings = start, address, put(links.place), put(links.direction), put(links.shape)
+        drive = partial(_launch, lattice_gpu.drive, len(links.openings) * THREADS)
+        self._drive = partial(drive, f, a.stride, self._openings, of_openings, self._source)
         swap = partial(_launch, lattice_gpu.swap, a.swap_address.shape[1], f, put(a.swap_address))
         self._steps = []
         for address_of, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):

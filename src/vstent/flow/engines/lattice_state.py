@@ -283,21 +283,11 @@ def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int
     relaxation = np.float32(scales.relaxation_steps), scales.thinning, state.limit, np.float32(ODD_RATE)
     resistance = screen.start, screen.place, screen.entry
     back = links.weight, links.source, refill.place, refill.refill
+    of_openings = links.start, links.address, links.place, links.direction, links.shape
     opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
     for pair in range(len(wanted)):
         links.openings[:, 1] = wanted[pair]
-        lattice.drive(
-            f,
-            a.stride,
-            links.openings,
-            links.start,
-            links.address,
-            links.place,
-            links.direction,
-            links.shape,
-            moments[pair],
-            opening_source,
-        )
+        lattice.drive(f, a.stride, links.openings, of_openings, moments[pair], opening_source)
         for address_of, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):
             lattice.update(f, address_of, a.length, relaxation, resistance, (path, *back), state.bands, threads)
             lattice.swap(f, *a.swap_address)
