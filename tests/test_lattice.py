@@ -17,7 +17,7 @@ from vstent.vessel import Vessel
 STRIDE = 40
 RATE, ODD_RATE, NO_LIMIT = 1.6, 0.7, 1e9
 NO_SCREEN = lattice.no_screen(1)
-NOTHING_SENT_BACK = lattice.NO_LINKS, np.array([[0, 0, 0], [1, 0, 0]], np.int32), 1
+NOTHING_SENT_BACK = lattice.NO_LINKS, np.array([[0, 0, 0], [1, 0, 0]], np.int32), lattice.ALONE
 
 
 def populations(seed=0):
@@ -78,15 +78,36 @@ def test_a_band_is_reflected_when_all_that_its_links_need_has_been_updated(threa
     assert len(state.bands) > 20
     assert np.array_equal(state.bands[-1], [len(a.length), len(links.source), len(refill.refill)])
     found = []
-    for bands, workers in ((state.bands, threads), (state.bands[[0, -1]], 1)):
+    shared = lattice.share(a.length, screen.start, state.bands, threads)
+    for bands, shares in ((state.bands, shared), (state.bands[[0, -1]], lattice.ALONE)):
         f = state.populations.copy()
         for address, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):
             back = path, links.weight, links.source, refill.place, refill.refill
             lattice.update(
-                f, address, a.length, relaxation, (screen.start, screen.place, screen.entry), back, bands, workers
+                f, address, a.length, relaxation, (screen.start, screen.place, screen.entry), back, bands, shares
             )
         found.append(f)
     np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])
+def test_threads_share_cells_links_and_screens_alike(threads):
+    """Half of the bands have twice the cells, the screen or the links: no share is off the mean by more than a band."""
+    heavy, vectors = np.arange(80) < 40, np.full(80, 4)
+    bands = np.stack([np.arange(81), np.zeros(81), np.zeros(81)], axis=1).astype(np.int32)
+    screened, linked = np.r_[0, np.cumsum(heavy)], bands.copy()
+    linked[1:, 1] = np.cumsum(np.where(heavy, round(4 / lattice.LINK_WORK), 0))
+    twice = {
+        "cells": (vectors * (1 + heavy), np.zeros(81, int), bands),
+        "screen": (vectors, screened, bands),
+        "links": (vectors, np.zeros(81, int), linked),
+    }
+    work = {"cells": 4 * (1 + heavy), "screen": np.where(heavy, 4 * lattice.SCREENED_WORK, 4), "links": 4 * (1 + heavy)}
+    for kind, (length, screen_start, of_bands) in twice.items():
+        shares = lattice.share(lanes.COUNT * length, screen_start, of_bands, threads)
+        assert (shares[0], shares[-1]) == (0, 80)
+        done = np.diff(np.r_[0, np.cumsum(work[kind])][shares])
+        assert np.abs(done - done.mean()).max() <= work[kind].max() + 0.01
 
 
 def test_a_collision_keeps_mass_and_momentum():

@@ -76,7 +76,9 @@ class Box:
         for _ in range(pairs):
             self.f[: 19 * len(self.cells)].reshape(19, -1)[:] += kick[:, None]
             for address in (self.even, self.odd):
-                lattice.update(self.f, address, self.length, relaxation, self.screen, lattice.NO_LINKS, bands, 1)
+                lattice.update(
+                    self.f, address, self.length, relaxation, self.screen, lattice.NO_LINKS, bands, lattice.ALONE
+                )
 
     def velocity(self) -> np.ndarray:
         return lattice.moments(self.f, len(self.cells), self.place)[:, 1:] + self.force

@@ -221,7 +221,7 @@ class _Grid:
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
             for address, path in zip((self._even, self._odd), self._paths, strict=True):
-                lattice.update(self._f, address, self._length, relaxation, screen, (path, *back), bands, 1)
+                lattice.update(self._f, address, self._length, relaxation, screen, (path, *back), bands, lattice.ALONE)
             if pair % DEFER_PAIRS == 0:
                 lattice.defer(self._f, self._links, self._correction, self._source, lost, np.float32(DEFER_PART))
 

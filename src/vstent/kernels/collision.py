@@ -173,21 +173,24 @@ def squared_reach(normal: Any) -> Any:
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def of_thin_sheet(across: Any, spread: Any, through: Any, blood: Any) -> Any:
-    """Speed along a thin sheet over that of the lattice in a cell of it, whose share of the sheet resists by `across`.
+def of_thin_sheet(across: Any, spread: Any, through: Any, blood: Any) -> tuple[Any, Any]:
+    """Part of the speed along a thin sheet that is left where a cell's share of it resists by `across`.
 
-    A thin sheet brakes blood that has been slowed on its way there, down to the speed that it leaves with. Parts a and
-    b of it in two layers of cells, d apart, brake twice: R + a b d R R / stir for R, where momentum goes from one to
-    the other at the rate stir = viscosity + |u_n| / 2; `spread` is a b d R of all layers, R the whole sheet's. And
-    where a lattice is pushed by F its velocity stands out by (1/4 - L) F / stir along an axis of the grid, by the
-    `squared_reach` of that elsewhere, L being the product of the relaxation times less a half each (the second
-    difference of the force: Ginzburg, Silva and Talon 2015, Phys. Rev. E 91, 023307): with L far below 1/4 a dense
-    braid would take twice what it should. `blood` is the viscosity and how much the velocity so stands out.
+    In the cell's half-force velocity, and in the sheet itself. A thin sheet brakes blood that has been slowed on its
+    way there, down to the speed that it leaves with. Parts a and b of it in two layers of cells, d apart, brake twice:
+    R + a b d R R / stir for R, where momentum goes from one to the other at the rate stir = viscosity + |u_n| / 2;
+    `spread` is a b d R of all layers, R the whole sheet's. And where a lattice is pushed by F its velocity stands out
+    by (1/4 - L) F / stir along an axis of the grid, by the `squared_reach` of that elsewhere, L being the product of
+    the relaxation times less a half each (the second difference of the force: Ginzburg, Silva and Talon 2015, Phys.
+    Rev. E 91, 023307): with L far below 1/4 a dense braid would take twice what it should. `blood` is the viscosity and
+    how much the velocity so stands out.
     """
     viscosity, shortfall = blood
     stir = viscosity + _HALF * larger(through, _ZERO - through)
-    part = _TWO / (_ONE + root(_ONE + _FOUR * spread / stir))
-    return part / (_ONE + shortfall * part * across / stir)
+    # The sheet's speed over the lattice's is 2 stir / open: all in one division, for divisions are what this costs.
+    open = stir + root(stir * (stir + _FOUR * spread)) + _TWO * shortfall * across
+    free = _ONE / (open + stir * across)
+    return open * free, _TWO * stir * free
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -203,15 +206,12 @@ def resist(normal: Any, entry: Any, u: Any, blood: Any) -> tuple[Any, Any]:
     blood = blood[0], blood[1] * squared_reach(normal)
     through = u[0] * normal[0] + u[1] * normal[1] + u[2] * normal[2]
     across = larger(u[0] * u[0] + u[1] * u[1] + u[2] * u[2] - through * through, _ZERO)
-    keep_along, keep_across = _ONE / (_ONE + _HALF * entry[0]), _ONE / (_ONE + _HALF * entry[1])
-    part = of_thin_sheet(entry[1], entry[3], keep_along * through, blood)
+    keep_along = _ONE / (_ONE + _HALF * entry[0])
+    keep_across, beside = of_thin_sheet(entry[1], entry[3], keep_along * through, blood)
     for _ in range(2):
-        beside = part * keep_across
         size = root(beside * beside * across + keep_along * keep_along * through * through)
         keep_along = _ONE / (_ONE + _HALF * (entry[0] + entry[2] * size))
-        thin = entry[1] + _HALF * entry[2] * size
-        part = of_thin_sheet(thin, entry[3], keep_along * through, blood)
-        keep_across = _ONE / (_ONE + _HALF * part * thin)
+        keep_across, beside = of_thin_sheet(entry[1] + _HALF * entry[2] * size, entry[3], keep_along * through, blood)
     extra = (keep_along - keep_across) * through
     v = (
         keep_across * u[0] + extra * normal[0],

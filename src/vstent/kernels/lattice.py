@@ -50,6 +50,8 @@ SEGMENT: Final = 128
 """Longest segment, in cells."""
 AHEAD: Final = 2
 """Segments by which their populations are fetched before they are needed."""
+LINK_WORK, SCREENED_WORK = 0.035, 2.0
+"""Time that a link takes, and a vector of a segment with screened cells, over that of a vector without."""
 ENTRY: Final = 7
 """Numbers that say what a cell of a screen resists (see `resist`): the unit normal and four of the resistance."""
 
@@ -78,18 +80,24 @@ def _thin(f: Any, address: Any, s: int, n: int, time: float, law: Any, times: An
         times[k] = thinned(times[k], time, law)
 
 
-@njit(cache=True, error_model="numpy")
-def _some(f: Any, address: Any, s: int, k: int, settings: Any, target: Any, places: Any, row: int, at: int) -> None:
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _collide(f: Any, address: Any, s: int, k: int, settings: Any, target: Any, places: Any, row: int, at: int) -> None:
     """Collide so many cells as Lanes hold of segment s, from its cell k on, into `target` at places[row] + at."""
-    times, limit, odd_rate, screen, is_screened = settings
+    times, limit, odd_rate = settings
+    scatter(target, places, row, at, collided(gather(f, address, s, k), load(times, k), limit, odd_rate))
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _collide_screened(
+    f: Any, address: Any, s: int, k: int, settings: Any, screen: Any, target: Any, places: Any, row: int, at: int
+) -> None:
+    """Do what `_collide` does, where there are cells of a screen among them."""
+    times, limit, odd_rate = settings
+    normal = load(screen, k), load(screen, k + _WIDE), load(screen, k + 2 * _WIDE)
+    linear = load(screen, k + 3 * _WIDE), load(screen, k + 4 * _WIDE)
+    entry = *linear, load(screen, k + 5 * _WIDE), load(screen, k + 6 * _WIDE)
     held, time = gather(f, address, s, k), load(times, k)
-    if is_screened:
-        normal = load(screen, k), load(screen, k + _WIDE), load(screen, k + 2 * _WIDE)
-        linear = load(screen, k + 3 * _WIDE), load(screen, k + 4 * _WIDE)
-        entry = *linear, load(screen, k + 5 * _WIDE), load(screen, k + 6 * _WIDE)
-        scatter(target, places, row, at, collided_screened(held, time, limit, odd_rate, normal, entry))
-    else:
-        scatter(target, places, row, at, collided(held, time, limit, odd_rate))
+    scatter(target, places, row, at, collided_screened(held, time, limit, odd_rate, normal, entry))
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -99,32 +107,43 @@ def _update_some(
     """Do what `update` does to the segments from `begin` on, before `end`."""
     time, law, limit, odd_rate = relaxation
     screen_start, screen_place, entry = screen
-    few, places, resistance, times = scratch
+    few, places, resistance, marked, times = scratch
     for s in range(begin, end):
         cells = length[s]
         if s + AHEAD < end:
             fetch(f, address, s + AHEAD, length[s + AHEAD])
         if law[0] > 0.0:
             _thin(f, address, s, cells, time, law, times)
-        first, last_entry = screen_start[s], screen_start[s + 1]
-        for e in range(first, last_entry):
-            for k in range(ENTRY):
-                resistance[k * _WIDE + screen_place[e]] = entry[e, k]
-        settings = times, limit[s], odd_rate, resistance, last_entry > first
+        settings = times, limit[s], odd_rate
         # The last cells are read before the others are written and written after them: whole vectors only.
         last = max(0, cells - COUNT)
-        _some(f, address, s, last, settings, few, places, 0, 0)
-        for k in range(0, last, COUNT):
-            _some(f, address, s, k, settings, f, address, s, k)
+        first_entry, last_entry = screen_start[s], screen_start[s + 1]
+        if last_entry > first_entry:
+            for e in range(first_entry, last_entry):
+                marked[screen_place[e] // COUNT] = True
+                for k in range(ENTRY):
+                    resistance[k * _WIDE + screen_place[e]] = entry[e, k]
+            _collide_screened(f, address, s, last, settings, resistance, few, places, 0, 0)
+            for k in range(0, last, COUNT):
+                if not marked[k // COUNT]:
+                    _collide(f, address, s, k, settings, f, address, s, k)
+            for k in range(0, last, COUNT):
+                if marked[k // COUNT]:
+                    _collide_screened(f, address, s, k, settings, resistance, f, address, s, k)
+            for e in range(first_entry, last_entry):
+                marked[screen_place[e] // COUNT] = False
+                for k in range(ENTRY):
+                    resistance[k * _WIDE + screen_place[e]] = _ZERO
+        else:
+            _collide(f, address, s, last, settings, few, places, 0, 0)
+            for k in range(0, last, COUNT):
+                _collide(f, address, s, k, settings, f, address, s, k)
         if cells >= COUNT:
             scatter(f, address, s, last, gather(few, places, 0, 0))
         else:
             for q in range(19):
                 for k in range(cells):
                     f[address[s, q] + k] = few[COUNT * q + k]
-        for e in range(first, last_entry):
-            for k in range(ENTRY):
-                resistance[k * _WIDE + screen_place[e]] = _ZERO
 
 
 @njit(cache=True, fastmath=True)
@@ -146,7 +165,7 @@ def _refill_some(f: Any, links: Any, begin: int, end: int) -> None:
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def update(
-    f: Any, address: Any, length: Any, relaxation: Any, screen: Any, links: Any, bands: Any, threads: int
+    f: Any, address: Any, length: Any, relaxation: Any, screen: Any, links: Any, bands: Any, shares: Any
 ) -> None:
     """Collide and stream every segment once, and send back what crosses a wall or an opening.
 
@@ -169,16 +188,14 @@ def update(
         (l,) float32 sources; (w,) int32 rest populations to which (w,) float32 is added.
     bands : (bands + 1, 3) first segment, link and rest population of every band, and of what would follow the last. A
         link needs no cells but those of its own band and the two beside it; links before the first band's need any.
-    threads : number of chunks.
+    shares : (threads + 1,) first band of every thread's share, and the number of bands (see `share`).
     """
-    count, rows = len(bands) - 1, bands[len(bands) - 1, 0]
-    begin = np.full(threads + 1, count)
-    for chunk in range(threads):
-        begin[chunk] = np.searchsorted(bands[:, 0], rows * chunk // threads)
+    threads = len(shares) - 1
     for chunk in prange(threads):
         few, places = np.zeros(19 * COUNT, np.float32), COUNT * np.arange(19, dtype=np.int32).reshape(1, 19)
-        scratch = few, places, np.zeros(ENTRY * _WIDE, np.float32), np.full(_WIDE, relaxation[0])
-        first, last = begin[chunk], begin[chunk + 1]
+        resistance, marked = np.zeros(ENTRY * _WIDE, np.float32), np.zeros(_WIDE // COUNT + 1, np.bool_)
+        scratch = few, places, resistance, marked, np.full(_WIDE, relaxation[0])
+        first, last = shares[chunk], shares[chunk + 1]
         for band in range(first, last):
             _update_some(f, address, length, relaxation, screen, scratch, bands[band, 0], bands[band + 1, 0])
             _refill_some(f, links, bands[band, 2], bands[band + 1, 2])
@@ -186,7 +203,7 @@ def update(
                 _reflect_some(f, links, bands[band - 1, 1], bands[band, 1])
     anywhere = bands[0, 1]
     for chunk in prange(threads):
-        first, last = begin[chunk], begin[chunk + 1]
+        first, last = shares[chunk], shares[chunk + 1]
         _reflect_some(f, links, anywhere * chunk // threads, anywhere * (chunk + 1) // threads)
         if last > first:
             _reflect_some(f, links, bands[first, 1], bands[first + 1, 1])
@@ -194,6 +211,16 @@ def update(
             _reflect_some(f, links, bands[last - 1, 1], bands[last, 1])
 
 
+def share(length: Ints, screen_start: Ints, bands: Ints, threads: int) -> Ints:
+    """Give every thread bands that keep it busy as long as the others: the `shares` of `update`."""
+    vectors = -(-length // COUNT) * np.where(np.diff(screen_start) > 0, SCREENED_WORK, 1.0)
+    done = np.r_[0.0, np.cumsum(vectors)][bands[:, 0]] + LINK_WORK * (bands[:, 1] - bands[0, 1])
+    wanted = done[-1] * np.arange(threads + 1) / threads
+    return np.abs(done[:, None] - wanted).argmin(axis=0).astype(np.int32)
+
+
+ALONE: Final = np.array([0, 1], np.int32)
+"""The `shares` of `update` where there is a single band."""
 NO_LINKS: Final = (
     np.zeros((0, 3), np.int32),
     np.zeros((0, 2), np.float32),
@@ -360,9 +387,9 @@ def outlet_density(opening: Any, flow: float) -> float:
 
 
 @njit(cache=True, forceinline=True)
-def outlet_source(f: Any, stride: int, place: int, q: int, opening: Any, density: float) -> float:
-    """What an outlet (9,) of this density deviation sends back along velocity q at a storage place."""
-    ux, uy, uz = velocity_at(f, stride, place)
+def outlet_source(velocity: Any, q: int, opening: Any, density: float) -> float:
+    """What an outlet (9,) of this density deviation sends back along velocity q into a cell, from its momentum (3)."""
+    ux, uy, uz = velocity
     inward = max(0.0, -(ux * opening[4] + uy * opening[5] + uz * opening[6]))
     return 2.0 * WEIGHTS[q] * even_part(q, density - 1.5 * inward * inward, ux, uy, uz)
 
@@ -377,10 +404,14 @@ def between(shape: Any, n: int, moment: Any) -> tuple[float, float]:
 
 @njit(cache=True)
 def _density(f: Any, stride: int, places: Any) -> float:
-    total = 0.0
+    """Mean density deviation at places, one after the other where they are the same."""
+    total, held = 0.0, 0.0
     for n in range(len(places)):
-        for q in range(19):
-            total += f[q * stride + places[n]]
+        if n == 0 or places[n] != places[n - 1]:
+            held = 0.0
+            for q in range(19):
+                held += f[q * stride + places[n]]
+        total += held
     return total / len(places)
 
 
@@ -427,7 +458,8 @@ def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: A
         density = opening[1]
         if opening[0] == OUTFLOW:
             density = outlet_density(opening, outflow(f, address[first:last]))
+        velocity = 0.0, 0.0, 0.0
         for n in range(first, last):
-            source[n] = outlet_source(
-                f, stride, place[n], direction[n], opening, density + between(shape, n, moment)[0]
-            )
+            if n == first or place[n] != place[n - 1]:  # a cell's links follow each other
+                velocity = velocity_at(f, stride, place[n])
+            source[n] = outlet_source(velocity, direction[n], opening, density + between(shape, n, moment)[0])

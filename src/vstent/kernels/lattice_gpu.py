@@ -226,4 +226,5 @@ def drive(
         if kind == INFLOW:
             source[n] = (linear + squared * answer) * answer
         else:
-            source[n] = outlet_source(f, stride, place[n], direction[n], opening, answer + linear)
+            velocity = velocity_at(f, stride, place[n])
+            source[n] = outlet_source(velocity, direction[n], opening, answer + linear)

@@ -89,7 +89,7 @@ def flow() -> None:
         lattice.no_screen(1),
         lattice.NO_LINKS,
         np.array([[0, 0, 0], [1, 0, 0]], np.int32),
-        1,
+        lattice.ALONE,
     )
     links, source = np.zeros((0, 6), np.int32), np.zeros(0, np.float32)
     nowhere = np.zeros(1, np.int32)

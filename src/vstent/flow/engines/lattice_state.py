@@ -278,7 +278,7 @@ def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int
     """Make pairs of steps with what `imposed` returns; the first is that pair since a check."""
     f, links, refill = state.populations, state.links, state.refill
     a, screen = state.addressing, state.screen
-    threads = numba.get_num_threads()
+    shares = lattice.share(a.length, screen.start, state.bands, numba.get_num_threads())
     scales = state.scales
     relaxation = np.float32(scales.relaxation_steps), scales.thinning, state.limit, np.float32(ODD_RATE)
     resistance = screen.start, screen.place, screen.entry
@@ -289,7 +289,7 @@ def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int
         links.openings[:, 1] = wanted[pair]
         lattice.drive(f, a.stride, links.openings, of_openings, moments[pair], opening_source)
         for address_of, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):
-            lattice.update(f, address_of, a.length, relaxation, resistance, (path, *back), state.bands, threads)
+            lattice.update(f, address_of, a.length, relaxation, resistance, (path, *back), state.bands, shares)
             lattice.swap(f, *a.swap_address)
         if (first_pair + pair) % DEFER_PAIRS == 0:
             part = np.float32(DEFER_PART)
