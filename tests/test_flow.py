@@ -1,5 +1,6 @@
 """The flow engine against exact flows in a tube."""
 
+import re
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -120,9 +121,11 @@ def test_a_guess_has_a_guess_as_long_as_grids_hold_the_vessel(monkeypatch: pytes
     for module in (flow, domain):
         monkeypatch.setattr(module, "MIN_CELLS", 20)
     seen: list[tuple[float, bool, float | None]] = []
+    limit: dict[float, int] = {}
 
     def telling(engine: AbstractEngine[Any], case: FlowCase, **more: Any) -> FlowField:
         start = more["start"]
+        limit[engine.cell_size_mm] = case.settings.max_steps
         seen.append((engine.cell_size_mm, case.screen is not None, None if start is None else start.cell_size_mm))
         return run(engine, case, **more)
 
@@ -130,17 +133,37 @@ def test_a_guess_has_a_guess_as_long_as_grids_hold_the_vessel(monkeypatch: pytes
     settings = replace(SETTINGS, cell_size_mm=0.25, max_steps=40)
     bare = simulate_case(FlowCase(tube(), settings=settings))
     assert seen == [(1.0, False, None), (0.5, False, 1.0), (0.25, False, 0.5)]
+    assert limit == {0.25: 40, 0.5: 20, 1.0: 10}  # the same time
     seen.clear()
     simulate_case(FlowCase(tube(), screen=disc(100.0), settings=settings), start=bare)
     coarsest = [(1.0, False, 0.5), (1.0, True, 1.0)]
     assert seen == [(0.5, False, 0.25), *coarsest, (0.5, True, 0.5), (0.25, True, 0.25)]
 
 
-@pytest.mark.parametrize("outlets", ["murray", "zero_pressure"])
-def test_outlets_share_the_flow_as_murray_says_when_asked(outlets: str) -> None:
+@cache
+def fork() -> Vessel:
+    """A tube that another, of 2.4 mm, crosses."""
     straight = phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM)
     phantom = phantoms.with_branch(straight, abscissa_mm=6.0, direction=[1, 0, 1], radius_mm=1.2, length_mm=7.0)
-    vessel = trace(Vessel(phantoms.phantom_surface(phantom)))
+    return trace(Vessel(phantoms.phantom_surface(phantom)))
+
+
+def test_a_branch_too_narrow_for_its_cells_is_told_of_where_that_matters() -> None:
+    case = FlowCase(fork(), settings=SETTINGS)
+    assert domain.too_narrow(case, 0.37) == ""
+    said = domain.too_narrow(case, 0.5)
+    assert re.search(r"cells of 0\.5 mm, outlet_2 \(2\.4 mm\) has 4\.8, outlet_3 \(2\.3 mm\) has 4\.7 across", said)
+    assert "outlet_1" not in said
+    assert domain.too_narrow(replace(case, settings=replace(SETTINGS, outlets="murray")), 0.5) == ""
+    assert domain.too_narrow(FlowCase(tube()), 1.0) == ""
+    assert simulate_case(replace(case, settings=replace(SETTINGS, cell_size_mm=0.5, max_steps=48))).advice.endswith(
+        said
+    )
+
+
+@pytest.mark.parametrize("outlets", ["murray", "zero_pressure"])
+def test_outlets_share_the_flow_as_murray_says_when_asked(outlets: str) -> None:
+    vessel = fork()
     settings = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.25, outlets=outlets, tolerance=0.005)
     field = simulate_case(FlowCase(vessel, settings=settings))
     cubes = np.array([outlet.diameter_mm**3 for outlet in vessel.outlets])

@@ -199,6 +199,22 @@ def test_no_close_up_without_a_sac_or_of_what_has_none() -> None:
         simulate_case(replace(bare, settings=replace(bare.settings, engine=OPENFOAM)))
 
 
+def test_a_close_up_in_a_flow_that_swings_is_given_two_thirds_of_the_steps() -> None:
+    case, outer = outer_of_demo()
+    limits = []
+    for is_converged in (True, False):
+        engine = LatticeBoltzmann(0.25, None, replace(outer, is_converged=is_converged))
+        limits.append(engine.max_checks(engine.init(case, outer)))
+    assert limits[1] == int(limits[0] * 2 / 3) >= 16
+
+
+def test_a_close_up_tells_of_branches_too_narrow_for_the_cells_around_it() -> None:
+    case, _ = outer_of_demo()
+    field = simulate_case(replace(case, settings=replace(case.settings, close_up=True, cell_size_mm=0.2, max_steps=96)))
+    assert "Of cells of 0.4 mm, outlet_2 (1.3 mm) has 3.2 across" in field.advice
+    assert "Of cells of 0.2 mm" not in field.advice
+
+
 @pytest.mark.validation
 def test_a_close_up_of_the_demo_is_what_fine_cells_all_over_give() -> None:
     case = flow_case(demo(), None, FlowSettings(cell_size_mm=0.14))

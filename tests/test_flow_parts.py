@@ -11,7 +11,7 @@ from vstent import device
 from vstent.errors import FlowError
 from vstent.flow import Blood, FlowCase, FlowSettings, domain, screen
 from vstent.flow.engines import AbstractEngine, run
-from vstent.flow.engines.lattice_boltzmann import field_left, fraction_left
+from vstent.flow.engines.lattice_boltzmann import field_left, fraction_left, swings
 from vstent.flow.profile import developed_profile
 from vstent.flow.screen import (
     CROSSING_PER_SOLIDITY,
@@ -224,6 +224,15 @@ def test_what_is_left_of_a_swing_is_neither_missed_nor_mistaken(period: float) -
     found = np.array([fraction_left(history[:n]) for n in range(60, 120)])
     assert (found > 0.5 * left[59:-1]).all()
     assert (found < 12 * left[59:-1]).all()
+
+
+def test_a_mean_is_told_with_what_it_ranges_over_and_how_it_moves() -> None:
+    time = np.arange(40.0)
+    drift, wave = 2.0 + 0.01 * time, 5.0 + 0.5 * np.cos(np.pi * time / 4)  # eight checks: a whole period
+    swing, moved = swings(np.stack([drift, wave], axis=1))
+    assert swing == pytest.approx(1.0 / 5.0)
+    assert moved == pytest.approx(0.08 / drift[-8:].mean())
+    assert np.isnan(swings(drift[:12, None])[1])
 
 
 def test_what_a_field_has_left_is_told_where_its_mean_speed_turns() -> None:

@@ -10,6 +10,7 @@ from vstent import flow, phantoms
 from vstent.errors import InputError
 from vstent.flow import FlowCase, FlowField, FlowSettings, domain, sampling, simulate_case
 from vstent.flow.engines.lattice_pulse import cycle_change, cycles_advice
+from vstent.flow.engines.lattice_state import steps_per_phase
 from vstent.flow.types import PHASES, Waveform
 from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
 from vstent.trace import trace
@@ -54,6 +55,18 @@ def test_a_pulse_that_begins_from_a_coarser_one_soon_repeats(monkeypatch: pytest
         monkeypatch.setattr(module, "MIN_CELLS", 20)
     second = 2 * PHASES - 1
     assert pulsing.__wrapped__().residual[second] < 0.05 * at_rest.residual[second]
+
+
+def test_the_time_step_goes_by_the_fastest_blood_of_a_cycle_that_is_known() -> None:
+    """Of a part of one it is not known: there it is the mean's fastest times the flow's peak."""
+    known = pulsing()
+    case = FlowCase(trace(Vessel(known.wall)), settings=FlowSettings(waveform=PULSE, lattice_speed=0.05))
+    slower = tuple(replace(phase, velocity_m_s=0.7 * phase.velocity_m_s) for phase in known.phases)
+    fastest_m_s = 1.1 * max(np.linalg.norm(phase.velocity_m_s, axis=1).max() for phase in slower)
+    foretold_m_s = 1.1 * known.speed_m_s.max() * PULSE.peak_factor
+    for phases, speed_m_s in ((slower, fastest_m_s), (slower[-1:], foretold_m_s), ((), foretold_m_s)):
+        steps = steps_per_phase(case, 0.25, replace(known, phases=phases))
+        assert speed_m_s * PULSE.period_s / PHASES / steps == pytest.approx(0.05 * 0.25e-3, rel=0.02)
 
 
 def test_cycles_that_go_on_differing_are_told_from_those_that_become_alike() -> None:

@@ -72,6 +72,8 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     ratios = metrics["stents"]["silk"]["ratios"]
     assert ratios["neck_inflow_mL_s_ratio"] == pytest.approx(1.0)
     assert metrics["bare"]["neck_inflow_mL_s"] == pytest.approx(metrics["bare"]["neck_outflow_mL_s"], rel=0.1)
+    report = (out / "report.html").read_text()
+    assert all(f"Flow, {name}: The flow has " in report for name in ("bare", "silk"))
     provenance = json.loads((out / "run.json").read_text())
     assert len(provenance["input"]["sha256"]) == 64
     assert {"numpy", "vstent", "python"} <= set(provenance["versions"])

@@ -254,7 +254,7 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
         is_converged=inner.is_converged and outer.is_converged,
         advice=(
             f"{inner.advice} Cells are {inner.cell_size_mm:.3g} mm wide in the sac and near it, "
-            f"{outer.cell_size_mm:.3g} mm elsewhere{'.' if outer.is_converged else f'; there: {outer.advice}'}"
+            f"{outer.cell_size_mm:.3g} mm elsewhere; there: {outer.advice}"
         ),
     )
 

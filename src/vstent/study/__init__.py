@@ -82,7 +82,8 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
         writers.write_json(out / METRICS, metrics)
     told = provenance(path, source, settings, ledger.seconds)
     writers.write_json(out / "run.json", told, is_exact=True)
-    notes = (*anatomy.vessel.notes, *anatomy.notes)
+    of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
+    notes = (*anatomy.vessel.notes, *anatomy.notes, *of_flows)
     return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, notes)
 
 

@@ -92,4 +92,4 @@ class CaseResult:
     provenance: dict[str, Any]
     """Versions, inputs with hashes, settings, seconds per stage."""
     notes: tuple[str, ...]
-    """What was found, guessed or repaired, one sentence each."""
+    """What was found, guessed or repaired, and how far every flow is to be relied on."""

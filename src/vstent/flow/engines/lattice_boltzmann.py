@@ -26,6 +26,9 @@ CHECKS_AGREEING = 3
 """Checks that must agree: a quantity that swings passes its end by chance."""
 CHECKS_AVERAGED = 8
 """Checks whose mean is the result where the flow does not settle."""
+SHARE_AFTER_SWINGING = 2 / 3
+"""Part of the time steps that a close-up makes at most where what surrounds it swings to its end: it begins from the
+mean of that, and will not settle either."""
 CHECKS_APART = 3
 """Checks between the fields whose difference tells what the velocity has left to go."""
 SHARE_OF_FIELD = 0.5
@@ -99,7 +102,9 @@ class LatticeBoltzmann(AbstractLattice):
 
     def max_checks(self, state: State) -> int:
         """Checks within the limit of time steps."""
-        return max(4, state.case.settings.max_steps // state.steps_per_check)
+        swings = self.outer is not None and not self.outer.is_converged
+        steps = state.case.settings.max_steps * (SHARE_AFTER_SWINGING if swings else 1)
+        return max(4, int(steps // state.steps_per_check))
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
         """Return the last check, or the mean of the last ones where the flow has not settled."""
@@ -155,10 +160,23 @@ def _series(last: Any, before: Any) -> Any:
 def _advice(state: State, outcome: Outcome) -> str:
     if outcome.is_converged:
         return "The flow has settled."
-    last = np.array(state.history[-CHECKS_AVERAGED:])
-    swing = float((np.ptp(last, axis=0) / np.maximum(np.abs(last.mean(axis=0)), 1e-12)).max())
-    span_ms = 1e3 * len(last) * state.steps_per_check * state.scales.step_s
+    swing, moved = swings(np.array(state.history))
+    drift = "" if np.isnan(moved) else f"; from the means of as long before, they differ by up to {100 * moved:.1f} %"
+    span_ms = 1e3 * min(len(state.history), CHECKS_AVERAGED) * state.steps_per_check * state.scales.step_s
     return (
         f"The flow has not settled in {state.steps} time steps and may be unsteady by nature: these are means over its "
-        f"last {span_ms:.0f} ms, in which what is monitored ranged over up to {100 * swing:.0f} % of its mean."
+        f"last {span_ms:.0f} ms, in which what is monitored ranged over up to {100 * swing:.1f} % of its mean"
+        f"{drift}."
     )
+
+
+def swings(history: Floats) -> tuple[float, float]:
+    """What any column of a history (checks, quantities) ranged over at most in the checks that a mean is taken of.
+
+    And how far that mean is from the one of as many checks before, nan where there are none: fractions of the mean.
+    """
+    last, before = history[-CHECKS_AVERAGED:], history[-2 * CHECKS_AVERAGED : -CHECKS_AVERAGED]
+    mean = last.mean(axis=0)
+    scale = np.maximum(np.abs(mean), 1e-12)
+    moved = np.abs(mean - before.mean(axis=0)) / scale if len(before) == len(last) else np.full(len(mean), np.nan)
+    return float((np.ptp(last, axis=0) / scale).max()), float(moved.max())

@@ -167,7 +167,7 @@ def build(
 
 
 def peak_speed_m_s(case: FlowCase, start: FlowField | None) -> float:
-    """Estimate the fastest blood at mean flow."""
+    """Estimate the fastest blood at mean flow, or at the moment that `start` is of."""
     if start is not None:
         return 1.1 * float(start.speed_m_s.max())
     narrowest_mm2 = min(case.vessel.inlet.area_mm2, sum(outlet.area_mm2 for outlet in case.vessel.outlets))
@@ -178,6 +178,8 @@ def steps_per_phase(case: FlowCase, cell_size_mm: float, start: FlowField | None
     """Time steps between two phases of a pulse, even: the fastest blood stays below `lattice_speed` cells a step."""
     waveform = waveform_of(case)
     peak_m_s = peak_speed_m_s(case, start) * waveform.peak_factor
+    if start is not None and len(start.phases) == PHASES:  # a whole cycle tells itself how fast its fastest blood is
+        peak_m_s = max(peak_speed_m_s(case, start.at_phase(phase)) for phase in start.phases)
     step_s = case.settings.lattice_speed * cell_size_mm * M_PER_MM / peak_m_s
     return 2 * ceil(0.5 * waveform.period_s / PHASES / step_s)
 
@@ -378,7 +380,7 @@ def field_of(state: State, flow: Reading, outcome: Outcome, advice: str, phases:
         outlet_pressure_Pa=section_Pa[1:],
         blood=state.case.blood,
         is_converged=outcome.is_converged,
-        advice=advice,
+        advice=advice if state.close_up else advice + domains.too_narrow(state.case, domain.cell_size_mm),
         residual=np.array(outcome.residual),
         steps=state.steps,
         seconds=outcome.seconds,
