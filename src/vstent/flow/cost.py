@@ -31,12 +31,12 @@ GPU_BYTES_PER_CELL = 320
 """Memory of a GPU per blood cell (sums of its arrays: 302 on 31,000 cells of the demo, 214 on 169,000)."""
 BYTES_AT_LEAST = 4.5e8
 """Memory of the program itself, its compiled kernels and one surface."""
-WHOLE_OVER_BLOCK = 2.0
+WHOLE_OVER_BLOCK = 3.5
 """Time of a flow over that of its steps in a block of blood, which a cache holds: walls, openings, checks, the first
-guess, and memory (the demo in cells of 0.14 mm, with Silk: 77 million updates a second, the block 157)."""
-BLOCK_ROWS = 4096
-"""Rows of the block that the rate is measured on."""
-BLOCK_BAND = 16
+guess, and memory (the demo in cells of 0.14 mm, with Silk: 87 million updates a second, the block 321)."""
+BLOCK_ROWS = 4095
+"""Rows of the block that the rate is measured on, an odd number (see `lattice_setup.OFF_PAGE`)."""
+BLOCK_BAND = 15
 """Rows of each of its bands."""
 MARGIN = 1.05
 """The cell size that is said to fit leaves this much room."""
