@@ -81,23 +81,48 @@ def _thin(f: Any, address: Any, s: int, n: int, time: float, law: Any, times: An
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _collide(f: Any, address: Any, s: int, k: int, settings: Any, target: Any, places: Any, row: int, at: int) -> None:
-    """Collide so many cells as Lanes hold of segment s, from its cell k on, into `target` at places[row] + at."""
+def _collide(f: Any, address: Any, s: int, k: int, settings: Any, to: Any) -> None:
+    """Collide so many cells as Lanes hold of segment s, from its cell k on; `to` says where `scatter` puts them."""
     times, limit, odd_rate = settings
+    target, places, row, at = to
     scatter(target, places, row, at, collided(gather(f, address, s, k), load(times, k), limit, odd_rate))
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _collide_screened(
-    f: Any, address: Any, s: int, k: int, settings: Any, screen: Any, target: Any, places: Any, row: int, at: int
-) -> None:
+def _collide_screened(f: Any, address: Any, s: int, k: int, settings: Any, resistance: Any, to: Any) -> None:
     """Do what `_collide` does, where there are cells of a screen among them."""
     times, limit, odd_rate = settings
-    normal = load(screen, k), load(screen, k + _WIDE), load(screen, k + 2 * _WIDE)
-    linear = load(screen, k + 3 * _WIDE), load(screen, k + 4 * _WIDE)
-    entry = *linear, load(screen, k + 5 * _WIDE), load(screen, k + 6 * _WIDE)
+    target, places, row, at = to
+    normal = load(resistance, k), load(resistance, k + _WIDE), load(resistance, k + 2 * _WIDE)
+    linear = load(resistance, k + 3 * _WIDE), load(resistance, k + 4 * _WIDE)
+    entry = *linear, load(resistance, k + 5 * _WIDE), load(resistance, k + 6 * _WIDE)
     held, time = gather(f, address, s, k), load(times, k)
     scatter(target, places, row, at, collided_screened(held, time, limit, odd_rate, normal, entry))
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _collide_across(f: Any, address: Any, s: int, last: int, settings: Any, screen: Any, scratch: Any) -> None:
+    """Collide the cells of segment s, which a screen crosses: those from `last` on into `few`.
+
+    Free and screened cells have a loop each: with both in one, a compiler keeps too little of either in registers.
+    """
+    screen_start, screen_place, entry = screen
+    few, places, resistance, marked, _ = scratch
+    for e in range(screen_start[s], screen_start[s + 1]):
+        marked[screen_place[e] // COUNT] = True
+        for k in range(ENTRY):
+            resistance[k * _WIDE + screen_place[e]] = entry[e, k]
+    _collide_screened(f, address, s, last, settings, resistance, (few, places, 0, 0))
+    for k in range(0, last, COUNT):
+        if not marked[k // COUNT]:
+            _collide(f, address, s, k, settings, (f, address, s, k))
+    for k in range(0, last, COUNT):
+        if marked[k // COUNT]:
+            _collide_screened(f, address, s, k, settings, resistance, (f, address, s, k))
+    for e in range(screen_start[s], screen_start[s + 1]):
+        marked[screen_place[e] // COUNT] = False
+        for k in range(ENTRY):
+            resistance[k * _WIDE + screen_place[e]] = _ZERO
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -106,8 +131,7 @@ def _update_some(
 ) -> None:
     """Do what `update` does to the segments from `begin` on, before `end`."""
     time, law, limit, odd_rate = relaxation
-    screen_start, screen_place, entry = screen
-    few, places, resistance, marked, times = scratch
+    few, places, _, _, times = scratch
     for s in range(begin, end):
         cells = length[s]
         if s + AHEAD < end:
@@ -117,27 +141,12 @@ def _update_some(
         settings = times, limit[s], odd_rate
         # The last cells are read before the others are written and written after them: whole vectors only.
         last = max(0, cells - COUNT)
-        first_entry, last_entry = screen_start[s], screen_start[s + 1]
-        if last_entry > first_entry:
-            for e in range(first_entry, last_entry):
-                marked[screen_place[e] // COUNT] = True
-                for k in range(ENTRY):
-                    resistance[k * _WIDE + screen_place[e]] = entry[e, k]
-            _collide_screened(f, address, s, last, settings, resistance, few, places, 0, 0)
-            for k in range(0, last, COUNT):
-                if not marked[k // COUNT]:
-                    _collide(f, address, s, k, settings, f, address, s, k)
-            for k in range(0, last, COUNT):
-                if marked[k // COUNT]:
-                    _collide_screened(f, address, s, k, settings, resistance, f, address, s, k)
-            for e in range(first_entry, last_entry):
-                marked[screen_place[e] // COUNT] = False
-                for k in range(ENTRY):
-                    resistance[k * _WIDE + screen_place[e]] = _ZERO
+        if screen[0][s] < screen[0][s + 1]:
+            _collide_across(f, address, s, last, settings, screen, scratch)
         else:
-            _collide(f, address, s, last, settings, few, places, 0, 0)
+            _collide(f, address, s, last, settings, (few, places, 0, 0))
             for k in range(0, last, COUNT):
-                _collide(f, address, s, k, settings, f, address, s, k)
+                _collide(f, address, s, k, settings, (f, address, s, k))
         if cells >= COUNT:
             scatter(f, address, s, last, gather(few, places, 0, 0))
         else:
