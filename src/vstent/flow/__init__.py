@@ -223,9 +223,6 @@ class _Runs:
         is_tiny = abs(case.vessel.closed.volume_mm3) < 4 * MIN_CELLS * coarse_mm**3
         if is_tiny or (start is not None and case.screen is None):
             return start
-        # A step is as many times longer there: the limit is the same time.
-        fewer = replace(case.settings, max_steps=round(case.settings.max_steps / self.engine.coarsening))
-        case = replace(case, settings=fewer)
         first, second = (
             self._part(rank * COARSE_SHARE, (rank + 1) * COARSE_SHARE) if depth == 0 else None for rank in range(2)
         )
