@@ -102,8 +102,8 @@ class LatticeBoltzmann(AbstractLattice):
 
     def max_checks(self, state: State) -> int:
         """Checks within the limit of time steps."""
-        swings = self.outer is not None and not self.outer.is_converged
-        steps = state.case.settings.max_steps * (SHARE_AFTER_SWINGING if swings else 1)
+        is_in_swing = self.outer is not None and not self.outer.is_converged
+        steps = state.case.settings.max_steps * (SHARE_AFTER_SWINGING if is_in_swing else 1)
         return max(4, int(steps // state.steps_per_check))
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
