@@ -20,6 +20,7 @@ from vstent.flow.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
 from vstent.flow.engines import lattice_state
 from vstent.flow.engines.lattice_checkpoint import pack
 from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
+from vstent.flow.engines.lattice_setup import build_bands
 from vstent.flow.types import CarreauYasuda, Waveform
 from vstent.kernels import lattice
 from vstent.study import Settings, repeat
@@ -80,8 +81,10 @@ def everything() -> lattice_state.State:
     course = 0.1 * swing[:, None] * np.abs(wanted).max() * [1.0, 0.0, 1.0]
     shape = swing[:, None, None] * links.shape
     state.links = replace(links, openings=openings, start=start, wanted=wanted, course=course, shape=shape)
-    somewhere = a.place[::40]
-    state.addressing = replace(a, swap_address=np.stack([a.stride + somewhere, 2 * a.stride + somewhere]))
+    somewhere = np.arange(0, len(a.place), 40)
+    septa = np.stack([3 * a.stride + a.place[somewhere], 4 * a.stride + a.place[somewhere]])
+    state.addressing = replace(a, septa=septa, septum_cell=somewhere)
+    state.bands = build_bands(state.domain, state.addressing, state.links)
     state.limit[::2] = 1.0
     state.steps_per_check = 2 * SETTLED_PAIRS + 4
     return state

@@ -1,5 +1,7 @@
 """The lattice-Boltzmann kernels against their algebra, and the grid and field kernels against geometry."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from vstent import phantoms
 from vstent.flow import FlowCase, FlowSettings
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_scales import ODD_RATE as VESSEL_ODD_RATE
-from vstent.flow.engines.lattice_setup import parabolic_weights
+from vstent.flow.engines.lattice_setup import address, build_bands, build_links, in_extensions, parabolic_weights
 from vstent.kernels import lanes, lattice, lattice_sampling, voxels
 from vstent.kernels.collision import squared_reach
 from vstent.trace import trace
@@ -17,7 +19,7 @@ from vstent.vessel import Vessel
 STRIDE = 40
 RATE, ODD_RATE, NO_LIMIT = 1.6, 0.7, 1e9
 NO_SCREEN = lattice.no_screen(1)
-NOTHING_SENT_BACK = lattice.NO_LINKS, np.array([[0, 0, 0], [1, 0, 0]], np.int32), lattice.ALONE
+NOTHING_SENT_BACK = lattice.NO_LINKS, *lattice.undivided(1)
 
 
 def populations(seed=0):
@@ -29,9 +31,9 @@ def populations(seed=0):
 def even_step(f, screen=NO_SCREEN, limit=NO_LIMIT, law=(0, 0, 0, 0)):
     """Collide all cells and bring the populations home: the even step leaves each at its opposite's place."""
     result = f.copy()
-    address = (np.arange(19) * STRIDE)[None].astype(np.int32)
+    address = (np.arange(19) * STRIDE)[None, None].astype(np.int32)
     relaxation = np.float32(1 / RATE), np.float32(law), np.float32([limit]), np.float32(ODD_RATE)
-    lattice.update(result, address, np.array([STRIDE], np.int32), relaxation, screen, *NOTHING_SENT_BACK)
+    lattice.update(result, (address, np.array([STRIDE], np.int32), relaxation, screen), *NOTHING_SENT_BACK)
     return result[: -lanes.COUNT].reshape(19, STRIDE)[lattice.OPPOSITE]
 
 
@@ -53,39 +55,55 @@ def test_the_velocity_set_is_isotropic_to_fourth_order():
 def test_a_segment_of_any_length_collides_as_its_cells_do_alone_and_no_other_is_touched(cells):
     """Eight cells are worked on at once; none of them twice, and the next row is not written to."""
     f = populations(7)
-    address = (np.arange(19) * STRIDE)[None].astype(np.int32)
+    address = (np.arange(19) * STRIDE)[None, None].astype(np.int32)
     relaxation = np.float32(1 / RATE), np.zeros(4, np.float32), np.float32([NO_LIMIT]), np.float32(ODD_RATE)
     together = f.copy()
-    lattice.update(together, address, np.array([cells], np.int32), relaxation, NO_SCREEN, *NOTHING_SENT_BACK)
+    lattice.update(together, (address, np.array([cells], np.int32), relaxation, NO_SCREEN), *NOTHING_SENT_BACK)
     alone = f.copy()
     one = np.ones(1, np.int32)
     for cell in range(cells):
-        lattice.update(alone, address + np.int32(cell), one, relaxation, NO_SCREEN, *NOTHING_SENT_BACK)
+        lattice.update(alone, (address + np.int32(cell), one, relaxation, NO_SCREEN), *NOTHING_SENT_BACK)
     np.testing.assert_array_equal(together, alone)
 
 
+def with_septa(domain, rng):
+    """Put walls half-way between every tenth pair or so of neighbouring cells."""
+    is_blood = np.zeros(domain.cells.max(axis=0) + 2, bool)
+    is_blood[tuple(domain.cells.T)] = True
+    ahead = domain.cells[:, None] + lattice.VELOCITIES[1::2]
+    cell, pair = np.nonzero(is_blood[tuple(np.moveaxis(ahead, -1, 0))] & (rng.random(ahead.shape[:2]) < 0.1))
+    return replace(domain, septum_cell=cell, septum_direction=2 * pair + 1)
+
+
 @pytest.mark.parametrize("threads", [1, 2, 5, 64])
-def test_a_band_is_reflected_when_all_that_its_links_need_has_been_updated(threads):
-    """Whatever the bands and whoever does them: as if every cell were updated first. A bend has links of all kinds."""
+def test_a_band_is_done_when_all_that_it_needs_is(threads):
+    """Whatever the bands and whoever does them: as if every stage were done everywhere first.
+
+    A bend has links of all kinds; walls half-way between its cells are put in.
+    """
     arc = phantoms.torus_arc(bend_radius_mm=5.0, angle_rad=1.0, radius_mm=2.0)
     case = FlowCase(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), settings=FlowSettings(inflow_mL_s=3.0))
     state = LatticeBoltzmann(0.3).init(case, None)
     rng = np.random.default_rng(5)
     state.populations[:] = 0.01 * rng.normal(size=state.populations.size)
     state.refill.refill[:] = 0.01 * rng.normal(size=state.refill.refill.size)
-    links, a, screen, refill = state.links, state.addressing, state.screen, state.refill
+    domain, refill = with_septa(state.domain, rng), state.refill
+    a = address(domain, in_extensions(case, domain))
+    links = build_links(case, domain, a, state.scales, None)
+    links.source[:] = 0.01 * rng.normal(size=links.source.size)
+    all_bands = build_bands(domain, a, links)
+    assert len(all_bands) > 20
+    everything = [len(a.length), len(refill.refill), len(links.source), links.start[-1], len(a.septa[0])]
+    assert np.array_equal(all_bands[-1], everything)
+    screen = state.screen.start, state.screen.place, state.screen.entry
     relaxation = np.float32(0.6), np.zeros(4, np.float32), state.limit, np.float32(ODD_RATE)
-    assert len(state.bands) > 20
-    assert np.array_equal(state.bands[-1], [len(a.length), len(links.source), len(refill.refill)])
+    cells = a.address, a.length, relaxation, screen
+    back = links.path, links.weight, links.source, links.by_layer, refill.place, refill.refill, a.septa
     found = []
-    shared = lattice.share(a.length, screen.start, state.bands, threads)
-    for bands, shares in ((state.bands, shared), (state.bands[[0, -1]], lattice.ALONE)):
+    shared = lattice.share(a.length, screen[0], all_bands, threads)
+    for bands, shares in ((all_bands, shared), (all_bands[[0, -1]], np.array([0, 1], np.int32))):
         f = state.populations.copy()
-        for address, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):
-            back = path, links.weight, links.source, refill.place, refill.refill
-            lattice.update(
-                f, address, a.length, relaxation, (screen.start, screen.place, screen.entry), back, bands, shares
-            )
+        lattice.update(f, cells, back, bands, shares)
         found.append(f)
     np.testing.assert_array_equal(*found)
 
@@ -94,9 +112,10 @@ def test_a_band_is_reflected_when_all_that_its_links_need_has_been_updated(threa
 def test_threads_share_cells_links_and_screens_alike(threads):
     """Half of the bands have twice the cells, the screen or the links: no share is off the mean by more than a band."""
     heavy, vectors = np.arange(80) < 40, np.full(80, 4)
-    bands = np.stack([np.arange(81), np.zeros(81), np.zeros(81)], axis=1).astype(np.int32)
+    bands = np.zeros((81, 5), np.int32)
+    bands[:, 0] = np.arange(81)
     screened, linked = np.r_[0, np.cumsum(heavy)], bands.copy()
-    linked[1:, 1] = np.cumsum(np.where(heavy, round(4 / lattice.LINK_WORK), 0))
+    linked[1:, 2] = np.cumsum(np.where(heavy, round(4 / lattice.LINK_WORK), 0))
     twice = {
         "cells": (vectors * (1 + heavy), np.zeros(81, int), bands),
         "screen": (vectors, screened, bands),

@@ -52,9 +52,10 @@ class Box:
         cut = (self.cells[:, 2] == 0) | (self.cells[:, 2] == 1) | (self.cells[:, 2] == last)
         first = np.flatnonzero(cut)
         self.length = np.diff(np.r_[first, len(cut)]).astype(np.int32)
-        self.even = (first[:, None] + len(cut) * np.arange(19)).astype(np.int32)
+        even = first[:, None] + len(cut) * np.arange(19)
         behind = [self._number(self.cells[first] - c) for c in lattice.VELOCITIES]
-        self.odd = np.stack([lattice.OPPOSITE[q] * len(cut) + behind[q] for q in range(19)], axis=1).astype(np.int32)
+        odd = np.stack([lattice.OPPOSITE[q] * len(cut) + behind[q] for q in range(19)], axis=1)
+        self.address = np.stack([even, odd]).astype(np.int32)
         cell, entry = entries(screen)
         segment = np.searchsorted(first, cell, side="right") - 1
         start = np.searchsorted(segment, np.arange(len(first) + 1)).astype(np.int32)
@@ -71,14 +72,11 @@ class Box:
         rows = len(self.length)
         limit = np.full(rows, np.inf, np.float32)
         relaxation = np.float32(3 * VISCOSITY + 0.5), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
-        bands = np.array([[0, 0, 0], [rows, 0, 0]], np.int32)
+        cells = self.address, self.length, relaxation, self.screen
         kick = (3 * lattice.WEIGHTS * (lattice.VELOCITIES @ (2 * self.force))).astype(np.float32)
         for _ in range(pairs):
             self.f[: 19 * len(self.cells)].reshape(19, -1)[:] += kick[:, None]
-            for address in (self.even, self.odd):
-                lattice.update(
-                    self.f, address, self.length, relaxation, self.screen, lattice.NO_LINKS, bands, lattice.ALONE
-                )
+            lattice.update(self.f, cells, lattice.NO_LINKS, *lattice.undivided(rows))
 
     def velocity(self) -> np.ndarray:
         return lattice.moments(self.f, len(self.cells), self.place)[:, 1:] + self.force

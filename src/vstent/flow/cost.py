@@ -158,12 +158,12 @@ def _measured_rate(on_gpu: bool) -> float:
 
         return stride / seconds_of_update(f, address, length, relaxation, nothing)
     rows = np.arange(0, BLOCK_ROWS + 1, BLOCK_BAND, dtype=np.int32)
-    bands = np.column_stack([rows, np.zeros((len(rows), 2), np.int32)])
+    bands = np.column_stack([rows, np.zeros((len(rows), 4), np.int32)])
     shares = lattice.share(length, nothing[0], bands, numba.get_num_threads())
     times: list[float] = []
     for _ in range(4):
         began = perf_counter()
-        lattice.update(f, address, length, relaxation, nothing, lattice.NO_LINKS, bands, shares)
+        lattice.update(f, (address[None], length, relaxation, nothing), lattice.NO_LINKS, bands, shares)
         times.append(perf_counter() - began)
     return stride / min(times)
 

@@ -185,9 +185,10 @@ class _Grid:
         if self._length.max() > lattice.SEGMENT:
             raise ValueError(f"a cell may be {lattice.SEGMENT} high at most")
         start = cells[first]
-        self._even = (self._place[first][:, None] + self._stride * np.arange(19)).astype(np.int32)
+        even = self._place[first][:, None] + self._stride * np.arange(19)
         behind = [self._number(start - c) for c in lattice.VELOCITIES]
-        self._odd = np.stack([lattice.OPPOSITE[q] * self._stride + behind[q] for q in range(19)], 1).astype(np.int32)
+        odd = np.stack([lattice.OPPOSITE[q] * self._stride + behind[q] for q in range(19)], axis=1)
+        self._address_of = np.stack([even, odd]).astype(np.int32)
 
     def _link(self, wires: Wires, cells: Ints) -> None:
         blood = self._is_blood.ravel()
@@ -206,7 +207,7 @@ class _Grid:
         out, back = q * self._stride, lattice.OPPOSITE[q] * self._stride
         rows = [back + at, back + before, out + at, out + after, back + further, out + before]
         self._links = np.stack(rows, axis=1).astype(np.int32)
-        *self._paths, self._weight = lattice.paths(self._links, weight)
+        self._path, self._weight = lattice.paths(self._links, weight)
         self._correction = correction.astype(np.float32)
         self._source = np.zeros(len(q), np.float32)
 
@@ -215,13 +216,13 @@ class _Grid:
         segments = len(self._length)
         limit = np.full(segments, np.inf, np.float32)
         relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
-        screen, back = lattice.no_screen(segments), (self._weight, self._source, *lattice.NO_LINKS[3:])
-        bands = np.array([[0, 0, 0], [segments, len(self._source), 0]], np.int32)
+        populations = self._address_of, self._length, relaxation, lattice.no_screen(segments)
+        back = self._path, self._weight, self._source, *lattice.NO_LINKS[3:]
+        bands = lattice.undivided(segments, len(self._source))
         lost = np.empty_like(self._source)  # made up for nowhere here
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
-            for address, path in zip((self._even, self._odd), self._paths, strict=True):
-                lattice.update(self._f, address, self._length, relaxation, screen, (path, *back), bands, lattice.ALONE)
+            lattice.update(self._f, populations, back, *bands)
             if pair % DEFER_PAIRS == 0:
                 lattice.defer(self._f, self._links, self._correction, self._source, lost, np.float32(DEFER_PART))
 

@@ -59,6 +59,15 @@ _ZERO = np.float32(0.0)
 _ROOT_THREE: Final = float(np.sqrt(3.0))
 _U = np.uint64
 _WIDE = SEGMENT + COUNT
+_KINDS: Final = 3
+"""Stages of a step: cells collide; links send back what these and the bands beside have sent; septa exchange what links
+of their band and the next have read."""
+_AHEAD: Final = (0, 1, 2)
+"""Bands after its own that have to have collided before each of them can be done to a band."""
+_BEHIND: Final = (0, 1, 1)
+"""Bands before its own."""
+_STEP: Final = 2
+"""Bands, before and after, that need to have done a step before a band can begin the next."""
 
 
 @njit(cache=True, inline="always")
@@ -155,87 +164,133 @@ def _update_some(
                     f[address[s, q] + k] = few[COUNT * q + k]
 
 
-@njit(cache=True, fastmath=True)
-def _reflect_some(f: Any, links: Any, begin: int, end: int) -> None:
-    """Send back what crosses the links from `begin` on, before `end`: a weighted sum of two and a source."""
-    path, weight, source, _, _ = links
-    for k in range(begin, end):
-        first, second, target = _U(path[k, 0]), _U(path[k, 1]), _U(path[k, 2])
-        f[target] = weight[k, 0] * f[first] + weight[k, 1] * f[second] + source[k]
+@njit(cache=True, fastmath=True, forceinline=True)
+def _reflect(f: Any, path: Any, weight: Any, source: Any, k: int) -> None:
+    """Send back what crosses link k: a weighted sum of two and a source."""
+    first, second, target = _U(path[k, 0]), _U(path[k, 1]), _U(path[k, 2])
+    f[target] = weight[k, 0] * f[first] + weight[k, 1] * f[second] + source[k]
 
 
-@njit(cache=True, fastmath=True)
-def _refill_some(f: Any, links: Any, begin: int, end: int) -> None:
-    """Add to the rest populations of wall cells what walls lose there."""
-    _, _, _, place, refill = links
-    for w in range(begin, end):
-        f[_U(place[w])] += refill[w]
+@njit(cache=True)
+def _swap(f: Any, septa: Any, k: int) -> None:
+    """Exchange what two blood cells send each other through septum k."""
+    first, second = _U(septa[0, k]), _U(septa[1, k])
+    kept = f[first]
+    f[first] = f[second]
+    f[second] = kept
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _do(stage: int, band: int, f: Any, cells: Any, links: Any, bands: Any, scratch: Any) -> None:
+    """Do a stage of the steps to a band (see `_KINDS`)."""
+    address, length, relaxation, screen = cells
+    path, weight, source, of_ends, place, refill, septa = links
+    step, kind = stage // _KINDS, stage % _KINDS
+    here, beyond = bands[band], bands[band + 1]
+    if kind == 0:
+        _update_some(f, address[step], length, relaxation, screen, scratch, here[0], beyond[0])
+        for w in range(here[1], beyond[1]):
+            f[_U(place[w])] += refill[w]
+    elif kind == 1:
+        for k in range(here[2], beyond[2]):
+            _reflect(f, path[step], weight, source, k)
+        for n in range(here[3], beyond[3]):
+            _reflect(f, path[step], weight, source, of_ends[n])
+    else:
+        for k in range(here[4], beyond[4]):
+            _swap(f, septa, k)
+
+
+@njit(cache=True)
+def _of_itself(stage: int, first: int, last: int, count: int) -> tuple[int, int]:
+    """First band, and the one after the last, to which a share can do a stage without waiting for the others."""
+    step, kind = stage // _KINDS, stage % _KINDS
+    before, after = _STEP * step + _BEHIND[kind], _STEP * step + _AHEAD[kind]
+    return first + (before if first > 0 else 0), last - (after if last < count else 0)
+
+
+@njit(cache=True)
+def _scratch(time: float) -> tuple[Any, ...]:
+    """Return what one thread's collisions need: see `_collide_across` and `_thin`."""
+    few, places = np.zeros(19 * COUNT, np.float32), COUNT * np.arange(19, dtype=np.int32).reshape(1, 19)
+    resistance, marked = np.zeros(ENTRY * _WIDE, np.float32), np.zeros(_WIDE // COUNT + 1, np.bool_)
+    return few, places, resistance, marked, np.full(_WIDE, time)
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def update(
-    f: Any, address: Any, length: Any, relaxation: Any, screen: Any, links: Any, bands: Any, shares: Any
-) -> None:
-    """Collide and stream every segment once, and send back what crosses a wall or an opening.
+def update(f: Any, cells: Any, links: Any, bands: Any, shares: Any) -> None:
+    """Make a step, or an even one and the odd one after it: collide and stream all cells, and send back at the walls.
 
-    A band of cells is reflected as soon as the bands beside it are updated, while it is still in the processor's cache:
-    links fetch as much memory as cells do. Only bands at the ends of a thread's share wait for the other threads.
+    Both steps sweep over the bands together, the second so far behind the first that it needs nothing still to come:
+    it finds the populations, and the links' too, in the processor's cache, and memory is read once for both (time
+    skewing; Wonnacott 2002, Int. J. Parallel Program. 30, 181). Only bands at the ends of a thread's share wait for the
+    other threads.
 
     Parameters
     ----------
     f : (19 * stride + COUNT,) float32 populations, in place; they may be read up to COUNT - 1 places beyond a segment.
-    address : (segments, 19) int32, where the populations of each segment begin: its own in an even step, its
-        neighbours' in an odd one.
-    length : (segments,) int32 cells of each segment, at most SEGMENT.
-    relaxation : float32 relaxation time of the stress, at high shear; (4,) float32 what blood at rest has more of it,
-        the time by which shear rates count, and the exponents a and (n - 1) / a of Carreau and Yasuda's law, the first
-        being 0 where the viscosity is the same everywhere; (segments,) float32 largest cell Reynolds number, speed over
-        viscosity: faster blood is made that thick; float32 relaxation rate of the odd part.
-    screen : (segments + 1,) int32 first screen entry of every segment; (e,) int32 place within the segment; (e,
-        ENTRY) float32 unit normal and resistance (see `resist`).
-    links : (l, 3) two places read and the one written, of this kind of step (see `paths`); (l, 2) float32 weights;
-        (l,) float32 sources; (w,) int32 rest populations to which (w,) float32 is added.
-    bands : (bands + 1, 3) first segment, link and rest population of every band, and of what would follow the last. A
-        link needs no cells but those of its own band and the two beside it; links before the first band's need any.
+    cells : a tuple of
+
+        - (steps, segments, 19) int32, where the populations of each segment begin: its own in an even step, its
+          neighbours' in an odd one;
+        - (segments,) int32 cells of each segment, at most SEGMENT;
+        - the relaxation: float32 time of the stress, at high shear; (4,) float32 what blood at rest has more of it, the
+          time by which shear rates count, and the exponents a and (n - 1) / a of Carreau and Yasuda's law, the first
+          being 0 where the viscosity is the same everywhere; (segments,) float32 largest cell Reynolds number, speed
+          over viscosity: faster blood is made that thick; float32 relaxation rate of the odd part;
+        - the screen: (segments + 1,) int32 first entry of every segment; (e,) int32 place within the segment; (e,
+          ENTRY) float32 unit normal and resistance (see `resist`).
+    links : a tuple of (steps, l, 3) two places read and the one written (see `paths`); (l, 2) float32 weights; (l,)
+        float32 sources; (o,) int32 those of the links that are no wall's; (w,) int32 rest populations to which (w,)
+        float32 is added; (2, t) int32 addresses of populations that a wall half-way between two cells exchanges.
+    bands : (bands + 1, 5) first segment, rest population, link of a wall, other link and septum of every band, and of
+        what would follow the last. What leaves a cell stays in its band or goes to one beside it; septa lie between
+        their band and the next.
     shares : (threads + 1,) first band of every thread's share, and the number of bands (see `share`).
     """
-    threads = len(shares) - 1
+    address, length, relaxation, screen = cells  # threads cannot be given tuples of tuples
+    threads, count, steps = len(shares) - 1, len(bands) - 1, len(address)
+    stages = _KINDS * steps
     for chunk in prange(threads):
-        few, places = np.zeros(19 * COUNT, np.float32), COUNT * np.arange(19, dtype=np.int32).reshape(1, 19)
-        resistance, marked = np.zeros(ENTRY * _WIDE, np.float32), np.zeros(_WIDE // COUNT + 1, np.bool_)
-        scratch = few, places, resistance, marked, np.full(_WIDE, relaxation[0])
-        first, last = shares[chunk], shares[chunk + 1]
-        for band in range(first, last):
-            _update_some(f, address, length, relaxation, screen, scratch, bands[band, 0], bands[band + 1, 0])
-            _refill_some(f, links, bands[band, 2], bands[band + 1, 2])
-            if band > first + 1:
-                _reflect_some(f, links, bands[band - 1, 1], bands[band, 1])
-    anywhere = bands[0, 1]
-    for chunk in prange(threads):
-        first, last = shares[chunk], shares[chunk + 1]
-        _reflect_some(f, links, anywhere * chunk // threads, anywhere * (chunk + 1) // threads)
-        if last > first:
-            _reflect_some(f, links, bands[first, 1], bands[first + 1, 1])
-        if last > first + 1:
-            _reflect_some(f, links, bands[last - 1, 1], bands[last, 1])
+        scratch, first, last = _scratch(relaxation[0]), shares[chunk], shares[chunk + 1]
+        for front in range(first, last + _STEP * steps):
+            for stage in range(stages):
+                band = front - _STEP * (stage // _KINDS) - _AHEAD[stage % _KINDS]
+                begin, end = _of_itself(stage, first, last, count)
+                if begin <= band < end:
+                    _do(stage, band, f, (address, length, relaxation, screen), links, bands, scratch)
+    for stage in range(1, stages if threads > 1 else 1):
+        if stage % _KINDS == 2 and bands[-1, 4] == 0:
+            continue
+        for chunk in prange(threads):
+            scratch, first, last = _scratch(relaxation[0]), shares[chunk], shares[chunk + 1]
+            begin, end = _of_itself(stage, first, last, count)
+            for band in range(first, last):
+                if not begin <= band < end:
+                    _do(stage, band, f, (address, length, relaxation, screen), links, bands, scratch)
 
 
 def share(length: Ints, screen_start: Ints, bands: Ints, threads: int) -> Ints:
     """Give every thread bands that keep it busy as long as the others: the `shares` of `update`."""
     vectors = -(-length // COUNT) * np.where(np.diff(screen_start) > 0, SCREENED_WORK, 1.0)
-    done = np.r_[0.0, np.cumsum(vectors)][bands[:, 0]] + LINK_WORK * (bands[:, 1] - bands[0, 1])
+    done = np.r_[0.0, np.cumsum(vectors)][bands[:, 0]] + LINK_WORK * (bands[:, 2] - bands[0, 2] + bands[:, 3])
     wanted = done[-1] * np.arange(threads + 1) / threads
     return np.abs(done[:, None] - wanted).argmin(axis=0).astype(np.int32)
 
 
-ALONE: Final = np.array([0, 1], np.int32)
-"""The `shares` of `update` where there is a single band."""
+def undivided(segments: int, links: int = 0) -> tuple[Ints, Ints]:
+    """Return the `bands` and `shares` of `update` where there is a single band, with so many links of walls."""
+    return np.array([[0, 0, 0, 0, 0], [segments, 0, links, 0, 0]], np.int32), np.array([0, 1], np.int32)
+
+
 NO_LINKS: Final = (
-    np.zeros((0, 3), np.int32),
+    np.zeros((2, 0, 3), np.int32),
     np.zeros((0, 2), np.float32),
     np.zeros(0, np.float32),
     np.zeros(0, np.int32),
+    np.zeros(0, np.int32),
     np.zeros(0, np.float32),
+    np.zeros((2, 0), np.int32),
 )
 """What `update` takes for links where there are none."""
 
@@ -245,7 +300,7 @@ def no_screen(segments: int) -> tuple[Ints, Ints, NDArray[np.float32]]:
     return np.zeros(segments + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, ENTRY), np.float32)
 
 
-def paths(address: Ints, weight: Floats) -> tuple[Ints, Ints, NDArray[np.float32]]:
+def paths(address: Ints, weight: Floats) -> tuple[Ints, NDArray[np.float32]]:
     """Prepare `update` for links whose reflection needs at most two populations.
 
     Parameters
@@ -257,13 +312,13 @@ def paths(address: Ints, weight: Floats) -> tuple[Ints, Ints, NDArray[np.float32
 
     Returns
     -------
-    The paths (links, 3) after an even and after an odd step, and their weights (links, 2).
+    The paths (2, links, 3) after an even and after an odd step, and their weights (links, 2).
     """
     needs_c = weight[:, 2] != 0
     after_even = np.where(needs_c[:, None], address[:, (0, 2, 3)], address[:, (0, 1, 3)])
     after_odd = np.where(needs_c[:, None], address[:, (3, 1, 0)], address[:, (3, 2, 0)])
     both = np.column_stack([weight[:, 0], np.where(needs_c, weight[:, 2], weight[:, 1])])
-    return np.ascontiguousarray(after_even), np.ascontiguousarray(after_odd), both.astype(np.float32)
+    return np.stack([after_even, after_odd]), both.astype(np.float32)
 
 
 @njit(cache=True, fastmath=True, forceinline=True)
@@ -317,15 +372,6 @@ def balance(lost: Any, groups: Any, refill: Any, part: float) -> None:
     """
     for g in prange(len(groups[0]) - 1):
         balance_group(g, lost, groups, refill, part)
-
-
-@njit(cache=True)
-def swap(f: Any, first: Any, second: Any) -> None:
-    """Exchange the populations at addresses `first` and `second` (s,): a wall half-way between two blood cells."""
-    for k in range(len(first)):
-        kept = f[first[k]]
-        f[first[k]] = f[second[k]]
-        f[second[k]] = kept
 
 
 @njit(cache=True, parallel=True)

@@ -117,7 +117,7 @@ def reflect(f: Any, path: Any, weight: Any, source: Any, place: Any, refill: Any
 
 @cuda.jit(cache=True)
 def swap(f: Any, pairs: Any) -> None:
-    """Exchange the populations at addresses pairs[0] and pairs[1] (see `lattice.swap`)."""
+    """Exchange the populations at addresses pairs[0] and pairs[1] (see `lattice.update`)."""
     k = cuda.grid(1)
     if k < pairs.shape[1]:
         first, second = _U(pairs[0, k]), _U(pairs[1, k])

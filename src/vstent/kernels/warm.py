@@ -81,21 +81,15 @@ def flow() -> None:
     """Call every kernel of a flow on one cell at rest, with every argument of the type that a flow has."""
     stride = lanes.COUNT
     f, none = np.zeros(20 * stride, np.float32), np.zeros(0, np.int32)
+    relaxation = np.float32(1.0), np.zeros(4, np.float32), np.full(1, np.inf, np.float32), np.float32(1.0)
+    address = stride * np.arange(19, dtype=np.int32)[None, None]
     lattice.update(
-        f,
-        stride * np.arange(19, dtype=np.int32)[None],
-        np.ones(1, np.int32),
-        (np.float32(1.0), np.zeros(4, np.float32), np.full(1, np.inf, np.float32), np.float32(1.0)),
-        lattice.no_screen(1),
-        lattice.NO_LINKS,
-        np.array([[0, 0, 0], [1, 0, 0]], np.int32),
-        lattice.ALONE,
+        f, (address, np.ones(1, np.int32), relaxation, lattice.no_screen(1)), lattice.NO_LINKS, *lattice.undivided(1)
     )
     links, source = np.zeros((0, 6), np.int32), np.zeros(0, np.float32)
     nowhere = np.zeros(1, np.int32)
     of_openings = nowhere, links, none, none, np.zeros((1, 0, 2))
     lattice.drive(f, stride, np.zeros((0, 9)), of_openings, np.zeros(3), source)
-    lattice.swap(f, none, none)
     lattice.defer(f, links, np.zeros((0, 5), np.float32), source, source, np.float32(1.0))
     lattice.balance(source, (nowhere, none, nowhere, none), source, np.float32(1.0))
     lattice.moments(f, stride, none)

@@ -41,9 +41,9 @@ class Device:
         of_openings = start, address, put(links.place), put(links.direction), put(links.shape)
         drive = partial(_launch, lattice_gpu.drive, len(links.openings) * THREADS)
         self._drive = partial(drive, f, a.stride, self._openings, of_openings, self._source)
-        swap = partial(_launch, lattice_gpu.swap, a.swap_address.shape[1], f, put(a.swap_address))
+        swap = partial(_launch, lattice_gpu.swap, a.septa.shape[1], f, put(a.septa))
         self._steps = []
-        for address_of, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):
+        for address_of, path in zip(a.address, links.path, strict=True):
             self._steps += [
                 partial(_launch, lattice_gpu.update, cells, f, put(address_of), *update),
                 partial(_launch, lattice_gpu.reflect, max(len(path), len(state.refill.refill)), f, put(path), *reflect),

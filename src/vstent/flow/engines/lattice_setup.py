@@ -39,18 +39,18 @@ class Addressing:
     """(s,) cells of every segment."""
     first_cell: Ints
     """(s,) first cell of every segment."""
-    even_address: Ints
-    """(s, 19) where the populations of every segment begin in an even step."""
-    odd_address: Ints
-    """(s, 19) the same in an odd step."""
+    address: Ints
+    """(2, s, 19) where the populations of every segment begin, in an even step and in an odd one."""
     link_address: Ints
     """(l, 6) see `lattice.paths`."""
     link_has_one: NDArray[np.bool_]
-    """(l,) the cell behind the link's cell is blood."""
+    """(l,) the cell behind the link's cell is blood, and no septum lies between."""
     link_has_two: NDArray[np.bool_]
-    """(l,) so are the two cells behind it."""
-    swap_address: Ints
-    """(2, t) see `lattice.swap`."""
+    """(l,) so it is with the two cells behind it."""
+    septa: Ints
+    """(2, t) see `lattice.update`, by layer of their cell."""
+    septum_cell: Ints
+    """(t,) that cell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +65,8 @@ class Links:
 
     address: Ints
     """(l, 6) see `lattice.paths`."""
-    even_path: Ints
-    """(l, 3) see `lattice.update`, after an even step."""
-    odd_path: Ints
-    """(l, 3) the same after an odd step."""
+    path: Ints
+    """(2, l, 3) see `lattice.update`, after an even step and after an odd one."""
     weight: NDArray[np.float32]
     """(l, 2) see `lattice.update`."""
     correction: NDArray[np.float32]
@@ -79,6 +77,8 @@ class Links:
     """(k, 9) see `lattice.drive`."""
     start: Ints
     """(k + 1,) first link of every opening, and of the wall."""
+    by_layer: Ints
+    """(o,) the ends' links, by layer of their cell."""
     place: Ints
     """(o,) storage place of every opening link."""
     direction: Ints
@@ -158,18 +158,18 @@ def address(domain: Domain, is_end: Bools) -> Addressing:
     behind = [number[tuple((start - c).T)] for c in lattice.VELOCITIES]
     even = place[first][:, None] + stride * np.arange(19)
     odd = np.stack([lattice.OPPOSITE[q] * stride + behind[q] for q in range(19)], axis=1)
-    links = _link_addresses(domain, number, inside, stride)
-    swaps = _swap_addresses(domain, number, stride)
+    septa = _septa(domain, number, stride)
+    links = _link_addresses(domain, number, inside, stride, septa)
     to_int = np.int32
     return Addressing(
         stride,
         place,
         length.astype(to_int),
         first.astype(to_int),
-        even.astype(to_int),
-        odd.astype(to_int),
+        np.stack([even, odd]).astype(to_int),
         *links,
-        swaps,
+        septa,
+        domain.septum_cell,
     )
 
 
@@ -183,16 +183,16 @@ def _cut(first: Ints, length: Ints) -> tuple[Ints, Ints]:
 
 
 def _link_addresses(
-    domain: Domain, number: Ints, inside: NDArray[np.bool_], stride: int
+    domain: Domain, number: Ints, inside: NDArray[np.bool_], stride: int, septa: Ints
 ) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
     """Addresses (l, 6) of `lattice.paths`, and whether one and whether two blood cells lie behind the link's cell."""
     q = domain.link_direction
     p = lattice.OPPOSITE[q]
     cell, c = domain.cells[domain.link_cell], lattice.VELOCITIES[q]
     second = np.maximum(cell - 2 * c, 0)
-    has_one = inside[tuple((cell - c).T)]
-    has_two = has_one & inside[tuple(second.T)]
     here, ahead, behind = (number[tuple(x.T)] for x in (cell, cell + c, cell - c))
+    has_one = inside[tuple((cell - c).T)] & ~np.isin(q * stride + here, septa)
+    has_two = has_one & inside[tuple(second.T)] & ~np.isin(q * stride + behind, septa)
     further = np.where(has_two, number[tuple(second.T)], here)
     rows = [
         p * stride + here,
@@ -205,7 +205,8 @@ def _link_addresses(
     return np.stack(rows, axis=1).astype(np.int32), has_one, has_two
 
 
-def _swap_addresses(domain: Domain, number: Ints, stride: int) -> Ints:
+def _septa(domain: Domain, number: Ints, stride: int) -> Ints:
+    """Addresses (2, t) of what cells send each other through septa."""
     q = domain.septum_direction
     cell = domain.cells[domain.septum_cell]
     here, ahead = (number[tuple(x.T)] for x in (cell, cell + lattice.VELOCITIES[q]))
@@ -239,6 +240,7 @@ def build_links(
         np.zeros(len(order), dtype=np.float32),
         openings,
         start,
+        np.argsort(domain.link_cell[opening_links], kind="stable").astype(np.int32),
         addressing.place[domain.link_cell[opening_links]],
         domain.link_direction[opening_links],
         wanted,
@@ -260,12 +262,12 @@ def _link_order(domain: Domain) -> Ints:
 
 def build_bands(domain: Domain, addressing: Addressing, links: Links) -> Ints:
     """Bands (b + 1, 3) of `lattice.update`: the layers of cells across the first axis of the grid."""
-    cell = domain.link_cell[_link_order(domain)][links.start[-1] :]
+    of_ends, of_walls = np.split(domain.link_cell[_link_order(domain)], links.start[-1:])
+    cells = addressing.first_cell, np.unique(of_walls), of_walls, of_ends[links.by_layer], addressing.septum_cell
     layer = domain.cells[:, 0]
     edges = np.arange(layer.min(), layer.max() + 2)
-    keys = layer[addressing.first_cell], layer[cell], layer[np.unique(cell)]
-    bands = np.stack([np.searchsorted(key, edges) for key in keys], axis=1)
-    bands[:, 1] += links.start[-1]
+    bands = np.stack([np.searchsorted(layer[ordered], edges) for ordered in cells], axis=1)
+    bands[:, 2] += links.start[-1]
     return bands.astype(np.int32)
 
 

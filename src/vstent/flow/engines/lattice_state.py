@@ -101,7 +101,7 @@ class State:
     refill: Refill
     """What the walls lose."""
     bands: Ints
-    """(b + 1, 3) see `lattice.update`."""
+    """(b + 1, 5) see `lattice.update`."""
     limit: NDArray[np.float32]
     """(s,) largest cell Reynolds number in every segment."""
     populations: NDArray[np.float32]
@@ -283,16 +283,14 @@ def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int
     shares = lattice.share(a.length, screen.start, state.bands, numba.get_num_threads())
     scales = state.scales
     relaxation = np.float32(scales.relaxation_steps), scales.thinning, state.limit, np.float32(ODD_RATE)
-    resistance = screen.start, screen.place, screen.entry
-    back = links.weight, links.source, refill.place, refill.refill
+    cells = a.address, a.length, relaxation, (screen.start, screen.place, screen.entry)
+    back = links.path, links.weight, links.source, links.by_layer, refill.place, refill.refill, a.septa
     of_openings = links.start, links.address, links.place, links.direction, links.shape
     opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
     for pair in range(len(wanted)):
         links.openings[:, 1] = wanted[pair]
         lattice.drive(f, a.stride, links.openings, of_openings, moments[pair], opening_source)
-        for address_of, path in ((a.even_address, links.even_path), (a.odd_address, links.odd_path)):
-            lattice.update(f, address_of, a.length, relaxation, resistance, (path, *back), state.bands, shares)
-            lattice.swap(f, *a.swap_address)
+        lattice.update(f, cells, back, state.bands, shares)
         if (first_pair + pair) % DEFER_PAIRS == 0:
             part = np.float32(DEFER_PART)
             lattice.defer(f, links.address[wall], links.correction[wall], links.source[wall], refill.lost, part)
