@@ -140,6 +140,7 @@ def field(strength):
         outlet_pressure_Pa=np.zeros(1),
         blood=Blood(),
         is_converged=True,
+        unsettled_fraction=0.001,
         advice="Converged.",
         residual=np.array([0.1, 0.001]),
         steps=100,

@@ -11,7 +11,7 @@ import pytest
 from vstent import flow, phantoms
 from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, domain, sampling, simulate_case
 from vstent.flow.engines import AbstractEngine, Outcome, run
-from vstent.flow.engines.lattice_boltzmann import CHECKS_AVERAGED, LatticeBoltzmann
+from vstent.flow.engines.lattice_boltzmann import CHECKS_AVERAGED, LatticeBoltzmann, swings
 from vstent.kernels import lattice
 from vstent.trace import trace
 from vstent.vessel import Vessel
@@ -87,6 +87,8 @@ def test_a_flow_that_does_not_settle_is_the_mean_of_its_last_checks(is_converged
     np.testing.assert_allclose(field.velocity_m_s, expected, atol=1e-6)
     assert np.abs(seen[-1] - expected).max() > 0.001 or is_converged
     assert ("settled in" in field.advice) == (not is_converged)
+    left = 0.5 if is_converged else max(swings(np.array(state.history)))
+    assert field.unsettled_fraction == pytest.approx(left)
 
 
 def disc(resistance_Pa_s_m: float) -> Screen:

@@ -208,6 +208,18 @@ def test_a_close_up_in_a_flow_that_swings_is_given_two_thirds_of_the_steps() -> 
     assert limits[1] == int(limits[0] * 2 / 3) >= 16
 
 
+def test_a_close_ups_time_step_goes_by_its_own_fastest_blood() -> None:
+    """Blood that is ten times as fast, but beyond its cuts, changes nothing; within it does."""
+    case, outer = outer_of_demo()
+    part = close_ups.close_up(case, outer).part
+    for is_faster, times in ((part >= 0, 1.0), (part < 0, 10.0)):
+        velocity_m_s = np.where(is_faster[:, None], 10.0, 1.0) * outer.velocity_m_s
+        faster = replace(outer, velocity_m_s=velocity_m_s)
+        step_s = [LatticeBoltzmann(0.25, None, one).init(case, one).scales.step_s for one in (outer, faster)]
+        assert step_s[0] == pytest.approx(times * step_s[1])
+        assert step_s[0] * 1.1 * outer.speed_m_s[part < 0].max() == pytest.approx(0.15 * 0.25e-3)
+
+
 def test_a_close_up_tells_of_branches_too_narrow_for_the_cells_around_it() -> None:
     case, _ = outer_of_demo()
     field = simulate_case(replace(case, settings=replace(case.settings, close_up=True, cell_size_mm=0.2, max_steps=96)))

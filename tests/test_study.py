@@ -74,6 +74,10 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     assert metrics["bare"]["neck_inflow_mL_s"] == pytest.approx(metrics["bare"]["neck_outflow_mL_s"], rel=0.1)
     report = (out / "report.html").read_text()
     assert all(f"Flow, {name}: The flow has " in report for name in ("bare", "silk"))
+    left = metrics["bare"]["unsettled_fraction"]
+    assert (left < 0.01) == ("Flow, bare: The flow has settled" in report)
+    assert metrics["stents"]["silk"]["flow"]["unsettled_fraction"] == left > 0
+    assert not any("unsettled" in key for key in ratios)
     provenance = json.loads((out / "run.json").read_text())
     assert len(provenance["input"]["sha256"]) == 64
     assert {"numpy", "vstent", "python"} <= set(provenance["versions"])

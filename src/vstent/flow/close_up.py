@@ -252,6 +252,7 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
         inlet_pressure_Pa=outer.inlet_pressure_Pa,
         outlet_pressure_Pa=outer.outlet_pressure_Pa,
         is_converged=inner.is_converged and outer.is_converged,
+        unsettled_fraction=max(inner.unsettled_fraction, outer.unsettled_fraction),
         advice=(
             f"{inner.advice} Cells are {inner.cell_size_mm:.3g} mm wide in the sac and near it, "
             f"{outer.cell_size_mm:.3g} mm elsewhere; there: {outer.advice}"

@@ -5,8 +5,8 @@ import tempfile
 from hashlib import sha1, sha256
 from pathlib import Path
 
-# A thread that waits looks for its turn about as long as waking it takes (some 50 microseconds), and sleeps then. To look
-# on costs a factor of ten on a machine that is busy otherwise; to sleep at once, a tenth on one that is not.
+# A thread that waits looks for its turn about as long as waking it takes (some 50 microseconds), and then sleeps. To
+# look on costs a factor of ten on a machine that is busy otherwise; to sleep at once, a tenth on one that is not.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ |= {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "1000"}
 

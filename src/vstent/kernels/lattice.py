@@ -318,7 +318,7 @@ def paths(address: Ints, weight: Floats) -> tuple[Ints, NDArray[np.float32]]:
     after_even = np.where(needs_c[:, None], address[:, (0, 2, 3)], address[:, (0, 1, 3)])
     after_odd = np.where(needs_c[:, None], address[:, (3, 1, 0)], address[:, (3, 2, 0)])
     both = np.column_stack([weight[:, 0], np.where(needs_c, weight[:, 2], weight[:, 1])])
-    return np.stack([after_even, after_odd]), both.astype(np.float32)
+    return np.ascontiguousarray([after_even, after_odd]), both.astype(np.float32)
 
 
 @njit(cache=True, fastmath=True, forceinline=True)

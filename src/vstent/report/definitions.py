@@ -185,6 +185,11 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "mean_wss_Pa": Definition("Wall shear stress, mean", "Area mean of its magnitude over the whole wall."),
     "inlet_pressure_Pa": Definition("Inlet pressure", "Mean over the inlet's section, above that of the outlets."),
     "pressure_drop_Pa": Definition("Pressure drop", "Inlet pressure less that of the widest outlet."),
+    "unsettled_fraction": Definition(
+        "Left to settle",
+        "What the sac's mean speed, neck inflow, inlet pressure or the vessel's mean speed has left to go; where they "
+        "swing, what they range over or how far their mean has moved; of a pulse, what its last two cycles differ by.",
+    ),
 }
 
 HEADLINES: Final = (

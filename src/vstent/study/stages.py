@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
@@ -206,12 +207,16 @@ def measure_all(
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
     shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
     flow = {name: indices(field, *shapes) for name, field in fields.items()}
+    left = {
+        name: {"unsettled_fraction": field.unsettled_fraction} if isfinite(field.unsettled_fraction) else {}
+        for name, field in fields.items()
+    }
     stents: dict[str, dict[str, Any]] = {}
     for name, deployment in deployments.items():
         stents[name] = {"deployment": measure(anatomy, deployment)}
         if name in flow:
-            stents[name] |= {"flow": flow[name], "ratios": compare(flow[BARE], flow[name])}
-    return {"vessel": morphology(anatomy), "stents": stents} | ({BARE: flow[BARE]} if flow else {})
+            stents[name] |= {"flow": flow[name] | left[name], "ratios": compare(flow[BARE], flow[name])}
+    return {"vessel": morphology(anatomy), "stents": stents} | ({BARE: flow[BARE] | left[BARE]} if flow else {})
 
 
 def _array(point_mm: Point | None) -> Floats | None:

@@ -7,6 +7,8 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from vstent.flow import close_up as close_ups
+from vstent.flow.close_up import CloseUp
 from vstent.flow.cost import estimate, refuse_too_large
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.engines.lattice_checkpoint import pack, unpack
@@ -60,13 +62,17 @@ class AbstractLattice(AbstractEngine[State]):
         """Return the case with a shorter time step: a narrow place inside may hold faster blood than the openings."""
         return replace(case, settings=replace(case.settings, lattice_speed=SLOWER * case.settings.lattice_speed))
 
+    def close_up(self, case: FlowCase) -> CloseUp | None:
+        """Return what of the vessel is computed; None: all of it."""
+        return None if self.outer is None else close_ups.close_up(case, self.outer)
+
     def save(self, state: State) -> Saved:
         """Return the run as arrays."""
         return pack(state)
 
     def resume(self, case: FlowCase, saved: Saved) -> State:
         """Build the run anew and put it where it was."""
-        return unpack(case, self.cell_size_mm, saved, self.outer)
+        return unpack(case, self.cell_size_mm, saved, self.close_up(case))
 
     def step(self, state: State) -> State:
         """Advance towards the next check."""
@@ -84,10 +90,11 @@ class LatticeBoltzmann(AbstractLattice):
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Choose the time step so that the fastest blood moves `lattice_speed` cells a step."""
-        cell_m = self.cell_size_mm * M_PER_MM
-        scales = Scales(cell_m, case.settings.lattice_speed * cell_m / peak_speed_m_s(case, start), case.blood)
+        cell_m, close_up = self.cell_size_mm * M_PER_MM, self.close_up(case)
+        step_s = case.settings.lattice_speed * cell_m / peak_speed_m_s(case, start, close_up)
+        scales = Scales(cell_m, step_s, case.blood)
         steps = _steps_per_check(case, scales)
-        return build(case, scales, steps, outer=self.outer, start=start, kept=CHECKS_AVERAGED)
+        return build(case, scales, steps, close_up=close_up, start=start, kept=CHECKS_AVERAGED)
 
     def terminate(self, state: State) -> float | None:
         """Fraction that the monitored quantities have left to go, the worst of the last checks."""
@@ -109,7 +116,9 @@ class LatticeBoltzmann(AbstractLattice):
     def result(self, state: State, outcome: Outcome) -> FlowField:
         """Return the last check, or the mean of the last ones where the flow has not settled."""
         kept = [state.snapshots[-1]] if outcome.is_converged else list(state.snapshots)
-        return field_of(state, read(state, kept), outcome, _advice(state, outcome))
+        range_and_drift = swings(np.array(state.history))
+        left = outcome.residual[-1] if outcome.is_converged else float(np.nanmax(range_and_drift))
+        return field_of(state, read(state, kept), outcome, left, _advice(state, outcome))
 
 
 def _steps_per_check(case: FlowCase, scales: Scales) -> int:

@@ -4,10 +4,11 @@ from collections import deque
 
 import numpy as np
 
+from vstent.flow.close_up import CloseUp
 from vstent.flow.engines import Saved
 from vstent.flow.engines.lattice_scales import Scales
 from vstent.flow.engines.lattice_state import Snapshot, State, build
-from vstent.flow.types import FlowCase, FlowField
+from vstent.flow.types import FlowCase
 from vstent.units import M_PER_MM
 
 
@@ -34,10 +35,10 @@ def pack(state: State) -> Saved:
     }
 
 
-def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, outer: FlowField | None) -> State:
+def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp | None) -> State:
     """Build the run of a case anew and put it where it was."""
     scales = Scales(cell_size_mm * M_PER_MM, float(saved["step_s"]), case.blood)
-    state = build(case, scales, int(saved["steps_per_check"]), outer=outer, start=None, kept=int(saved["kept"]))
+    state = build(case, scales, int(saved["steps_per_check"]), close_up=close_up, start=None, kept=int(saved["kept"]))
     state.populations[: 19 * state.addressing.stride] = saved["populations"]
     state.links.source[:] = saved["source"]
     state.links.openings[:] = saved["openings"]

@@ -31,10 +31,11 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Choose a time step that divides the cycle and keeps the fastest blood below `lattice_speed` cells a step."""
-        steps = steps_per_phase(case, self.cell_size_mm, start)
+        close_up = self.close_up(case)
+        steps = steps_per_phase(case, self.cell_size_mm, start, close_up)
         phase_s = waveform_of(case).period_s / PHASES
         scales = Scales(self.cell_size_mm * M_PER_MM, phase_s / steps, case.blood)
-        return build(case, scales, steps, outer=self.outer, start=start, kept=PHASES)
+        return build(case, scales, steps, close_up=close_up, start=start, kept=PHASES)
 
     def terminate(self, state: State) -> float | None:
         """Relative change of the monitored quantities from the last cycle but one to the last; inf within a cycle."""
@@ -54,7 +55,8 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
             phases.append(Phase(time_s, *through_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa))
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])
         advice = cycles_advice(changes, len(state.history) // PHASES, is_converged=outcome.is_converged)
-        return field_of(state, read(state, list(state.snapshots)), outcome, advice, tuple(phases))
+        left = float(changes[-1]) if len(changes) else float("nan")
+        return field_of(state, read(state, list(state.snapshots)), outcome, left, advice, tuple(phases))
 
 
 def cycle_change(history: Floats) -> float:

@@ -125,22 +125,21 @@ def build(
     scales: Scales,
     steps_per_check: int,
     *,
-    outer: FlowField | None,
+    close_up: CloseUp | None,
     start: FlowField | None,
     kept: int,
 ) -> State:
-    """Build grid, storage and coefficients; begin at rest or from a field on any grid; `kept` checks are remembered.
+    """Build grid, storage and coefficients, of a close-up or of the whole vessel.
 
-    In an `outer` flow only the close-up is computed.
+    Begin at rest or from a field on any grid; `kept` checks are remembered.
     """
     if case.settings.device_gpu:
         require_gpu()
     keep_flow()
     cell_size_mm = scales.cell_m / M_PER_MM
-    if outer is None:
-        close_up, domain = None, domains.build(case.vessel, cell_size_mm)
+    if close_up is None:
+        domain = domains.build(case.vessel, cell_size_mm)
     else:
-        close_up = close_ups.close_up(case, outer)
         domain = close_ups.build(case, cell_size_mm, close_up)
     is_end = in_extensions(case, domain) | at_cuts(case, domain)
     addressing = address(domain, is_end)
@@ -166,20 +165,23 @@ def build(
     return state
 
 
-def peak_speed_m_s(case: FlowCase, start: FlowField | None) -> float:
-    """Estimate the fastest blood at mean flow, or at the moment that `start` is of."""
+def peak_speed_m_s(case: FlowCase, start: FlowField | None, close_up: CloseUp | None = None) -> float:
+    """Estimate the fastest blood at mean flow, or at the moment that `start` is of; in a close-up, where it begins."""
     if start is not None:
-        return 1.1 * float(start.speed_m_s.max())
+        within = slice(None) if close_up is None else close_up.part < 0
+        return 1.1 * float(start.speed_m_s[within].max())
     narrowest_mm2 = min(case.vessel.inlet.area_mm2, sum(outlet.area_mm2 for outlet in case.vessel.outlets))
     return 3.0 * case.inflow_mL_s / narrowest_mm2
 
 
-def steps_per_phase(case: FlowCase, cell_size_mm: float, start: FlowField | None) -> int:
+def steps_per_phase(
+    case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up: CloseUp | None = None
+) -> int:
     """Time steps between two phases of a pulse, even: the fastest blood stays below `lattice_speed` cells a step."""
     waveform = waveform_of(case)
-    peak_m_s = peak_speed_m_s(case, start) * waveform.peak_factor
+    peak_m_s = peak_speed_m_s(case, start, close_up) * waveform.peak_factor
     if start is not None and len(start.phases) == PHASES:  # a whole cycle tells itself how fast its fastest blood is
-        peak_m_s = max(peak_speed_m_s(case, start.at_phase(phase)) for phase in start.phases)
+        peak_m_s = max(peak_speed_m_s(case, start.at_phase(phase), close_up) for phase in start.phases)
     step_s = case.settings.lattice_speed * cell_size_mm * M_PER_MM / peak_m_s
     return 2 * ceil(0.5 * waveform.period_s / PHASES / step_s)
 
@@ -359,8 +361,10 @@ def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, outflow_mL_s)
 
 
-def field_of(state: State, flow: Reading, outcome: Outcome, advice: str, phases: tuple[Phase, ...] = ()) -> FlowField:
-    """Put a flow together with how it was reached."""
+def field_of(
+    state: State, flow: Reading, outcome: Outcome, left: float, advice: str, phases: tuple[Phase, ...] = ()
+) -> FlowField:
+    """Put a flow together with how it was reached, and what it has `left` to go."""
     domain, vessel = state.domain, state.case.vessel
     section_Pa = np.array([_section_pressure_Pa(state, flow.pressure_Pa, k) for k in range(len(vessel.openings))])
     field = FlowField(
@@ -378,6 +382,7 @@ def field_of(state: State, flow: Reading, outcome: Outcome, advice: str, phases:
         outlet_pressure_Pa=section_Pa[1:],
         blood=state.case.blood,
         is_converged=outcome.is_converged,
+        unsettled_fraction=left,
         advice=advice if state.close_up else advice + domains.too_narrow(state.case, domain.cell_size_mm),
         residual=np.array(outcome.residual),
         steps=state.steps,
