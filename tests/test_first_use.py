@@ -126,13 +126,13 @@ def test_the_set_up_compiles_what_takes_a_flows_time_so_that_all_processes_run_t
     from vstent.vessel import Vessel
 
     warm.warm()
-    kernels_ready = {kernel: kernel.signatures for kernel in (lattice.update, lattice.defer)}
+    kernels = lattice.update, lattice.defer
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.5)))
     said = []
     with telling(lambda: said.append("compiling")):
         simulate_case(FlowCase(vessel, settings=FlowSettings(inflow_mL_s=1.0, cell_size_mm=0.4, max_steps=10)))
     assert said == []
-    assert {kernel: kernel.signatures for kernel in kernels_ready} == kernels_ready
+    assert [len(kernel.signatures) for kernel in kernels] == [1, 1]  # no other layout than the set-up's, here or before
 
 
 def test_a_kernel_is_compiled_anew_when_a_function_in_another_file_that_it_calls_has_changed(tmp_path):

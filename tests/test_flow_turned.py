@@ -7,12 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tubes import line, tube
+from vstent import flow as flows
 from vstent import phantoms
 from vstent.deploy import deploy
 from vstent.device import find_design
-from vstent.flow import FlowCase, FlowField, FlowSettings, flow_case, sampling, simulate_case
+from vstent.flow import Blood, FlowCase, FlowField, FlowSettings, domain, flow_case, sampling, simulate_case
 from vstent.flow.positions import turned
 from vstent.trace import trace
+from vstent.units import M_PER_MM
 from vstent.vessel import Vessel
 
 RADIUS_MM, BEND_MM, ANGLE, INFLOW_ML_S = 1.95, 5.0, 0.6 * np.pi, 3.7
@@ -78,3 +80,38 @@ def test_a_turned_bend_carries_the_same_flow() -> None:
 def test_what_turning_changes_vanishes_with_the_cells(turn: Rotation) -> None:
     coarse, fine = np.array(differences(turn, 0.2)), np.array(differences(turn, 0.14))
     assert np.log(coarse.sum() / fine.sum()) / np.log(0.2 / 0.14) > 1.4
+
+
+BLOOD = Blood()
+OBLIQUE = Rotation.from_euler("y", 30, degrees=True) * Rotation.from_euler("x", 17, degrees=True)
+BRANCH_MM, BRANCH_LENGTH_MM = 1.0, 16.0
+
+
+def resistance(turn: Rotation, cells_across: float, reynolds: float) -> float:
+    """Fall of pressure in a narrow tube over Poiseuille's."""
+    mean_m_s = reynolds * BLOOD.kinematic_viscosity_m2_s / (BRANCH_MM * M_PER_MM)
+    settings = FlowSettings(inflow_mL_s=mean_m_s * np.pi / 4 * BRANCH_MM**2, cell_size_mm=BRANCH_MM / cells_across)
+    branch = tube(line(BRANCH_LENGTH_MM), 0.5 * BRANCH_MM, around=60).vessel
+    field = simulate_case(turned(FlowCase(branch, settings=settings), turn))
+    along_m = M_PER_MM * turn.inv().apply(field.centers_mm)[:, 2]
+    middle = np.abs(along_m / (M_PER_MM * BRANCH_LENGTH_MM) - 0.5) < 0.25
+    fall_Pa_m = -np.polyfit(along_m[middle], field.pressure_Pa[middle], 1)[0]
+    return float(fall_Pa_m / (32 * BLOOD.viscosity_Pa_s * mean_m_s / (BRANCH_MM * M_PER_MM) ** 2))
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("turn", [DIAGONAL, OBLIQUE], ids=["diagonal", "oblique"])
+@pytest.mark.parametrize(("reynolds", "most_of_six", "most_of_eight"), [(10, 1.05, 1.04), (340, 1.45, 1.15)])
+def test_a_branch_needs_six_cells_across(
+    reynolds: float, most_of_six: float, most_of_eight: float, turn: Rotation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With fewer it resists ever more than it should: what `domain.BRANCH_CELLS` warns of."""
+    for module in (flows, domain):
+        monkeypatch.setattr(module, "MIN_CELLS", 50)
+    three, four, six, eight = (resistance(turn, across, reynolds) for across in (3, 4, 6, 8))
+    found = f"{three:.2f}, {four:.2f}, {six:.2f} and {eight:.2f} times Poiseuille's fall"
+    print(f"3, 4, 6 and 8 cells across a tube, Re {reynolds}: {found}")  # noqa: T201
+    assert three > four > six > eight > 1
+    assert six < most_of_six
+    assert eight < most_of_eight
+    assert three - 1 > 5 * (six - 1)

@@ -62,12 +62,12 @@ _WIDE = SEGMENT + COUNT
 _KINDS: Final = 3
 """Stages of a step: cells collide; links send back what these and the bands beside have sent; septa exchange what links
 of their band and the next have read."""
-_AHEAD: Final = (0, 1, 2)
-"""Bands after its own that have to have collided before each of them can be done to a band."""
-_BEHIND: Final = (0, 1, 1)
-"""Bands before its own."""
+_AFTER: Final = (0, 1, 2)
+"""Bands after a band that have to have collided before each stage can be done to it."""
+_BEFORE: Final = (0, 1, 1)
+"""Bands before it that have to."""
 _STEP: Final = 2
-"""Bands, before and after, that need to have done a step before a band can begin the next."""
+"""The same, before and after, for it to begin the next step."""
 
 
 @njit(cache=True, inline="always")
@@ -205,7 +205,7 @@ def _do(stage: int, band: int, f: Any, cells: Any, links: Any, bands: Any, scrat
 def _of_itself(stage: int, first: int, last: int, count: int) -> tuple[int, int]:
     """First band, and the one after the last, to which a share can do a stage without waiting for the others."""
     step, kind = stage // _KINDS, stage % _KINDS
-    before, after = _STEP * step + _BEHIND[kind], _STEP * step + _AHEAD[kind]
+    before, after = _STEP * step + _BEFORE[kind], _STEP * step + _AFTER[kind]
     return first + (before if first > 0 else 0), last - (after if last < count else 0)
 
 
@@ -255,7 +255,7 @@ def update(f: Any, cells: Any, links: Any, bands: Any, shares: Any) -> None:
         scratch, first, last = _scratch(relaxation[0]), shares[chunk], shares[chunk + 1]
         for front in range(first, last + _STEP * steps):
             for stage in range(stages):
-                band = front - _STEP * (stage // _KINDS) - _AHEAD[stage % _KINDS]
+                band = front - _STEP * (stage // _KINDS) - _AFTER[stage % _KINDS]
                 begin, end = _of_itself(stage, first, last, count)
                 if begin <= band < end:
                     _do(stage, band, f, (address, length, relaxation, screen), links, bands, scratch)
