@@ -185,10 +185,8 @@ class _Grid:
         if self._length.max() > lattice.SEGMENT:
             raise ValueError(f"a cell may be {lattice.SEGMENT} high at most")
         start = cells[first]
-        even = self._place[first][:, None] + self._stride * np.arange(19)
         behind = [self._number(start - c) for c in lattice.VELOCITIES]
-        odd = np.stack([lattice.OPPOSITE[q] * self._stride + behind[q] for q in range(19)], axis=1)
-        self._address_of = np.stack([even, odd]).astype(np.int32)
+        self._populations = lattice.addresses(self._place[first], behind, self._stride)
 
     def _link(self, wires: Wires, cells: Ints) -> None:
         blood = self._is_blood.ravel()
@@ -216,13 +214,13 @@ class _Grid:
         segments = len(self._length)
         limit = np.full(segments, np.inf, np.float32)
         relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
-        populations = self._address_of, self._length, relaxation, lattice.no_screen(segments)
+        cells = self._populations, self._length, relaxation, lattice.no_screen(segments)
         back = self._path, self._weight, self._source, *lattice.NO_LINKS[3:]
         bands = lattice.undivided(segments, len(self._source))
         lost = np.empty_like(self._source)  # made up for nowhere here
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
-            lattice.update(self._f, populations, back, *bands)
+            lattice.update(self._f, cells, back, *bands)
             if pair % DEFER_PAIRS == 0:
                 lattice.defer(self._f, self._links, self._correction, self._source, lost, np.float32(DEFER_PART))
 

@@ -257,7 +257,7 @@ class FlowField:
     unsettled_fraction: float
     """What any monitored quantity has left to go at most, as a fraction of it. Where it swings about a mean, what it
     ranges over, or how far the mean has moved, if that is more; of a pulse, what its last two cycles differ by (rms);
-    nan where there is a single one."""
+    inf where there is a single one."""
     advice: str
     """One plain sentence: what to know or do about this result."""
     residual: Floats

@@ -15,6 +15,7 @@ an opening sends back is put there (before an odd step) or taken from there (aft
 Populations are numbered 0 rest, then in opposite pairs (1, 2), (3, 4), ... (17, 18).
 """
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -298,6 +299,18 @@ NO_LINKS: Final = (
 def no_screen(segments: int) -> tuple[Ints, Ints, NDArray[np.float32]]:
     """Return what `update` takes for the screen where there is none."""
     return np.zeros(segments + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, ENTRY), np.float32)
+
+
+def addresses(place: Ints, behind: Sequence[Ints], stride: int) -> Ints:
+    """Where populations of segments begin (2, s, 19), in an even and in an odd step.
+
+    Parameters
+    ----------
+    place : (s,) storage place of every segment's first cell; behind : 19 of (s,), that of the cell each comes from.
+    """
+    own = place[:, None] + stride * np.arange(19)
+    neighbours = np.stack([OPPOSITE[q] * stride + behind[q] for q in range(19)], axis=1)
+    return np.stack([own, neighbours]).astype(np.int32)
 
 
 def paths(address: Ints, weight: Floats) -> tuple[Ints, NDArray[np.float32]]:

@@ -55,8 +55,8 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
             phases.append(Phase(time_s, *through_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa))
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])
         advice = cycles_advice(changes, len(state.history) // PHASES, is_converged=outcome.is_converged)
-        left = float(changes[-1]) if len(changes) else float("nan")
-        return field_of(state, read(state, list(state.snapshots)), outcome, left, advice, tuple(phases))
+        flow, left = read(state, list(state.snapshots)), outcome.residual[-1]
+        return field_of(state, flow, outcome, left, advice, tuple(phases))
 
 
 def cycle_change(history: Floats) -> float:

@@ -156,8 +156,6 @@ def address(domain: Domain, is_end: Bools) -> Addressing:
     first, length = _cut(first, length)
     start = cells[first]
     behind = [number[tuple((start - c).T)] for c in lattice.VELOCITIES]
-    even = place[first][:, None] + stride * np.arange(19)
-    odd = np.stack([lattice.OPPOSITE[q] * stride + behind[q] for q in range(19)], axis=1)
     septa = _septa(domain, number, stride)
     links = _link_addresses(domain, number, inside, stride, septa)
     to_int = np.int32
@@ -166,7 +164,7 @@ def address(domain: Domain, is_end: Bools) -> Addressing:
         place,
         length.astype(to_int),
         first.astype(to_int),
-        np.stack([even, odd]).astype(to_int),
+        lattice.addresses(place[first], behind, stride),
         *links,
         septa,
         domain.septum_cell,
@@ -261,7 +259,7 @@ def _link_order(domain: Domain) -> Ints:
 
 
 def build_bands(domain: Domain, addressing: Addressing, links: Links) -> Ints:
-    """Bands (b + 1, 3) of `lattice.update`: the layers of cells across the first axis of the grid."""
+    """Bands (b + 1, 5) of `lattice.update`: the layers of cells across the first axis of the grid."""
     of_ends, of_walls = np.split(domain.link_cell[_link_order(domain)], links.start[-1:])
     cells = addressing.first_cell, np.unique(of_walls), of_walls, of_ends[links.by_layer], addressing.septum_cell
     layer = domain.cells[:, 0]

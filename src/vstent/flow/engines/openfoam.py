@@ -222,7 +222,7 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
         outlet_pressure_Pa=section_Pa[1:],
         blood=state.case.blood,
         is_converged=outcome.is_converged,
-        unsettled_fraction=outcome.residual[-1] if np.isfinite(outcome.residual[-1]) else float("nan"),
+        unsettled_fraction=outcome.residual[-1],
         advice=_advice(state, outcome),
         residual=np.array(outcome.residual),
         steps=steps,
