@@ -38,7 +38,8 @@ def test_twice_as_fine_costs_eight_times_the_cells_and_pulsatile_steps_twice():
 def test_the_pulsatile_steps_foretold_are_those_made():
     case = case_of(waveform=OLDER_ADULT_ICA)
     state = PulsatileLatticeBoltzmann(0.2).init(case, None)
-    assert estimate(case).steps == state.steps_per_check * PHASES * case.settings.max_cycles
+    assert len(state.pace) == PHASES
+    assert estimate(case).steps == state.pace.sum() * case.settings.max_cycles
 
 
 def test_the_time_foretold_is_of_a_measured_rate():

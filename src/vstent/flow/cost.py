@@ -11,8 +11,8 @@ import numpy as np
 
 from vstent.errors import FlowError
 from vstent.flow import close_up
-from vstent.flow.domain import INLET_EXTENSION, OUTLET_EXTENSION, default_cell_size_mm
-from vstent.flow.engines.lattice_state import steps_per_phase
+from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
+from vstent.flow.engines.lattice_pace import pace
 from vstent.flow.gpu import free_gpu_bytes
 from vstent.flow.types import PHASES, FlowCase
 from vstent.kernels import lanes, lattice
@@ -108,10 +108,7 @@ def _refuse(case: FlowCase, needed_bytes: Callable[[float], float], free_bytes: 
 def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     """Cells and bytes."""
     vessel = case.vessel
-    ends = [
-        k.area_mm2 * k.diameter_mm * (OUTLET_EXTENSION if n else INLET_EXTENSION) for n, k in enumerate(vessel.openings)
-    ]
-    volume_mm3 = abs(vessel.closed.volume_mm3) + sum(ends)
+    volume_mm3 = extended_volume_mm3(vessel)
     widest = max(opening.diameter_mm for opening in vessel.openings)
     box_mm3 = float(np.prod(np.ptp(vessel.lumen.vertices_mm, axis=0) + 2 * widest))
     phases = 0 if case.settings.waveform is None else PHASES
@@ -135,7 +132,7 @@ def _steps(case: FlowCase, cell_size_mm: float) -> int:
     settings = case.settings
     if settings.waveform is None:
         return settings.max_steps
-    return steps_per_phase(case, cell_size_mm, None) * PHASES * settings.max_cycles
+    return int(pace(case, cell_size_mm, None).sum()) * settings.max_cycles
 
 
 def block_rate(*, on_gpu: bool = False) -> float:

@@ -225,6 +225,16 @@ def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
     return surface, np.concatenate(patch).astype(np.int32), tuple(sections[k] for k in range(len(vessel.openings)))
 
 
+def extended_volume_mm3(vessel: Vessel) -> float:
+    """Foretell the volume of a vessel with its extensions, none of which another wall cuts short."""
+    ends = (opening.area_mm2 * _extension_mm(vessel, k) for k, opening in enumerate(vessel.openings))
+    return abs(vessel.closed.volume_mm3) + sum(ends)
+
+
+def _extension_mm(vessel: Vessel, k: int) -> float:
+    return vessel.openings[k].diameter_mm * (OUTLET_EXTENSION if k else INLET_EXTENSION)
+
+
 def _opening_of(vessel: Vessel, ring: Floats) -> int | None:
     center = triangles.polygon_centroid(ring)
     distance = [np.linalg.norm(opening.center_mm - center) / opening.diameter_mm for opening in vessel.openings]
@@ -235,7 +245,7 @@ def _opening_of(vessel: Vessel, ring: Floats) -> int | None:
 def _extruded(vessel: Vessel, k: int, ring: Floats) -> Floats:
     """Ring moved out along the opening's normal onto the plane where the extension ends."""
     opening = vessel.openings[k]
-    wanted = opening.diameter_mm * (INLET_EXTENSION if k == 0 else OUTLET_EXTENSION)
+    wanted = _extension_mm(vessel, k)
     outer = float(((ring - opening.center_mm) @ opening.normal).max())
     starts = (
         ring

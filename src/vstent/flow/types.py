@@ -81,10 +81,11 @@ class Waveform:
         angle = 2 * np.pi / self.period_s * np.multiply.outer(time_s, np.arange(1, len(self.cosine) + 1))
         return 1 + np.cos(angle) @ np.array(self.cosine) + np.sin(angle) @ np.array(self.sine)
 
-    @property
-    def peak_factor(self) -> float:
-        """Largest flow of the cycle, either way, over mean flow."""
-        return float(np.abs(self.factor(np.linspace(0.0, self.period_s, 1001))).max())
+    def curvature_per_s2(self, time_s: Floats) -> Floats:
+        """Second time derivative (t,) of the flow over the mean flow."""
+        rate_per_s = 2 * np.pi / self.period_s * np.arange(1, len(self.cosine) + 1)
+        harmonics = replace(self, cosine=tuple(rate_per_s**2 * self.cosine), sine=tuple(rate_per_s**2 * self.sine))
+        return 1 - harmonics.factor(time_s)
 
 
 @dataclass(frozen=True, eq=False)

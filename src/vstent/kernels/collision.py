@@ -258,3 +258,21 @@ def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any,
         yz + y * fz + z * fy,
     )
     return _relaxed(f, density, u, pushed, third, (half_odd * force[0], half_odd * force[1], half_odd * force[2]), kept)
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def rescaled(f: Any, stretch: Any, stress: Any) -> tuple[Any, ...]:
+    """Return populations of the same flow in time steps `stretch` times as long, each in the place of its opposite.
+
+    Of `f` (19,), an array: speeds grow with the step, densities with its square, as does what the odd part has beyond
+    its equilibrium, for that is the density's gradient; the stress grows with the step times its relaxation time, by
+    `stress` (Thuerey, Pohl, Ruede, Oechsner and Koerner 2006, Comput. Fluids 35, 934). The momentum in a screen
+    is not that of the flow, by half the force: as little is it carried over, for a step.
+    """
+    density, u, flux = moments_of(f)
+    held = _times(stress, departure(flux, u))
+    faster = stretch * u[0], stretch * u[1], stretch * u[2]
+    zero = u[0] - u[0]
+    none = zero, zero, zero
+    flux = _plus_square(held, faster)
+    return _relaxed(stretch * f, stretch * stretch * density, faster, flux, (*none, *none), none, stretch)

@@ -12,8 +12,8 @@ from vstent.flow.close_up import CloseUp
 from vstent.flow.cost import estimate, refuse_too_large
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.engines.lattice_checkpoint import pack, unpack
-from vstent.flow.engines.lattice_scales import Scales
-from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, peak_speed_m_s, read, step
+from vstent.flow.engines.lattice_pace import longest_step_s, peak_speed_m_s
+from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, read, step
 from vstent.flow.engines.lattice_trouble import trouble
 from vstent.flow.gpu import require_gpu
 from vstent.flow.types import FlowCase, FlowField
@@ -90,11 +90,11 @@ class LatticeBoltzmann(AbstractLattice):
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Choose the time step so that the fastest blood moves `lattice_speed` cells a step."""
-        cell_m, close_up = self.cell_size_mm * M_PER_MM, self.close_up(case)
-        step_s = case.settings.lattice_speed * cell_m / peak_speed_m_s(case, start, close_up)
-        scales = Scales(cell_m, step_s, case.blood)
-        steps = _steps_per_check(case, scales)
-        return build(case, scales, steps, close_up=close_up, start=start, kept=CHECKS_AVERAGED)
+        close_up, kept = self.close_up(case), CHECKS_AVERAGED
+        step_s = longest_step_s(case, self.cell_size_mm, peak_speed_m_s(case, start, close_up))
+        steps = _steps_per_check(case, step_s)
+        pace = np.array([steps])
+        return build(case, self.cell_size_mm, steps * step_s, pace, close_up=close_up, start=start, kept=kept)
 
     def terminate(self, state: State) -> float | None:
         """Fraction that the monitored quantities have left to go, the worst of the last checks."""
@@ -121,10 +121,10 @@ class LatticeBoltzmann(AbstractLattice):
         return field_of(state, read(state, kept), outcome, left, _advice(state, outcome))
 
 
-def _steps_per_check(case: FlowCase, scales: Scales) -> int:
+def _steps_per_check(case: FlowCase, step_s: float) -> int:
     inlet = case.vessel.inlet
     speed_m_s = case.inflow_mL_s / inlet.area_mm2
-    steps = CHECK_DIAMETERS * inlet.diameter_mm * M_PER_MM / speed_m_s / scales.step_s
+    steps = CHECK_DIAMETERS * inlet.diameter_mm * M_PER_MM / speed_m_s / step_s
     return 2 * max(1, round(0.5 * min(steps, case.settings.max_steps / LEAST_CHECKS)))
 
 
@@ -171,7 +171,7 @@ def _advice(state: State, outcome: Outcome) -> str:
         return "The flow has settled."
     swing, moved = swings(np.array(state.history))
     drift = "" if np.isnan(moved) else f"; from the means of as long before, they differ by up to {100 * moved:.1f} %"
-    span_ms = 1e3 * min(len(state.history), CHECKS_AVERAGED) * state.steps_per_check * state.scales.step_s
+    span_ms = 1e3 * min(len(state.history), CHECKS_AVERAGED) * state.check_s
     return (
         f"The flow has not settled in {state.steps} time steps and may be unsteady by nature: these are means over its "
         f"last {span_ms:.0f} ms, in which what is monitored ranged over up to {100 * swing:.1f} % of its mean"

@@ -1,15 +1,14 @@
 """A lattice-Boltzmann run as arrays, and going on from them as if it had never stopped."""
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
 from vstent.flow.close_up import CloseUp
 from vstent.flow.engines import Saved
-from vstent.flow.engines.lattice_scales import Scales
-from vstent.flow.engines.lattice_state import Snapshot, State, build
+from vstent.flow.engines.lattice_state import Snapshot, State, build, take_pace
 from vstent.flow.types import FlowCase
-from vstent.units import M_PER_MM
 
 
 def pack(state: State) -> Saved:
@@ -19,16 +18,18 @@ def pack(state: State) -> Saved:
     snapshots = state.snapshots
     n = len(state.domain.cells)
     return {
-        "step_s": np.array(state.scales.step_s),
-        "steps_per_check": np.array(state.steps_per_check),
+        "check_s": np.array(state.check_s),
+        "pace": state.pace,
         "kept": np.array(snapshots.maxlen or 0),
         "steps": np.array(state.steps),
+        "since_check": np.array(state.since_check),
         "loop_seconds": np.array(state.loop_seconds),
         "populations": state.populations[: 19 * state.addressing.stride],
         "source": state.links.source,
         "openings": state.links.openings,
         "refill": state.refill.refill,
         "history": np.array(state.history),
+        "step_s": np.array([one.scales.step_s for one in snapshots]),
         "velocity": np.array([one.velocity for one in snapshots], np.float32).reshape(len(snapshots), n, 3),
         "density": np.array([one.density for one in snapshots], np.float32).reshape(len(snapshots), n),
         "outflow": np.array([one.outflow for one in snapshots]),
@@ -37,14 +38,17 @@ def pack(state: State) -> Saved:
 
 def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp | None) -> State:
     """Build the run of a case anew and put it where it was."""
-    scales = Scales(cell_size_mm * M_PER_MM, float(saved["step_s"]), case.blood)
-    state = build(case, scales, int(saved["steps_per_check"]), close_up=close_up, start=None, kept=int(saved["kept"]))
+    check_s, kept = float(saved["check_s"]), int(saved["kept"])
+    state = build(case, cell_size_mm, check_s, saved["pace"], close_up=close_up, start=None, kept=kept)
+    state.history = list(saved["history"])
+    take_pace(state)
     state.populations[: 19 * state.addressing.stride] = saved["populations"]
     state.links.source[:] = saved["source"]
     state.links.openings[:] = saved["openings"]
     state.refill.refill[:] = saved["refill"]
-    columns = (saved["velocity"], saved["density"], saved["outflow"])
-    state.snapshots = deque((Snapshot(*one) for one in zip(*columns, strict=True)), maxlen=int(saved["kept"]))
-    state.history = list(saved["history"])
-    state.steps, state.loop_seconds = int(saved["steps"]), float(saved["loop_seconds"])
+    units = [replace(state.scales, step_s=float(step_s)) for step_s in saved["step_s"]]
+    columns = units, saved["velocity"], saved["density"], saved["outflow"]
+    state.snapshots = deque((Snapshot(*one) for one in zip(*columns, strict=True)), maxlen=kept)
+    state.steps, state.since_check = int(saved["steps"]), int(saved["since_check"])
+    state.loop_seconds = float(saved["loop_seconds"])
     return state

@@ -7,19 +7,10 @@ import numpy as np
 
 from vstent.flow.engines import Outcome
 from vstent.flow.engines.lattice_boltzmann import AbstractLattice
-from vstent.flow.engines.lattice_scales import Scales
-from vstent.flow.engines.lattice_state import (
-    State,
-    build,
-    field_of,
-    is_at_check,
-    read,
-    steps_per_phase,
-    waveform_of,
-)
+from vstent.flow.engines.lattice_pace import pace, waveform_of
+from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, read
 from vstent.flow.types import PHASES, FlowCase, FlowField, Phase
 from vstent.kernels.arrays import Floats
-from vstent.units import M_PER_MM
 
 STALLED: Final = 0.8
 """Where a cycle's change is more than this part of the last one's, further cycles will not become alike."""
@@ -30,12 +21,10 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
     """The sparse D3Q19 engine with a waveform at the inlet."""
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
-        """Choose a time step that divides the cycle and keeps the fastest blood below `lattice_speed` cells a step."""
-        close_up = self.close_up(case)
-        steps = steps_per_phase(case, self.cell_size_mm, start, close_up)
-        phase_s = waveform_of(case).period_s / PHASES
-        scales = Scales(self.cell_size_mm * M_PER_MM, phase_s / steps, case.blood)
-        return build(case, scales, steps, close_up=close_up, start=start, kept=PHASES)
+        """Choose time steps that divide a phase and keep its fastest blood below `lattice_speed` cells a step."""
+        close_up, phase_s = self.close_up(case), waveform_of(case).period_s / PHASES
+        steps = pace(case, self.cell_size_mm, start, close_up)
+        return build(case, self.cell_size_mm, phase_s, steps, close_up=close_up, start=start, kept=PHASES)
 
     def terminate(self, state: State) -> float | None:
         """Relative change of the monitored quantities from the last cycle but one to the last; inf within a cycle."""
@@ -50,7 +39,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
         phases = []
         for k, snapshot in enumerate(state.snapshots):
             flow = read(state, [snapshot])
-            time_s = (k + 1) * state.steps_per_check * state.scales.step_s
+            time_s = (k + 1) * state.check_s
             through_mL_s = -float(flow.outflow_mL_s[0]), flow.outflow_mL_s[1:]
             phases.append(Phase(time_s, *through_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa))
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])

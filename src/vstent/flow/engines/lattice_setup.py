@@ -1,6 +1,7 @@
 """What the lattice-Boltzmann engine needs before its first step: addresses, units, walls, openings, screen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ CUT_CELLS = 6
 PAGE, OFF_PAGE = 1024, 216
 """Numbers in 4096 bytes, and by how many more than whole pages of them a cell's populations lie apart: a cache has the
 same few places for what is whole pages apart, and nineteen such runs at once would take a quarter longer."""
+CURVE: Final = np.array([1.0, -2.0, 0.0, 1.0, 0.0], np.float32)
+"""The second difference along a link, of a, b, c, e and g (see `lattice.defer`)."""
 REFILL_BLOCK = 2
 """Edge, in cells, of the blocks within which the walls' losses are made up."""
 
@@ -71,10 +74,12 @@ class Links:
     """(l, 2) see `lattice.update`."""
     correction: NDArray[np.float32]
     """(l, 5) see `lattice.defer`."""
+    viscous: NDArray[np.float32]
+    """(l,) how much of `CURVE` viscosity takes off that."""
     source: NDArray[np.float32]
     """(l,)."""
     openings: Floats
-    """(k, 9) see `lattice.drive`."""
+    """(k, 10) see `lattice.drive`."""
     start: Ints
     """(k + 1,) first link of every opening, and of the wall."""
     by_layer: Ints
@@ -89,6 +94,17 @@ class Links:
     """(m, k) what is wanted there besides, speed or density, at equal times of a cycle."""
     shape: Floats
     """(m, o, 2) see `lattice.drive`, at the same times."""
+
+    def stretched(self, stretch: float) -> "Links":
+        """The same for time steps that are so many times as long; what changes in place is shared."""
+        is_inflow = np.repeat(self.openings[:, 0] == lattice.INFLOW, np.diff(self.start))
+        return replace(
+            self,
+            correction=self.correction - np.outer(np.float32(stretch - 1) * self.viscous, CURVE),
+            wanted=stretch * self.wanted,
+            course=stretch * self.course,
+            shape=np.where(is_inflow, 1.0, stretch**2)[:, None] * self.shape,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +133,10 @@ class ScreenEntries:
     """(e, `lattice.ENTRY`)."""
     cell: Ints
     """(e,) cell."""
+
+    def stretched(self, stretch: float) -> "ScreenEntries":
+        """The same for time steps that are so many times as long: all that goes with a speed is so much more."""
+        return replace(self, entry=self.entry * np.array([1, 1, 1, stretch, stretch, 1, stretch], np.float32))
 
 
 def in_extensions(case: FlowCase, domain: Domain) -> Bools:
@@ -222,10 +242,11 @@ def build_links(
     start: Ints = np.asarray(np.searchsorted(of_ends, np.r_[patches, patches[-1] + 1]), dtype=np.int32)
     fraction = domain.link_fraction[order]
     weight = linear_weights(fraction, addressing.link_has_one[order])
-    correction = parabolic_weights(fraction, scales.relaxation_steps)
+    correction, viscous = parabolic_weights(fraction, scales.relaxation_steps)
     correction[:, :3] -= weight
-    correction[~addressing.link_has_two[order]] = 0.0
-    weight[: start[-1]], correction[: start[-1]] = (-1.0, 0.0, 0.0), 0.0
+    is_plain = ~addressing.link_has_two[order]
+    is_plain[: start[-1]] = True
+    correction[is_plain], viscous[is_plain], weight[: start[-1]] = 0.0, 0.0, (-1.0, 0.0, 0.0)
     opening_links = order[: start[-1]]
     ends = Ends(case, domain, scales, close_up)
     openings, wanted, course, shape = ends.imposed(patches, np.split(opening_links, start[1:-1]))
@@ -235,6 +256,7 @@ def build_links(
         addressing.link_address[order],
         *lattice.paths(addressing.link_address[order], weight),
         correction.astype(np.float32),
+        viscous.astype(np.float32),
         np.zeros(len(order), dtype=np.float32),
         openings,
         start,
@@ -290,8 +312,10 @@ def quadratic_weights(fraction: Floats) -> Floats:
     return np.where(x[:, None] < 0.5, near, far)
 
 
-def parabolic_weights(fraction: Floats, relaxation_steps: float) -> Floats:
+def parabolic_weights(fraction: Floats, relaxation_steps: float) -> tuple[Floats, Floats]:
     """Reflection that is exact for a parabola along the link: (l, 5) weights of a, b, c, e and g (see `lattice.defer`).
+
+    And how much of `CURVE` they would have more (l,) without viscosity.
 
     Quadratic interpolation alone lets blood slip by up to an eighth of a squared cell times the flow's curvature: its
     populations carry, beside the velocity, second differences and what the odd rate has still to relax (Ginzburg and
@@ -300,8 +324,9 @@ def parabolic_weights(fraction: Floats, relaxation_steps: float) -> Floats:
     would be wrong where a screen's force meets the wall.
     """
     x, even, odd = fraction, relaxation_steps - 0.5, 1 / ODD_RATE - 0.5
-    slip = (x * (1 - x) - even * (odd + np.abs(x - 0.5))) / np.maximum(1, x * (2 * x + 1))
-    return quadratic_weights(fraction) + slip[:, None] * np.array([1.0, -2.0, 0.0, 1.0, 0.0])
+    per = 1 / np.maximum(1, x * (2 * x + 1))
+    viscous = even * (odd + np.abs(x - 0.5)) * per
+    return quadratic_weights(fraction) + np.outer(x * (1 - x) * per - viscous, CURVE), viscous
 
 
 def build_refill(domain: Domain, addressing: Addressing) -> Refill:

@@ -2,8 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from math import ceil
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.errors import FlowError
 from vstent.flow import close_up as close_ups
 from vstent.flow import domain as domains
 from vstent.flow import sampling
@@ -33,7 +31,7 @@ from vstent.flow.engines.lattice_setup import (
     in_extensions,
 )
 from vstent.flow.gpu import require_gpu, told
-from vstent.flow.types import PHASES, FlowCase, FlowField, Phase, Waveform
+from vstent.flow.types import FlowCase, FlowField, Phase
 from vstent.flow.wall_stress import wall_stress
 from vstent.kernels import lanes, lattice, lattice_sampling
 from vstent.kernels.arrays import Floats, Ints
@@ -67,12 +65,29 @@ class Probe:
 class Snapshot:
     """The flow at a check, in lattice units."""
 
+    scales: Scales
+    """These units."""
     velocity: NDArray[np.float32]
     """(n, 3) of every cell."""
     density: NDArray[np.float32]
     """(n,) deviation of every cell."""
     outflow: Floats
     """(k,) through every end."""
+
+    @property
+    def velocity_m_s(self) -> NDArray[np.float32]:
+        """(n, 3) of every cell."""
+        return self.velocity * np.float32(self.scales.speed_m_s)
+
+    @property
+    def pressure_Pa(self) -> NDArray[np.float32]:
+        """(n,) of every cell."""
+        return self.density * np.float32(self.scales.pressure_Pa)
+
+    @property
+    def outflow_mL_s(self) -> Floats:
+        """(k,) through every end."""
+        return self.outflow * self.scales.flow_mL_s
 
 
 @dataclass(eq=False)
@@ -91,11 +106,13 @@ class State:
     addressing: Addressing
     """The storage."""
     scales: Scales
-    """Lattice units."""
+    """Lattice units; they change with the time step."""
+    built: tuple[Links, ScreenEntries]
+    """What walls and openings send back, and the resistance of the stent by segment, for the first time steps."""
     links: Links
-    """What walls and openings send back."""
+    """The former for the present ones."""
     screen: ScreenEntries
-    """Resistance of the stent by segment."""
+    """The latter for the present ones."""
     probe: Probe
     """Monitored quantities."""
     refill: Refill
@@ -106,12 +123,16 @@ class State:
     """(s,) largest cell Reynolds number in every segment."""
     populations: NDArray[np.float32]
     """(19 * stride + lanes.COUNT,) shifted populations."""
-    steps_per_check: int
-    """Time steps between checks, even."""
+    pace: Ints
+    """(m,) time steps from each check to the next, even, in turn."""
+    check_s: float
+    """Time between checks."""
     snapshots: deque[Snapshot]
     """The flow at the last checks."""
     steps: int = 0
     """Time steps made."""
+    since_check: int = 0
+    """Those since the last check."""
     history: list[Floats] = field(default_factory=list)
     """Monitored quantities at every check."""
     loop_seconds: float = 0.0
@@ -119,24 +140,39 @@ class State:
     device: "Device | None" = None
     """The run on a GPU, once it is there."""
 
+    @property
+    def steps_per_check(self) -> int:
+        """Time steps from the last check to the next."""
+        return int(self.pace[len(self.history) % len(self.pace)])
+
+    @property
+    def time_s(self) -> float:
+        """Time since the run began."""
+        return self.check_s * (len(self.history) + self.since_check / self.steps_per_check)
+
 
 def build(
     case: FlowCase,
-    scales: Scales,
-    steps_per_check: int,
+    cell_size_mm: float,
+    check_s: float,
+    pace: Ints,
     *,
     close_up: CloseUp | None,
     start: FlowField | None,
     kept: int,
 ) -> State:
-    """Build grid, storage and coefficients, of a close-up or of the whole vessel.
+    """Build grid, storage and coefficients, of a close-up or of the whole vessel, for the first steps.
 
-    Begin at rest or from a field on any grid; `kept` checks are remembered.
+    Parameters
+    ----------
+    check_s, pace : time between checks, and (m,) the steps that it is made in, even, in turn.
+    start : a field on any grid to begin from; None: at rest.
+    kept : checks that are remembered.
     """
     if case.settings.device_gpu:
         require_gpu()
     keep_flow()
-    cell_size_mm = scales.cell_m / M_PER_MM
+    scales = Scales(cell_size_mm * M_PER_MM, check_s / int(pace[0]), case.blood)
     if close_up is None:
         domain = domains.build(case.vessel, cell_size_mm)
     else:
@@ -144,59 +180,28 @@ def build(
     is_end = in_extensions(case, domain) | at_cuts(case, domain)
     addressing = address(domain, is_end)
     links = build_links(case, domain, addressing, scales, close_up)
+    screen = build_screen(case, domain, addressing, scales)
     state = State(
         case,
         close_up,
         domain,
         addressing,
         scales,
+        (links, screen),
         links,
-        build_screen(case, domain, addressing, scales),
+        screen,
         _probe(case, domain),
         build_refill(domain, addressing),
         build_bands(domain, addressing, links),
         np.where(is_end, CELL_REYNOLDS_AT_END, np.inf)[addressing.first_cell].astype(np.float32),
         np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
-        steps_per_check,
+        pace,
+        check_s,
         deque(maxlen=kept),
     )
     if start is not None:
         _begin_from(state, start)
     return state
-
-
-def peak_speed_m_s(case: FlowCase, start: FlowField | None, close_up: CloseUp | None = None) -> float:
-    """Estimate the fastest blood at mean flow, or at the moment that `start` is of; in a close-up, where it begins."""
-    if start is not None:
-        within = slice(None) if close_up is None else close_up.part < 0
-        return 1.1 * float(start.speed_m_s[within].max())
-    narrowest_mm2 = min(case.vessel.inlet.area_mm2, sum(outlet.area_mm2 for outlet in case.vessel.outlets))
-    return 3.0 * case.inflow_mL_s / narrowest_mm2
-
-
-def steps_per_phase(
-    case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up: CloseUp | None = None
-) -> int:
-    """Time steps between two phases of a pulse, even: the fastest blood stays below `lattice_speed` cells a step."""
-    waveform = waveform_of(case)
-    peak_m_s = peak_speed_m_s(case, start, close_up) * waveform.peak_factor
-    if start is not None and len(start.phases) == PHASES:  # a whole cycle tells itself how fast its fastest blood is
-        peak_m_s = max(peak_speed_m_s(case, start.at_phase(phase), close_up) for phase in start.phases)
-    step_s = case.settings.lattice_speed * cell_size_mm * M_PER_MM / peak_m_s
-    return 2 * ceil(0.5 * waveform.period_s / PHASES / step_s)
-
-
-def waveform_of(case: FlowCase) -> Waveform:
-    """Return the pulse of a case.
-
-    Raises
-    ------
-    FlowError
-        When it has none.
-    """
-    if case.settings.waveform is None:
-        raise FlowError("pulsatile flow needs a waveform: set one, or compute the steady flow")
-    return case.settings.waveform
 
 
 def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
@@ -228,17 +233,43 @@ def _begin_from(state: State, start: FlowField) -> None:
 def step(state: State) -> None:
     """Make the time steps of a few seconds, no further than to the next check; there, read the monitored quantities."""
     began = perf_counter()
-    advance(state, min(_slice_steps(state), state.steps_per_check - state.steps % state.steps_per_check))
+    advance(state, min(_slice_steps(state), state.steps_per_check - state.since_check))
     state.loop_seconds += perf_counter() - began
-    if is_at_check(state):
+    if state.since_check == state.steps_per_check:
         with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is told of, not warned of
             state.snapshots.append(_snapshot(state))
             state.history.append(_monitor(state, state.snapshots[-1]))
+            state.since_check = 0
+            _keep_pace(state)
 
 
 def is_at_check(state: State) -> bool:
     """Whether the last steps ended at a check."""
-    return state.steps % state.steps_per_check == 0
+    return state.since_check == 0
+
+
+def _keep_pace(state: State) -> None:
+    """Go on, after a check, in time steps as long as they may be until the next; what moves, moves on as before."""
+    last, following = (int(state.pace[(len(state.history) + k) % len(state.pace)]) for k in (-1, 0))
+    if last == following:
+        return
+    if state.device is not None:
+        state.device.fetch(state)
+        state.device = None
+    before, stretch = state.scales.relaxation_steps, last / following
+    take_pace(state)
+    stress, a = stretch * state.scales.relaxation_steps / before, state.addressing
+    lattice.rescale(state.populations, a.stride, a.place, state.links.address, np.float32(stretch), np.float32(stress))
+    state.links.openings[:, lattice.OWN_DENSITIES] *= stretch**2
+    _settle(state, 1.0)
+
+
+def take_pace(state: State) -> None:
+    """Set the coefficients to the time steps until the next check; populations and openings stay as they are."""
+    stretch = int(state.pace[0]) / state.steps_per_check
+    state.scales = replace(state.scales, step_s=state.check_s / state.steps_per_check)
+    links, screen = state.built
+    state.links, state.screen = links.stretched(stretch), screen.stretched(stretch)
 
 
 def _slice_steps(state: State) -> int:
@@ -247,25 +278,29 @@ def _slice_steps(state: State) -> int:
 
 def advance(state: State, steps: int) -> None:
     """Make an even number of time steps, in pairs."""
-    wanted, moments = imposed(state, state.steps + 1 + np.arange(0, steps, 2))
-    first_pair = state.steps % state.steps_per_check // 2
+    wanted, moments = imposed(state, state.since_check + 1 + np.arange(0, steps, 2))
+    first_pair = state.since_check // 2
     if state.case.settings.device_gpu:
         with told():
             _device(state).advance(wanted, moments, first_pair)
     else:
         _advance_here(state, wanted, moments, first_pair)
     state.steps += steps
+    state.since_check += steps
 
 
-def imposed(state: State, steps: Ints) -> tuple[Floats, Floats]:
-    """What is wanted (t, k) at every end at steps (t,), and their moments (t, 3), see `lattice.drive`."""
+def imposed(state: State, steps: Floats | Ints) -> tuple[Floats, Floats]:
+    """What is wanted (t, k) at every end at steps (t,) since the last check, and their moments (t, 3).
+
+    See `lattice.drive`.
+    """
     links = state.links
     count = len(links.course)
-    place = steps / state.steps_per_check - 1  # the first moment is the first check
-    now, part = np.divmod(place, 1)
+    checks = len(state.history) + steps / state.steps_per_check
+    now, part = np.divmod(checks - 1, 1)  # the first moment is the first check
     moments = np.column_stack([now % count, (now + 1) % count, part])
     before, after = (links.course[moments[:, k].astype(int)] for k in range(2))
-    factor = state.case.settings.inflow_factor(np.float64(state.scales.step_s) * steps)
+    factor = state.case.settings.inflow_factor(state.check_s * checks)
     return factor[:, None] * links.wanted + before + part[:, None] * (after - before), moments
 
 
@@ -288,15 +323,22 @@ def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int
     cells = a.address, a.length, relaxation, (screen.start, screen.place, screen.entry)
     back = links.path, links.weight, links.source, links.by_layer, refill.place, refill.refill, a.septa
     of_openings = links.start, links.address, links.place, links.direction, links.shape
-    opening_source, wall = links.source[: links.start[-1]], slice(links.start[-1], None)
+    opening_source = links.source[: links.start[-1]]
     for pair in range(len(wanted)):
         links.openings[:, 1] = wanted[pair]
         lattice.drive(f, a.stride, links.openings, of_openings, moments[pair], opening_source)
         lattice.update(f, cells, back, state.bands, shares)
         if (first_pair + pair) % DEFER_PAIRS == 0:
-            part = np.float32(DEFER_PART)
-            lattice.defer(f, links.address[wall], links.correction[wall], links.source[wall], refill.lost, part)
-            lattice.balance(refill.lost, refill.groups, refill.refill, part)
+            _settle(state, DEFER_PART)
+
+
+def _settle(state: State, part: float) -> None:
+    """Let what is deferred, the correction of the walls and the balance of what they lose, go so far of its way."""
+    links, refill, share = state.links, state.refill, np.float32(part)
+    wall = slice(links.start[-1], None)
+    of_walls = links.address[wall], links.correction[wall], links.source[wall]
+    lattice.defer(state.populations, *of_walls, refill.lost, share)
+    lattice.balance(refill.lost, refill.groups, refill.refill, share)
 
 
 def _snapshot(state: State) -> Snapshot:
@@ -305,7 +347,7 @@ def _snapshot(state: State) -> Snapshot:
     if len(state.screen.cell):
         rates = np.float32(state.scales.relaxation_steps), np.float32(ODD_RATE)
         velocity[state.screen.cell] = lattice.resisted(velocity[state.screen.cell], state.screen.entry, *rates)
-    return Snapshot(velocity, moment[:, 0], outflow)
+    return Snapshot(state.scales, velocity, moment[:, 0], outflow)
 
 
 def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
@@ -319,13 +361,14 @@ def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
 
 def _monitor(state: State, now: Snapshot) -> Floats:
     """Mean speed of the sac, pressure and mean speed of the vessel, neck inflow: what convergence is judged by."""
-    speed = np.linalg.norm(now.velocity, axis=1)
+    velocity_m_s = now.velocity_m_s
+    speed_m_s = np.linalg.norm(velocity_m_s, axis=1)
     first_inflow = state.links.patch[np.argmax(state.links.openings[:, 0] == lattice.INFLOW)]
     inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
-    values = [speed[state.probe.cells].mean(), now.density[inlet].mean(), speed.mean()]
+    values = [speed_m_s[state.probe.cells].mean(), now.pressure_Pa[inlet].mean(), speed_m_s.mean()]
     if len(state.probe.ostium_points):
         index = state.domain.index
-        through = lattice_sampling.interpolate(index, now.velocity.astype(float), state.probe.ostium_points, True)
+        through = lattice_sampling.interpolate(index, velocity_m_s.astype(float), state.probe.ostium_points, True)
         values.append(float(np.maximum(np.einsum("ij,ij->i", through, state.probe.ostium_area_mm2), 0.0).sum()))
     return np.array(values, dtype=float)
 
@@ -348,15 +391,15 @@ class Reading:
 
 def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     """Return the mean of some snapshots in SI units, with the stress on the wall."""
-    scales, domain = state.scales, state.domain
-    velocity_m_s = np.mean([one.velocity for one in snapshots], axis=0, dtype=float) * scales.speed_m_s
-    pressure_Pa = np.mean([one.density for one in snapshots], axis=0, dtype=float) * scales.pressure_Pa
+    domain = state.domain
+    velocity_m_s = np.mean([one.velocity_m_s for one in snapshots], axis=0, dtype=float)
+    pressure_Pa = np.mean([one.pressure_Pa for one in snapshots], axis=0, dtype=float)
     stress_Pa, wall_pressure_Pa = wall_stress(
         domain, velocity_m_s, pressure_Pa, lumen=state.case.vessel.lumen, blood=state.case.blood
     )
     outflow_mL_s = np.full(len(state.case.vessel.openings), np.nan)
     is_opening = state.links.patch <= len(outflow_mL_s)
-    through = np.mean([one.outflow for one in snapshots], axis=0) * scales.flow_mL_s
+    through = np.mean([one.outflow_mL_s for one in snapshots], axis=0)
     outflow_mL_s[state.links.patch[is_opening] - 1] = through[is_opening]
     return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, outflow_mL_s)
 

@@ -4,18 +4,17 @@ import numpy as np
 
 from vstent.flow.engines.lattice_setup import CELL_REYNOLDS_AT_END
 from vstent.flow.engines.lattice_state import Snapshot, State
+from vstent.kernels import lattice
 from vstent.kernels.arrays import Floats
 
-SOUND = 3**-0.5
-"""Speed of the lattice's sound, in cells per time step; faster blood is no flow."""
 FAST = 0.3
 """Speed from which the sound is too near."""
 
 
 def trouble(state: State) -> str:
     """One sentence: what happened, the last good state, the likeliest cause and what to do about it."""
-    good = [one for one in state.snapshots if np.abs(one.velocity).max() < SOUND]
-    when_ms = 1e3 * state.steps * state.scales.step_s
+    good = [one for one in state.snapshots if np.abs(one.velocity).max() < lattice.SOUND]  # faster is no flow
+    when_ms = 1e3 * state.time_s
     if not good:
         return (
             f"the flow diverged within the first {when_ms:.3g} ms, before any good check: the time step is too long"
@@ -25,10 +24,10 @@ def trouble(state: State) -> str:
     speed = np.linalg.norm(last.velocity, axis=1)
     fastest = int(speed.argmax())
     behind = next(k for k, one in enumerate(reversed(state.snapshots)) if one is last)
-    good_ms = when_ms - 1e3 * behind * state.steps_per_check * state.scales.step_s
+    good_ms = when_ms - 1e3 * behind * state.check_s
     return (
         f"the flow diverged between {good_ms:.3g} and {when_ms:.3g} ms; at the last good check the fastest blood moved "
-        f"{speed[fastest] * state.scales.speed_m_s:.2g} m/s at {_place(state.domain.centers_mm[fastest])}: "
+        f"{speed[fastest] * last.scales.speed_m_s:.2g} m/s at {_place(state.domain.centers_mm[fastest])}: "
         + _cause(state, last, speed, fastest)
     )
 
@@ -45,7 +44,7 @@ def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
         role = state.case.vessel.openings[coming_back[0]].role
         return f"blood comes back through {role}; cut the vessel further from there, or share the outflow (murray)"
     otherwise = "" if state.close_up is None else ", or leave out --close-up (close_up)"
-    cell_reynolds = speed[fastest] / state.scales.viscosity
+    cell_reynolds = speed[fastest] / last.scales.viscosity
     return (
         f"the grid is too coarse for it (speed x cell / viscosity = {cell_reynolds:.0f}, in the openings' extensions "
         f"at most {CELL_REYNOLDS_AT_END:.0f}); set a cell size of {0.7 * state.domain.cell_size_mm:.2g} mm{otherwise}"
