@@ -160,6 +160,22 @@ def test_a_branch_too_narrow_for_its_cells_is_told_of_where_that_matters() -> No
     )
 
 
+def test_blood_too_fast_for_its_cells_is_told_of_but_behind_the_openings() -> None:
+    """Speed x cell / viscosity is 75 there at most, by blood that is computed thicker."""
+    assert "too fast" not in poiseuille().advice
+    fast = FlowCase(tube(), settings=replace(SETTINGS, inflow_mL_s=12.0, cell_size_mm=0.5, max_steps=240))
+    field = simulate_case(fast)
+    z, speed = field.centers_mm[:, 2], np.where(field.centers_mm[:, 2] < 0, 0.0, field.speed_m_s)
+    speed[z > LENGTH_MM] = 0.0
+    reynolds = speed * 0.5e-3 / (0.004 / 1060)
+    said = re.search(r"In (.+) % of the cells of 0.5 mm .*up to (.+) m/s .*up to (.+) times as thick", field.advice)
+    assert said is not None
+    found = [float(number) for number in said.groups()]
+    assert found == pytest.approx([100 * (reynolds > 75).mean(), speed.max(), reynolds.max() / 75], rel=0.05)
+    limit = LatticeBoltzmann(0.5).init(fast, None).limit
+    assert set(limit.tolist()) == {25.0, 75.0}
+
+
 @pytest.mark.parametrize("outlets", ["murray", "zero_pressure"])
 def test_outlets_share_the_flow_as_murray_says_when_asked(outlets: str) -> None:
     vessel = fork()

@@ -7,11 +7,12 @@ import numpy as np
 from scipy import ndimage
 
 from vstent.errors import FlowError
-from vstent.flow.types import FlowCase
+from vstent.flow.types import Blood, FlowCase
 from vstent.kernels import triangles, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 from vstent.kernels.lattice import VELOCITIES
 from vstent.surface import Surface
+from vstent.units import M_PER_MM
 from vstent.vessel import Opening, Vessel
 
 INLET_EXTENSION = 0.5
@@ -110,6 +111,24 @@ def too_narrow(case: FlowCase, cell_size_mm: float) -> str:
     return (
         f" Of cells of {cell_size_mm:.3g} mm, {named} across: with fewer than {BRANCH_CELLS:.0f} a branch resists too "
         "much and takes too little blood; set a smaller cell size, or split the flow by Murray's law."
+    )
+
+
+def too_fast(grid: Domain, speed_m_s: Floats, blood: Blood, most: float) -> str:
+    """Say where blood, its speed (n,) in every cell, is computed thicker than it is; nothing where none is.
+
+    That is where speed x cell / viscosity is more than `most`.
+    """
+    cell_reynolds = speed_m_s * grid.cell_size_mm * M_PER_MM / blood.kinematic_viscosity_m2_s
+    fastest = int(cell_reynolds.argmax())
+    if cell_reynolds[fastest] <= most:
+        return ""
+    share = float((cell_reynolds > most).mean())
+    at_mm = ", ".join(f"{x:.1f}" for x in grid.centers_mm[fastest])
+    return (
+        f" In {100 * share:.2g} % of the cells of {grid.cell_size_mm:.3g} mm blood is too fast for them, up to "
+        f"{speed_m_s[fastest]:.2g} m/s at ({at_mm}) mm, and computed up to {cell_reynolds[fastest] / most:.2g} times "
+        "as thick as it is: set a smaller cell size to see what that changes."
     )
 
 

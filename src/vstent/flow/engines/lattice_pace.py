@@ -21,7 +21,7 @@ FASTER: Final = 1.1
 """The fastest blood over the fastest on the wider cells that it is foretold from."""
 LONGEST: Final = 3.0
 """A pulse's longest time step over its shortest."""
-STORED: Final = 0.01
+STORED: Final = 0.005
 """Part of the flow that a phase with longer steps may store for a moment."""
 MOMENTS: Final = 25
 """Moments of each phase at which the waveform is looked at."""

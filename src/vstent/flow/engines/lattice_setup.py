@@ -18,7 +18,9 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 
 CELL_REYNOLDS_AT_END = 25.0
 """Largest speed x cell / viscosity in the openings' extensions, whose ends are where fast blood becomes unstable first
-(30 to 50 were seen to fail): faster blood is made thicker there. In the vessel there is no limit."""
+(30 to 50 were seen to fail): faster blood is made thicker there."""
+CELL_REYNOLDS: Final = 75.0
+"""The same in the vessel. C0038's systole diverged with 100 in cells of 0.4 mm and with 150 in cells of 0.2 mm."""
 CUT_CELLS = 6
 """Cells at the cuts of a close-up that count as such an extension."""
 PAGE, OFF_PAGE = 1024, 216

@@ -17,6 +17,7 @@ from vstent.flow.close_up import CloseUp
 from vstent.flow.engines import Outcome
 from vstent.flow.engines.lattice_scales import ODD_RATE, Scales
 from vstent.flow.engines.lattice_setup import (
+    CELL_REYNOLDS,
     CELL_REYNOLDS_AT_END,
     Addressing,
     Links,
@@ -193,7 +194,7 @@ def build(
         _probe(case, domain),
         build_refill(domain, addressing),
         build_bands(domain, addressing, links),
-        np.where(is_end, CELL_REYNOLDS_AT_END, np.inf)[addressing.first_cell].astype(np.float32),
+        np.where(is_end, CELL_REYNOLDS_AT_END, CELL_REYNOLDS)[addressing.first_cell].astype(np.float32),
         np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
         pace,
         check_s,
@@ -426,7 +427,7 @@ def field_of(
         blood=state.case.blood,
         is_converged=outcome.is_converged,
         unsettled_fraction=left,
-        advice=advice if state.close_up else advice + domains.too_narrow(state.case, domain.cell_size_mm),
+        advice=advice + _of_the_grid(state, flow, phases),
         residual=np.array(outcome.residual),
         steps=state.steps,
         seconds=outcome.seconds,
@@ -434,6 +435,14 @@ def field_of(
         phases=phases,
     )
     return field if state.close_up is None else close_ups.assembled(state.close_up, field)
+
+
+def _of_the_grid(state: State, flow: Reading, phases: tuple[Phase, ...]) -> str:
+    """Say where the cells are too wide for the vessel (in a close-up those around it are, if any) or for the flow."""
+    narrow = "" if state.close_up else domains.too_narrow(state.case, state.domain.cell_size_mm)
+    is_vessel = np.repeat(state.limit, state.addressing.length) > CELL_REYNOLDS_AT_END
+    speed_m_s = np.max([np.linalg.norm(moment.velocity_m_s, axis=1) for moment in phases or (flow,)], axis=0)
+    return narrow + domains.too_fast(state.domain, np.where(is_vessel, speed_m_s, 0.0), state.case.blood, CELL_REYNOLDS)
 
 
 def _section_pressure_Pa(state: State, pressure_Pa: Floats, k: int) -> float:

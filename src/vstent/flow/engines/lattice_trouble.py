@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vstent.flow.engines.lattice_setup import CELL_REYNOLDS_AT_END
+from vstent.flow.engines.lattice_setup import CELL_REYNOLDS, CELL_REYNOLDS_AT_END
 from vstent.flow.engines.lattice_state import Snapshot, State
 from vstent.kernels import lattice
 from vstent.kernels.arrays import Floats
@@ -46,8 +46,9 @@ def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
     otherwise = "" if state.close_up is None else ", or leave out --close-up (close_up)"
     cell_reynolds = speed[fastest] / last.scales.viscosity
     return (
-        f"the grid is too coarse for it (speed x cell / viscosity = {cell_reynolds:.0f}, in the openings' extensions "
-        f"at most {CELL_REYNOLDS_AT_END:.0f}); set a cell size of {0.7 * state.domain.cell_size_mm:.2g} mm{otherwise}"
+        f"the grid is too coarse for it (speed x cell / viscosity = {cell_reynolds:.0f}, while blood is computed "
+        f"thicker from {CELL_REYNOLDS:.0f} on, behind openings from {CELL_REYNOLDS_AT_END:.0f}); "
+        f"set a cell size of {0.7 * state.domain.cell_size_mm:.2g} mm{otherwise}"
     )
 
 
