@@ -50,7 +50,7 @@ COARSE_SHARE = 0.12
 OUTER_SHARE = 0.35
 """Part of the whole time that the flow around a close-up takes, for the progress."""
 
-CALMER_TRIES = 2
+CALMER_TRIES = 3
 """Times that a run which diverged is tried again with a shorter time step."""
 
 OnProgress = Callable[[Progress], None]

@@ -36,7 +36,7 @@ CHECKS_APART = 3
 SHARE_OF_FIELD = 0.5
 """What means have left to go, at most, over what the field has (behind Silk and Enterprise: 0.1 to 0.5)."""
 
-SLOWER: Final = 0.3
+SLOWER: Final = 0.5
 """A run that diverged is tried once more with a time step so much shorter."""
 
 
