@@ -46,6 +46,8 @@ DEFER_PAIRS = 8
 """Step pairs between updates of what is deferred."""
 DEFER_PART = 0.15
 """Part of the way that each update goes."""
+TOO_FAST = 0.75
+"""Speed over the sound's from which a result is not to be trusted: at that speed a tube loses a tenth of its blood."""
 SLICE_UPDATES = 2e8
 """Cell updates between looks at the clock: a few seconds of one core."""
 
@@ -247,6 +249,11 @@ def step(state: State) -> None:
 def is_at_check(state: State) -> bool:
     """Whether the last steps ended at a check."""
     return state.since_check == 0
+
+
+def is_lost(state: State) -> bool:
+    """Whether, at a check, the run has diverged, or its blood is so near the lattice's sound that it is no flow."""
+    return not np.abs(state.snapshots[-1].velocity).max() < TOO_FAST * lattice.SOUND  # which nan is not either
 
 
 def _keep_pace(state: State) -> None:
