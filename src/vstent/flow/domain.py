@@ -13,7 +13,7 @@ from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 from vstent.kernels.lattice import VELOCITIES
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
-from vstent.vessel import Opening, Vessel
+from vstent.vessel import Vessel
 
 INLET_EXTENSION = 0.5
 """Length of the straight tube before the inlet, in inlet diameters: the imposed profile is developed already."""
@@ -124,11 +124,11 @@ def too_fast(grid: Domain, speed_m_s: Floats, blood: Blood, most: float) -> str:
     if cell_reynolds[fastest] <= most:
         return ""
     share = float((cell_reynolds > most).mean())
-    at_mm = ", ".join(f"{x:.1f}" for x in grid.centers_mm[fastest])
     return (
         f" In {100 * share:.2g} % of the cells of {grid.cell_size_mm:.3g} mm blood is too fast for them, up to "
-        f"{speed_m_s[fastest]:.2g} m/s at ({at_mm}) mm, and computed up to {cell_reynolds[fastest] / most:.2g} times "
-        "as thick as it is: set a smaller cell size to see what that changes."
+        f"{speed_m_s[fastest]:.2g} m/s at {place(grid.centers_mm[fastest])}, and computed up to "
+        f"{cell_reynolds[fastest] / most:.2g} times as thick as it is: set a smaller cell size to see what that "
+        "changes."
     )
 
 
@@ -161,8 +161,9 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
     cells = np.argwhere(inside).astype(np.int32)
     if len(cells) < MIN_CELLS:
         raise FlowError(
-            f"only {len(cells)} cells of {cell_size_mm:.3g} mm connect to the inlet at {_place(vessel.inlet)}: "
-            "the grid is too coarse for this vessel or the inlet is blocked; set a smaller cell size"
+            f"only {len(cells)} cells of {cell_size_mm:.3g} mm connect to the inlet at "
+            f"{place(vessel.inlet.center_mm)}: the grid is too coarse for this vessel or the inlet is "
+            "blocked; set a smaller cell size"
         )
     index = np.full(inside.shape, -1, dtype=np.int32)
     index[inside] = np.arange(len(cells), dtype=np.int32)
@@ -187,8 +188,9 @@ def _largest(inside: Bools) -> Bools:
     return np.asarray(label == 1 + np.bincount(label.ravel())[1:].argmax())
 
 
-def _place(opening: Opening) -> str:
-    return "(" + ", ".join(f"{x:.1f}" for x in opening.center_mm) + ") mm"
+def place(point_mm: Floats) -> str:
+    """Say where a point (3,) is."""
+    return "(" + ", ".join(f"{x:.1f}" for x in point_mm) + ") mm"
 
 
 def _connected(
@@ -202,7 +204,8 @@ def _connected(
     found = label[tuple(index.T)]
     found = found[found > 0]
     if len(found) == 0:
-        raise FlowError(f"no blood behind the inlet at {_place(vessel.inlet)}: check that the inlet is an open end")
+        at = place(vessel.inlet.center_mm)
+        raise FlowError(f"no blood behind the inlet at {at}: check that the inlet is an open end")
     return label == np.bincount(found).argmax()
 
 

@@ -13,7 +13,7 @@ from vstent.flow.cost import estimate, refuse_too_large
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.engines.lattice_checkpoint import pack, unpack
 from vstent.flow.engines.lattice_pace import longest_step_s, peak_speed_m_s
-from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, is_lost, read, step
+from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, read, step
 from vstent.flow.engines.lattice_trouble import trouble
 from vstent.flow.gpu import require_gpu
 from vstent.flow.types import FlowCase, FlowField
@@ -100,7 +100,7 @@ class LatticeBoltzmann(AbstractLattice):
         """Fraction that the monitored quantities have left to go, the worst of the last checks."""
         if not is_at_check(state):
             return None
-        if is_lost(state):
+        if state.snapshots[-1].is_lost:
             return float("nan")
         history = np.array(state.history)
         agreeing = range(min(CHECKS_AGREEING, len(history)))

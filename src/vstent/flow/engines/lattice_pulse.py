@@ -8,7 +8,7 @@ import numpy as np
 from vstent.flow.engines import Outcome
 from vstent.flow.engines.lattice_boltzmann import AbstractLattice
 from vstent.flow.engines.lattice_pace import pace, waveform_of
-from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, is_lost, read
+from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, read
 from vstent.flow.types import PHASES, FlowCase, FlowField, Phase
 from vstent.kernels.arrays import Floats
 
@@ -30,7 +30,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
         """Relative change of the monitored quantities from the last cycle but one to the last; inf within a cycle."""
         if not is_at_check(state):
             return None
-        return float("nan") if is_lost(state) else cycle_change(np.array(state.history))
+        return float("nan") if state.snapshots[-1].is_lost else cycle_change(np.array(state.history))
 
     def max_checks(self, state: State) -> int:
         """Phases of all cycles allowed."""

@@ -92,6 +92,11 @@ class Snapshot:
         """(k,) through every end."""
         return self.outflow * self.scales.flow_mL_s
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether the run has diverged, or its blood is so near the lattice's sound that it is no flow."""
+        return not np.abs(self.velocity).max() < TOO_FAST * lattice.SOUND  # which nan is not either
+
 
 @dataclass(eq=False)
 class State:
@@ -249,11 +254,6 @@ def step(state: State) -> None:
 def is_at_check(state: State) -> bool:
     """Whether the last steps ended at a check."""
     return state.since_check == 0
-
-
-def is_lost(state: State) -> bool:
-    """Whether, at a check, the run has diverged, or its blood is so near the lattice's sound that it is no flow."""
-    return not np.abs(state.snapshots[-1].velocity).max() < TOO_FAST * lattice.SOUND  # which nan is not either
 
 
 def _keep_pace(state: State) -> None:

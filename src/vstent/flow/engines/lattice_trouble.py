@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from vstent.flow.domain import place
 from vstent.flow.engines.lattice_setup import CELL_REYNOLDS, CELL_REYNOLDS_AT_END
 from vstent.flow.engines.lattice_state import Snapshot, State
-from vstent.kernels import lattice
 from vstent.kernels.arrays import Floats
 
 FAST = 0.3
@@ -13,7 +13,7 @@ FAST = 0.3
 
 def trouble(state: State) -> str:
     """One sentence: what happened, the last good state, the likeliest cause and what to do about it."""
-    good = [one for one in state.snapshots if np.abs(one.velocity).max() < lattice.SOUND]  # faster is no flow
+    good = [one for one in state.snapshots if not one.is_lost]
     when_ms = 1e3 * state.time_s
     if not good:
         return (
@@ -27,7 +27,7 @@ def trouble(state: State) -> str:
     good_ms = when_ms - 1e3 * behind * state.check_s
     return (
         f"the flow diverged between {good_ms:.3g} and {when_ms:.3g} ms; at the last good check the fastest blood moved "
-        f"{speed[fastest] * last.scales.speed_m_s:.2g} m/s at {_place(state.domain.centers_mm[fastest])}: "
+        f"{speed[fastest] * last.scales.speed_m_s:.2g} m/s at {place(state.domain.centers_mm[fastest])}: "
         + _cause(state, last, speed, fastest)
     )
 
@@ -56,7 +56,3 @@ def _backflow(state: State, last: Snapshot, k: int) -> float:
     """Fastest blood that enters through outlet k, in cells a step."""
     cell = state.domain.link_cell[state.domain.link_patch == k + 1]
     return float(-(last.velocity[cell] @ state.case.vessel.openings[k].normal).min()) if len(cell) else 0.0
-
-
-def _place(point_mm: Floats) -> str:
-    return "(" + ", ".join(f"{x:.1f}" for x in point_mm) + ") mm"
