@@ -11,8 +11,11 @@ import pytest
 from vstent import flow, phantoms
 from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, domain, sampling, simulate_case
 from vstent.flow.engines import AbstractEngine, Outcome, run
-from vstent.flow.engines.lattice_boltzmann import CHECKS_AVERAGED, LatticeBoltzmann, swings
+from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
+from vstent.flow.engines.lattice_settling import mean_of, swings, with_check
+from vstent.flow.engines.lattice_state import State
 from vstent.kernels import lattice
+from vstent.kernels.arrays import Floats
 from vstent.trace import trace
 from vstent.vessel import Vessel
 
@@ -73,22 +76,60 @@ def test_wall_shear_stress_is_poiseuilles() -> None:
     assert np.abs(stress[:, 2] / expected - 1).max() < 0.03
 
 
-@pytest.mark.parametrize("is_converged", [True, False])
-def test_a_flow_that_does_not_settle_is_the_mean_of_its_last_checks(is_converged: bool) -> None:
+def unsettled(checks: int) -> tuple[LatticeBoltzmann, State, list[Floats]]:
+    """A run from rest, far from its end, and the velocity at each of its checks."""
     engine = LatticeBoltzmann(0.4)
     state = engine.init(FlowCase(tube(), settings=replace(SETTINGS, max_steps=480)), None)
     seen = []
-    for _ in range(CHECKS_AVERAGED + 3):
+    for _ in range(checks):
         state = engine.step(state)
         moments = lattice.moments(state.populations, state.addressing.stride, state.addressing.place)
         seen.append(moments[:, 1:] * state.scales.speed_m_s)
-    field = engine.result(state, Outcome(is_converged, (0.5,), 1.0, 1.0))
-    expected = seen[-1] if is_converged else np.mean(seen[-CHECKS_AVERAGED:], axis=0)
-    np.testing.assert_allclose(field.velocity_m_s, expected, atol=1e-6)
-    assert np.abs(seen[-1] - expected).max() > 0.001 or is_converged
-    assert ("settled in" in field.advice) == (not is_converged)
-    left = 0.5 if is_converged else max(swings(np.array(state.history)))
-    assert field.unsettled_fraction == pytest.approx(left)
+    return engine, state, seen
+
+
+def test_a_flow_that_does_not_settle_is_the_mean_of_its_last_checks() -> None:
+    engine, state, seen = unsettled(11)
+    assert [block.checks for block in state.blocks] == [2, 2, 2, 2, 2, 1]
+    field = engine.result(state, Outcome(False, (0.5,), 1.0, 1.0))
+    np.testing.assert_allclose(field.velocity_m_s, np.mean(seen[-9:], axis=0), atol=1e-6)
+    assert np.abs(seen[-1] - field.velocity_m_s).max() > 0.001
+    assert "has not settled in" in field.advice
+    assert field.unsettled_fraction == pytest.approx(np.nanmax(swings(np.array(state.history), 9)))
+
+
+def test_a_flow_that_has_settled_is_its_last_check() -> None:
+    engine, state, seen = unsettled(11)
+    state.history = [state.history[-1]] * 12
+    state.snapshots.extend([state.snapshots[-1]] * 7)
+    field = engine.result(state, Outcome(True, (1e-3,), 1.0, 1.0))
+    np.testing.assert_allclose(field.velocity_m_s, seen[-1], atol=1e-6)
+    assert "has settled" in field.advice
+    assert field.unsettled_fraction == 0.0
+
+
+def test_a_flow_that_swings_is_its_mean_once_that_is_known() -> None:
+    """Its speed is made to swing by 2 % about 1 with a period of 5.5 checks."""
+    engine, state, _ = unsettled(3)
+    still = state.snapshots[-1]
+    state.history, state.blocks, left, speeds = [], (), [], []
+    for k in range(80):
+        speeds.append(1 + 0.02 * np.sin(2 * np.pi * k / 5.5))
+        state.history.append(speeds[-1] * np.ones(3))
+        now = replace(still, velocity=np.float32(speeds[-1]) * still.velocity)
+        state.snapshots.append(now)
+        state.blocks = with_check(state.blocks, now)
+        left.append(engine.terminate(state))
+    known = next(k for k, one in enumerate(left) if one < state.case.settings.tolerance)
+    assert 24 <= known + 1 < 40
+    field = engine.result(state, Outcome(True, tuple(left), 1.0, 1.0))
+    mean = mean_of(state.blocks, np.array(state.history), state.probe.cells)
+    assert mean.checks >= 40
+    factor = np.mean(speeds[-mean.checks :])
+    np.testing.assert_allclose(field.velocity_m_s, factor * still.velocity_m_s, atol=1e-6)
+    assert factor == pytest.approx(1.0, abs=mean.uncertainty)
+    assert field.unsettled_fraction == pytest.approx(mean.uncertainty)
+    assert "The flow goes on moving about its mean: these are means over its last" in field.advice
 
 
 def disc(resistance_Pa_s_m: float) -> Screen:

@@ -11,7 +11,9 @@ from vstent import device
 from vstent.errors import FlowError
 from vstent.flow import Blood, FlowCase, FlowSettings, domain, screen
 from vstent.flow.engines import AbstractEngine, run
-from vstent.flow.engines.lattice_boltzmann import field_left, fraction_left, swings
+from vstent.flow.engines.lattice_scales import Scales
+from vstent.flow.engines.lattice_settling import field_left, fraction_left, mean_of, standard_error, swings, with_check
+from vstent.flow.engines.lattice_state import Snapshot
 from vstent.flow.profile import developed_profile
 from vstent.flow.screen import (
     CROSSING_PER_SOLIDITY,
@@ -229,10 +231,47 @@ def test_what_is_left_of_a_swing_is_neither_missed_nor_mistaken(period: float) -
 def test_a_mean_is_told_with_what_it_ranges_over_and_how_it_moves() -> None:
     time = np.arange(40.0)
     drift, wave = 2.0 + 0.01 * time, 5.0 + 0.5 * np.cos(np.pi * time / 4)  # eight checks: a whole period
-    swing, moved = swings(np.stack([drift, wave], axis=1))
+    swing, moved = swings(np.stack([drift, wave], axis=1), 8)
     assert swing == pytest.approx(1.0 / 5.0)
     assert moved == pytest.approx(0.08 / drift[-8:].mean())
-    assert np.isnan(swings(drift[:12, None])[1])
+    assert np.isnan(swings(drift[:12, None], 8)[1])
+
+
+def test_the_mean_of_what_swings_is_told_with_its_error() -> None:
+    """Of an autoregressive swing it is known: the mean lies within two standard errors in 95 of a hundred runs."""
+    rng, keep, checks = np.random.default_rng(7), 0.6, 200
+    runs = np.zeros((checks, 400))
+    runs[0] = rng.normal(size=400)
+    for k in range(1, checks):
+        runs[k] = keep * runs[k - 1] + np.sqrt(1 - keep**2) * rng.normal(size=400)
+    true = 0.1 * np.sqrt((1 + keep) / (1 - keep) / checks)
+    found = np.array([standard_error(1 + 0.1 * run[:, None]) for run in runs.T])
+    assert np.median(found) == pytest.approx(true, rel=0.25)
+    assert (np.abs(0.1 * runs.mean(axis=0)) < 2 * found).mean() > 0.9
+    assert standard_error(1 + 0.1 * runs[:23, :1]) == np.inf
+
+
+def test_what_drifts_has_no_mean() -> None:
+    """Its whole range is what it is unsure by, although its batches differ by little, and though it swings as well."""
+    time = np.arange(60.0)
+    drift = 1 + 0.1 * np.exp(-time / 40)
+    assert standard_error(drift[:, None]) == pytest.approx(np.ptp(drift) / drift.mean())
+    swinging = drift + 0.02 * np.sin(time)
+    assert standard_error(swinging[:, None]) > 0.2 * np.ptp(drift)
+
+
+def test_a_vortex_that_creeps_has_no_mean_though_its_speed_has() -> None:
+    blocks: tuple[Snapshot, ...] = ()
+    scales, checks = Scales(1e-4, 1e-5, Blood()), 64
+    for angle in np.linspace(0.0, 0.4, checks):
+        velocity = np.array([[np.cos(angle), np.sin(angle), 0.0], [9.0, 9.0, 9.0]], np.float32)
+        blocks = with_check(blocks, Snapshot(scales, velocity, np.zeros(2, np.float32), np.zeros(1)))
+    assert sum(block.checks for block in blocks) == checks
+    still = np.ones((checks, 2))
+    assert standard_error(still) == 0.0
+    # The last half turns from 0.2 to 0.4: its halves' means are 0.1 apart, and what is told is a tenth of half of it.
+    assert mean_of(blocks, still, np.array([0])).standard_error == pytest.approx(0.005, rel=0.02)
+    assert mean_of(blocks, still, np.array([1])).standard_error == 0.0
 
 
 def test_what_a_field_has_left_is_told_where_its_mean_speed_turns() -> None:

@@ -67,6 +67,11 @@ def test_a_pulse_that_begins_from_a_coarser_one_soon_repeats(monkeypatch: pytest
     assert pulsing.__wrapped__().residual[second] < 0.05 * at_rest.residual[second]
 
 
+def fast(speed_m_s: np.ndarray) -> float:
+    """What all but a thousandth keep below."""
+    return float(np.quantile(speed_m_s, 0.999))
+
+
 SWING_OF_HALF = Waveform(1.0, (0.5,), (0.0,))
 
 
@@ -74,7 +79,7 @@ def steps_of(waveform: Waveform, speed_m_s: np.ndarray | None, way_mm: float = 1
     """Steps of every phase of a pulse whose blood is that fast at the end of each; None: that is not known."""
     field = pulsing()
     case = FlowCase(trace(Vessel(field.wall)), settings=FlowSettings(waveform=waveform, lattice_speed=0.05))
-    fastest_m_s = np.array([np.linalg.norm(phase.velocity_m_s, axis=1).max() for phase in field.phases])
+    fastest_m_s = np.array([fast(np.linalg.norm(phase.velocity_m_s, axis=1)) for phase in field.phases])
     phases = [] if speed_m_s is None else zip(field.phases, speed_m_s / fastest_m_s, strict=True)
     known = replace(field, phases=tuple(replace(phase, velocity_m_s=s * phase.velocity_m_s) for phase, s in phases))
     with pytest.MonkeyPatch.context() as patch:
@@ -100,7 +105,7 @@ def test_time_steps_go_by_the_fastest_blood_of_their_phase() -> None:
 def test_where_no_cycle_is_known_blood_is_faster_as_the_flow_is_and_goes_on_for_a_phase() -> None:
     flow = 1 + 0.5 * np.cos(2 * np.pi * np.arange(PHASES + 1) / PHASES)
     within = np.maximum(flow[1:], flow[:-1])
-    expected = 1.1 * pulsing().speed_m_s.max() * np.maximum(within, np.roll(within, 1)) / PHASES / (0.05 * 0.25e-3)
+    expected = 1.1 * fast(pulsing().speed_m_s) * np.maximum(within, np.roll(within, 1)) / PHASES / (0.05 * 0.25e-3)
     found = steps_of(SWING_OF_HALF, None)
     np.testing.assert_allclose(found, np.maximum(expected, expected.max() / 3), atol=2.01)
 

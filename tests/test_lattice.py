@@ -10,7 +10,7 @@ from vstent import phantoms
 from vstent.flow import FlowCase, FlowSettings
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_scales import ODD_RATE as VESSEL_ODD_RATE
-from vstent.flow.engines.lattice_setup import address, build_bands, build_links, in_extensions, parabolic_weights
+from vstent.flow.engines.lattice_setup import address, build_bands, build_links, parabolic_weights, thickest
 from vstent.kernels import lanes, lattice, lattice_sampling, voxels
 from vstent.kernels.collision import squared_reach
 from vstent.trace import trace
@@ -88,7 +88,7 @@ def test_a_band_is_done_when_all_that_it_needs_is(threads):
     state.populations[:] = 0.01 * rng.normal(size=state.populations.size)
     state.refill.refill[:] = 0.01 * rng.normal(size=state.refill.refill.size)
     domain, refill = with_septa(state.domain, rng), state.refill
-    a = address(domain, in_extensions(case, domain))
+    a = address(domain, thickest(case, domain))
     links = build_links(case, domain, a, state.scales, None)
     links.source[:] = 0.01 * rng.normal(size=links.source.size)
     all_bands = build_bands(domain, a, links)

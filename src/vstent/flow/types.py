@@ -114,8 +114,8 @@ class FlowSettings:
     """Most cells of the vessel, where no cell size is given."""
     tolerance: float = 0.01
     """Converged when every monitored quantity has less than this fraction of itself left to go, and the sac's velocity
-    less than twice that (root mean square)."""
-    max_steps: int = 24_000
+    less than twice that (root mean square); where they swing, when the standard error of every mean is less."""
+    max_steps: int = 48_000
     """Most time steps on the fine grid."""
     lattice_speed: float = 0.15
     """Peak speed in cells per time step: sets the time step. Of steady flow the grid's error, not the time step's, is
@@ -254,11 +254,11 @@ class FlowField:
     blood: Blood
     """The fluid."""
     is_converged: bool
-    """Whether every monitored quantity has settled to within the tolerance."""
+    """Whether every monitored quantity, or the mean that it swings about, has settled to within the tolerance."""
     unsettled_fraction: float
-    """What any monitored quantity has left to go at most, as a fraction of it. Where it swings about a mean, what it
-    ranges over, or how far the mean has moved, if that is more; of a pulse, what its last two cycles differ by (rms);
-    inf where there is a single one."""
+    """What any monitored quantity has left to go at most, as a fraction of it. Where it swings, three standard errors
+    of its mean; after too few checks to tell, what it ranges over, or how far its mean has moved, if that is more. Of a
+    pulse, what its last two cycles differ by (rms); inf where there is a single one."""
     advice: str
     """One plain sentence: what to know or do about this result."""
     residual: Floats

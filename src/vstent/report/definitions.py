@@ -188,7 +188,8 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "unsettled_fraction": Definition(
         "Left to settle",
         "What the sac's mean speed, neck inflow, inlet pressure or the vessel's mean speed has left to go; where they "
-        "swing, what they range over or how far their mean has moved; of a pulse, what its last two cycles differ by.",
+        "swing, three standard errors of their means, or what they range over if checks are too few to tell; of a "
+        "pulse, what its last two cycles differ by.",
     ),
 }
 

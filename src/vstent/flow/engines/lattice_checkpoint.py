@@ -1,12 +1,14 @@
 """A lattice-Boltzmann run as arrays, and going on from them as if it had never stopped."""
 
 from collections import deque
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from vstent.flow.close_up import CloseUp
 from vstent.flow.engines import Saved
+from vstent.flow.engines.lattice_scales import Scales
 from vstent.flow.engines.lattice_state import Snapshot, State, build, take_pace
 from vstent.flow.types import FlowCase
 
@@ -15,12 +17,10 @@ def pack(state: State) -> Saved:
     """All of a run that its case and grid do not say."""
     if state.device is not None:
         state.device.fetch(state)
-    snapshots = state.snapshots
-    n = len(state.domain.cells)
     return {
         "check_s": np.array(state.check_s),
         "pace": state.pace,
-        "kept": np.array(snapshots.maxlen or 0),
+        "kept": np.array(state.snapshots.maxlen or 0),
         "steps": np.array(state.steps),
         "since_check": np.array(state.since_check),
         "loop_seconds": np.array(state.loop_seconds),
@@ -29,11 +29,28 @@ def pack(state: State) -> Saved:
         "openings": state.links.openings,
         "refill": state.refill.refill,
         "history": np.array(state.history),
-        "step_s": np.array([one.scales.step_s for one in snapshots]),
-        "velocity": np.array([one.velocity for one in snapshots], np.float32).reshape(len(snapshots), n, 3),
-        "density": np.array([one.density for one in snapshots], np.float32).reshape(len(snapshots), n),
-        "outflow": np.array([one.outflow for one in snapshots]),
+        **_columns("last", state.snapshots, len(state.domain.cells)),
+        **_columns("means", state.blocks, len(state.domain.cells)),
     }
+
+
+def _columns(name: str, snapshots: Collection[Snapshot], cells: int) -> Saved:
+    """Snapshots as arrays of this name."""
+    count = len(snapshots)
+    return {
+        f"{name} step_s": np.array([one.scales.step_s for one in snapshots]),
+        f"{name} velocity": np.array([one.velocity for one in snapshots], np.float32).reshape(count, cells, 3),
+        f"{name} density": np.array([one.density for one in snapshots], np.float32).reshape(count, cells),
+        f"{name} outflow": np.array([one.outflow for one in snapshots]),
+        f"{name} checks": np.array([one.checks for one in snapshots]),
+    }
+
+
+def _snapshots(name: str, saved: Saved, scales: Scales) -> Iterator[Snapshot]:
+    """The snapshots saved by this name."""
+    columns = (saved[f"{name} {what}"] for what in ("step_s", "velocity", "density", "outflow", "checks"))
+    for step_s, velocity, density, outflow, checks in zip(*columns, strict=True):
+        yield Snapshot(replace(scales, step_s=float(step_s)), velocity, density, outflow, int(checks))
 
 
 def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp | None) -> State:
@@ -46,9 +63,8 @@ def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp 
     state.links.source[:] = saved["source"]
     state.links.openings[:] = saved["openings"]
     state.refill.refill[:] = saved["refill"]
-    units = [replace(state.scales, step_s=float(step_s)) for step_s in saved["step_s"]]
-    columns = units, saved["velocity"], saved["density"], saved["outflow"]
-    state.snapshots = deque((Snapshot(*one) for one in zip(*columns, strict=True)), maxlen=kept)
+    state.snapshots = deque(_snapshots("last", saved, state.scales), maxlen=kept)
+    state.blocks = tuple(_snapshots("means", saved, state.scales))
     state.steps, state.since_check = int(saved["steps"]), int(saved["since_check"])
     state.loop_seconds = float(saved["loop_seconds"])
     return state

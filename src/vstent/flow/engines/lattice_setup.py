@@ -23,6 +23,11 @@ CELL_REYNOLDS: Final = 75.0
 """The same in the vessel. C0038's systole diverged with 100 in cells of 0.4 mm and with 150 in cells of 0.2 mm."""
 CUT_CELLS = 6
 """Cells at the cuts of a close-up that count as such an extension."""
+CELL_REYNOLDS_IN_CUT: Final = 5.0
+"""The same in a cut's own cells: in the few between it and the wall what moves would grow (C0038 at systole: tenfold in
+60 steps)."""
+CELLS_IN_CUT: Final = 2
+"""How many cells deep those are."""
 PAGE, OFF_PAGE = 1024, 216
 """Numbers in 4096 bytes, and by how many more than whole pages of them a cell's populations lie apart: a cache has the
 same few places for what is whole pages apart, and nineteen such runs at once would take a quarter longer."""
@@ -153,16 +158,20 @@ def in_extensions(case: FlowCase, domain: Domain) -> Bools:
     return result
 
 
-def at_cuts(case: FlowCase, domain: Domain) -> Bools:
-    """Whether every cell (n,) of a close-up lies beside a cut."""
+def thickest(case: FlowCase, domain: Domain) -> NDArray[np.float32]:
+    """Largest cell Reynolds number (n,) of every cell: faster blood is computed thicker."""
+    limit = np.where(in_extensions(case, domain), CELL_REYNOLDS_AT_END, CELL_REYNOLDS)
     cut = np.zeros(domain.cells.max(axis=0) + 2, dtype=bool)
     cut[tuple(domain.cells[domain.link_cell[domain.link_patch > len(case.vessel.openings)]].T)] = True
-    near = ndimage.binary_dilation(cut, ndimage.generate_binary_structure(3, 3), CUT_CELLS) if cut.any() else cut
-    return np.asarray(near[tuple(domain.cells.T)])
+    for cells, most in ((CUT_CELLS, CELL_REYNOLDS_AT_END), (CELLS_IN_CUT, CELL_REYNOLDS_IN_CUT)):
+        if cut.any():
+            near = ndimage.binary_dilation(cut, ndimage.generate_binary_structure(3, 3), cells)
+            limit[near[tuple(domain.cells.T)]] = most
+    return limit.astype(np.float32)
 
 
-def address(domain: Domain, is_end: Bools) -> Addressing:
-    """Lay out the populations of a domain; no segment spans cells where `is_end` (n,) differs."""
+def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
+    """Lay out the populations of a domain; no segment spans cells where `limit` (n,) differs (see `thickest`)."""
     cells = domain.cells
     inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
     inside[tuple(cells.T)] = True
@@ -172,7 +181,7 @@ def address(domain: Domain, is_end: Bools) -> Addressing:
     stride = count + (OFF_PAGE - count) % PAGE
     number[stored] = np.arange(count, dtype=np.int32)
     place = number[tuple(cells.T)]
-    is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(is_end) != 0)
+    is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(limit) != 0)
     first: Ints = np.flatnonzero(np.r_[True, is_new])
     length = np.diff(np.r_[first, len(cells)])
     first, length = _cut(first, length)

@@ -1,7 +1,7 @@
 """The lattice-Boltzmann run itself: built from a case, advanced from check to check, read out in SI units."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import TYPE_CHECKING
@@ -18,18 +18,16 @@ from vstent.flow.engines import Outcome
 from vstent.flow.engines.lattice_scales import ODD_RATE, Scales
 from vstent.flow.engines.lattice_setup import (
     CELL_REYNOLDS,
-    CELL_REYNOLDS_AT_END,
     Addressing,
     Links,
     Refill,
     ScreenEntries,
     address,
-    at_cuts,
     build_bands,
     build_links,
     build_refill,
     build_screen,
-    in_extensions,
+    thickest,
 )
 from vstent.flow.gpu import require_gpu, told
 from vstent.flow.types import FlowCase, FlowField, Phase
@@ -66,7 +64,7 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The flow at a check, in lattice units."""
+    """The flow at a check, or its mean over some, in lattice units."""
 
     scales: Scales
     """These units."""
@@ -76,6 +74,19 @@ class Snapshot:
     """(n,) deviation of every cell."""
     outflow: Floats
     """(k,) through every end."""
+    checks: int = 1
+    """Checks that it is the mean of."""
+
+    def and_also(self, other: "Snapshot") -> "Snapshot":
+        """Return the mean of this and another, each counting as many times as it has checks; units are alike."""
+        share = np.float32(other.checks / (self.checks + other.checks))
+        return Snapshot(
+            self.scales,
+            self.velocity + share * (other.velocity - self.velocity),
+            self.density + share * (other.density - self.density),
+            self.outflow + share * (other.outflow - self.outflow),
+            self.checks + other.checks,
+        )
 
     @property
     def velocity_m_s(self) -> NDArray[np.float32]:
@@ -137,6 +148,8 @@ class State:
     """Time between checks."""
     snapshots: deque[Snapshot]
     """The flow at the last checks."""
+    blocks: tuple[Snapshot, ...] = ()
+    """Its means over all checks of a steady run, block by block."""
     steps: int = 0
     """Time steps made."""
     since_check: int = 0
@@ -185,8 +198,8 @@ def build(
         domain = domains.build(case.vessel, cell_size_mm)
     else:
         domain = close_ups.build(case, cell_size_mm, close_up)
-    is_end = in_extensions(case, domain) | at_cuts(case, domain)
-    addressing = address(domain, is_end)
+    limit = thickest(case, domain)
+    addressing = address(domain, limit)
     links = build_links(case, domain, addressing, scales, close_up)
     screen = build_screen(case, domain, addressing, scales)
     state = State(
@@ -201,7 +214,7 @@ def build(
         _probe(case, domain),
         build_refill(domain, addressing),
         build_bands(domain, addressing, links),
-        np.where(is_end, CELL_REYNOLDS_AT_END, CELL_REYNOLDS)[addressing.first_cell].astype(np.float32),
+        limit[addressing.first_cell],
         np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
         pace,
         check_s,
@@ -400,14 +413,19 @@ class Reading:
 def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     """Return the mean of some snapshots in SI units, with the stress on the wall."""
     domain = state.domain
-    velocity_m_s = np.mean([one.velocity_m_s for one in snapshots], axis=0, dtype=float)
-    pressure_Pa = np.mean([one.pressure_Pa for one in snapshots], axis=0, dtype=float)
+    share = np.array([one.checks for one in snapshots]) / sum(one.checks for one in snapshots)
+
+    def mean(values: Iterable[Floats | NDArray[np.float32]]) -> Floats:
+        return np.asarray(sum(part * value for part, value in zip(share, values, strict=True)))
+
+    velocity_m_s = mean(one.velocity_m_s for one in snapshots)
+    pressure_Pa = mean(one.pressure_Pa for one in snapshots)
     stress_Pa, wall_pressure_Pa = wall_stress(
         domain, velocity_m_s, pressure_Pa, lumen=state.case.vessel.lumen, blood=state.case.blood
     )
     outflow_mL_s = np.full(len(state.case.vessel.openings), np.nan)
     is_opening = state.links.patch <= len(outflow_mL_s)
-    through = np.mean([one.outflow_mL_s for one in snapshots], axis=0)
+    through = mean(one.outflow_mL_s for one in snapshots)
     outflow_mL_s[state.links.patch[is_opening] - 1] = through[is_opening]
     return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, outflow_mL_s)
 
@@ -447,7 +465,7 @@ def field_of(
 def _of_the_grid(state: State, flow: Reading, phases: tuple[Phase, ...]) -> str:
     """Say where the cells are too wide for the vessel (in a close-up those around it are, if any) or for the flow."""
     narrow = "" if state.close_up else domains.too_narrow(state.case, state.domain.cell_size_mm)
-    is_vessel = np.repeat(state.limit, state.addressing.length) > CELL_REYNOLDS_AT_END
+    is_vessel = np.repeat(state.limit, state.addressing.length) == CELL_REYNOLDS
     speed_m_s = np.max([np.linalg.norm(moment.velocity_m_s, axis=1) for moment in phases or (flow,)], axis=0)
     return narrow + domains.too_fast(state.domain, np.where(is_vessel, speed_m_s, 0.0), state.case.blood, CELL_REYNOLDS)
 

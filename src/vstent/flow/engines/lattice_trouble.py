@@ -7,7 +7,7 @@ from vstent.flow.engines.lattice_setup import CELL_REYNOLDS, CELL_REYNOLDS_AT_EN
 from vstent.flow.engines.lattice_state import Snapshot, State
 from vstent.kernels.arrays import Floats
 
-FAST = 0.3
+FAST = 0.4
 """Speed from which the sound is too near."""
 
 

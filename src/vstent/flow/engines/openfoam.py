@@ -16,8 +16,8 @@ from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow import sampling
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
-from vstent.flow.engines.lattice_boltzmann import CHECKS_AGREEING, CHECKS_AVERAGED, fraction_left
 from vstent.flow.engines.lattice_pulse import cycle_change
+from vstent.flow.engines.lattice_settling import quantities_left
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
@@ -31,6 +31,8 @@ from vstent.surface import Surface
 
 CHECK_ITERATIONS: Final = 50
 """Iterations of a steady flow between checks."""
+CHECKS_AVERAGED: Final = 8
+"""Checks whose mean is the result where a steady flow does not settle."""
 CHECKS_HELD: Final = 3
 """Checks at which the inflow is corrected for the inlet's meshed area."""
 
@@ -130,7 +132,7 @@ class OpenFoam(AbstractEngine[State]):
             return cycle_change(history)
         if state.is_settled:
             return 0.0
-        return max(fraction_left(history[: len(history) - k]) for k in range(min(CHECKS_AGREEING, len(history))))
+        return quantities_left(history)
 
     def save(self, state: State) -> None:
         """Return nothing: OpenFOAM's own times in the case folder are what a run goes on from."""
