@@ -12,7 +12,7 @@ from vstent import flow, phantoms
 from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, domain, sampling, simulate_case
 from vstent.flow.engines import AbstractEngine, Outcome, run
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
-from vstent.flow.engines.lattice_settling import mean_of, swings, with_check
+from vstent.flow.engines.lattice_settling import SURE, mean_of, swings, with_check
 from vstent.flow.engines.lattice_state import State
 from vstent.kernels import lattice
 from vstent.kernels.arrays import Floats
@@ -127,8 +127,8 @@ def test_a_flow_that_swings_is_its_mean_once_that_is_known() -> None:
     assert mean.checks >= 40
     factor = np.mean(speeds[-mean.checks :])
     np.testing.assert_allclose(field.velocity_m_s, factor * still.velocity_m_s, atol=1e-6)
-    assert factor == pytest.approx(1.0, abs=mean.uncertainty)
-    assert field.unsettled_fraction == pytest.approx(mean.uncertainty)
+    assert factor == pytest.approx(1.0, abs=SURE * mean.standard_error)
+    assert field.unsettled_fraction == pytest.approx(SURE * mean.standard_error)
     assert "The flow goes on moving about its mean: these are means over its last" in field.advice
 
 

@@ -270,8 +270,8 @@ def test_a_vortex_that_creeps_has_no_mean_though_its_speed_has() -> None:
     still = np.ones((checks, 2))
     assert standard_error(still) == 0.0
     # The last half turns from 0.2 to 0.4: its halves' means are 0.1 apart, and what is told is a tenth of half of it.
-    assert mean_of(blocks, still, np.array([0])).standard_error == pytest.approx(0.005, rel=0.02)
-    assert mean_of(blocks, still, np.array([1])).standard_error == 0.0
+    assert mean_of(blocks, still, np.array([0])).left == pytest.approx(0.005, rel=0.02)
+    assert mean_of(blocks, still, np.array([1])).left == 0.0
 
 
 def test_what_a_field_has_left_is_told_where_its_mean_speed_turns() -> None:

@@ -98,7 +98,7 @@ class LatticeBoltzmann(AbstractLattice):
             return None
         if state.snapshots[-1].is_lost:
             return float("nan")
-        return min(_left(state), _mean(state).standard_error)
+        return min(_left(state), _mean(state).left)
 
     def max_checks(self, state: State) -> int:
         """Checks within the limit of time steps."""
@@ -137,11 +137,15 @@ def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, st
         f"means over its last {1e3 * mean.checks * state.check_s:.0f} ms, in which what is monitored ranged over up to "
         f"{100 * swing:.1f} % of its mean"
     )
-    known = f"they are known to within {100 * mean.uncertainty:.1f} % ({SURE} standard errors)"
+    of_means, of_field = (100 * SURE * error for error in (mean.standard_error, mean.field_error))
+    known = (
+        f"they are known to within {of_means:.1f} %, the sac's velocity, place by place, to within {of_field:.0f} % "
+        f"({SURE} standard errors)"
+    )
     if is_converged:
-        return mean.uncertainty, f"The flow goes on moving about its mean: these are {means}; {known}."
+        return of_means / 100, f"The flow goes on moving about its mean: these are {means}; {known}."
     unsettled = f"The flow has not settled in {state.steps} time steps and may be unsteady by nature: these are {means}"
-    if np.isfinite(mean.uncertainty):
-        return mean.uncertainty, f"{unsettled}; {known}: allow more steps to know them better."
+    if np.isfinite(mean.left):
+        return of_means / 100, f"{unsettled}; {known}: allow more steps to know them better."
     drift = "" if np.isnan(moved) else f"; from the means of as long before, they differ by up to {100 * moved:.1f} %"
     return float(np.nanmax([swing, moved])), f"{unsettled}{drift}."

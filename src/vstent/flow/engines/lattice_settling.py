@@ -28,7 +28,7 @@ SURE: Final = 3
 """Standard errors that a mean is told to be known to within: Student's 2.6 for six batches (95 %), and some more since
 runs end when it looks small (C0038 in cells of 0.4 mm, stopped at 1 %: off by 1.5 % root mean square)."""
 NO_MEAN: Final = 0.05
-"""Standard error from which a mean tells less than the last checks do."""
+"""What is `left` of a mean that tells less than the last checks do."""
 LATEST: Final = 8
 """These checks."""
 LEAST_CROSSINGS: Final = 5
@@ -45,11 +45,13 @@ class Mean:
     """Blocks that they are."""
     standard_error: float
     """Of any monitored quantity's mean, the largest, as a fraction of it; inf where the checks do not tell."""
+    field_error: float
+    """The same of the sac's mean velocity, place by place, root mean square."""
 
     @property
-    def uncertainty(self) -> float:
-        """What it is known to within, as a fraction."""
-        return SURE * self.standard_error
+    def left(self) -> float:
+        """What the tolerance is asked of."""
+        return max(self.standard_error, SHARE_OF_MEAN_FIELD * self.field_error)
 
 
 def left_to_settle(history: Floats, velocity: Sequence[NDArray[np.float32]]) -> float:
@@ -128,11 +130,11 @@ def mean_of(blocks: Sequence[Snapshot], history: Floats, sac: Ints) -> Mean:
     def mean(last: int) -> Mean:
         checks = int(lengths[last])
         error = standard_error(history[-checks:])
-        of_field = SHARE_OF_MEAN_FIELD * field_error(blocks[-last - 1 :], sac) if np.isfinite(error) else error
-        return Mean(checks, last + 1, max(error, of_field))
+        of_field = field_error(blocks[-last - 1 :], sac) if np.isfinite(error) else error
+        return Mean(checks, last + 1, error, of_field)
 
-    best = min((mean(last) for last in enough), key=lambda one: one.standard_error)
-    return best if best.standard_error < NO_MEAN else mean(min(int(np.searchsorted(lengths, LATEST)), len(blocks) - 1))
+    best = min((mean(last) for last in enough), key=lambda one: one.left)
+    return best if best.left < NO_MEAN else mean(min(int(np.searchsorted(lengths, LATEST)), len(blocks) - 1))
 
 
 def field_error(blocks: Sequence[Snapshot], cells: Ints) -> float:
