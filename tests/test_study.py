@@ -10,10 +10,11 @@ import pytest
 from tubes import line, tube, with_neck
 from vstent import phantoms
 from vstent.cli import main
-from vstent.flow import FlowCase, FlowField
+from vstent.device import find_design
+from vstent.flow import FlowCase, FlowField, FlowSettings
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
-from vstent.study import Settings, restore_vessel, stages
+from vstent.study import Settings, restore_vessel, run, stages
 from vstent.study.outputs import write_anatomy
 
 
@@ -81,3 +82,24 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     provenance = json.loads((out / "run.json").read_text())
     assert len(provenance["input"]["sha256"]) == 64
     assert {"numpy", "vstent", "python"} <= set(provenance["versions"])
+
+
+def test_a_device_whose_wires_change_does_not_get_the_flow_of_the_former(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    artery, out = tmp_path / "artery.stl", tmp_path / "out"
+    write_stl(artery, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
+    real, computed = stages.simulate_case, []
+    design = find_design("silk")
+
+    def computed_once(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
+        computed.append(case.stent.design.wires if case.stent else ())
+        return start if start is not None else real(case, start=start, **given)
+
+    monkeypatch.setattr(stages, "simulate_case", computed_once)
+    settings = Settings(devices=("silk",), flow=FlowSettings(cell_size_mm=0.35))
+    run(artery, out, settings, lambda *_: None)
+    monkeypatch.setattr("vstent.study.find_design", lambda _: replace(design, wires=((48, 40.0),)))
+    run(artery, out, settings, lambda *_: None)
+    run(artery, out, settings, lambda *_: None)
+    assert computed == [(), design.wires, ((48, 40.0),)]

@@ -29,7 +29,10 @@ class Case:
     def keys(self) -> dict[str, str]:
         """Key of every device's row: names everything that the row depends on."""
         source = hash_of(self.path)
-        return {name: key_of(source, replace(self.settings, devices=(name,))) for name in self.settings.devices}
+        return {
+            name: key_of(source, find_design(name), replace(self.settings, devices=(name,)))
+            for name in self.settings.devices
+        }
 
 
 def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:

@@ -129,8 +129,8 @@ def compute_flows(
     fields: dict[str, FlowField] = {}
     for name in (BARE, *deployments):
         stent = deployments[name].stent if name in deployments else None
-        placing = settings.placing(name) if stent else None
-        stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, placing)
+        placed = (stent.design, settings.placing(name)) if stent else ()
+        stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, *placed)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
             if name == BARE:
@@ -183,7 +183,8 @@ def vary_all(
     found = {}
     for name, deployment in deployments.items():
         stage = f"vary {name}"
-        key = key_of(anatomy_key(source, settings), settings.uncertainty, flow, name, settings.placing(name))
+        placed = deployment.stent.design, settings.placing(name)
+        key = key_of(anatomy_key(source, settings), settings.uncertainty, flow, name, *placed)
         varied = ledger.recall(stage, key, Uncertainty)
         if varied is None:
             with ledger.stage(stage) as tell:
