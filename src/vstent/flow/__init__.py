@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
@@ -13,7 +14,7 @@ from vstent import plugins
 from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.close_up import WIDTH, require_sac
-from vstent.flow.domain import MIN_CELLS, default_cell_size_mm
+from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
@@ -54,6 +55,7 @@ CALMER_TRIES = 3
 """Times that a run which diverged is tried again with a shorter time step."""
 
 OnProgress = Callable[[Progress], None]
+Guess = Callable[[], FlowField | None]
 
 
 class Checkpoint(Protocol):
@@ -196,22 +198,21 @@ class _Runs:
         cell_size_mm = default_cell_size_mm(case)
         if case.settings.close_up:
             return self._close_up(case, start, cell_size_mm)
-        bookmark = self._bookmark("answer")
-        guess = start
-        if bookmark is None or bookmark.saved is None:
-            guess = self._guess(case, start, cell_size_mm)
         progress = self._part(_coarse_runs(self.engine, case, start) * COARSE_SHARE, 1.0)
-        return self._run(self.engine(cell_size_mm, self.folder), case, guess, progress, bookmark)
+        engine = self.engine(cell_size_mm, self.folder)
+        return self._run(
+            engine, case, lambda: self._guess(case, start, cell_size_mm), progress, self._bookmark("answer")
+        )
 
     def _close_up(self, case: FlowCase, start: FlowField | None, cell_size_mm: float) -> FlowField:
         """Compute the vessel on wide cells, and then the sac and its neck on fine ones in it."""
         require_sac(case)
         outer = self._coarse(case, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
         engine = self.engine(cell_size_mm, self.folder, outer)
-        return self._run(engine, case, outer, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))
+        return self._run(engine, case, lambda: outer, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))
 
     def _guess(self, case: FlowCase, start: FlowField | None, cell_size_mm: float, depth: int = 0) -> FlowField | None:
-        """First guess for a grid, from coarser ones; only `start` where the next would be too coarse, or diverges.
+        """First guess for a grid, from coarser ones; only `start` where the next is too coarse, or diverges.
 
         Where a bare flow is known, the coarse grid only has to say what the screen changes (the correction scheme of
         multigrid, Brandt 1977, Math. Comput. 31, 333). What the grids differ by in the bare flow is scaled by what the
@@ -226,7 +227,7 @@ class _Runs:
         first, second = (
             self._part(rank * COARSE_SHARE, (rank + 1) * COARSE_SHARE) if depth == 0 else None for rank in range(2)
         )
-        with suppress(DivergenceError):
+        with suppress(DivergenceError, CoarseGridError):
             if start is None:
                 return self._coarse(case, coarse_mm, None, "guess", first, depth)
             bare = self._coarse(replace(case, screen=None, stent=None), coarse_mm, start, "bare guess", first, depth)
@@ -245,28 +246,34 @@ class _Runs:
         """Compute a flow on wider cells, itself from a guess; one deeper than the first takes no time to speak of."""
         name = depth * "coarser " + name
         engine = engine_class(case.settings)(cell_size_mm, self.folder / name)
-        bookmark = self._bookmark(name)
-        if bookmark is None or bookmark.saved is None:
-            start = self._guess(case, start, cell_size_mm, depth + 1)
-        return self._run(engine, case, start, progress, bookmark)
+        return self._run(
+            engine, case, lambda: self._guess(case, start, cell_size_mm, depth + 1), progress, self._bookmark(name)
+        )
 
     def _run(
         self,
         engine: AbstractEngine[Any],
         case: FlowCase,
-        start: FlowField | None,
+        guess: Guess,
         progress: OnProgress | None,
         bookmark: Bookmark | None,
     ) -> FlowField:
+        """Drive an engine from a guess, made once, or from where it left off; what diverges begins anew, calmer."""
+        guess = cache(guess)
+
+        def attempt() -> FlowField:
+            is_under_way = bookmark is not None and bookmark.saved is not None
+            return run(engine, case, start=None if is_under_way else guess(), progress=progress, bookmark=bookmark)
+
         for _ in range(CALMER_TRIES):
             try:
-                return run(engine, case, start=start, progress=progress, bookmark=bookmark)
+                return attempt()
             except DivergenceError:
                 calmer = engine.calmer(case)
                 if calmer is None:
                     raise
                 case, bookmark = calmer, None if bookmark is None else replace(bookmark, saved=None)
-        return run(engine, case, start=start, progress=progress, bookmark=bookmark)
+        return attempt()
 
     def _bookmark(self, name: str) -> Bookmark | None:
         checkpoint = self.checkpoint

@@ -7,13 +7,14 @@ import numpy as np
 from scipy import ndimage
 
 from vstent.errors import FlowError
+from vstent.flow import sampling
 from vstent.flow.types import Blood, FlowCase
 from vstent.kernels import triangles, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 from vstent.kernels.lattice import VELOCITIES
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
-from vstent.vessel import Vessel
+from vstent.vessel import Opening, Vessel
 
 INLET_EXTENSION = 0.5
 """Length of the straight tube before the inlet, in inlet diameters: the imposed profile is developed already."""
@@ -31,6 +32,10 @@ BEYOND = -1
 BACK_TO_BACK = -0.5
 """Largest cosine between the normals of two walls that part two blood cells: a corner that a link clips parts nothing,
 and blood sent back there turns a jet that leaves its edge (13 links, 3 % of the peak in the FDA's nozzle)."""
+
+
+class CoarseGridError(FlowError):
+    """The grid is too coarse to hold what is to be computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +119,46 @@ def too_narrow(case: FlowCase, cell_size_mm: float) -> str:
     )
 
 
+def unreached(vessel: Vessel, grid: Domain) -> str:
+    """Say which outlets no cell of a whole vessel's grid reaches; nothing where there is none."""
+    closed = [outlet for k, outlet in enumerate(vessel.outlets) if not (grid.link_patch == k + 2).any()]
+    if not closed:
+        return ""
+    named = ", ".join(f"{outlet.role} ({outlet.diameter_mm:.2g} mm)" for outlet in closed)
+    return f" No cell of {grid.cell_size_mm:.3g} mm reaches {named}, where no blood leaves: set a smaller cell size."
+
+
+def cells_of_sac(case: FlowCase, grid: Domain) -> Ints:
+    """Cells of a case's sac in a grid, all cells where it has none.
+
+    Raises
+    ------
+    CoarseGridError
+        When no cell lies in the sac.
+    """
+    if case.sac is None:
+        return np.arange(len(grid.cells), dtype=np.int32)
+    cells = sampling.cells_inside(case.sac, grid.centers_mm, grid.cell_size_mm)
+    if len(cells) == 0:
+        raise CoarseGridError(
+            f"no cell of {grid.cell_size_mm:.3g} mm lies in the sac of {abs(case.sac.volume_mm3):.2g} mm3 near "
+            f"{place(case.sac.vertices_mm.mean(axis=0))}: set a smaller cell size"
+        )
+    return cells
+
+
+def section_pressure_Pa(vessel: Vessel, grid: Domain, pressure_Pa: Floats) -> Floats:
+    """Mean pressure (k,) of the cells on the plane of every opening itself, not of its extension's end; nan of none."""
+
+    def mean_Pa(opening: Opening) -> float:
+        offset = grid.centers_mm - opening.center_mm
+        near = np.abs(offset @ opening.normal) < grid.cell_size_mm
+        near &= np.linalg.norm(offset, axis=1) < 0.75 * opening.diameter_mm
+        return float(pressure_Pa[near].mean()) if near.any() else float("nan")
+
+    return np.array([mean_Pa(opening) for opening in vessel.openings])
+
+
 def too_fast(grid: Domain, speed_m_s: Floats, blood: Blood, most: float) -> str:
     """Say where blood, its speed (n,) in every cell, is computed thicker than it is; nothing where none is.
 
@@ -133,12 +178,16 @@ def too_fast(grid: Domain, speed_m_s: Floats, blood: Blood, most: float) -> str:
 
 
 def default_cell_size_mm(case: FlowCase) -> float:
-    """Edge of a cell: as set; else `cells_per_diameter` across the vessel's mean diameter, within the cell budget."""
+    """Edge of a cell: as set; else `cells_per_diameter` across the vessel, within the cell budget.
+
+    That is across its mean diameter 4 V / A, or across its inlet where that is less: a large sac widens the mean.
+    """
     settings = case.settings
     if settings.cell_size_mm is not None:
         return settings.cell_size_mm
     volume_mm3 = case.vessel.closed.volume_mm3
-    by_diameter = 4 * volume_mm3 / case.vessel.lumen.area_mm2 / settings.cells_per_diameter
+    mean_mm = 4 * volume_mm3 / case.vessel.lumen.area_mm2
+    by_diameter = min(mean_mm, case.vessel.inlet.diameter_mm) / settings.cells_per_diameter
     by_budget = (volume_mm3 / settings.cell_budget) ** (1 / 3)
     return max(by_diameter, by_budget)
 
@@ -148,7 +197,7 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
 
     Raises
     ------
-    FlowError
+    CoarseGridError
         When no blood connects to the inlet, or far too few cells do.
     """
     surface, face_patch, sections = extend(vessel)
@@ -160,7 +209,7 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
         inside = _largest(filled & window.mask)
     cells = np.argwhere(inside).astype(np.int32)
     if len(cells) < MIN_CELLS:
-        raise FlowError(
+        raise CoarseGridError(
             f"only {len(cells)} cells of {cell_size_mm:.3g} mm connect to the inlet at "
             f"{place(vessel.inlet.center_mm)}: the grid is too coarse for this vessel or the inlet is "
             "blocked; set a smaller cell size"
@@ -205,7 +254,10 @@ def _connected(
     found = found[found > 0]
     if len(found) == 0:
         at = place(vessel.inlet.center_mm)
-        raise FlowError(f"no blood behind the inlet at {at}: check that the inlet is an open end")
+        raise CoarseGridError(
+            f"no cell of {cell_size_mm:.3g} mm lies behind the inlet at {at}: check that the inlet is an open end, or "
+            "set a smaller cell size"
+        )
     return label == np.bincount(found).argmax()
 
 

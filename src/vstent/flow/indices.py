@@ -36,24 +36,24 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
     widest outlet), ``mean_wss_Pa``. With a sac (closed) and its ostium (normals into the sac), besides:
 
     - ``neck_inflow_mL_s`` = integral over the ostium of max(u.n, 0), ``neck_outflow_mL_s`` of max(-u.n, 0);
-      ``turnover_time_s`` = sac volume / inflow;
+      ``inflow_area_fraction`` = part of the ostium where u.n > 0; ``turnover_time_s`` = sac volume / inflow;
     - ``mean_sac_velocity_m_s``, ``max_sac_velocity_m_s``, ``mean_sac_pressure_Pa`` over the sac's cells;
       ``sac_kinetic_energy_J`` = integral of rho u^2 / 2; ``fast_sac_volume_mm3`` where u > 0.08 m/s;
     - ``mean_sac_wss_Pa``, ``max_sac_wss_Pa`` over the sac's wall; ``parent_wss_Pa`` over the other wall within 10 mm of
       the neck; ``low_shear_area_fraction`` of the sac's wall below 0.4 Pa, ``relative_low_shear_area_fraction`` below a
       tenth of the parent's mean;
-    - ``inflow_concentration_index`` = (inflow / inlet flow) / (inflow area / ostium area) (Cebral et al. 2011, AJNR 32,
-      145).
+    - ``inflow_concentration_index`` = (inflow / inlet flow) / inflow area fraction (Cebral et al. 2011, AJNR 32, 145).
 
-    Of a pulsatile flow, the means over its cycle; wall shear stress is then its magnitude's time average (TAWSS), and
-    ``mean_sac_oscillatory_shear_fraction`` (OSI) is given besides.
+    Of a pulsatile flow, the means over its cycle, and quotients of these; wall shear stress is then its magnitude's
+    time average (TAWSS), and ``mean_sac_oscillatory_shear_fraction`` (OSI) is given besides.
     """
-    moments = [field.at_phase(phase) for phase in field.phases] or [field]
     result = _of_vessel(field)
     if sac is not None and ostium is not None:
-        of_moments = [_of_ostium(now, sac, ostium) | _of_sac(now, sac) for now in moments]
+        # One moment at a time: each unpacks a whole field.
+        moments = (field.at_phase(phase) for phase in field.phases) if field.phases else (field,)
+        of_moments = [_of_ostium(now, ostium) | _of_sac(now, sac) for now in moments]
         result |= {key: float(np.mean([one[key] for one in of_moments])) for key in of_moments[0]}
-        result |= _of_sac_wall(field, sac, ostium)
+        result |= _quotients(result, sac) | _of_sac_wall(field, sac, ostium)
     return result
 
 
@@ -73,19 +73,25 @@ def _of_vessel(field: FlowField) -> dict[str, float]:
     }
 
 
-def _of_ostium(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, float]:
+def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
     points_mm, area_mm2 = sampling.surface_samples(ostium, field.cell_size_mm)
     points = (points_mm - field.origin_mm) / field.cell_size_mm
     velocity_m_s = lattice_sampling.interpolate(field.index, field.velocity_m_s, points, True)
-    through_mL_s = np.einsum("ij,ij->i", velocity_m_s, area_mm2)  # m/s times mm^2 is mL/s
-    inflow_mL_s = float(through_mL_s[through_mL_s > 0].sum())
+    through_mL_s = sampling.through_mL_s(velocity_m_s, area_mm2)
     sizes_mm2 = np.linalg.norm(area_mm2, axis=1)
-    inflow_share = sizes_mm2[through_mL_s > 0].sum() / sizes_mm2.sum()
     return {
-        "neck_inflow_mL_s": inflow_mL_s,
-        "neck_outflow_mL_s": float(-through_mL_s[through_mL_s < 0].sum()),
+        "neck_inflow_mL_s": sampling.inflow_mL_s(through_mL_s),
+        "neck_outflow_mL_s": sampling.inflow_mL_s(-through_mL_s),
+        "inflow_area_fraction": float(sizes_mm2[through_mL_s > 0].sum() / sizes_mm2.sum()),
+    }
+
+
+def _quotients(mean: dict[str, float], sac: Surface) -> dict[str, float]:
+    """Quotients of means over the cycle: those of moments are without bound where the flow stands still."""
+    inflow_mL_s, share = mean["neck_inflow_mL_s"], mean["inflow_area_fraction"]
+    return {
         "turnover_time_s": abs(sac.volume_mm3) * 1e-3 / max(inflow_mL_s, 1e-12),
-        "inflow_concentration_index": inflow_mL_s / field.inlet_mL_s / max(float(inflow_share), 1e-12),
+        "inflow_concentration_index": inflow_mL_s / mean["inlet_flow_mL_s"] / max(share, 1e-12),
     }
 
 
@@ -108,7 +114,7 @@ def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, f
     stress_Pa = field.shear_Pa
     area_mm2 = _vertex_areas_mm2(field.wall)
     is_sac = on_sac(field.wall, sac, 0.2 * field.cell_size_mm)
-    is_near = np.linalg.norm(field.wall.vertices_mm - ostium.vertices_mm.mean(axis=0), axis=1) < NEAR_MM
+    is_near = ostium.closest(field.wall.vertices_mm)[1] < NEAR_MM
     parent_Pa = _mean(stress_Pa, area_mm2, is_near & ~is_sac)
     pulse = {}
     if field.phases:

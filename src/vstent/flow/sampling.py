@@ -35,6 +35,16 @@ def _quartered(corners: Floats) -> Floats:
     return np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
 
 
+def through_mL_s(velocity_m_s: Floats, area_mm2: Floats) -> Floats:
+    """Flow (p,) through sample points with velocities (p, 3) and area vectors (p, 3)."""
+    return np.einsum("ij,ij->i", velocity_m_s, area_mm2)  # m/s times mm2 is mL/s
+
+
+def inflow_mL_s(through_mL_s: Floats) -> float:
+    """Sum of what goes through sample points (p,) the way of their area vectors; what comes back is left out."""
+    return float(np.maximum(through_mL_s, 0.0).sum())
+
+
 def cells_inside(surface: Surface, centers_mm: Floats, cell_size_mm: float) -> Ints:
     """Numbers of the cell centres (n, 3) that lie inside a closed surface."""
     low = surface.vertices_mm.min(axis=0) - cell_size_mm

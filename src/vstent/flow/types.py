@@ -190,6 +190,14 @@ class FlowCase:
             return self.settings.inflow_mL_s
         return MEAN_INLET_SPEED_M_S * self.vessel.inlet.area_mm2
 
+    @property
+    def held_shares(self) -> dict[int, float]:
+        """Murray's part of the inflow, by the outlet's number from 0; the first, the widest, takes what is left."""
+        if self.settings.outlets == "zero_pressure":
+            return {}
+        cubes = np.array([outlet.diameter_mm**3 for outlet in self.vessel.outlets])
+        return {k: float(cubes[k] / cubes.sum()) for k in range(1, len(cubes))}
+
 
 MEAN_INLET_SPEED_M_S = 0.27
 """Mean speed in an internal carotid artery (design.md section 5)."""
@@ -308,7 +316,6 @@ class FlowField:
     @cached_property
     def oscillatory_shear_index(self) -> Floats:
         """(v,) (1 - norm(mean stress) / mean norm) / 2 (He and Ku 1996, J. Biomech. Eng. 118, 74); 0 in steady flow."""
-        # The stress is linear in the velocity: that of the mean flow is the mean stress.
         return 0.5 * (1 - np.linalg.norm(self.wall_shear_stress_Pa, axis=1) / np.maximum(self.shear_Pa, 1e-12))
 
     @cached_property

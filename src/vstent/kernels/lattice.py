@@ -435,12 +435,27 @@ def rescale(f: Any, stride: int, places: Any, links: Any, stretch: float, stress
 
 
 @njit(cache=True)
-def resisted(velocity: Any, entries: Any, time: float, odd_rate: float) -> Any:
-    """Half-force velocity (e, 3) of screened cells from their momentum (e, 3) and entries (e, ENTRY) (see `resist`)."""
+def relaxation_times(f: Any, stride: int, places: Any, time: float, law: Any) -> Any:
+    """Relaxation times (n,) of blood that thins, at storage `places` (n,), all populations being at home."""
+    result = np.zeros(len(places), np.float32)
+    held = np.zeros(19, np.float32)
+    for i in range(len(places)):
+        for q in range(19):
+            held[q] = f[q * stride + places[i]]
+        result[i] = thinned(stress_size(held), time, law)
+    return result
+
+
+@njit(cache=True)
+def resisted(velocity: Any, entries: Any, times: Any, odd_rate: float) -> Any:
+    """Half-force velocity (e, 3) of screened cells from their momentum (e, 3) and entries (e, ENTRY) (see `resist`).
+
+    And from their relaxation times (e,).
+    """
     result = np.zeros_like(velocity)
     for e in range(len(entries)):
         normal, entry = entries[e, :3], entries[e, 3:]
-        u, _ = resist(normal, entry, (velocity[e, 0], velocity[e, 1], velocity[e, 2]), rates(time, odd_rate))
+        u, _ = resist(normal, entry, (velocity[e, 0], velocity[e, 1], velocity[e, 2]), rates(times[e], odd_rate))
         result[e, 0], result[e, 1], result[e, 2] = u
     return result
 

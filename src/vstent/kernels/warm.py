@@ -93,6 +93,8 @@ def flow() -> None:
     lattice.defer(f, links, np.zeros((0, 5), np.float32), source, source, np.float32(1.0))
     lattice.balance(source, (nowhere, none, nowhere, none), source, np.float32(1.0))
     lattice.moments(f, stride, none)
+    times = lattice.relaxation_times(f, stride, none, relaxation[0], relaxation[1])
+    lattice.resisted(np.zeros((0, 3), np.float32), np.zeros((0, lattice.ENTRY), np.float32), times, np.float32(1.0))
     lattice.rescale(f, stride, none, links, np.float32(1.0), np.float32(1.0))
     index, numbers, points = np.zeros((2, 2, 2), np.int32), np.zeros(1), np.zeros((0, 3))
     lattice_sampling.fit_wall(index, numbers, np.zeros((1, 3)), numbers, points, points, 1)

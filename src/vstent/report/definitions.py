@@ -173,6 +173,7 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "max_sac_velocity_m_s": Definition("Largest sac velocity", "Largest magnitude of the velocity in the sac."),
     "neck_outflow_mL_s": Definition("Neck outflow", "Integral over the neck of the velocity where it leaves the sac."),
     "sac_kinetic_energy_J": Definition("Kinetic energy of the sac", "Integral over the sac of density u² / 2."),
+    "inflow_area_fraction": Definition("Inflow area", "Part of the neck where blood enters the sac."),
     "inflow_concentration_index": Definition(
         "Inflow concentration",
         "(Neck inflow / inlet flow) / (inflow area / neck area).",

@@ -67,10 +67,9 @@ class Ends:
 
     def _opening(self, k: int, links: Ints) -> tuple[Floats, Floats]:
         opening = self.case.vessel.openings[k]
-        outflow_mL_s = _outflow_mL_s(self.case, k)
-        kind = lattice.INFLOW if k == 0 else lattice.PRESSURE if outflow_mL_s is None else lattice.OUTFLOW
-        flow_mL_s = self.case.inflow_mL_s if k == 0 else outflow_mL_s or 0.0
-        speed = flow_mL_s / opening.area_mm2 / self.scales.speed_m_s
+        share = 1.0 if k == 0 else self.case.held_shares.get(k - 1)
+        kind = lattice.INFLOW if k == 0 else lattice.PRESSURE if share is None else lattice.OUTFLOW
+        speed = self.case.inflow_mL_s * (share or 0.0) / opening.area_mm2 / self.scales.speed_m_s
         area = opening.area_mm2 / self.domain.cell_size_mm**2
         row = np.array([kind, speed, 0.0, self._rate(kind), *opening.normal, area, 0.0])
         return row, self._developed(links, area) if k == 0 else np.zeros((len(links), 2))
@@ -144,14 +143,6 @@ class Ends:
         faces = c[q <= lattice.AXIAL].sum(axis=0)
         area = float(np.linalg.norm(faces))
         return faces / area, area
-
-
-def _outflow_mL_s(case: FlowCase, k: int) -> float | None:
-    """Murray's share of the inflow for opening k; None where pressure is imposed: the widest outlet takes the rest."""
-    cubes = np.array([outlet.diameter_mm**3 for outlet in case.vessel.outlets])
-    if case.settings.outlets == "zero_pressure" or k in (0, 1 + int(np.argmax(cubes))):
-        return None
-    return float(case.inflow_mL_s * cubes[k - 1] / cubes.sum())
 
 
 def _sent(direction: Ints, normal: Floats, area: float, inner: Floats, at: Floats, outer: Floats) -> Floats:

@@ -1,6 +1,6 @@
 """The embedded engine for pulsatile flow: the same steps, the inflow following a waveform until cycles repeat."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -46,8 +46,10 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
             phases.append(Phase(time_s, *through_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa))
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])
         advice = cycles_advice(changes, len(state.history) // PHASES, is_converged=outcome.is_converged)
-        flow, left = read(state, list(state.snapshots)), outcome.residual[-1]
-        return field_of(state, flow, outcome, left, advice, tuple(phases))
+        # The stress of the mean flow is the mean stress only where blood does not thin.
+        mean_Pa = np.asarray(np.mean([phase.wall_shear_stress_Pa for phase in phases], axis=0, dtype=np.float64))
+        flow = replace(read(state, list(state.snapshots)), wall_shear_stress_Pa=mean_Pa)
+        return field_of(state, flow, outcome, outcome.residual[-1], advice, tuple(phases))
 
 
 def cycle_change(history: Floats) -> float:

@@ -226,9 +226,9 @@ def build(
 
 
 def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
-    if case.sac is None or case.ostium is None:
-        return Probe(np.arange(len(domain.cells), dtype=np.int32), np.zeros((0, 3)), np.zeros((0, 3)))
-    cells = sampling.cells_inside(case.sac, domain.centers_mm, domain.cell_size_mm)
+    cells = domains.cells_of_sac(case, domain)
+    if case.ostium is None:
+        return Probe(cells, np.zeros((0, 3)), np.zeros((0, 3)))
     points_mm, area_mm2 = sampling.surface_samples(case.ostium, domain.cell_size_mm)
     return Probe(cells, (points_mm - domain.origin_mm) / domain.cell_size_mm, area_mm2)
 
@@ -365,10 +365,22 @@ def _settle(state: State, part: float) -> None:
 def _snapshot(state: State) -> Snapshot:
     moment, outflow = _read_here(state) if state.device is None else state.device.read()
     velocity = np.ascontiguousarray(moment[:, 1:])
-    if len(state.screen.cell):
-        rates = np.float32(state.scales.relaxation_steps), np.float32(ODD_RATE)
-        velocity[state.screen.cell] = lattice.resisted(velocity[state.screen.cell], state.screen.entry, *rates)
+    cells = state.screen.cell
+    if len(cells):
+        times = _relaxation_times(state, cells)
+        velocity[cells] = lattice.resisted(velocity[cells], state.screen.entry, times, np.float32(ODD_RATE))
     return Snapshot(state.scales, velocity, moment[:, 0], outflow)
+
+
+def _relaxation_times(state: State, cells: Ints) -> NDArray[np.float32]:
+    """Relaxation times (e,) of some cells, as they collide with."""
+    time, law = np.float32(state.scales.relaxation_steps), state.scales.thinning
+    if law[0] == 0:
+        return np.full(len(cells), time)
+    if state.device is not None:
+        state.device.fetch(state)
+    a = state.addressing
+    return np.asarray(lattice.relaxation_times(state.populations, a.stride, a.place[cells], time, law))
 
 
 def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
@@ -390,7 +402,7 @@ def _monitor(state: State, now: Snapshot) -> Floats:
     if len(state.probe.ostium_points):
         index = state.domain.index
         through = lattice_sampling.interpolate(index, velocity_m_s.astype(float), state.probe.ostium_points, True)
-        values.append(float(np.maximum(np.einsum("ij,ij->i", through, state.probe.ostium_area_mm2), 0.0).sum()))
+        values.append(sampling.inflow_mL_s(sampling.through_mL_s(through, state.probe.ostium_area_mm2)))
     return np.array(values, dtype=float)
 
 
@@ -407,7 +419,7 @@ class Reading:
     wall_pressure_Pa: Floats
     """(v,)."""
     outflow_mL_s: Floats
-    """(k,) through every opening; nan where a close-up does not reach it."""
+    """(k,) through every opening; nan where a close-up does not reach it, 0 where no cell of all does."""
 
 
 def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
@@ -423,7 +435,7 @@ def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     stress_Pa, wall_pressure_Pa = wall_stress(
         domain, velocity_m_s, pressure_Pa, lumen=state.case.vessel.lumen, blood=state.case.blood
     )
-    outflow_mL_s = np.full(len(state.case.vessel.openings), np.nan)
+    outflow_mL_s = np.full(len(state.case.vessel.openings), np.nan if state.close_up else 0.0)
     is_opening = state.links.patch <= len(outflow_mL_s)
     through = mean(one.outflow_mL_s for one in snapshots)
     outflow_mL_s[state.links.patch[is_opening] - 1] = through[is_opening]
@@ -435,7 +447,7 @@ def field_of(
 ) -> FlowField:
     """Put a flow together with how it was reached, and what it has `left` to go."""
     domain, vessel = state.domain, state.case.vessel
-    section_Pa = np.array([_section_pressure_Pa(state, flow.pressure_Pa, k) for k in range(len(vessel.openings))])
+    section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
     field = FlowField(
         cells=domain.cells,
         origin_mm=domain.origin_mm,
@@ -464,16 +476,10 @@ def field_of(
 
 def _of_the_grid(state: State, flow: Reading, phases: tuple[Phase, ...]) -> str:
     """Say where the cells are too wide for the vessel (in a close-up those around it are, if any) or for the flow."""
-    narrow = "" if state.close_up else domains.too_narrow(state.case, state.domain.cell_size_mm)
+    narrow = ""
+    if state.close_up is None:
+        narrow = domains.too_narrow(state.case, state.domain.cell_size_mm)
+        narrow += domains.unreached(state.case.vessel, state.domain)
     is_vessel = np.repeat(state.limit, state.addressing.length) == CELL_REYNOLDS
     speed_m_s = np.max([np.linalg.norm(moment.velocity_m_s, axis=1) for moment in phases or (flow,)], axis=0)
     return narrow + domains.too_fast(state.domain, np.where(is_vessel, speed_m_s, 0.0), state.case.blood, CELL_REYNOLDS)
-
-
-def _section_pressure_Pa(state: State, pressure_Pa: Floats, k: int) -> float:
-    """Mean pressure of the cells on the plane of opening k itself, not of its extension's end."""
-    opening = state.case.vessel.openings[k]
-    offset = state.domain.centers_mm - opening.center_mm
-    along = offset @ opening.normal
-    near = (np.abs(along) < state.domain.cell_size_mm) & (np.linalg.norm(offset, axis=1) < 0.75 * opening.diameter_mm)
-    return float(pressure_Pa[near].mean()) if near.any() else float("nan")

@@ -14,7 +14,6 @@ import numpy as np
 
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
-from vstent.flow import sampling
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.engines.lattice_pulse import cycle_change
 from vstent.flow.engines.lattice_settling import quantities_left
@@ -103,9 +102,7 @@ class OpenFoam(AbstractEngine[State]):
         if start is not None and not results.times(self.folder):
             folders.begin_from(self.folder, start)
         domain = domains.build(case.vessel, self.grid_size_mm or self.cell_size_mm)
-        sac = np.arange(len(domain.cells), dtype=np.int32)
-        if case.sac is not None:
-            sac = sampling.cells_inside(case.sac, domain.centers_mm, domain.cell_size_mm).astype(np.int32)
+        sac = domains.cells_of_sac(case, domain)
         across = bridge(case, domain, self.folder)
         kept: deque[Snapshot] = deque(maxlen=PHASES if case.settings.waveform else CHECKS_AVERAGED)
         return State(case, setup, found, foam.application, self.folder, domain, across, sac, kept)
@@ -207,7 +204,7 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
 
     vessel, domain = state.case.vessel, state.domain
     pressure_Pa, outflow_mL_s = mean("pressure_Pa"), mean("outflow_mL_s")
-    section_Pa = np.array([_section_pressure_Pa(state, pressure_Pa, k) for k in range(len(vessel.openings))])
+    section_Pa = domains.section_pressure_Pa(vessel, domain, pressure_Pa)
     steps = len(state.history) * (1 if state.is_pulse else CHECK_ITERATIONS)
     return FlowField(
         cells=domain.cells,
@@ -237,15 +234,6 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
 def _phase(one: Snapshot) -> Phase:
     inlet_mL_s, outlets_mL_s = -float(one.outflow_mL_s[0]), one.outflow_mL_s[1:]
     return Phase(float(one.time), inlet_mL_s, outlets_mL_s, one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa)
-
-
-def _section_pressure_Pa(state: State, pressure_Pa: Floats, k: int) -> float:
-    """Mean pressure of the cells on the plane of opening k itself, not of its extension's end."""
-    opening = state.case.vessel.openings[k]
-    offset = state.domain.centers_mm - opening.center_mm
-    near = np.abs(offset @ opening.normal) < state.domain.cell_size_mm
-    near &= np.linalg.norm(offset, axis=1) < 0.75 * opening.diameter_mm
-    return float(pressure_Pa[near].mean()) if near.any() else float("nan")
 
 
 def _advice(state: State, outcome: Outcome) -> str:

@@ -31,7 +31,7 @@ def pressure(case: FlowCase, walls: list[str]) -> str:
     """0/p."""
     patches: dict[str, Any] = {name: {"type": "zeroGradient"} for name in (*walls, "inlet")}
     for k, outlet in enumerate(case.vessel.outlets):
-        is_held = k in _held_shares(case)
+        is_held = k in case.held_shares
         patches[outlet.role] = {"type": "zeroGradient"} if is_held else {"type": "fixedValue", "value": "uniform 0"}
     return _field("p", "volScalarField", "[0 2 -2 0 0 0 0]", "0", patches)
 
@@ -46,16 +46,8 @@ def tables(case: FlowCase) -> dict[str, str]:
     if case.settings.waveform is None:
         return {}
     shares = {"inlet": 1.0 / case.inflow_mL_s / M3_PER_ML}  # the inlet's profile is that of the mean flow
-    shares |= {case.vessel.outlets[k].role: share for k, share in _held_shares(case).items()}
+    shares |= {case.vessel.outlets[k].role: share for k, share in case.held_shares.items()}
     return {f"flow_{name}": _cycle(case, share) for name, share in shares.items()}
-
-
-def _held_shares(case: FlowCase) -> dict[int, float]:
-    """Part of the flow that is set at an outlet, by its number; the first always takes what is left."""
-    if case.settings.outlets == "zero_pressure":
-        return {}
-    cubes = np.array([outlet.diameter_mm**3 for outlet in case.vessel.outlets])
-    return {k: float(cubes[k] / cubes.sum()) for k in range(1, len(cubes))}
 
 
 def _cycle(case: FlowCase, share: float) -> str:
@@ -91,7 +83,7 @@ def _inlet(case: FlowCase, setup: FoamSetup) -> dict[str, Any]:
 
 
 def _outlet_velocity(case: FlowCase, setup: FoamSetup, k: int) -> dict[str, Any]:
-    share = _held_shares(case).get(k)
+    share = case.held_shares.get(k)
     if share is None:
         return {"type": "inletOutlet", "inletValue": "uniform (0 0 0)", "value": "uniform (0 0 0)"}
     flow = _over_time(case, setup, "volumetricFlowRate", case.vessel.outlets[k].role, share)

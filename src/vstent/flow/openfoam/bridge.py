@@ -111,7 +111,7 @@ def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
     # OpenFOAM's is what the wall does to the blood, over density.
     traction_Pa = across.wall_to_lumen @ (-density * np.concatenate([stress[name] for name in across.walls]))
     normal = case.vessel.lumen.vertex_normals
-    through_mL_s = np.einsum("ij,ij->i", across.to_ostium @ known, across.ostium_area_mm2)  # m/s times mm2 is mL/s
+    through_mL_s = sampling.through_mL_s(across.to_ostium @ known, across.ostium_area_mm2)
     return Snapshot(
         time,
         across.to_cells @ known,
@@ -119,5 +119,5 @@ def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
         traction_Pa - np.einsum("ij,ij->i", traction_Pa, normal)[:, None] * normal,
         across.pressure_to_lumen @ pressure_Pa,
         np.array([folders.flow_mL_s(folder, opening.role) for opening in case.vessel.openings]),
-        float(through_mL_s[through_mL_s > 0].sum()),
+        sampling.inflow_mL_s(through_mL_s),
     )

@@ -4,7 +4,7 @@ from typing import Final
 
 from vstent.errors import FlowError
 from vstent.flow.cost import free_memory_bytes
-from vstent.flow.domain import INLET_EXTENSION, OUTLET_EXTENSION
+from vstent.flow.domain import extended_volume_mm3
 from vstent.flow.types import FlowCase
 
 CELLS_PER_CUBE: Final = 1.6
@@ -23,11 +23,7 @@ def tell_cost(case: FlowCase, cell_size_mm: float) -> str:
     FlowError
         When it does not fit in the free memory, naming the cell size that would.
     """
-    vessel = case.vessel
-    ends = [
-        k.area_mm2 * k.diameter_mm * (OUTLET_EXTENSION if n else INLET_EXTENSION) for n, k in enumerate(vessel.openings)
-    ]
-    cells = CELLS_PER_CUBE * (abs(vessel.closed.volume_mm3) + sum(ends)) / cell_size_mm**3
+    cells = CELLS_PER_CUBE * extended_volume_mm3(case.vessel) / cell_size_mm**3
     needed, free = cells * BYTES_PER_CELL, free_memory_bytes()
     if needed > free:
         fitting_mm = cell_size_mm * (needed / free) ** (1 / 3) * 1.02
