@@ -8,14 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shapes import sphere
 from vstent import flow, phantoms
 from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, domain, sampling, simulate_case
+from vstent.flow.close_up import close_up
 from vstent.flow.engines import AbstractEngine, Outcome, run
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_settling import SURE, mean_of, swings, with_check
 from vstent.flow.engines.lattice_state import State
 from vstent.kernels import lattice
 from vstent.kernels.arrays import Floats
+from vstent.openings import open_ends
+from vstent.surface import Surface
 from vstent.trace import trace
 from vstent.vessel import Vessel
 
@@ -199,6 +203,33 @@ def test_a_branch_too_narrow_for_its_cells_is_told_of_where_that_matters() -> No
     assert simulate_case(replace(case, settings=replace(SETTINGS, cell_size_mm=0.5, max_steps=48))).advice.endswith(
         said
     )
+
+
+def test_from_a_branch_that_no_cell_reaches_no_blood_leaves_and_that_is_told() -> None:
+    """Also where a close-up asks what passes there."""
+    straight = phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM)
+    phantom = phantoms.with_branch(straight, abscissa_mm=6.0, direction=[1, 0, 1], radius_mm=0.25, length_mm=7.0)
+    vessel = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.15)))
+    thin = vessel.outlets[1]
+    settings = replace(SETTINGS, cell_size_mm=0.5, max_steps=600, tolerance=0.05)
+    field = simulate_case(FlowCase(vessel, settings=settings))
+    assert field.outlets_mL_s[1] == 0.0
+    assert field.outlets_mL_s[0] == pytest.approx(INFLOW_ML_S, rel=0.1)
+    assert f"No cell of 0.5 mm reaches outlet_2 ({thin.diameter_mm:.2g} mm)" in field.advice
+    assert all(np.isfinite(value) for value in flow.indices(field).values())
+    sac = Surface(sphere(1.0).vertices_mm + vessel.inlet.center_mm * [1, 1, 0] + [0, 0, 10.0], sphere(1.0).faces)
+    assert np.isfinite(close_up(FlowCase(vessel, sac=sac, settings=settings), field).inflow_mL_s).all()
+
+
+def test_a_sac_wider_than_its_artery_leaves_the_artery_its_cells() -> None:
+    """Its mean diameter 4 V / A is four times the artery's."""
+    thin = phantoms.tube(length_mm=40.0, radius_mm=1.25)
+    giant = phantoms.with_sac(thin, abscissa_mm=20.0, width_mm=18.0, neck_mm=6.0)
+    vessel = open_ends(Vessel(phantoms.phantom_surface(giant, edge_mm=0.6)))[0]
+    fine = FlowCase(vessel, settings=FlowSettings(cell_budget=1e9))
+    assert domain.default_cell_size_mm(fine) == pytest.approx(vessel.inlet.diameter_mm / 29)
+    volume_mm3 = vessel.closed.volume_mm3
+    assert domain.default_cell_size_mm(FlowCase(vessel)) == pytest.approx((volume_mm3 / 480_000) ** (1 / 3))
 
 
 def test_blood_too_fast_for_its_cells_is_told_of_but_behind_the_openings() -> None:

@@ -52,6 +52,15 @@ def of_tube() -> FlowField:
     return simulate_case(FlowCase(vessel, sac=ball((0.0, 0.0, 24.0)), settings=settings))
 
 
+def at_rest(case: FlowCase, grid: domain.Domain) -> FlowField:
+    """A flow of one outlet of which nothing but what goes through it is known."""
+    still, lumen = np.zeros((len(grid.cells), 3)), case.vessel.lumen
+    stress = np.zeros((len(lumen.vertices_mm), 3))
+    values = still, still[:, 0], lumen, stress, stress[:, 0], case.inflow_mL_s, np.array([case.inflow_mL_s])
+    told = case.blood, True, 0.0, "", np.zeros(1), 1, 1.0, 1.0
+    return FlowField(grid.cells, grid.origin_mm, grid.cell_size_mm, *values, 0.0, np.zeros(1), *told)
+
+
 @cache
 def outer_of_demo() -> tuple[FlowCase, FlowField]:
     case = flow_case(demo(), None, FlowSettings(cell_size_mm=0.5))
@@ -209,6 +218,20 @@ def test_an_artery_that_only_passes_by_is_not_in_the_close_up() -> None:
     assert fine.centers_mm[:, 0].max() < 2.4
     assert fine.centers_mm[:, 2].min() < -14.0  # upstream it reaches the inlet's extension
     assert fine.centers_mm[:, 2].max() < -9.0 + 1.0 + 3.8 + 2 * 0.38
+
+
+@pytest.mark.parametrize("gap_mm", [0.3, 0.5])
+def test_a_close_up_does_not_reach_through_the_walls_of_arteries_that_touch(gap_mm: float) -> None:
+    """Gaps narrower than a wide cell, along limbs and extensions."""
+    middle_mm = 1.5 + 0.5 * gap_mm
+    vessel = tube(arc(middle_mm, np.pi, straight_mm=28.0), 1.5).vessel
+    grid = domain.build(vessel, 0.6)
+    assert len(grid.septum_cell) > 100
+    case = FlowCase(vessel, sac=ball((-1.5, 0.0, -14.0)), settings=FlowSettings(inflow_mL_s=2.0))
+    close_up = close_ups.close_up(case, at_rest(case, grid))
+    assert (close_up.part[grid.centers_mm[:, 0] > middle_mm] >= 0).all()
+    assert close_up.part_of_opening.tolist() == [0, 1]
+    assert close_up.inflow_mL_s == pytest.approx([2.0, -2.0])
 
 
 def test_a_recess_that_leads_nowhere_belongs_to_the_close_up() -> None:

@@ -5,14 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shapes import sphere
 from tubes import line, tube
 from vstent.errors import FlowError
 from vstent.flow import FlowCase, FlowSettings, domain, simulate_case
-from vstent.flow.cost import block_rate, estimate, free_memory_bytes, refuse_too_large
+from vstent.flow.cost import MOST_CELLS, block_rate, estimate, free_memory_bytes, refuse_too_large
+from vstent.flow.engines import DivergenceError
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
 from vstent.flow.types import PHASES
 from vstent.flow.waveform import OLDER_ADULT_ICA
+from vstent.surface import Surface
 
 SETTINGS = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.2)
 
@@ -60,6 +63,14 @@ def test_what_does_not_fit_is_refused_with_the_cell_size_that_does():
     assert free_memory_bytes() > 1e7
 
 
+def test_more_cells_than_can_be_numbered_are_refused_whatever_the_memory():
+    assert 19 * 1.05 * MOST_CELLS < 2**31
+    case = case_of(cell_size_mm=0.007)
+    assert estimate(case).cells > MOST_CELLS
+    with pytest.raises(FlowError, match=r"more than the 100 million .* set a cell size of 0\.01\d? mm"):
+        refuse_too_large(case, free_bytes=1e15)
+
+
 def test_too_long_a_time_step_is_named_with_the_last_good_state():
     with pytest.raises(FlowError, match="diverged") as error:
         simulate_case(case_of(cell_size_mm=0.4, lattice_speed=25.0, max_steps=4000))
@@ -102,6 +113,56 @@ def test_a_guess_that_diverges_is_done_without(monkeypatch):
     monkeypatch.setattr(LatticeBoltzmann, "init", ill_guessed)
     np.testing.assert_array_equal(simulate_case(case).velocity_m_s, wanted.velocity_m_s)
     assert tried == pytest.approx([0.6, 0.6, 0.6, 0.6, 0.4])
+
+
+def test_a_guess_whose_grid_is_too_coarse_is_done_without(monkeypatch):
+    """At 45 degrees to the grid a throat of 0.5 mm is closed in cells of 0.44 mm; those of 0.11 mm leave it open."""
+    points, frames = line(18.0)
+    radius = 2.0 - 1.75 * np.exp(-(((points[:, 2] - 8.0) / 1.5) ** 2))
+    turn = np.array([[1, 0, 1], [0, 2**0.5, 0], [-1, 0, 1]]) / 2**0.5
+    vessel = tube((points @ turn.T, frames @ turn.T), radius).vessel
+    case, tried = FlowCase(vessel, settings=replace(SETTINGS, cell_size_mm=0.11, max_steps=60)), []
+    real = LatticeBoltzmann.init
+
+    def told(engine, case, start):
+        tried.append(engine.cell_size_mm)
+        return real(engine, case, start)
+
+    monkeypatch.setattr(LatticeBoltzmann, "init", told)
+    monkeypatch.setattr("vstent.flow.MIN_CELLS", 500)
+    with pytest.raises(domain.CoarseGridError):
+        domain.build(vessel, 0.44)
+    assert simulate_case(case).cell_size_mm == 0.11
+    assert tried == pytest.approx([0.44, 0.22, 0.11])
+
+
+def test_what_diverges_after_it_was_resumed_begins_anew_from_the_guess(monkeypatch):
+    case, tried = case_of(cell_size_mm=0.1), []
+
+    def stub(engine, case, *, start, progress, bookmark):
+        tried.append((engine.cell_size_mm, case.settings.lattice_speed, start))
+        if len(tried) == 1:
+            raise DivergenceError("too fast")
+        return f"cells of {engine.cell_size_mm} mm"
+
+    class Kept:
+        def load(self, run):
+            return {"begun": np.zeros(1)} if run == "answer" else None
+
+        def save(self, run, saved):
+            pass
+
+    monkeypatch.setattr("vstent.flow.run", stub)
+    assert simulate_case(case, checkpoint=Kept()) == "cells of 0.1 mm"
+    speed = case.settings.lattice_speed
+    assert tried == [(0.1, speed, None), (0.2, speed, None), (0.1, 0.5 * speed, "cells of 0.2 mm")]
+
+
+def test_a_sac_smaller_than_a_cell_is_told_as_that():
+    sac = Surface(sphere(0.08).vertices_mm + np.array([0.07, 0.07, 4.07]), sphere(0.08).faces)
+    case = replace(case_of(cell_size_mm=0.4), sac=sac)
+    with pytest.raises(FlowError, match=r"no cell of 0\.4 mm lies in the sac .* near \(0\.1, 0\.1, 4\.1\) mm: set"):
+        simulate_case(case)
 
 
 def test_the_last_good_check_is_told_with_time_speed_and_place():

@@ -6,6 +6,7 @@ their flow and pressure from the wide ones where they end (one-way nesting; Davi
 405). What enters and leaves is exact: through every cut passes what the openings beyond it take or give.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import pi, sqrt
@@ -120,11 +121,12 @@ def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
     FlowError
         When the case has no sac.
     """
-    graph = _neighbours(outer)
+    surface, _, sections = domains.extend(case.vessel)
+    graph = _neighbours(outer, surface)
     sac = sampling.cells_inside(require_sac(case), outer.centers_mm, outer.cell_size_mm)
     distance_mm = dijkstra(graph, directed=False, indices=sac, min_only=True)
     diameter_mm = _mean_diameter_mm(case)
-    ends = _cells_at_ends(case, outer)
+    ends = _cells_at_ends(outer, sections)
     whole_mm = np.full(len(distance_mm), np.inf)
     part = _parts(graph, distance_mm > DOWNSTREAM_DIAMETERS * diameter_mm, ends)
     near = CloseUp(outer, whole_mm, part, part[ends])
@@ -153,9 +155,8 @@ def _mean_diameter_mm(case: FlowCase) -> float:
     return 4 * abs(case.vessel.closed.volume_mm3) / case.vessel.lumen.area_mm2
 
 
-def _cells_at_ends(case: FlowCase, outer: FlowField) -> Ints:
-    """Cell (k,) at the end of every opening's extension."""
-    _, _, sections = domains.extend(case.vessel)
+def _cells_at_ends(outer: FlowField, sections: Sequence[Floats]) -> Ints:
+    """Cell (k,) at the end of every opening's extension, of which these are the polygons."""
     return np.asarray(cKDTree(outer.centers_mm).query([section.mean(axis=0) for section in sections])[1])
 
 
@@ -171,17 +172,16 @@ def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints) -> Ints:
     return np.where(np.isin(part, through), np.searchsorted(through, part), -1).astype(np.int32)
 
 
-def _neighbours(field: FlowField) -> csr_matrix:
-    """Way between neighbouring cells, mm."""
-    first, second, length_mm = [], [], []
-    for velocity in VELOCITIES[1::2]:
-        beside = field.index[tuple((field.cells + velocity).T)]
-        is_blood = np.flatnonzero(beside >= 0)
-        first.append(is_blood)
-        second.append(beside[is_blood])
-        length_mm.append(np.full(len(is_blood), field.cell_size_mm * np.linalg.norm(velocity)))
-    places = np.concatenate(first), np.concatenate(second)
-    return csr_matrix(coo_matrix((np.concatenate(length_mm), places), shape=(len(field.cells),) * 2))
+def _neighbours(field: FlowField, surface: Surface) -> csr_matrix:
+    """Way between neighbouring cells that no wall of the blood's surface parts, mm."""
+    neighbour = np.stack([field.index[tuple((field.cells + c).T)] for c in VELOCITIES], axis=1)
+    is_open = neighbour >= 0
+    is_open[:, 0::2] = False  # every pair once
+    is_open[domains.septa(surface, neighbour, field.cells, field.origin_mm, field.cell_size_mm)] = False
+    cell, direction = np.nonzero(is_open)
+    length_mm = field.cell_size_mm * np.linalg.norm(VELOCITIES, axis=1)[direction]
+    places = cell, neighbour[cell, direction]
+    return csr_matrix(coo_matrix((length_mm, places), shape=(len(field.cells),) * 2))
 
 
 def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:

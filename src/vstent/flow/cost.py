@@ -27,6 +27,8 @@ BYTES_PER_PHASE_AND_CELL = 32
 """Memory for every kept phase of a cycle and its cell, computed or only filled in."""
 BYTES_PER_GRID_POINT = 6
 """Memory per point of the box around the vessel (3 measured)."""
+MOST_CELLS = 1e8
+"""Cells of blood whose 19 populations still have numbers of 32 bits, with those beside the wall (2^31 / 19 places)."""
 GPU_BYTES_PER_CELL = 320
 """Memory of a GPU per blood cell (sums of its arrays: 302 on 31,000 cells of the demo, 214 on 169,000)."""
 BYTES_AT_LEAST = 4.5e8
@@ -76,7 +78,7 @@ def estimate(case: FlowCase) -> Cost:
 
 
 def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes: float | None = None) -> None:
-    """Refuse a flow that does not fit in the free memory, or in the GPU's where it is to run on one.
+    """Refuse a flow that does not fit in the free memory, or in the GPU's where it is to run on one, or in 32 bits.
 
     Raises
     ------
@@ -84,6 +86,13 @@ def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes:
         Naming the cell size that would fit.
     """
     free_bytes = free_memory_bytes() if free_bytes is None else free_bytes
+    cell_size_mm = default_cell_size_mm(case)
+    if (cells := _size(case, cell_size_mm)[0]) > MOST_CELLS:
+        raise FlowError(
+            f"the flow on {cells / 1e6:.3g} million cells of {cell_size_mm:.3g} mm has more than the "
+            f"{MOST_CELLS / 1e6:.0f} million that can be numbered: set a cell size of "
+            f"{_fitting_mm(case, lambda cell_mm: _size(case, cell_mm)[0], MOST_CELLS):.2g} mm"
+        )
     _refuse(case, lambda cell_mm: _size(case, cell_mm)[1], free_bytes, "memory")
     if case.settings.device_gpu:
         gpu_bytes = free_gpu_bytes() if gpu_bytes is None else gpu_bytes
@@ -95,14 +104,19 @@ def _refuse(case: FlowCase, needed_bytes: Callable[[float], float], free_bytes: 
     cell_size_mm = default_cell_size_mm(case)
     if needed_bytes(cell_size_mm) <= free_bytes:
         return
-    fitting_mm = cell_size_mm
-    while needed_bytes(fitting_mm) > free_bytes and fitting_mm < 1e3 * cell_size_mm:
-        fitting_mm *= MARGIN
     raise FlowError(
         f"the flow on {_size(case, cell_size_mm)[0] / 1e6:.3g} million cells of {cell_size_mm:.3g} mm needs "
         f"{needed_bytes(cell_size_mm) / 1e9:.2g} GB, but {free_bytes / 1e9:.2g} GB of {of} are free: set a cell size "
-        f"of {fitting_mm:.2g} mm"
+        f"of {_fitting_mm(case, needed_bytes, free_bytes):.2g} mm"
     )
+
+
+def _fitting_mm(case: FlowCase, needed: Callable[[float], float], most: float) -> float:
+    """Cell size from the case's own on at which so much at most is needed."""
+    own_mm = fitting_mm = default_cell_size_mm(case)
+    while needed(fitting_mm) > most and fitting_mm < 1e3 * own_mm:
+        fitting_mm *= MARGIN
+    return fitting_mm
 
 
 def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 """The blood's domain: the lumen with straight extensions on a regular grid, and every link that leaves it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -219,8 +220,8 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
     neighbour = np.stack([index[tuple((cells + c).T)] for c in VELOCITIES], axis=1)
     is_beyond = filled & ~inside & (window is not None)
     links = _links(surface, face_patch, neighbour, cells, is_beyond, origin_mm, cell_size_mm)
-    septa = _septa(surface, neighbour, cells, origin_mm, cell_size_mm)
-    return Domain(cell_size_mm, origin_mm, cells, *links, *septa, surface, sections)
+    parted = septa(surface, neighbour, cells, origin_mm, cell_size_mm)
+    return Domain(cell_size_mm, origin_mm, cells, *links, *parted, surface, sections)
 
 
 def _box(surface: Surface, cell_size_mm: float) -> tuple[Floats, tuple[int, int, int]]:
@@ -270,7 +271,7 @@ def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
     face_patch : (m,) 0 the wall, k + 1 the end of opening k.
     sections : for every opening the polygon (j, 3) of its end.
     """
-    lumen = vessel.lumen
+    lumen, obstacles = vessel.lumen, [vessel.closed]
     vertices, faces = [lumen.vertices_mm], [lumen.faces]
     patch = [np.full(len(lumen.faces), WALL)]
     sections: dict[int, Floats] = {}
@@ -281,7 +282,8 @@ def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
             ring, ring_ids = lumen.vertices_mm[loop], loop
             patch_id = WALL
         else:
-            ring = _extruded(vessel, k, lumen.vertices_mm[loop])
+            ring = _extruded(vessel, k, lumen.vertices_mm[loop], obstacles)
+            obstacles.append(_tube(lumen.vertices_mm[loop], ring))
             ring_ids = np.arange(count, count + len(loop), dtype=np.int32)
             vertices.append(ring)
             faces.append(_strip(loop, ring_ids))
@@ -316,19 +318,24 @@ def _opening_of(vessel: Vessel, ring: Floats) -> int | None:
     return nearest if distance[nearest] < 0.5 else None
 
 
-def _extruded(vessel: Vessel, k: int, ring: Floats) -> Floats:
-    """Ring moved out along the opening's normal onto the plane where the extension ends."""
+def _extruded(vessel: Vessel, k: int, ring: Floats, obstacles: Sequence[Surface]) -> Floats:
+    """Ring moved out along the opening's normal onto the plane where the extension ends, half-way to an obstacle."""
     opening = vessel.openings[k]
-    wanted = _extension_mm(vessel, k)
-    outer = float(((ring - opening.center_mm) @ opening.normal).max())
-    starts = (
-        ring
-        + opening.normal * (0.05 * opening.diameter_mm + outer - (ring - opening.center_mm) @ opening.normal)[:, None]
-    )
-    free = vessel.lumen.first_hit(starts, np.broadcast_to(opening.normal, starts.shape)).min()
-    length = outer + min(wanted, 0.5 * float(free))
-    along = length - (ring - opening.center_mm) @ opening.normal
-    return ring + along[:, None] * opening.normal
+    ahead = (ring - opening.center_mm) @ opening.normal
+    outer = float(ahead.max())
+    rim = ring + (0.05 * opening.diameter_mm + outer - ahead)[:, None] * opening.normal
+    middle = rim.mean(axis=0)
+    starts = np.concatenate([rim, 0.5 * (rim + middle), middle[None]])
+    ways = np.broadcast_to(opening.normal, starts.shape)
+    free = min(float(obstacle.first_hit(starts, ways).min()) for obstacle in obstacles)
+    length = outer + min(_extension_mm(vessel, k), 0.5 * free)
+    return ring + (length - ahead)[:, None] * opening.normal
+
+
+def _tube(inner_mm: Floats, outer_mm: Floats) -> Surface:
+    """Tube between two rings (j, 3)."""
+    inner = np.arange(len(inner_mm), dtype=np.int32)
+    return Surface(np.concatenate([inner_mm, outer_mm]), _strip(inner, inner + len(inner)))
 
 
 def _strip(inner: Ints, outer: Ints) -> Ints:
@@ -360,8 +367,14 @@ def _links(
     return cell.astype(np.int32), direction.astype(np.int32), fraction, patch.astype(np.int32)
 
 
-def _septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, cell_size_mm: float) -> tuple[Ints, Ints]:
-    """Links between two blood cells with a wall between them: their cell and direction, each pair once."""
+def septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, cell_size_mm: float) -> tuple[Ints, Ints]:
+    """Links between two blood cells with a wall between them: their cell and direction, each pair once.
+
+    Parameters
+    ----------
+    surface : the blood's; neighbour : (n, 19) number of every cell's neighbours, -1 where these are no blood.
+    cells, origin_mm, cell_size_mm : as of a `Domain`.
+    """
     is_edge = np.asarray((neighbour < 0).any(axis=1))
     candidate = is_edge[:, None] & (neighbour >= 0) & is_edge[neighbour]
     candidate[:, 0::2] = False
