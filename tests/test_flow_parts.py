@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tubes import line, tube
+from tubes import arc, line, tube
 from vstent import device
 from vstent.errors import FlowError
 from vstent.flow import Blood, FlowCase, FlowSettings, domain, screen
@@ -189,6 +189,19 @@ def duct(section_mm: list[tuple[float, float]], length_mm: float = 6.0) -> Vesse
         for h, s, role in zip(z, (-1, 1), ("inlet", "outlet_1"), strict=True)
     ]
     return Vessel(Surface(vertices, faces.astype(np.int32)), tuple(ends))
+
+
+@pytest.mark.parametrize(("turn_degrees", "straight_mm"), [(300, 2.0), (300, 3.0)])
+def test_extensions_of_openings_that_face_each_other_keep_apart(turn_degrees: float, straight_mm: float) -> None:
+    """The blood is the vessel's and both extensions', none of it twice; both ends are open as a tube's."""
+    vessel = tube(arc(8.0, np.radians(turn_degrees), straight_mm=straight_mm), 1.5, around=60).vessel
+    grid = domain.build(vessel, 0.15)
+    ends = zip(grid.sections, vessel.openings, strict=True)
+    length_mm = sum(float(((section - k.center_mm) @ k.normal).max()) for section, k in ends)
+    expected_mm3 = abs(vessel.closed.volume_mm3) + np.pi * 1.5**2 * length_mm
+    assert len(grid.cells) * 0.15**3 == pytest.approx(expected_mm3, rel=1e-3)
+    links = np.bincount(grid.link_patch)[1:]
+    assert links.min() > 0.8 * 5 * np.pi * (1.5 / 0.15) ** 2
 
 
 def test_a_corner_that_a_link_clips_parts_nothing_but_a_wall_thinner_than_a_cell_does() -> None:

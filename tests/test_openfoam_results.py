@@ -9,9 +9,10 @@ import pytest
 from vstent import phantoms
 from vstent.errors import FlowError, ReadError
 from vstent.flow import FlowCase, FlowSettings, Screen, sampling
-from vstent.flow.engines import run
+from vstent.flow.engines import Progress, run
 from vstent.flow.engines.openfoam import OpenFoam
 from vstent.flow.openfoam import program, results, scatter
+from vstent.flow.types import PHASES, Waveform
 from vstent.trace import trace
 from vstent.vessel import Vessel
 
@@ -146,3 +147,27 @@ def test_openfoams_flow_in_a_tube_is_poiseuilles(tmp_path: Path) -> None:
     assert np.abs(stress / expected - 1).max() < 0.05
     # The same case goes on from the last time written: nothing is left to do.
     assert run(engine, case).steps <= field.steps / 2
+
+
+@pytest.mark.skipif(shutil.which("pimpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")
+def test_a_pulse_that_openfoam_stopped_in_goes_on_in_the_same_cycle(tmp_path: Path) -> None:
+    """It was stopped in the second of two cycles: that one is completed, and compared with the first."""
+    engine, pulse = OpenFoam(0.6, tmp_path / "case", layers=0, grid_size_mm=0.4), Waveform(0.4, (0.5,), (0.0,))
+    case = FlowCase(tube(), settings=FlowSettings(inflow_mL_s=FLOW_ML_S, waveform=pulse, max_cycles=2))
+    checks = []
+
+    def stopping(progress: Progress) -> None:
+        checks.append(progress.fraction)
+        if len(checks) == PHASES + 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(engine, case, progress=stopping)
+    field = run(engine, case)
+    assert len(field.residual) == PHASES - 3
+    assert f"Cycle 2 repeats the one before to within {100 * field.residual[-1]:.1f} %" in field.advice
+    assert field.residual[-1] < 0.05
+    time_s = np.array([phase.time_s for phase in field.phases])
+    np.testing.assert_allclose(time_s, 0.4 * np.arange(1, PHASES + 1) / PHASES)
+    inflow_mL_s = np.array([phase.inlet_mL_s for phase in field.phases])
+    np.testing.assert_allclose(inflow_mL_s, FLOW_ML_S * pulse.factor(time_s), rtol=0.02)

@@ -15,7 +15,8 @@ import numpy as np
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
-from vstent.flow.engines.lattice_pulse import cycle_change
+from vstent.flow.engines.lattice_pace import waveform_of
+from vstent.flow.engines.lattice_pulse import cycle_change, cycles_advice
 from vstent.flow.engines.lattice_settling import quantities_left
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
@@ -96,16 +97,19 @@ class OpenFoam(AbstractEngine[State]):
         setup = FoamSetup(
             self.cell_size_mm, found.flavour, self.layers, processes=case.settings.processes, struts=solids
         )
+        domain = domains.build(case.vessel, self.grid_size_mm or self.cell_size_mm)
+        sac = domains.cells_of_sac(case, domain)
         foam = foam_case(case, setup)
         folders.prepare(self.folder, foam)
         folders.mesh(found, self.folder, setup)
         if start is not None and not results.times(self.folder):
             folders.begin_from(self.folder, start)
-        domain = domains.build(case.vessel, self.grid_size_mm or self.cell_size_mm)
-        sac = domains.cells_of_sac(case, domain)
         across = bridge(case, domain, self.folder)
         kept: deque[Snapshot] = deque(maxlen=PHASES if case.settings.waveform else CHECKS_AVERAGED)
-        return State(case, setup, found, foam.application, self.folder, domain, across, sac, kept)
+        state = State(case, setup, found, foam.application, self.folder, domain, across, sac, kept)
+        for time in _whole_cycles(case, results.times(self.folder)):
+            _note(state, time)
+        return state
 
     def step(self, state: State) -> State:
         """Run the solver to the next check and read what it wrote."""
@@ -115,8 +119,7 @@ class OpenFoam(AbstractEngine[State]):
         folders.stop_at(state.folder, end, every=None if state.is_pulse else CHECK_ITERATIONS)
         said = program.run(state.found, state.folder, [state.application], processes=state.setup.processes)
         state.loop_seconds += perf_counter() - began
-        state.snapshots.append(read(state.case, state.bridge, state.folder, results.times(state.folder)[-1]))
-        state.history.append(_monitored(state, state.snapshots[-1]))
+        _note(state, results.times(state.folder)[-1])
         state.is_settled = not _correct_inflow(state) and "solution converged" in said
         return state
 
@@ -149,7 +152,8 @@ class OpenFoam(AbstractEngine[State]):
     def max_checks(self, state: State) -> int:
         """Checks within the limit of iterations, or phases of all cycles."""
         if state.is_pulse:
-            return PHASES * state.case.settings.max_cycles
+            left = PHASES * state.case.settings.max_cycles - _phases_done(state)
+            return left if left > 0 else PHASES
         return state.setup.iterations // CHECK_ITERATIONS
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
@@ -173,11 +177,32 @@ def _solids(case: FlowCase) -> Surface | None:
 
 
 def _next_end(state: State, reached: float) -> float:
-    waveform = state.case.settings.waveform
-    if waveform is None:
+    if not state.is_pulse:
         return reached + CHECK_ITERATIONS
-    phase_s = waveform.period_s / PHASES
+    phase_s = waveform_of(state.case).period_s / PHASES
     return (round(reached / phase_s) + 1) * phase_s
+
+
+def _whole_cycles(case: FlowCase, written: list[str]) -> list[str]:
+    """Times from the beginning of the first cycle of which all are still there; none of a steady flow."""
+    if case.settings.waveform is None:
+        return []
+    phase_s = case.settings.waveform.period_s / PHASES
+    is_first = [round(float(time) / phase_s) % PHASES == 1 for time in written]
+    return written[is_first.index(True) :] if any(is_first) else []
+
+
+def _phases_done(state: State) -> int:
+    """Phases since the pulse began, in this run and those that it goes on from."""
+    if not state.snapshots:
+        return 0
+    return round(float(state.snapshots[-1].time) * PHASES / waveform_of(state.case).period_s)
+
+
+def _note(state: State, time: str) -> None:
+    """Read what was written at a time, and what is monitored of it."""
+    state.snapshots.append(read(state.case, state.bridge, state.folder, time))
+    state.history.append(_monitored(state, state.snapshots[-1]))
 
 
 def _monitored(state: State, now: Snapshot) -> Floats:
@@ -227,20 +252,27 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
         steps=steps,
         seconds=outcome.seconds,
         updates_per_s=state.bridge.n_cells * steps / max(state.loop_seconds, 1e-9),
-        phases=tuple(map(_phase, kept)) if state.is_pulse else (),
+        phases=_phases(state.case, kept) if state.is_pulse else (),
     )
 
 
-def _phase(one: Snapshot) -> Phase:
-    inlet_mL_s, outlets_mL_s = -float(one.outflow_mL_s[0]), one.outflow_mL_s[1:]
-    return Phase(float(one.time), inlet_mL_s, outlets_mL_s, one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa)
+def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
+    """The last cycle; its times are those of the waveform."""
+    phase_s = waveform_of(case).period_s / PHASES
+
+    def phase(k: int, one: Snapshot) -> Phase:
+        through_mL_s = -float(one.outflow_mL_s[0]), one.outflow_mL_s[1:]
+        return Phase((k + 1) * phase_s, *through_mL_s, one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa)
+
+    return tuple(phase(k, one) for k, one in enumerate(cycle))
 
 
 def _advice(state: State, outcome: Outcome) -> str:
     mesh = f"OpenFOAM on {state.bridge.n_cells} cells ({state.folder})."
     if state.is_pulse:
-        cycles = len(state.history) // PHASES
-        return f"Cycle {cycles} repeats the one before to within {100 * outcome.residual[-1]:.1f} %. {mesh}"
+        changes = np.array([change for change in outcome.residual if np.isfinite(change)])
+        cycles = _phases_done(state) // PHASES
+        return f"{cycles_advice(changes, cycles, is_converged=outcome.is_converged)} {mesh}"
     if outcome.is_converged:
         return f"The flow has settled. {mesh}"
     return (

@@ -118,6 +118,6 @@ def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
         across.pressure_to_cells @ pressure_Pa,
         traction_Pa - np.einsum("ij,ij->i", traction_Pa, normal)[:, None] * normal,
         across.pressure_to_lumen @ pressure_Pa,
-        np.array([folders.flow_mL_s(folder, opening.role) for opening in case.vessel.openings]),
+        np.array([folders.flow_mL_s(folder, opening.role, time) for opening in case.vessel.openings]),
         sampling.inflow_mL_s(through_mL_s),
     )

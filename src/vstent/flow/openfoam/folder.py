@@ -6,6 +6,8 @@ import shutil
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from vstent.flow import sampling
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.case import FoamCase
@@ -90,11 +92,13 @@ def stop_at(folder: Path, end: float, *, every: int | None) -> None:
     write_text(path, text)
 
 
-def flow_mL_s(folder: Path, patch: str) -> float:
-    """Last flow out through a patch that the function objects noted."""
-    files = (folder / "postProcessing" / f"flow_{patch}").glob("*/*.dat")
-    last = max(files, key=lambda path: path.stat().st_mtime_ns).read_text().splitlines()[-1]
-    return float(last.split()[1]) / M3_PER_ML
+def flow_mL_s(folder: Path, patch: str, time: str) -> float:
+    """Flow out through a patch at a time, as the function objects noted it; the last run's, where several did."""
+    files = sorted(
+        (folder / "postProcessing" / f"flow_{patch}").glob("*/*.dat"), key=lambda path: float(path.parent.name)
+    )
+    rows = np.concatenate([np.loadtxt(path, usecols=(0, 1), ndmin=2) for path in reversed(files)])
+    return float(rows[np.abs(rows[:, 0] - float(time)).argmin(), 1]) / M3_PER_ML
 
 
 def scale_inflow(folder: Path, factor: float) -> bool:
