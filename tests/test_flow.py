@@ -15,7 +15,7 @@ from vstent.flow.close_up import close_up
 from vstent.flow.engines import AbstractEngine, Outcome, run
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_settling import SURE, mean_of, swings, with_check
-from vstent.flow.engines.lattice_state import State
+from vstent.flow.engines.lattice_state import State, read
 from vstent.kernels import lattice
 from vstent.kernels.arrays import Floats
 from vstent.openings import open_ends
@@ -134,6 +134,27 @@ def test_a_flow_that_swings_is_its_mean_once_that_is_known() -> None:
     assert factor == pytest.approx(1.0, abs=SURE * mean.standard_error)
     assert field.unsettled_fraction == pytest.approx(SURE * mean.standard_error)
     assert "The flow goes on moving about its mean: these are means over its last" in field.advice
+
+
+def test_what_goes_to_and_fro_is_told_by_its_size_and_not_by_its_mean() -> None:
+    engine, state, _ = unsettled(3)
+    still, factors = state.snapshots[-1], np.cos(2 * np.pi * np.arange(64) / 8 + 0.3)
+    state.history, state.blocks = [], ()
+    for factor in factors:
+        now = replace(still, velocity=np.float32(factor) * still.velocity)
+        state.history.append(np.array([abs(factor), 1.0, abs(factor), 2.0 + abs(factor)]))
+        state.snapshots.append(now)
+        state.blocks = with_check(state.blocks, now)
+    field = engine.result(state, Outcome(False, (0.5,), 1.0, 1.0))
+    checks = mean_of(state.blocks, np.array(state.history), state.probe.cells).checks
+    size = np.abs(factors[-checks:]).mean()
+    speed_m_s = np.linalg.norm(still.velocity_m_s, axis=1)
+    assert np.linalg.norm(field.velocity_m_s, axis=1).max() < 1e-3 * speed_m_s.max()
+    np.testing.assert_allclose(field.speed_m_s, size * speed_m_s, rtol=1e-4)
+    steady_Pa = np.linalg.norm(read(state, [still]).wall_shear_stress_Pa, axis=1)
+    np.testing.assert_allclose(field.shear_Pa, size * steady_Pa, atol=0.02 * size * steady_Pa.max())
+    assert field.swing is not None
+    assert field.swing.neck_inflow_mL_s == pytest.approx(2.0 + size)
 
 
 def disc(resistance_Pa_s_m: float) -> Screen:

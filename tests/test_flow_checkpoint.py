@@ -80,6 +80,8 @@ def test_a_stopped_flow_goes_on_to_the_same_bits(
 def assert_same(a: FlowField, b: FlowField) -> None:
     np.testing.assert_array_equal(a.velocity_m_s, b.velocity_m_s)
     np.testing.assert_array_equal(a.pressure_Pa, b.pressure_Pa)
+    np.testing.assert_array_equal(a.speed_m_s, b.speed_m_s)
+    np.testing.assert_array_equal(a.shear_Pa, b.shear_Pa)
     np.testing.assert_array_equal(a.residual, b.residual)
     assert (a.steps, a.advice, len(a.phases)) == (b.steps, b.advice, len(b.phases))
     for one, other in zip(a.phases, b.phases, strict=True):

@@ -8,7 +8,7 @@ import pytest
 from shapes import sphere
 from vstent.flow import Blood, FlowField, compare, indices
 from vstent.flow.indices import NEAR_MM
-from vstent.flow.types import Phase
+from vstent.flow.types import Phase, Swing
 from vstent.kernels.arrays import Floats
 from vstent.surface import Surface
 
@@ -108,6 +108,18 @@ def test_quotients_of_a_pulse_are_of_its_means() -> None:
     assert found["neck_inflow_mL_s"] == pytest.approx(0.75 * of_steady["neck_inflow_mL_s"], rel=1e-3)
     assert found["turnover_time_s"] == pytest.approx(of_steady["turnover_time_s"] / 0.75, rel=1e-3)
     assert found["inflow_concentration_index"] == pytest.approx(of_steady["inflow_concentration_index"], rel=1e-3)
+
+
+def test_of_a_flow_that_moves_sizes_are_meant_not_the_size_of_the_mean() -> None:
+    """Its mean goes into the sac at 0.02 m/s; what goes to and fro besides is told by its swing."""
+    still = flow(through_neck(0.02, 0.0))
+    swing = Swing(np.full(len(still.cells), 0.09), 3.0 * still.shear_Pa, 5.0)
+    found = indices(replace(still, swing=swing), sac(), plate(NECK_HALF_MM, 0.2))
+    assert found["mean_sac_velocity_m_s"] == pytest.approx(0.09)
+    assert found["fast_sac_volume_mm3"] == pytest.approx(sac().volume_mm3)
+    assert found["mean_sac_wss_Pa"] == pytest.approx(6.0)
+    assert found["neck_inflow_mL_s"] == 5.0
+    assert found["neck_inflow_mL_s"] - found["neck_outflow_mL_s"] == pytest.approx(0.02 * 64)
 
 
 def test_ratios_are_of_what_both_have_and_nothing_is_divided_by_zero() -> None:

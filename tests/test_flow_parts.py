@@ -25,7 +25,7 @@ from vstent.flow.screen import (
     on_grid,
     tangential_share,
 )
-from vstent.flow.wall_stress import wall_stress
+from vstent.flow.wall_stress import mean_shear_Pa, wall_stress
 from vstent.stent import Stent
 from vstent.surface import Surface
 from vstent.vessel import Opening, Vessel
@@ -152,6 +152,9 @@ def test_wall_stress_of_an_exact_poiseuille_flow_is_exact(cells_per_diameter):
     # 0.44 % at most, from the facets: depths are those of a polygon, the velocity that of the circle round it.
     np.testing.assert_allclose(stress[middle, 2], 0.004 * 1.0 / 2e-3 * 2, rtol=0.005)
     np.testing.assert_allclose(pressure[middle], 3.0 - 2.0 * z[middle], atol=1e-6)
+    # As much of a flow that goes to and fro: beside a wall the mean speed grows by the mean shear rate.
+    sizes_Pa = mean_shear_Pa(grid, 2 / np.pi * velocity[:, 2], lumen=vessel.lumen, blood=Blood())
+    np.testing.assert_allclose(sizes_Pa[middle], 2 / np.pi * 0.004 * 1.0 / 2e-3 * 2, rtol=0.005)
 
 
 def test_the_grid_of_a_tube_has_its_volume_its_ends_and_exact_wall_distances():

@@ -21,7 +21,7 @@ from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow import sampling
 from vstent.flow.domain import BEYOND, Domain, Window
-from vstent.flow.types import FlowCase, FlowField, Phase
+from vstent.flow.types import FlowCase, FlowField, Phase, Swing
 from vstent.kernels import lattice_sampling
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.lattice import VELOCITIES
@@ -224,15 +224,21 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
     shift = np.rint((inner.origin_mm - corner_mm) / inner.cell_size_mm).astype(np.int32)
     cells = np.concatenate([inner.cells + shift, children])
     order = np.lexsort(cells.T[::-1])
+    around_mm = corner_mm + children * inner.cell_size_mm
     is_fine = _is_well_within(chosen, inner.wall)
 
     def joined(fine: Phase | FlowField, wide: FlowField) -> tuple[Floats, Floats, Floats]:
         """Velocity and pressure in all cells and stress on the wall, at a moment."""
-        around = sampling.values_at(wide, corner_mm + children * inner.cell_size_mm)
+        around = sampling.values_at(wide, around_mm)
         within = fine.velocity_m_s, fine.pressure_Pa
         velocity_m_s, pressure_Pa = (np.concatenate(pair)[order] for pair in zip(within, around, strict=True))
         stress_Pa = np.where(is_fine[:, None], fine.wall_shear_stress_Pa, wide.wall_shear_stress_Pa)
         return velocity_m_s, pressure_Pa, stress_Pa
+
+    def swinging(swing: Swing) -> Swing:
+        """That of the close-up, and elsewhere what the wide cells have."""
+        speed_m_s = np.concatenate([swing.speed_m_s, sampling.speed_at(outer, around_mm)])[order]
+        return Swing(speed_m_s, np.where(is_fine, swing.shear_Pa, outer.shear_Pa), swing.neck_inflow_mL_s)
 
     velocity_m_s, pressure_Pa, stress_Pa = joined(inner, outer)
     return replace(
@@ -247,6 +253,7 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
             Phase(fine.time_s, wide.inlet_mL_s, wide.outlets_mL_s, *joined(fine, outer.at_phase(wide)))
             for fine, wide in zip(inner.phases, outer.phases, strict=True)
         ),
+        swing=None if inner.swing is None else swinging(inner.swing),
         inlet_mL_s=outer.inlet_mL_s,
         outlets_mL_s=outer.outlets_mL_s,
         inlet_pressure_Pa=outer.inlet_pressure_Pa,

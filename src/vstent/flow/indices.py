@@ -45,7 +45,9 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
     - ``inflow_concentration_index`` = (inflow / inlet flow) / inflow area fraction (Cebral et al. 2011, AJNR 32, 145).
 
     Of a pulsatile flow, the means over its cycle, and quotients of these; wall shear stress is then its magnitude's
-    time average (TAWSS), and ``mean_sac_oscillatory_shear_fraction`` (OSI) is given besides.
+    time average (TAWSS), and ``mean_sac_oscillatory_shear_fraction`` (OSI) is given besides. Of a steady flow that
+    moves, the means of speed, stress and neck inflow too, not those of the mean flow, in which what goes to and fro
+    cancels; only where blood enters is told from the mean flow.
     """
     result = _of_vessel(field)
     if sac is not None and ostium is not None:
@@ -79,9 +81,10 @@ def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
     velocity_m_s = lattice_sampling.interpolate(field.index, field.velocity_m_s, points, True)
     through_mL_s = sampling.through_mL_s(velocity_m_s, area_mm2)
     sizes_mm2 = np.linalg.norm(area_mm2, axis=1)
+    inflow_mL_s = sampling.inflow_mL_s(through_mL_s) if field.swing is None else field.swing.neck_inflow_mL_s
     return {
-        "neck_inflow_mL_s": sampling.inflow_mL_s(through_mL_s),
-        "neck_outflow_mL_s": sampling.inflow_mL_s(-through_mL_s),
+        "neck_inflow_mL_s": inflow_mL_s,
+        "neck_outflow_mL_s": inflow_mL_s - float(through_mL_s.sum()),
         "inflow_area_fraction": float(sizes_mm2[through_mL_s > 0].sum() / sizes_mm2.sum()),
     }
 

@@ -16,6 +16,12 @@ def values_at(field: FlowField, points_mm: Floats) -> tuple[Floats, Floats]:
     return velocity, pressure
 
 
+def speed_at(field: FlowField, points_mm: Floats) -> Floats:
+    """Speed (m,) in m/s at points (m, 3), its mean where a steady flow moves; zero outside."""
+    points = (points_mm - field.origin_mm) / field.cell_size_mm
+    return lattice_sampling.interpolate(field.index, field.speed_m_s[:, None], points, True)[:, 0]
+
+
 def surface_samples(surface: Surface, spacing_mm: float) -> tuple[Floats, Floats]:
     """Points (p, 3) at most about `spacing_mm` apart on a surface and their area vectors (p, 3) in mm^2."""
     done, corners = [], surface.corners_mm

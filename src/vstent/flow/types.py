@@ -232,6 +232,22 @@ class Phase:
 
 
 @dataclass(frozen=True, eq=False)
+class Swing:
+    """What the mean of a steady flow that moves does not tell: what goes to and fro cancels in it."""
+
+    speed_m_s: Floats
+    """(n,) mean speed at the cell centres."""
+    shear_Pa: Floats
+    """(v,) mean magnitude of the wall shear stress at the lumen's vertices."""
+    neck_inflow_mL_s: float
+    """Mean neck inflow; 0 where there is no neck."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "speed_m_s", np.float64, (-1,))
+        freeze(self, "shear_Pa", np.float64, (-1,))
+
+
+@dataclass(frozen=True, eq=False)
 class FlowField:
     """A computed flow and how it was reached: steady, or the mean of one that swings or pulses."""
 
@@ -279,6 +295,8 @@ class FlowField:
     """Cell updates per second, the finest grid's loop alone."""
     phases: tuple[Phase, ...] = ()
     """The last cycle of a pulsatile flow, at equal times; empty for a steady one."""
+    swing: Swing | None = None
+    """Of a steady flow that moves about its mean; None of any other."""
 
     def __post_init__(self) -> None:
         freeze(self, "cells", np.int32, (-1, 3))
@@ -299,8 +317,8 @@ class FlowField:
 
     @cached_property
     def speed_m_s(self) -> Floats:
-        """(n,) magnitude of the velocity."""
-        return np.linalg.norm(self.velocity_m_s, axis=1)
+        """(n,) magnitude of the velocity; its mean where a steady flow moves."""
+        return np.linalg.norm(self.velocity_m_s, axis=1) if self.swing is None else self.swing.speed_m_s
 
     @cached_property
     def index(self) -> Ints:
@@ -309,7 +327,9 @@ class FlowField:
 
     @cached_property
     def shear_Pa(self) -> Floats:
-        """(v,) magnitude of the wall shear stress; its time average (TAWSS) where the flow pulses."""
+        """(v,) magnitude of the wall shear stress; its time average (TAWSS) where the flow pulses or moves."""
+        if self.swing is not None:
+            return self.swing.shear_Pa
         moments = self.phases or (self,)
         return np.mean([np.linalg.norm(now.wall_shear_stress_Pa, axis=1) for now in moments], axis=0, dtype=float)
 
@@ -333,4 +353,5 @@ class FlowField:
             inlet_mL_s=phase.inlet_mL_s,
             outlets_mL_s=phase.outlets_mL_s,
             phases=(),
+            swing=None,
         )

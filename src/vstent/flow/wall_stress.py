@@ -27,6 +27,25 @@ def wall_stress(
     velocity_m_s, pressure_Pa : (n, 3), (n,) of the cells.
     lumen : the wall, open at its ends; its faces are outward.
     """
+    gradient_per_s, wall_pressure_Pa = _fit(domain, velocity_m_s, pressure_Pa, lumen)
+    normal = lumen.vertex_normals
+    shear_per_s = gradient_per_s - np.einsum("ij,ij->i", gradient_per_s, normal)[:, None] * normal
+    viscosity_Pa_s = blood.viscosity_at_Pa_s(np.linalg.norm(shear_per_s, axis=1))
+    return viscosity_Pa_s[:, None] * shear_per_s, wall_pressure_Pa
+
+
+def mean_shear_Pa(domain: Domain, speed_m_s: Floats, *, lumen: Surface, blood: Blood) -> Floats:
+    """Mean magnitude (v,) of the wall shear stress from the mean speed (n,) of the cells.
+
+    Beside a wall speed is shear rate times distance at every moment: the mean speed's gradient is the mean shear rate.
+    """
+    speeds = speed_m_s[:, None] * np.eye(3)[0]
+    rate_per_s = np.abs(_fit(domain, speeds, np.zeros(len(speeds)), lumen)[0][:, 0])
+    return blood.viscosity_at_Pa_s(rate_per_s) * rate_per_s
+
+
+def _fit(domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, lumen: Surface) -> tuple[Floats, Floats]:
+    """Gradient (v, 3) of the velocity away from the wall, 1/s, and pressure (v,) at the vertices of the lumen."""
     fit = lattice_sampling.fit_wall(
         domain.index,
         domain.depth_mm / domain.cell_size_mm,
@@ -36,8 +55,4 @@ def wall_stress(
         -lumen.vertex_normals,
         REACH,
     )
-    gradient_per_s = fit[:, :3] / (domain.cell_size_mm * M_PER_MM)
-    normal = lumen.vertex_normals
-    shear_per_s = gradient_per_s - np.einsum("ij,ij->i", gradient_per_s, normal)[:, None] * normal
-    viscosity_Pa_s = blood.viscosity_at_Pa_s(np.linalg.norm(shear_per_s, axis=1))
-    return viscosity_Pa_s[:, None] * shear_per_s, fit[:, 3]
+    return fit[:, :3] / (domain.cell_size_mm * M_PER_MM), fit[:, 3]

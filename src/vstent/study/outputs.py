@@ -61,9 +61,11 @@ def write_field(folder: Path, field: FlowField) -> None:
     """Write the flow in the cells and on the wall."""
     folder.mkdir(parents=True, exist_ok=True)
     of_cell = {"velocity_m_s": field.velocity_m_s, "pressure_Pa": field.pressure_Pa}
+    if field.swing:
+        of_cell["mean_speed_m_s"] = field.speed_m_s
     writers.write_cells(folder / "field.vtu", field.centers_mm, field.cell_size_mm, of_cell)
     of_vertex = {"wall_shear_stress_Pa": field.wall_shear_stress_Pa, "pressure_Pa": field.wall_pressure_Pa}
-    if field.phases:
+    if field.phases or field.swing:
         of_vertex |= {
             "time_averaged_wall_shear_stress_Pa": field.shear_Pa,
             "oscillatory_shear_index": field.oscillatory_shear_index,

@@ -12,7 +12,7 @@ from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.engines.lattice_checkpoint import pack, unpack
 from vstent.flow.engines.lattice_pace import longest_step_s, peak_speed_m_s
 from vstent.flow.engines.lattice_settling import CHECKS_APART, SURE, Mean, left_to_settle, mean_of, swings, with_check
-from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, read, step
+from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, read, read_moving, step
 from vstent.flow.engines.lattice_trouble import trouble
 from vstent.flow.gpu import require_gpu
 from vstent.flow.types import FlowCase, FlowField
@@ -112,7 +112,7 @@ class LatticeBoltzmann(AbstractLattice):
             return field_of(state, read(state, [state.snapshots[-1]]), outcome, left, "The flow has settled.")
         mean = _mean(state)
         uncertain, advice = _of_mean(state, mean, is_converged=outcome.is_converged)
-        return field_of(state, read(state, state.blocks[-mean.blocks :]), outcome, uncertain, advice)
+        return field_of(state, read_moving(state, state.blocks[-mean.blocks :]), outcome, uncertain, advice)
 
 
 def _steps_per_check(case: FlowCase, step_s: float) -> int:

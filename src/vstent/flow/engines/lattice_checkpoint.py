@@ -43,14 +43,17 @@ def _columns(name: str, snapshots: Collection[Snapshot], cells: int) -> Saved:
         f"{name} density": np.array([one.density for one in snapshots], np.float32).reshape(count, cells),
         f"{name} outflow": np.array([one.outflow for one in snapshots]),
         f"{name} checks": np.array([one.checks for one in snapshots]),
+        f"{name} speed": np.array([one.speed for one in snapshots if one.checks > 1], np.float32).reshape(-1, cells),
     }
 
 
 def _snapshots(name: str, saved: Saved, scales: Scales) -> Iterator[Snapshot]:
     """The snapshots saved by this name."""
     columns = (saved[f"{name} {what}"] for what in ("step_s", "velocity", "density", "outflow", "checks"))
+    speeds = iter(saved[f"{name} speed"])
     for step_s, velocity, density, outflow, checks in zip(*columns, strict=True):
-        yield Snapshot(replace(scales, step_s=float(step_s)), velocity, density, outflow, int(checks))
+        speed = next(speeds) if checks > 1 else None
+        yield Snapshot(replace(scales, step_s=float(step_s)), velocity, density, outflow, int(checks), speed)
 
 
 def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp | None) -> State:

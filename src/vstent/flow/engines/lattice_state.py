@@ -30,8 +30,8 @@ from vstent.flow.engines.lattice_setup import (
     thickest,
 )
 from vstent.flow.gpu import require_gpu, told
-from vstent.flow.types import FlowCase, FlowField, Phase
-from vstent.flow.wall_stress import wall_stress
+from vstent.flow.types import FlowCase, FlowField, Phase, Swing
+from vstent.flow.wall_stress import mean_shear_Pa, wall_stress
 from vstent.kernels import lanes, lattice, lattice_sampling
 from vstent.kernels.arrays import Floats, Ints
 from vstent.kernels.warm import keep_flow
@@ -46,6 +46,8 @@ DEFER_PART = 0.15
 """Part of the way that each update goes."""
 TOO_FAST = 0.75
 """Speed over the sound's from which a result is not to be trusted: at that speed a tube loses a tenth of its blood."""
+NECK_INFLOW = 3
+"""Column of the monitored quantities that is the neck inflow, where there is a neck."""
 SLICE_UPDATES = 2e8
 """Cell updates between looks at the clock: a few seconds of one core."""
 
@@ -76,6 +78,15 @@ class Snapshot:
     """(k,) through every end."""
     checks: int = 1
     """Checks that it is the mean of."""
+    mean_speed: NDArray[np.float32] | None = None
+    """(n,) mean speed of every cell over them; None of a single one."""
+
+    @property
+    def speed(self) -> NDArray[np.float32]:
+        """(n,) speed of every cell, or its mean over the checks."""
+        if self.mean_speed is None:
+            return np.asarray(np.linalg.norm(self.velocity, axis=1))
+        return self.mean_speed
 
     def and_also(self, other: "Snapshot") -> "Snapshot":
         """Return the mean of this and another, each counting as many times as it has checks; units are alike."""
@@ -86,12 +97,18 @@ class Snapshot:
             self.density + share * (other.density - self.density),
             self.outflow + share * (other.outflow - self.outflow),
             self.checks + other.checks,
+            self.speed + share * (other.speed - self.speed),
         )
 
     @property
     def velocity_m_s(self) -> NDArray[np.float32]:
         """(n, 3) of every cell."""
         return self.velocity * np.float32(self.scales.speed_m_s)
+
+    @property
+    def speed_m_s(self) -> NDArray[np.float32]:
+        """(n,) of every cell, or its mean over the checks."""
+        return self.speed * np.float32(self.scales.speed_m_s)
 
     @property
     def pressure_Pa(self) -> NDArray[np.float32]:
@@ -420,26 +437,40 @@ class Reading:
     """(v,)."""
     outflow_mL_s: Floats
     """(k,) through every opening; nan where a close-up does not reach it, 0 where no cell of all does."""
+    swing: Swing | None = None
+    """What it is the mean of, where a steady flow moves."""
 
 
 def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     """Return the mean of some snapshots in SI units, with the stress on the wall."""
     domain = state.domain
-    share = np.array([one.checks for one in snapshots]) / sum(one.checks for one in snapshots)
-
-    def mean(values: Iterable[Floats | NDArray[np.float32]]) -> Floats:
-        return np.asarray(sum(part * value for part, value in zip(share, values, strict=True)))
-
-    velocity_m_s = mean(one.velocity_m_s for one in snapshots)
-    pressure_Pa = mean(one.pressure_Pa for one in snapshots)
+    velocity_m_s = _mean(snapshots, (one.velocity_m_s for one in snapshots))
+    pressure_Pa = _mean(snapshots, (one.pressure_Pa for one in snapshots))
     stress_Pa, wall_pressure_Pa = wall_stress(
         domain, velocity_m_s, pressure_Pa, lumen=state.case.vessel.lumen, blood=state.case.blood
     )
     outflow_mL_s = np.full(len(state.case.vessel.openings), np.nan if state.close_up else 0.0)
     is_opening = state.links.patch <= len(outflow_mL_s)
-    through = mean(one.outflow_mL_s for one in snapshots)
+    through = _mean(snapshots, (one.outflow_mL_s for one in snapshots))
     outflow_mL_s[state.links.patch[is_opening] - 1] = through[is_opening]
     return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, outflow_mL_s)
+
+
+def read_moving(state: State, snapshots: Sequence[Snapshot]) -> Reading:
+    """Return the mean of the last snapshots of a flow that moves, with what a mean does not tell."""
+    flow, case = read(state, snapshots), state.case
+    speed_m_s = _mean(snapshots, (one.speed_m_s for one in snapshots))
+    shear_Pa = mean_shear_Pa(state.domain, speed_m_s, lumen=case.vessel.lumen, blood=case.blood)
+    least_Pa = np.linalg.norm(flow.wall_shear_stress_Pa, axis=1)
+    checks = sum(one.checks for one in snapshots)
+    inflow_mL_s = float(np.array(state.history)[-checks:, NECK_INFLOW:].mean(axis=0).sum())
+    return replace(flow, swing=Swing(speed_m_s, np.maximum(shear_Pa, least_Pa), inflow_mL_s))
+
+
+def _mean(snapshots: Sequence[Snapshot], values: Iterable[Floats | NDArray[np.float32]]) -> Floats:
+    """Mean of a value of each snapshot, each counting as many times as it has checks."""
+    share = np.array([one.checks for one in snapshots]) / sum(one.checks for one in snapshots)
+    return np.asarray(sum(part * value for part, value in zip(share, values, strict=True)))
 
 
 def field_of(
@@ -470,6 +501,7 @@ def field_of(
         seconds=outcome.seconds,
         updates_per_s=len(domain.cells) * state.steps / state.loop_seconds,
         phases=phases,
+        swing=flow.swing,
     )
     return field if state.close_up is None else close_ups.assembled(state.close_up, field)
 

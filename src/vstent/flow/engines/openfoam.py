@@ -24,7 +24,7 @@ from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
 from vstent.flow.openfoam.case import STRUT_REACH_MM, foam_case, wires_near
 from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.setup import FoamSetup
-from vstent.flow.types import PHASES, FlowCase, FlowField, Phase
+from vstent.flow.types import PHASES, FlowCase, FlowField, Phase, Swing
 from vstent.kernels.arrays import Floats, Ints
 from vstent.struts import struts
 from vstent.surface import Surface
@@ -253,7 +253,15 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
         seconds=outcome.seconds,
         updates_per_s=state.bridge.n_cells * steps / max(state.loop_seconds, 1e-9),
         phases=_phases(state.case, kept) if state.is_pulse else (),
+        swing=None if state.is_pulse or len(kept) == 1 else _swing(kept),
     )
+
+
+def _swing(kept: list[Snapshot]) -> Swing:
+    """What the mean of a steady solver's last checks does not tell."""
+    speed_m_s = np.mean([np.linalg.norm(one.velocity_m_s, axis=1) for one in kept], axis=0)
+    shear_Pa = np.mean([np.linalg.norm(one.wall_shear_stress_Pa, axis=1) for one in kept], axis=0)
+    return Swing(speed_m_s, shear_Pa, float(np.mean([one.neck_inflow_mL_s for one in kept])))
 
 
 def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
