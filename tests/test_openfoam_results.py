@@ -1,6 +1,7 @@
 """What comes back from OpenFOAM: fields read, brought to the grid, failures put into words, a tube's exact flow."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ from vstent import phantoms
 from vstent.errors import FlowError, ReadError
 from vstent.flow import FlowCase, FlowSettings, Screen, sampling
 from vstent.flow.engines import Progress, run
-from vstent.flow.engines.openfoam import OpenFoam
+from vstent.flow.engines.openfoam import OpenFoam, swing_of
 from vstent.flow.openfoam import program, results, scatter
+from vstent.flow.openfoam.bridge import Snapshot
 from vstent.flow.types import PHASES, Waveform
 from vstent.trace import trace
 from vstent.vessel import Vessel
@@ -147,6 +149,18 @@ def test_openfoams_flow_in_a_tube_is_poiseuilles(tmp_path: Path) -> None:
     assert np.abs(stress / expected - 1).max() < 0.05
     # The same case goes on from the last time written: nothing is left to do.
     assert run(engine, case).steps <= field.steps / 2
+
+
+def test_what_goes_to_and_fro_from_check_to_check_is_told_by_its_size() -> None:
+    still, outflow = np.zeros(2), np.zeros(2)
+    one = Snapshot("50", np.array([[3.0, 4, 0], [0, 1, 0]]), still, np.array([[0.0, 0, 2]]), still, outflow, 1.0)
+    other = replace(
+        one, velocity_m_s=-one.velocity_m_s, wall_shear_stress_Pa=-one.wall_shear_stress_Pa, neck_inflow_mL_s=2
+    )
+    found = swing_of([one, other])
+    np.testing.assert_allclose(found.speed_m_s, [5, 1])
+    np.testing.assert_allclose(found.shear_Pa, [2])
+    assert found.neck_inflow_mL_s == 1.5
 
 
 @pytest.mark.skipif(shutil.which("pimpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")

@@ -253,11 +253,11 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
         seconds=outcome.seconds,
         updates_per_s=state.bridge.n_cells * steps / max(state.loop_seconds, 1e-9),
         phases=_phases(state.case, kept) if state.is_pulse else (),
-        swing=None if state.is_pulse or len(kept) == 1 else _swing(kept),
+        swing=None if state.is_pulse or len(kept) == 1 else swing_of(kept),
     )
 
 
-def _swing(kept: list[Snapshot]) -> Swing:
+def swing_of(kept: list[Snapshot]) -> Swing:
     """What the mean of a steady solver's last checks does not tell."""
     speed_m_s = np.mean([np.linalg.norm(one.velocity_m_s, axis=1) for one in kept], axis=0)
     shear_Pa = np.mean([np.linalg.norm(one.wall_shear_stress_Pa, axis=1) for one in kept], axis=0)
