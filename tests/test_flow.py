@@ -14,8 +14,9 @@ from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, domain, sampl
 from vstent.flow.close_up import close_up
 from vstent.flow.engines import AbstractEngine, Outcome, run
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
+from vstent.flow.engines.lattice_reading import read
 from vstent.flow.engines.lattice_settling import SURE, mean_of, swings, with_check
-from vstent.flow.engines.lattice_state import State, read
+from vstent.flow.engines.lattice_state import State
 from vstent.kernels import lattice
 from vstent.kernels.arrays import Floats
 from vstent.openings import open_ends

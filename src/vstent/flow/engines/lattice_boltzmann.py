@@ -11,8 +11,9 @@ from vstent.flow.cost import estimate, refuse_too_large
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.engines.lattice_checkpoint import pack, unpack
 from vstent.flow.engines.lattice_pace import longest_step_s, peak_speed_m_s
+from vstent.flow.engines.lattice_reading import field_of, read, read_moving
 from vstent.flow.engines.lattice_settling import CHECKS_APART, SURE, Mean, left_to_settle, mean_of, swings, with_check
-from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, read, read_moving, step
+from vstent.flow.engines.lattice_state import State, build, is_at_check, step
 from vstent.flow.engines.lattice_trouble import trouble
 from vstent.flow.gpu import require_gpu
 from vstent.flow.types import FlowCase, FlowField

@@ -8,7 +8,8 @@ import numpy as np
 from vstent.flow.engines import Outcome
 from vstent.flow.engines.lattice_boltzmann import AbstractLattice
 from vstent.flow.engines.lattice_pace import pace, waveform_of
-from vstent.flow.engines.lattice_state import State, build, field_of, is_at_check, read
+from vstent.flow.engines.lattice_reading import field_of, read
+from vstent.flow.engines.lattice_state import State, build, is_at_check
 from vstent.flow.types import PHASES, FlowCase, FlowField, Phase
 from vstent.kernels.arrays import Floats
 
