@@ -250,6 +250,24 @@ def test_a_file_that_breaks_off_is_refused(oblique, tmp_path, suffix):
         read_image(file)
 
 
+@pytest.mark.parametrize("has_links", [True, False])
+@pytest.mark.parametrize("wanted", [".nii", ".nii.gz", ".NII.gz"])
+def test_a_nifti_file_is_read_and_not_one_beside_it_that_differs_in_its_suffix(
+    oblique, tmp_path, monkeypatch, wanted, has_links
+):
+    for suffix in (".nii", ".nii.gz", ".hdr"):
+        shifted = Image(oblique.voxels + (1000 if suffix == wanted.lower() else 0), oblique.affine_mm)
+        SimpleITK.WriteImage(itk_scan(shifted), str(tmp_path / f"scan{suffix}"))
+    (tmp_path / f"scan{wanted.lower()}").rename(tmp_path / f"scan{wanted}")
+    if not has_links:
+        monkeypatch.setattr("pathlib.Path.symlink_to", refused)
+    np.testing.assert_array_equal(read_image(tmp_path / f"scan{wanted}").voxels, oblique.voxels + 1000)
+
+
+def refused(*_):
+    raise OSError("no links here")
+
+
 def test_nifti_without_pixel_sizes_is_refused(oblique, tmp_path):
     file = tmp_path / "scan.nii"
     SimpleITK.WriteImage(itk_scan(oblique), str(file))

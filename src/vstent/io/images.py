@@ -2,9 +2,12 @@
 
 import gzip
 import math
+import shutil
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -112,9 +115,9 @@ def _read_itk(path: Path, kind: str, *, has_spacing: bool) -> Image:
     if kind in (".mha", ".mhd"):
         _refuse_odd_meta(path)
     reader = SimpleITK.ImageFileReader()
-    reader.SetFileName(str(path))
     try:
-        with silenced():
+        with silenced(), _alone(path, kind) as lone:
+            reader.SetFileName(str(lone))
             reader.ReadImageInformation()
             _refuse_untrue(path, kind, reader)
             scan = reader.Execute()
@@ -135,6 +138,21 @@ def _read_itk(path: Path, kind: str, *, has_spacing: bool) -> Image:
     affine[:3, :3] = np.reshape(scan.GetDirection(), (3, 3)) * scan.GetSpacing()
     affine[:3, 3] = scan.GetOrigin()
     return Image(SimpleITK.GetArrayViewFromImage(scan).transpose(), affine)
+
+
+@contextmanager
+def _alone(path: Path, kind: str) -> Iterator[Path]:
+    """Give a name of a NIfTI file in a folder of its own: beside `a.nii.gz` ITK would take the voxels of `a.nii`."""
+    if kind not in (".nii", ".nii.gz"):
+        yield path
+        return
+    with TemporaryDirectory(prefix="vstent-") as folder:
+        lone = Path(folder) / f"scan{kind}"
+        try:
+            lone.symlink_to(path.resolve())
+        except OSError:  # Windows lets few users make links
+            shutil.copyfile(path, lone)
+        yield lone
 
 
 def _refuse_odd_meta(path: Path) -> None:
