@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from vstent.errors import InputError, ReadError, UnitError
 from vstent.image import Image
 from vstent.io.dicom_writer import write_dicom
-from vstent.io.images import read_image
+from vstent.io.images import files_of, read_image
 
 SPACING = np.array([0.21, 0.23, 0.37])
 
@@ -97,6 +97,25 @@ def test_one_file_stands_for_its_series(oblique, series):
         shutil.copy(file, series / f"small_{file.name}")
     assert read_image(series / "small_IM0002.dcm").voxels.shape == (9, 8, 4)
     assert read_image(series / "IM0002.dcm").voxels.shape == (9, 8, 7)
+
+
+def test_a_file_that_is_no_image_does_not_stand_for_those_beside_it(series):
+    report = pydicom.dcmread(slices(series)[0])
+    for keyword in ("Rows", "Columns", "PixelData"):
+        delattr(report, keyword)
+    report.SOPClassUID = report.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.88.11"
+    report.save_as(series / "report.dcm")
+    with pytest.raises(ReadError, match="holds no DICOM images"):
+        read_image(series / "report.dcm")
+
+
+def test_a_series_has_the_files_of_that_series_whichever_of_them_is_given(oblique, series):
+    files = slices(series)
+    write_dicom(Image(oblique.voxels[:, :, :4] + 1, oblique.affine_mm), series / "other")
+    slices(series / "other")[0].rename(series / "z.dcm")
+    assert files_of(files[0]) == files_of(files[3]) == files
+    files[2].write_bytes(files[2].read_bytes()[:200])
+    assert files_of(files[0]) == [files[0]]
 
 
 def test_missing_slice_is_refused_with_its_neighbours_named(series):
@@ -262,6 +281,56 @@ def test_a_nifti_file_is_read_and_not_one_beside_it_that_differs_in_its_suffix(
     if not has_links:
         monkeypatch.setattr("pathlib.Path.symlink_to", refused)
     np.testing.assert_array_equal(read_image(tmp_path / f"scan{wanted}").voxels, oblique.voxels + 1000)
+
+
+META = "ObjectType = Image\nNDims = 3\nElementSpacing = 1 1 1\nDimSize = 4 4 4\nElementType = MET_SHORT\n{}"
+NRRD = "NRRD0004\ntype: short\ndimension: 3\nsizes: 4 4 4\nendian: little\nencoding: raw\nspacings: 1 1 1\n{}"
+VOXELS_APART = {
+    "one file": ("my voxels.raw", ["my voxels.raw"]),
+    "a list": ("LIST\nin/s 0.raw\nin/s 1.raw\nin/s 2.raw\nin/s 3.raw", [f"in/s {k}.raw" for k in range(4)]),
+    "a pattern": ("s%02d.raw 0 3 1", [f"s{k:02d}.raw" for k in range(4)]),
+}
+
+
+@pytest.mark.parametrize("name", VOXELS_APART)
+@pytest.mark.parametrize(
+    ("suffix", "head"),
+    [
+        (".mhd", META.format("ElementDataFile = ")),
+        (".mha", META.format("elementdatafile=")),
+        (".nhdr", NRRD.format("data file: ")),
+        (".nrrd", NRRD.format("datafile: ")),
+    ],
+)
+def test_voxels_apart_from_their_header_are_among_the_files(tmp_path, suffix, head, name):
+    voxels = np.arange(64, dtype="<i2").reshape(4, 4, 4)
+    said, parts = VOXELS_APART[name]
+    (tmp_path / "in").mkdir()
+    (tmp_path / "s.raw").write_bytes(b"none of them")
+    for part, data in zip(parts, np.split(voxels, len(parts), axis=0), strict=True):
+        (tmp_path / part).write_bytes(data.tobytes())
+    scan = tmp_path / f"scan{suffix}"
+    scan.write_text(f"{head}{said}\n")
+    if suffix != ".mha":  # ITK knows its keys in one spelling
+        np.testing.assert_array_equal(read_image(scan).voxels, voxels.T)
+    assert files_of(scan) == [scan, *(tmp_path / part for part in parts)]
+    (tmp_path / parts[-1]).unlink()
+    assert files_of(scan) == [scan, *(tmp_path / part for part in parts[:-1])]
+
+
+@pytest.mark.parametrize("name", ["scan.mha", "scan.nrrd", "scan.nii.gz", "scan.raw", "artery.stl"])
+def test_what_holds_its_voxels_itself_is_one_file(oblique, tmp_path, name):
+    (tmp_path / name).write_text("ElementDataFile of nobody")
+    if name in ("scan.mha", "scan.nrrd", "scan.nii.gz"):
+        SimpleITK.WriteImage(itk_scan(oblique), str(tmp_path / name))
+    assert files_of(tmp_path / name) == [tmp_path / name]
+
+
+@pytest.mark.parametrize("name", ["", "gone.raw", "a\0b", "%d\0/%d", "%d" + "/x" * 5000, "x" * 60_000, ".", "100%"])
+def test_odd_names_of_voxels_are_not_among_the_files(tmp_path, name):
+    scan = tmp_path / "scan.mhd"
+    scan.write_text(META.format(f"ElementDataFile = {name}\n"))
+    assert files_of(scan) == [scan]
 
 
 def refused(*_):

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,12 @@ from vstent import phantoms
 from vstent.cli import main
 from vstent.device import find_design
 from vstent.flow import FlowCase, FlowField, FlowSettings
+from vstent.image import Image
+from vstent.io.dicom_writer import write_dicom
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
 from vstent.study import Settings, restore_vessel, run, stages
+from vstent.study.ledger import hash_of
 from vstent.study.outputs import write_anatomy
 
 
@@ -30,6 +34,25 @@ def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path)
         assert (tmp_path / f"neck{number}.vtp").stat().st_size > 500
     write_anatomy(tmp_path, artery)
     assert {file.name for file in tmp_path.glob("[sn][ae]c*.vtp")} == {"sac.vtp", "neck.vtp", "sac_mine.vtp"}
+
+
+def test_a_source_is_all_files_that_its_scan_is_read_from(tmp_path: Path) -> None:
+    header, voxels = tmp_path / "scan.mhd", tmp_path / "scan.raw"
+    header.write_text("ElementDataFile = scan.raw\n")
+    voxels.write_bytes(b"one vessel")
+    first = hash_of(header)
+    assert first == sha256(header.read_bytes() + b"one vessel").hexdigest()
+    voxels.write_bytes(b"a later one")
+    assert hash_of(header) != first
+    write_dicom(Image(np.arange(5 * 6 * 7, dtype=np.int16).reshape(5, 6, 7), np.eye(4)), tmp_path / "series")
+    given, *others = sorted((tmp_path / "series").iterdir())
+    whole = hash_of(given)
+    (tmp_path / "series" / "notes.txt").write_text("not of the series")
+    assert hash_of(given) == hash_of(others[-1]) == whole
+    write_dicom(Image(np.zeros((5, 6, 7), dtype=np.int16), np.eye(4)), tmp_path / "other")
+    others[2].write_bytes((tmp_path / "other" / others[2].name).read_bytes())
+    assert hash_of(given) != whole
+    assert hash_of(voxels) == sha256(b"a later one").hexdigest()
 
 
 def test_trimmed_otherwise_the_vessel_is_the_one_that_was_traced_and_the_result_the_same(tmp_path: Path) -> None:

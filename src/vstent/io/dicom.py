@@ -82,6 +82,15 @@ def read_dicom(path: Path) -> Image:
     return Image(voxels.transpose(1, 0, 2), affine, modality, note)
 
 
+def series_of(path: Path) -> list[Path]:
+    """Return the files of the series that a file belongs to, by name; that file alone where one cannot be read."""
+    try:
+        with quiet():
+            return sorted(file for file, _ in _choose(path)[0])
+    except ReadError:
+        return [path]
+
+
 @contextmanager
 def quiet() -> Iterator[None]:
     """Keep pydicom's remarks on small faults to itself: what matters is raised."""
@@ -112,11 +121,10 @@ def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
         dataset = _header(file)
         if dataset is not None:
             found.setdefault(str(getattr(dataset, "SeriesInstanceUID", "")), []).append((file, dataset))
-    if not found:
+    wanted = [key for key, files in found.items() if path.is_dir() or any(file == path for file, _ in files)]
+    if not wanted:
         raise ReadError(f"{path} holds no DICOM images; check the path, or export the series again.")
-    uid = max(found, key=lambda key: sum(_n_voxels(dataset) for _, dataset in found[key]))
-    if path.is_file():
-        uid = next(key for key, files in found.items() if any(file == path for file, _ in files))
+    uid = max(wanted, key=lambda key: sum(_n_voxels(dataset) for _, dataset in found[key]))
     if (n_voxels := sum(_n_voxels(dataset) for _, dataset in found[uid])) > MOST_VOXELS:
         raise ReadError(
             f"{path} announces {n_voxels / 1e9:.3g} billion voxels, more than any scan of a head; export it again."

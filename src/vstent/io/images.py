@@ -1,7 +1,10 @@
 """Scans -> Image: DICOM, NIfTI, NRRD, MetaImage and raw voxels, in the LPS frame and mm."""
 
+import glob
 import gzip
 import math
+import os
+import re
 import shutil
 import zlib
 from collections.abc import Iterator, Sequence
@@ -16,7 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 from vstent.errors import ReadError, UnitError
 from vstent.image import Image
 from vstent.io import dicom
-from vstent.io.files import IMAGE_SUFFIXES, RAW_SUFFIXES, existing, silenced, suffix
+from vstent.io.files import IMAGE_SUFFIXES, RAW_SUFFIXES, existing, is_surface_file, silenced, suffix
 
 VOXEL_MM: Final = (0.01, 5.0)
 """Voxel edges that a scan of the head can have."""
@@ -69,6 +72,45 @@ def read_image(
     if spacing_mm is not None:
         image = _respaced(image, _three(spacing_mm, "spacing"))
     return _plausible(image, path)
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return the files that a scan or a surface is read from when one file is given.
+
+    They are itself, the voxels that lie apart from their header, and the series of a DICOM file. What is missing is
+    left out: `read_image` will refuse it.
+    """
+    if is_surface_file(path):
+        return [path]
+    if dicom.is_dicom(path):
+        return dicom.series_of(path)
+    return [path, *(file for file in _voxel_files(path) if os.path.isfile(file))]  # a name may be too long
+
+
+APART: Final = {
+    **dict.fromkeys((".mha", ".mhd"), re.compile(rb"^[ \t]*elementdatafile[ \t]*=([^\0\r\n]{1,1000})", re.I | re.M)),
+    **dict.fromkeys((".nrrd", ".nhdr"), re.compile(rb"^data ?file:([^\0\r\n]{1,1000})", re.I | re.M)),
+}
+"""Line of a header that names the file of the voxels, or is ``LIST`` with files in the lines below, or a pattern."""
+
+
+def _voxel_files(path: Path) -> list[Path]:
+    """Files that a header names for its voxels, there or not."""
+    kind = suffix(path)
+    if kind not in APART:
+        return []
+    with path.open("rb") as file:
+        line = APART[kind].search(head := file.read(65536))
+    if line is None:
+        return []
+    name = os.fsdecode(line[1].strip())
+    if name.split()[:1] == ["LIST"]:
+        return [path.parent / os.fsdecode(one.strip()) for one in head[line.end() :].splitlines()]
+    if "%" in name:
+        place = path.parent / name.split()[0]
+        slices = re.sub(r"%\d*d", "[0-9]*", glob.escape(place.name))
+        return [Path(one) for one in sorted(glob.glob(os.path.join(glob.escape(str(place.parent)), slices)))]
+    return [path.parent / name]
 
 
 def _three(values: Sequence[float], what: str) -> NDArray[np.float64]:

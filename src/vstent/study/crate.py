@@ -3,13 +3,13 @@
 Version 1.1, https://w3id.org/ro/crate/1.1 (Soiland-Reyes et al. 2022, Data Science 5:97).
 """
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from vstent.errors import ReadError
 from vstent.io.writers import write_json
-from vstent.study.ledger import hash_of
 
 NAME: Final = "ro-crate-metadata.json"
 LICENSE: Final = "https://spdx.org/licenses/BSD-3-Clause"
@@ -76,13 +76,15 @@ def _is_shown(path: Path) -> bool:
 
 
 def _file(folder: Path, path: Path) -> dict[str, Any]:
+    with path.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256")
     return {
         "@id": path.relative_to(folder).as_posix(),
         "@type": "File",
         "name": ABOUT.get(path.name, path.name),
         "encodingFormat": FORMATS.get(path.suffix, "application/octet-stream"),
         "contentSize": str(path.stat().st_size),
-        "sha256": hash_of(path),
+        "sha256": digest.hexdigest(),
     }
 
 

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from vstent.errors import ReadError
 from vstent.flow import Progress as FlowProgress
 from vstent.io.archive import load_noun, save_noun
+from vstent.io.images import files_of
 from vstent.study.types import Progress, Settings
 
 Noun = TypeVar("Noun")
@@ -89,10 +90,13 @@ def refuse_missing(path: Path) -> None:
 
 
 def hash_of(path: Path) -> str:
-    """SHA-256 of a file, whatever its name, or of all files of a folder with their names, in the order of these."""
+    """SHA-256 of a file, whatever its name, or of all files of a folder with their names, in the order of these.
+
+    Of a scan that is several files, one of which is given, it is that of their contents one after the other.
+    """
     refuse_missing(path)
     digest = hashlib.sha256()
-    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+    for file in sorted(path.rglob("*")) if path.is_dir() else files_of(path):
         if file.is_file():
             digest.update(file.name.encode() + b"\0" if path.is_dir() else b"")
             with file.open("rb") as stream:
