@@ -12,11 +12,12 @@ from tubes import line, tube, with_neck
 from vstent import phantoms
 from vstent.cli import main
 from vstent.device import find_design
+from vstent.errors import InputError
 from vstent.flow import FlowCase, FlowField, FlowSettings
 from vstent.image import Image
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.surfaces import read_surface
-from vstent.io.writers import write_stl
+from vstent.io.writers import write_json, write_stl
 from vstent.study import Settings, restore_vessel, run, stages
 from vstent.study.ledger import hash_of
 from vstent.study.outputs import write_anatomy
@@ -53,6 +54,73 @@ def test_a_source_is_all_files_that_its_scan_is_read_from(tmp_path: Path) -> Non
     others[2].write_bytes((tmp_path / "other" / others[2].name).read_bytes())
     assert hash_of(given) != whole
     assert hash_of(voxels) == sha256(b"a later one").hexdigest()
+
+
+@pytest.fixture(scope="module")
+def arteries(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two patients."""
+    folder = tmp_path_factory.mktemp("arteries")
+    for name, length_mm in (("first", 24.0), ("second", 26.0)):
+        artery = phantoms.with_sac(phantoms.tube(length_mm=length_mm), abscissa_mm=12.0, width_mm=5.0, neck_mm=3.5)
+        write_stl(folder / f"{name}.stl", phantoms.phantom_surface(artery, edge_mm=0.6))
+    return folder / "first.stl", folder / "second.stl"
+
+
+RESULTS_OF_ONE = (
+    *("report.pdf", "ranking.csv", "flow/bare/field.vtu", "flow/silk/wall.vtp"),
+    *("flow/bare/openfoam/vstent.key", "flow/bare/openfoam/system/controlDict"),
+)
+OF_THE_USER = ("notes.txt", "stents/silk/mine.vtp", "stents/my.stl", "flow/mine/case/field.vtu")
+
+
+def shown(folder: Path) -> set[str]:
+    """All files that are not hidden, by their way from the folder."""
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    return {name for name in files if not name.startswith(".")}
+
+
+@pytest.mark.parametrize("knows", ["input.json", "run.json"])
+def test_a_folder_used_for_another_patient_holds_nothing_of_the_former(
+    arteries: tuple[Path, Path], tmp_path: Path, knows: str
+) -> None:
+    first, second = arteries
+    out = tmp_path / "out"
+    settings = Settings(devices=("silk",), units="mm", flow=None)
+    run(first, out, settings, lambda *_: None)
+    for name in (*RESULTS_OF_ONE, *OF_THE_USER):
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("of the first")
+    (out / ".vstent" / "flow silk-1234.npz").write_text("kept")
+    if knows == "run.json":  # as version 0.1.0 left it
+        write_json(out / ".vstent" / "input.json", {"path": str(first)})
+    before = {name: (out / name).read_bytes() for name in shown(out)}
+    with pytest.raises(InputError):
+        run(second, out, replace(settings, length_mm=1e3), lambda *_: None)
+    assert {name: (out / name).read_bytes() for name in shown(out)} == before
+
+    again = replace(settings, devices=("enterprise",))
+    run(second, out, again, lambda *_: None)
+    run(second, tmp_path / "anew", again, lambda *_: None)
+    assert shown(out) == shown(tmp_path / "anew") | set(OF_THE_USER)
+    assert (out / "vessel.vtp").read_bytes() == (tmp_path / "anew" / "vessel.vtp").read_bytes()
+    assert (out / ".vstent" / "flow silk-1234.npz").read_text() == "kept"
+
+
+def test_the_same_patient_keeps_what_was_found_and_another_one_only_restored_does_not(
+    arteries: tuple[Path, Path], tmp_path: Path
+) -> None:
+    first, second = arteries
+    moved = tmp_path / "moved.stl"
+    moved.write_bytes(first.read_bytes())
+    settings = Settings(devices=("silk",), units="mm", flow=None)
+    run(first, tmp_path / "out", settings, lambda *_: None)
+    (tmp_path / "out" / "report.pdf").write_text("of the first")
+    restore_vessel(moved, tmp_path / "out", settings, lambda *_: None)
+    run(moved, tmp_path / "out", replace(settings, devices=("enterprise",)), lambda *_: None)
+    assert {"report.pdf", "stents/silk/struts.stl", "stents/enterprise/struts.stl"} < shown(tmp_path / "out")
+    restore_vessel(second, tmp_path / "out", settings, lambda *_: None)
+    restore_vessel(second, tmp_path / "anew", settings, lambda *_: None)
+    assert shown(tmp_path / "out") == shown(tmp_path / "anew")
 
 
 def test_trimmed_otherwise_the_vessel_is_the_one_that_was_traced_and_the_result_the_same(tmp_path: Path) -> None:

@@ -16,9 +16,9 @@ from vstent.measure import morphology
 from vstent.study.crate import write_crate
 from vstent.study.folder import CACHE, claiming
 from vstent.study.ledger import Ledger, hash_of
-from vstent.study.outputs import write_anatomy, write_ranking, write_stent, write_vessel
+from vstent.study.outputs import take_away_results, write_anatomy, write_ranking, write_stent, write_vessel
 from vstent.study.provenance import INPUT, METRICS, provenance
-from vstent.study.repeat import Record, agreement, read_record
+from vstent.study.repeat import Record, agreement, former_source, read_record
 from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all, refine, vary_all
 from vstent.study.types import CaseResult, Placing, Progress, Settings
 from vstent.vessel import Anatomy, Vessel
@@ -67,9 +67,8 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     source = hash_of(path)
     anatomy = find_anatomy(path, source, settings, ledger)
     deployments = deploy_all(designs, anatomy, settings, ledger)
-    ledger.settle()
+    _settle(path, out, source, ledger)
     write_anatomy(out, anatomy)
-    writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve())})
     for name, deployment in deployments.items():
         with ledger.stage(f"struts {name}") as tell:
             tell(write_stent(out / "stents" / name, deployment))
@@ -104,8 +103,9 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) 
         Something given cannot be used; nothing has been written.
     """
     ledger = Ledger(out / CACHE, progress)
-    vessel = find_vessel(path, hash_of(path), settings, ledger)
-    ledger.settle()
+    source = hash_of(path)
+    vessel = find_vessel(path, source, settings, ledger)
+    _settle(path, out, source, ledger)
     write_vessel(out, vessel)
     return vessel
 
@@ -132,7 +132,7 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
     source = hash_of(path)
     anatomy = find_anatomy(path, source, settings, ledger)
     measures = morphology(anatomy)
-    ledger.settle()
+    _settle(path, out, source, ledger)
     write_anatomy(out, anatomy)
     writers.write_json(out / "morphology.json", measures)
     return anatomy, measures
@@ -159,9 +159,17 @@ def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
     anatomy = find_anatomy(path, source, settings, ledger)
-    ledger.settle()
+    _settle(path, out, source, ledger)
     found = refine(out, anatomy, settings, ledger)
     kept = {one.name: asdict(one) for one in found.refinements}
     kept["grid_position"] = {key: asdict(one) for key, one in found.positions.items()}
     writers.write_json(out / "convergence.json", kept)
     return found
+
+
+def _settle(path: Path, out: Path, source: str, ledger: Ledger) -> None:
+    """Keep what is held: the folder is this input's from here on, and results of another one are taken away."""
+    ledger.settle()
+    if former_source(out) not in (source, None):
+        take_away_results(out)
+    writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve()), "sha256": source})

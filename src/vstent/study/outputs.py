@@ -1,13 +1,16 @@
 """The files of a case folder."""
 
+import shutil
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vstent.flow import FlowField
+from vstent.flow.openfoam.folder import KEY
 from vstent.io import writers
 from vstent.io.tables import write_rows
 from vstent.io.three_mf import write_3mf
@@ -15,6 +18,29 @@ from vstent.rank import Ranking
 from vstent.stent import Deployment
 from vstent.struts import struts
 from vstent.vessel import Anatomy, Centerline, Vessel
+
+STENT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
+FIELD: Final = ("field.vtu", "wall.vtp")
+SACS: Final = ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp")
+RESULTS: Final = (
+    *("vessel.vtp", "centerlines.vtp", "openings.json", "landing_surface.vtp", *SACS),
+    *("morphology.json", "convergence.json", "ranking.csv", "ranking.json", "metrics.json", "run.json"),
+    *("report.html", "report.pdf", "ro-crate-metadata.json"),
+    *(f"stents/*/{name}" for name in STENT),
+    *(f"flow/*/{name}" for name in FIELD),
+)
+"""All that is written into a case folder beside the cache and the folders of OpenFOAM."""
+
+
+def take_away_results(out: Path) -> None:
+    """Take away the results in a case folder; what is kept in the cache, and files of the user's own, stay."""
+    for file in [file for pattern in RESULTS for file in out.glob(pattern)]:
+        file.unlink()
+    for key in list(out.glob(f"flow/**/{KEY}")):
+        shutil.rmtree(key.parent)
+    for folder in [*out.glob("stents/*/"), *out.glob("flow/*/"), out / "stents", out / "flow"]:
+        with suppress(OSError):  # it is not there, or not empty
+            folder.rmdir()
 
 
 def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
@@ -27,7 +53,7 @@ def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
 
 
 def write_anatomy(out: Path, anatomy: Anatomy) -> None:
-    """Write the vessel, the parent artery and the sacs; those of an earlier input are taken away."""
+    """Write the vessel, the parent artery and the sacs; sacs found before and no more are taken away."""
     write_vessel(out, anatomy.vessel, anatomy.axis)
     restored = {"is_restored": anatomy.is_restored.astype(np.uint8)}
     writers.write_surface(out / "landing_surface.vtp", anatomy.landing_surface, restored)
@@ -38,8 +64,8 @@ def write_anatomy(out: Path, anatomy: Anatomy) -> None:
         closed = np.concatenate([aneurysm.neck_mm, aneurysm.neck_mm[:1]])
         writers.write_lines(out / neck, closed, np.array([0, len(closed)], dtype=np.int32))
         written |= {sac, neck}
-    for pattern in ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp"):
-        for stale in {file.name for file in out.glob(pattern)} - written:  # of another input or of other settings
+    for pattern in SACS:
+        for stale in {file.name for file in out.glob(pattern)} - written:  # of other settings
             (out / stale).unlink()
 
 

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +14,8 @@ from vstent.study.provenance import INPUT, METRICS, devices_of, machine, version
 from vstent.study.types import Settings
 
 MISSING: Final = "absent"
+UNTOLD: Final = (OSError, ValueError, KeyError, TypeError)
+"""What comes of a file that is missing, damaged, or of another kind."""
 TOLERANCE: Final = 1e-3
 """Relative, between machines: other processors round otherwise, and a count of pixels or an end of settling may turn on
 that. Measured on one processor with and without its wide and fused instructions: 2e-4, where the flow is steady."""
@@ -66,10 +69,19 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
 def _input(folder: Path) -> Path:
     try:
         return Path(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except UNTOLD:
         raise ReadError(
             f"{folder} does not say where its input lay (its folder {CACHE} is gone): say it with --input."
         ) from None
+
+
+def former_source(folder: Path) -> str | None:
+    """Return the hash of the input that a case folder's results are of; None where it does not say."""
+    with suppress(*UNTOLD):
+        return str(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["sha256"])
+    with suppress(*UNTOLD):
+        return str(json.loads((folder / "run.json").read_text(encoding="utf-8"))["input"]["sha256"])
+    return None
 
 
 def _settings(told: Mapping[str, Any]) -> Settings:
