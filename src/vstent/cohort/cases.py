@@ -4,14 +4,18 @@ import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import isfinite
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from vstent.device import find_design
 from vstent.errors import InputError, ReadError
 from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
 from vstent.study import Settings
 from vstent.study.ledger import hash_of, key_of, refuse_missing
+from vstent.units import MM_PER
+
+Number = TypeVar("Number", int, float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +116,33 @@ def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Cas
     return Case(name, path, replace(settings, **changes))
 
 
+def _number(text: str) -> float:
+    value = float(text)
+    if not isfinite(value):
+        raise ValueError("a finite number is needed")
+    return value
+
+
+def _size(text: str) -> float:
+    return _above_zero(_number(text))
+
+
+def _count(text: str) -> int:
+    return _above_zero(int(text))
+
+
+def _above_zero(value: Number) -> Number:
+    if value <= 0:
+        raise ValueError("it must be above zero")
+    return value
+
+
+def _units(text: str) -> str:
+    if text not in MM_PER:
+        raise ValueError(f"give one of {', '.join(MM_PER)}")
+    return text
+
+
 def _three(kind: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
     def read(text: str) -> tuple[Any, ...]:
         values = tuple(kind(word) for word in text.replace(",", " ").replace(";", " ").split())
@@ -128,16 +159,16 @@ def _devices(text: str) -> tuple[str, ...]:
 
 COLUMNS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
     "devices": ("devices", _devices),
-    "units": ("units", str),
-    "threshold": ("threshold", float),
-    "at": ("at_mm", _three(float)),
-    "inlet": ("inlet_mm", _three(float)),
-    "outlet": ("outlet_mm", _three(float)),
-    "spacing": ("spacing_mm", _three(float)),
-    "shape": ("shape", _three(int)),
-    "diameter": ("diameter_mm", float),
-    "length": ("length_mm", float),
-    "center": ("center_mm", float),
+    "units": ("units", _units),
+    "threshold": ("threshold", _number),
+    "at": ("at_mm", _three(_number)),
+    "inlet": ("inlet_mm", _three(_number)),
+    "outlet": ("outlet_mm", _three(_number)),
+    "spacing": ("spacing_mm", _three(_size)),
+    "shape": ("shape", _three(_count)),
+    "diameter": ("diameter_mm", _size),
+    "length": ("length_mm", _size),
+    "center": ("center_mm", _number),
 }
 """Titles of a CSV file's columns: the setting each fills, and how it is read."""
 
