@@ -317,6 +317,18 @@ def test_a_slurm_job_asks_for_twice_the_memory_foreseen_and_holds_one_case():
     assert "--nthreads 1" in script
 
 
+def test_without_slurm_nothing_is_sent_and_a_scheduler_beside_it_is_refused(tmp_path, monkeypatch, capsys):
+    (tmp_path / "a.stl").write_text("no surface")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    command = ["batch", str(tmp_path), "--out", str(tmp_path / "out"), "--no-flow", "--slurm"]
+    assert main(command) == 2
+    assert "no `sbatch` on the PATH" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(SystemExit, match="2"):
+        main([*command, "--scheduler", "tcp://head:8786"])
+    assert "not allowed with argument --slurm" in capsys.readouterr().err
+
+
 QUEUE = {
     "sbatch": 'job=$(cat "$1")\nsetsid sh -c "$job" >/dev/null 2>&1 &\necho $! >> {log}; echo "Submitted batch job $!"',
     "scancel": "kill -9 -- -$1",

@@ -20,8 +20,9 @@ def add(commands: options.Commands) -> None:
     run.add_study(parser)
     working = parser.add_argument_group("working")
     options.add_jobs(working)
-    working.add_argument("--scheduler", metavar="ADDRESS", help="let the workers of this Dask scheduler do it")
-    working.add_argument("--slurm", action="store_true", help="let --jobs jobs of a Slurm queue do it (dask-jobqueue)")
+    crew = working.add_mutually_exclusive_group()
+    crew.add_argument("--scheduler", metavar="ADDRESS", help="let the workers of this Dask scheduler do it")
+    crew.add_argument("--slurm", action="store_true", help="let --jobs jobs of a Slurm queue do it (dask-jobqueue)")
     working.add_argument("--files", action="store_true", help="keep all that `vstent run` writes of every case")
     parser.set_defaults(command=_batch)
 

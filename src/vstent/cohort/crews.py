@@ -1,6 +1,7 @@
 """Crews: who does the cases: processes of this machine, or the workers of a Dask cluster."""
 
 import multiprocessing
+import shutil
 import signal
 import time
 from abc import ABC, abstractmethod
@@ -131,8 +132,12 @@ class Slurm(AbstractCrew):
         Raises
         ------
         InputError
-            When dask-jobqueue is missing.
+            When dask-jobqueue or Slurm is missing.
         """
+        if shutil.which("sbatch") is None:  # dask-jobqueue would try to send jobs for ever
+            raise InputError(
+                "There is no Slurm here (no `sbatch` on the PATH): give the command where jobs are sent from."
+            )
         with self.cluster() as cluster:
             cluster.adapt(minimum_jobs=self.jobs, maximum_jobs=self.jobs)  # a job that the queue ends is asked for anew
             yield from DaskCluster(cluster.scheduler_address).do(tasks)
