@@ -216,6 +216,14 @@ def test_a_threshold_above_everything_is_refused(demo):
         segment(demo[1], threshold=1e5)
 
 
+@pytest.mark.parametrize("below", [0.0, 5.0])
+def test_a_threshold_below_everything_is_refused(demo, below):
+    _, image, _ = demo
+    low, high = image.voxels.min(), image.voxels.max()
+    with pytest.raises(VesselError, match=rf"no voxel is below threshold .* \(the scan's range is {low} to {high}\)"):
+        segment(image, threshold=low - below)
+
+
 def test_fine_meshes_are_decimated_without_losing_volume(demo, monkeypatch):
     phantom, image, whole = demo
     monkeypatch.setattr(import_module("vstent.segment"), "MOST_FACES", 12_000)

@@ -146,6 +146,11 @@ def _edge_level(voxels: NDArray[Any]) -> float:
 def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
     """Pick the connected voxels above the threshold: the component nearest to the point, or the largest."""
     above = image.voxels >= threshold
+    if above.all():
+        raise VesselError(
+            f"No lumen: no voxel is below threshold {threshold:.4g} "
+            f"(the scan's range is {image.voxels.min()} to {image.voxels.max()}); give another --threshold."
+        )
     label, n_components = ndimage.label(above)
     size = np.bincount(label[above], minlength=n_components + 1)
     if size.max(initial=0) < FEWEST_VOXELS:
