@@ -1,5 +1,6 @@
 """The command line as a user meets it: help, errors, exit codes, resume."""
 
+import argparse
 import json
 import subprocess
 import sys
@@ -11,7 +12,8 @@ import pytest
 from shapes import sphere
 from vessel_truth import read_centerlines
 from vstent import phantoms
-from vstent.cli import main
+from vstent.cli import main, rank
+from vstent.cli import run as cli_run
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
 from vstent.study import CACHE
@@ -178,3 +180,15 @@ def test_points_are_checked(text: str, capsys: pytest.CaptureFixture[str]) -> No
         main(["run", "scan.nii", "--out", "out", f"--at={text}"])
     assert stopped.value.code == 2
     assert "--at" in capsys.readouterr().err
+
+
+def test_a_number_may_begin_with_a_minus() -> None:
+    parser = argparse.ArgumentParser()
+    commands = parser.add_subparsers()
+    for command in (cli_run, rank):
+        command.add(commands)
+    words = ["--at", "-1.5,-8.0,20", "--inlet", "-.5,0,0", "--outlet", "-1e1,2,3", "--center", "-1e1", "-j", "2"]
+    given = parser.parse_args(["run", "scan.nii", "--out", "out", *words])
+    assert (given.at, given.inlet, given.outlet) == ((-1.5, -8.0, 20.0), (-0.5, 0.0, 0.0), (-10.0, 2.0, 3.0))
+    assert (given.center, given.processes) == (-10.0, 2)
+    assert parser.parse_args(["rank", "scan.nii", "--out", "out", "--shift", "-2,0,2"]).shift == [-2.0, 0.0, 2.0]

@@ -3,6 +3,7 @@
 import argparse
 import math
 import os
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -35,7 +36,10 @@ def positive(text: str) -> float:
 
 def add_command(commands: Commands, name: str, text: str) -> argparse.ArgumentParser:
     """Add a command with its line of help."""
-    return commands.add_parser(name, help=text, description=text, epilog=EPILOG)
+    parser = commands.add_parser(name, help=text, description=text, epilog=EPILOG)
+    # What begins with a digit behind the minus is a number or a point, no option; argparse knows -1 alone.
+    parser._negative_number_matcher = re.compile(r"-\.?\d")
+    return parser
 
 
 def add_geometry(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":

@@ -22,7 +22,7 @@ def add(commands: options.Commands) -> None:
         type=options.numbers,
         default=[0.0],
         metavar="MM,MM,...",
-        help="landing places to try, against the proposed one, distally (write --shift=-2,0,2)",
+        help="landing places to try, against the proposed one, distally",
     )
     options.add_jobs(ranking)
     parser.set_defaults(command=_rank)
