@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from vstent.cli import app, batch, demo, devices, export, flow, rank, restore, run, trace
+from vstent.cli.interrupt import borne_interrupts
 from vstent.cli.options import EPILOG
 from vstent.errors import InputError, VstentError
 
@@ -22,7 +23,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code (0 done, 1 failed, 2 bad input, 130 interrupted)."""
     # Many small systems are solved, none large: threads of the linear algebra only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    arguments = _parser().parse_args(argv)
+    with borne_interrupts():
+        return _done(_parser().parse_args(argv))
+
+
+def _done(arguments: argparse.Namespace) -> int:
+    """Do what was asked; return the exit code."""
     try:
         if arguments.command.__module__ in (app.__name__, devices.__name__):  # they begin without kernels
             return int(arguments.command(arguments))
