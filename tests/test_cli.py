@@ -9,14 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import tubes
 from shapes import sphere
 from vessel_truth import read_centerlines
 from vstent import phantoms
 from vstent.cli import main, rank
 from vstent.cli import run as cli_run
+from vstent.errors import InputError
+from vstent.flow import FlowSettings
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
 from vstent.study import CACHE
+from vstent.study.stages import check_inflow
 from vstent.surface import Surface
 
 
@@ -52,6 +56,12 @@ BAD = {
         b"0,1\n2,1\n1,1\n3,1\n4,1",
         ["--pulsatile", "FILE"],
         "do not increase",
+    ),
+    "a pulse in milliseconds": (
+        "pulse.csv",
+        b"ms,flow\n0,1\n200,3\n400,2\n600,1.5\n800,1.2\n1000,1\n",
+        ["--pulsatile", "FILE"],
+        "its times in seconds",
     ),
     "a device that does not exist": ("text.stl", b"hello\n", ["--device", "slik"], "silk"),
 }
@@ -192,3 +202,40 @@ def test_a_number_may_begin_with_a_minus() -> None:
     assert (given.at, given.inlet, given.outlet) == ((-1.5, -8.0, 20.0), (-0.5, 0.0, 0.0), (-10.0, 2.0, 3.0))
     assert (given.center, given.processes) == (-10.0, 2)
     assert parser.parse_args(["rank", "scan.nii", "--out", "out", "--shift", "-2,0,2"]).shift == [-2.0, 0.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--viscosity", "4"], "4 mPa s are 0.004"),
+        (["--viscosity", "1e-6"], "Pa s"),
+        (["--density", "1.06"], "1.06 g/mL are 1060"),
+    ],
+)
+def test_blood_in_other_units_is_refused(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["flow", "artery.stl", "--out", "out", *words])
+    assert stopped.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "command", [["run", "--device", "silk"], ["flow"], ["flow", "--convergence"], ["export", "openfoam"]]
+)
+def test_an_inflow_in_other_units_is_refused_before_anything_is_written(
+    command: list[str], artery: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main([*command, str(artery), "--out", str(out), "--units", "mm", "--flow-rate", "240"]) == 2
+    assert _complaint(capsys, "240 mL/min are 4")
+    assert not out.exists()
+
+
+def test_inflows_of_arteries_are_taken() -> None:
+    anatomy = tubes.with_neck(tubes.tube(tubes.line(20.0), 2.0), 8.0, 12.0)
+    area_mm2 = anatomy.vessel.inlet.area_mm2
+    for speed_m_s in (0.011, 0.27, 1.99):
+        check_inflow(anatomy, FlowSettings(inflow_mL_s=speed_m_s * area_mm2))
+    for speed_m_s in (0.009, 2.01):
+        with pytest.raises(InputError, match=f"{speed_m_s:.2g} m/s"):
+            check_inflow(anatomy, FlowSettings(inflow_mL_s=speed_m_s * area_mm2))

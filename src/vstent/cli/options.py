@@ -4,6 +4,7 @@ import argparse
 import math
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -16,6 +17,9 @@ EPILOG: Final = (
 )
 PUBLISHED: Final = "published"
 """The waveform where none is given."""
+LONGEST_CYCLE_S: Final = 3.0
+SHORTEST_CYCLE_S: Final = 0.2
+"""Cycles of hearts: 20 to 300 beats a minute."""
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """What a command adds itself to."""
@@ -32,6 +36,18 @@ def positive(text: str) -> float:
     if value <= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not above zero")
     return value
+
+
+def within(low: float, high: float, remark: str) -> Callable[[str], float]:
+    """Return what reads a number between two; `remark` names the unit, and how another is turned into it."""
+
+    def read(text: str) -> float:
+        value = number(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {low:g} to {high:g} {remark}")
+        return value
+
+    return read
 
 
 def add_command(commands: Commands, name: str, text: str) -> argparse.ArgumentParser:
@@ -98,8 +114,9 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         metavar="CSV",
         help="follow a pulse: columns time in s and flow in any unit (the published one of the internal carotid)",
     )
-    flow.add_argument("--density", type=positive, default=1060.0, metavar="KG_M3", help="of blood (1060)")
-    flow.add_argument("--viscosity", type=positive, metavar="PA_S", help="of blood (0.004; at high shear 0.00345)")
+    density, viscosity = within(900, 1200, "kg/m3: 1.06 g/mL are 1060"), within(0.001, 0.1, "Pa s: 4 mPa s are 0.004")
+    flow.add_argument("--density", type=density, default=1060.0, metavar="KG_M3", help="of blood (1060)")
+    flow.add_argument("--viscosity", type=viscosity, metavar="PA_S", help="of blood (0.004; at high shear 0.00345)")
     flow.add_argument(
         "--thinning", action="store_true", help="blood thins with the shear rate, as Carreau and Yasuda's law has it"
     )
@@ -272,10 +289,17 @@ def _blood(arguments: argparse.Namespace) -> "Blood":
 
 
 def _waveform(source: str | None) -> "Waveform | None":
+    from vstent.errors import InputError
     from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
     from vstent.io.tables import read_columns
 
     if source is None or source == PUBLISHED:
         return OLDER_ADULT_ICA if source else None
     time_s, flow = read_columns(Path(source), 2).T
-    return waveform_of(time_s, flow)
+    waveform = waveform_of(time_s, flow)
+    if not SHORTEST_CYCLE_S <= waveform.period_s <= LONGEST_CYCLE_S:
+        raise InputError(
+            f"the cycle in {source} takes {waveform.period_s:g} s, and a heart's {SHORTEST_CYCLE_S:g} to "
+            f"{LONGEST_CYCLE_S:g}: give one cycle, its times in seconds"
+        )
+    return waveform

@@ -19,7 +19,16 @@ from vstent.study.ledger import Ledger, hash_of
 from vstent.study.outputs import take_away_results, write_anatomy, write_ranking, write_stent, write_vessel
 from vstent.study.provenance import INPUT, METRICS, provenance
 from vstent.study.repeat import Record, agreement, former_source, read_record
-from vstent.study.stages import compute_flows, deploy_all, find_anatomy, find_vessel, measure_all, refine, vary_all
+from vstent.study.stages import (
+    check_inflow,
+    compute_flows,
+    deploy_all,
+    find_anatomy,
+    find_vessel,
+    measure_all,
+    refine,
+    vary_all,
+)
 from vstent.study.types import CaseResult, Placing, Progress, Settings
 from vstent.vessel import Anatomy, Vessel
 
@@ -66,6 +75,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
     anatomy = find_anatomy(path, source, settings, ledger)
+    check_inflow(anatomy, settings.flow)
     deployments = deploy_all(designs, anatomy, settings, ledger)
     _settle(path, out, source, ledger)
     write_anatomy(out, anatomy)
@@ -159,6 +169,7 @@ def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
     anatomy = find_anatomy(path, source, settings, ledger)
+    check_inflow(anatomy, settings.flow)
     _settle(path, out, source, ledger)
     found = refine(out, anatomy, settings, ledger)
     kept = {one.name: asdict(one) for one in found.refinements}

@@ -21,7 +21,7 @@ from vstent.stent import Deployment
 from vstent.struts import struts
 from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, hash_of
-from vstent.study.stages import deploy_all, find_anatomy
+from vstent.study.stages import check_inflow, deploy_all, find_anatomy
 from vstent.study.types import Progress, Settings
 from vstent.surface import Surface
 from vstent.vessel import Anatomy
@@ -47,6 +47,7 @@ def export_openfoam(
     """
     ledger = Ledger(out / CACHE, progress)
     anatomy = _anatomy(path, settings, ledger)
+    check_inflow(anatomy, settings.flow)
     case = flow_case(anatomy, None, settings.flow or FlowSettings())
     setup = FoamSetup(default_cell_size_mm(case))
     setup = replace(

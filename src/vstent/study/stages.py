@@ -11,6 +11,7 @@ import numpy as np
 
 from vstent.deploy import deploy, propose_size
 from vstent.device import Design, Size, find_size
+from vstent.errors import InputError
 from vstent.flow import FlowField, FlowSettings, compare, flow_case, foretell_cost, indices, ostium, simulate_case
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.io.files import is_surface_file
@@ -33,6 +34,9 @@ from vstent.vessel import Anatomy, Vessel
 
 BARE: Final = "bare"
 """Name of the flow without a device."""
+SLOWEST_M_S: Final = 0.01
+FASTEST_M_S: Final = 2.0
+"""Mean speeds at the inlet beyond which no artery of the brain's blood flows."""
 
 
 def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) -> Anatomy:
@@ -113,6 +117,20 @@ def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
         diameter_mm=placing.diameter_mm or proposed.diameter_mm,
         length_mm=placing.length_mm or proposed.length_mm,
     )
+
+
+def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
+    """Refuse a mean inflow with which no blood flows: another unit was meant."""
+    if flow is None or flow.inflow_mL_s is None:
+        return
+    inlet = anatomy.vessel.inlet
+    speed_m_s = flow.inflow_mL_s / inlet.area_mm2
+    if not SLOWEST_M_S <= speed_m_s <= FASTEST_M_S:
+        raise InputError(
+            f"a mean inflow of {flow.inflow_mL_s:g} mL/s through an inlet {inlet.diameter_mm:.1f} mm wide flows at "
+            f"{speed_m_s:.2g} m/s, and blood in arteries at {SLOWEST_M_S:g} to {FASTEST_M_S:g}: give mL/s (240 mL/min "
+            "are 4), or another inlet"
+        )
 
 
 def compute_flows(
