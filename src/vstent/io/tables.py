@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,22 +16,26 @@ from vstent.kernels.arrays import Floats
 
 
 def read_columns(path: Path, count: int) -> Floats:
-    """Read a CSV file of `count` columns of numbers (n, count); lines that do not begin with a number are titles.
+    """Read a CSV file of `count` columns of numbers (n, count); lines without a number before them are titles.
 
     Raises
     ------
     ReadError
-        The file is missing, or a line of numbers has not `count` of them.
+        The file is missing, or a line has not `count` finite numbers.
     """
     lines = existing(path).read_text(encoding="utf-8-sig", errors="replace").splitlines()
     rows: list[list[float]] = []
     for number, line in enumerate(lines, start=1):
         words = [word for word in line.replace(";", ",").replace("\t", ",").split(",") if word.strip()]
         values = [_number(word) for word in words]
-        if not values or values[0] is None:
+        is_title = not rows and all(value is None for value in values)
+        if not values or is_title:
             continue
         if len(values) != count or None in values:
-            raise ReadError(f"line {number} of {path} is {line[:60]!r}: give {count} numbers, parted by commas")
+            raise ReadError(
+                f"line {number} of {path} is {line[:60]!r}: give {count} finite numbers, with decimal points, parted by "
+                "commas"
+            )
         rows.append([float(value) for value in values if value is not None])
     if not rows:
         raise ReadError(f"{path} holds no numbers: give {count} columns, parted by commas")
@@ -73,7 +78,9 @@ def _plain(value: Any) -> Any:
 
 
 def _number(word: str) -> float | None:
+    """Read a finite number; None where it is none."""
     try:
-        return float(word)
+        value = float(word)
     except ValueError:
         return None
+    return value if math.isfinite(value) else None
