@@ -123,10 +123,41 @@ def test_metrics_are_finite_numbers_in_their_units():
     assert set(found["shares"]["deployed_length_mm"]) == {f"{name}_fraction" for name in (*CAUSES, "rest")}
 
 
-@pytest.mark.parametrize("ranges", [Ranges(16, landing_mm=-1.0), Ranges(16, threshold_mm=2.0), Ranges(1)])
-def test_ranges_that_cannot_be_are_refused(ranges):
-    with pytest.raises(InputError):
-        vary(artery(), deployed(), ranges)
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"samples": 1}, "at least 2"),
+        ({"flow_samples": -1}, "0 flows"),
+        ({"landing_mm": -1.0}, "landing_mm"),
+        ({"landing_mm": float("nan")}, "landing_mm"),
+        ({"threshold_mm": float("inf")}, "threshold_mm"),
+        ({"device_mm": -0.1}, "device_mm"),
+        ({"inflow_fraction": 1.0}, "less than 1"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(given, said):
+    with pytest.raises(InputError, match=said):
+        Ranges(**given)
+
+
+def test_a_threshold_that_would_close_the_artery_is_refused():
+    with pytest.raises(InputError, match="close the artery"):
+        vary(artery(), deployed(), Ranges(16, threshold_mm=2.0))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--uncertainty", "1"], "at least 2"),
+        (["--uncertainty", "8", "--uncertain-flows", "-1"], "0 flows"),
+        (["--uncertainty", "8", "--vary", "landing=nan"], "landing_mm"),
+        (["--vary", "landing=2"], "--uncertainty N"),
+        (["--uncertain-flows", "2"], "--uncertainty N"),
+    ],
+)
+def test_the_command_refuses_them_before_anything_is_read(words, said, tmp_path, capsys):
+    assert main(["run", str(tmp_path / "none.stl"), "--out", str(tmp_path / "out"), *words]) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_a_widened_artery_is_wider_by_as_much_everywhere_and_its_sac_stays_closed():

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
+from vstent.errors import InputError
+
 if TYPE_CHECKING:
     from vstent.flow.types import Blood, FlowSettings, Waveform
     from vstent.uncertainty import Ranges
@@ -196,6 +198,10 @@ def _cause(text: str) -> tuple[str, float]:
 def given_ranges(arguments: argparse.Namespace) -> "Ranges | None":
     """Collect what is to be varied, and how far."""
     if arguments.uncertainty is None:
+        if arguments.vary or arguments.uncertain_flows:
+            raise InputError(
+                "--vary and --uncertain-flows say how --uncertainty is to be done: give --uncertainty N too"
+            )
         return None
     from vstent.uncertainty import Ranges
 
@@ -289,7 +295,6 @@ def _blood(arguments: argparse.Namespace) -> "Blood":
 
 
 def _waveform(source: str | None) -> "Waveform | None":
-    from vstent.errors import InputError
     from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
     from vstent.io.tables import read_columns
 

@@ -33,8 +33,8 @@ def read_columns(path: Path, count: int) -> Floats:
             continue
         if len(values) != count or None in values:
             raise ReadError(
-                f"line {number} of {path} is {line[:60]!r}: give {count} finite numbers, with decimal points, parted by "
-                "commas"
+                f"line {number} of {path} is {line[:60]!r}: give {count} finite numbers, with decimal points, "
+                "parted by commas"
             )
         rows.append([float(value) for value in values if value is not None])
     if not rows:

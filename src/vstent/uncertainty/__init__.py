@@ -6,6 +6,7 @@ Sobol's sequence (scipy.stats.qmc), each in the middle of its stratum, so that e
 the same question gets the same answer.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -59,6 +60,19 @@ class Ranges:
     """Of the free diameter: a device as wide as it was made, braided of as many pieces of wire."""
     inflow_fraction: float = 0.2
     """Of the mean inflow, relative."""
+
+    def __post_init__(self) -> None:
+        if self.samples < 2 or self.flow_samples < 0:
+            raise InputError(
+                f"{self.samples} samples, {self.flow_samples} of them with flows, say nothing of a spread: take at "
+                "least 2, and no fewer than 0 flows"
+            )
+        for name in ("threshold_mm", "landing_mm", "device_mm", "inflow_fraction"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < math.inf:
+                raise InputError(f"{value:g} is no range of {name}: give how far to either side, 0 or more")
+        if self.inflow_fraction >= 1:
+            raise InputError(f"an inflow that varies by {self.inflow_fraction:g} of itself may stop: give less than 1")
 
     def of(self, anatomy: Anatomy) -> Floats:
         """Return the ranges (4,) in the order of `CAUSES`."""
@@ -148,13 +162,15 @@ def vary(
     Raises
     ------
     InputError
-        When a range or a number of samples cannot be.
+        When the range of the threshold would close the artery.
     FlowError
         When a flow cannot be computed.
     """
     spread, points = ranges.of(anatomy), _points(ranges)
-    if spread.min() < 0 or 2 * spread[0] > anatomy.section_radius_mm.min():
-        raise InputError("a range is below zero, or its threshold would close the artery: give smaller, positive ones")
+    if 2 * spread[0] > anatomy.section_radius_mm.min():
+        raise InputError(
+            f"diameters that vary by {spread[0]:.2g} mm would close the artery: give a smaller range of the threshold"
+        )
     stent = deployment.stent
     middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
     rows = []
@@ -174,8 +190,6 @@ def _points(ranges: Ranges) -> Floats:
     """Sobol's points (n, 4), -1 to 1, each in the middle of its stratum."""
     from scipy.stats import qmc
 
-    if ranges.samples < 2:
-        raise InputError(f"{ranges.samples} samples say nothing of a spread: take at least 2")
     power = int(np.ceil(np.log2(ranges.samples)))
     unit = qmc.Sobol(len(CAUSES), scramble=False).random_base2(power)
     return 2 * (unit + 0.5 / len(unit)) - 1
