@@ -239,3 +239,24 @@ def test_inflows_of_arteries_are_taken() -> None:
     for speed_m_s in (0.009, 2.01):
         with pytest.raises(InputError, match=f"{speed_m_s:.2g} m/s"):
             check_inflow(anatomy, FlowSettings(inflow_mL_s=speed_m_s * area_mm2))
+
+
+@pytest.mark.parametrize("option", ["--inlet", "--outlet"])
+def test_a_point_far_from_every_opening_is_refused(
+    option: str, artery: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["restore", str(artery), "--out", str(tmp_path / "out"), "--units", "mm", option, "900,1,2"]
+    assert main(command) == 2
+    assert _complaint(capsys, "no opening of the vessel is near (900.0, 1.0, 2.0) mm")
+    assert not (tmp_path / "out").exists()
+
+
+def test_points_where_the_vessel_was_cut_are_taken_and_what_they_choose_is_told(
+    artery: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["restore", str(artery), "--units", "mm", "--upstream", "7", "--downstream", "7"]
+    assert main([*command, "--out", str(tmp_path / "first")]) == 0
+    cut = json.loads((tmp_path / "first" / "openings.json").read_text())["openings"]
+    centers = [",".join(map(str, opening["center_mm"])) for opening in cut]
+    assert main([*command, "--out", str(tmp_path / "again"), "--inlet", centers[0], "--outlet", centers[1]]) == 0
+    assert "mm from the point given" in " ".join(capsys.readouterr().err.split())

@@ -16,7 +16,7 @@ from vstent import phantoms
 from vstent.errors import InputError, VesselError
 from vstent.kernels import curves, triangles
 from vstent.measure import morphology
-from vstent.openings import open_ends
+from vstent.openings import open_ends, opening_at
 from vstent.repair import repair
 from vstent.restore import restore
 from vstent.segment import segment
@@ -140,6 +140,20 @@ def test_the_inlet_can_be_chosen(fork: Vessel) -> None:
     chosen = trace(replace(fork, centerlines=()), inlet_mm=fork.outlets[1].center_mm)
     np.testing.assert_array_equal(chosen.inlet.center_mm, fork.outlets[1].center_mm)
     assert chosen.outlets[0].area_mm2 == fork.inlet.area_mm2
+
+
+def test_a_point_far_from_every_opening_chooses_none(fork: Vessel) -> None:
+    untraced, outlet = replace(fork, centerlines=()), fork.outlets[1]
+    reach_mm = max(5.0, 2 * outlet.diameter_mm)
+    near, far = (outlet.center_mm + factor * reach_mm * outlet.normal for factor in (0.99, 1.01))
+    assert opening_at(untraced, near) is outlet
+    with pytest.raises(InputError, match="mm away"):
+        trace(untraced, inlet_mm=far)
+    within = fork.centerlines[1].points_mm[-len(fork.centerlines[1].points_mm) // 3]
+    assert np.linalg.norm(within - outlet.center_mm) > reach_mm
+    assert opening_at(untraced, within) is outlet
+    assert "mm from the point given" in trace(untraced, inlet_mm=within).notes[-1]
+    assert trace(untraced, inlet_mm=near).notes == untraced.notes
 
 
 def test_real_centerlines_agree_with_vmtk(shared_data) -> None:

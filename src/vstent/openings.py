@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vstent.errors import VesselError
+from vstent.errors import InputError, VesselError
 from vstent.kernels import curves, medial, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.surface import Surface
@@ -32,6 +32,9 @@ ARM_SHARE: Final = 0.15
 """Opening an arm takes off its tip and the twigs on it: no more than this fraction of the wall."""
 ARM_RADIUS_MM: Final = 0.5
 """Thinner blind arms are left closed: no flow worth computing leaves through them."""
+FARTHEST_MM: Final = 5.0
+FARTHEST_DIAMETERS: Final = 2.0
+"""How far from an opening a point beside it may lie: the greater of the two."""
 
 
 def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
@@ -65,10 +68,43 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
     return replace(vessel, lumen=lumen, openings=openings, centerlines=(), notes=(*vessel.notes, *notes)), spheres
 
 
+def opening_at(vessel: Vessel, point_mm: Floats) -> Opening:
+    """Return the opening nearest to a point (3,) beside it, or within the lumen that leads to it.
+
+    Raises
+    ------
+    InputError
+        When the point lies outside the lumen, farther than 5 mm and two diameters from every opening.
+    """
+    nearest = min(vessel.openings, key=lambda opening: _away_mm(opening, point_mm))
+    if _is_far(nearest, point_mm) and vessel.lumen.closed.signed_distance(point_mm[None])[0] > 0:
+        x, y, z = point_mm
+        raise InputError(
+            f"no opening of the vessel is near ({x:.1f}, {y:.1f}, {z:.1f}) mm: the nearest, {_place(nearest)}, is "
+            f"{_away_mm(nearest, point_mm):.0f} mm away; give a point beside an opening, in LPS mm"
+        )
+    return nearest
+
+
 def with_inlet(vessel: Vessel, inlet_mm: Floats) -> Vessel:
-    """Return the vessel with the opening nearest to `inlet_mm` (3,) as its inlet."""
-    nearest = min(vessel.openings, key=lambda opening: float(np.linalg.norm(opening.center_mm - inlet_mm)))
-    return replace(vessel, openings=_named(nearest, list(vessel.openings)), centerlines=())
+    """Return the vessel with the opening at `inlet_mm` (3,), see `opening_at`, as its inlet; a note tells a far one."""
+    inlet = opening_at(vessel, inlet_mm)
+    note = f"The inlet, {_place(inlet)}, is {_away_mm(inlet, inlet_mm):.0f} mm from the point given."
+    notes = (*vessel.notes, note) if _is_far(inlet, inlet_mm) else vessel.notes
+    return replace(vessel, openings=_named(inlet, list(vessel.openings)), centerlines=(), notes=notes)
+
+
+def _away_mm(opening: Opening, point_mm: Floats) -> float:
+    return float(np.linalg.norm(opening.center_mm - point_mm))
+
+
+def _is_far(opening: Opening, point_mm: Floats) -> bool:
+    return _away_mm(opening, point_mm) > max(FARTHEST_MM, FARTHEST_DIAMETERS * opening.diameter_mm)
+
+
+def _place(opening: Opening) -> str:
+    x, y, z = opening.center_mm
+    return f"{opening.diameter_mm:.1f} mm wide at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
 
 
 def still_open(vessel: Vessel) -> Vessel | None:

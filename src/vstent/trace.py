@@ -48,6 +48,8 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
 
     Raises
     ------
+    InputError
+        When no opening is near `inlet_mm`.
     VesselError
         When fewer than two ends are found, or an outlet cannot be reached from the inlet.
     """

@@ -19,6 +19,7 @@ from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
 from vstent.kernels.arrays import Floats
 from vstent.measure import measure, morphology
+from vstent.openings import opening_at
 from vstent.repair import repair
 from vstent.restore import restore
 from vstent.segment import segment
@@ -51,11 +52,13 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
     whole = find_vessel(path, source, settings, ledger)
     neck_mm = None if settings.neck_mm is None else np.array(settings.neck_mm, dtype=np.float64)
     at_mm = _array(settings.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
+    outlet_mm = _array(settings.outlet_mm)
+    if outlet_mm is not None:
+        opening_at(whole, outlet_mm)  # before ends are cut off: the outlet meant may be one of them
     with ledger.stage("trim") as tell:
         traced = trim(whole, at_mm=at_mm, upstream_mm=settings.upstream_mm, downstream_mm=settings.downstream_mm)
         tell(" ".join(traced.notes[len(whole.notes) :]))
     with ledger.stage("restore") as tell:
-        outlet_mm = _array(settings.outlet_mm)
         anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
         tell(" ".join([*anatomy.notes, *(f"Sac of {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
     ledger.hold("anatomy", key, anatomy)
@@ -73,7 +76,8 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
         tell(" ".join(vessel.notes))
     with ledger.stage("trace") as tell:
         traced = trace(vessel, inlet_mm=_array(settings.inlet_mm))
-        tell(f"{len(traced.outlets)} outlets; inlet {traced.inlet.diameter_mm:.1f} mm wide.")
+        found = f"{len(traced.outlets)} outlets; inlet {traced.inlet.diameter_mm:.1f} mm wide."
+        tell(" ".join([found, *traced.notes[len(vessel.notes) :]]))
     ledger.hold("vessel", key, traced)
     return traced
 
