@@ -260,3 +260,11 @@ def test_points_where_the_vessel_was_cut_are_taken_and_what_they_choose_is_told(
     centers = [",".join(map(str, opening["center_mm"])) for opening in cut]
     assert main([*command, "--out", str(tmp_path / "again"), "--inlet", centers[0], "--outlet", centers[1]]) == 0
     assert "mm from the point given" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("port", ["65536", "99999", "-1", "http", "8e3"])
+def test_ports_that_do_not_exist_are_refused(port: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["app", f"--port={port}"])
+    assert stopped.value.code == 2
+    assert "0 to 65535" in capsys.readouterr().err

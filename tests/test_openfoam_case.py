@@ -12,7 +12,7 @@ from tubes import line, tube
 from vstent import phantoms
 from vstent.deploy import deploy
 from vstent.device import find_design
-from vstent.errors import ReadError
+from vstent.errors import LandingError, ReadError
 from vstent.flow import Blood, FlowCase, FlowSettings
 from vstent.flow.openfoam import FoamSetup, foam_case, named_patches
 from vstent.flow.openfoam.case import struts_near, wires_near
@@ -218,6 +218,8 @@ def test_only_wires_at_the_neck_are_meshed_each_whole() -> None:
     assert len(kept.faces) == len(near.faces)
     assert kept.volume_mm3 == pytest.approx(near.volume_mm3)
     assert kept.corners_mm[..., 2].max() < 2.0
+    with pytest.raises(LandingError, match="of the neck"):
+        struts_near(Surface(both.vertices_mm + 5.0, both.faces), sphere(0.4), 0.5)
 
 
 def test_only_the_pieces_of_wire_near_the_neck_are_left() -> None:
@@ -237,6 +239,13 @@ def test_only_the_pieces_of_wire_near_the_neck_are_left() -> None:
     both = whole[inside & (neck.closest(whole[:, 3:6])[1] < 1.0)]
     np.testing.assert_array_equal(left, both)
     assert 10 < len(left) < 0.5 * len(whole)
+    ends = points_mm[0] + np.array([[0.0, 0, 0], [9, 9, 9]])
+    one_near = Stent(
+        design, design.sizes[0], np.zeros((2, 3, 3)), np.zeros(2), ends, np.array([0, 2]), np.array([30.0])
+    )
+    for lone in (replace(stent, wire_points_mm=points_mm + 99.0), one_near):
+        with pytest.raises(LandingError, match="within 1 mm of the neck"):
+            wires_near(lone, neck, 1.0)
 
 
 def _pieces(stent: Stent) -> np.ndarray:

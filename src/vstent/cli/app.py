@@ -5,12 +5,15 @@ import importlib.util
 import socket
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from vstent.cli import options
 
 if TYPE_CHECKING:
     from vstent.app.desk import Desk
+
+
+LAST_PORT: Final = 65535
 
 
 def add(commands: options.Commands) -> None:
@@ -19,9 +22,15 @@ def add(commands: options.Commands) -> None:
     parser.add_argument("input", type=Path, nargs="?", help="scan, surface or case folder (else drop one on the page)")
     parser.add_argument("--cases", type=Path, default=Path("vstent-cases"), metavar="DIR", help="folder of the cases")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
-    parser.add_argument("--port", type=int, default=0, help="port to listen at (default: a free one)")
+    parser.add_argument("--port", type=_port, default=0, help="port to listen at (default: a free one)")
     parser.add_argument("--no-browser", action="store_true", help="only print the page's address")
     parser.set_defaults(command=_app)
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or int(text) > LAST_PORT:
+        raise argparse.ArgumentTypeError(f"{text!r} is no port: give 0 to {LAST_PORT}")
+    return int(text)
 
 
 def _app(arguments: argparse.Namespace) -> int:

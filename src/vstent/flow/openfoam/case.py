@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 
+from vstent.errors import LandingError
 from vstent.flow.openfoam import boundary, control, mesh, scripts
 from vstent.flow.openfoam.patches import Patch, named_patches, stl_text
 from vstent.flow.openfoam.setup import FoamSetup
@@ -137,12 +138,20 @@ def _inside_mm(case: FlowCase, sections: tuple[Floats, ...]) -> Floats:
 
 
 def wires_near(stent: Stent, ostium: Surface, reach_mm: float) -> Stent:
-    """Return a stent of which only the pieces of wire are left that lie nearer to the ostium than `reach_mm`."""
+    """Return a stent of which only the pieces of wire are left that lie nearer to the ostium than `reach_mm`.
+
+    Raises
+    ------
+    LandingError
+        When none does.
+    """
     wire = np.repeat(np.arange(len(stent.wire_starts) - 1), np.diff(stent.wire_starts))
     is_near = ostium.closest(stent.wire_points_mm)[1] < reach_mm
     first = is_near & ~np.r_[False, is_near[:-1] & (wire[1:] == wire[:-1])]
     piece, kept = np.cumsum(first) - 1, np.flatnonzero(is_near)
     kept = kept[np.bincount(piece[kept])[piece[kept]] > 1]  # a single point is no piece
+    if not len(kept):
+        raise _none_near(reach_mm)
     starts = np.r_[np.flatnonzero(np.r_[True, np.diff(piece[kept]) > 0]), len(kept)]
     return replace(
         stent,
@@ -158,6 +167,11 @@ def struts_near(struts: Surface, ostium: Surface, reach_mm: float) -> Surface:
     Parameters
     ----------
     struts : closed solids that share no vertex with each other.
+
+    Raises
+    ------
+    LandingError
+        When none comes so near.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -169,5 +183,14 @@ def struts_near(struts: Surface, ostium: Surface, reach_mm: float) -> Surface:
     graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
     _, solid = connected_components(graph, directed=False)
     is_near = ostium.closest(struts.vertices_mm)[1] < reach_mm
+    if not is_near.any():
+        raise _none_near(reach_mm)
     chosen = np.isin(solid[struts.faces[:, 0]], np.unique(solid[is_near]))
     return Surface(struts.vertices_mm, struts.faces[chosen])
+
+
+def _none_near(reach_mm: float) -> LandingError:
+    return LandingError(
+        f"no wire of the device lies within {reach_mm:g} mm of the neck, where OpenFOAM meshes its struts: land it "
+        "across the neck, or leave it away"
+    )
