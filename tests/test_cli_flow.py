@@ -82,6 +82,32 @@ def test_the_blood_asked_for_is_the_blood_computed(words: list[str], expected: B
     assert asdict(options.given_flow(parser.parse_args(words)).blood) == asdict(expected)
 
 
+@pytest.mark.parametrize(
+    "words", [["--steady", "--pulsatile"], ["--pulsatile", "--steady"], ["--convergence", "--device", "silk"]]
+)
+def test_what_excludes_each_other_is_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["flow", "tube.stl", "--out", "out", *words])
+    assert stopped.value.code == 2
+    assert "not allowed with" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["run", "flow"])
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--engine", "nonsense"], "There is no 'nonsense'"),
+        (["--engine", "openfoam", "--close-up"], "does not compute a close-up"),
+        (["--engine", "openfoam", "--device-gpu"], "does not compute on a GPU"),
+    ],
+)
+def test_an_engine_is_refused_before_anything_is_read(
+    command: str, words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, str(tmp_path / "none.stl"), "--out", str(tmp_path / "out"), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
 def _wall(path: Path) -> tuple[np.ndarray, np.ndarray]:
     reader = vtkXMLPolyDataReader()
     reader.SetFileName(str(path))

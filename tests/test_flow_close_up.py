@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from shapes import sphere
 from tubes import arc, line, tube
 from vstent import phantoms
-from vstent.errors import FlowError
+from vstent.errors import FlowError, InputError
 from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, domain, flow_case, indices, simulate_case
 from vstent.flow import close_up as close_ups
 from vstent.flow.cost import estimate
@@ -263,7 +263,7 @@ def test_no_close_up_without_a_sac_or_of_what_has_none() -> None:
     bare = FlowCase(tube(line(8.0), 2.0).vessel, settings=FlowSettings(cell_size_mm=0.3, close_up=True))
     with pytest.raises(FlowError, match="this vessel has none: leave out --close-up"):
         simulate_case(bare)
-    with pytest.raises(FlowError, match="the engine openfoam does not compute a close-up: leave out --close-up"):
+    with pytest.raises(InputError, match="the engine openfoam does not compute a close-up: leave out --close-up"):
         simulate_case(replace(bare, settings=replace(bare.settings, engine=OPENFOAM)))
 
 

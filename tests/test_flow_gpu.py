@@ -13,7 +13,7 @@ import pytest
 
 from tubes import line, tube
 from vstent.cli import main
-from vstent.errors import FlowError
+from vstent.errors import FlowError, InputError
 from vstent.flow import Blood, FlowCase, FlowSettings, Screen, domain, engine_class, foretell_cost, simulate_case
 from vstent.flow import gpu as gpus
 from vstent.flow.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
@@ -158,7 +158,7 @@ def test_the_command_line_says_so_before_it_reads_anything(
 
 
 def test_an_engine_that_knows_no_gpu_is_not_asked_to_use_one() -> None:
-    with pytest.raises(FlowError, match="the engine openfoam does not compute on a GPU"):
+    with pytest.raises(InputError, match="the engine openfoam does not compute on a GPU"):
         engine_class(replace(ASKED, engine="openfoam"))
 
 

@@ -1,7 +1,6 @@
 """`vstent flow`: the flow alone, in any vessel, sac or not, stent or not."""
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,14 +19,14 @@ def add(commands: options.Commands) -> None:
         commands, "flow", "scan or surface -> blood flow, in any vessel, with or without devices"
     )
     options.add_outlet(options.add_geometry(parser))
-    parser.add_argument("--device", action="append", metavar="NAME", help="a device of the catalogue too; repeatable")
-    flow = options.add_flow(parser)
-    flow.add_argument("--steady", action="store_true", help="at the mean inflow, not pulsing (the default)")
-    flow.add_argument(
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--device", action="append", metavar="NAME", help="a device of the catalogue too; repeatable")
+    what.add_argument(
         "--convergence",
         action="store_true",
         help="the bare flow on three grids, with three time steps and turned three ways on the grid, compared",
     )
+    options.add_flow(parser)
     parser.set_defaults(command=_flow)
 
 
@@ -35,11 +34,8 @@ def _flow(arguments: argparse.Namespace) -> int:
     from vstent.console import Console
     from vstent.study import Settings
 
-    flow = options.given_flow(arguments)
-    if arguments.steady:
-        flow = replace(flow, waveform=None)
     devices = tuple(dict.fromkeys(arguments.device or ()))
-    settings = Settings(devices=devices, flow=flow, **options.given_geometry(arguments))
+    settings = Settings(devices=devices, flow=options.given_flow(arguments), **options.given_geometry(arguments))
     console = Console()
     compute = _converge if arguments.convergence else _compute
     for table in compute(arguments.input, arguments.out, settings, console):

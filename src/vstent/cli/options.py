@@ -109,7 +109,9 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         "--flow-rate", type=positive, metavar="ML_S", help="mean inflow (0.27 m/s times the inlet's area)"
     )
     flow.add_argument("--cell-size", type=positive, metavar="MM", help="edge of a flow cell")
-    flow.add_argument(
+    pulse = flow.add_mutually_exclusive_group()
+    pulse.add_argument("--steady", action="store_true", help="at the mean inflow, not pulsing (the default)")
+    pulse.add_argument(
         "--pulsatile",
         nargs="?",
         const=PUBLISHED,
@@ -267,12 +269,10 @@ def given_devices(arguments: argparse.Namespace) -> tuple[str, ...]:
 
 def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
     """Collect what was said of the flow."""
-    from vstent.flow import FlowSettings
+    from vstent.flow import FlowSettings, engine_class
     from vstent.flow.gpu import require_gpu
 
-    if arguments.device_gpu:
-        require_gpu()  # before anything else is computed
-    return FlowSettings(
+    settings = FlowSettings(
         inflow_mL_s=arguments.flow_rate,
         blood=_blood(arguments),
         waveform=_waveform(arguments.pulsatile),
@@ -283,6 +283,10 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
         processes=arguments.processes,
         device_gpu=arguments.device_gpu,
     )
+    engine_class(settings)  # what cannot be is told before anything is computed
+    if settings.device_gpu:
+        require_gpu()
+    return settings
 
 
 def _blood(arguments: argparse.Namespace) -> "Blood":

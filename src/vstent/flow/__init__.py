@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from vstent import plugins
-from vstent.errors import FlowError
+from vstent.errors import InputError
 from vstent.flow import sampling
 from vstent.flow.close_up import WIDTH, require_sac
 from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
@@ -154,17 +154,17 @@ def engine_class(settings: FlowSettings) -> type[AbstractEngine[Any]]:
     ------
     PluginError
         When there is none.
-    FlowError
+    InputError
         When it is to run on a GPU or in a close-up and does not.
     """
     engine = _engine_of(settings)
     if settings.close_up and not engine.closes_up:
-        raise FlowError(
+        raise InputError(
             f"the engine {settings.engine} does not compute a close-up: leave out --close-up (close_up), or take "
             f"{LATTICE}"
         )
     if settings.device_gpu and not engine.runs_on_gpu:
-        raise FlowError(
+        raise InputError(
             f"the engine {settings.engine} does not compute on a GPU: leave out --device-gpu (device_gpu), or take "
             f"{LATTICE}"
         )
