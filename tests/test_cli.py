@@ -4,6 +4,7 @@ import argparse
 import json
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -268,3 +269,21 @@ def test_ports_that_do_not_exist_are_refused(port: str, capsys: pytest.CaptureFi
         main(["app", f"--port={port}"])
     assert stopped.value.code == 2
     assert "0 to 65535" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["run", "none.json", "--out", "out"], ["rank", "a.stl", "--out", "out", "--criteria", "none.toml"]],
+)
+def test_files_besides_the_scan_are_told_where_they_are_missing(
+    command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command) == 2
+    assert _complaint(capsys, "does not exist: check the path")
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["--version"])
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out == f"vstent {version('vstent')}\n"

@@ -181,7 +181,7 @@ def test_a_device_of_ones_own_joins_the_catalogue_and_can_be_replaced(own_folder
         (OWN.replace(', confidence = "derived"', ""), "is wrong at device.0.braid.braid_angle_rad.confidence"),
         (OWN.replace("value = 1.2", "value = 2.0"), "has an angle of 2.000 rad"),
         (OWN.replace("]]", "]"), "is not valid TOML"),
-        (None, "cannot be read"),
+        (None, "does not exist"),
     ],
     ids=["taken", "no confidence", "angle", "no TOML", "no file"],
 )

@@ -359,6 +359,8 @@ def add_devices(path: Path) -> dict[str, Design]:
 def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise DeviceError(f"{path} does not exist: check the path.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise DeviceError(f"{path} cannot be read as text: give a TOML file of devices, or remove it.") from error
 

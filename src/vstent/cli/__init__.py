@@ -70,10 +70,22 @@ def _fail(sentence: str, code: int) -> int:
     return code
 
 
+class _Version(argparse.Action):
+    """Tells the version; to know it takes a while, so only when asked."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *given: object) -> None:
+        """Print it and end."""
+        from importlib.metadata import version
+
+        print(f"vstent {version('vstent')}")
+        parser.exit()
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="vstent", description="Virtual stenting of intracranial aneurysms.", epilog=EPILOG
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="tell the version, and end")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for command in COMMANDS:
         command.add(commands)

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, ValidationE
 
 from vstent.device import Design
 from vstent.errors import InputError
+from vstent.io.files import existing
 
 
 class _Strict(BaseModel):
@@ -94,10 +95,10 @@ def read_criteria(path: Path) -> Criteria:
     Raises
     ------
     InputError
-        When it is no readable text or breaks the schema.
+        When it does not exist, is no readable text or breaks the schema.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = existing(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read as text: give a TOML file of criteria.") from error
     return parse(text, str(path))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from vstent.errors import InputError, ReadError
+from vstent.io.files import existing
 from vstent.study.folder import CACHE
 from vstent.study.ledger import hash_of
 from vstent.study.provenance import INPUT, METRICS, devices_of, machine, versions
@@ -48,12 +49,12 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
     Raises
     ------
     ReadError
-        The file is not of this version's kind, or the input is not where it was.
+        The file does not exist or is not of this version's kind, or the input is not where it was.
     InputError
         The input is another one than then.
     """
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
+        told = json.loads(existing(path).read_text(encoding="utf-8"))
         settings, sha256 = _settings(told["settings"]), str(told["input"]["sha256"])
         differences = _differences(told, settings)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
