@@ -71,6 +71,34 @@ def test_an_openfoam_case_of_a_studied_case_has_its_device_over_the_neck(studied
     assert flow_m3_s == pytest.approx(2.5e-6, rel=0.01)
 
 
+@pytest.mark.parametrize("what", ["openfoam", "patches"])
+def test_a_studied_vessel_is_not_found_otherwise(
+    what: str, studied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--upstream", "9", "--at", "1,2,3"]
+    assert main(["export", what, str(studied), "--out", str(tmp_path / "out"), *words]) == 2
+    assert "leave out --at (at_mm), --upstream (upstream_mm)" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--layers", "-3"], "0 or more"),
+        (["--engine", "nonsense"], "unrecognized"),
+        (["--close-up"], "unrecognized"),
+        (["--device-gpu"], "unrecognized"),
+    ],
+)
+def test_options_that_openfoams_case_has_no_use_for_are_refused(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["export", "openfoam", "artery.stl", "--out", "out", *words])
+    assert stopped.value.code == 2
+    assert said in capsys.readouterr().err
+
+
 def test_bad_input_leaves_nothing_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_stl(tmp_path / "sphere.stl", sphere(3.0))
     for what in ("openfoam", "patches"):

@@ -1,6 +1,7 @@
 """`vstent export`: a case for other solvers."""
 
 import argparse
+from pathlib import Path
 
 from vstent.cli import options
 
@@ -12,10 +13,11 @@ def add(commands: options.Commands) -> None:
     foam = options.add_command(kinds, "openfoam", "an OpenFOAM case folder: mesh, boundary conditions, scripts")
     _add_input(foam)
     foam.add_argument("--device", metavar="NAME", help="mesh this device's struts over the neck (none)")
-    options.add_flow(foam)
+    options.add_problem(foam)
     group = foam.add_argument_group("OpenFOAM")
+    options.add_processes(group)
     group.add_argument("--flavour", choices=("com", "org"), help="openfoam.com or .org (the one found, or com)")
-    group.add_argument("--layers", type=int, default=2, metavar="N", help="layers of flat cells along the wall (2)")
+    group.add_argument("--layers", type=_layers, default=2, metavar="N", help="layers of flat cells along the wall (2)")
     foam.set_defaults(command=_openfoam)
     patches = options.add_command(kinds, "patches", "the blood's boundary as watertight named patches")
     _add_input(patches)
@@ -23,7 +25,15 @@ def add(commands: options.Commands) -> None:
 
 
 def _add_input(parser: argparse.ArgumentParser) -> None:
-    options.add_outlet(options.add_geometry(parser))
+    parser.add_argument("input", type=Path, help="case folder of `vstent run`, or a scan or surface as that takes")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
+    options.add_outlet(options.add_given(parser))
+
+
+def _layers(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of layers: give 0 or more")
+    return int(text)
 
 
 def _openfoam(arguments: argparse.Namespace) -> int:
@@ -32,7 +42,7 @@ def _openfoam(arguments: argparse.Namespace) -> int:
     from vstent.study.exports import export_openfoam
 
     devices = (arguments.device,) if arguments.device else ()
-    settings = Settings(devices=devices, flow=options.given_flow(arguments), **options.given_geometry(arguments))
+    settings = Settings(devices=devices, flow=options.given_problem(arguments), **options.given_geometry(arguments))
     foam = {"processes": arguments.processes, "layers": arguments.layers}
     if arguments.flavour:
         foam["flavour"] = arguments.flavour

@@ -5,6 +5,7 @@ import math
 import os
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -102,8 +103,8 @@ def add_devices(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
-    """Add how the flow is computed; return the group."""
+def add_problem(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add which flow it is, whatever computes it; return the group."""
     flow = parser.add_argument_group("flow")
     flow.add_argument(
         "--flow-rate", type=positive, metavar="ML_S", help="mean inflow (0.27 m/s times the inlet's area)"
@@ -124,17 +125,28 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
     flow.add_argument(
         "--thinning", action="store_true", help="blood thins with the shear rate, as Carreau and Yasuda's law has it"
     )
+    flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
+    return flow
+
+
+def add_processes(group: "argparse._ArgumentGroup") -> None:
+    """Add how many processes OpenFOAM is given."""
+    group.add_argument("-j", "--processes", type=_jobs, default=1, metavar="N", help="processes for OpenFOAM (1)")
+
+
+def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
+    """Add which flow it is and how it is computed; return the group."""
+    flow = add_problem(parser)
     flow.add_argument(
         "--engine", default="lattice_boltzmann", metavar="NAME", help="openfoam, or a plug-in that computes the flow"
     )
-    flow.add_argument("-j", "--processes", type=_jobs, default=1, metavar="N", help="processes for OpenFOAM (1)")
+    add_processes(flow)
     flow.add_argument(
         "--close-up",
         action="store_true",
         help="cells of that size only in the sac and near it, twice as wide elsewhere",
     )
     flow.add_argument("--device-gpu", action="store_true", help="compute the flow on an NVIDIA GPU (the extra gpu)")
-    flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
     return flow
 
 
@@ -267,17 +279,26 @@ def given_devices(arguments: argparse.Namespace) -> tuple[str, ...]:
     return tuple(dict.fromkeys(arguments.device or ("silk", "enterprise")))
 
 
-def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
-    """Collect what was said of the flow."""
-    from vstent.flow import FlowSettings, engine_class
-    from vstent.flow.gpu import require_gpu
+def given_problem(arguments: argparse.Namespace) -> "FlowSettings":
+    """Collect which flow it is."""
+    from vstent.flow import FlowSettings
 
-    settings = FlowSettings(
+    return FlowSettings(
         inflow_mL_s=arguments.flow_rate,
         blood=_blood(arguments),
         waveform=_waveform(arguments.pulsatile),
         outlets=arguments.outlets,
         cell_size_mm=arguments.cell_size,
+    )
+
+
+def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
+    """Collect which flow it is and how it is computed."""
+    from vstent.flow import engine_class
+    from vstent.flow.gpu import require_gpu
+
+    settings = replace(
+        given_problem(arguments),
         close_up=arguments.close_up,
         engine=arguments.engine,
         processes=arguments.processes,

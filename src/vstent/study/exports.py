@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -25,6 +25,12 @@ from vstent.study.stages import check_inflow, deploy_all, find_anatomy
 from vstent.study.types import Progress, Settings
 from vstent.surface import Surface
 from vstent.vessel import Anatomy
+
+GEOMETRY: Final = (
+    *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
+    *("neck_mm", "upstream_mm", "downstream_mm"),
+)
+"""Settings that say how the vessel is found."""
 
 
 def export_openfoam(
@@ -109,6 +115,10 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
     kept = sorted((path / CACHE).glob("anatomy-*.npz")) if path.is_dir() else []
     if not kept:
         return find_anatomy(path, hash_of(path), settings, ledger)
+    given = [name for name in GEOMETRY if getattr(settings, name) is not None]
+    if given:
+        words = ", ".join(f"--{name.removesuffix('_mm')} ({name})" for name in given)
+        raise InputError(f"{path} is a case folder, and its vessel is taken as it lies there: leave out {words}")
     with ledger.stage("anatomy") as tell:
         anatomy = load_noun(kept[-1], Anatomy)
         tell(f"taken from {path}")
