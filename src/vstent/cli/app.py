@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 
 LAST_PORT: Final = 65535
+"""Ports have 16 bits."""
 
 
 def add(commands: options.Commands) -> None:
