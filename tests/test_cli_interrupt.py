@@ -3,12 +3,20 @@
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 from vstent.cli import devices, main
+
+
+@pytest.fixture(autouse=True)
+def _answered() -> Iterator[None]:
+    """Have Ctrl-C answered as Python does it: in a job that a script has put into the background it is ignored."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)
 
 
 def _interrupted(package: str, done: list[str]) -> Callable[[object], int]:
@@ -69,12 +77,9 @@ def test_what_is_over_is_not_interrupted(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_who_ignores_ctrl_c_goes_on_ignoring_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices, "_devices", lambda arguments: signal.raise_signal(signal.SIGINT) or 0)
-    former = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        assert main(["devices"]) == 0
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, former)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    assert main(["devices"]) == 0
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 def test_off_the_main_thread_no_handler_is_set() -> None:
