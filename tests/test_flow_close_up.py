@@ -20,7 +20,7 @@ from vstent.flow.engines.lattice_pace import peak_speed_m_s
 from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
 from vstent.flow.engines.lattice_setup import thickest
 from vstent.flow.engines.lattice_state import build, imposed, take_pace
-from vstent.flow.types import OPENFOAM
+from vstent.flow.types import OPENFOAM, Swing
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.kernels import lattice
 from vstent.restore import restore
@@ -232,6 +232,31 @@ def test_a_close_up_does_not_reach_through_the_walls_of_arteries_that_touch(gap_
     assert (close_up.part[grid.centers_mm[:, 0] > middle_mm] >= 0).all()
     assert close_up.part_of_opening.tolist() == [0, 1]
     assert close_up.inflow_mL_s == pytest.approx([2.0, -2.0])
+
+
+def test_what_a_swing_tells_is_the_close_ups_within_and_that_of_the_wide_cells_elsewhere() -> None:
+    vessel = tube(line(30.0), RADIUS_MM).vessel
+    case = FlowCase(vessel, sac=ball((0.0, 0.0, 15.0)), settings=FlowSettings(inflow_mL_s=INFLOW_ML_S))
+    outer = at_rest(case, domain.build(vessel, 0.5))
+    outer = replace(outer, velocity_m_s=outer.velocity_m_s + np.array([0.0, 0.0, 0.3]))
+    chosen = close_ups.close_up(case, outer)
+    inner = at_rest(case, close_ups.build(case, 0.25, chosen))
+    of_wall = np.arange(len(vessel.lumen.vertices_mm), dtype=float)
+    swing = Swing(np.linspace(1.0, 2.0, len(inner.cells)), of_wall, 3.0)
+    found = close_ups.assembled(chosen, replace(inner, swing=swing))
+    assert found.swing is not None
+    assert found.swing.neck_inflow_mL_s == 3.0
+    nearest_mm, of_inner = cKDTree(inner.centers_mm).query(found.centers_mm)
+    is_inner = nearest_mm < 1e-6
+    np.testing.assert_array_equal(found.speed_m_s[is_inner], swing.speed_m_s[of_inner[is_inner]])
+    deep = ~is_inner & (np.linalg.norm(found.centers_mm[:, :2], axis=1) < 1.0)
+    deep &= np.abs(found.centers_mm[:, 2] - 15.0) < 14.0
+    assert deep.sum() > 1000
+    np.testing.assert_allclose(found.speed_m_s[deep], 0.3, rtol=1e-6)
+    assert set(np.flatnonzero(found.shear_Pa != of_wall)) <= set(np.flatnonzero(found.shear_Pa == 0.0))
+    assert (found.shear_Pa == of_wall).sum() > 1000
+    assert (found.shear_Pa == 0.0).sum() > 1000
+    assert close_ups.assembled(chosen, inner).swing is None
 
 
 def test_a_recess_that_leads_nowhere_belongs_to_the_close_up() -> None:
