@@ -4,13 +4,13 @@ import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import isfinite
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from vstent.device import find_design
 from vstent.errors import InputError, ReadError
 from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
+from vstent.io.tables import finite
 from vstent.study import Settings
 from vstent.study.ledger import hash_of, key_of, refuse_missing
 from vstent.units import MM_PER
@@ -116,15 +116,8 @@ def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Cas
     return Case(name, path, replace(settings, **changes))
 
 
-def _number(text: str) -> float:
-    value = float(text)
-    if not isfinite(value):
-        raise ValueError("a finite number is needed")
-    return value
-
-
 def _size(text: str) -> float:
-    return _above_zero(_number(text))
+    return _above_zero(finite(text))
 
 
 def _count(text: str) -> int:
@@ -160,15 +153,15 @@ def _devices(text: str) -> tuple[str, ...]:
 COLUMNS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
     "devices": ("devices", _devices),
     "units": ("units", _units),
-    "threshold": ("threshold", _number),
-    "at": ("at_mm", _three(_number)),
-    "inlet": ("inlet_mm", _three(_number)),
-    "outlet": ("outlet_mm", _three(_number)),
+    "threshold": ("threshold", finite),
+    "at": ("at_mm", _three(finite)),
+    "inlet": ("inlet_mm", _three(finite)),
+    "outlet": ("outlet_mm", _three(finite)),
     "spacing": ("spacing_mm", _three(_size)),
     "shape": ("shape", _three(_count)),
     "diameter": ("diameter_mm", _size),
     "length": ("length_mm", _size),
-    "center": ("center_mm", _number),
+    "center": ("center_mm", finite),
 }
 """Titles of a CSV file's columns: the setting each fills, and how it is read."""
 

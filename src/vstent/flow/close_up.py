@@ -125,7 +125,7 @@ def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
     graph = _neighbours(outer, surface)
     sac = sampling.cells_inside(require_sac(case), outer.centers_mm, outer.cell_size_mm)
     distance_mm = dijkstra(graph, directed=False, indices=sac, min_only=True)
-    diameter_mm = _mean_diameter_mm(case)
+    diameter_mm = domains.mean_diameter_mm(case.vessel)
     ends = _cells_at_ends(outer, sections)
     whole_mm = np.full(len(distance_mm), np.inf)
     part = _parts(graph, distance_mm > DOWNSTREAM_DIAMETERS * diameter_mm, ends)
@@ -145,14 +145,10 @@ def volume_mm3(case: FlowCase) -> float:
     FlowError
         When the case has no sac.
     """
-    sac, diameter_mm = require_sac(case), _mean_diameter_mm(case)
+    sac, diameter_mm = require_sac(case), domains.mean_diameter_mm(case.vessel)
     neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
     stretch_mm = (UPSTREAM_DIAMETERS + DOWNSTREAM_DIAMETERS) * diameter_mm + sqrt(4 / pi * neck_mm2)
     return min(abs(sac.volume_mm3) + pi / 4 * diameter_mm**2 * stretch_mm, abs(case.vessel.closed.volume_mm3))
-
-
-def _mean_diameter_mm(case: FlowCase) -> float:
-    return 4 * abs(case.vessel.closed.volume_mm3) / case.vessel.lumen.area_mm2
 
 
 def _cells_at_ends(outer: FlowField, sections: Sequence[Floats]) -> Ints:
@@ -174,7 +170,7 @@ def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints) -> Ints:
 
 def _neighbours(field: FlowField, surface: Surface) -> csr_matrix:
     """Way between neighbouring cells that no wall of the blood's surface parts, mm."""
-    neighbour = np.stack([field.index[tuple((field.cells + c).T)] for c in VELOCITIES], axis=1)
+    neighbour = domains.neighbours(field.index, field.cells)
     is_open = neighbour >= 0
     is_open[:, 0::2] = False  # every pair once
     is_open[domains.septa(surface, neighbour, field.cells, field.origin_mm, field.cell_size_mm)] = False

@@ -187,10 +187,15 @@ def default_cell_size_mm(case: FlowCase) -> float:
     if settings.cell_size_mm is not None:
         return settings.cell_size_mm
     volume_mm3 = case.vessel.closed.volume_mm3
-    mean_mm = 4 * volume_mm3 / case.vessel.lumen.area_mm2
-    by_diameter = min(mean_mm, case.vessel.inlet.diameter_mm) / settings.cells_per_diameter
+    across_mm = min(mean_diameter_mm(case.vessel), case.vessel.inlet.diameter_mm)
+    by_diameter = across_mm / settings.cells_per_diameter
     by_budget = (volume_mm3 / settings.cell_budget) ** (1 / 3)
     return max(by_diameter, by_budget)
+
+
+def mean_diameter_mm(vessel: Vessel) -> float:
+    """Mean (hydraulic) diameter 4 V / A of a vessel, its sac included."""
+    return 4 * abs(vessel.closed.volume_mm3) / vessel.lumen.area_mm2
 
 
 def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> Domain:
@@ -217,7 +222,7 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
         )
     index = np.full(inside.shape, -1, dtype=np.int32)
     index[inside] = np.arange(len(cells), dtype=np.int32)
-    neighbour = np.stack([index[tuple((cells + c).T)] for c in VELOCITIES], axis=1)
+    neighbour = neighbours(index, cells)
     is_beyond = filled & ~inside & (window is not None)
     links = _links(surface, face_patch, neighbour, cells, is_beyond, origin_mm, cell_size_mm)
     parted = septa(surface, neighbour, cells, origin_mm, cell_size_mm)
@@ -367,12 +372,17 @@ def _links(
     return cell.astype(np.int32), direction.astype(np.int32), fraction, patch.astype(np.int32)
 
 
+def neighbours(index: Ints, cells: Ints) -> Ints:
+    """Number (n, 19) of every cell's neighbours, -1 where these are no blood, by the `index` (i, j, k) of the grid."""
+    return np.stack([index[tuple((cells + c).T)] for c in VELOCITIES], axis=1)
+
+
 def septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, cell_size_mm: float) -> tuple[Ints, Ints]:
     """Links between two blood cells with a wall between them: their cell and direction, each pair once.
 
     Parameters
     ----------
-    surface : the blood's; neighbour : (n, 19) number of every cell's neighbours, -1 where these are no blood.
+    surface : the blood's; neighbour : (n, 19) see `neighbours`.
     cells, origin_mm, cell_size_mm : as of a `Domain`.
     """
     is_edge = np.asarray((neighbour < 0).any(axis=1))

@@ -77,10 +77,23 @@ def _plain(value: Any) -> Any:
     return f"{value:.{SIGNIFICANT_DIGITS}g}" if isinstance(value, float) else value
 
 
+def finite(word: str) -> float:
+    """Read a finite number.
+
+    Raises
+    ------
+    ValueError
+        When it is none.
+    """
+    value = float(word)
+    if not math.isfinite(value):
+        raise ValueError("a finite number is needed")
+    return value
+
+
 def _number(word: str) -> float | None:
     """Read a finite number; None where it is none."""
     try:
-        value = float(word)
+        return finite(word)
     except ValueError:
         return None
-    return value if math.isfinite(value) else None

@@ -27,7 +27,7 @@ SHARE_OF_CLOSE_UP = 1 / 2
 """Part of the time steps that a close-up makes at most: it begins from the end of what surrounds it."""
 
 SLOWER: Final = 0.5
-"""A run that diverged is tried once more with a time step so much shorter."""
+"""A run that diverged is tried again with a time step so much shorter."""
 
 
 class AbstractLattice(AbstractEngine[State]):
