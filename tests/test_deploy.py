@@ -380,6 +380,30 @@ def test_the_proposed_size_is_the_smallest_that_fills_the_wider_zone_and_the_sho
         assert min(26 - short.proximal_abscissa_mm, short.distal_abscissa_mm - 31) < margin_mm
 
 
+def with_wide_pieces(diameter_mm, *pieces_mm):
+    """A straight artery of 3 mm with a neck from 28 to 32 mm, wider in some pieces."""
+    along_mm = np.linspace(0, 60, 301)
+    is_wide = np.logical_or.reduce([(along_mm > first) & (along_mm < last) for first, last in pieces_mm])
+    return with_neck(tube(line(60), np.where(is_wide, diameter_mm / 2, 1.5)), 28.0, 32.0)
+
+
+def test_a_size_that_would_stand_off_beyond_the_landing_zones_gives_way_to_the_next():
+    # The zones, 5 mm on either side of the neck, are 3 mm wide; what is proposed for them reaches beyond them.
+    anatomy = with_wide_pieces(3.6, (0, 22.9), (37.1, 60))
+    assert max(sizing.landing_diameters_mm(anatomy)) == pytest.approx(3.0)
+    narrow = propose_size(SILK, with_wide_pieces(3.6, (0, 15), (45, 60)))
+    assert narrow.diameter_mm == 3.0
+    assert measure(anatomy, deploy(SILK, anatomy, size=narrow))["apposed_fraction"] < 0.95
+    size = propose_size(SILK, anatomy)
+    assert size.diameter_mm == 3.5
+    assert measure(anatomy, deploy(SILK, anatomy, size=size))["apposed_fraction"] == 1.0
+
+
+@pytest.mark.parametrize("wide", [(5.0, (0, 22.9), (37.1, 60)), (3.6, (24.0, 24.4)), (3.6, (28.5, 31.5))])
+def test_no_wider_size_is_proposed_where_it_would_stand_off_too_or_for_a_short_bulge_or_one_across_the_neck(wide):
+    assert propose_size(SILK, with_wide_pieces(*wide)).diameter_mm == 3.0
+
+
 def test_near_the_end_of_the_artery_the_landing_gives_way():
     anatomy = with_neck(straight(), 3.0, 7.0)
     size = device.find_size(SILK, diameter_mm=4, length_mm=20)

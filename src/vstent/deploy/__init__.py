@@ -34,8 +34,6 @@ METHODS: dict[str, type[ConstantWire] | type[Zhong2016]] = {"constant_wire": Con
 
 APPOSED_GAP_MM = 0.1
 """A node is apposed when the device's outer face is nearer to the wall than this."""
-LOOSE_FRACTION = 0.05
-"""Less of the device than this may stand off the wall without a word."""
 
 propose_landing = sizing.propose_landing
 propose_size = sizing.propose_size
@@ -122,7 +120,7 @@ def _advice(stent: Stent, course: Course, gap_mm: Floats, is_at_patient: Bools) 
         return f"{lies}, but only {done:.0%} of its contour reached the wall: raise the iteration limit or tau."
     is_loose = is_at_patient & (gap_mm > APPOSED_GAP_MM)
     loose = is_loose.sum() / max(is_at_patient.sum(), 1)
-    if loose <= LOOSE_FRACTION:
+    if loose <= sizing.LOOSE_FRACTION:
         return f"{lies}, and {1 - loose:.0%} of it lies against the wall."
     off = f"{loose:.0%} of it stands off the wall, by up to {gap_mm[is_at_patient].max():.2f} mm"
     return f"{lies}, and {off}: {_remedy(stent, gap_mm, is_loose)}"

@@ -1,10 +1,12 @@
 """Sizing: which size, and where.
 
 The rule (vstent's own, after common practice in manual sizing): the label diameter is the smallest that is not below
-the wider of the two landing zones; the length is the shortest whose *deployed* length covers the neck and a margin on
-both sides, because in a narrower artery a braid becomes longer than its label says.
+the wider of the two landing zones, or the next one where only that lies against the wall beside the neck; the length
+is the shortest whose *deployed* length covers the neck and a margin on both sides, because in a narrower artery a braid
+becomes longer than its label says.
 """
 
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -23,6 +25,8 @@ END_MM: Final = 0.5
 """A proposed device stays this far from the artery's ends: its length is only foreseen before it is deployed."""
 DIAMETER_SLACK_MM: Final = 0.05
 """A label this much below the landing zone still counts as not below it."""
+LOOSE_FRACTION: Final = 0.05
+"""Less of a device than this may stand off the wall without a word, and without a wider one being proposed."""
 
 
 def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
@@ -54,14 +58,13 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
     """
     wider_mm = max(landing_diameters_mm(anatomy))
     labels = sorted({size.diameter_mm for size in design.sizes})
-    label = next((d for d in labels if d >= wider_mm - DIAMETER_SLACK_MM), labels[-1])
-    for diameter_mm in [d for d in reversed(labels) if d <= label]:
-        same = sorted((size for size in design.sizes if size.diameter_mm == diameter_mm), key=lambda s: s.length_mm)
-        spans = {size: _span(design, anatomy, size) for size in same}
-        fitting = [size for size in same if _fits(anatomy, *spans[size])]
-        if fitting:
-            enough_mm = max(MARGIN_MM, wider_mm)
-            return next((size for size in fitting if _margin(anatomy, *spans[size]) >= enough_mm), fitting[-1])
+    zone = next((i for i, label in enumerate(labels) if label >= wider_mm - DIAMETER_SLACK_MM), len(labels) - 1)
+    # No size follows a bulge: where the next one would stand off too, the label of the landing zone stays.
+    held = (_of_label(design, anatomy, label, lying=True) for label in labels[zone : zone + 2])
+    any_of_label = (_of_label(design, anatomy, label) for label in reversed(labels[: zone + 1]))
+    proposed = next((size for size in chain(held, any_of_label) if size is not None), None)
+    if proposed is not None:
+        return proposed
     shortest_mm = min(last - first for first, last in (_span(design, anatomy, size) for size in design.sizes))
     raise LandingError(
         f"No size of {design.name} fits: the shortest would be {shortest_mm:.1f} mm long in a parent artery of "
@@ -84,6 +87,27 @@ def propose_landing(design: Design, anatomy: Anatomy, size: Size) -> Landing:
             move_mm = min(max(move_mm, end_mm - first), anatomy.axis.length_mm - end_mm - last)
         wanted_mm += move_mm
     return Landing(wanted_mm)
+
+
+def _of_label(design: Design, anatomy: Anatomy, label_mm: float, *, lying: bool = False) -> Size | None:
+    """The shortest size of a label that reaches far enough, or the longest that fits; `lying`: against the wall."""
+    same = sorted((size for size in design.sizes if size.diameter_mm == label_mm), key=lambda size: size.length_mm)
+    spans = {size: _span(design, anatomy, size) for size in same}
+    fitting = [size for size in same if _fits(anatomy, *spans[size])]
+    if not fitting:
+        return None
+    enough_mm = max(MARGIN_MM, *landing_diameters_mm(anatomy))
+    chosen = next((size for size in fitting if _margin(anatomy, *spans[size]) >= enough_mm), fitting[-1])
+    return chosen if not lying or _loose_fraction(design, anatomy, chosen, *spans[chosen]) <= LOOSE_FRACTION else None
+
+
+def _loose_fraction(design: Design, anatomy: Anatomy, size: Size, first_mm: float, last_mm: float) -> float:
+    """How much of the artery beside the neck, where the device will lie, is wider than it opens."""
+    proximal_mm, distal_mm = neck_span_mm(anatomy)
+    under_mm = np.linspace(first_mm, last_mm, 201)
+    beside_mm = under_mm[(under_mm <= proximal_mm) | (under_mm >= distal_mm)]
+    is_loose = expected_profile(design, anatomy).at(beside_mm) > size.free_diameter_mm
+    return float(is_loose.mean()) if len(is_loose) else 0.0
 
 
 def _span(design: Design, anatomy: Anatomy, size: Size) -> tuple[float, float]:
