@@ -106,6 +106,25 @@ def test_artery_neck_and_sac_of_a_noisy_scan(row: tuple[str, float]) -> None:
     np.testing.assert_allclose(aneurysm.sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.03 if voxel_mm < 0.3 else 0.05)
 
 
+@pytest.mark.parametrize("stretch", [1.5, 1 / 1.5], ids=["sac on the wide side", "sac on the narrow side"])
+def test_an_oval_artery_is_its_own_wall_and_keeps_its_sac(stretch: float) -> None:
+    # A round artery drawn out across its axis by as much as it is pressed in: volumes stay.
+    round_one = with_sac(phantoms.tube(length_mm=26), abscissa_mm=13, width_mm=6.0, neck_mm=3.8, direction=X)
+    assert round_one.sac is not None
+    surface = phantoms.phantom_surface(round_one, edge_mm=0.3)
+    factor = np.array([np.sqrt(stretch), 1 / np.sqrt(stretch), 1.0])
+    anatomy = restore(trace(Vessel(Surface(surface.vertices_mm * factor, surface.faces))))
+    (aneurysm,) = anatomy.aneurysms
+    np.testing.assert_allclose(aneurysm.sac.volume_mm3, round_one.sac_volume_mm3, rtol=0.01)
+    landed = anatomy.landing_surface.vertices_mm / factor
+    error = np.hypot(landed[:, 0], landed[:, 1]) / 2.0 - 1
+    beside = np.abs(landed[:, 2] - 13) > 5.0
+    assert np.abs(error).max() < 0.06
+    assert np.abs(error[beside]).max() < 0.01
+    inside = (landed[:, 2] > 1.0) & (landed[:, 2] < 25.0)  # at the ends rays leave by the opening
+    assert not anatomy.is_restored[beside & inside].any()
+
+
 def test_two_sacs_are_both_found_and_the_one_at_a_point_alone() -> None:
     long = phantoms.tube(length_mm=46)
     first = with_sac(long, abscissa_mm=15, width_mm=5.0, neck_mm=3.6, direction=X)

@@ -7,7 +7,7 @@ from vstent.io.surfaces import read_surface
 from vstent.kernels import smoothing
 from vstent.repair import repair
 from vstent.restore import _width_beyond_fork, restore
-from vstent.restore.axis import _fit, _Necks
+from vstent.restore.axis import Tube, _fit, _Necks
 from vstent.restore.bulges import Bulge
 from vstent.restore.landing import Landing
 from vstent.restore.neck import MOUTH, apart_mm
@@ -105,13 +105,22 @@ def test_across_a_neck_the_axis_goes_to_the_medial_line_and_into_it_stays() -> N
     none = np.zeros((n, n_rays))
     for axis in (0, 1):
         across = np.eye(2)[axis] * np.ones((n, 1))
-        necks = _Necks(np.full(n, 2.0), np.full(n, 10.0 * n_rays), none > 0, across)
-        moved, radius = _fit(points, necks.radius_mm, none, none, necks, medial)
+        oval = np.tile([2.0, 0.3, -0.2], (n, 1))
+        necks = _Necks(Tube(points, oval), np.full(n, 10.0 * n_rays), none > 0, across)
+        moved, fitted = _fit(none, none, necks, medial)
         direction = (moved - points).mean(axis=0)
         # A straight artery's normals are two directions square to z; the axis has moved along one of them only.
         assert np.linalg.norm(direction) == pytest.approx(abs(direction @ _normal(points, axis)), rel=1e-6)
         assert (moved - medial) @ _normal(points, axis) == pytest.approx(0.0, abs=1e-3)
-        np.testing.assert_allclose(radius, 2.0, rtol=1e-6)
+        np.testing.assert_allclose(fitted[:, 0], 2.0, rtol=1e-6)
+        # A circle counts for a five-hundredth of what the oval across a neck does.
+        np.testing.assert_allclose(_oval_in_world(fitted, moved) * 1.002, _oval_in_world(oval, points), rtol=1e-6)
+
+
+def _oval_in_world(oval: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Oval of a tube along z as a complex number of twice the angle from x."""
+    first = Centerline(points, np.ones(len(points))).frames[:, 1]
+    return (oval[:, 1] + 1j * oval[:, 2]) * np.exp(2j * np.arctan2(first[:, 1], first[:, 0]))
 
 
 def _normal(points: np.ndarray, axis: int) -> np.ndarray:

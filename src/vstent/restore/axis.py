@@ -1,9 +1,10 @@
 """The parent artery's own axis: a smooth tube fitted to the wall that is not sac or branch.
 
 The medial line bulges into a sac. The wall opposite the neck does not: from a first guess of the axis, rays to the
-wall in every section give distances rho(s, theta); the centre of a section is the circle through those that are
+wall in every section give distances rho(s, theta); the centre of a section is that of the oval through those that are
 neither sac nor branch, and where a neck leaves few of them, smoothness along the artery decides. Rays, weights and
-fit alternate, the weights tightening.
+fit alternate, the weights tightening. (With circles for ovals the axis of an artery 1.4 times as wide as high runs to
+one side of it, and its sac is lost.)
 """
 
 from collections.abc import Sequence
@@ -34,18 +35,33 @@ INTO: Final = 0.5
 SIDE_TRUST: Final = 0.1
 """Across the way into a neck the medial line counts as this fraction of all rays of a section."""
 NECK_TRUST: Final = 10.0
-"""Weight of the interpolated radius across a neck against all rays of a section."""
+"""Weight of the interpolated oval across a neck against all rays of a section."""
+OVAL_WAVES: Final = 4.0
+"""Ovals follow waves this many times as long: a fork widens a section in one direction too."""
+OVAL_MOST: Final = 0.4
+"""A section's radius departs from its mean by at most this fraction: it is then 2.3 times as wide as high."""
+ROUND_TRUST: Final = 0.02
+"""Weight of a circle beside all rays of a section: what few rays leave open is round."""
 TOLERANCE: Final = ((0.40, 1.00),) * 4 + ((0.20, 0.50),) * 4 + ((0.12, 0.35),) * 4
-"""Per iteration: relative excess of a ray over the radius up to which it counts fully, and from which not at all."""
+"""Per iteration: relative excess of a ray over the oval up to which it counts fully, and from which not at all."""
 
 
 class Tube(NamedTuple):
-    """A circular tube."""
+    """A tube of oval sections."""
 
     points_mm: Floats
     """(n, 3) axis."""
-    radius_mm: Floats
-    """(n,) radius."""
+    oval_mm: Floats
+    """(n, 3) mean radius, and the parts of the radius that go with the cosine and the sine of twice the angle."""
+
+    @property
+    def radius_mm(self) -> Floats:
+        """(n,) mean radius."""
+        return self.oval_mm[:, 0]
+
+    def rho_mm(self, n_rays: int) -> Floats:
+        """Distance (n, n_rays) from the axis to the wall, at the angles of `section_rays`."""
+        return self.oval_mm @ _waves(n_rays)[[0, 3, 4]]
 
 
 class Mouth(NamedTuple):
@@ -71,29 +87,31 @@ def fit_axis(lumen: Surface, line: Centerline, mouths: Sequence[Mouth] = ()) -> 
     abscissa = curves.arc_length(points)
     parent = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
     radius = np.interp(abscissa / abscissa[-1], line.abscissa_mm / line.length_mm, parent)
+    tube = Tube(points, radius[:, None] * [1.0, 0.0, 0.0])
     for full, none in TOLERANCE:
-        necks = _across_necks(points, radius, mouths)
-        rho = section_rays(lumen, points, N_RAYS)
-        excess = rho / necks.radius_mm[:, None] - 1.0
+        necks = _across_necks(tube, mouths)
+        rho = section_rays(lumen, tube.points_mm, N_RAYS)
+        excess = rho / necks.tube.rho_mm(N_RAYS) - 1.0
         weight = np.clip((none - excess) / (none - full), 0.0, 1.0)
         weight = np.where(necks.is_sacward, 0.0, weight)
-        points, radius = _fit(points, necks.radius_mm, np.where(weight > 0, rho, 0.0), weight, necks, line.points_mm)
-    return Tube(points, radius)
+        tube = _fit(np.where(weight > 0, rho, 0.0), weight, necks, line.points_mm)
+    return tube
 
 
 class _Necks(NamedTuple):
-    radius_mm: Floats
-    """(n,) radius, interpolated across necks."""
+    tube: Tube
+    """The artery, its ovals interpolated across necks."""
     trust: Floats
-    """(n,) weight of that radius, in rays."""
+    """(n,) weight of those ovals, in rays."""
     is_sacward: Bools
     """(n, rays) rays into a neck: only the wall on the far side says where the artery is."""
     across: Floats
     """(n, 2) unit vector in the section, along its two normals, square to the way into the neck; zero off necks."""
 
 
-def _across_necks(points: Floats, radius: Floats, mouths: Sequence[Mouth]) -> _Necks:
+def _across_necks(tube: Tube, mouths: Sequence[Mouth]) -> _Necks:
     """Where the necks are, and what the healthy stations on both sides of them say."""
+    points, radius = tube.points_mm, tube.radius_mm
     abscissa, healthy = curves.arc_length(points), np.ones(len(points), dtype=bool)
     sacward = np.zeros((len(points), N_RAYS), dtype=bool)
     across = np.zeros((len(points), 2))
@@ -115,9 +133,10 @@ def _across_necks(points: Floats, radius: Floats, mouths: Sequence[Mouth]) -> _N
         across = np.where(beside, square / np.maximum(np.linalg.norm(square, axis=1, keepdims=True), 1e-12), across)
         healthy &= ~neck
     if not healthy.any():
-        return _Necks(radius, np.zeros(len(points)), sacward, across)
+        return _Necks(tube, np.zeros(len(points)), sacward, across)
     trust = np.where(healthy, 0.0, NECK_TRUST * N_RAYS)
-    return _Necks(np.interp(abscissa, abscissa[healthy], radius[healthy]), trust, sacward, across)
+    between = curves.interpolate(abscissa[healthy], tube.oval_mm[healthy], abscissa)
+    return _Necks(Tube(points, between), trust, sacward, across)
 
 
 def section_rays(lumen: Surface, points_mm: Floats, n_rays: int) -> Floats:
@@ -139,37 +158,54 @@ def _toward(line_mm: Floats, points: Floats) -> Floats:
     return curves.interpolate(curves.arc_length(line_mm), line_mm, curves.project(line_mm, points)[0]) - points
 
 
-def _fit(
-    points: Floats, radius: Floats, rho: Floats, weight: Floats, necks: _Necks, medial_mm: Floats
-) -> tuple[Floats, Floats]:
-    """One least-squares step: rho = r + a cos + b sin with smooth radius r and smooth axis points + a n1 + b n2.
-
-    Across the way into a neck the axis is drawn to the medial line (k, 3): a wall of which a wide neck has left a
-    slope is one along which a circle rolls, and the medial line bulges into the sac, but not to its side.
-    """
-    n, n_rays = rho.shape
+def _waves(n_rays: int) -> Floats:
+    """Constant, cosine and sine of the angle and of twice the angle (5, n_rays) at the rays of a section."""
     angle = 2 * np.pi * np.arange(n_rays) / n_rays
-    basis = np.stack([np.ones(n_rays), np.cos(angle), np.sin(angle)])
+    return np.stack([np.ones(n_rays), np.cos(angle), np.sin(angle), np.cos(2 * angle), np.sin(2 * angle)])
+
+
+def _fit(rho: Floats, weight: Floats, necks: _Necks, medial_mm: Floats) -> Tube:
+    """One least-squares step: rho = r + a cos + b sin + c cos 2 + d sin 2, with a smooth oval r, c, d.
+
+    The axis points + a n1 + b n2 is smooth too. Across the way into a neck it is drawn to the medial line (k, 3): a
+    wall of which a wide neck has left a slope is one along which a circle rolls, and the medial line bulges into the
+    sac, but not to its side.
+    """
+    (points, oval), (n, n_rays) = necks.tube, rho.shape
+    basis = _waves(n_rays)
     normal = np.einsum("ik,nk,jk->ijn", basis, weight, basis)
     right = np.einsum("ik,nk,nk->in", basis, weight, rho)
-    normal[0, 0] += necks.trust
-    right[0] += necks.trust * radius
+    for i, value in zip((0, 3, 4), oval.T, strict=True):
+        normal[i, i] += necks.trust + (ROUND_TRUST * n_rays if i else 0.0)
+        right[i] += necks.trust * value
     frames = curves.parallel_frames(points)
     aside = SIDE_TRUST * n_rays * np.einsum("nk,nkd,nd->n", necks.across, frames[:, 1:], _toward(medial_mm, points))
-    right[1:] += aside * necks.across.T
-    normal[1:, 1:] += SIDE_TRUST * n_rays * np.einsum("ni,nj->ijn", necks.across, necks.across)
-    wave = WAVELENGTH * 2.0 * float(np.median(radius)) / (2 * np.pi * STEP_MM)
+    right[1:3] += aside * necks.across.T
+    normal[1:3, 1:3] += SIDE_TRUST * n_rays * np.einsum("ni,nj->ijn", necks.across, necks.across)
+    wave = WAVELENGTH * 2.0 * float(np.median(oval[:, 0])) / (2 * np.pi * STEP_MM)
     stiff_radius = n_rays * wave**4 * curves.roughness(n, 2)
     stiff_axis = n_rays / 2 * wave**6 * curves.roughness(n, 3)
-    blocks = [[diags(normal[i, j]) for j in range(3)] for i in range(3)]
-    blocks[0][0] = blocks[0][0] + stiff_radius
+    blocks = [[diags(normal[i, j]) for j in range(5)] for i in range(5)]
+    for i, times in ((0, 1.0), (3, OVAL_WAVES**4), (4, OVAL_WAVES**4)):
+        blocks[i][i] = blocks[i][i] + times * stiff_radius
     for i in (1, 2):
         for axis in range(3):
             side = diags(frames[:, i, axis])
             right[i] -= side @ (stiff_axis @ points[:, axis])
             for j in (1, 2):
                 blocks[i][j] = blocks[i][j] + side @ stiff_axis @ diags(frames[:, j, axis])
-    ridge = 1e-6 * n_rays * diags(np.ones(3 * n))
-    solution = spsolve(csc_matrix(bmat(blocks) + ridge), right.ravel()).reshape(3, n)
+    ridge = 1e-6 * n_rays * diags(np.ones(5 * n))
+    solution = spsolve(csc_matrix(bmat(blocks) + ridge), right.ravel()).reshape(5, n)
     moved = points + solution[1][:, None] * frames[:, 1] + solution[2][:, None] * frames[:, 2]
-    return curves.resample_evenly(moved, n), np.maximum(solution[0], 0.1)
+    radius = np.maximum(solution[0], 0.1)
+    most = OVAL_MOST * radius / np.maximum(np.hypot(*solution[3:]), 1e-12)
+    oval = np.stack([radius, *(solution[3:] * np.minimum(most, 1.0))], axis=1)
+    evenly = curves.resample_evenly(moved, n)
+    return Tube(evenly, _turned(oval, frames, curves.parallel_frames(evenly)))
+
+
+def _turned(oval: Floats, frames: Floats, others: Floats) -> Floats:
+    """Ovals (n, 3) whose angles are counted in frames (n, 3, 3), counted in others."""
+    along, across = (np.einsum("nd,nd->n", others[:, 1], frames[:, k]) for k in (1, 2))
+    turned = (oval[:, 1] + 1j * oval[:, 2]) * np.exp(-2j * np.arctan2(across, along))
+    return np.stack([oval[:, 0], turned.real, turned.imag], axis=1)

@@ -17,6 +17,9 @@ HEIGHT: Final = 1.0
 """A sac stands out by at least this many parent radii..."""
 HEIGHT_MM: Final = 1.5
 """... and by at least this much."""
+SHOULDER: Final = 3.0
+"""A bulge goes no farther than this many parent radii from where it stands out by one: the wide sides of an oval
+artery, which stand out of round tubes all along it, are no part of a sac on them."""
 WIDTH: Final = 1.0
 """A sac is at least this many parent radii wide inside (its diameter); what is thinner is a twig."""
 
@@ -61,9 +64,10 @@ def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> li
     thickness = _thickness_mm(lumen)
     found, sacs = [], []
     for member in _patches(lumen, height > FLANK * parent):
+        typical = float(np.median(parent[member]))
+        member = _about_dome(lumen.vertices_mm[member], height[member] / typical, SHOULDER * typical, member)
         bulge = _bulge(lumen, height, member)
         found.append(bulge)
-        typical = float(np.median(parent[member]))
         width_mm = max(float(np.median(thickness[member])), 1e-6)
         is_high = bulge.height_mm > max(HEIGHT * typical, HEIGHT_MM)
         if is_high and width_mm > WIDTH * typical and bulge.height_mm < LENGTH * width_mm:
@@ -73,6 +77,14 @@ def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> li
     point = np.asarray(at_mm, dtype=np.float64)[None]
     near = [b for b in found if float(b.distances_mm(point)[0]) < max(2.0 * b.height_mm, 1.0)]
     return sorted(near, key=lambda bulge: float(bulge.distances_mm(point)[0]))[:1]
+
+
+def _about_dome(points_mm: Floats, rise: Floats, reach_mm: float, member: Ints) -> Ints:
+    """Those of a patch's vertices (n,) that lie within a reach of ones as high as a sac's; all where none is."""
+    is_high = rise > HEIGHT
+    if not is_high.any():
+        return member
+    return np.asarray(member[cKDTree(points_mm[is_high]).query(points_mm)[0] <= reach_mm])
 
 
 def bulge_at(lumen: Surface, height_mm: Floats, is_out: Bools, dome_mm: Floats) -> Bulge | None:
