@@ -178,9 +178,16 @@ def test_a_pushed_braid_is_shorter_and_denser_and_its_wires_as_long_as_before(fr
     )
 
 
+def test_pushed_together_the_papers_own_device_is_shorter_too():
+    done = deploy(SILK, straight(2.05), size=SIZE, compaction_fraction=0.2, method="zhong2016")
+    assert done.stent.deployed_length_mm == pytest.approx(0.8 * SIZE.length_mm, rel=1e-9)
+
+
 def test_what_cannot_be_compacted_is_refused():
     with pytest.raises(DeviceError, match="its wires would stand too steep"):
         device.compacted(SILK, SIZE, 0.5)
+    with pytest.raises(DeviceError, match=r"its wires would be pulled straight\. Give a part nearer to 0"):
+        device.compacted(SILK, SIZE, -3.0)
     with pytest.raises(DeviceError, match="its cells are joined"):
         device.compacted(ENTERPRISE, ENTERPRISE.sizes[0], 0.1)
 

@@ -60,6 +60,11 @@ class Size:
     """Part by which pushing has shortened a braid at its label diameter; below zero where it was pulled."""
 
     @property
+    def compacted_length_mm(self) -> float:
+        """Length at the label diameter, pushed together as it is."""
+        return self.length_mm * (1 - self.compaction_fraction)
+
+    @property
     def label(self) -> str:
         """The size as one reads it on the box."""
         return f"{self.diameter_mm:.2f} x {self.length_mm:g} mm"
@@ -190,7 +195,7 @@ class Grid(NamedTuple):
 def grid(design: Design, size: Size) -> Grid:
     """Return the contour's grid: one node per junction column and row, finer where cells are large."""
     spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
-    rows = max(2, round(size.length_mm * (1 - size.compaction_fraction) / spacing_mm) + 1)
+    rows = max(2, round(size.compacted_length_mm / spacing_mm) + 1)
     row_split = int(np.ceil(spacing_mm / NODE_SPACING_LIMIT_MM))
     column_split = int(np.ceil(np.pi * size.diameter_mm / design.n_columns / NODE_SPACING_LIMIT_MM))
     return Grid((rows - 1) * row_split + 1, design.n_columns * column_split, row_split, column_split)
@@ -216,10 +221,14 @@ def compacted(design: Design, size: Size, fraction: float) -> Size:
         return size
     changed = replace(size, compaction_fraction=fraction)
     if not (isinstance(design, Braid) and np.sin(STEEP_RAD[0]) < _free_sine(design, changed) < np.sin(STEEP_RAD[1])):
+        would = "its wires would stand too steep" if fraction > 0 else "its wires would be pulled straight"
+        why, then = (
+            (would, "a part nearer to 0")
+            if isinstance(design, Braid)
+            else ("its cells are joined", "0, or another device")
+        )
         raise DeviceError(
-            f"{design.name} {size.label} cannot be compacted by {fraction:g} of its length: "
-            f"{'its wires would stand too steep' if isinstance(design, Braid) else 'its cells are joined'}. "
-            f"Give {'a smaller part' if isinstance(design, Braid) else '0, or another device'}."
+            f"{design.name} {size.label} cannot be compacted by {fraction:g} of its length: {why}. Give {then}."
         )
     return changed
 

@@ -44,6 +44,11 @@ class DeviceError(InputError):
 class LandingError(InputError):
     """A landing zone that does not fit the artery."""
 
+    def __init__(self, sentence: str, move_mm: float = 0.0) -> None:
+        super().__init__(sentence)
+        self.move_mm = move_mm
+        """How far along the artery (above zero: distally) to move the device; 0 where that is no help."""
+
 
 class PluginError(InputError):
     """A plug-in that does not exist or cannot be loaded."""

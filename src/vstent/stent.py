@@ -2,14 +2,19 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 
 from vstent.device import Design, Size
+from vstent.errors import LandingError
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.surface import Surface
+
+Anchor = Literal["center", "distal", "proximal"]
+"""A point of a device by which it can be landed."""
+ANCHORS: Final[tuple[str, ...]] = get_args(Anchor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,8 +23,12 @@ class Landing:
 
     abscissa_mm: float
     """Arc length on the parent axis."""
-    anchor: Literal["center", "distal", "proximal"] = "center"
+    anchor: Anchor = "center"
     """Which point of the device lies there."""
+
+    def __post_init__(self) -> None:
+        if self.anchor not in ANCHORS:
+            raise LandingError(f"A device cannot be landed by its {self.anchor!r}: choose one of {', '.join(ANCHORS)}.")
 
 
 @dataclass(frozen=True, eq=False)

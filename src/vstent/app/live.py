@@ -16,6 +16,7 @@ from vstent.app.choices import DeviceChoice, placing_of
 from vstent.app.cuts import at_phase, cut
 from vstent.deploy import propose_landing
 from vstent.deploy.contour import planes
+from vstent.deploy.method import laid_inside
 from vstent.deploy.sketch import Bed, Sketch, bed, sketch
 from vstent.device import coverage_fraction, find_design
 from vstent.errors import ReadError
@@ -134,7 +135,10 @@ class Live:
             wall = self.bed(choice)
             if landing is None and choice.center_mm is not None:
                 landing = Landing(choice.center_mm)
-            return sketch(wall, landing or propose_landing(wall.design, self.anatomy, wall.size))
+            lay = partial(sketch, wall)
+            if landing is None:
+                return laid_inside(lay, propose_landing(wall.design, self.anatomy, wall.size))
+            return lay(landing)
 
     def deployment(self, choice: DeviceChoice) -> Deployment:
         """Return the deployed device."""
@@ -209,7 +213,7 @@ class Live:
             contour = device_layers(choice.name, deployment, self.anatomy)[0]
             layers = [wires, contour]
             center_mm = choice.center_mm if choice.center_mm is not None else _center_mm(stent)
-            found = self.sketch(choice, Landing(center_mm))
+            found = laid_inside(partial(sketch, self.bed(choice)), Landing(center_mm))
             measures = self.remembered(("measures", *key), lambda: measure(self.anatomy, deployment))
             return message(
                 layers,

@@ -8,7 +8,7 @@ import numpy as np
 from vstent.deploy import sizing, wires
 from vstent.deploy.active_contour import ActiveContour
 from vstent.deploy.braid import ConstantWire
-from vstent.deploy.method import AbstractMethod, Course, Placement, Progress, run
+from vstent.deploy.method import AbstractMethod, Course, Placement, Progress, laid_inside, run
 from vstent.deploy.wall import landing_wall
 from vstent.deploy.zhong2016 import Zhong2016
 from vstent.device import Design, LaserCut, Size, compacted
@@ -57,7 +57,8 @@ def deploy(
     design : the device; see `vstent.device.catalogue`.
     anatomy : the artery, restored.
     size : the size; None proposes one.
-    landing : where its center, proximal or distal end is to lie; None centers it on the neck of the largest aneurysm.
+    landing : where its center, proximal or distal end is to lie; None centers it on the neck of the largest aneurysm,
+        or as near to it as the artery's ends let it lie.
     method : ``constant_wire``, ``zhong2016`` (the paper's contour and nothing else), or one with its own weights.
     compaction_fraction : part by which pushing shortens a braid against its natural length (pulling: below zero).
     inside : devices that lie in the artery already, in which this one opens where they overlap (telescoping).
@@ -80,9 +81,12 @@ def deploy(
     began = time.perf_counter()
     chosen = _method(method).beside(design.wall_offset_um * MM_PER_UM)
     size = compacted(design, size or propose_size(design, anatomy), compaction_fraction)
-    landing = landing or propose_landing(design, anatomy, size)
     wall, is_patient = landing_wall(anatomy, inside, chosen.wall)
-    course = run(chosen, Placement(design, size, landing, anatomy, wall), progress)
+
+    def opened_at(there: Landing) -> Course:
+        return run(chosen, Placement(design, size, there, anatomy, wall), progress)
+
+    course = laid_inside(opened_at, propose_landing(design, anatomy, size)) if landing is None else opened_at(landing)
     nodes_mm = course.opened.contour.nodes_mm
     drawn = wires.draw(design, size, nodes_mm, wall)
     stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, drawn.points_mm, drawn.starts, drawn.diameter_um)

@@ -4,7 +4,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self, final
+from typing import Final, Literal, Self, TypeVar, final
 
 import numpy as np
 
@@ -19,6 +19,13 @@ from vstent.vessel import Anatomy
 
 Progress = Callable[[int, float], None]
 """Called after every iteration with its number and the fraction of nodes terminated."""
+Laid = TypeVar("Laid")
+MOVES: Final = 4
+"""A device is moved so often at most from where it was proposed."""
+SPARE_MM: Final = 0.1
+"""So much further it is moved than it left the artery: moved, it is a little longer or shorter."""
+TOLD_MM: Final = 0.1
+"""What is asked for in a sentence is rounded up to a multiple of this."""
 
 
 @final
@@ -36,6 +43,9 @@ class Placement:
     """The artery."""
     wall: AbstractWall
     """What the device opens against."""
+
+    def __post_init__(self) -> None:
+        check_landing(self.landing, self.anatomy.axis.length_mm)
 
     @property
     def across(self) -> Planes:
@@ -156,13 +166,47 @@ def _check_finite(state: State, iteration: int) -> None:
         )
 
 
+def laid_inside(lay: Callable[[Landing], Laid], proposed: Landing) -> Laid:
+    """Lay a device at the place proposed, moved along the artery where it would leave it: its ends were only foreseen.
+
+    Raises
+    ------
+    LandingError
+        When it leaves the artery wherever it is moved to.
+    """
+    landing = proposed
+    for _ in range(MOVES):
+        try:
+            return lay(landing)
+        except LandingError as error:
+            if error.move_mm == 0.0:
+                raise
+            landing = replace(landing, abscissa_mm=landing.abscissa_mm + error.move_mm)
+    return lay(landing)
+
+
+def check_landing(landing: Landing, artery_mm: float) -> None:
+    """See that a landing point lies on an artery of length `artery_mm`.
+
+    Raises
+    ------
+    LandingError
+        When it does not.
+    """
+    if not 0 <= landing.abscissa_mm <= artery_mm:
+        raise LandingError(
+            f"A landing point at {landing.abscissa_mm:.1f} mm is not on the parent artery, which runs from 0 to "
+            f"{artery_mm:.1f} mm: give one between them."
+        )
+
+
 def check_inside(design: Design, size: Size, abscissa_mm: Floats, artery_mm: float) -> None:
     """See that the rows (rows,) lie on an artery of length `artery_mm`.
 
     Raises
     ------
     LandingError
-        When they do not; the sentence says where the device would lie and what to do.
+        When they do not; the sentence says where the device would lie and what to do, the error how far to move it.
     """
     first, last = float(abscissa_mm[0]), float(abscissa_mm[-1])
     if first >= 0 and last <= artery_mm:
@@ -177,8 +221,10 @@ def check_inside(design: Design, size: Size, abscissa_mm: Floats, artery_mm: flo
             f"{lies}: deployed it is {length_mm:.1f} mm long, longer than the artery. Choose a shorter size."
         )
     end, by_mm = ("proximal", -first) if first < 0 else ("distal", last - artery_mm)
-    move = "distally" if first < 0 else "proximally"
+    move, sense = ("distally", 1) if first < 0 else ("proximally", -1)
+    told_mm = np.ceil(by_mm / TOLD_MM) * TOLD_MM
     raise LandingError(
-        f"{lies}: it leaves the artery by {by_mm:.1f} mm at the {end} end. "
-        f"Land it at least {by_mm:.1f} mm more {move} or choose a shorter size."
+        f"{lies}: it leaves the artery by {told_mm:.1f} mm at the {end} end. "
+        f"Land it at least {told_mm:.1f} mm more {move} or choose a shorter size.",
+        sense * (by_mm + SPARE_MM),
     )

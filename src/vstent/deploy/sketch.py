@@ -14,7 +14,7 @@ import numpy as np
 from vstent.deploy import cells, pieces
 from vstent.deploy.braid import FreeDiameter, Profile, expected_profile, landed_row, march
 from vstent.deploy.contour import Planes, circles, evenly_spaced, perimeters, planes
-from vstent.deploy.method import check_inside
+from vstent.deploy.method import check_inside, check_landing
 from vstent.deploy.wall import AbstractWall, Contact
 from vstent.deploy.wires import Wires, draw
 from vstent.device import Design, Size, grid
@@ -104,6 +104,7 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
         When it would leave the artery.
     """
     design, size = wall.design, wall.size
+    check_landing(landing, float(wall.abscissa_mm[-1]))
     marched_mm = rows_mm = march(design, size, landing, wall.profile)
     check_inside(design, size, rows_mm, float(wall.abscissa_mm[-1]))
     flat = np.concatenate([wall.in_plane_mm, wall.gap_mm[..., None]], axis=2).reshape(len(wall.abscissa_mm), -1)

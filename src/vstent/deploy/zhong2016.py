@@ -24,7 +24,7 @@ class Zhong2016(AbstractMethod):
     def init(self, placement: Placement) -> Opened:
         """Put evenly spaced rows of inscribed circles over the label's length."""
         rows = grid(placement.design, placement.size).rows
-        rows_mm = evenly_spaced_rows(placement.landing, placement.size.length_mm, rows)
+        rows_mm = evenly_spaced_rows(placement.landing, placement.size.compacted_length_mm, rows)
         return Opened(placement.start(self.contour, rows_mm), rows_mm)
 
     def step(self, placement: Placement, opened: Opened) -> Opened:

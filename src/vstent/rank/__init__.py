@@ -140,7 +140,8 @@ def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) 
     """Deploy, measure and grade one size at one shift."""
     (anatomy, criteria), (design, size, shift_mm) = common, task
     try:
-        landing = Landing(propose_landing(design, anatomy, size).abscissa_mm + shift_mm)
+        # Unmoved it is for `deploy` to say where the proposed place is: near an end of the artery only it knows.
+        landing = Landing(propose_landing(design, anatomy, size).abscissa_mm + shift_mm) if shift_mm else None
         deployment = deploy(design, anatomy, size=size, landing=landing)
     except LandingError as error:
         return Candidate(design, size, shift_mm, {}, {}, 0.0, False, str(error))
