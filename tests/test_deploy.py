@@ -402,6 +402,17 @@ def test_a_size_that_would_stand_off_beyond_the_landing_zones_gives_way_to_the_n
     assert measure(anatomy, deploy(SILK, anatomy, size=size))["apposed_fraction"] == 1.0
 
 
+@pytest.mark.parametrize(("gap_mm", "label_mm"), [(0.09, 3.0), (0.11, 3.5)])
+def test_what_stands_off_for_the_proposal_is_what_stands_off_when_measured(gap_mm, label_mm):
+    size = device.find_size(SILK, diameter_mm=3, length_mm=15)
+    wide_mm = size.free_diameter_mm + 2 * (SILK.wall_offset_um * 1e-3 + gap_mm)
+    anatomy = with_wide_pieces(wide_mm, (0, 22.9), (37.1, 60))
+    found = measure(anatomy, deploy(SILK, anatomy, size=size))
+    assert found["max_wall_gap_mm"] == pytest.approx(gap_mm, abs=0.003)
+    assert (found["apposed_fraction"] == 1.0) is (label_mm == 3.0)
+    assert propose_size(SILK, anatomy).diameter_mm == label_mm
+
+
 @pytest.mark.parametrize("wide", [(5.0, (0, 22.9), (37.1, 60)), (3.6, (24.0, 24.4)), (3.6, (28.5, 31.5))])
 def test_no_wider_size_is_proposed_where_it_would_stand_off_too_or_for_a_short_bulge_or_one_across_the_neck(wide):
     assert propose_size(SILK, with_wide_pieces(*wide)).diameter_mm == 3.0

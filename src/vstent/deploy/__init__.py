@@ -32,9 +32,7 @@ __all__ = [
 METHODS: dict[str, type[ConstantWire] | type[Zhong2016]] = {"constant_wire": ConstantWire, "zhong2016": Zhong2016}
 """Ways to deploy, by name."""
 
-APPOSED_GAP_MM = 0.1
-"""A node is apposed when the device's outer face is nearer to the wall than this."""
-
+APPOSED_GAP_MM = sizing.APPOSED_GAP_MM
 propose_landing = sizing.propose_landing
 propose_size = sizing.propose_size
 

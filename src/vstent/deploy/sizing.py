@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from vstent.deploy.braid import expected_profile, march
+from vstent.deploy.sketch import bed
 from vstent.device import Design, Size
 from vstent.errors import LandingError
 from vstent.stent import Landing
@@ -25,6 +26,8 @@ END_MM: Final = 0.5
 """A proposed device stays this far from the artery's ends: its length is only foreseen before it is deployed."""
 DIAMETER_SLACK_MM: Final = 0.05
 """A label this much below the landing zone still counts as not below it."""
+APPOSED_GAP_MM: Final = 0.1
+"""A node is apposed when the device's outer face is nearer to the wall than this."""
 LOOSE_FRACTION: Final = 0.05
 """Less of a device than this may stand off the wall without a word, and without a wider one being proposed."""
 
@@ -102,12 +105,13 @@ def _of_label(design: Design, anatomy: Anatomy, label_mm: float, *, lying: bool 
 
 
 def _loose_fraction(design: Design, anatomy: Anatomy, size: Size, first_mm: float, last_mm: float) -> float:
-    """How much of the artery beside the neck, where the device will lie, is wider than it opens."""
+    """How much of the device beside the neck will stand off the wall, as it finds it there."""
     proximal_mm, distal_mm = neck_span_mm(anatomy)
-    under_mm = np.linspace(first_mm, last_mm, 201)
-    beside_mm = under_mm[(under_mm <= proximal_mm) | (under_mm >= distal_mm)]
-    is_loose = expected_profile(design, anatomy).at(beside_mm) > size.free_diameter_mm
-    return float(is_loose.mean()) if len(is_loose) else 0.0
+    found = bed(design, size, anatomy)
+    along_mm = found.abscissa_mm
+    is_under = (along_mm >= first_mm) & (along_mm <= last_mm)
+    is_loose = found.gap_mm[is_under & ((along_mm <= proximal_mm) | (along_mm >= distal_mm))] > APPOSED_GAP_MM
+    return float(is_loose.mean()) if is_loose.size else 0.0
 
 
 def _span(design: Design, anatomy: Anatomy, size: Size) -> tuple[float, float]:
