@@ -491,8 +491,19 @@ def test_in_a_short_artery_a_narrower_size_is_proposed_before_none():
 
 
 def test_no_size_fits_a_stump():
-    with pytest.raises(LandingError, match=r"No size of Silk fits: the shortest would be \d+\.\d mm long in a"):
+    with pytest.raises(
+        LandingError, match=r"No size of Silk up to 4\.5 mm wide fits: the shortest would be 1\d\.\d mm"
+    ):
         propose_size(SILK, tube(line(10), 1.9))
+
+
+def test_a_size_too_wide_for_the_artery_is_not_said_to_be_too_long_for_it():
+    wide = device.Size(4.0, 8.0, 4.2)
+    design = replace(SILK, sizes=(device.Size(3.0, 25.0, 3.2), device.Size(3.5, 25.0, 3.7), wide))
+    anatomy = with_neck(tube(line(20), 1.45), 8.0, 12.0)
+    with pytest.raises(LandingError, match=r"up to 3\.5 mm wide fits: the shortest would be [2-4]\d\.\d mm long in a"):
+        propose_size(design, anatomy)
+    assert deploy(design, anatomy, size=wide).stent.deployed_length_mm < 20
 
 
 def test_a_contour_that_is_not_given_the_time_says_so():

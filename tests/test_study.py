@@ -11,16 +11,18 @@ import pytest
 from tubes import line, tube, with_neck
 from vstent import phantoms
 from vstent.cli import main
-from vstent.device import find_design
-from vstent.errors import InputError
+from vstent.deploy import deploy, propose_size
+from vstent.device import Size, find_design, find_size
+from vstent.errors import DeviceError, InputError, LandingError
 from vstent.flow import FlowCase, FlowField, FlowSettings
 from vstent.image import Image
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_json, write_stl
-from vstent.study import Settings, restore_vessel, run, stages
+from vstent.study import Placing, Settings, restore_vessel, run, stages
 from vstent.study.ledger import hash_of
 from vstent.study.outputs import write_anatomy
+from vstent.study.stages import deploy_one, size_of
 
 
 def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path) -> None:
@@ -54,6 +56,42 @@ def test_a_source_is_all_files_that_its_scan_is_read_from(tmp_path: Path) -> Non
     others[2].write_bytes((tmp_path / "other" / others[2].name).read_bytes())
     assert hash_of(given) != whole
     assert hash_of(voxels) == sha256(b"a later one").hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("name", "diameter_mm", "length_mm"), [("pipeline", 3.25, 30.0), ("pipeline", 3.0, 35.0), ("silk", 4.0, 15.0)]
+)
+def test_of_a_diameter_alone_the_length_is_as_long_as_that_diameter_needs(
+    name: str, diameter_mm: float, length_mm: float
+) -> None:
+    artery, design = with_neck(tube(line(60), 1.75), 24.0, 36.0), find_design(name)
+    size = size_of(design, artery, Placing(diameter_mm))
+    assert (size.diameter_mm, size.length_mm) == (diameter_mm, length_mm)
+    margins = {}
+    for length in sorted(size.length_mm for size in design.sizes if size.diameter_mm == diameter_mm):
+        stent = deploy(design, artery, size=find_size(design, diameter_mm=diameter_mm, length_mm=length)).stent
+        margins[length] = min(24 - stent.proximal_abscissa_mm, stent.distal_abscissa_mm - 36)
+        if length == length_mm:
+            break
+    assert margins.pop(length_mm) >= 3.9
+    assert all(margin_mm < 4 for margin_mm in margins.values())
+
+
+def test_of_a_length_alone_the_diameter_is_the_artery_s() -> None:
+    artery, silk = with_neck(tube(line(60), 1.75), 28.0, 32.0), find_design("silk")
+    assert size_of(silk, artery, Placing(length_mm=25.0)) == find_size(silk, diameter_mm=3.5, length_mm=25.0)
+    assert size_of(silk, artery, Placing()) == propose_size(silk, artery)
+
+
+def test_a_size_given_whole_is_taken_though_none_could_be_proposed() -> None:
+    artery, silk = with_neck(tube(line(20), 1.45), 8.0, 12.0), find_design("silk")
+    wide = Size(4.0, 8.0, 4.2)
+    own = replace(silk, sizes=(Size(3.0, 25.0, 3.2), Size(3.5, 25.0, 3.7), wide))
+    assert deploy_one(own, artery, Placing(4.0, 8.0)).stent.size == wide
+    with pytest.raises(LandingError, match="No size of"):
+        size_of(own, artery, Placing())
+    with pytest.raises(DeviceError, match=r"not made in 4\.1 mm"):
+        size_of(own, artery, Placing(4.1))
 
 
 @pytest.fixture(scope="module")

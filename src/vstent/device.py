@@ -399,8 +399,8 @@ def find_design(name: str) -> Design:
     raise DeviceError(f"There is no device called {name!r}.{hint} Choose one of: {', '.join(sorted(designs))}.")
 
 
-def find_size(design: Design, *, diameter_mm: float | None = None, length_mm: float | None = None) -> Size:
-    """Return the one size with this label diameter and length; None matches any, the smallest and shortest wins.
+def find_sizes(design: Design, *, diameter_mm: float | None = None, length_mm: float | None = None) -> tuple[Size, ...]:
+    """Return all sizes with this label diameter and length, the smallest and shortest first; None matches any.
 
     Raises
     ------
@@ -411,12 +411,17 @@ def find_size(design: Design, *, diameter_mm: float | None = None, length_mm: fl
         size for size in design.sizes if diameter_mm in (None, size.diameter_mm) and length_mm in (None, size.length_mm)
     ]
     if fits:
-        return min(fits, key=lambda size: (size.diameter_mm, size.length_mm))
+        return tuple(sorted(fits, key=lambda size: (size.diameter_mm, size.length_mm)))
     asked = " x ".join(f"{value:g} mm" for value in (diameter_mm, length_mm) if value is not None)
     same = [size for size in design.sizes if size.diameter_mm == diameter_mm]
     offered = _listed(size.length_mm for size in same) if same else _listed(size.diameter_mm for size in design.sizes)
     what = f"in {diameter_mm:g} mm its lengths are" if same else "its diameters are"
     raise DeviceError(f"{design.name} is not made in {asked}: {what} {offered} mm. Choose one of them.")
+
+
+def find_size(design: Design, *, diameter_mm: float | None = None, length_mm: float | None = None) -> Size:
+    """Return the smallest and shortest size of `find_sizes`, and raise what that raises."""
+    return find_sizes(design, diameter_mm=diameter_mm, length_mm=length_mm)[0]
 
 
 def _listed(values: Iterable[float]) -> str:

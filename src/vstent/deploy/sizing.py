@@ -57,7 +57,7 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
     Raises
     ------
     LandingError
-        When even the shortest size does not fit the artery.
+        When even the shortest size that is not too wide for the artery is too long for it.
     """
     wider_mm = max(landing_diameters_mm(anatomy))
     labels = sorted({size.diameter_mm for size in design.sizes})
@@ -68,10 +68,12 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
     proposed = next((size for size in chain(held, any_of_label) if size is not None), None)
     if proposed is not None:
         return proposed
-    shortest_mm = min(last - first for first, last in (_span(design, anatomy, size) for size in design.sizes))
+    tried_mm = labels[: zone + 2][-1]
+    tried = [size for size in design.sizes if size.diameter_mm <= tried_mm]
+    shortest_mm = min(last - first for first, last in (_span(design, anatomy, size) for size in tried))
     raise LandingError(
-        f"No size of {design.name} fits: the shortest would be {shortest_mm:.1f} mm long in a parent artery of "
-        f"{anatomy.axis.length_mm:.1f} mm. Choose another device or a longer piece of artery."
+        f"No size of {design.name} up to {tried_mm:g} mm wide fits: the shortest would be {shortest_mm:.1f} mm long in "
+        f"a parent artery of {anatomy.axis.length_mm:.1f} mm. Choose another device or a longer piece of artery."
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from vstent.deploy import deploy, propose_size
-from vstent.device import Design, Size, find_size
+from vstent.device import Design, Size, find_sizes
 from vstent.errors import InputError
 from vstent.flow import FlowField, FlowSettings, compare, flow_case, foretell_cost, indices, ostium, simulate_case
 from vstent.flow.convergence import Sensitivity, convergence
@@ -112,15 +112,19 @@ def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment
 
 
 def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
-    """Return the size given; what of it is not given is as proposed."""
-    proposed = propose_size(design, anatomy)
-    if placing.diameter_mm is None and placing.length_mm is None:
-        return proposed
-    return find_size(
-        design,
-        diameter_mm=placing.diameter_mm or proposed.diameter_mm,
-        length_mm=placing.length_mm or proposed.length_mm,
-    )
+    """Return the size given; where of it a diameter or a length is not given, what is proposed of those that match.
+
+    Raises
+    ------
+    DeviceError
+        When the device is not made in that size.
+    LandingError
+        When none of those that match fits the artery.
+    """
+    sizes = find_sizes(design, diameter_mm=placing.diameter_mm, length_mm=placing.length_mm)
+    if placing.diameter_mm is not None and placing.length_mm is not None:
+        return sizes[0]
+    return propose_size(replace(design, sizes=sizes), anatomy)
 
 
 def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
