@@ -20,7 +20,7 @@ from vstent.deploy import (
     propose_size,
     sizing,
 )
-from vstent.deploy.braid import Profile, march
+from vstent.deploy.braid import Profile, expected_profile, march
 from vstent.deploy.method import SPARE_MM, check_inside, laid_inside
 from vstent.deploy.sketch import bed, sketch
 from vstent.errors import LandingError
@@ -275,6 +275,25 @@ def test_in_a_bend_wider_than_the_device_tilted_rows_are_no_wider_than_the_free_
     stent = deploy(SILK, tube(arc(BEND_MM, np.pi / 2, 14), 2.5), size=SILK_SIZE).stent
     assert stent.row_diameter_mm.max() <= SILK_SIZE.free_diameter_mm * (1 + 1e-6)
     assert stent.row_diameter_mm == pytest.approx(np.full(len(stent.nodes_mm), 4.2), rel=0.01)
+
+
+@pytest.mark.parametrize("wide_mm", [8.6, 9.2])
+def test_a_device_that_ends_in_a_wide_piece_of_a_bend_is_as_long_as_its_rows_say(wide_mm):
+    path = arc(20.0, 1.2, 14)
+    along_mm = np.arange(len(path[0])) * 0.2
+    bulge = np.exp(-(((along_mm - 26.0) / 6.0) ** 4))
+    anatomy = tube(path, 1.9 + (0.5 * wide_mm - 1.9) * bulge)
+    stent = deploy(SILK, anatomy, size=SILK_SIZE, landing=Landing(30.0)).stent
+    assert np.isfinite(stent.nodes_mm).all()
+    diameter_mm = contour.perimeters(stent.nodes_mm) / np.pi
+    half_mm = 0.5 * (diameter_mm[1:] + diameter_mm[:-1])
+    middle_mm = 0.5 * (stent.row_abscissa_mm[1:] + stent.row_abscissa_mm[:-1])
+    across = contour.planes(anatomy.axis)
+    curvature = np.interp(middle_mm, across.abscissa_mm, across.curvature_per_mm)
+    closed_mm = device.row_spacing_mm(SILK, SILK_SIZE, half_mm, curvature).sum()
+    assert stent.deployed_length_mm == pytest.approx(closed_mm, abs=0.2)
+    foreseen = march(SILK, SILK_SIZE, Landing(30.0), expected_profile(SILK, SILK_SIZE, anatomy))
+    assert stent.deployed_length_mm == pytest.approx(np.ptp(foreseen), abs=0.5)
 
 
 @pytest.mark.parametrize("artery", [straight, tapered, bent, oval])

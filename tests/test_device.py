@@ -42,7 +42,10 @@ def test_the_piece_between_junctions_keeps_its_length_at_every_diameter():
 
 def test_the_free_diameter_bounds_every_formula():
     design, size = braid48(60, free_mm=4.2)
-    assert device.row_spacing_mm(design, size, 9.0) == device.row_spacing_mm(design, size, 4.2)
+    for bend_per_mm in (0.0, 0.25):
+        assert device.row_spacing_mm(design, size, 9.0, bend_per_mm) == device.row_spacing_mm(
+            design, size, 4.2, bend_per_mm
+        )
 
 
 def test_coverage_sums_the_diameters_of_mixed_wires():

@@ -239,6 +239,19 @@ def test_branches_that_leave_between_the_ends_are_jailed():
     assert jailed(1.0, 12.0, 18.0) == 2
 
 
+def test_a_branch_with_many_outlets_behind_it_is_one_and_branches_side_by_side_are_two():
+    one = with_branches(16.0)
+    trunk = one.vessel.centerlines[1].points_mm
+    forked, opposite = trunk.copy(), trunk * [-1.0, 1.0, 1.0]
+    forked[60:, 1] += np.linspace(0, 4, 20)
+    for extra, count in (([forked], 1), ([forked, forked * [1, -1, 1]], 1), ([opposite], 2), ([forked, opposite], 2)):
+        lines = (*one.vessel.centerlines, *(Centerline(points_mm, np.full(80, 0.5)) for points_mm in extra))
+        anatomy = replace(one, vessel=replace(one.vessel, centerlines=lines))
+        found = measure(anatomy, deployed(SILK))
+        assert found["jailed_branches_count"] == count
+        assert found["proximal_end_to_branch_mm"] == measure(one, deployed(SILK))["proximal_end_to_branch_mm"]
+
+
 def test_coverage_of_the_quads_is_that_of_wires_drawn_on_paper():
     """Average coverage of a plane weave of strips against counting points square by square."""
     stent = deployed(SILK).stent

@@ -264,7 +264,8 @@ def row_spacing_mm(
     piece_mm, angle = piece_length_mm(design, size), angle_rad(design, size, diameter_mm)
     if not np.any(curvature_per_mm):
         return piece_mm * np.cos(angle)
-    bend = np.minimum(0.5 * np.abs(curvature_per_mm) * diameter_mm, STEEPEST_BEND)
+    opened_mm = np.minimum(diameter_mm, size.free_diameter_mm)
+    bend = np.minimum(0.5 * np.abs(curvature_per_mm) * opened_mm, STEEPEST_BEND)
     apart = 1 + np.multiply.outer(bend, np.cos(np.pi * (np.arange(BEND_SAMPLES) + 0.5) / BEND_SAMPLES))
     longest = STRAIGHTEST / (1 + bend)
     cosine = np.minimum(np.cos(angle), longest)

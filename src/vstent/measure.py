@@ -191,14 +191,21 @@ def _stretch(stent: Stent) -> Measures:
 
 @lru_cache(maxsize=8)
 def branch_abscissas_mm(anatomy: Anatomy) -> Floats:
-    """Where on the parent axis (b,) the centerlines of other outlets leave the parent artery."""
+    """Where on the parent axis (b,) branches leave the parent artery.
+
+    Centerlines of outlets that leave it at one place, within the branch's radius, go through one branch.
+    """
     axis, left_mm = anatomy.axis, []
+    ostia_mm: list[Floats] = []
     for line in anatomy.vessel.centerlines:
         foot_mm, distance_mm = curves.project(axis.points_mm, line.points_mm)
         is_away = distance_mm > np.interp(foot_mm, axis.abscissa_mm, anatomy.section_radius_mm)
         is_gone = np.logical_and.accumulate(is_away[::-1])[::-1]
-        if is_gone[-1]:
-            left_mm.append(foot_mm[np.argmax(is_gone)])
+        first = np.argmax(is_gone)
+        ostium_mm, radius_mm = line.points_mm[first], line.inscribed_radius_mm[first]
+        if is_gone[-1] and all(np.linalg.norm(ostium_mm - other_mm) > radius_mm for other_mm in ostia_mm):
+            ostia_mm.append(ostium_mm)
+            left_mm.append(foot_mm[first])
     return np.array(left_mm)
 
 

@@ -59,14 +59,14 @@ class Profile:
         return replace(self, abscissa_mm=together[order], diameter_mm=values[order])
 
 
-def expected_profile(design: Design, anatomy: Anatomy) -> Profile:
-    """Diameter that the contour will have where it lies against the landing surface, and the bends its rows heed.
+def expected_profile(design: Design, size: Size, anatomy: Anatomy) -> Profile:
+    """Diameter that the contour will have, against the landing surface or free, and the bends its rows heed.
 
     Rows of a laser-cut device are put as in a straight artery: in a tight bend its cells leave the wall, and its rows
     do not come as near together as those of a braid. From there `vstent.deploy.cells` moves them.
     """
     offset_mm = design.wall_offset_um * MM_PER_UM
-    diameter_mm = 2 * (anatomy.section_radius_mm - offset_mm)
+    diameter_mm = np.minimum(2 * (anatomy.section_radius_mm - offset_mm), size.free_diameter_mm)
     if isinstance(design, LaserCut):
         return Profile(anatomy.axis.abscissa_mm, diameter_mm)
     return Profile(anatomy.axis.abscissa_mm, diameter_mm, bend(anatomy))
@@ -131,7 +131,7 @@ class ConstantWire(AbstractMethod):
 
     def init(self, placement: Placement) -> Opened:
         """Put rows where they would lie if the device filled the artery."""
-        profile = expected_profile(placement.design, placement.anatomy)
+        profile = expected_profile(placement.design, placement.size, placement.anatomy)
         rows_mm = march(placement.design, placement.size, placement.landing, profile)
         return Opened(placement.start(self.contour, rows_mm, placement.size.free_diameter_mm), rows_mm)
 
@@ -206,7 +206,7 @@ class ConstantWire(AbstractMethod):
             When a row leaves the artery.
         """
         design, size, axis = placement.design, placement.size, placement.anatomy.axis
-        profile = expected_profile(design, placement.anatomy)
+        profile = expected_profile(design, size, placement.anatomy)
         for done in range(ROUNDS):
             profile = profile.corrected(opened.abscissa_mm, perimeters(opened.contour.nodes_mm) / np.pi)
             rows_mm = march(design, size, placement.landing, profile)

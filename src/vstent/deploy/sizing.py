@@ -79,7 +79,7 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
 
 def propose_landing(design: Design, anatomy: Anatomy, size: Size) -> Landing:
     """Propose to center the deployed device on the neck, moved as little as the artery's ends demand."""
-    profile = expected_profile(design, anatomy)
+    profile = expected_profile(design, size, anatomy)
     target_mm = float(np.mean(neck_span_mm(anatomy)))
     wanted_mm = target_mm
     for _ in range(4):  # the middle row is not the middle of the length where the artery tapers
@@ -117,7 +117,7 @@ def _loose_fraction(design: Design, anatomy: Anatomy, size: Size, first_mm: floa
 
 
 def _span(design: Design, anatomy: Anatomy, size: Size) -> tuple[float, float]:
-    rows_mm = march(design, size, propose_landing(design, anatomy, size), expected_profile(design, anatomy))
+    rows_mm = march(design, size, propose_landing(design, anatomy, size), expected_profile(design, size, anatomy))
     return float(rows_mm[0]), float(rows_mm[-1])
 
 

@@ -92,7 +92,7 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     nodes_mm = across.place(abscissa_mm, in_plane_mm).reshape(-1, 3)
     gap_mm = np.maximum(anatomy.landing_surface.closest(nodes_mm)[1] - dd_mm, 0.0).reshape(-1, columns)
     band_mm = anatomy.vessel.threshold_band_mm or ASSUMED_BAND_MM
-    return Bed(design, size, across, abscissa_mm, in_plane_mm, gap_mm, expected_profile(design, anatomy), band_mm)
+    return Bed(design, size, across, abscissa_mm, in_plane_mm, gap_mm, expected_profile(design, size, anatomy), band_mm)
 
 
 def sketch(wall: Bed, landing: Landing) -> Sketch:
