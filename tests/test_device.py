@@ -55,6 +55,13 @@ def test_coverage_sums_the_diameters_of_mixed_wires():
     assert device.coverage_fraction(mixed, size, 4) == pytest.approx(device.coverage_fraction(one, size, 4), rel=1e-12)
 
 
+def test_wires_that_touch_cover_everything_and_no_more():
+    thick = Braid("a", "A", ((48, 400.0),), 1.0, ())
+    size = Size(4, 20, 4.2)
+    fractions = [device.coverage_fraction(thick, size, diameter_mm) for diameter_mm in (1.0, 2.0, 3.0, 4.2)]
+    assert fractions == [1.0] * 4
+
+
 def test_silk_and_enterprise_are_those_of_the_paper():
     silk, enterprise = device.find_design("Silk"), device.find_design("ENTERPRISE")
     assert isinstance(silk, Braid)
@@ -122,6 +129,16 @@ def test_a_catalogue_entry_becomes_a_design():
         ("value = 1.0", "value = -1.0", "braid_angle_rad"),
         ('maker = "Y"', 'maker = "Y"\nprice = 3', "price"),
         ("count = 12", "count = 13", "13 wires"),
+        (
+            "wires = [{ count = 12,",
+            'wires = [{ count = 5, diameter_um = 40, source = "here", confidence = "cited" }, { count = 7,',
+            "5 wires of 40 um",
+        ),
+        ("diameter_um = 40", "diameter_um = 0.04", "0.04 um is thinner than any wire or strut, give micrometres"),
+        ("diameter_um = 40", "diameter_um = 900", "has no room for its wires or struts: side by side they take 1."),
+        ("lengths_mm = [10,", "lengths_mm = [1,", "3.00 x 1 mm is shorter than two rows of its cells, 0."),
+        ('key = "x"', 'key = "bare"', "as the flow without a device is called"),
+        ('name = "X"', 'name = "Bare"', "as the flow without a device is called"),
         ("[[device]]", "[[device", "not valid TOML"),
     ],
 )
@@ -132,8 +149,11 @@ def test_a_wrong_catalogue_is_refused_and_the_place_named(old, new, said):
 
 
 def test_one_key_for_two_devices_is_refused():
-    with pytest.raises(DeviceError, match="one key for two devices"):
+    with pytest.raises(DeviceError, match="one key or name for two devices"):
         device_schema.parse(ENTRY + ENTRY)
+    for other in (ENTRY.replace('"x"', '"y"'), ENTRY.replace('"X"', '"Y"').replace('"x"', '"y"').replace('"Y"', '"x"')):
+        with pytest.raises(DeviceError, match="one key or name for two devices"):
+            device_schema.parse(ENTRY + other)
 
 
 def test_importing_devices_does_not_load_pydantic():
@@ -181,12 +201,16 @@ def test_a_device_of_ones_own_joins_the_catalogue_and_can_be_replaced(own_folder
     ("text", "complaint"),
     [
         (OWN.replace('"own"', '"silk"'), "names a device that the catalogue has already, silk"),
+        (
+            OWN.replace('"Own"', '"SILK"'),
+            "names a device that the catalogue has already, silk: give it another key and",
+        ),
         (OWN.replace(', confidence = "derived"', ""), "is wrong at device.0.braid.braid_angle_rad.confidence"),
         (OWN.replace("value = 1.2", "value = 2.0"), "has an angle of 2.000 rad"),
         (OWN.replace("]]", "]"), "is not valid TOML"),
         (None, "does not exist"),
     ],
-    ids=["taken", "no confidence", "angle", "no TOML", "no file"],
+    ids=["taken", "taken name", "no confidence", "angle", "no TOML", "no file"],
 )
 def test_a_bad_device_file_is_refused_and_not_kept(own_folder, tmp_path, capsys, text, complaint):
     file = tmp_path / "mine.toml"

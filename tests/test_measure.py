@@ -11,6 +11,7 @@ from tubes import arc, line, tube, with_neck
 from vstent import device
 from vstent.deploy import deploy
 from vstent.measure import coverage_fractions, is_over_neck, measure, morphology, pore_areas_mm2
+from vstent.rank import rank
 from vstent.surface import Surface
 from vstent.vessel import Aneurysm, Centerline
 
@@ -186,6 +187,26 @@ def test_a_node_pushed_through_the_wall_is_reported():
     broken = replace(done, stent=replace(done.stent, nodes_mm=nodes_mm))
     assert measure(artery(), done)["max_outside_mm"] == 0
     assert measure(artery(), broken)["max_outside_mm"] == pytest.approx(0.3, abs=0.002)
+
+
+def test_a_device_wholly_over_restored_wall_has_no_gaps_to_tell_of():
+    done, here = deployed(SILK), artery()
+    restored = replace(here, is_restored=np.ones_like(here.is_restored))
+    left_out = {"apposed_fraction", "mean_wall_gap_mm", "max_wall_gap_mm", "malapposition_volume_mm3"}
+    found, usual = measure(restored, done), measure(here, done)
+    assert set(usual) - set(found) == left_out
+    assert found == {key: value for key, value in usual.items() if key not in left_out}
+    (candidate,) = rank(restored, [replace(SILK, sizes=(SIZES["silk"],))]).candidates
+    assert "apposed_fraction" not in candidate.grades
+
+
+@pytest.mark.parametrize("length_mm", [0.1, 0.3])
+def test_a_device_without_a_whole_pore_has_no_pores_to_tell_of(length_mm):
+    size = replace(SIZES["silk"], length_mm=length_mm)
+    done = deploy(SILK, artery(), size=size)
+    found = measure(artery(), done)
+    assert ("pore_density_per_mm2" in found) is (device.grid(SILK, size).lattice_rows > 2)
+    assert all(np.isfinite(value) for value in found.values() if not isinstance(value, str))
 
 
 def test_gaps_over_the_neck_do_not_count_as_malapposed():

@@ -8,7 +8,7 @@ column, pi D / n, and the row spacing is what is left: h(D) = sqrt((l/n)^2 - (pi
 
 import difflib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -22,6 +22,8 @@ from vstent.units import MM_PER_UM
 
 Confidence = Literal["cited", "derived", "estimated"]
 
+BARE = "bare"
+"""Name of the flow without a device, so no device's."""
 STEEP_RAD = 0.1, 1.5
 """Angles between wire and axis that a device may have at its free diameter."""
 BEND_SAMPLES, BEND_STEPS = 12, 6
@@ -94,6 +96,13 @@ class Braid:
     def __post_init__(self) -> None:
         _check_columns(self.name, self.n_wires)
         _check_angle(self.name, self.braid_angle_rad)
+        for count, diameter_um in self.wires:
+            if count % 2:
+                raise DeviceError(
+                    f"{self.name} has {count} wires of {diameter_um:g} um: half of them wind either way, so use an "
+                    "even number of each."
+                )
+        _check_sizes(self)
 
     @property
     def n_wires(self) -> int:
@@ -144,6 +153,7 @@ class LaserCut:
     def __post_init__(self) -> None:
         _check_columns(self.name, self.n_columns)
         _check_angle(self.name, self.cell_angle_rad)
+        _check_sizes(self)
 
     @property
     def angle_rad(self) -> float:
@@ -167,6 +177,23 @@ def _check_columns(name: str, n_columns: int) -> None:
 def _check_angle(name: str, angle_rad: float) -> None:
     if not STEEP_RAD[0] < angle_rad < STEEP_RAD[1]:
         raise DeviceError(f"{name} has an angle of {angle_rad:.3f} rad to the axis: give 0.1 to 1.5 rad.")
+
+
+def _check_sizes(design: Design) -> None:
+    """See that wires have room round every size, and that it is long enough to hold two rows of cells."""
+    for size in design.sizes:
+        taken = _strips_fraction(design, size, size.free_diameter_mm)
+        if taken >= 1:
+            raise DeviceError(
+                f"{design.name} {size.label} has no room for its wires or struts: side by side they take {taken:.1f} "
+                "times its circumference. Give fewer or thinner ones."
+            )
+        spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
+        if size.length_mm < 2 * spacing_mm:
+            raise DeviceError(
+                f"{design.name} {size.label} is shorter than two rows of its cells, {spacing_mm:.1f} mm apart: give a "
+                "longer size, or more wires or struts."
+            )
 
 
 class Grid(NamedTuple):
@@ -295,11 +322,17 @@ def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
     Two hands of strips cover 1 - (1 - f)^2, f = sum of wire diameters of one hand / (pi D cos(alpha)); struts that
     meet without crossing cover 2 f.
     """
-    per_axis = np.pi * diameter_mm * float(np.cos(angle_rad(design, size, diameter_mm)))
+    strips = min(1.0, _strips_fraction(design, size, diameter_mm))
+    return strips if isinstance(design, LaserCut) else 1 - (1 - strips) ** 2
+
+
+def _strips_fraction(design: Design, size: Size, diameter_mm: float) -> float:
+    """Part of the circumference that all struts, or the wires of one hand, take side by side; 1 and more: no room."""
+    per_axis_mm = np.pi * diameter_mm * float(np.cos(angle_rad(design, size, diameter_mm)))
     if isinstance(design, LaserCut):
-        return float(design.n_columns * design.strut_width_um * MM_PER_UM / per_axis)
-    hand_mm = 0.5 * sum(count * diameter for count, diameter in design.wires) * MM_PER_UM
-    return float(1 - (1 - hand_mm / per_axis) ** 2)
+        return float(design.n_columns * design.strut_width_um * MM_PER_UM / per_axis_mm)
+    hand_um = 0.5 * sum(count * diameter for count, diameter in design.wires)
+    return float(hand_um * MM_PER_UM / per_axis_mm)
 
 
 def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> float:
@@ -375,10 +408,17 @@ def _text(path: Path) -> str:
         raise DeviceError(f"{path} cannot be read as text: give a TOML file of devices, or remove it.") from error
 
 
-def _check_new(added: Iterable[str], known: Iterable[str], source: object) -> None:
-    twice = sorted(set(added) & set(known))
+def called(designs: Iterable[Design]) -> list[str]:
+    """Return what devices are called, their keys and names in lower case; two that clash are in it twice."""
+    return [word for design in designs for word in sorted({design.key.casefold(), design.name.casefold()})]
+
+
+def _check_new(added: Mapping[str, Design], known: Mapping[str, Design], source: object) -> None:
+    twice = sorted(set(called(added.values())) & set(called(known.values())))
     if twice:
-        raise DeviceError(f"{source} names a device that the catalogue has already, {twice[0]}: give it another key.")
+        raise DeviceError(
+            f"{source} names a device that the catalogue has already, {twice[0]}: give it another key and name."
+        )
 
 
 def find_design(name: str) -> Design:
@@ -390,8 +430,7 @@ def find_design(name: str) -> Design:
         When there is none; the sentence says which there are and the nearest.
     """
     designs = catalogue()
-    by_name = {design.key.casefold(): design for design in designs.values()}
-    by_name |= {design.name.casefold(): design for design in designs.values()}
+    by_name = {word: design for design in designs.values() for word in called([design])}
     wanted = name.strip().casefold()
     if wanted in by_name:
         return by_name[wanted]

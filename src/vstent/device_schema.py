@@ -3,19 +3,28 @@
 import tomllib
 from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from vstent.device import Braid, Confidence, Design, Fact, LaserCut, Size
+from vstent.device import BARE, Braid, Confidence, Design, Fact, LaserCut, Size, called
 from vstent.errors import DeviceError
 
 MOST_WIRES: Final = 1000
 LARGEST_UM: Final = 1000.0
+THINNEST_UM: Final = 5.0
 LARGEST_MM: Final = 200.0
 MOST_SIZES: Final = 100
 
 _Whole = Annotated[int, Field(gt=0, le=MOST_WIRES)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_Width_um = Annotated[float, Field(gt=0, le=LARGEST_UM)]
+
+
+def _in_um(width: float) -> float:
+    if width < THINNEST_UM:
+        raise ValueError(f"{width:g} um is thinner than any wire or strut, give micrometres")
+    return width
+
+
+_Width_um = Annotated[float, Field(gt=0, le=LARGEST_UM), AfterValidator(_in_um)]
 _Lengths_mm = Annotated[list[Annotated[float, Field(gt=0, le=LARGEST_MM)]], Field(min_length=1, max_length=MOST_SIZES)]
 
 
@@ -142,6 +151,9 @@ def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:
     except RecursionError:
         raise DeviceError(f"{name} is nested too deeply to be a catalogue: give it the form of devices.toml.") from None
     designs = {entry.key: entry.design() for entry in found}
-    if len(designs) < len(found):
-        raise DeviceError(f"{name} uses one key for two devices: give each its own.")
+    words = called(designs.values())
+    if len(designs) < len(found) or len(set(words)) < len(words):
+        raise DeviceError(f"{name} uses one key or name for two devices: give each its own.")
+    if BARE in words:
+        raise DeviceError(f"{name} calls a device {BARE!r}, as the flow without a device is called: call it otherwise.")
     return designs

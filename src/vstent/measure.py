@@ -37,6 +37,9 @@ SAMPLES_PER_QUAD: Final = 8
 def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
     """Measure how a device lies in its artery.
 
+    What there is nothing to measure by is left out: the neck without an aneurysm, pores where none is whole, gaps where
+    all of the device lies over restored wall.
+
     Fractions over the "neck" concern the part of the contour that closes the largest aneurysm. Coverage and pore
     density are measured on the drawn wires; the closed formulas at the same mean diameter stand beside them.
     """
@@ -86,14 +89,16 @@ def _apposition(anatomy: Anatomy, deployment: Deployment) -> Measures:
     is_wall = ~anatomy.is_restored[surface.faces[face]].all(axis=1)
     middle_mm = np.repeat(stent.nodes_mm.mean(axis=1), stent.nodes_mm.shape[1], axis=0)
     outside_mm = np.where(surface.crosses(middle_mm, points_mm), distance_mm, 0.0)
-    gap_mm, area_mm2 = deployment.wall_gap_mm.ravel(), _node_areas_mm2(stent).ravel()
+    gap_mm, area_mm2 = deployment.wall_gap_mm.ravel()[is_wall], _node_areas_mm2(stent).ravel()[is_wall]
+    outside: Measures = {"max_outside_mm": float(outside_mm.max())}
+    if not is_wall.any():
+        return outside
     return {
-        "apposed_fraction": float((gap_mm[is_wall] < APPOSED_GAP_MM).mean()),
-        "mean_wall_gap_mm": float(gap_mm[is_wall].mean()),
-        "max_wall_gap_mm": float(gap_mm[is_wall].max()),
-        "malapposition_volume_mm3": float((gap_mm * area_mm2)[is_wall].sum()),
-        "max_outside_mm": float(outside_mm.max()),
-    }
+        "apposed_fraction": float((gap_mm < APPOSED_GAP_MM).mean()),
+        "mean_wall_gap_mm": float(gap_mm.mean()),
+        "max_wall_gap_mm": float(gap_mm.max()),
+        "malapposition_volume_mm3": float((gap_mm * area_mm2).sum()),
+    } | outside
 
 
 def quad_areas_mm2(stent: Stent) -> Floats:
@@ -147,9 +152,10 @@ def _density(anatomy: Anatomy, stent: Stent) -> Measures:
     found: Measures = {
         "metal_coverage_fraction": float(np.average(hidden, weights=area_mm2)),
         "metal_coverage_formula_fraction": coverage_fraction(stent.design, stent.size, diameter_mm),
-        "pore_density_per_mm2": float(len(pore_mm2) / pore_mm2.sum()),
         "pore_density_formula_per_mm2": pore_density_per_mm2(stent.design, stent.size, diameter_mm),
     }
+    if len(pores_mm):
+        found["pore_density_per_mm2"] = float(len(pore_mm2) / pore_mm2.sum())
     if anatomy.aneurysms:
         on_neck = is_over_neck(anatomy, quads_mm)
         if on_neck.any():

@@ -18,7 +18,7 @@ from vstent.deploy import propose_landing
 from vstent.deploy.contour import planes
 from vstent.deploy.method import laid_inside
 from vstent.deploy.sketch import Bed, Sketch, bed, sketch
-from vstent.device import coverage_fraction, find_design
+from vstent.device import BARE, coverage_fraction, find_design
 from vstent.errors import ReadError
 from vstent.flow import FlowField
 from vstent.io.archive import load_noun
@@ -43,7 +43,7 @@ from vstent.report.scene import (
 )
 from vstent.stent import Deployment, Landing, Stent
 from vstent.study import CACHE
-from vstent.study.stages import BARE, deploy_one, size_of
+from vstent.study.stages import deploy_one, size_of
 from vstent.surface import Surface
 from vstent.vessel import Anatomy, Opening
 

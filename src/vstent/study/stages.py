@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from vstent.deploy import deploy, propose_size
-from vstent.device import Design, Size, find_sizes
+from vstent.device import BARE, Design, Size, find_sizes
 from vstent.errors import InputError
 from vstent.flow import FlowField, FlowSettings, compare, flow_case, foretell_cost, indices, ostium, simulate_case
 from vstent.flow.convergence import Sensitivity, convergence
@@ -33,8 +33,6 @@ from vstent.trim import trim
 from vstent.uncertainty import Uncertainty, vary
 from vstent.vessel import Anatomy, Vessel
 
-BARE: Final = "bare"
-"""Name of the flow without a device."""
 SLOWEST_M_S: Final = 0.01
 FASTEST_M_S: Final = 2.0
 """Mean speeds at the inlet beyond which no artery of the brain's blood flows."""
@@ -154,7 +152,7 @@ def compute_flows(
         return {}
     fields: dict[str, FlowField] = {}
     for name in (BARE, *deployments):
-        stent = deployments[name].stent if name in deployments else None
+        stent = None if name == BARE else deployments[name].stent
         placed = (stent.design, settings.placing(name)) if stent else ()
         stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, *placed)
         field = ledger.recall(stage, key, FlowField)
