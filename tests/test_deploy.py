@@ -1,5 +1,6 @@
 """Whole deployments in arteries whose answer is known."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -523,6 +524,58 @@ def test_a_size_too_wide_for_the_artery_is_not_said_to_be_too_long_for_it():
     with pytest.raises(LandingError, match=r"up to 3\.5 mm wide fits: the shortest would be [2-4]\d\.\d mm long in a"):
         propose_size(design, anatomy)
     assert deploy(design, anatomy, size=wide).stent.deployed_length_mm < 20
+
+
+@cache
+def beside_a_neck():
+    return with_neck(tube(line(60), 1.9), 14.0, 18.0)
+
+
+@pytest.mark.parametrize(
+    ("center_mm", "said"),
+    [
+        (45.0, r"22\.\d mm short of the neck's proximal end \(land it more proximally\)"),
+        (24.0, r"1\.\d mm short of the neck's proximal end \(land it more proximally\)"),
+        (20.0, r"only 2\.9 mm beyond the neck's proximal end \(land it more proximally\)"),
+        (12.0, r"only 3\.1 mm beyond the neck's distal end \(land it more distally\)"),
+    ],
+)
+def test_a_device_that_misses_the_neck_or_hardly_passes_it_says_by_how_much(center_mm, said):
+    assert re.search(said, deploy(SILK, beside_a_neck(), size=SILK_SIZE, landing=Landing(center_mm)).advice)
+
+
+def test_a_device_too_short_for_the_neck_asks_for_a_longer_one_where_that_helps():
+    wide_neck = with_neck(tube(line(60), 1.9), 20.0, 36.0)
+    advice = deploy(SILK, wide_neck, size=SILK_SIZE).advice
+    assert re.search(r"only 1\.0 mm beyond the neck's \w+ end \(choose a longer size\), and 100% of it lies", advice)
+    at_the_end = with_neck(tube(line(60), 1.9), 0.0, 5.0)
+    assert ", 0.5 mm short of the neck's proximal end, and" in deploy(SILK, at_the_end, size=SILK_SIZE).advice
+
+
+@pytest.mark.parametrize("anatomy", [straight(), beside_a_neck()])
+def test_of_a_device_that_is_as_it_should_be_no_more_is_said(anatomy):
+    form = (
+        r"Silk 4\.00 x 15 mm lies from \d+\.\d to \d+\.\d mm of the parent artery, 18\.0 mm long, and 100% of it lies "
+    )
+    assert re.fullmatch(form + r"against the wall\.", deploy(SILK, anatomy, size=SILK_SIZE).advice)
+
+
+def test_of_a_device_wholly_over_restored_wall_nothing_is_said_of_gaps():
+    restored = replace(straight(), is_restored=np.ones(len(straight().landing_surface.vertices_mm), dtype=bool))
+    assert deploy(SILK, restored, size=SILK_SIZE).advice.endswith("and none of it against the patient's own wall.")
+
+
+@pytest.mark.parametrize(
+    ("length_mm", "remedy"),
+    [
+        (14, "and wider sizes are too long for this artery; choose another"),
+        (30, "; choose a wider size."),
+    ],
+)
+def test_a_wider_size_is_asked_for_where_one_fits(length_mm, remedy):
+    lvis = device.find_design("lvis")
+    narrow = device.find_size(lvis, diameter_mm=3.5, length_mm=15)
+    assert remedy in deploy(lvis, tube(line(length_mm), 2.2), size=narrow).advice
 
 
 def test_a_contour_that_is_not_given_the_time_says_so():

@@ -7,13 +7,13 @@ import numpy as np
 
 from vstent.deploy import sizing, wires
 from vstent.deploy.active_contour import ActiveContour
+from vstent.deploy.advice import Gaps, advise
 from vstent.deploy.braid import ConstantWire
 from vstent.deploy.method import AbstractMethod, Course, Placement, Progress, laid_inside, run
 from vstent.deploy.wall import landing_wall
 from vstent.deploy.zhong2016 import Zhong2016
-from vstent.device import Design, LaserCut, Size, compacted
+from vstent.device import Design, Size, compacted
 from vstent.errors import InputError
-from vstent.kernels.arrays import Bools, Floats
 from vstent.stent import Deployment, Landing, Stent
 from vstent.units import MM_PER_UM
 from vstent.vessel import Anatomy
@@ -94,7 +94,7 @@ def deploy(
     return Deployment(
         stent=stent,
         outcome=course.outcome,
-        advice=_advice(stent, course, gap_mm, is_at_patient),
+        advice=advise(anatomy, stent, course, Gaps(gap_mm, is_at_patient)),
         terminated_fraction=np.array(course.terminated_fraction),
         seconds=time.perf_counter() - began,
         wall_gap_mm=gap_mm,
@@ -109,32 +109,3 @@ def _method(method: AbstractMethod | str) -> AbstractMethod:
     if method not in METHODS:
         raise InputError(f"There is no way to deploy called {method!r}: choose one of {', '.join(METHODS)}.")
     return METHODS[method]()
-
-
-def _advice(stent: Stent, course: Course, gap_mm: Floats, is_at_patient: Bools) -> str:
-    """One sentence: where the device lies, what to do when it does not fit; gaps (rows, columns), and whose wall."""
-    lies = (
-        f"{stent.design.name} {stent.size.label} lies from {stent.proximal_abscissa_mm:.1f} to "
-        f"{stent.distal_abscissa_mm:.1f} mm of the parent artery, {stent.deployed_length_mm:.1f} mm long"
-    )
-    if course.outcome == "iteration_limit":
-        done = course.terminated_fraction[-1]
-        return f"{lies}, but only {done:.0%} of its contour reached the wall: raise the iteration limit or tau."
-    is_loose = is_at_patient & (gap_mm > APPOSED_GAP_MM)
-    loose = is_loose.sum() / max(is_at_patient.sum(), 1)
-    if loose <= sizing.LOOSE_FRACTION:
-        return f"{lies}, and {1 - loose:.0%} of it lies against the wall."
-    off = f"{loose:.0%} of it stands off the wall, by up to {gap_mm[is_at_patient].max():.2f} mm"
-    return f"{lies}, and {off}: {_remedy(stent, gap_mm, is_loose)}"
-
-
-def _remedy(stent: Stent, gap_mm: Floats, is_loose: Bools) -> str:
-    """Why nodes stand off the wall by `gap_mm` (rows, columns), and what to do."""
-    free_mm = stent.size.free_diameter_mm
-    could_open = stent.row_diameter_mm + 2 * gap_mm.mean(axis=1) < free_mm
-    if isinstance(stent.design, LaserCut) and is_loose[could_open].sum() > 0.5 * is_loose.sum():
-        return "its struts do not stretch, and the way outside the bend is longer; choose a device of braided wires."
-    wider = any(size.diameter_mm > stent.size.diameter_mm for size in stent.design.sizes)
-    return (
-        f"its free diameter is {free_mm:.2f} mm; choose {'a wider size' if wider else 'a device that is made wider'}."
-    )

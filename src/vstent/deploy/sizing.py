@@ -7,6 +7,7 @@ becomes longer than its label says.
 """
 
 from itertools import chain
+from math import inf
 from typing import Final
 
 import numpy as np
@@ -49,6 +50,11 @@ def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
     diameter_mm = 2 * anatomy.section_radius_mm
     first, second = (np.interp(zone, anatomy.axis.abscissa_mm, diameter_mm).mean() for zone in (before, after))
     return float(first), float(second)
+
+
+def wanted_margin_mm(anatomy: Anatomy) -> float:
+    """How far a device is to reach beyond the neck, on either side."""
+    return max(MARGIN_MM, *landing_diameters_mm(anatomy))
 
 
 def propose_size(design: Design, anatomy: Anatomy) -> Size:
@@ -94,6 +100,12 @@ def propose_landing(design: Design, anatomy: Anatomy, size: Size) -> Landing:
     return Landing(wanted_mm)
 
 
+def reach_mm(design: Design, anatomy: Anatomy, size: Size) -> float:
+    """How far a size, landed as proposed, reaches beyond the neck on its shorter side; -inf where it does not fit."""
+    first_mm, last_mm = _span(design, anatomy, size)
+    return _margin(anatomy, first_mm, last_mm) if _fits(anatomy, first_mm, last_mm) else -inf
+
+
 def _of_label(design: Design, anatomy: Anatomy, label_mm: float, *, lying: bool = False) -> Size | None:
     """The shortest size of a label that reaches far enough, or the longest that fits; `lying`: against the wall."""
     same = sorted((size for size in design.sizes if size.diameter_mm == label_mm), key=lambda size: size.length_mm)
@@ -101,8 +113,8 @@ def _of_label(design: Design, anatomy: Anatomy, label_mm: float, *, lying: bool 
     fitting = [size for size in same if _fits(anatomy, *spans[size])]
     if not fitting:
         return None
-    enough_mm = max(MARGIN_MM, *landing_diameters_mm(anatomy))
-    chosen = next((size for size in fitting if _margin(anatomy, *spans[size]) >= enough_mm), fitting[-1])
+    wanted_mm = wanted_margin_mm(anatomy)
+    chosen = next((size for size in fitting if _margin(anatomy, *spans[size]) >= wanted_mm), fitting[-1])
     return chosen if not lying or _loose_fraction(design, anatomy, chosen, *spans[chosen]) <= LOOSE_FRACTION else None
 
 
