@@ -14,12 +14,13 @@ import pytest
 from tubes import arc, line, tube, with_neck
 from vstent import device, phantoms
 from vstent.cli import main
-from vstent.deploy import propose_size
+from vstent.deploy import deploy, propose_size
 from vstent.errors import InputError, VstentError
 from vstent.io.writers import write_stl
 from vstent.measure import measure
-from vstent.rank import bend_ratios, default_criteria, rank, read_criteria
-from vstent.rank.criteria import Criterion, parse
+from vstent.rank import bend_ratios, default_criteria, landing_measures, rank, read_criteria
+from vstent.rank.criteria import MEASURES, Criterion, parse
+from vstent.vessel import Centerline
 from vstent.workers import spread
 
 SILK, ENTERPRISE = device.find_design("silk"), device.find_design("enterprise")
@@ -81,7 +82,7 @@ def test_scores_are_the_weighted_means_of_grades_of_what_was_measured():
 
 def test_measures_are_those_of_the_same_deployment_made_alone():
     best = ranking().candidates[0]
-    from vstent.deploy import deploy, propose_landing
+    from vstent.deploy import propose_landing
 
     landing = replace(propose_landing(best.design, artery(), best.size))
     assert best.shift_mm == 0.0
@@ -160,6 +161,26 @@ def test_the_users_criteria_decide(tmp_path):
     assert f"{lengths[0]:.1f} mm long" in candidates[0].reason
 
 
+ASKED = "[[criterion]]\nkey='apposed_fraction'\ntitle='x'\nweight=1\nnone=0.7\nfull=0.9\nphrase='{:.0%}'\nsource='test'"
+
+
+def test_what_criteria_can_ask_for_is_what_is_measured():
+    deployment = deploy(SILK, artery(), size=device.find_size(SILK, diameter_mm=4, length_mm=15))
+    up, out = artery().axis.points_mm, np.linspace([0.1, 0, 35.0], [8.0, 0, 35.0], 40)
+    branch = Centerline(np.concatenate([up[up[:, 2] < 35], out]), np.full((up[:, 2] < 35).sum() + 40, 0.5))
+    forked = replace(artery(), vessel=replace(artery().vessel, centerlines=(artery().axis, branch)))
+    measures = measure(forked, deployment)
+    measures |= landing_measures(forked, measures)
+    assert {key for key, value in measures.items() if not isinstance(value, str)} == set(MEASURES)
+    assert len(MEASURES) == len(set(MEASURES))
+
+
+def test_a_device_that_no_criterion_concerns_does_not_meet_them():
+    of_braids = parse(ASKED + "\nkind='braid'")
+    found = rank(artery(), [replace(ENTERPRISE, sizes=ENTERPRISE.sizes[:1])], criteria=of_braids).candidates[0]
+    assert found.reason == "No criterion asks for anything that was measured of it."
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -173,6 +194,14 @@ def test_the_users_criteria_decide(tmp_path):
             "[[criterion]]\nkey='x'\ntitle='x'\nweight=1\nnone=0\nfull=1\nenough=2\nphrase='{}'\nsource='test'",
             "come together",
         ),
+        (ASKED.replace("apposed", "aposed"), r"asks for aposed_fraction, .* Did you mean apposed_fraction\?"),
+        (ASKED.replace("apposed_fraction", "size"), "asks for size, which is no number that is measured"),
+        (ASKED.replace("{:.0%}", "{} {}"), "phrase must have one place for a number"),
+        (ASKED.replace("{:.0%}", "apposed"), "phrase must have one place for a number"),
+        (ASKED.replace("{:.0%}", "{x}"), "phrase must have one place for a number"),
+        (ASKED.replace("none=0.7", "none=nan"), "none: Input should be a finite number"),
+        (ASKED.replace("full=0.9", "full=inf"), "full: Input should be a finite number"),
+        (ASKED.replace("weight=1", "weight=inf"), "weight: Input should be a finite number"),
         ("[[criterion]]\nkey='x'\ntitle='x'\nweight=0\nnone=0\nfull=1\nphrase='{}'\nsource='test'", "weight"),
     ],
 )

@@ -140,6 +140,12 @@ def test_ranges_that_cannot_be_are_refused(given, said):
         Ranges(**given)
 
 
+@pytest.mark.parametrize("device_mm", [0.43, 5.0])
+def test_a_device_made_so_much_wider_that_it_is_another_is_refused(device_mm):
+    with pytest.raises(InputError, match=r"no device 4\.20 mm wide when free .* give a range of less than 0\.42 mm"):
+        vary(artery(), deployed(), Ranges(2, device_mm=device_mm))
+
+
 def test_a_threshold_that_would_close_the_artery_is_refused():
     with pytest.raises(InputError, match="close the artery"):
         vary(artery(), deployed(), Ranges(16, threshold_mm=2.0))

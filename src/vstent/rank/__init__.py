@@ -183,6 +183,8 @@ def bend_ratios(anatomy: Anatomy) -> Floats:
 
 def _reason(asked: Sequence[Criterion], grades: dict[str, float], measures: Measures) -> str:
     """One sentence: what rules it out, or what costs it most."""
+    if not asked:
+        return "No criterion asks for anything that was measured of it."
     weight = sum(item.weight for item in asked)
     said = {item.key: item.phrase.format(measures[item.key]) for item in asked}
     out = [said[item.key] for item in asked if grades[item.key] == 0]

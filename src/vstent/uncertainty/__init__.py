@@ -40,6 +40,8 @@ RESULTS: Final = (
 """Measures of the deployment that get intervals."""
 FLOW_RESULTS: Final = ("neck_inflow_mL_s_ratio", "mean_sac_velocity_m_s_ratio", "mean_sac_wss_Pa_ratio")
 """Ratios of the flow after to the flow before that get intervals."""
+WIDEST_FRACTION: Final = 0.1
+"""A device is made wider or narrower by less than this part of its free diameter."""
 INTERVAL: Final = (0.025, 0.975)
 """Quantiles of an interval: 95 % of the cases lie in it."""
 
@@ -162,7 +164,7 @@ def vary(
     Raises
     ------
     InputError
-        When the range of the threshold would close the artery.
+        When the range of the threshold would close the artery, or that of the device makes another device of it.
     FlowError
         When a flow cannot be computed.
     """
@@ -172,6 +174,12 @@ def vary(
             f"diameters that vary by {spread[0]:.2g} mm would close the artery: give a smaller range of the threshold"
         )
     stent = deployment.stent
+    free_mm = stent.size.free_diameter_mm
+    if ranges.device_mm >= WIDEST_FRACTION * free_mm:
+        raise InputError(
+            f"no device {free_mm:.2f} mm wide when free is made {ranges.device_mm:g} mm wider or narrower: give a "
+            f"range of less than {WIDEST_FRACTION * free_mm:.2f} mm"
+        )
     middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
     rows = []
     for number, offset in enumerate(points * spread):
