@@ -616,7 +616,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(OPTION, "point of two numbers", run("--at", "1,2"), INPUT, "2 numbers, not 3"),
     Fault(OPTION, "device that does not exist", run("--device", "slik"), INPUT, "Did you mean silk"),
     Fault(OPTION, "size that is not made", run("--diameter", "17"), INPUT, "is not made in"),
-    Fault(OPTION, "device beyond the artery", run("--center", "900"), INPUT, "leaves the artery"),
+    Fault(OPTION, "device beyond the artery", run("--center", "900"), INPUT, "is not on the parent artery"),
     Fault(DEVICE, "no TOML", toml("[[device"), INPUT, "not valid TOML", own_catalogue),
     Fault(DEVICE, "no text", toml(b"\xff\xfe\x00"), INPUT, "as text", own_catalogue),
     Fault(

@@ -181,10 +181,14 @@ def test_a_dragged_end_lies_where_the_hand_is_and_where_the_deployment_puts_it(c
         assert np.median(apart) < 0.06
 
 
-def test_a_device_dragged_out_of_the_artery_is_refused_with_a_sentence(client, case):
-    answer = client.post(f"{case}/sketch", json={"device": SILK, "anchor": "proximal", "abscissa_mm": -5})
+@pytest.mark.parametrize(
+    ("anchor", "abscissa_mm", "said"),
+    [("proximal", -5, "is not on the parent artery"), ("distal", 5, "leaves the artery")],
+)
+def test_a_device_dragged_out_of_the_artery_is_refused_with_a_sentence(client, case, anchor, abscissa_mm, said):
+    answer = client.post(f"{case}/sketch", json={"device": SILK, "anchor": anchor, "abscissa_mm": abscissa_mm})
     assert answer.status_code == 422
-    assert "leaves the artery" in answer.json()["detail"]
+    assert said in answer.json()["detail"]
 
 
 def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
