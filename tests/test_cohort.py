@@ -32,7 +32,7 @@ from vstent.cohort import (
 )
 from vstent.cohort.estimate import START_CPU_S
 from vstent.cohort.work import COST, flat_metrics, read_row, row_path, work
-from vstent.errors import InputError, ReadError, VstentError
+from vstent.errors import FlowError, InputError, ReadError, VstentError
 from vstent.io.tables import write_parquet
 from vstent.io.writers import write_stl
 from vstent.report import cohort_report
@@ -110,6 +110,21 @@ def test_the_table_has_a_row_a_case_and_device_with_every_metric_or_the_failure(
         assert by_name["c", device]["outcome"] == "failed"
         assert by_name["c", device]["stage"] == "segment"
         assert "not a .stl" in by_name["c", device]["sentence"]
+
+
+def test_a_device_whose_flow_fails_leaves_the_files_of_the_others(scans, tmp_path, monkeypatch):
+    def failing(out, anatomy, deployments, *_):
+        if "enterprise" in deployments:
+            raise FlowError("it diverged")
+        return {}
+
+    monkeypatch.setattr("vstent.study.compute_flows", failing)
+    (case, *_) = find_cases(scans, SETTINGS)
+    (task,) = left_to_do([case], tmp_path, keeps_files=True)
+    work(task)
+    kept = json.loads((task.folder / "study" / "metrics.json").read_text())
+    assert list(kept["stents"]) == ["silk"]
+    assert [path.name for path in (task.folder / "study" / "stents").iterdir()] == ["silk"]
 
 
 def test_a_worker_killed_midway_is_replaced_and_the_table_is_the_same(scans, table, tmp_path):

@@ -19,10 +19,10 @@ from vstent.image import Image
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_json, write_stl
-from vstent.study import Placing, Settings, restore_vessel, run, stages
+from vstent.study import Placing, Settings, restore_vessel, run, stages, write_crate
 from vstent.study.ledger import hash_of
 from vstent.study.outputs import write_anatomy
-from vstent.study.stages import deploy_one, size_of
+from vstent.study.stages import deploy_one, engine_folders, size_of
 
 
 def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path) -> None:
@@ -153,12 +153,88 @@ def test_the_same_patient_keeps_what_was_found_and_another_one_only_restored_doe
     settings = Settings(devices=("silk",), units="mm", flow=None)
     run(first, tmp_path / "out", settings, lambda *_: None)
     (tmp_path / "out" / "report.pdf").write_text("of the first")
+    before = shown(tmp_path / "out")
     restore_vessel(moved, tmp_path / "out", settings, lambda *_: None)
-    run(moved, tmp_path / "out", replace(settings, devices=("enterprise",)), lambda *_: None)
-    assert {"report.pdf", "stents/silk/struts.stl", "stents/enterprise/struts.stl"} < shown(tmp_path / "out")
+    run(first, tmp_path / "out", settings, lambda *_: None)
+    assert shown(tmp_path / "out") == before | {"morphology.json"}
     restore_vessel(second, tmp_path / "out", settings, lambda *_: None)
     restore_vessel(second, tmp_path / "anew", settings, lambda *_: None)
     assert shown(tmp_path / "out") == shown(tmp_path / "anew")
+
+
+def test_a_folder_used_with_other_settings_holds_nothing_of_the_former(
+    arteries: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out, anew = tmp_path / "out", tmp_path / "anew"
+    former = Settings(
+        devices=("silk", "enterprise"), units="mm", flow=FlowSettings(cell_size_mm=0.5, engine="openfoam")
+    )
+    written_by_openfoam = [*engine_folders(out, former).values(), out / "flow" / "convergence" / "openfoam" / "grid"]
+    run(arteries[0], out, replace(former, flow=None), lambda *_: None)
+    restore_vessel(arteries[0], out, former, lambda *_: None)
+    for name in (*RESULTS_OF_ONE, *OF_THE_USER, "report.html", "ro-crate-metadata.json"):
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("of the former")
+    for folder in written_by_openfoam:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "vstent.key").write_text("a key")
+    cached = {path.name for path in (out / ".vstent").glob("*.npz")}
+    with pytest.raises(InputError):
+        run(arteries[0], out, replace(former, flow=None, length_mm=1e3), lambda *_: None)
+    assert (out / "report.pdf").exists()
+
+    settings = replace(former, devices=("enterprise",), flow=None)
+    run(arteries[0], out, settings, lambda *_: None)
+    run(arteries[0], anew, settings, lambda *_: None)
+    convergence = "flow/convergence/openfoam/grid/vstent.key"
+    assert shown(out) == shown(anew) | {*OF_THE_USER, "ranking.csv", "morphology.json", convergence}
+    assert (out / "metrics.json").read_bytes() == (anew / "metrics.json").read_bytes()
+    assert {path.name for path in (out / ".vstent").glob("*.npz")} == cached
+    run(arteries[0], out, replace(settings, upstream_mm=6.0), lambda *_: None)
+    assert shown(out) == shown(anew) | {*OF_THE_USER, "ranking.csv"}
+
+
+def test_stopped_with_other_settings_a_folder_holds_nothing_of_the_former_beside_the_new_flow(
+    arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, computed = tmp_path / "out", []
+    real = stages.simulate_case
+    stops = {"of": None}
+
+    def counted(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
+        if case.screen is not None and stops["of"] == case.settings.inflow_mL_s:
+            raise KeyboardInterrupt
+        computed.append((case.screen is not None, case.settings.inflow_mL_s))
+        return start if start is not None else real(case, start=start, **given)
+
+    monkeypatch.setattr(stages, "simulate_case", counted)
+    slow = Settings(devices=("silk",), units="mm", flow=FlowSettings(cell_size_mm=0.5, inflow_mL_s=1.0, max_steps=20))
+    fast = replace(slow, flow=replace(slow.flow, inflow_mL_s=3.0))
+    run(arteries[0], out, slow, lambda *_: None)
+    (out / "report.html").write_text("of the slow flow")
+    whole = shown(out)
+    run(arteries[0], out, slow, lambda *_: None)  # the same again: everything stays
+    assert shown(out) == whole
+
+    stops["of"] = 3.0
+    with pytest.raises(KeyboardInterrupt):
+        run(arteries[0], out, fast, lambda *_: None)
+    of_flow = {"flow/bare/field.vtu", "flow/bare/wall.vtp"}
+    assert {name for name in shown(out) if name.startswith("flow/")} == of_flow
+    assert not {"metrics.json", "run.json", "report.html"} & shown(out)
+    stops["of"] = None
+    run(arteries[0], out, fast, lambda *_: None)
+    assert shown(out) == whole - {"report.html"}
+    assert computed == [(False, 1.0), (True, 1.0), (False, 3.0), (True, 3.0)]
+    assert json.loads((out / "run.json").read_text())["settings"]["flow"]["inflow_mL_s"] == 3.0
+
+
+def test_a_crate_does_not_outlive_what_it_describes(arteries: tuple[Path, Path], tmp_path: Path) -> None:
+    settings = Settings(devices=("silk",), units="mm", flow=None)
+    case = run(arteries[0], tmp_path, settings, lambda *_: None)
+    write_crate(tmp_path, case.provenance, "2026-01-01")
+    run(arteries[0], tmp_path, settings, lambda *_: None)
+    assert "ro-crate-metadata.json" not in shown(tmp_path)
 
 
 def test_trimmed_otherwise_the_vessel_is_the_one_that_was_traced_and_the_result_the_same(tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def work(task: Task) -> None:
         began, cpu = time.perf_counter(), time.process_time()
         rows = _rows(task)
         done = tuple(device for device, row in rows.items() if row["outcome"] == DONE)
-        if task.keeps_files and len(done) > 1:  # the folder of one study with all devices: nothing is computed anew
+        if task.keeps_files and done and len(rows) > 1:  # one study with all that can be done: nothing is computed anew
             run(task.case.path, task.folder / "study", replace(task.case.settings, devices=done), _Watch())
         if not task.keeps_files:
             shutil.rmtree(task.folder / "study", ignore_errors=True)

@@ -13,16 +13,26 @@ from vstent.device import find_design
 from vstent.flow.convergence import Sensitivity
 from vstent.io import writers
 from vstent.measure import morphology
+from vstent.study.crate import NAME as CRATE
 from vstent.study.crate import write_crate
 from vstent.study.folder import CACHE, claiming
-from vstent.study.ledger import Ledger, hash_of
-from vstent.study.outputs import take_away_results, write_anatomy, write_ranking, write_stent, write_vessel
-from vstent.study.provenance import INPUT, METRICS, provenance
-from vstent.study.repeat import Record, agreement, former_source, read_record
+from vstent.study.ledger import ANATOMY, Ledger, hash_of
+from vstent.study.outputs import (
+    take_away_measures,
+    take_away_results,
+    take_away_study,
+    write_anatomy,
+    write_ranking,
+    write_stent,
+    write_vessel,
+)
+from vstent.study.provenance import INPUT, METRICS, RUN, provenance
+from vstent.study.repeat import SECONDS, Record, agreement, former_source, is_of_another, read_record
 from vstent.study.stages import (
     check_inflow,
     compute_flows,
     deploy_all,
+    engine_folders,
     find_anatomy,
     find_vessel,
     measure_all,
@@ -77,7 +87,12 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     anatomy = find_anatomy(path, source, settings, ledger)
     check_inflow(anatomy, settings.flow)
     deployments = deploy_all(designs, anatomy, settings, ledger)
+    told = provenance(path, source, settings)
+    has_former = is_of_another(out, told)
     _settle(path, out, source, ledger)
+    if has_former:
+        take_away_study(out, engine_folders(out, settings).values())
+    (out / CRATE).unlink(missing_ok=True)  # it describes files that are written anew
     write_anatomy(out, anatomy)
     for name, deployment in deployments.items():
         with ledger.stage(f"struts {name}") as tell:
@@ -89,8 +104,8 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
         for name, spread in varied.items():
             metrics["stents"][name]["uncertainty"] = spread
         writers.write_json(out / METRICS, metrics)
-    told = provenance(path, source, settings, ledger.seconds)
-    writers.write_json(out / "run.json", told, is_exact=True)
+    told[SECONDS] = ledger.seconds
+    writers.write_json(out / RUN, told, is_exact=True)
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     notes = (*anatomy.vessel.notes, *anatomy.notes, *of_flows)
     return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, notes)
@@ -179,8 +194,11 @@ def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -
 
 
 def _settle(path: Path, out: Path, source: str, ledger: Ledger) -> None:
-    """Keep what is held: the folder is this input's from here on, and results of another one are taken away."""
-    ledger.settle()
-    if former_source(out) not in (source, None):
+    """Keep what is held: the folder is this input's from here on; results of another one, or its anatomy, go."""
+    former = former_source(out)
+    if former not in (source, None):
         take_away_results(out)
+    elif former is not None and ledger.is_held(ANATOMY):
+        take_away_measures(out)
+    ledger.settle()
     writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve()), "sha256": source})

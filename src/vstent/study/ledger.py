@@ -9,7 +9,7 @@ from dataclasses import asdict, is_dataclass, replace
 from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from vstent.errors import ReadError
 from vstent.flow import Progress as FlowProgress
@@ -18,6 +18,8 @@ from vstent.io.images import files_of
 from vstent.study.types import Progress, Settings
 
 Noun = TypeVar("Noun")
+ANATOMY: Final = "anatomy"
+"""Name under which an anatomy is kept."""
 
 
 class Ledger:
@@ -64,6 +66,10 @@ class Ledger:
     def hold(self, name: str, key: str, noun: Any) -> None:
         """Keep a noun under a key when `settle` is called: until then something given may yet turn out unusable."""
         self._held.append((name, key, noun))
+
+    def is_held(self, name: str) -> bool:
+        """Tell whether what is called so was found anew and is not kept yet."""
+        return any(held == name for held, *_ in self._held)
 
     def settle(self) -> None:
         """Keep what is held: from here on things are written."""

@@ -1,6 +1,7 @@
 """The files of a case folder."""
 
 import shutil
+from collections.abc import Collection, Iterable
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -17,26 +18,48 @@ from vstent.io.three_mf import write_3mf
 from vstent.rank import Ranking
 from vstent.stent import Deployment
 from vstent.struts import struts
+from vstent.study.crate import NAME as CRATE
+from vstent.study.provenance import METRICS, RUN
 from vstent.vessel import Anatomy, Centerline, Vessel
 
 STENT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
 FIELD: Final = ("field.vtu", "wall.vtp")
 SACS: Final = ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp")
-RESULTS: Final = (
-    *("vessel.vtp", "centerlines.vtp", "openings.json", "landing_surface.vtp", *SACS),
-    *("morphology.json", "convergence.json", "ranking.csv", "ranking.json", "metrics.json", "run.json"),
-    *("report.html", "report.pdf", "ro-crate-metadata.json"),
+OF_STUDY: Final = (
+    *(METRICS, RUN, "report.html", "report.pdf", CRATE),
     *(f"stents/*/{name}" for name in STENT),
     *(f"flow/*/{name}" for name in FIELD),
+)
+"""What a study writes of devices and flows, and tells of them."""
+OF_ANATOMY: Final = ("morphology.json", "convergence.json")
+"""What is found of an anatomy alone."""
+RESULTS: Final = (
+    *("vessel.vtp", "centerlines.vtp", "openings.json", "landing_surface.vtp", *SACS),
+    *("ranking.csv", "ranking.json", *OF_ANATOMY, *OF_STUDY),
 )
 """All that is written into a case folder beside the cache and the folders of OpenFOAM."""
 
 
 def take_away_results(out: Path) -> None:
     """Take away the results in a case folder; what is kept in the cache, and files of the user's own, stay."""
-    for file in [file for pattern in RESULTS for file in out.glob(pattern)]:
+    _take_away(out, RESULTS, list(out.glob(f"flow/**/{KEY}")))
+
+
+def take_away_study(out: Path, kept: Collection[Path]) -> None:
+    """Take away what a study with other settings wrote, but for OpenFOAM's folders in `kept`: it goes on from them."""
+    _take_away(out, OF_STUDY, [key for key in out.glob(f"flow/*/*/{KEY}") if key.parent not in kept])
+
+
+def take_away_measures(out: Path) -> None:
+    """Take away what was found of another anatomy alone."""
+    _take_away(out, OF_ANATOMY, list(out.glob(f"flow/convergence/**/{KEY}")))
+
+
+def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None:
+    """Take away files, OpenFOAM's folders by their `keys`, and folders that are empty then."""
+    for file in [file for pattern in patterns for file in out.glob(pattern)]:
         file.unlink()
-    for key in list(out.glob(f"flow/**/{KEY}")):
+    for key in keys:
         shutil.rmtree(key.parent)
     for folder in [*out.glob("stents/*/"), *out.glob("flow/*/"), out / "stents", out / "flow"]:
         with suppress(OSError):  # it is not there, or not empty

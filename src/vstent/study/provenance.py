@@ -1,7 +1,7 @@
 """Provenance: everything that it takes to repeat a run."""
 
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -16,17 +16,17 @@ PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pyd
 INPUT: Final = "input.json"
 """File in the case folder that says where the input lies: not for handing on, for its path may name the patient."""
 METRICS: Final = "metrics.json"
+RUN: Final = "run.json"
 
 
-def provenance(path: Path, source: str, settings: Settings, seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Return versions, machine, devices, input with its hash `source`, settings, and the seconds of every stage."""
+def provenance(path: Path, source: str, settings: Settings) -> dict[str, Any]:
+    """Return versions, machine, devices, input with its hash `source`, and settings: all that a result depends on."""
     return {
         "versions": versions(),
         "machine": machine(settings),
         "devices": devices_of(settings.devices),
         "input": {"name": "DICOM folder" if path.is_dir() else path.name, "sha256": source},
         "settings": asdict(settings),
-        "seconds": seconds,
         "research_use_only": True,
     }
 

@@ -11,10 +11,12 @@ from vstent.errors import InputError, ReadError
 from vstent.io.files import existing
 from vstent.study.folder import CACHE
 from vstent.study.ledger import hash_of
-from vstent.study.provenance import INPUT, METRICS, devices_of, machine, versions
+from vstent.study.provenance import INPUT, METRICS, RUN, devices_of, machine, versions
 from vstent.study.types import Settings
 
 MISSING: Final = "absent"
+SECONDS: Final = "seconds"
+"""Key of what every stage took."""
 UNTOLD: Final = (OSError, ValueError, KeyError, TypeError)
 """What comes of a file that is missing, damaged, or of another kind."""
 TOLERANCE: Final = 1e-3
@@ -81,8 +83,16 @@ def former_source(folder: Path) -> str | None:
     with suppress(*UNTOLD):
         return str(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["sha256"])
     with suppress(*UNTOLD):
-        return str(json.loads((folder / "run.json").read_text(encoding="utf-8"))["input"]["sha256"])
+        return str(json.loads((folder / RUN).read_text(encoding="utf-8"))["input"]["sha256"])
     return None
+
+
+def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
+    """Tell whether a case folder was begun by a run other than that with the provenance `told`, or one not ended."""
+    with suppress(*UNTOLD):
+        former = json.loads((folder / RUN).read_text(encoding="utf-8"))
+        return {key: former[key] for key in former if key != SECONDS} != json.loads(json.dumps(told))
+    return former_source(folder) is not None
 
 
 def _settings(told: Mapping[str, Any]) -> Settings:

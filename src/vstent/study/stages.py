@@ -25,7 +25,7 @@ from vstent.restore import restore
 from vstent.segment import segment
 from vstent.stent import Deployment, Landing
 from vstent.study.checkpoint import FlowCheckpoint
-from vstent.study.ledger import Ledger, anatomy_key, key_of, vessel_key
+from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of, vessel_key
 from vstent.study.outputs import write_field
 from vstent.study.types import Placing, Point, Settings
 from vstent.trace import trace
@@ -44,7 +44,7 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
     What is found is held by the ledger: its `settle` keeps it.
     """
     key = anatomy_key(source, settings)
-    kept = ledger.recall("anatomy", key, Anatomy)
+    kept = ledger.recall(ANATOMY, key, Anatomy)
     if kept is not None:
         return kept
     whole = find_vessel(path, source, settings, ledger)
@@ -59,7 +59,7 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
     with ledger.stage("restore") as tell:
         anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
         tell(" ".join([*anatomy.notes, *(f"Sac of {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
-    ledger.hold("anatomy", key, anatomy)
+    ledger.hold(ANATOMY, key, anatomy)
     return anatomy
 
 
@@ -139,6 +139,13 @@ def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
         )
 
 
+def engine_folders(out: Path, settings: Settings) -> dict[str, Path]:
+    """Return where an engine keeps files of its own of every flow, by name; none where no flow is computed."""
+    if settings.flow is None:
+        return {}
+    return {name: out / "flow" / name / settings.flow.engine for name in (BARE, *settings.devices)}
+
+
 def compute_flows(
     out: Path,
     anatomy: Anatomy,
@@ -151,6 +158,7 @@ def compute_flows(
     if settings.flow is None:
         return {}
     fields: dict[str, FlowField] = {}
+    folders = engine_folders(out, settings)
     for name in (BARE, *deployments):
         stent = None if name == BARE else deployments[name].stent
         placed = (stent.design, settings.placing(name)) if stent else ()
@@ -163,7 +171,7 @@ def compute_flows(
                 field = simulate_case(
                     flow_case(anatomy, stent, settings.flow),
                     start=fields.get(BARE),
-                    folder=out / "flow" / name / settings.flow.engine,
+                    folder=folders[name],
                     progress=ledger.teller(stage),
                     checkpoint=FlowCheckpoint(ledger.folder, stage, key),
                 )
