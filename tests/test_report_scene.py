@@ -3,14 +3,16 @@
 import base64
 import itertools
 import zlib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import report_case
+from vstent.report.figures import pictures
 from vstent.report.packing import pack
-from vstent.report.scene import LineLayer, round_up, scene_of
+from vstent.report.scene import LineLayer, flow_layers, round_up, scales_of, scene_of
 from vstent.report.thinning import thin_frames, thin_lines, thin_surface
 
 
@@ -57,7 +59,41 @@ def test_one_scale_serves_every_pane():
     assert sorted(scale.id for scale in scene.scales) == ["coverage", "shear", "speed", "wall_gap"]
     shear = [layer for layer in scene.layers if layer.id == "shear"]
     assert [layer.pane for layer in shear] == ["bare", "silk", "enterprise"]
-    assert scene.scale("shear").high == round_up(max(np.percentile(layer.values, 98) for layer in shear))
+
+
+def shear_scale(fields, anatomy):
+    layers = [layer for pane, field in fields.items() for layer in flow_layers(pane, field, anatomy)]
+    return next(scale for scale in scales_of(layers, anatomy) if scale.id == "shear")
+
+
+def throated(strength, throat_Pa):
+    """A flow whose artery has a throat of `throat_Pa` where it is 4 mm and more from the sac."""
+    field = report_case.field(strength)
+    (sac,) = report_case.anatomy().aneurysms
+    is_far = sac.sac.closest(field.wall.vertices_mm)[1] > 4.0
+    stress_Pa = np.where(is_far[:, None], throat_Pa * np.eye(3)[0], field.wall_shear_stress_Pa)
+    return replace(field, wall_shear_stress_Pa=stress_Pa)
+
+
+def test_scales_of_the_flow_are_as_wide_as_what_is_about_the_sac_before():
+    case, tiny = report_case.case(), 1e-3
+    near = case.anatomy.aneurysms[0].sac.closest(case.fields["bare"].wall.vertices_mm)[1] < 1.0
+    wanted = round_up(np.percentile(case.fields["bare"].shear_Pa[near], 98))
+    assert shear_scale(case.fields, case.anatomy).high == pytest.approx(wanted)
+    # Neither a throat elsewhere nor what a device does takes the scale from the sac.
+    throats = {"bare": throated(1.0, 60.0), "silk": throated(0.01, 90.0)}
+    assert shear_scale(throats, case.anatomy).high == pytest.approx(wanted)
+    slow = {"bare": replace(throats["bare"], wall_shear_stress_Pa=tiny * throats["bare"].wall_shear_stress_Pa)}
+    assert shear_scale(slow, case.anatomy).high == pytest.approx(tiny * wanted)
+    # Without a sac it is all about the whole wall.
+    assert shear_scale(throats, replace(case.anatomy, aneurysms=())).high == round_up(90.0)
+
+
+def test_pictures_of_the_flow_say_what_is_done_with_what_is_above_their_scale():
+    words = {picture.id: picture.caption for picture in pictures(report_case.scene())}
+    assert all(
+        "What is above the scale is drawn in its last colour." in words[name] for name in ("streamlines", "shear")
+    )
 
 
 @pytest.mark.parametrize(("value", "expected"), [(0.97, 1), (1.0, 1), (1.2, 1.5), (0.041, 0.05), (7.1, 8), (83, 100)])

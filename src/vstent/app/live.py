@@ -1,8 +1,7 @@
 """Live: what a hand on the page asks is answered here, at once, from what the case has found so far."""
 
 import threading
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Hashable
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
@@ -29,14 +28,12 @@ from vstent.report.packing import message
 from vstent.report.scene import (
     LineLayer,
     MeshLayer,
-    Scale,
     View,
     anatomy_layers,
     device_layers,
     device_title,
     flow_layers,
     node_coverage,
-    round_up,
     scales_of,
     view_of,
     views_of,
@@ -57,8 +54,6 @@ KEPT: Final = 40
 """Results remembered per case."""
 SECTION_REACH_MM: Final = 9.0
 """A section shows what is this near to the axis."""
-BESIDE_SAC_MM: Final = 1.0
-"""What is this near to the sac says how wide the scales of the flow are."""
 BESIDE_MM: Final = 8.0
 """The profile shows so much of the artery beside the neck."""
 NEIGHBOURS: Final = 3
@@ -200,7 +195,7 @@ class Live:
         with LOCK:
             found = self.sketch(choice, landing)
             wires = _wires(choice.name, found.stent, found.gap_mm, colour, lambda: _formula_coverage(found.stent))
-            return message([wires], scales_of([wires]), **_place(found, found.stent))
+            return message([wires], scales_of([wires], self.anatomy), **_place(found, found.stent))
 
     def deployment_message(self, choice: DeviceChoice, colour: Colour) -> bytes:
         """Return a deployed device with its expansion and its numbers."""
@@ -217,7 +212,7 @@ class Live:
             measures = self.remembered(("measures", *key), lambda: measure(self.anatomy, deployment))
             return message(
                 layers,
-                scales_of(layers),
+                scales_of(layers, self.anatomy),
                 **_place(found, stent),
                 title=device_title(deployment),
                 advice=deployment.advice,
@@ -234,9 +229,7 @@ class Live:
             bare = self._field(next(iter(paths.values())), None)
             most = _peak(bare)
             of_scales = layers if moment is None or most is None else self._flow_layers(BARE, paths[BARE], most)
-            return message(
-                layers, _scales_about_the_sac(of_scales, self.anatomy), **_moments(bare, moment), panes=list(paths)
-            )
+            return message(layers, scales_of(of_scales, self.anatomy), **_moments(bare, moment), panes=list(paths))
 
     def section(self, name: str | None, abscissa_mm: float) -> dict[str, Any]:
         """Return what a plane across the parent axis cuts: curves in the plane and diameters."""
@@ -267,22 +260,6 @@ def _views(anatomy: Anatomy) -> list[View]:
     treated = np.concatenate([axis.points_mm[is_near], *sacs])
     whole = view_of("whole", profile.axes, anatomy.vessel.lumen.vertices_mm)
     return [view_of("profile", profile.axes, treated, 1.15), whole, *others]
-
-
-def _scales_about_the_sac(layers: Sequence[MeshLayer | LineLayer], anatomy: Anatomy) -> list[Scale]:
-    """The scales of the layers, as wide as what the flow without a device has about the sac, which it is all about."""
-    scales = list(scales_of(list(layers)))
-    if not anatomy.aneurysms:
-        return scales
-    tree = cKDTree(anatomy.aneurysms[0].sac.vertices_mm)
-    found = []
-    for scale in scales:
-        layer = next(layer for layer in layers if layer.scale == scale.id)
-        points_mm = layer.points_mm if isinstance(layer, LineLayer) else layer.surface.vertices_mm
-        near = layer.values[tree.query(points_mm, distance_upper_bound=BESIDE_SAC_MM)[0] < BESIDE_SAC_MM]
-        high = round_up(float(np.percentile(near, 98))) if len(near) and near.max() > 0 else scale.high
-        found.append(replace(scale, high=high))
-    return found
 
 
 def _axis(anatomy: Anatomy) -> dict[str, list[float]]:

@@ -19,6 +19,7 @@ _INK = "#16262e"
 _QUIET = "#54666f"
 _LIGHT = np.array([-0.35, 0.50, 0.79])
 _SUPERSAMPLING = 2
+ABOVE = "What is above the scale is drawn in its last colour."
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,13 +176,13 @@ def _wires(scene: Scene) -> Picture:
 def _streamlines(scene: Scene) -> Picture:
     ids = ("lumen", "streamlines", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes]
-    caption = "Streamlines through artery and sac, coloured by speed on one scale."
+    caption = f"Streamlines through artery and sac, coloured by speed on one scale. {ABOVE}"
     return Picture("streamlines", "Blood flow before and after", caption, sheet(scene, shots, "speed"))
 
 
 def _shear(scene: Scene) -> Picture:
     shots = [Shot(title, scene.pick(("shear", "neck"), pane), scene.view("profile")) for pane, title in scene.panes]
-    caption = "Wall shear stress on the lumen, on one scale."
+    caption = f"Wall shear stress on the lumen, on one scale. {ABOVE}"
     return Picture("shear", "Wall shear stress before and after", caption, sheet(scene, shots, "shear"))
 
 

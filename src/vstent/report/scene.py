@@ -1,9 +1,11 @@
 """A case as things to look at: layers with colours, scales and views, for the viewer and for the pictures alike."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from vstent.flow.streamlines import inlet_seeds_mm, neck_seeds_mm, streamlines
 from vstent.flow.types import FlowField
@@ -16,6 +18,8 @@ from vstent.vessel import Anatomy
 
 N_INLET, N_NECK = 70, 60
 """Streamlines through the inlet and through the neck."""
+BESIDE_SAC_MM = 1.0
+"""What is this near to the sac says how wide the scales of the flow are."""
 
 if TYPE_CHECKING:
     from vstent.study import CaseResult
@@ -154,7 +158,7 @@ def scene_of(case: "CaseResult") -> Scene:
     return Scene(
         panes=((BARE, "Before (no device)"), *devices),
         layers=tuple(layers),
-        scales=scales_of(layers),
+        scales=scales_of(layers, anatomy),
         views=views_of(anatomy, case.deployments),
         fade_mm=1.2 * float(np.median(anatomy.section_radius_mm)),
     )
@@ -277,17 +281,32 @@ _SCALES = {
     "diameter": ("Deployed diameter", "mm", "viridis", 1.0),
 }
 """Name -> title, unit, colour map and the smallest range worth a scale."""
+_OF_FLOW = ("speed", "shear")
 
 
-def scales_of(layers: list[MeshLayer | LineLayer]) -> tuple[Scale, ...]:
-    """Return the scales that the layers use, each wide enough for all of them."""
+def scales_of(layers: Sequence[MeshLayer | LineLayer], anatomy: Anatomy) -> tuple[Scale, ...]:
+    """Return the scales that the layers use, each wide enough for all of them.
+
+    Those of the flow are as wide as what it has about the sac without a device, which is its first layer.
+    """
     scales = []
     for name, (title, unit, colour_map, least) in _SCALES.items():
-        values = [layer.values for layer in layers if layer.scale == name and len(layer.values)]
-        if values:
-            high = round_up(max(least, *(float(np.percentile(value, 98)) for value in values)))
-            scales.append(Scale(name, title, unit, 0.0, high, _colours(colour_map)))
+        used = [layer for layer in layers if layer.scale == name and len(layer.values)]
+        if used:
+            near = _about_the_sac(used[0], anatomy) if name in _OF_FLOW else np.zeros(0)
+            highs = [least, *(float(np.percentile(layer.values, 98)) for layer in used)]
+            high = float(np.percentile(near, 98)) if near.any() else max(highs)
+            scales.append(Scale(name, title, unit, 0.0, round_up(high), _colours(colour_map)))
     return tuple(scales)
+
+
+def _about_the_sac(layer: MeshLayer | LineLayer, anatomy: Anatomy) -> Floats:
+    """Values (k,) of a layer's points near the wall of the first sac; none without one."""
+    if not anatomy.aneurysms:
+        return np.zeros(0)
+    points_mm = layer.points_mm if isinstance(layer, LineLayer) else layer.surface.vertices_mm
+    tree = cKDTree(anatomy.aneurysms[0].sac.vertices_mm)
+    return layer.values[tree.query(points_mm, distance_upper_bound=BESIDE_SAC_MM)[0] < BESIDE_SAC_MM]
 
 
 def round_up(value: float) -> float:
