@@ -110,6 +110,24 @@ def test_quotients_of_a_pulse_are_of_its_means() -> None:
     assert found["inflow_concentration_index"] == pytest.approx(of_steady["inflow_concentration_index"], rel=1e-3)
 
 
+def test_the_largest_of_a_pulse_is_that_of_its_moments_and_the_rest_its_mean() -> None:
+    """Velocity and stress rise and fall with the inflow, which is 1.9 times its mean at most."""
+    steady, shares = flow(through_neck(0.1, 0.0)), np.array([1.9, 1.0, 0.1])
+    still_Pa, stress_Pa = np.zeros(len(steady.cells)), steady.wall_shear_stress_Pa
+    phases = tuple(
+        Phase(k, share * 10.0, np.array([share * 10.0]), through_neck(share * 0.1, 0.0), still_Pa, share * stress_Pa)
+        for k, share in enumerate(shares)
+    )
+    pulse, of_steady = (
+        indices(one, sac(), plate(NECK_HALF_MM, 0.2)) for one in (replace(steady, phases=phases), steady)
+    )
+    for key in ("max_sac_velocity_m_s", "max_sac_wss_Pa"):
+        assert pulse[key] == pytest.approx(1.9 * of_steady[key], rel=1e-6)
+    for key in ("mean_sac_velocity_m_s", "mean_sac_wss_Pa", "parent_wss_Pa", "neck_inflow_mL_s"):
+        assert pulse[key] == pytest.approx(shares.mean() * of_steady[key], rel=1e-6)
+    assert pulse["sac_kinetic_energy_J"] == pytest.approx((shares**2).mean() * of_steady["sac_kinetic_energy_J"])
+
+
 def test_of_a_flow_that_moves_sizes_are_meant_not_the_size_of_the_mean() -> None:
     """Its mean goes into the sac at 0.02 m/s; what goes to and fro besides is told by its swing."""
     still = flow(through_neck(0.02, 0.0))

@@ -4,17 +4,21 @@ import base64
 import hashlib
 import math
 import re
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import report_case
+from vstent.flow.types import Phase
 from vstent.report import report
-from vstent.report.definitions import DEFINITIONS, HEADLINES
+from vstent.report.definitions import DEFINITIONS, HEADLINES, OF_PULSE
+from vstent.report.page import as_html, contents_of
 from vstent.report.quantities import compare, flatten, format_change, format_number, format_value, split_unit
 
 
@@ -151,6 +155,17 @@ def test_without_flow_and_devices_the_report_says_so_and_keeps_the_rest():
     assert "No blood flow was computed" in page.text
     assert "Sac volume" in page.text
     assert "Research use only" in page.text
+
+
+def test_of_a_pulse_it_is_said_which_numbers_are_means(page):
+    assert OF_PULSE not in page.text.partition("In three dimensions")[0]
+    assert OF_PULSE in page.text.partition("Definitions")[2]
+    pulse = replace(report_case.contents(), is_pulse=True)
+    assert OF_PULSE in Page(as_html(pulse)).text.partition("In three dimensions")[0]
+    assert contents_of(bare_case()).is_pulse is False
+    flow = report_case.field(1.0)
+    moment = Phase(0.0, 3.4, np.array([3.4]), flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa)
+    assert contents_of(bare_case(fields={"bare": replace(flow, phases=(moment,))})).is_pulse is True
 
 
 def test_provenance_is_whole(page):

@@ -9,6 +9,7 @@ import pytest
 
 import report_case
 from vstent.report import write_report
+from vstent.report.definitions import OF_PULSE
 from vstent.report.method import _bead_layer, _expansion, _unit_sphere
 from vstent.report.pdf import WIDTH, _Paper, _wrapped, as_pdf
 from vstent.report.scene import scene_of
@@ -51,6 +52,7 @@ def test_pages_are_a4_and_the_same_report_is_the_same_file(told, printed):
 def test_every_number_and_its_definition_stand_in_the_pdf(told, printed):
     text = " ".join(printed[1].split())
     assert "Research use only" in text
+    assert OF_PULSE in text.partition("Definitions")[2]
     for quantity in (*told.vessel, *(q for stent in told.stents for q in stent["quantities"])):
         assert quantity.name in text, quantity
         assert " ".join(quantity.text.split()) in text, quantity

@@ -44,8 +44,9 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
       tenth of the parent's mean;
     - ``inflow_concentration_index`` = (inflow / inlet flow) / inflow area fraction (Cebral et al. 2011, AJNR 32, 145).
 
-    Of a pulsatile flow, the means over its cycle, and quotients of these; wall shear stress is then its magnitude's
-    time average (TAWSS), and ``mean_sac_oscillatory_shear_fraction`` (OSI) is given besides. Of a steady flow that
+    Of a pulsatile flow, the means over its cycle, and quotients of these, but the largest of all its moments where one
+    is called ``max``; wall shear stress is then its magnitude's time average (TAWSS), and
+    ``mean_sac_oscillatory_shear_fraction`` (OSI) is given besides. Of a steady flow that
     moves, the means of speed, stress and neck inflow too, not those of the mean flow, in which what goes to and fro
     cancels; only where blood enters is told from the mean flow.
     """
@@ -54,9 +55,14 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
         # One moment at a time: each unpacks a whole field.
         moments = (field.at_phase(phase) for phase in field.phases) if field.phases else (field,)
         of_moments = [_of_ostium(now, ostium) | _of_sac(now, sac) for now in moments]
-        result |= {key: float(np.mean([one[key] for one in of_moments])) for key in of_moments[0]}
+        result |= {key: _over_cycle(key, [one[key] for one in of_moments]) for key in of_moments[0]}
         result |= _quotients(result, sac) | _of_sac_wall(field, sac, ostium)
     return result
+
+
+def _over_cycle(key: str, of_moments: list[float]) -> float:
+    """What a cycle is told by: the largest of its moments where that is asked for, else their mean."""
+    return max(of_moments) if key.startswith("max_") else float(np.mean(of_moments))
 
 
 def compare(bare: dict[str, float], stented: dict[str, float]) -> dict[str, float]:
@@ -119,12 +125,13 @@ def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, f
     is_sac = on_sac(field.wall, sac, 0.2 * field.cell_size_mm)
     is_near = ostium.closest(field.wall.vertices_mm)[1] < NEAR_MM
     parent_Pa = _mean(stress_Pa, area_mm2, is_near & ~is_sac)
+    moments_Pa = [np.linalg.norm(phase.wall_shear_stress_Pa[is_sac], axis=1) for phase in field.phases]
     pulse = {}
     if field.phases:
         pulse["mean_sac_oscillatory_shear_fraction"] = _mean(field.oscillatory_shear_index, area_mm2, is_sac)
     return pulse | {
         "mean_sac_wss_Pa": _mean(stress_Pa, area_mm2, is_sac),
-        "max_sac_wss_Pa": float(stress_Pa[is_sac].max()),
+        "max_sac_wss_Pa": float(max(one_Pa.max() for one_Pa in moments_Pa or [stress_Pa[is_sac]])),
         "parent_wss_Pa": parent_Pa,
         "low_shear_area_fraction": _mean(stress_Pa < LOW_SHEAR_PA, area_mm2, is_sac),
         "relative_low_shear_area_fraction": _mean(stress_Pa < LOW_SHEAR_SHARE * parent_Pa, area_mm2, is_sac),

@@ -160,7 +160,8 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "Wall shear stress on the sac, mean", "Area mean over the sac's wall of the magnitude of the wall shear stress."
     ),
     "max_sac_wss_Pa": Definition(
-        "Wall shear stress on the sac, largest", "Largest magnitude of the wall shear stress on the sac's wall."
+        "Wall shear stress on the sac, largest",
+        "Largest magnitude of the wall shear stress on the sac's wall; of a pulse in any of its moments.",
     ),
     "parent_wss_Pa": Definition(
         "Wall shear stress on the parent artery, mean", "Area mean of its magnitude over the parent artery's own wall."
@@ -170,7 +171,9 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     ),
     "mean_sac_pressure_Pa": Definition("Sac pressure, mean", "Mean over the sac's volume, above that of the outlets."),
     "fast_sac_volume_mm3": Definition("Fast sac volume", "Volume of the sac with a speed above 8 cm/s."),
-    "max_sac_velocity_m_s": Definition("Largest sac velocity", "Largest magnitude of the velocity in the sac."),
+    "max_sac_velocity_m_s": Definition(
+        "Largest sac velocity", "Largest magnitude of the velocity in the sac; of a pulse in any of its moments."
+    ),
     "neck_outflow_mL_s": Definition("Neck outflow", "Integral over the neck of the velocity where it leaves the sac."),
     "sac_kinetic_energy_J": Definition("Kinetic energy of the sac", "Integral over the sac of density u² / 2."),
     "inflow_area_fraction": Definition("Inflow area", "Part of the neck where blood enters the sac."),
@@ -193,6 +196,12 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "pulse, what its last two cycles differ by.",
     ),
 }
+
+OF_PULSE: Final = (
+    "Of a pulse every number of the flow is the mean over its last cycle, unless it is called largest; wall shear "
+    "stress is the time average of its magnitude (TAWSS)."
+)
+"""What holds for all numbers of the flow."""
 
 HEADLINES: Final = (
     "neck_inflow_mL_s",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from markupsafe import Markup
 
-from vstent.report.definitions import HEADLINES, Definition
+from vstent.report.definitions import HEADLINES, OF_PULSE, Definition
 from vstent.report.figures import Picture, pictures
 from vstent.report.method import method_pictures
 from vstent.report.packing import pack
@@ -58,6 +58,8 @@ class Contents:
     """Numbers before and after."""
     stents: list[dict[str, Any]]
     """Every device: title, words, advice, quantities, facts."""
+    is_pulse: bool
+    """Whether the flow is one."""
     notes: tuple[str, ...]
     """What was found, guessed or repaired."""
     provenance: list[tuple[str, list[tuple[str, str]]]]
@@ -102,6 +104,7 @@ def contents_of(case: "CaseResult") -> Contents:
         pictures=(before, *method_pictures(case, scene), *after),
         changes=compare(metrics),
         stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
+        is_pulse=any(field.phases for field in case.fields.values()),
         notes=tuple(case.notes),
         provenance=_provenance(case.provenance),
     )
@@ -127,6 +130,8 @@ def as_html(told: Contents) -> str:
         vessel=told.vessel,
         stents=told.stents,
         flow=told.changes,
+        of_pulse=OF_PULSE,
+        is_pulse=told.is_pulse,
         flow_only=_flow_only(told.metrics, told.changes, dict(told.devices)),
         uncertainty=told.uncertainty,
         other=_other(told.metrics),

@@ -5,6 +5,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+from vstent.report.definitions import OF_PULSE
 from vstent.report.page import LIMITS, Contents, contents_of
 from vstent.report.quantities import Change, Quantity, format_change
 
@@ -180,6 +181,8 @@ def _summary(paper: _Paper, told: Contents) -> None:
     if told.headlines:
         paper.heading("Before and after")
         _changes(paper, told, told.headlines)
+        if told.is_pulse:
+            paper.text(OF_PULSE)
     else:
         paper.text("No blood flow was computed for this case.")
 
@@ -232,6 +235,8 @@ def _words(paper: _Paper, told: Contents) -> None:
     for note in (*told.notes, *LIMITS):
         paper.text(f"• {note}")
     paper.heading("Definitions")
+    if told.changes:
+        paper.text(OF_PULSE, 8)
     for definition, unit in told.definitions:
         source = f" ({definition.source})" if definition.source else ""
         paper.text(f"{definition.name}{f' [{unit}]' if unit else ''}: {definition.meaning}{source}", 8)
