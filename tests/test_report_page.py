@@ -4,7 +4,7 @@ import base64
 import hashlib
 import math
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html import unescape
 from html.parser import HTMLParser
 from importlib.resources import files
@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import report_case
-from vstent.flow.types import Phase
+from vstent.flow import Blood, FlowSettings
+from vstent.flow.types import CarreauYasuda, Phase
 from vstent.report import report
 from vstent.report.definitions import DEFINITIONS, HEADLINES, OF_PULSE
 from vstent.report.page import as_html, contents_of
@@ -166,6 +167,33 @@ def test_of_a_pulse_it_is_said_which_numbers_are_means(page):
     flow = report_case.field(1.0)
     moment = Phase(0.0, 3.4, np.array([3.4]), flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa)
     assert contents_of(bare_case(fields={"bare": replace(flow, phases=(moment,))})).is_pulse is True
+
+
+@pytest.mark.parametrize(
+    ("settings", "told", "untold"),
+    [
+        (
+            FlowSettings(),
+            ("Blood is Newtonian", "pressure at the outlets was set", "thin resistance"),
+            ("thins", "cube"),
+        ),
+        (
+            FlowSettings(blood=Blood(thinning=CarreauYasuda()), outlets="murray", engine="openfoam"),
+            ("Blood thins", "by the cube of their radius", "struts over the neck"),
+            ("Newtonian", "pressure at the outlets", "thin resistance"),
+        ),
+        (FlowSettings(engine="my_engine"), ("Blood is Newtonian",), ("a device is",)),
+        (None, (), ("Blood", "outlets", "a device is")),
+    ],
+)
+def test_limits_are_those_of_the_flow_that_was_computed(settings, told, untold):
+    flow = None if settings is None else asdict(settings)
+    limits = contents_of(bare_case(provenance={"settings": {"flow": flow}})).limits
+    words = " ".join(limits)
+    assert all(one in words for one in told)
+    assert not any(one in words for one in untold)
+    assert "does not give way" in limits[0]
+    assert "Research use only" in limits[-1]
 
 
 def test_provenance_is_whole(page):

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import PurePath
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from markupsafe import Markup
 
+from vstent.flow.types import LATTICE, OPENFOAM
 from vstent.report.definitions import HEADLINES, OF_PULSE, Definition
 from vstent.report.figures import Picture, pictures
 from vstent.report.method import method_pictures
@@ -24,13 +26,21 @@ if TYPE_CHECKING:
     from vstent.study import CaseResult
 
 WEBP_QUALITY: Final = 90
-LIMITS = (
+OF_CONTOUR: Final = (
     "The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way: "
-    "how an artery and a device push each other is not computed.",
-    "Blood is Newtonian and the wall rigid; the pressure at the outlets was set, not measured in a patient.",
-    "In the flow a device is a thin resistance computed from its wires, unless the settings say otherwise.",
-    "Research use only. Nothing here has been cleared for diagnosis or treatment.",
+    "how an artery and a device push each other is not computed."
 )
+OF_USE: Final = "Research use only. Nothing here has been cleared for diagnosis or treatment."
+AT_OUTLETS: Final = {
+    "zero_pressure": "the pressure at the outlets was set, not measured in a patient",
+    "murray": "the flow was split among the outlets by the cube of their radius, not measured in a patient",
+}
+"""Setting of the outlets -> what it leaves out."""
+OF_DEVICE: Final = {
+    LATTICE: "In the flow a device is a thin resistance computed from its wires.",
+    OPENFOAM: "In the flow a device is its struts over the neck, meshed.",
+}
+"""Engine -> what it makes of a device."""
 
 
 def report(case: "CaseResult") -> str:
@@ -62,6 +72,8 @@ class Contents:
     """Whether the flow is one."""
     notes: tuple[str, ...]
     """What was found, guessed or repaired."""
+    limits: tuple[str, ...]
+    """What is left out."""
     provenance: list[tuple[str, list[tuple[str, str]]]]
     """Groups of lines: how this was made."""
 
@@ -106,8 +118,22 @@ def contents_of(case: "CaseResult") -> Contents:
         stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
         is_pulse=any(field.phases for field in case.fields.values()),
         notes=tuple(case.notes),
+        limits=limits_of(case.provenance),
         provenance=_provenance(case.provenance),
     )
+
+
+def limits_of(provenance: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what a result leaves out, a sentence each: of a flow, where there is one, by its own settings."""
+    flow = provenance.get("settings", {}).get("flow")
+    return (OF_CONTOUR, *([] if flow is None else _limits_of_flow(flow)), OF_USE)
+
+
+def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
+    thins = flow["blood"]["thinning"] is not None
+    blood = "Blood thins with the shear rate by a law fitted to others' blood" if thins else "Blood is Newtonian"
+    told = [f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
+    return [*told, OF_DEVICE[flow["engine"]]] if flow["engine"] in OF_DEVICE else told
 
 
 def as_html(told: Contents) -> str:
@@ -136,7 +162,7 @@ def as_html(told: Contents) -> str:
         uncertainty=told.uncertainty,
         other=_other(told.metrics),
         notes=told.notes,
-        limits=LIMITS,
+        limits=told.limits,
         definitions=told.definitions,
         provenance=told.provenance,
         manifest=manifest,

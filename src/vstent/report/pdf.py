@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from vstent.report.definitions import OF_PULSE
-from vstent.report.page import LIMITS, Contents, contents_of
+from vstent.report.page import Contents, contents_of
 from vstent.report.quantities import Change, Quantity, format_change
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ def _uncertainty(paper: _Paper, told: Contents) -> None:
 
 def _words(paper: _Paper, told: Contents) -> None:
     paper.heading("Notes and limits")
-    for note in (*told.notes, *LIMITS):
+    for note in (*told.notes, *told.limits):
         paper.text(f"• {note}")
     paper.heading("Definitions")
     if told.changes:
