@@ -213,8 +213,14 @@ def test_stopped_with_other_settings_a_folder_holds_nothing_of_the_former_beside
     run(arteries[0], out, slow, lambda *_: None)
     (out / "report.html").write_text("of the slow flow")
     whole = shown(out)
+    first = json.loads((out / "run.json").read_text())["seconds"]
     run(arteries[0], out, slow, lambda *_: None)  # the same again: everything stays
     assert shown(out) == whole
+    again = json.loads((out / "run.json").read_text())["seconds"]
+    anew = {stage for stage in first if stage.partition(" ")[0] in ("deploy", "struts", "measure")}
+    assert {"segment", "trace", "trim", "restore", "plan flow", "flow bare", "flow silk"} == set(first) - anew
+    assert set(again) == set(first)
+    assert {stage for stage in first if again[stage] != first[stage]} == anew
 
     stops["of"] = 3.0
     with pytest.raises(KeyboardInterrupt):

@@ -4,7 +4,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass, replace
 from importlib.metadata import version
 from math import isfinite
@@ -15,6 +15,7 @@ from vstent.errors import ReadError
 from vstent.flow import Progress as FlowProgress
 from vstent.io.archive import load_noun, save_noun
 from vstent.io.images import files_of
+from vstent.io.writers import write_json
 from vstent.study.types import Progress, Settings
 
 Noun = TypeVar("Noun")
@@ -28,7 +29,8 @@ class Ledger:
     def __init__(self, folder: Path, progress: Progress) -> None:
         self.folder, self.progress = folder, progress
         self.seconds: dict[str, float] = {}
-        self._held: list[tuple[str, str, Any]] = []
+        self._held: list[tuple[str, str, Any, dict[str, float]]] = []
+        self._before: dict[str, set[str]] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Callable[[str], None]]:
@@ -51,21 +53,23 @@ class Ledger:
         return tell
 
     def recall(self, name: str, key: str, noun_type: type[Noun]) -> Noun | None:
-        """Return what was kept under this key; None where it is missing or damaged."""
+        """Return what was kept under this key, with the seconds it took then; None where it is missing or damaged."""
         path = self.folder / f"{name}-{key}.npz"
+        self._before[name] = set(self.seconds)
         if not path.exists():
             return None
+        self.progress(name, 0.0, "")
         try:
-            with self.stage(name) as tell:
-                noun = load_noun(path, noun_type)
-                tell("already done")
+            noun = load_noun(path, noun_type)
         except ReadError:
             return None
+        self.seconds |= _seconds_of(path)
+        self.progress(name, 1.0, "already done")
         return noun
 
     def hold(self, name: str, key: str, noun: Any) -> None:
         """Keep a noun under a key when `settle` is called: until then something given may yet turn out unusable."""
-        self._held.append((name, key, noun))
+        self._held.append((name, key, noun, self._seconds_since(name)))
 
     def is_held(self, name: str) -> bool:
         """Tell whether what is called so was found anew and is not kept yet."""
@@ -73,20 +77,35 @@ class Ledger:
 
     def settle(self) -> None:
         """Keep what is held: from here on things are written."""
-        for name, key, noun in self._held:
-            self.keep(name, key, noun)
+        for held in self._held:
+            self._write(*held)
         self._held.clear()
 
     def keep(self, name: str, key: str, noun: Any) -> None:
         """Keep a noun under a key; what was kept under the same name before is dropped."""
+        self._write(name, key, noun, self._seconds_since(name))
+
+    def _seconds_since(self, name: str) -> dict[str, float]:
+        """Seconds of every stage since a noun was asked for: of those that it took."""
+        return {stage: took for stage, took in self.seconds.items() if stage not in self._before.get(name, ())}
+
+    def _write(self, name: str, key: str, noun: Any, seconds: dict[str, float]) -> None:
         path = self.folder / f"{name}-{key}.npz"
         if path.exists():
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        stale = list(self.folder.glob(f"{name}-*.npz"))
+        stale = list(self.folder.glob(f"{name}-*"))
+        write_json(path.with_suffix(".json"), seconds, is_exact=True)
         save_noun(path, noun)
         for old in stale:
             old.unlink()
+
+
+def _seconds_of(path: Path) -> dict[str, float]:
+    """Seconds of every stage that something kept took; none where it does not say."""
+    with suppress(OSError, ValueError):
+        return dict(json.loads(path.with_suffix(".json").read_text(encoding="utf-8")))
+    return {}
 
 
 def refuse_missing(path: Path) -> None:
