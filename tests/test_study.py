@@ -235,6 +235,21 @@ def test_stopped_with_other_settings_a_folder_holds_nothing_of_the_former_beside
     assert json.loads((out / "run.json").read_text())["settings"]["flow"]["inflow_mL_s"] == 3.0
 
 
+def test_what_is_kept_damaged_is_found_anew_and_replaced(arteries: tuple[Path, Path], tmp_path: Path) -> None:
+    told: list[str] = []
+
+    def stages_told() -> set[str]:
+        told.clear()
+        restore_vessel(arteries[0], tmp_path, Settings(units="mm"), lambda stage, *_: told.append(stage))
+        return set(told)
+
+    assert stages_told() == {"segment", "trace", "trim", "restore"}
+    (kept,) = (tmp_path / ".vstent").glob("anatomy-*.npz")
+    kept.write_bytes(kept.read_bytes()[:100])
+    assert stages_told() == {"anatomy", "vessel", "trim", "restore"}
+    assert stages_told() == {"anatomy"}
+
+
 def test_a_crate_does_not_outlive_what_it_describes(arteries: tuple[Path, Path], tmp_path: Path) -> None:
     settings = Settings(devices=("silk",), units="mm", flow=None)
     case = run(arteries[0], tmp_path, settings, lambda *_: None)

@@ -91,11 +91,10 @@ class Ledger:
 
     def _write(self, name: str, key: str, noun: Any, seconds: dict[str, float]) -> None:
         path = self.folder / f"{name}-{key}.npz"
-        if path.exists():
-            return
         self.folder.mkdir(parents=True, exist_ok=True)
-        stale = list(self.folder.glob(f"{name}-*"))
-        write_json(path.with_suffix(".json"), seconds, is_exact=True)
+        told = path.with_suffix(".json")
+        stale = set(self.folder.glob(f"{name}-*")) - {path, told}
+        write_json(told, seconds, is_exact=True)
         save_noun(path, noun)
         for old in stale:
             old.unlink()
