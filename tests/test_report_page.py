@@ -215,6 +215,8 @@ def test_provenance_is_whole(page):
         ("sac_volume_mm3", 1520.4, "1520 mm³"),
         ("max_outside_mm", 0.0, "0 mm"),
         ("max_outside_mm", 1.2e-6, "1.20e-06 mm"),
+        ("malapposition_volume_mm3", 1.08e-13, "0 mm³"),
+        ("sac_kinetic_energy_J", 4.16e-5, "41.6 µJ"),
         ("outlets_mL_s", [1.5, 2.25], "1.50 mL/s, 2.25 mL/s"),
         ("sac_mean_wss_Pa", math.nan, "–"),
         ("seed_mm", None, "–"),
@@ -259,6 +261,43 @@ def test_only_what_was_measured_on_both_sides_is_compared():
         }
     )
     assert [(row.before.key, row.after["x"].value) for row in rows] == [("b_mm", 1.0)]
+
+
+def test_how_sure_a_flow_is_is_no_change_but_told():
+    flow = {"mean_sac_velocity_m_s": 1.0, "unsettled_fraction": 0.0279}
+    metrics = {"bare": flow, "stents": {"silk": {"flow": flow | {"unsettled_fraction": 0.00762}}}}
+    assert [row.before.key for row in compare(metrics)] == ["mean_sac_velocity_m_s"]
+    html = as_html(replace(report_case.contents(), metrics=metrics, changes=compare(metrics)))
+    text = Page(html).text.replace("\u202f", " ")
+    assert "Left to settle 2.79 %" in text
+    assert "Left to settle 0.762 %" in text
+
+
+def test_ratios_and_outlets_go_by_the_words_of_what_they_are_of():
+    named = {
+        "mean_wss_Pa_ratio": "Wall shear stress, mean, after / before",
+        "relative_low_shear_area_fraction_ratio": "Low shear area, relative, after / before",
+        "outlet_3_flow_mL_s": "Outlet flow, outlet 3",
+        "outlet_3_flow_mL_s_ratio": "Outlet flow, outlet 3, after / before",
+        "aspect_ratio": "Aspect ratio",
+    }
+    for key, name in named.items():
+        (quantity,) = flatten({key: 0.5})
+        assert quantity.name == name
+        assert quantity.definition.meaning
+    metrics = {"bare": {"outlet_3_flow_mL_s": 0.5}, "stents": {"silk": {"ratios": {"mean_wss_Pa_ratio": 0.5}}}}
+    told = replace(report_case.contents(), metrics=metrics).definitions
+    assert told == [(DEFINITIONS["outlet_flow_mL_s"], "mL/s"), (DEFINITIONS["mean_wss_Pa"], "Pa")]
+
+
+def test_every_opening_is_told_with_its_width_and_place(page):
+    row = page.text.partition("Center (LPS)")[2].replace("\u202f", " ")
+    assert row.startswith(" inlet 4.00 mm 12.6 mm² -8.9, 0.0, 1.3 mm outlet 1 4.00 mm 12.6 mm² 8.9, 0.0, 1.3 mm")
+
+
+def test_facts_on_a_device_are_named_without_the_unit_of_their_key(page):
+    assert "Braid angle " in page.text
+    assert "braid angle rad" not in page.text
 
 
 def test_headlines_are_defined():

@@ -52,6 +52,9 @@ def test_pages_are_a4_and_the_same_report_is_the_same_file(told, printed):
 def test_every_number_and_its_definition_stand_in_the_pdf(told, printed):
     text = " ".join(printed[1].split())
     assert "Research use only" in text
+    assert "outlet 1 4.00 mm 12.6 mm² 8.9, 0.0, 1.3 mm" in text.replace("\u202f", " ")
+    assert "Braid angle " in text
+    assert "braid angle rad" not in text
     assert OF_PULSE in text.partition("Definitions")[2]
     for quantity in (*told.vessel, *(q for stent in told.stents for q in stent["quantities"])):
         assert quantity.name in text, quantity

@@ -17,19 +17,19 @@ from vstent.rank import Ranking
 from vstent.vessel import Opening
 
 ROWS: Final = (
-    ("Neck inflow", "neck_inflow_mL_s", "mL/s"),
-    ("Mean sac velocity", "mean_sac_velocity_m_s", "m/s"),
-    ("Sac wall shear stress, mean", "mean_sac_wss_Pa", "Pa"),
-    ("Turnover time", "turnover_time_s", "s"),
+    ("Neck inflow", "neck_inflow_mL_s"),
+    ("Mean sac velocity", "mean_sac_velocity_m_s"),
+    ("Sac wall shear stress, mean", "mean_sac_wss_Pa"),
+    ("Turnover time", "turnover_time_s"),
 )
-"""Rows of the comparison: title, key of the index, unit."""
+"""Rows of the comparison: title, key of the index."""
 DEVICE_ROWS: Final = (
-    ("Size (label)", "size", ""),
-    ("Deployed length", "deployed_length_mm", "mm"),
-    ("Apposed", "apposed_fraction", ""),
-    ("Metal coverage over the neck", "neck_metal_coverage_fraction", ""),
+    ("Size (label)", "size"),
+    ("Deployed length", "deployed_length_mm"),
+    ("Apposed", "apposed_fraction"),
+    ("Metal coverage over the neck", "neck_metal_coverage_fraction"),
 )
-"""Rows on the devices: title, key of the measure, unit."""
+"""Rows on the devices: title, key of the measure."""
 
 
 QUIET_S: Final = 30.0
@@ -77,19 +77,19 @@ class Console:
 
 
 def comparison_table(metrics: Mapping[str, Any]) -> Table:
-    """Table of bare artery and devices: each value, and its change against bare."""
+    """Table of bare artery and devices: each value with its unit, and its change against bare."""
     stents = metrics["stents"]
-    table = Table("", "unit", "bare", *stents)
-    for title, key, unit in DEVICE_ROWS:
-        table.add_row(title, unit, "", *(_cell(stent["deployment"].get(key)) for stent in stents.values()))
+    table = Table("", "bare", *stents)
+    for title, key in DEVICE_ROWS:
+        table.add_row(title, "", *(_cell(key, stent["deployment"].get(key)) for stent in stents.values()))
     if "bare" not in metrics:
         return table
     table.add_section()
-    for title, key, unit in ROWS:
+    for title, key in ROWS:
         bare = metrics["bare"].get(key)
         if bare is None:
             continue
-        table.add_row(title, unit, _cell(bare), *(_change(bare, stent["flow"][key]) for stent in stents.values()))
+        table.add_row(title, _cell(key, bare), *(_change(key, bare, stent["flow"][key]) for stent in stents.values()))
     return table
 
 
@@ -161,10 +161,11 @@ def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
 
 def opening_table(openings: Sequence[Opening]) -> Table:
     """Table of the vessel's ends: role, diameter, area, where."""
-    table = Table("opening", "diameter, mm", "area, mm²", "center, mm (LPS)")
-    for opening in openings:
-        center = ", ".join(f"{x:.1f}" for x in opening.center_mm)
-        table.add_row(opening.role, f"{opening.diameter_mm:.2f}", f"{opening.area_mm2:.2f}", center)
+    from vstent.report.quantities import opening_rows
+
+    table = Table("opening", "diameter", "area", "center (LPS)")
+    for row in opening_rows(openings):
+        table.add_row(*map(_spaced, row))
     return table
 
 
@@ -185,8 +186,8 @@ def flow_table(metrics: Mapping[str, Any]) -> Table:
     stents = metrics["stents"]
     table = Table("flow", "bare", *stents)
     for quantity in flatten(metrics["bare"]):
-        changes = (_change(quantity.value, stent["flow"][quantity.key]) for stent in stents.values())
-        table.add_row(quantity.name, quantity.text, *changes)
+        changes = (_change(quantity.key, quantity.value, stent["flow"][quantity.key]) for stent in stents.values())
+        table.add_row(quantity.name, _cell(quantity.key, quantity.value), *changes)
     return table
 
 
@@ -200,7 +201,7 @@ def convergence_table(found: Refinement) -> Table:
         order = "not one way" if one.order is None else f"{one.order:.1f}"
         values = [quantity.text for value in one.values for quantity in flatten({key: value})]
         name = flatten({key: 0.0})[0].name
-        table.add_row(name, *values, order, _cell(one.extrapolated), f"{one.uncertainty_fraction:.1%}")
+        table.add_row(name, *values, order, _cell(key, one.extrapolated), f"{one.uncertainty_fraction:.1%}")
     return table
 
 
@@ -215,12 +216,23 @@ def positions_table(found: Mapping[str, Scatter]) -> Table:
     return table
 
 
-def _cell(value: float | str | None) -> str:
-    return "" if value is None else value if isinstance(value, str) else f"{value:.3g}"
+def _cell(key: str, value: Any) -> str:
+    """A value with its unit; empty where there is none."""
+    from vstent.report.quantities import format_value
+
+    return "" if value is None else _spaced(format_value(key, value))
 
 
-def _change(bare: float, value: float) -> str:
-    return f"{value:.3g} ({value / bare - 1:+.0%})" if bare else f"{value:.3g}"
+def _spaced(text: str) -> str:
+    """Put plain spaces for narrow ones, which not every terminal has."""
+    return text.replace("\u202f", " ")
+
+
+def _change(key: str, bare: float, value: float) -> str:
+    from vstent.report.quantities import ERRORS
+
+    is_told = bare and key not in ERRORS
+    return f"{_cell(key, value)} ({value / bare - 1:+.0%})" if is_told else _cell(key, value)
 
 
 def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:

@@ -168,5 +168,4 @@ def _leaf(key: str) -> str:
 
 
 def _name(key: str) -> str:
-    after = ", after / before" if key.startswith("ratios.") else ""
-    return Quantity((_leaf(key).removesuffix("_ratio") if after else _leaf(key),), 0.0).name + after
+    return Quantity((_leaf(key),), 0.0).name

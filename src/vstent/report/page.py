@@ -13,11 +13,11 @@ import numpy as np
 from markupsafe import Markup
 
 from vstent.flow.types import LATTICE, OPENFOAM
-from vstent.report.definitions import HEADLINES, OF_PULSE, Definition
+from vstent.report.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
 from vstent.report.figures import Picture, pictures
 from vstent.report.method import method_pictures
 from vstent.report.packing import pack
-from vstent.report.quantities import Change, Quantity, compare, flatten, format_change
+from vstent.report.quantities import Change, Quantity, base_of, compare, flatten, format_change, opening_rows, unit_of
 from vstent.report.scene import BARE, Scene, device_title, scene_of
 from vstent.report.uncertainty import Varied, uncertainty_of
 from vstent.stent import Deployment
@@ -68,6 +68,8 @@ class Contents:
     """Numbers before and after."""
     stents: list[dict[str, Any]]
     """Every device: title, words, advice, quantities, facts."""
+    openings: list[tuple[str, str, str, str]]
+    """Role, diameter, area and center of every end of the vessel."""
     is_pulse: bool
     """Whether the flow is one."""
     notes: tuple[str, ...]
@@ -100,9 +102,10 @@ class Contents:
 
     @property
     def definitions(self) -> list[tuple[Definition, str]]:
-        """What every number means, and its unit, by name."""
-        found = {q.key: (q.definition, q.unit) for q in flatten(self.metrics) if q.definition.meaning}
-        return sorted(found.values(), key=lambda pair: pair[0].name.casefold())
+        """What every number means, and its unit, by name; ratios and outlets under what they are of."""
+        keys = {base_of(q.key)[0] for q in flatten(self.metrics)}
+        found = [(DEFINITIONS[key], unit_of(key)) for key in keys if key in DEFINITIONS]
+        return sorted(found, key=lambda pair: pair[0].name.casefold())
 
 
 def contents_of(case: "CaseResult") -> Contents:
@@ -116,6 +119,7 @@ def contents_of(case: "CaseResult") -> Contents:
         pictures=(before, *method_pictures(case, scene), *after),
         changes=compare(metrics),
         stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
+        openings=opening_rows(case.anatomy.vessel.openings),
         is_pulse=any(field.phases for field in case.fields.values()),
         notes=tuple(case.notes),
         limits=limits_of(case.provenance),
@@ -154,6 +158,7 @@ def as_html(told: Contents) -> str:
         summary=told.headlines,
         pictures=[_picture(picture) for picture in told.pictures],
         vessel=told.vessel,
+        openings=told.openings,
         stents=told.stents,
         flow=told.changes,
         of_pulse=OF_PULSE,
@@ -234,7 +239,7 @@ def _stent(name: str, deployment: Deployment, metrics: dict[str, Any]) -> dict[s
         "words": f"{wires}. The contour {how} after {steps}, in {deployment.seconds:.2f} s.",
         "advice": deployment.advice,
         "quantities": values,
-        "facts": stent.design.facts,
+        "facts": [(Quantity((f.name,), None).name, f"{f.confidence}: {f.source}") for f in stent.design.facts],
     }
 
 
@@ -244,7 +249,7 @@ def _flow_only(metrics: dict[str, Any], rows: list[Change], titles: dict[str, st
     found = [("Before", [q for q in flatten(metrics.get("bare", {}), ("bare", "")) if q.path[2:] not in paired])]
     for name, stent in metrics.get("stents", {}).items():
         values = [q for q in flatten(stent.get("flow", {}), ("flow", name)) if q.path[2:] not in paired]
-        found.append((f"{titles.get(name, name)}: after / before", flatten(stent.get("ratios", {}), ("ratios", name))))
+        found.append((f"{titles.get(name, name)}: ratios", flatten(stent.get("ratios", {}), ("ratios", name))))
         found.append((titles.get(name, name), values))
     return [(title, values) for title, values in found if values]
 

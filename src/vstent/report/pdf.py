@@ -40,6 +40,8 @@ def as_pdf(told: Contents) -> bytes:
             paper.picture(picture)
         paper.heading("Anatomy")
         paper.table(_rows(told.vessel, 1), (0.66, 0.34))
+        paper.heading("Openings")
+        paper.table(told.openings, (0.25, 0.2, 0.2, 0.35), head=("Opening", "Diameter", "Area", "Center (LPS)"))
         _devices(paper, told)
         _flow(paper, told)
         _uncertainty(paper, told)
@@ -209,8 +211,7 @@ def _devices(paper: _Paper, told: Contents) -> None:
         paper.text(stent["advice"])
         paper.table(_rows(stent["quantities"], 3), (0.66, 0.34))
         paper.text("Where the device's numbers come from:", 8, color=_QUIET)
-        facts = ((fact.name.replace("_", " "), f"{fact.confidence}: {fact.source}") for fact in stent["facts"])
-        paper.table(facts, (0.26, 0.74))
+        paper.table(stent["facts"], (0.26, 0.74))
 
 
 def _flow(paper: _Paper, told: Contents) -> None:

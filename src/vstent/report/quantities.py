@@ -2,10 +2,12 @@
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from vstent.report.definitions import DEFINITIONS, Definition
+from vstent.vessel import Opening
 
 UNITS: dict[str, tuple[str, float]] = {
     "Pa_per_m_s": ("Pa/(m/s)", 1.0),
@@ -38,16 +40,22 @@ UNITS: dict[str, tuple[str, float]] = {
     "mJ": ("mJ", 1.0),
     "uW": ("µW", 1.0),
     "mW": ("mW", 1.0),
-    "J": ("J", 1.0),
+    "J": ("µJ", 1e6),
     "W": ("W", 1.0),
     "MB": ("MB", 1.0),
     "s": ("s", 1.0),
 }
-"""End of a key -> unit for people, and the factor to it (angles in degrees and fractions in percent: here only)."""
+"""End of a key -> unit for people, and the factor to it (degrees, percent and µJ: here only)."""
 
 
-NOTHING = 1e-13
+NOTHING = 1e-9
 """What is smaller is what rounding leaves of zero."""
+RATIO = "_ratio"
+"""End of the key of a quantity after over before."""
+OUTLET = re.compile(r"outlet_(\d+)_(\w+)")
+"""Key of a quantity of one of several outlets."""
+ERRORS = ("unsettled_fraction",)
+"""How far numbers are to be relied on: that one changes says nothing of a device."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +75,10 @@ class Quantity:
 
     @property
     def definition(self) -> Definition:
-        """Name, meaning and source."""
-        return DEFINITIONS.get(self.key) or Definition(_spell(split_unit(self.key)[0]), "", "")
+        """Name, meaning and source: of a ratio, or of one of several outlets, those of what it is a ratio or one of."""
+        key, more = base_of(self.key)
+        known = DEFINITIONS.get(key) or Definition(_spell(split_unit(key)[0]), "", "")
+        return known._replace(name=known.name + more)
 
     @property
     def name(self) -> str:
@@ -84,7 +94,7 @@ class Quantity:
     @property
     def unit(self) -> str:
         """Unit for people; empty for a pure number."""
-        return UNITS.get(split_unit(self.key)[1], ("", 1.0))[0]
+        return unit_of(self.key)
 
     @property
     def text(self) -> str:
@@ -99,6 +109,22 @@ class Change(NamedTuple):
     """Without a device."""
     after: dict[str, Quantity]
     """With each device, by its name."""
+
+
+def base_of(key: str) -> tuple[str, str]:
+    """Return the key that a key's definition stands under, and what it adds to that name."""
+    if key in DEFINITIONS:
+        return key, ""
+    if key.endswith(RATIO):
+        base, more = base_of(key.removesuffix(RATIO))
+        return base, f"{more}, after / before"
+    outlet = OUTLET.fullmatch(key)
+    return (f"outlet_{outlet[2]}", f", outlet {outlet[1]}") if outlet else (key, "")
+
+
+def unit_of(key: str) -> str:
+    """Return the unit for people that a key ends in; empty for a pure number."""
+    return UNITS.get(split_unit(key)[1], ("", 1.0))[0]
 
 
 def split_unit(key: str) -> tuple[str, str]:
@@ -156,15 +182,33 @@ def flatten(metrics: Any, path: tuple[str, ...] = ()) -> list[Quantity]:
     return [Quantity(path, metrics)]
 
 
+def opening_rows(openings: Iterable[Opening]) -> list[tuple[str, str, str, str]]:
+    """Return role, diameter, area and center (LPS) of every opening: by its role the numbers of the flow go."""
+    return [
+        (
+            opening.role.replace("_", " "),
+            format_value("diameter_mm", opening.diameter_mm),
+            format_value("area_mm2", opening.area_mm2),
+            ", ".join(f"{x:.1f}" for x in opening.center_mm) + "\u202fmm",
+        )
+        for opening in openings
+    ]
+
+
 def compare(metrics: dict[str, Any]) -> list[Change]:
-    """Return the numbers that were measured before (``bare``) and after (``stents.NAME.flow``), in order."""
+    """Return the numbers that were measured before (``bare``) and after (``stents.NAME.flow``), in order; no errors."""
     after = {name: dict(_flow(stent)) for name, stent in metrics.get("stents", {}).items()}
     rows = []
     for quantity in flatten(metrics.get("bare", {})):
         found = {name: values[quantity.path] for name, values in after.items() if quantity.path in values}
-        if found and isinstance(quantity.value, (int, float)) and not isinstance(quantity.value, bool):
+        if found and _is_compared(quantity):
             rows.append(Change(quantity, found))
     return rows
+
+
+def _is_compared(quantity: Quantity) -> bool:
+    is_number = isinstance(quantity.value, (int, float)) and not isinstance(quantity.value, bool)
+    return is_number and quantity.key not in ERRORS
 
 
 def _flow(stent: dict[str, Any]) -> list[tuple[tuple[str, ...], Quantity]]:

@@ -41,12 +41,10 @@ def intervals(stent: Mapping[str, Any]) -> list[Interval]:
 
 
 def _interval(key: str, ends: Mapping[str, float], shares: Mapping[str, float]) -> Interval:
-    after = ", after / before" if key.endswith("_ratio") else ""
-    name = Quantity((key.removesuffix("_ratio"),), 0.0).name + after
     parts = [(CAUSES[cause.removesuffix("_fraction")], share) for cause, share in shares.items()]
     parts.sort(key=lambda part: -part[1])
     mean, low, high = (format_value(key, ends[end]) for end in ("mean", "low", "high"))
-    return Interval(name, mean, low, high, parts)
+    return Interval(Quantity((key,), 0.0).name, mean, low, high, parts)
 
 
 def uncertainty_of(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Varied]:

@@ -1,0 +1,56 @@
+"""What the terminal's tables say: every value with the unit and the digits of the report."""
+
+import pytest
+from rich.table import Table
+
+from vstent.console import comparison_table, flow_table, opening_table
+from vstent.vessel import Opening
+
+BARE = {"neck_inflow_mL_s": 6.861, "mean_sac_velocity_m_s": 0.4049, "turnover_time_s": 0.0571}
+AFTER = {"neck_inflow_mL_s": 4.453, "mean_sac_velocity_m_s": 0.2381, "turnover_time_s": 0.0880}
+DEPLOYED = {
+    "size": "3.5 x 15 mm",
+    "deployed_length_mm": 23.0,
+    "apposed_fraction": 0.9171,
+    "neck_metal_coverage_fraction": 0.1299,
+}
+
+
+def columns(table: Table) -> list[list[str]]:
+    return [[str(cell) for cell in column.cells] for column in table.columns]
+
+
+def test_the_comparison_tells_every_value_with_its_unit() -> None:
+    metrics = {"bare": BARE, "stents": {"silk": {"deployment": DEPLOYED, "flow": AFTER}}}
+    names, bare, silk = columns(comparison_table(metrics))
+    assert dict(zip(names, bare, strict=True))["Neck inflow"] == "6.86 mL/s"
+    assert dict(zip(names, silk, strict=True)) == {
+        "Size (label)": "3.5 x 15 mm",
+        "Deployed length": "23.0 mm",
+        "Apposed": "91.7 %",
+        "Metal coverage over the neck": "13.0 %",
+        "Neck inflow": "4.45 mL/s (-35%)",
+        "Mean sac velocity": "0.238 m/s (-41%)",
+        "Turnover time": "0.0880 s (+54%)",
+    }
+
+
+def test_the_flows_table_compares_numbers_and_not_how_sure_they_are() -> None:
+    sure = {"unsettled_fraction": 0.0279}
+    metrics = {"bare": BARE | sure, "stents": {"silk": {"flow": AFTER | {"unsettled_fraction": 0.00762}}}}
+    names, bare, silk = columns(flow_table(metrics))
+    assert (bare[-1], silk[-1]) == ("2.79 %", "0.762 %")
+    assert silk[names.index("Neck inflow")] == "4.45 mL/s (-35%)"
+
+
+def test_openings_are_told_with_their_units() -> None:
+    opening = Opening([1.0, -2.25, 30.04], [0.0, 0.0, 1.0], 12.566, "outlet_1")
+    assert columns(opening_table([opening])) == [["outlet 1"], ["4.00 mm"], ["12.6 mm²"], ["1.0, -2.2, 30.0 mm"]]
+
+
+@pytest.mark.parametrize("missing", ["bare", "apposed_fraction"])
+def test_what_is_missing_leaves_its_cell_empty(missing: str) -> None:
+    deployed = {key: value for key, value in DEPLOYED.items() if key != missing}
+    names, bare, silk = columns(comparison_table({"stents": {"silk": {"deployment": deployed}}}))
+    assert set(bare) == {""}
+    assert silk[names.index("Apposed")] == ("" if missing == "apposed_fraction" else "91.7 %")
