@@ -236,6 +236,20 @@ def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
     assert not client.get(f"{case}/ranking").json()["is_current"]
 
 
+def test_a_job_computes_what_was_chosen_when_it_was_started(client, case):
+    before = client.get(case).json()
+    client.post(f"{case}/jobs/flow")
+    changed = choose(client, case, devices=[{"name": "enterprise"}]).json()  # before the job has loaded its modules
+    assert changed["job"]["stage"] == ""
+    while client.get(case).json()["job"]["stage"] == "":
+        time.sleep(0.02)
+    client.post(f"{case}/undo", json={"revision": changed["revision"]})
+    view = app_case.wait(client, case.rpartition("/")[2])
+    assert view["choices"] == before["choices"]
+    assert set(view["steps"].values()) == {"done"}
+    assert list(client.get(f"{case}/files/metrics.json").json()["stents"]) == ["silk"]
+
+
 def test_a_job_is_stopped_within_a_second_and_said_so(client, case):
     client.post(f"{case}/jobs/anatomy")
     time.sleep(0.3)

@@ -121,6 +121,8 @@ class Job:
         assert self._process.stdout is not None
         assert self._process.stdin is not None
         failure = ""
+        with suppress(BrokenPipeError):  # it has ended already, which is told below
+            self._process.stdin.write(self._given.model_dump_json(exclude={"undo", "redo"}) + "\n")
         for line in self._process.stdout:
             told = json.loads(line)
             if "error" in told:
@@ -130,7 +132,8 @@ class Job:
             else:
                 self._take(told["stage"], told["fraction"], told["detail"])
         self._process.stdout.close()
-        self._process.stdin.close()
+        with suppress(BrokenPipeError):
+            self._process.stdin.close()
         code = self._process.wait()
         if self._is_stopped:
             failure = STOPPED

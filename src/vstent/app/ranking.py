@@ -9,7 +9,7 @@ from vstent.device import find_design
 from vstent.io.writers import write_json
 from vstent.rank import rank
 from vstent.study import CACHE, Progress
-from vstent.study.ledger import Ledger
+from vstent.study.ledger import Ledger, anatomy_key
 from vstent.study.stages import find_anatomy
 
 MOST_PROCESSES: Final = 4
@@ -39,7 +39,7 @@ def rank_sizes(case: Case, progress: Progress) -> None:
     found = rank(anatomy, designs, jobs=jobs, progress=told)
     rows = found.rows()
     content: dict[str, Any] = {
-        "anatomy": case.state.anatomy,
+        "anatomy": anatomy_key(case.state.source, settings),
         "devices": sorted(settings.devices),
         "names": {design.key: design.name for design in designs},
         "rows": rows,

@@ -1,7 +1,8 @@
 """Worker: `python -m vstent.app.worker KIND FOLDER` does one job of a case and tells of it, a line of JSON each time.
 
-Its standard input closes when the server that started it is gone, however it went; it then ends with all its processes,
-so that the case folder is free when the server starts again.
+The first line of its standard input is the case's state as it was when the job was started: what is chosen meanwhile is
+none of this job's. The input closes when the server that started it is gone, however it went; the worker then ends with
+all its processes, so that the case folder is free when the server starts again.
 """
 
 import json
@@ -13,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from vstent.app.cases import Case, load
+from vstent.app.cases import Case, State
 from vstent.errors import VstentError
 from vstent.study import run
 from vstent.study.ledger import anatomy_key, hash_of
@@ -72,9 +73,10 @@ JOBS: Final[dict[str, Callable[[Case], None]]] = {"anatomy": find_anatomy, "rank
 
 def main(kind: str, folder: Path) -> int:
     """Do a job; return the exit code."""
+    given = State.model_validate_json(sys.stdin.readline())
     threading.Thread(target=end_with_the_server, daemon=True).start()
     try:
-        JOBS[kind](load(folder.name, folder))
+        JOBS[kind](Case(folder.name, folder, given))
     except VstentError as error:
         tell(error=str(error))
         return 1
