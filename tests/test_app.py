@@ -2,10 +2,11 @@
 
 import hashlib
 import json
+import shutil
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -18,9 +19,11 @@ import vstent
 from vstent import phantoms
 from vstent.app import cuts, sheets
 from vstent.app.cases import STEPS
+from vstent.app.finished import kept_flows
 from vstent.cli import main
 from vstent.deploy import deploy
 from vstent.device import find_design
+from vstent.flow import FlowSettings
 from vstent.flow.types import Phase
 from vstent.io.archive import load_noun
 from vstent.io.dicom_writer import write_dicom
@@ -29,6 +32,9 @@ from vstent.io.writers import write_stl
 from vstent.measure import measure
 from vstent.stent import Landing
 from vstent.study import CACHE, Settings
+from vstent.study.ledger import Ledger
+from vstent.study.repeat import settings_of
+from vstent.study.stages import flow_key
 from vstent.vessel import Anatomy
 
 SILK = {"name": "silk"}
@@ -296,6 +302,56 @@ def test_a_folder_of_vstent_run_opens_with_all_that_it_holds(study, tmp_path):
         told, _ = app_case.opened(client.post(f"{case}/deployment", json={"device": SILK}))
         measured = json.loads((study / "metrics.json").read_text())["stents"]["silk"]["deployment"]
         assert told["length_mm"] == pytest.approx(measured["deployed_length_mm"], rel=1e-6)
+
+
+def keep_flow(folder, source, settings, name):
+    """Keep a flow as a study of these settings does."""
+    key = flow_key(source, settings, name, None if name == "bare" else find_design(name))
+    Ledger(folder / CACHE, lambda *_: None).keep(f"flow {name}", key, report_case.field(1.0))
+
+
+@pytest.fixture
+def flown(study, tmp_path):
+    """A study's folder with flows, and what its run.json tells."""
+    folder = tmp_path / "flown"
+    shutil.copytree(study, folder, ignore=shutil.ignore_patterns("app.json"))
+    told = json.loads((folder / "run.json").read_text())
+    told["settings"]["flow"] = asdict(FlowSettings(inflow_mL_s=1.0))
+    (folder / "run.json").write_text(json.dumps(told))
+    for name in ("bare", "silk"):
+        keep_flow(folder, told["input"]["sha256"], settings_of(told["settings"]), name)
+    return folder, told
+
+
+def test_flows_of_other_settings_are_not_taken_for_those_of_the_results(flown, tmp_path):
+    folder, told = flown
+    with app_case.served(tmp_path / "cases", folder) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        view = client.get(case).json()
+        assert view["has_flow"]
+        assert set(view["steps"].values()) == {"done"}
+        # A study with another inflow was stopped after its first flow: the flow of the results is there no more.
+        settings = settings_of(told["settings"])
+        other = replace(settings, flow=replace(settings.flow, inflow_mL_s=3.0))
+        keep_flow(folder, told["input"]["sha256"], other, "bare")
+        view = client.get(case).json()
+        assert not view["has_flow"]
+        assert (view["steps"]["flow"], view["steps"]["report"]) == ("todo", "done")
+        assert "run the step Flow" in client.get(f"{case}/flow").json()["detail"]
+        (folder / "report.html").unlink()
+        assert client.get(case).json()["steps"]["report"] == "todo"
+    (folder / "app.json").unlink()
+    with app_case.served(tmp_path / "others", folder) as client:
+        (listed,) = client.get("/api/cases").json()["cases"]
+        assert listed["done"] == list(STEPS[:5])
+
+
+def test_flows_of_a_study_before_one_without_flow_are_not_its(flown):
+    folder, told = flown
+    assert [path.name.partition("-")[0] for path in kept_flows(folder).values()] == ["flow bare", "flow silk"]
+    told["settings"]["flow"] = None
+    (folder / "run.json").write_text(json.dumps(told))
+    assert kept_flows(folder) == {}
 
 
 def test_slices_hold_the_scans_voxels_and_the_live_surface_is_its_wall(tmp_path):

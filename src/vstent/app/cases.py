@@ -5,6 +5,7 @@ import hashlib
 import json
 import re
 import threading
+from collections.abc import Set
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -74,8 +75,8 @@ def dependencies(state: State) -> dict[str, str]:
     return found
 
 
-def statuses(state: State, at_work: str) -> dict[str, Status]:
-    """Return how every step stands; `at_work` is the step that a job is at, or empty."""
+def statuses(state: State, at_work: str, lost: Set[str]) -> dict[str, Status]:
+    """Return how every step stands; `at_work`: the step that a job is at, or empty; `lost`: whose results are gone."""
     keys = dependencies(state)
 
     def status(step: str) -> Status:
@@ -83,7 +84,7 @@ def statuses(state: State, at_work: str) -> dict[str, Status]:
             return "running"
         if step in state.failed:
             return "failed"
-        if step not in state.done:
+        if step not in state.done or step in lost:
             return "todo"
         return "done" if state.done[step] == keys[step] else "stale"
 

@@ -10,8 +10,9 @@ from typing import Any, Literal
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Conflict, Store, dependencies, statuses
 from vstent.app.choices import DeviceChoice, Point
+from vstent.app.finished import REPORT, RUN, kept_flows, lost_steps
 from vstent.app.jobs import KINDS, RANKING, Jobs
-from vstent.app.reopening import RUN, reopened, stem
+from vstent.app.reopening import reopened, stem
 from vstent.errors import InputError, ReadError
 from vstent.io.files import existing
 
@@ -58,7 +59,7 @@ class Desk:
                 case = self.store.get(case_id)
             except ReadError:
                 continue  # somebody else's folder, or a damaged one
-            steps = statuses(case.state, "")
+            steps = statuses(case.state, "", lost_steps(case.folder, case.state))
             found.append({"id": case_id, "name": case.state.name, "done": [s for s in STEPS if steps[s] == "done"]})
         return found
 
@@ -66,13 +67,14 @@ class Desk:
         """Return all that a tab must know of a case."""
         state, job = case.state, self.jobs.of(case)
         is_at_work = job is not None and job.is_alive
+        at_work = job.step if job is not None and is_at_work else ""
         return {
             "id": case.id,
             "name": state.name,
             "folder": str(case.folder),
             "revision": state.revision,
             "choices": state.choices.model_dump(mode="json"),
-            "steps": statuses(state, job.step if job is not None and is_at_work else ""),
+            "steps": statuses(state, at_work, lost_steps(case.folder, state)),
             "failed": state.failed,
             "can_undo": bool(state.undo),
             "can_redo": bool(state.redo),
@@ -81,10 +83,10 @@ class Desk:
             "wants_grid": bool(state.source) and _wants_grid(case),
             "has_anatomy": bool(state.anatomy),
             "anatomy": state.anatomy,
-            "has_report": (case.folder / "report.html").is_file(),
+            "has_report": (case.folder / REPORT).is_file(),
             "has_pdf": (case.folder / "report.pdf").is_file(),
             "has_ranking": (case.folder / RANKING).is_file(),
-            "has_flow": (case.folder / "metrics.json").is_file() and "flow" in state.done,
+            "has_flow": bool(kept_flows(case.folder)),
             "job": job.told() if job is not None and is_at_work else None,
         }
 

@@ -13,6 +13,7 @@ from vstent.app import necks, sheets
 from vstent.app.cases import Case
 from vstent.app.choices import DeviceChoice, placing_of
 from vstent.app.cuts import at_phase, cut
+from vstent.app.finished import kept_flows
 from vstent.deploy import propose_landing
 from vstent.deploy.contour import planes
 from vstent.deploy.method import laid_inside
@@ -140,12 +141,6 @@ class Live:
         key = ("deployment", self.case.state.anatomy, *choice.model_dump().values())
         return self.remembered(key, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice)))
 
-    def flows(self) -> dict[str, Path]:
-        """Return where the flows computed last are kept, ``bare`` first."""
-        names = (BARE, *(device.name for device in self.case.state.choices.devices))
-        paths = {name: _kept(self.case.folder / CACHE, f"flow {name}") for name in names}
-        return {name: path for name, path in paths.items() if path is not None}
-
     def _field(self, path: Path, moment: int | None) -> FlowField:
         """A flow: its mean, or a moment of its last cycle."""
         field = self.remembered(("flow", path, path.stat().st_mtime_ns), lambda: load_noun(path, FlowField))
@@ -222,9 +217,9 @@ class Live:
     def flow_message(self, moment: int | None) -> bytes:
         """Return wall shear stress, streamlines and a cut of every flow, on one scale: the mean, or one moment."""
         with LOCK:
-            paths = self.flows()
+            paths = kept_flows(self.case.folder)
             if not paths:
-                raise ReadError("No flow has been computed yet: run the step Flow.")
+                raise ReadError("Not every flow of the results there are is kept: run the step Flow.")
             layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]
             bare = self._field(next(iter(paths.values())), None)
             most = _peak(bare)
@@ -279,11 +274,6 @@ def _peak(field: FlowField) -> int | None:
 def _moments(field: FlowField, moment: int | None) -> dict[str, Any]:
     """Times of the moments there are, and the one shown."""
     return {"times_s": [phase.time_s for phase in field.phases], "moment": moment if field.phases else None}
-
-
-def _kept(folder: Path, stage: str) -> Path | None:
-    found = (path for path in sorted(folder.glob(f"{stage}-*.npz")) if not path.name.endswith(".running.npz"))
-    return next(found, None)
 
 
 def _said(opening: Opening) -> dict[str, Any]:

@@ -8,11 +8,10 @@ from pydantic import ValidationError
 
 from vstent.app.cases import STEPS, Case, State, Store, dependencies
 from vstent.app.choices import Choices, DeviceChoice, FlowChoice
+from vstent.app.finished import RUN, lost_steps
 from vstent.errors import ReadError
 from vstent.io.files import suffix
 
-RUN: Final = "run.json"
-"""What a study says of itself."""
 GEOMETRY: Final = (
     *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
     *("neck_mm", "upstream_mm", "downstream_mm"),
@@ -45,8 +44,9 @@ def reopened(store: Store, folder: Path) -> Case:
         ) from None
     anatomy = next((path.stem.rpartition("-")[2] for path in (folder / CACHE).glob("anatomy-*.npz")), "")
     known = {"input": where, "source": told["input"]["sha256"], "choices": choices, "anatomy": anatomy}
-    keys = dependencies(State(name=folder.name, **known))
-    is_whole = choices.flow.is_wanted and (folder / "report.html").is_file()
+    state = State(name=folder.name, **known)
+    keys = dependencies(state)
+    is_whole = choices.flow.is_wanted and not lost_steps(folder, state)
     done = {step: keys[step] for step in (STEPS if is_whole else STEPS[:5])}
     return store.create(folder.name, folder, done=done, **known)
 

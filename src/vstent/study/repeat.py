@@ -57,7 +57,7 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
     """
     try:
         told = json.loads(existing(path).read_text(encoding="utf-8"))
-        settings, sha256 = _settings(told["settings"]), str(told["input"]["sha256"])
+        settings, sha256 = settings_of(told["settings"]), str(told["input"]["sha256"])
         differences = _differences(told, settings)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         raise ReadError(f"{path} is no run.json of this version: give the scan and the options again.") from None
@@ -95,8 +95,8 @@ def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
     return former_source(folder) is not None
 
 
-def _settings(told: Mapping[str, Any]) -> Settings:
-    """Rebuild the settings; ValueError where this version does not know one."""
+def settings_of(told: Mapping[str, Any]) -> Settings:
+    """Rebuild the settings that a `run.json` tells; ValueError where this version does not know one."""
     from pydantic import TypeAdapter  # its ValidationError is a ValueError
 
     unknown = sorted(set(told) - {field.name for field in fields(Settings)})

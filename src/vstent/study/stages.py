@@ -161,8 +161,7 @@ def compute_flows(
     folders = engine_folders(out, settings)
     for name in (BARE, *deployments):
         stent = None if name == BARE else deployments[name].stent
-        placed = (stent.design, settings.placing(name)) if stent else ()
-        stage, key = f"flow {name}", key_of(anatomy_key(source, settings), settings.flow, name, *placed)
+        stage, key = f"flow {name}", flow_key(source, settings, name, stent.design if stent else None)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
             if name == BARE:
@@ -180,6 +179,12 @@ def compute_flows(
         fields[name] = field
         write_field(out / "flow" / name, field)
     return fields
+
+
+def flow_key(source: str, settings: Settings, name: str, design: Design | None) -> str:
+    """Key of one flow of an input: ``bare``, or behind a device of this design."""
+    placed = (design, settings.placing(name)) if design else ()
+    return key_of(anatomy_key(source, settings), settings.flow, name, *placed)
 
 
 def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Sensitivity:
