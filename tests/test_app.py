@@ -256,6 +256,35 @@ def test_a_job_computes_what_was_chosen_when_it_was_started(client, case):
     assert list(client.get(f"{case}/files/metrics.json").json()["stents"]) == ["silk"]
 
 
+def test_a_failure_is_told_while_what_caused_it_is_chosen(client, case):
+    choose(client, case, devices=[{"name": "unheard of"}])
+    client.post(f"{case}/jobs/flow")
+    failed = app_case.wait(client, case.rpartition("/")[2])
+    assert "unheard of" in failed["failed"]["flow"]
+    assert failed["steps"]["flow"] == "failed"
+    chosen = choose(client, case, devices=[SILK]).json()
+    assert chosen["failed"] == {}
+    assert "failed" not in chosen["steps"].values()
+    undone = client.post(f"{case}/undo", json={"revision": chosen["revision"]}).json()
+    assert undone["failed"] == failed["failed"]
+    choose(client, case, devices=[SILK])
+
+
+def test_a_flow_after_another_choice_of_the_vessel_finds_the_vessel_first(client, case):
+    before = client.get(case).json()
+    changed = choose(client, case, upstream_mm=12.0).json()
+    assert changed["steps"]["vessel"] == "stale"
+    client.post(f"{case}/jobs/flow")
+    while client.get(case).json()["anatomy"] == before["anatomy"]:
+        time.sleep(0.05)
+    view = client.delete(f"{case}/jobs").json()  # the former anatomy is not kept any more
+    assert [view["steps"][step] for step in STEPS[:3]] == ["done"] * 3
+    assert client.get(f"{case}/anatomy").status_code == 200
+    choose(client, case, upstream_mm=None)
+    client.post(f"{case}/jobs/anatomy")
+    app_case.wait(client, case.rpartition("/")[2])
+
+
 def test_a_job_is_stopped_within_a_second_and_said_so(client, case):
     client.post(f"{case}/jobs/anatomy")
     time.sleep(0.3)

@@ -48,6 +48,8 @@ class State(BaseModel):
     """Step -> what it depended on when it was done."""
     failed: dict[str, str] = Field(default_factory=dict)
     """Step -> why."""
+    failed_with: dict[str, str] = Field(default_factory=dict)
+    """Step -> what the job depended on that failed there."""
     anatomy: str = ""
     """Key of the anatomy in the ledger."""
     job: str = ""
@@ -75,14 +77,20 @@ def dependencies(state: State) -> dict[str, str]:
     return found
 
 
+def failures(state: State) -> dict[str, str]:
+    """Return the steps that failed with what is chosen now, and why."""
+    keys = set(dependencies(state).values())
+    return {step: why for step, why in state.failed.items() if state.failed_with.get(step) in keys}
+
+
 def statuses(state: State, at_work: str, lost: Set[str]) -> dict[str, Status]:
     """Return how every step stands; `at_work`: the step that a job is at, or empty; `lost`: whose results are gone."""
-    keys = dependencies(state)
+    keys, failed = dependencies(state), failures(state)
 
     def status(step: str) -> Status:
         if step == at_work:
             return "running"
-        if step in state.failed:
+        if step in failed:
             return "failed"
         if step not in state.done or step in lost:
             return "todo"

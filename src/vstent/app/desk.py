@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vstent.app import intake
-from vstent.app.cases import STATE, STEPS, Case, Conflict, Store, dependencies, statuses
+from vstent.app.cases import STATE, STEPS, Case, Conflict, Store, dependencies, failures, statuses
 from vstent.app.choices import DeviceChoice, Point
 from vstent.app.finished import REPORT, RUN, kept_flows, lost_steps
 from vstent.app.jobs import KINDS, RANKING, Jobs
@@ -75,7 +75,7 @@ class Desk:
             "revision": state.revision,
             "choices": state.choices.model_dump(mode="json"),
             "steps": statuses(state, at_work, lost_steps(case.folder, state)),
-            "failed": state.failed,
+            "failed": failures(state),
             "can_undo": bool(state.undo),
             "can_redo": bool(state.redo),
             "has_input": bool(state.source),

@@ -128,7 +128,7 @@ class Job:
             if "error" in told:
                 failure = told["error"]
             elif "anatomy" in told:
-                self.case.update(anatomy=told["anatomy"])
+                self._take_anatomy(told["anatomy"])
             else:
                 self._take(told["stage"], told["fraction"], told["detail"])
         self._process.stdout.close()
@@ -142,6 +142,12 @@ class Job:
                 f"The computation broke off (its last words: {LAST_WORDS}); what was finished is kept. Start it again."
             )
         self._close(failure)
+
+    def _take_anatomy(self, key: str) -> None:
+        """The anatomy of the choices given is found, whatever job it was found for."""
+        steps, keys, state = KINDS["anatomy"], dependencies(self._given), self.case.state
+        failed = {step: why for step, why in state.failed.items() if step not in steps}
+        self.case.update(anatomy=key, done=state.done | {step: keys[step] for step in steps}, failed=failed)
 
     def _take(self, stage: str, fraction: float, detail: str) -> None:
         if stage != self.stage:
@@ -165,13 +171,13 @@ class Job:
     def _close(self, failure: str) -> None:
         state = self.case.state
         failed = {step: why for step, why in state.failed.items() if step not in KINDS[self.kind]}
-        done = dict(state.done)
+        done, failed_with, keys = dict(state.done), dict(state.failed_with), dependencies(self._given)
         if failure:
-            failed[self.step or KINDS[self.kind][0]] = failure
+            step = self.step or KINDS[self.kind][0]
+            failed[step], failed_with[step] = failure, keys[KINDS[self.kind][-1]]
         else:
-            keys = dependencies(self._given)
             done |= {step: keys[step] for step in KINDS[self.kind]}
-        self.case.update(done=done, failed=failed, job="")
+        self.case.update(done=done, failed=failed, failed_with=failed_with, job="")
 
 
 class _Deaf:

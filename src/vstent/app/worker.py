@@ -43,19 +43,21 @@ def find_anatomy(case: Case) -> None:
     """Find vessel, sac, neck and parent artery."""
     from vstent.study import restore_vessel
 
-    _tell_anatomy(case, restore_vessel(case.input, case.folder, case.state.choices.settings(), progress))
+    restore_vessel(case.input, case.folder, case.state.choices.settings(), progress)
+    tell(anatomy=_anatomy_key(case))
 
 
-def _tell_anatomy(case: Case, _: Any) -> None:
-    tell(anatomy=anatomy_key(hash_of(case.input), case.state.choices.settings()))
+def _anatomy_key(case: Case) -> str:
+    return anatomy_key(hash_of(case.input), case.state.choices.settings())
 
 
 def compute(case: Case) -> None:
     """Deploy, compute the flow where it is wanted, and write the report: what `vstent run` does."""
     from vstent.report import write_report
 
+    if _anatomy_key(case) != case.state.anatomy:
+        find_anatomy(case)  # and told before the flow: a job that is stopped there has replaced the former one
     result = run(case.input, case.folder, case.state.choices.settings(), progress)
-    _tell_anatomy(case, result)
     progress("report", 0.0, "")
     write_report(result, case.folder, is_printed=True)
     progress("report", 1.0, "")
