@@ -18,13 +18,15 @@ import report_case
 import vstent
 from vstent import phantoms
 from vstent.app import cuts, sheets
-from vstent.app.cases import STEPS
+from vstent.app.cases import STEPS, Store, load
+from vstent.app.desk import Desk
 from vstent.app.finished import kept_flows
 from vstent.cli import main
 from vstent.deploy import deploy
 from vstent.device import find_design
+from vstent.errors import ReadError
 from vstent.flow import FlowSettings
-from vstent.flow.types import Phase
+from vstent.flow.types import Blood, CarreauYasuda, Phase, Waveform
 from vstent.io.archive import load_noun
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
@@ -35,6 +37,7 @@ from vstent.study import CACHE, Settings
 from vstent.study.ledger import Ledger
 from vstent.study.repeat import settings_of
 from vstent.study.stages import flow_key
+from vstent.uncertainty import Ranges
 from vstent.vessel import Anatomy
 
 SILK = {"name": "silk"}
@@ -373,6 +376,47 @@ def test_flows_of_other_settings_are_not_taken_for_those_of_the_results(flown, t
     with app_case.served(tmp_path / "others", folder) as client:
         (listed,) = client.get("/api/cases").json()["cases"]
         assert listed["done"] == list(STEPS[:5])
+
+
+def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_path):
+    folder, told = flown
+    pulse = Waveform(0.8, (0.2,), (0.1,))
+    blood = Blood(1050.0, 0.0035, CarreauYasuda())
+    flow = FlowSettings(inflow_mL_s=1.0, blood=blood, waveform=pulse, close_up=True)
+    given = replace(settings_of(told["settings"]), flow=flow, uncertainty=Ranges(16, landing_mm=2.0), length_mm=20.0)
+    told["settings"] = asdict(given)
+    (folder / "run.json").write_text(json.dumps(told))
+    with app_case.served(tmp_path / "cases", folder) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        view = client.get(case).json()
+        assert {"flow blood viscosity_Pa_s 0.0035", "flow blood thinning", "flow close_up True"} < set(view["unseen"])
+        assert client.get("/api/waveform", params={"case_id": case.rpartition("/")[2]}).json()["time_s"][-1] == 0.8
+        choose(client, case, flow=view["choices"]["flow"] | {"inflow_mL_s": 2.0}, devices=[{"name": "enterprise"}])
+        asked = load("flown", folder).state.settings()
+    assert asdict(asked.flow) == asdict(replace(flow, inflow_mL_s=2.0))
+    assert asdict(asked.uncertainty) == asdict(given.uncertainty)
+    assert asked.placing("enterprise").length_mm is None  # that of Silk alone
+
+
+def test_a_setting_that_the_page_does_not_take_is_named(flown, tmp_path):
+    folder, told = flown
+    told["settings"]["flow"]["cell_size_mm"] = 0.03
+    (folder / "run.json").write_text(json.dumps(told))
+    with pytest.raises(ReadError, match=r"flow.cell_size_mm = 0.03.*vstent run"):
+        Desk(Store(tmp_path / "cases")).open(folder)
+
+
+def test_a_folder_whose_study_was_run_again_at_the_shell_shows_no_other_results_as_done(flown, tmp_path):
+    folder, told = flown
+    with app_case.served(tmp_path / "cases", folder) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        told["settings"]["flow"]["inflow_mL_s"] = 3.0
+        (folder / "run.json").write_text(json.dumps(told))
+        for name in ("bare", "silk"):
+            keep_flow(folder, told["input"]["sha256"], settings_of(told["settings"]), name)
+        view = client.get(case).json()
+    assert view["has_flow"]
+    assert (view["steps"]["flow"], view["steps"]["report"]) == ("todo", "todo")
 
 
 def test_flows_of_a_study_before_one_without_flow_are_not_its(flown):

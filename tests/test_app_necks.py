@@ -9,6 +9,7 @@ from vstent.app import necks
 from vstent.app.cases import State, dependencies
 from vstent.app.choices import NECK_HANDLES, Choices
 from vstent.measure import morphology
+from vstent.study import Settings
 from vstent.uncertainty import Ranges
 
 
@@ -77,9 +78,9 @@ def test_a_neck_and_lengths_make_what_depends_on_them_stale_and_reach_the_study(
         assert [step for step in steps if after[step] != before[step]] == steps[steps.index(first) :]
         ((name, value),) = changes.items()
         if name == "uncertainty_samples":
-            assert choices.settings().uncertainty == Ranges(16)
+            assert choices.settings(Settings()).uncertainty == Ranges(16)
         else:
-            assert getattr(choices.settings(), name) == value
+            assert getattr(choices.settings(Settings()), name) == value
 
 
 def test_the_neck_is_told_over_http(anatomy, tmp_path, monkeypatch):

@@ -83,7 +83,7 @@ class Page {
     this.anatomy = null;
     this.scan = this.slices = this.scanViews = null;
     this.measures = {};
-    this.moment = this.times = this.flowPanes = this.sheets = undefined;
+    this.moment = this.times = this.flowPanes = this.sheets = this.pulse = undefined;
   }
 
   async openCase(id, step) {
@@ -496,7 +496,7 @@ class Page {
     };
     const draw = () => box.replaceChildren(pulseChart(this.pulse, this.view.choices.flow.is_pulsatile, this.times || [], this.moment, shown));
     if (this.pulse) draw();
-    else get("/api/waveform").then((pulse) => ((this.pulse = pulse), draw())).catch((problem) => this.complain(problem));
+    else get(`/api/waveform?case_id=${this.view.id}`).then((pulse) => ((this.pulse = pulse), draw())).catch((problem) => this.complain(problem));
     return box;
   }
 

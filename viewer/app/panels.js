@@ -21,6 +21,12 @@ function earlier(page) {
   return [make("p", { className: "note stale" }, ["The vessel shown is of an earlier choice. ", make("button", { type: "button", className: "link", onClick: () => page.go(stale) }, ["Find it again"])])];
 }
 
+/** What the study that the case was opened from was told besides. */
+function unseen(page) {
+  const { unseen } = page.view;
+  return unseen.length ? [make("p", { className: "note" }, [`As in the study that this case was opened from: ${unseen.join(", ")}.`])] : [];
+}
+
 function main(page, words, act, isOff = false) {
   return make("button", { type: "button", className: "primary wide", disabled: isOff, onClick: act }, [words]);
 }
@@ -151,7 +157,7 @@ export const panels = {
       select("pulse", "Inlet", flow.is_pulsatile ? "1" : "", [["", "steady, at the mean"], ["1", "pulse of the carotid"]], (value) => page.chooseFlow({ is_pulsatile: Boolean(value) })),
       select("outlets", "Outlets", flow.outlets, [["zero_pressure", "zero pressure"], ["murray", "split by r³ (Murray)"]], (value) => page.chooseFlow({ outlets: value })),
     );
-    parts.push(page.pulseChart(), ...failure(page), ...staleness(page));
+    parts.push(page.pulseChart(), ...unseen(page), ...failure(page), ...staleness(page));
     if (!job) parts.push(main(page, steps.flow === "done" ? "Run again" : "Run the flow", () => page.start("flow"), !page.view.has_anatomy || !page.device));
     if (page.flowPanes?.length) parts.push(modes(page));
     if (page.view.has_report && steps.report === "done") parts.push(next(page, "report", "Report →"));

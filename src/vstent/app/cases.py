@@ -5,16 +5,20 @@ import hashlib
 import json
 import re
 import threading
-from collections.abc import Set
+from collections.abc import Iterator, Set
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vstent.app.choices import Choices
 from vstent.errors import InputError, ReadError
 from vstent.io.files import atomic
+
+if TYPE_CHECKING:  # loaded when a study is to be told something, as in `vstent.app.choices`
+    from vstent.study import Settings
 
 STATE: Final = "app.json"
 """File of a case folder that remembers the page's state."""
@@ -41,6 +45,8 @@ class State(BaseModel):
     """The scan or surface: inside the case folder, or anywhere on this machine where it was given at the shell."""
     source: str = ""
     """SHA-256 of the input."""
+    former: dict[str, Any] = Field(default_factory=dict)
+    """Settings of the study that the case was opened from, as its `run.json` tells them; empty where it began here."""
     choices: Choices = Choices()
     undo: tuple[Choices, ...] = ()
     redo: tuple[Choices, ...] = ()
@@ -54,6 +60,43 @@ class State(BaseModel):
     """Key of the anatomy in the ledger."""
     job: str = ""
     """What is at work or, after the server was killed, was."""
+
+    def former_settings(self) -> "Settings":
+        """Return what stays where nothing can be chosen on the page.
+
+        Raises
+        ------
+        ReadError
+            They are of a study of another version.
+        """
+        from vstent.study import Settings
+        from vstent.study.repeat import settings_of
+
+        try:
+            return settings_of(self.former) if self.former else Settings()
+        except ValueError:
+            raise ReadError(
+                f"{self.name} was opened from a study of another version of vstent: open its scan anew."
+            ) from None
+
+    def settings(self) -> "Settings":
+        """Return what a study is told."""
+        return self.choices.settings(self.former_settings())
+
+    def unseen(self) -> list[str]:
+        """Return the settings, with their values, that cannot be chosen on the page and are not as it has them."""
+        from vstent.study import Settings
+
+        return list(_differences(asdict(self.settings()), asdict(self.choices.settings(Settings()))))
+
+
+def _differences(given: dict[str, Any], usual: dict[str, Any], before: str = "") -> Iterator[str]:
+    """Names, with their values where those are short, of what is not as usual."""
+    for name, value in given.items():
+        if isinstance(value, dict) and isinstance(usual[name], dict):
+            yield from _differences(value, usual[name], f"{before}{name} ")
+        elif value != usual[name]:
+            yield f"{before}{name}" + ("" if isinstance(value, dict | tuple) else f" {value}")
 
 
 def dependencies(state: State) -> dict[str, str]:

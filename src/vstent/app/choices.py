@@ -1,11 +1,13 @@
 """What a user has chosen, as the page and the REST interface say it, and as a study understands it."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 if TYPE_CHECKING:  # a study's modules are loaded when it is to be told something: the page must be there at once
     from vstent.flow import FlowSettings
+    from vstent.flow.types import Waveform
     from vstent.study import Placing, Settings
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
@@ -39,16 +41,14 @@ class FlowChoice(Strict):
     is_pulsatile: bool = False
     outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
 
-    def settings(self) -> "FlowSettings | None":
-        """Return what a study is told of the flow."""
-        from vstent.flow import FlowSettings
-        from vstent.flow.waveform import OLDER_ADULT_ICA
-
+    def settings(self, former: "FlowSettings") -> "FlowSettings | None":
+        """Return what a study is told of the flow; what cannot be chosen here stays as it was in `former`."""
         if not self.is_wanted:
             return None
-        return FlowSettings(
+        return replace(
+            former,
             inflow_mL_s=self.inflow_mL_s,
-            waveform=OLDER_ADULT_ICA if self.is_pulsatile else None,
+            waveform=pulse_of(former) if self.is_pulsatile else None,
             outlets=self.outlets,
             cell_size_mm=self.cell_size_mm,
         )
@@ -84,13 +84,18 @@ class Choices(Strict):
             raise ValueError("a device can be chosen once")
         return devices
 
-    def settings(self) -> "Settings":
-        """Return what a study is told."""
-        from vstent.study import Placing, Settings
+    def settings(self, former: "Settings") -> "Settings":
+        """Return what a study is told; what cannot be chosen here stays as it was in `former`."""
+        from vstent.flow import FlowSettings
+        from vstent.study import Placing
         from vstent.uncertainty import Ranges
 
         samples = self.uncertainty_samples
-        return Settings(
+        return replace(
+            former,
+            diameter_mm=None,  # every device is told its own below
+            length_mm=None,
+            center_mm=None,
             devices=tuple(device.name for device in self.devices),
             units=self.units,
             spacing_mm=self.spacing_mm,
@@ -102,10 +107,17 @@ class Choices(Strict):
             neck_mm=self.neck_mm,
             upstream_mm=self.upstream_mm,
             downstream_mm=self.downstream_mm,
-            flow=self.flow.settings(),
+            flow=self.flow.settings(former.flow or FlowSettings()),
             placings={device.name: placing for device in self.devices if (placing := placing_of(device)) != Placing()},
-            uncertainty=None if samples is None else Ranges(samples),
+            uncertainty=None if samples is None else replace(former.uncertainty or Ranges(), samples=samples),
         )
+
+
+def pulse_of(former: "FlowSettings") -> "Waveform":
+    """Return the pulse that can be chosen: the former one, or the published one where there was none."""
+    from vstent.flow.waveform import OLDER_ADULT_ICA
+
+    return former.waveform or OLDER_ADULT_ICA
 
 
 def placing_of(device: DeviceChoice) -> "Placing":

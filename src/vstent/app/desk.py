@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Conflict, Store, dependencies, failures, statuses
-from vstent.app.choices import DeviceChoice, Point
+from vstent.app.choices import DeviceChoice, Point, pulse_of
 from vstent.app.finished import REPORT, RUN, kept_flows, lost_steps
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.app.reopening import reopened, stem
@@ -57,9 +57,9 @@ class Desk:
         for case_id in self.store.ids():
             try:
                 case = self.store.get(case_id)
+                steps = statuses(case.state, "", lost_steps(case.folder, case.state))
             except ReadError:
                 continue  # somebody else's folder, or a damaged one
-            steps = statuses(case.state, "", lost_steps(case.folder, case.state))
             found.append({"id": case_id, "name": case.state.name, "done": [s for s in STEPS if steps[s] == "done"]})
         return found
 
@@ -74,6 +74,7 @@ class Desk:
             "folder": str(case.folder),
             "revision": state.revision,
             "choices": state.choices.model_dump(mode="json"),
+            "unseen": state.unseen() if state.former else [],
             "steps": statuses(state, at_work, lost_steps(case.folder, state)),
             "failed": failures(state),
             "can_undo": bool(state.undo),
@@ -285,14 +286,16 @@ def ranking(case: Case) -> dict[str, Any]:
     return found | {"is_current": is_current}
 
 
-def pulse() -> dict[str, Any]:
-    """Return the published pulse: times and flow over mean flow."""
+def pulse(case: Case | None) -> dict[str, Any]:
+    """Return the pulse that can be chosen, the published one unless a case has its own: times, flow over mean flow."""
     import numpy as np
 
-    from vstent.flow.waveform import OLDER_ADULT_ICA
+    from vstent.flow import FlowSettings
 
-    time_s = np.linspace(0.0, OLDER_ADULT_ICA.period_s, 101)
-    return {"time_s": time_s.tolist(), "factor": OLDER_ADULT_ICA.factor(time_s).tolist()}
+    former = None if case is None else case.state.former_settings().flow
+    waveform = pulse_of(former or FlowSettings())
+    time_s = np.linspace(0.0, waveform.period_s, 101)
+    return {"time_s": time_s.tolist(), "factor": waveform.factor(time_s).tolist()}
 
 
 def _titles(metrics: dict[str, Any], case: Case) -> dict[str, str]:

@@ -60,6 +60,8 @@ class Job:
         self.finished: list[dict[str, Any]] = []
         self.residual: deque[tuple[float, float]] = deque(maxlen=POINTS_KEPT)
         self._given = case.state
+        keys = dependencies(self._given)
+        self._has_anatomy = all(self._given.done.get(step) == keys[step] for step in KINDS["anatomy"])
         self._is_stopped = False
         command = [sys.executable, "-m", "vstent.app.worker", kind, str(case.folder)]
         with (case.folder / LAST_WORDS).open("w", encoding="utf-8") as last_words:
@@ -80,7 +82,9 @@ class Job:
         """The step that is at work; empty once all is done."""
         if self._process.poll() is not None and not self._thread.is_alive():
             return ""
-        return STAGES.get(self.stage.partition(" ")[0], FIRST[self.kind])
+        step = STAGES.get(self.stage.partition(" ")[0], FIRST[self.kind])
+        is_past = self._has_anatomy and step not in KINDS[self.kind]  # the anatomy is only read again
+        return FIRST[self.kind] if is_past else step
 
     @property
     def is_alive(self) -> bool:
@@ -145,6 +149,7 @@ class Job:
 
     def _take_anatomy(self, key: str) -> None:
         """The anatomy of the choices given is found, whatever job it was found for."""
+        self._has_anatomy = True
         steps, keys, state = KINDS["anatomy"], dependencies(self._given), self.case.state
         failed = {step: why for step, why in state.failed.items() if step not in steps}
         self.case.update(anatomy=key, done=state.done | {step: keys[step] for step in steps}, failed=failed)

@@ -25,7 +25,7 @@ def rank_sizes(case: Case, progress: Progress) -> None:
     InputError
         No device is chosen.
     """
-    settings = case.state.choices.settings()
+    settings = case.state.settings()
     ledger = Ledger(case.folder / CACHE, progress)
     anatomy = find_anatomy(case.input, case.state.source, settings, ledger)
 

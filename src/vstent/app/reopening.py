@@ -1,21 +1,26 @@
 """Reopening: a case folder that `vstent run` has written becomes a case of the page, with all that was found."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 from pydantic import ValidationError
 
 from vstent.app.cases import STEPS, Case, State, Store, dependencies
-from vstent.app.choices import Choices, DeviceChoice, FlowChoice
+from vstent.app.choices import Choices
 from vstent.app.finished import RUN, lost_steps
 from vstent.errors import ReadError
 from vstent.io.files import suffix
+
+if TYPE_CHECKING:  # loaded when a folder is opened, as in `vstent.app.choices`
+    from vstent.study import Settings
 
 GEOMETRY: Final = (
     *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
     *("neck_mm", "upstream_mm", "downstream_mm"),
 )
+FLOW: Final = ("cell_size_mm", "inflow_mL_s", "outlets")
 
 
 def stem(path: Path) -> str:
@@ -30,20 +35,23 @@ def reopened(store: Store, folder: Path) -> Case:
     Raises
     ------
     ReadError
-        The folder does not say how it was made, or not in a way that this version understands.
+        The folder does not say how it was made, or not in a way that this version understands, or has a setting that
+        the page does not take.
     """
     from vstent.study import CACHE, INPUT
+    from vstent.study.repeat import UNTOLD, settings_of
 
     try:
         told = json.loads((folder / RUN).read_text(encoding="utf-8"))
-        choices = _choices(told["settings"])
+        settings, source = settings_of(told["settings"]), told["input"]["sha256"]
         where = json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"]
-    except (OSError, ValueError, KeyError, TypeError, ValidationError):
+    except UNTOLD:
         raise ReadError(
             f"{folder} was not written by this version of vstent: run the study again, or open its scan."
         ) from None
+    choices = _choices(settings, folder)
     anatomy = next((path.stem.rpartition("-")[2] for path in (folder / CACHE).glob("anatomy-*.npz")), "")
-    known = {"input": where, "source": told["input"]["sha256"], "choices": choices, "anatomy": anatomy}
+    known = {"input": where, "source": source, "former": told["settings"], "choices": choices, "anatomy": anatomy}
     state = State(name=folder.name, **known)
     keys = dependencies(state)
     is_whole = choices.flow.is_wanted and not lost_steps(folder, state)
@@ -51,19 +59,20 @@ def reopened(store: Store, folder: Path) -> Case:
     return store.create(folder.name, folder, done=done, **known)
 
 
-def _choices(settings: dict[str, Any]) -> Choices:
-    placings = settings.get("placings", {})
-    shared = {name: settings[name] for name in ("diameter_mm", "length_mm", "center_mm")}
-    devices = tuple(DeviceChoice(name=name, **placings.get(name, shared)) for name in settings["devices"])
-    flow, varied = settings["flow"], settings["uncertainty"]
-    chosen = FlowChoice(is_wanted=False)
+def _choices(settings: "Settings", folder: Path) -> Choices:
+    """What of a study's settings can be chosen on the page; ReadError where a value cannot."""
+    flow, varied = settings.flow, settings.uncertainty
+    chosen = {name: getattr(settings, name) for name in GEOMETRY}
+    chosen["devices"] = [{"name": name} | asdict(settings.placing(name)) for name in settings.devices]
+    chosen["flow"] = {"is_wanted": False}
     if flow is not None:
-        chosen = FlowChoice(
-            cell_size_mm=flow["cell_size_mm"],
-            inflow_mL_s=flow["inflow_mL_s"],
-            is_pulsatile=flow["waveform"] is not None,
-            outlets=flow["outlets"],
-        )
-    geometry = {name: settings[name] for name in GEOMETRY}
-    samples = None if varied is None else varied["samples"]
-    return Choices(devices=devices, flow=chosen, uncertainty_samples=samples, **geometry)
+        chosen["flow"] = {name: getattr(flow, name) for name in FLOW} | {"is_pulsatile": flow.waveform is not None}
+    chosen["uncertainty_samples"] = None if varied is None else varied.samples
+    try:
+        return Choices.model_validate(chosen)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ReadError(
+            f"{folder} has {'.'.join(map(str, first['loc']))} = {first['input']}, which the page does not take "
+            f"({first['msg']}): go on with it by `vstent run`."
+        ) from None

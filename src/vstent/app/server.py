@@ -286,6 +286,6 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
     def flow(case_id: str, moment: Annotated[int | None, Query(ge=0)] = None) -> Response:
         return Response(desk.live(desk.store.get(case_id)).flow_message(moment), media_type=BINARY)
 
-    @api.get("/api/waveform", summary="The pulse of the internal carotid: flow over mean flow")
-    def waveform() -> dict[str, Any]:
-        return desks.pulse()
+    @api.get("/api/waveform", summary="The pulse that can be chosen, the published one or a case's own")
+    def waveform(case_id: str | None = None) -> dict[str, Any]:
+        return desks.pulse(None if case_id is None else desk.store.get(case_id))

@@ -43,12 +43,12 @@ def find_anatomy(case: Case) -> None:
     """Find vessel, sac, neck and parent artery."""
     from vstent.study import restore_vessel
 
-    restore_vessel(case.input, case.folder, case.state.choices.settings(), progress)
+    restore_vessel(case.input, case.folder, case.state.settings(), progress)
     tell(anatomy=_anatomy_key(case))
 
 
 def _anatomy_key(case: Case) -> str:
-    return anatomy_key(hash_of(case.input), case.state.choices.settings())
+    return anatomy_key(hash_of(case.input), case.state.settings())
 
 
 def compute(case: Case) -> None:
@@ -57,7 +57,7 @@ def compute(case: Case) -> None:
 
     if _anatomy_key(case) != case.state.anatomy:
         find_anatomy(case)  # and told before the flow: a job that is stopped there has replaced the former one
-    result = run(case.input, case.folder, case.state.choices.settings(), progress)
+    result = run(case.input, case.folder, case.state.settings(), progress)
     progress("report", 0.0, "")
     write_report(result, case.folder, is_printed=True)
     progress("report", 1.0, "")

@@ -4,8 +4,9 @@ import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from vstent.errors import InputError, ReadError
 from vstent.io.files import existing
@@ -13,6 +14,9 @@ from vstent.study.folder import CACHE
 from vstent.study.ledger import hash_of
 from vstent.study.provenance import INPUT, METRICS, RUN, devices_of, machine, versions
 from vstent.study.types import Settings
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 MISSING: Final = "absent"
 SECONDS: Final = "seconds"
@@ -97,12 +101,17 @@ def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
 
 def settings_of(told: Mapping[str, Any]) -> Settings:
     """Rebuild the settings that a `run.json` tells; ValueError where this version does not know one."""
-    from pydantic import TypeAdapter  # its ValidationError is a ValueError
-
     unknown = sorted(set(told) - {field.name for field in fields(Settings)})
     if unknown:
         raise ValueError(f"unknown settings: {unknown}")
-    return TypeAdapter(Settings).validate_python(dict(told))
+    return _adapter().validate_python(dict(told))
+
+
+@cache
+def _adapter() -> "TypeAdapter[Settings]":
+    from pydantic import TypeAdapter  # its ValidationError is a ValueError
+
+    return TypeAdapter(Settings)
 
 
 def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]:
