@@ -17,7 +17,7 @@ import app_case
 import report_case
 import vstent
 from vstent import phantoms
-from vstent.app import cuts, sheets
+from vstent.app import cuts, intake, sheets
 from vstent.app.cases import STEPS, Store, load
 from vstent.app.desk import Desk
 from vstent.app.finished import kept_flows
@@ -128,6 +128,54 @@ def test_voxels_without_a_header_wait_for_their_number_and_size(client):
         assert (told["shape"], told["spacing_mm"]) == ([16, 20, 24], pytest.approx(spacing_mm))
 
 
+def test_a_case_takes_one_scan(client, case, artery):
+    answer = client.put(f"{case}/input", params={"name": "other.stl"}, content=artery.read_bytes())
+    assert answer.status_code == 422
+    assert "make another case for other.stl" in answer.json()["detail"]
+    two = f"/api/cases/{client.post('/api/cases', json={'name': 'two'}).json()['id']}"
+    for name in ("one.stl", "other.stl"):
+        assert client.put(f"{two}/input", params={"name": name}, content=artery.read_bytes()).status_code == 200
+    answer = client.post(f"{two}/input/done")
+    assert answer.status_code == 422
+    assert "one.stl and other.stl" in answer.json()["detail"]
+
+
+def test_a_header_and_the_voxels_that_it_names_are_one_scan(tmp_path):
+    (tmp_path / intake.FOLDER).mkdir()
+    (tmp_path / intake.FOLDER / "a.raw").write_bytes(bytes(8))
+    header = tmp_path / intake.FOLDER / "b.mhd"
+    header.write_text("ObjectType = Image\nNDims = 3\nDimSize = 2 2 2\nElementDataFile = a.raw\n")
+    assert intake.found(tmp_path) == f"{intake.FOLDER}/b.mhd"
+    (tmp_path / intake.FOLDER / "c.raw").write_bytes(bytes(8))
+    with pytest.raises(ReadError, match=r"b.mhd and c.raw"):
+        intake.found(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("way", "status", "words"),
+    [
+        ("/api/cases/unheard-of", 404, "no such case"),
+        ("/assets/unheard-of", 404, "no such file"),
+        ("{case}/section?abscissa_mm=nan", 422, "finite"),
+        ("{case}/image/surface?threshold=inf", 422, "finite"),
+    ],
+)
+def test_what_is_not_there_and_what_is_no_number_is_said_so(client, case, workspace, way, status, words):
+    answer = client.get(way.format(case=case))
+    assert answer.status_code == status
+    assert words in answer.text
+    assert str(workspace) not in answer.text
+
+
+def test_a_place_for_a_deployment_is_one_of_the_choices(client, case):
+    assert client.post(f"{case}/deployment", json={"device": SILK, "abscissa_mm": 12.0}).status_code == 422
+
+
+def test_a_case_without_a_scan_says_so(client):
+    empty = client.post("/api/cases", json={"name": "empty"}).json()["id"]
+    assert "no scan yet" in client.get(f"/api/cases/{empty}/image").json()["detail"]
+
+
 def test_a_second_tab_cannot_undo_what_the_first_has_done(client, case):
     before = client.get(case).json()
     assert choose(client, case, inlet_mm=[1.0, 2.0, 3.0]).status_code == 200
@@ -159,6 +207,7 @@ def test_a_second_tab_cannot_undo_what_the_first_has_done(client, case):
         {"flow": {"cell_size_mm": 0.001}},
         {"nonsense": 1},
         {"threshold": "high"},
+        {"shape": [-1, 0, 3]},
     ],
 )
 def test_choices_that_mean_nothing_are_refused(client, case, changes):

@@ -34,6 +34,10 @@ class Conflict(InputError):
     """Somebody else has changed the case since it was looked at."""
 
 
+class Absent(ReadError):
+    """There is nothing of that name."""
+
+
 class State(BaseModel):
     """What a case folder remembers."""
 
@@ -272,13 +276,15 @@ class Store:
 
         Raises
         ------
-        ReadError
+        Absent
             There is none of that name.
+        ReadError
+            It is damaged.
         """
         with self._lock:
             if case_id not in self._cases:
-                if identifier(case_id) != case_id:
-                    raise ReadError("There is no such case.")
+                if identifier(case_id) != case_id or not (self.workspace / case_id / STATE).is_file():
+                    raise Absent("There is no such case: choose one of the list on the first page.")
                 self._cases[case_id] = load(case_id, self.workspace / case_id)
             return self._cases[case_id]
 

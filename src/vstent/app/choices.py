@@ -12,6 +12,7 @@ if TYPE_CHECKING:  # a study's modules are loaded when it is to be told somethin
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
 Length = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
+Count = Annotated[int, Field(gt=0, le=100_000)]
 NECK_HANDLES: Final = 12
 """Points of a neck that can be pulled, evenly spaced."""
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -59,7 +60,7 @@ class Choices(Strict):
 
     units: Literal["m", "cm", "mm"] | None = None
     spacing_mm: tuple[Length, Length, Length] | None = None
-    shape: tuple[int, int, int] | None = None
+    shape: tuple[Count, Count, Count] | None = None
     threshold: Annotated[float, Field(allow_inf_nan=False)] | None = None
     at_mm: Point | None = None
     inlet_mm: Point | None = None

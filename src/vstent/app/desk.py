@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vstent.app import intake
-from vstent.app.cases import STATE, STEPS, Case, Conflict, Store, dependencies, failures, statuses
+from vstent.app.cases import STATE, STEPS, Absent, Case, Conflict, Store, dependencies, failures, statuses
 from vstent.app.choices import DeviceChoice, Point, pulse_of
 from vstent.app.finished import REPORT, RUN, kept_flows, lost_steps
 from vstent.app.jobs import KINDS, RANKING, Jobs
@@ -160,12 +160,12 @@ class Desk:
         Raises
         ------
         InputError
-            It is a surface.
+            It is a surface, or nothing has come in yet.
         """
         from vstent.app.scans import Scan
         from vstent.io.images import read_image
 
-        if not case.state.source or _is_surface(case):
+        if _is_surface(case):
             raise InputError("This case has no scan: it began with a surface.")
         choices = case.state.choices
         grid = choices.spacing_mm, choices.shape
@@ -232,11 +232,21 @@ def code_of(error: Exception) -> int:
     """Return the HTTP status that says what kind of error it is."""
     if isinstance(error, Conflict):
         return 409
+    if isinstance(error, Absent):
+        return 404
     return 422 if isinstance(error, InputError) else 500
 
 
 def begin_upload(case: Case, name: str) -> Path:
-    """Return a file to write an upload to."""
+    """Return a file to write an upload to.
+
+    Raises
+    ------
+    InputError
+        The case has its scan, or the name is none of a scan or a surface.
+    """
+    if case.state.source:
+        raise InputError(f"{case.state.name} has its scan or surface already: make another case for {name}.")
     intake.checked_name(name)
     folder = case.folder / intake.FOLDER
     folder.mkdir(parents=True, exist_ok=True)

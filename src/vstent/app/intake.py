@@ -78,18 +78,25 @@ def found(case_folder: Path) -> str:
     Raises
     ------
     ReadError
-        Nothing that can be read has come in.
+        Nothing that can be read has come in, or more than one scan or surface.
     """
+    from vstent.io.images import files_of  # not for the first page, which needs no reader
+
     folder = case_folder / FOLDER
-    if (folder / SERIES).is_dir():
-        return f"{FOLDER}/{SERIES}"
     files = sorted(path for path in folder.glob("*") if path.is_file() and not path.name.startswith("."))
     known = [path for path in files if suffix(path) in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES)]
-    # A header that names its data file says more than that.
-    known.sort(key=lambda path: suffix(path) not in (".mhd", ".nhdr"))
-    if not known:
+    voxels = {file for path in known for file in files_of(path)[1:]}  # that lie apart from their header
+    scans = [path for path in known if path not in voxels]
+    if (folder / SERIES).is_dir():
+        scans.append(folder / SERIES)
+    if not scans:
         raise ReadError("Nothing that has come in is a scan or a surface: drop a DICOM folder, a volume or a surface.")
-    return f"{FOLDER}/{known[0].name}"
+    if len(scans) > 1:
+        names = " and ".join(path.name for path in scans[:2])
+        raise ReadError(
+            f"More than one scan or surface has come in ({names}): drop one of them, for a case of its own."
+        )
+    return f"{FOLDER}/{scans[0].name}"
 
 
 def _take_slice(path: Path, folder: Path) -> None:

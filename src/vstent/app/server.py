@@ -16,6 +16,7 @@ from fastapi.responses import FileResponse, JSONResponse, Response, StreamingRes
 from pydantic import Field
 
 from vstent.app import desk as desks
+from vstent.app.cases import Absent
 from vstent.app.choices import NECK_HANDLES, Choices, DeviceChoice, Point, Strict
 from vstent.app.desk import Desk
 from vstent.app.security import REPORT_POLICY, Guard
@@ -30,6 +31,7 @@ ASSETS: Final = ("index.html", "app.js", "app.css", "docs.html", "docs.js", *SHA
 BEAT_S: Final = 15.0
 """A quiet stream of events says something this often."""
 
+Finite = Annotated[float, Query(allow_inf_nan=False)]
 Revision = Annotated[int, Field(ge=0)]
 
 
@@ -52,13 +54,18 @@ class Seen(Strict):
     revision: Revision
 
 
-class SketchWanted(Strict):
-    """A device at a place, to be drawn."""
+class DeviceWanted(Strict):
+    """A device, to be drawn."""
 
     device: DeviceChoice
+    colour: Literal["wall_gap", "coverage", "diameter"] = "wall_gap"
+
+
+class SketchWanted(DeviceWanted):
+    """A device at a place, to be drawn."""
+
     anchor: Literal["proximal", "center", "distal"] = "center"
     abscissa_mm: float | None = Field(default=None, ge=-1000, le=1000)
-    colour: Literal["wall_gap", "coverage", "diameter"] = "wall_gap"
 
 
 class NeckWanted(Strict):
@@ -127,7 +134,7 @@ def _add_page(app: FastAPI) -> None:
     @app.get("/assets/{name}", include_in_schema=False)
     def one(name: str) -> Response:
         if name not in ASSETS:
-            raise ReadError("There is no such file.")
+            raise Absent("There is no such file: the page is at /.")
         return asset(name)
 
 
@@ -222,7 +229,7 @@ def _add_input(api: APIRouter, desk: Desk) -> None:
         return Response(desk.scan(desk.store.get(case_id)).slice(axis, index), media_type=BINARY)
 
     @api.get("/api/cases/{case_id}/image/surface", summary="The surface that a threshold gives (binary)")
-    def surface(case_id: str, threshold: float) -> Response:
+    def surface(case_id: str, threshold: Finite) -> Response:
         return Response(desk.surface(desk.store.get(case_id), threshold), media_type=BINARY)
 
 
@@ -272,14 +279,14 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
         return Response(live.sketch_message(wanted.device, landing, wanted.colour), media_type=BINARY)
 
     @api.post("/api/cases/{case_id}/deployment", summary="A device deployed, with its expansion and numbers (binary)")
-    def deployment(case_id: str, wanted: SketchWanted) -> Response:
+    def deployment(case_id: str, wanted: DeviceWanted) -> Response:
         found = desk.store.get(case_id)
         answer = desk.live(found).deployment_message(wanted.device, wanted.colour)
         desk.note_deployed(found, wanted.device)
         return Response(answer, media_type=BINARY)
 
     @api.get("/api/cases/{case_id}/section", summary="What a plane across the parent axis cuts")
-    def section(case_id: str, abscissa_mm: float, device: str | None = None) -> dict[str, Any]:
+    def section(case_id: str, abscissa_mm: Finite, device: str | None = None) -> dict[str, Any]:
         return desk.live(desk.store.get(case_id)).section(device, abscissa_mm)
 
     @api.get("/api/cases/{case_id}/flow", summary="Wall shear stress, streamlines and a cut, on one scale (binary)")
