@@ -7,6 +7,7 @@ is closed by the smoothest surface through the wall around them (`landing`). Wha
 and holds the sac's dome is the sac (`sac`).
 """
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import Final
 
@@ -33,6 +34,10 @@ IN_SAC: Final = 1.2
 """A sphere reaches into a sac whose wall is within this many of its radii."""
 PASSING: Final = 2.0
 """A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
+ON_SAC_MM: Final = 0.05
+"""A bulge whose dome is not further outside a sac than this is a lobe of it."""
+NEAR_SAC_MM: Final = 4.0
+"""An opening so near to a sac's wall is told."""
 
 __all__ = ["restore"]
 
@@ -78,14 +83,23 @@ def restore(
         landing.surface,
         landing.is_restored.ravel(),
         aneurysms,
-        _notes(vessel, path, aneurysms, len(bulges)),
+        (*_notes(vessel, path, aneurysms, bulges), *_near_sacs(vessel, bulges)),
     )
 
 
 def _sacs(vessel: Vessel, landing: Landing, side_lines: list[Centerline], bulges: list[Bulge]) -> list[Aneurysm]:
     """The sacs of those bulges that hang on the parent artery and are not flat."""
-    cut = (cut_sac(vessel, landing, side_lines, bulge) for bulge in bulges)
-    return [sac for sac in cut if sac is not None]
+    found: list[Aneurysm] = []
+    for bulge in bulges:
+        # Bulges apart above the tubes may be one sac above the landing surface, which lies lower.
+        sac = None if _is_in_one(bulge, found) else cut_sac(vessel, landing, side_lines, bulge)
+        found += [] if sac is None else [sac]
+    return found
+
+
+def _is_in_one(bulge: Bulge, aneurysms: Sequence[Aneurysm]) -> bool:
+    """Tell whether a bulge's dome belongs to one of the sacs."""
+    return any(one.sac.signed_distance(bulge.dome_mm[None])[0] < ON_SAC_MM for one in aneurysms)
 
 
 def _parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -> int:
@@ -125,23 +139,47 @@ def _foot_on(line: Centerline, bulge: Bulge) -> Floats:
 
 
 def _is_wider(one: Centerline, other: Centerline, one_is_off: Bools, other_is_off: Bools) -> bool:
-    """Tell whether the first of two centerlines is the wider over `REACH_MM` beyond their fork, off the sac."""
+    """Tell whether the first of two centerlines is the wider over `REACH_MM` beyond their fork."""
     return _width_beyond_fork(one, other, one_is_off) >= _width_beyond_fork(other, one, other_is_off)
 
 
 def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> float:
+    """Median radius of a centerline over `REACH_MM` beyond its fork from another; 0 where it parts in the sac alone."""
     distance = curves.project(other.points_mm, line.points_mm)[1]
     apart = np.flatnonzero((distance > line.inscribed_radius_mm) & is_off)
-    fork_mm = line.abscissa_mm[apart[0]] if len(apart) else line.length_mm
+    if not len(apart):
+        return 0.0
+    fork_mm = line.abscissa_mm[apart[0]]
     beyond = (line.abscissa_mm >= fork_mm) & (line.abscissa_mm <= fork_mm + REACH_MM)
-    return float(np.median(line.inscribed_radius_mm[beyond]))
+    # A way that is mostly in the sac is a branch of the sac: the sac's own width is none of its.
+    own = beyond & is_off if (beyond & is_off).sum() < 0.5 * beyond.sum() else beyond
+    return float(np.median(line.inscribed_radius_mm[own]))
 
 
-def _notes(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges: int) -> tuple[str, ...]:
+def _notes(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], bulges: list[Bulge]) -> tuple[str, ...]:
     outlet = vessel.outlets[path]
     notes = [f"The parent artery runs from the inlet to {outlet.role} (diameter {outlet.diameter_mm:.1f} mm)."]
     if not aneurysms:
         notes.append("No sac was found: the landing surface is the artery's own wall with its side branches closed.")
-    if n_bulges > len(aneurysms) > 0:
-        notes.append(f"{n_bulges - len(aneurysms)} more bulges are flat or hang on other branches: left in the lumen.")
+        return tuple(notes)
+    n_left = sum(not _is_in_one(bulge, aneurysms) for bulge in bulges)
+    if n_left:
+        notes.append(f"{n_left} more bulges are flat or hang on other branches: left in the lumen.")
+    if len(bulges) > n_left + len(aneurysms):
+        notes.append(f"{len(bulges) - n_left - len(aneurysms)} more bulges are lobes of a sac and measured with it.")
+    return tuple(notes)
+
+
+def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
+    """Sentences on the openings that lie on a sac or beside one: holes in it, or branches cut off at their mouth."""
+    notes = []
+    for opening in vessel.openings:
+        gap_mm = min((float(bulge.distances_mm(opening.center_mm[None])[0]) for bulge in bulges), default=np.inf)
+        if gap_mm < NEAR_SAC_MM:
+            x, y, z = opening.center_mm
+            notes.append(
+                f"{opening.role}, {opening.diameter_mm:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm, lies "
+                f"{gap_mm:.1f} mm from a sac's wall: close it where it is a hole; give --outlet where the parent "
+                "artery leads elsewhere."
+            )
     return tuple(notes)

@@ -1,0 +1,63 @@
+"""Vessels that mislead: openings on a sac, lobes, trims too short, arteries that are sacs themselves."""
+
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+from vstent import phantoms
+from vstent.repair import repair
+from vstent.restore import restore
+from vstent.restore.bulges import find_bulges
+from vstent.restore.tubes import tubes_of
+from vstent.trace import trace
+from vstent.vessel import Anatomy, Centerline, Vessel
+
+
+def traced(phantom: phantoms.Phantom) -> Vessel:
+    return trace(Vessel(repair(phantoms.phantom_surface(phantom, edge_mm=0.3))[0]))
+
+
+@pytest.fixture(scope="module")
+def demo() -> Anatomy:
+    return restore(traced(phantoms.demo_phantom()))
+
+
+def demo_with_a_stub_in_its_dome(*, length_mm: float, radius_mm: float) -> phantoms.Phantom:
+    """The demo's phantom and a branch that leaves the dome of its sac and is cut off so far beyond it."""
+    phantom = phantoms.demo_phantom()
+    assert phantom.sac is not None
+    reach = np.linspace(0.0, phantom.sac.height_radius_mm + length_mm, 120)
+    points = phantom.sac.center_mm + reach[:, None] * phantom.sac.direction
+    stub = Centerline(points, np.full(len(points), radius_mm))
+    return replace(phantom, branches=(*phantom.branches, stub))
+
+
+def test_a_short_branch_out_of_the_sac_is_not_the_parent_artery(demo) -> None:
+    anatomy = restore(traced(demo_with_a_stub_in_its_dome(length_mm=1.0, radius_mm=0.7)))
+    assert "outlet_1 (diameter 3.6 mm)" in anatomy.notes[0]
+    np.testing.assert_allclose(anatomy.aneurysms[0].neck.area_mm2, demo.aneurysms[0].neck.area_mm2, rtol=0.03)
+    np.testing.assert_allclose(anatomy.aneurysms[0].sac.volume_mm3, demo.aneurysms[0].sac.volume_mm3, rtol=0.02)
+
+
+@pytest.mark.parametrize(("length_mm", "radius_mm"), [(1.0, 0.7), (2.0, 1.2)])
+def test_an_opening_on_a_sac_is_told_with_its_place(length_mm: float, radius_mm: float) -> None:
+    vessel = traced(demo_with_a_stub_in_its_dome(length_mm=length_mm, radius_mm=radius_mm))
+    x, y, z = vessel.outlets[1].center_mm
+    (note,) = (note for note in restore(vessel).notes if "from a sac's wall" in note)
+    assert note.startswith(f"outlet_2, {2 * radius_mm:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm, lies ")
+
+
+def test_openings_far_from_the_sac_are_not_told(demo) -> None:
+    assert not any("from a sac's wall" in note for note in demo.notes)
+
+
+def test_a_lobe_of_a_sac_is_no_sac_of_its_own(demo, monkeypatch) -> None:
+    (bulge,) = find_bulges(demo.vessel.lumen, tubes_of(demo.vessel.centerlines))
+    far_side = bulge.points_mm[np.argmax(np.linalg.norm(bulge.points_mm - bulge.dome_mm, axis=1))]
+    lobe = replace(bulge, dome_mm=far_side)
+    monkeypatch.setattr(import_module("vstent.restore"), "find_bulges", lambda *_: [bulge, lobe])
+    anatomy = restore(demo.vessel)
+    assert len(anatomy.aneurysms) == 1
+    assert anatomy.notes[1:] == ("1 more bulges are lobes of a sac and measured with it.",)
