@@ -140,6 +140,41 @@ def test_the_band_told_for_five_per_cent_is_what_happens(demo):
     assert told == pytest.approx(measured, rel=0.15)
 
 
+def beyond_the_field_of_view(image):
+    """Tell the voxels outside a cylinder about the first axis."""
+    place = [(np.arange(n) - (n - 1) / 2) / ((n - 1) / 2) for n in image.voxels.shape[1:]]
+    return np.broadcast_to(np.hypot(*np.meshgrid(*place, indexing="ij")) > 0.98, image.voxels.shape)
+
+
+@pytest.mark.parametrize(("scale", "shift", "padding"), [(1.0, 0.0, -2000), (1.0, 0.0, -32768), (0.2, 20.0, -1000)])
+def test_padding_or_air_around_the_field_of_view_does_not_hide_the_vessel(demo, scale, shift, padding):
+    _, image, vessel = demo
+    voxels = np.where(beyond_the_field_of_view(image), padding, image.voxels * scale + shift).astype(np.int32)
+    assert threshold_of(segment(Image(voxels, image.affine_mm))) == pytest.approx(
+        threshold_of(vessel) * scale + shift, rel=0.02
+    )
+
+
+def test_brighter_bone_far_from_the_point_given_does_not_move_the_threshold(demo):
+    phantom, image, vessel = demo
+    n = image.voxels.shape
+    wide = np.random.default_rng(0).normal(100, 60, (n[0] + 110, *n[1:]))
+    wide[: n[0]] = image.voxels
+    wide[n[0] + 60 : n[0] + 100, 5:-5, 5:-5] = 6000
+    found = segment(Image(wide.astype(np.int16), image.affine_mm), at_mm=phantom.sac.center_mm)
+    assert threshold_of(found) == pytest.approx(threshold_of(vessel), rel=0.01)
+    assert capped_volume(found.lumen) == pytest.approx(capped_volume(vessel.lumen), rel=0.01)
+
+
+def test_what_is_wider_than_any_artery_is_refused():
+    voxels = np.zeros((60, 60, 60))
+    voxels[8:52, 8:52] = 1000
+    with pytest.raises(
+        VesselError, match=r"about \(29\.5, 29\.5, 29\.5\) mm is 45 mm wide, and no artery is wider than"
+    ):
+        segment(Image(gaussian_filter(voxels, 0.8), np.eye(4)), threshold=500.0)
+
+
 def test_smoothing_keeps_the_volume(demo):
     _, image, vessel = demo
     shrinkage = float(re.search(r"volume by ([+-][\d.]+)%", " ".join(vessel.notes))[1])
@@ -196,10 +231,17 @@ def test_a_larger_vessel_within_the_bend_of_the_one_wanted_is_left_out():
     assert capped_volume(segment(image, threshold=500.0).lumen) == pytest.approx(12 * 14 * 31 * 0.3**3, rel=0.1)
 
 
+def test_a_vessel_beside_a_far_larger_bone_is_found_at_a_point():
+    voxels = np.zeros((200, 60, 60))
+    voxels[4:8, 28:32] = voxels[24:196, 4:56, 4:56] = 1000
+    found = segment(Image(gaussian_filter(voxels, 0.8), 0.3 * np.eye(4)), threshold=500.0, at_mm=np.array([1.8, 9, 9]))
+    assert capped_volume(found.lumen) == pytest.approx(4 * 4 * 60 * 0.3**3, rel=0.2)
+
+
 def test_a_point_far_from_any_vessel_is_refused(two_vessels):
     image, in_thin = two_vessels
     for away in ([0, 0, 40.0], [500.0, 0, 0]):
-        with pytest.raises(VesselError, match=r"no lumen within 5 mm"):
+        with pytest.raises(VesselError, match=r"no lumen within 5 mm .* brighter than threshold \d+; check --at"):
             segment(image, at_mm=in_thin + np.array(away))
 
 

@@ -58,9 +58,11 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
         notes.append(f"{n_arms} arms that end blind were cut open square to their axis.")
     loops = lumen.boundary_loops
     if len(loops) < 2:
+        x, y, z = lumen.vertices_mm.mean(axis=0)
         raise VesselError(
-            f"the surface has {len(loops)} openings, but blood needs a way in and a way out: "
-            "cut the vessel open at its ends, or give a longer piece of it"
+            f"the surface about ({x:.1f}, {y:.1f}, {z:.1f}) mm has {len(loops)} openings, but blood needs a way in and "
+            "a way out: cut the vessel open at its ends, or give a longer piece of it; in a scan it may be bone: give "
+            "--at with a point in the artery"
         )
     found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
     widest = max(found, key=lambda opening: opening.area_mm2)

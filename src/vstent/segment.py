@@ -1,7 +1,7 @@
 """Segment: a scan -> the wall of the contrast-filled lumen."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,18 +10,28 @@ from scipy.special import ndtr
 
 from vstent.errors import VesselError
 from vstent.image import Image
+from vstent.io.surfaces import GIANT_DIAMETER_MM, VESSEL_DIAMETER_MM
 from vstent.kernels import smoothing, topology, triangles
-from vstent.kernels.arrays import Bools, Floats
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.isosurface import isosurface
 from vstent.surface import Surface
 from vstent.vessel import Vessel
 
 FEWEST_VOXELS: Final = 300
 """A lumen of fewer voxels is noise."""
-NOTABLE_COMPONENT: Final = 0.02
-"""Components smaller than this fraction of the largest are not taken for the vessel at the point given."""
+NOTABLE_PIECE: Final = 0.02
+"""Pieces with less than this fraction of the voxels of the largest about the point given are not taken for the vessel
+there."""
 FARTHEST_MM: Final = 5.0
 """How far from the point given the lumen may be."""
+AROUND_MM: Final = 15.0
+"""Where a point is given, the first threshold is that of the scan within this distance of it."""
+FILLS: Final = 0.2
+"""What fills more of the scan than this fraction, and is wider than vessels are, is a head or a field of view..."""
+AIR_MM: Final = 2.0
+"""... and what lies no further than this from the air or padding around it says nothing of vessels."""
+MOST_GROUNDS: Final = 3
+"""Padding, air and tissue: no more levels than these lie below a vessel's."""
 MOST_FACES: Final = 120_000
 """Meshes of more triangles are decimated to this number."""
 SMOOTHING_STEPS: Final = 12
@@ -54,11 +64,13 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     Raises
     ------
     VesselError
-        There is no lumen: nothing, or almost nothing, is brighter than the threshold, or nothing near the point.
+        There is no lumen: nothing, or almost nothing, is brighter than the threshold, or nothing near the point, or
+        what is brighter is wider than any artery.
 
     Smoothing is that of Taubin 1995; what volume it takes is measured, said and given back.
     """
     lumen, notes, profile = propose(image, at_mm=at_mm) if threshold is None else _at(image, float(threshold), at_mm)
+    _refuse_wide(image, lumen, profile)
     surface, smooth_note = _smooth(_wall(lumen))
     if threshold is None:
         surface = _unblurred(surface, profile)
@@ -104,8 +116,8 @@ def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[
     s, does not lie at one half but at Phi(-s / (2 R)) of the step (mean curvature flow, to first order); s is taken
     from the slope of the profile. R is the whole vessel's; `_unblurred` sees to branches and sacs.
     """
-    first = _lumen(image, _edge_level(image.voxels), at_mm)
-    second = replace(first, threshold=_profile(first).wall_level)
+    first, profile = _first(image, at_mm)
+    second = replace(first, threshold=profile.wall_level)
     profile = _profile(second)
     lumen = _lumen(image, profile.wall_level, at_mm)
     note = (
@@ -122,11 +134,66 @@ def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tu
     return lumen, (note,), profile
 
 
+def _refuse_wide(image: Image, lumen: Lumen, profile: "Profile") -> None:
+    if 2 * profile.radius_mm <= GIANT_DIAMETER_MM:
+        return
+    x, y, z = lumen.affine_mm[:3] @ [*(0.5 * (np.array(lumen.field.shape) - 1)), 1.0]
+    raise VesselError(
+        f"What is brighter than threshold {lumen.threshold:.4g} about ({x:.1f}, {y:.1f}, {z:.1f}) mm is "
+        f"{2 * profile.radius_mm:.0f} mm wide, and no artery is wider than {GIANT_DIAMETER_MM:g} mm: it is a head, "
+        "bone or the field of view; give --threshold, or --at with a point in the artery."
+    )
+
+
 # -- voxels ------------------------------------------------------------------------------------------------------------
 
 
-def _edge_level(voxels: NDArray[Any]) -> float:
-    """Mean intensity weighted with the squared gradient, on every other voxel; gradients of the noise do not count."""
+def _first(image: Image, at_mm: Floats | None) -> tuple[Lumen, "Profile"]:
+    """Pick the vessel at a first threshold, and sample the profile across its wall.
+
+    The strongest edges of a scan may be those between a head and the air, or a field of view and its padding. What is
+    brighter than such a threshold fills the scan: then the next threshold is looked for within that.
+    """
+    voxels = image.voxels[_around(image, at_mm)]
+    lumen = _lumen(image, _edge_level(voxels), at_mm)
+    profile = _profile(lumen)
+    for _ in range(MOST_GROUNDS):
+        is_wide = 2 * profile.radius_mm > VESSEL_DIAMETER_MM[1]
+        if not is_wide or lumen.n_voxels < FILLS * image.voxels.size:
+            break
+        is_within = _clear_of(voxels < lumen.threshold, image.spacing_mm)
+        lumen = _lumen(image, _edge_level(voxels, is_within), at_mm)
+        profile = _profile(lumen)
+    return lumen, profile
+
+
+def _around(image: Image, at_mm: Floats | None) -> tuple[slice, ...]:
+    """Box of the voxels within `AROUND_MM` of a point (3,); the whole scan without one, or far from it."""
+    whole = tuple(slice(0, n) for n in image.voxels.shape)
+    if at_mm is None:
+        return whole
+    low, high = _reach(image, at_mm, AROUND_MM)
+    return tuple(map(slice, low, high)) if (high - low > 2).all() else whole
+
+
+def _reach(image: Image, at_mm: Floats, reach_mm: float) -> tuple[Ints, Ints]:
+    """First (3,) and behind the last (3,) index of the voxels in a box about a point (3,), within the scan."""
+    reach = np.ceil(reach_mm / image.spacing_mm).astype(int) + 1
+    middle = np.round(image.to_index(np.asarray(at_mm, dtype=np.float64)[None])[0]).astype(int)
+    low = np.clip(middle - reach, 0, image.voxels.shape)
+    return low, np.clip(middle + reach + 1, low, image.voxels.shape)
+
+
+def _clear_of(is_ground: Bools, spacing_mm: Floats) -> Bools:
+    """Tell the voxels further than `AIR_MM` from the ground."""
+    return np.asarray(ndimage.distance_transform_edt(~is_ground, sampling=spacing_mm) > AIR_MM)
+
+
+def _edge_level(voxels: NDArray[Any], is_within: Bools | None = None) -> float:
+    """Mean intensity weighted with the squared gradient, on every other voxel; gradients of the noise do not count.
+
+    With `is_within`, as large as the scan, on those of its voxels alone.
+    """
     if min(voxels.shape) < 3:
         raise VesselError(f"A scan of {' x '.join(map(str, voxels.shape))} voxels is too thin to find a lumen in it.")
     middle = (slice(1, -1, 2),) * 3
@@ -135,7 +202,9 @@ def _edge_level(voxels: NDArray[Any]) -> float:
         ahead, behind = list(middle), list(middle)
         ahead[axis], behind[axis] = slice(2, None, 2), slice(0, -2, 2)
         squared += (voxels[tuple(ahead)].astype(np.float32) - voxels[tuple(behind)].astype(np.float32)) ** 2
-    weight = np.where(squared > 8 * np.median(squared), squared, 0.0).astype(np.float64)
+    counts = np.ones(squared.shape, dtype=bool) if is_within is None else is_within[middle]
+    noise = float(np.median(squared[counts])) if counts.any() else 0.0
+    weight = np.where(counts & (squared > 8 * noise), squared, 0.0).astype(np.float64)
     if not weight.sum() > 0:
         raise VesselError(
             "The scan has no edges, so there is no contrast-filled lumen in it; check that it is the right series."
@@ -143,8 +212,19 @@ def _edge_level(voxels: NDArray[Any]) -> float:
     return float((weight * voxels[middle]).sum() / weight.sum())
 
 
+class _Pieces(NamedTuple):
+    """The connected pieces of what is brighter than a threshold."""
+
+    label: NDArray[Any]
+    """(i, j, k) number of the piece that a voxel is of, 0 for none."""
+    size: NDArray[Any]
+    """(pieces + 1,) voxels in each; 0 in the first."""
+    threshold: float
+    """The threshold."""
+
+
 def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
-    """Pick the connected voxels above the threshold: the component nearest to the point, or the largest."""
+    """Pick the connected voxels above the threshold: the piece nearest to the point, or the largest."""
     above = image.voxels >= threshold
     if above.all():
         raise VesselError(
@@ -158,7 +238,8 @@ def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
             f"No lumen: at threshold {threshold:.4g} the largest piece has {size.max(initial=0)} voxels "
             f"(the scan's range is {image.voxels.min()} to {image.voxels.max()}); give another --threshold."
         )
-    chosen = int(size.argmax()) if at_mm is None else _nearest(image, label, size, np.asarray(at_mm, dtype=np.float64))
+    pieces = _Pieces(label, size, threshold)
+    chosen = int(size.argmax()) if at_mm is None else _nearest(image, pieces, np.asarray(at_mm, dtype=np.float64))
     box = _with_margin(ndimage.find_objects(label, max_label=chosen)[chosen - 1], label.shape)
     part = label[box]
     field = image.voxels[box].astype(np.float32)
@@ -169,18 +250,24 @@ def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
     return Lumen(field, affine, threshold, int(size[chosen]), int(size.sum()))
 
 
-def _nearest(image: Image, label: NDArray[Any], size: NDArray[Any], at_mm: Floats) -> int:
-    notable = np.flatnonzero(size >= max(FEWEST_VOXELS, NOTABLE_COMPONENT * size.max()))
-    reach = np.ceil(FARTHEST_MM / image.spacing_mm).astype(int) + 1
-    middle = np.round(image.to_index(at_mm[None])[0]).astype(int)
-    low = np.clip(middle - reach, 0, label.shape)
-    part = label[tuple(slice(a, max(a, b)) for a, b in zip(low, middle + reach + 1, strict=True))]
-    index = np.argwhere(np.isin(part, notable))
-    distance = np.linalg.norm(image.to_mm(low + index) - at_mm, axis=1) if len(index) else np.array([np.inf])
+def _nearest(image: Image, pieces: _Pieces, at_mm: Floats) -> int:
+    """Number of the piece nearest to a point (3,), debris left out."""
+    low, high = _reach(image, at_mm, FARTHEST_MM)
+    part = pieces.label[tuple(map(slice, low, high))]
+    # Counted about the point alone: the bone of a head has a hundred times an artery's voxels.
+    n_near = np.bincount(part.ravel(), minlength=len(pieces.size))
+    n_near[pieces.size < FEWEST_VOXELS] = 0
+    index = np.argwhere(np.isin(part, np.flatnonzero(n_near > NOTABLE_PIECE * n_near.max())))
+    distance = (
+        np.linalg.norm(image.to_mm((low + index).astype(np.float64)) - at_mm, axis=1)
+        if len(index)
+        else np.array([np.inf])
+    )
     if distance.min() > FARTHEST_MM:
         place = ", ".join(f"{v:.1f}" for v in at_mm)
         raise VesselError(
-            f"There is no lumen within {FARTHEST_MM:g} mm of ({place}) mm; check --at, which is in LPS mm."
+            f"There is no lumen within {FARTHEST_MM:g} mm of ({place}) mm: nothing notable there is brighter than "
+            f"threshold {pieces.threshold:.4g}; check --at, which is in LPS mm, or give another --threshold."
         )
     return int(part[tuple(index[distance.argmin()])])
 

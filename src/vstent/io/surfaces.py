@@ -16,6 +16,8 @@ Unit = Literal["m", "cm", "mm"]
 
 VESSEL_DIAMETER_MM: Final = (0.8, 14.0)
 """Hydraulic diameters 4 V / A of intracranial vessel trees, sacs included."""
+GIANT_DIAMETER_MM: Final = 25.0
+"""That of an artery 4 mm wide with a giant sac of 36 mm: 4 V / A of a sphere is two thirds of its diameter."""
 TYPICAL_DIAMETER_MM: Final = 3.5
 VESSEL_SIZE_MM: Final = (5.0, 400.0)
 """Diagonals of their bounding boxes."""
