@@ -301,7 +301,7 @@ def test_trimming_keeps_the_lengths_that_are_given() -> None:
     low, high = sorted(opening.center_mm[2] for opening in vessel.openings)
     assert low == pytest.approx(13.0, abs=0.1)
     assert high == pytest.approx(34.0, abs=0.1)
-    assert "12 mm of vessel before the sac and 9 mm beyond" in vessel.notes[-1]
+    assert "12 mm of vessel before the sac's middle and 9 mm beyond" in vessel.notes[-1]
     with pytest.raises(InputError, match="above zero"):
         trim(traced, downstream_mm=0.0)
 

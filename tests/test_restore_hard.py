@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from vstent import phantoms
+from vstent.errors import InputError
 from vstent.repair import repair
 from vstent.restore import restore
 from vstent.restore.bulges import find_bulges
 from vstent.restore.tubes import tubes_of
 from vstent.trace import trace
+from vstent.trim import trim
 from vstent.vessel import Anatomy, Centerline, Vessel
 
 
@@ -61,3 +63,24 @@ def test_a_lobe_of_a_sac_is_no_sac_of_its_own(demo, monkeypatch) -> None:
     anatomy = restore(demo.vessel)
     assert len(anatomy.aneurysms) == 1
     assert anatomy.notes[1:] == ("1 more bulges are lobes of a sac and measured with it.",)
+
+
+@pytest.fixture(scope="module")
+def sac_on_a_tube() -> Vessel:
+    phantom = phantoms.with_sac(phantoms.tube(length_mm=40.0), abscissa_mm=20.0, width_mm=6.0, neck_mm=4.0)
+    return trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.35)), inlet_mm=np.zeros(3))
+
+
+@pytest.mark.parametrize("side", ["upstream", "downstream"])
+def test_a_trim_that_would_cut_the_sac_is_refused_with_the_least_length(sac_on_a_tube, side: str) -> None:
+    with pytest.raises(
+        InputError, match=rf"^2 mm of artery .* mm would be cut .*; give --{side} [\d.]+ or more"
+    ) as refused:
+        trim(sac_on_a_tube, **{f"{side}_mm": 2.0})
+    least_mm = float(str(refused.value).split()[-3])
+    assert 2.0 + 2.0 < least_mm < 2.0 + 2.0 + 1.5  # half a neck and a radius, and what the foot is wider than the neck
+    np.testing.assert_allclose(
+        restore(trim(sac_on_a_tube, **{f"{side}_mm": least_mm})).aneurysms[0].neck.area_mm2,
+        restore(sac_on_a_tube).aneurysms[0].neck.area_mm2,
+        rtol=0.05,
+    )

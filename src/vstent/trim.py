@@ -17,13 +17,13 @@ from vstent.openings import cut_square
 from vstent.restore.bulges import Bulge, find_bulges
 from vstent.restore.tubes import tubes_of
 from vstent.surface import Surface
-from vstent.trace import trace
+from vstent.trace import parent_radius_mm, trace
 from vstent.vessel import Centerline, Vessel
 
 UPSTREAM_MM: Final = 35.0
-"""Length of artery kept before the sac: half of the longest device, and five diameters for the flow to develop."""
+"""Length of artery kept before the sac's middle: half of the longest device, five diameters for the flow to develop."""
 DOWNSTREAM_MM: Final = 25.0
-"""Length of every way kept beyond the sac."""
+"""Length of every way kept beyond the sac's middle."""
 SPARE_MM: Final = 5.0
 """Nothing is cut for less than this."""
 STRIDE_MM: Final = 1.0
@@ -34,7 +34,7 @@ class _Kept(NamedTuple):
     """What is kept of the artery."""
 
     upstream_mm: float
-    """Length before the sac."""
+    """Length before the sac's middle."""
     downstream_mm: float
     """Length of every way beyond it."""
     spare_mm: tuple[float, float]
@@ -58,12 +58,12 @@ def trim(
     at_mm : (3,) a point near the sac to keep; the highest otherwise.
     upstream_mm : length of artery to keep before the sac's middle, above zero; 35 mm, and nothing is cut for less
         than 5 mm more, where it is not given.
-    downstream_mm : length to keep of every way beyond the sac, likewise; 25 mm where it is not given.
+    downstream_mm : length to keep of every way beyond the sac's middle, likewise; 25 mm where it is not given.
 
     Raises
     ------
     InputError
-        When a length is not above zero.
+        When a length is not above zero, or so short that the cut would come within an artery's radius of the sac.
     """
     kept = _kept(upstream_mm, downstream_mm)
     bulges = find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
@@ -80,8 +80,8 @@ def trim(
             inlet_mm = center if sense < 0 else inlet_mm
     if lumen is vessel.lumen:
         return vessel
-    note = f"Trimmed to {kept.upstream_mm:.4g} mm of vessel before the sac and {kept.downstream_mm:.4g} mm beyond it, "
-    note += "cut square."
+    note = f"Trimmed to {kept.upstream_mm:.4g} mm of vessel before the sac's middle and {kept.downstream_mm:.4g} mm "
+    note += "beyond it, cut square."
     notes = (*vessel.notes, note, *_left_out(lumen, bulges[1:]))
     return trace(replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=notes), inlet_mm=inlet_mm)
 
@@ -114,6 +114,7 @@ def _cuts(vessel: Vessel, bulge: Bulge, kept: _Kept) -> list[tuple[Centerline, f
     main = int(np.argmin([gap.min() for gap in gaps]))
     parent = vessel.centerlines[main]
     sac_mm = float(parent.nearest_abscissa_mm(bulge.foot_mm).mean())
+    _refuse_short(parent, bulge, sac_mm, kept)
     cuts = [(parent, sac_mm - kept.upstream_mm, -1)] if sac_mm > kept.upstream_mm + kept.spare_mm[0] else []
     for line in vessel.centerlines:
         fork_mm = min(_fork_mm(line, parent), line.length_mm)
@@ -125,6 +126,26 @@ def _cuts(vessel: Vessel, bulge: Bulge, kept: _Kept) -> list[tuple[Centerline, f
         if line.length_mm > abscissa_mm + kept.spare_mm[1]:
             cuts.append((line, abscissa_mm, 1))
     return cuts
+
+
+def _refuse_short(parent: Centerline, bulge: Bulge, sac_mm: float, kept: _Kept) -> None:
+    """Refuse lengths from the sac's middle, at `sac_mm`, with which a cut would come within a radius of its foot."""
+    foot_mm = parent.nearest_abscissa_mm(bulge.foot_mm)
+    radius_mm = parent_radius_mm(parent.abscissa_mm, parent.inscribed_radius_mm)
+    clear_mm = float(np.interp(sac_mm, parent.abscissa_mm, radius_mm))
+    sides = (
+        ("before", "--upstream", kept.upstream_mm, sac_mm - foot_mm.min(), sac_mm),
+        ("beyond", "--downstream", kept.downstream_mm, foot_mm.max() - sac_mm, parent.length_mm - sac_mm),
+    )
+    for side, option, length_mm, half_mm, whole_mm in sides:
+        least_mm = half_mm + clear_mm
+        if length_mm < min(least_mm, whole_mm):
+            x, y, z = bulge.foot_mm.mean(axis=0)
+            raise InputError(
+                f"{length_mm:g} mm of artery {side} the middle of the sac at {x:.1f}, {y:.1f}, {z:.1f} mm would be cut "
+                f"through the sac or beside it: its neck reaches {half_mm:.1f} mm from there; give {option} "
+                f"{np.ceil(10 * least_mm) / 10:.1f} or more"
+            )
 
 
 def _fork_mm(line: Centerline, parent: Centerline) -> float:

@@ -68,9 +68,9 @@ class Choices(Strict):
     neck_mm: Annotated[tuple[Point, ...], Field(min_length=3, max_length=1000)] | None = None
     """A neck drawn by hand: a closed curve near the wall."""
     upstream_mm: Length | None = None
-    """Artery to keep before the sac."""
+    """Artery to keep before the sac's middle."""
     downstream_mm: Length | None = None
-    """Of every way beyond the sac, what is to be kept."""
+    """Of every way beyond the sac's middle, what is to be kept."""
     devices: tuple[DeviceChoice, ...] = Field(
         default=(DeviceChoice(name="silk"), DeviceChoice(name="enterprise")), max_length=3
     )

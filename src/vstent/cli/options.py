@@ -85,8 +85,8 @@ def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
 def add_outlet(given: "argparse._ArgumentGroup") -> None:
     """Add the point that picks the parent artery's outlet, and how much of the vessel is kept."""
     given.add_argument("--outlet", type=_point, metavar="X,Y,Z", help="a point near the parent artery's outlet, mm")
-    given.add_argument("--upstream", type=positive, metavar="MM", help="artery to keep before the sac (35)")
-    given.add_argument("--downstream", type=positive, metavar="MM", help="vessel to keep beyond the sac (25)")
+    given.add_argument("--upstream", type=positive, metavar="MM", help="artery to keep before the sac's middle (35)")
+    given.add_argument("--downstream", type=positive, metavar="MM", help="vessel to keep beyond the sac's middle (25)")
 
 
 def add_neck(given: "argparse._ArgumentGroup") -> None:

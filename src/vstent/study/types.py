@@ -46,9 +46,9 @@ class Settings:
     neck_mm: tuple[Point, ...] | None = None
     """A neck drawn by hand: a closed curve near the wall around the sac's mouth."""
     upstream_mm: float | None = None
-    """Length of artery to keep before the sac."""
+    """Length of artery to keep before the sac's middle."""
     downstream_mm: float | None = None
-    """Length to keep of every way beyond the sac."""
+    """Length to keep of every way beyond the sac's middle."""
     diameter_mm: float | None = None
     """Label diameter of the devices."""
     length_mm: float | None = None
