@@ -103,6 +103,16 @@ def test_unit_is_guessed_and_said(tmp_path, unit):
     assert no_notes == ()
 
 
+@pytest.mark.parametrize("units", [None, "mm"])
+def test_a_giant_aneurysm_is_read(tmp_path, units):
+    scale = 20.0 / hydraulic_diameter(cylinder())
+    write_surface(tmp_path / "a.vtp", Surface(cylinder().vertices_mm * scale, cylinder().faces))
+    assert hydraulic_diameter(read_surface(tmp_path / "a.vtp", units=units)[0]) == pytest.approx(20.0)
+    write_surface(tmp_path / "b.vtp", Surface(cylinder().vertices_mm * 1.5 * scale, cylinder().faces))
+    with pytest.raises(UnitError, match=r"0\.8 to 25 mm wide|of 30 mm, which no vessel"):
+        read_surface(tmp_path / "b.vtp", units=units)
+
+
 @pytest.mark.parametrize("scale", [1e-6, 1e3, 1e6])
 def test_what_fits_no_unit_is_refused(tmp_path, scale):
     write_surface(tmp_path / "a.vtp", Surface(cylinder().vertices_mm * scale, cylinder().faces))

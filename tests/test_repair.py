@@ -152,10 +152,22 @@ def test_fin_is_dropped():
 
 
 def test_loose_piece_is_dropped_and_its_size_told():
-    other = Surface(SOUND.vertices_mm * 0.5 + [20.0, 0, 0], SOUND.faces)
+    other = Surface(SOUND.vertices_mm * 0.5 + [20.0, 9.0, 0], SOUND.faces)
     surface, notes = repair(with_faces(SOUND, other.faces + len(SOUND.vertices_mm), other.vertices_mm))
     np.testing.assert_array_equal(surface.faces, SOUND.faces)
-    assert notes == (f"1 loose piece dropped (80.0% of the area kept), the notable of {other.area_mm2:.1f} mm2.",)
+    assert notes == (
+        f"1 loose piece dropped (80.0% of the area kept), the notable of {other.area_mm2:.1f} mm2 about 20.0, 9.0, "
+        "3.8 mm: give --at to keep another one.",
+    )
+
+
+def test_the_piece_at_a_point_is_kept_however_small_but_for_debris():
+    other = Surface(SOUND.vertices_mm * 0.5 + [20.0, 0, 0], SOUND.faces)
+    both = with_faces(SOUND, other.faces + len(SOUND.vertices_mm), other.vertices_mm)
+    debris = with_faces(both, CUBE_FACES + len(both.vertices_mm), 0.1 * CUBE + [24.0, 0, 3.0])
+    surface, notes = repair(debris, at_mm=np.array([23.9, 0, 3.0]))
+    np.testing.assert_allclose(surface.vertices_mm, other.vertices_mm, atol=1e-9)
+    assert f"2 loose pieces dropped (20.0% of the area kept), the notable of {SOUND.area_mm2:.1f} mm2 about" in notes[0]
 
 
 def test_two_cubes_that_kiss_along_an_edge_part():

@@ -23,6 +23,7 @@ from vstent.study import Placing, Settings, restore_vessel, run, stages, write_c
 from vstent.study.ledger import hash_of
 from vstent.study.outputs import write_anatomy
 from vstent.study.stages import deploy_one, engine_folders, size_of
+from vstent.surface import Surface
 
 
 def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path) -> None:
@@ -270,6 +271,18 @@ def test_trimmed_otherwise_the_vessel_is_the_one_that_was_traced_and_the_result_
     for name in ("vessel.vtp", "landing_surface.vtp", "sac.vtp", "morphology.json"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "anew" / name).read_bytes()
     np.testing.assert_array_equal(again.landing_surface.vertices_mm, anew.landing_surface.vertices_mm)
+
+
+@pytest.mark.parametrize("given", ["at_mm", "inlet_mm"])
+def test_of_two_vessels_in_one_surface_the_one_at_the_point_given_is_taken(tmp_path: Path, given: str) -> None:
+    wide, thin = (phantoms.phantom_surface(phantoms.tube(radius_mm=r), edge_mm=0.6) for r in (2.0, 1.5))
+    vertices = np.concatenate([wide.vertices_mm, np.add(thin.vertices_mm, [30.0, 0, 0])])
+    faces = np.concatenate([wide.faces, thin.faces + len(wide.vertices_mm)])
+    write_stl(tmp_path / "both.stl", Surface(vertices, faces))
+    settings = Settings(units="mm")
+    assert stages._vessel(tmp_path / "both.stl", settings).lumen.vertices_mm[:, 0].max() < 3.0
+    settings = replace(settings, **{given: (30.0, 0.0, 0.0)})
+    assert stages._vessel(tmp_path / "both.stl", settings).lumen.vertices_mm[:, 0].min() > 27.0
 
 
 def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(

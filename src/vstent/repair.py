@@ -1,6 +1,7 @@
 """Repair: a surface as it comes from a file -> one oriented manifold whose open loops are the vessel's ends."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -24,16 +25,17 @@ NOTABLE_OF_AREA: Final = 0.02
 """Components dropped are told one by one from this fraction of the area on."""
 
 
-def repair(surface: Surface) -> tuple[Surface, tuple[str, ...]]:
+def repair(surface: Surface, *, at_mm: Floats | None = None) -> tuple[Surface, tuple[str, ...]]:
     """Make a sound surface of a faulty one, and say what was done.
 
     Duplicate vertices are welded, degenerate and duplicate faces dropped, faces turned to agree and then outward,
-    non-manifold edges and vertices cut apart, the component of largest area kept, holes in the wall filled. Nothing is
-    moved. The result is a manifold with boundary, outward oriented; its open loops are the vessel's ends.
+    non-manifold edges and vertices cut apart, one piece kept, holes in the wall filled. Nothing is moved. The result
+    is a manifold with boundary, outward oriented; its open loops are the vessel's ends.
 
     Parameters
     ----------
     surface : any triangles, in mm.
+    at_mm : (3,) a point near the piece to keep, debris left out; the piece of largest area where not given.
 
     Returns
     -------
@@ -47,9 +49,9 @@ def repair(surface: Surface) -> tuple[Surface, tuple[str, ...]]:
     """
     if not len(surface.faces):
         raise VesselError("The surface has no triangles; check the file.")
-    mesh = _once(_Mesh(surface.vertices_mm, surface.faces, ()))
+    mesh = _once(_Mesh(surface.vertices_mm, surface.faces, ()), at_mm)
     if mesh.notes:  # filling a hole that a pinched vertex runs through leaves needles: a second pass finds them
-        mesh = _Mesh(*_once(_Mesh(mesh.vertices, mesh.faces, ())).geometry, mesh.notes)
+        mesh = _Mesh(*_once(_Mesh(mesh.vertices, mesh.faces, ()), at_mm).geometry, mesh.notes)
     vertices, faces = triangles.compact(mesh.vertices, mesh.faces)
     return Surface(vertices, faces), mesh.notes
 
@@ -70,8 +72,9 @@ class _Mesh:
         return _Mesh(vertices, faces, (*self.notes, note) if note else self.notes)
 
 
-def _once(mesh: _Mesh) -> _Mesh:
-    for step in (_welded, _cleaned, _opened, _turned, _unzipped, _largest, _outward, _filled):
+def _once(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
+    one_piece = partial(_one_piece, at_mm=at_mm)
+    for step in (_welded, _cleaned, _opened, _turned, _unzipped, one_piece, _outward, _filled):
         mesh = step(mesh)
         if len(mesh.faces) < 4:
             raise VesselError("No surface is left after repair: its faces are all degenerate or loose; check the file.")
@@ -138,16 +141,28 @@ def _unzipped(mesh: _Mesh) -> _Mesh:
     return mesh.after(vertices, faces, note if n_edges or n_vertices > 0 else "")
 
 
-def _largest(mesh: _Mesh) -> _Mesh:
+def _one_piece(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
+    """Keep the largest piece, or the notable one nearest to a point (3,)."""
     label = topology.face_components(mesh.faces)
     area = np.bincount(label, triangles.areas(mesh.vertices[mesh.faces]))
-    order = np.argsort(-area)
     if len(area) <= 1:
         return mesh
-    notable = [f"{a:.1f} mm2" for a in area[order[1:]] if a > NOTABLE_OF_AREA * area.sum()]
-    note = f"{_count(len(area) - 1, 'loose piece')} dropped ({area[order[0]] / area.sum():.1%} of the area kept)"
-    note += f", the notable of {', '.join(notable)}." if notable else "."
-    return mesh.after(mesh.vertices, mesh.faces[label == order[0]], note)
+    order = np.argsort(-area)
+    notable = [k for k in order if k == order[0] or area[k] > NOTABLE_OF_AREA * area.sum()]
+    kept = notable[0] if at_mm is None else min(notable, key=lambda k: _gap_mm(mesh, label == k, at_mm))
+    left = [f"{area[k]:.1f} mm2 about {_middle(mesh, label == k)} mm" for k in notable if k != kept]
+    note = f"{_count(len(area) - 1, 'loose piece')} dropped ({area[kept] / area.sum():.1%} of the area kept)"
+    note += f", the notable of {', '.join(left)}: give --at to keep another one." if left else "."
+    return mesh.after(mesh.vertices, mesh.faces[label == kept], note)
+
+
+def _gap_mm(mesh: _Mesh, member: Bools, at_mm: Floats) -> float:
+    """Distance of a point (3,) to a piece of the mesh."""
+    return float(Surface(mesh.vertices, mesh.faces[member]).closest(at_mm[None])[1][0])
+
+
+def _middle(mesh: _Mesh, member: Bools) -> str:
+    return ", ".join(f"{x:.1f}" for x in mesh.vertices[np.unique(mesh.faces[member])].mean(axis=0))
 
 
 def _outward(mesh: _Mesh) -> _Mesh:

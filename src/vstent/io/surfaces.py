@@ -15,7 +15,7 @@ from vstent.units import MM_PER
 Unit = Literal["m", "cm", "mm"]
 
 VESSEL_DIAMETER_MM: Final = (0.8, 14.0)
-"""Hydraulic diameters 4 V / A of intracranial vessel trees, sacs included."""
+"""Hydraulic diameters 4 V / A of intracranial vessel trees, sacs included, by which a unit is guessed."""
 GIANT_DIAMETER_MM: Final = 25.0
 """That of an artery 4 mm wide with a giant sac of 36 mm: 4 V / A of a sphere is two thirds of its diameter."""
 TYPICAL_DIAMETER_MM: Final = 3.5
@@ -140,23 +140,26 @@ def hydraulic_diameter(surface: Surface) -> float:
     return float(4 * abs(triangles.volume(vertices[closed])) / surface.area_mm2)
 
 
-def _fits(size_mm: float, diameter_mm: float) -> bool:
-    low, high = VESSEL_DIAMETER_MM
-    return low <= diameter_mm <= high and VESSEL_SIZE_MM[0] <= size_mm <= VESSEL_SIZE_MM[1]
+def _fits(size_mm: float, diameter_mm: float, widest_mm: float) -> bool:
+    return VESSEL_DIAMETER_MM[0] <= diameter_mm <= widest_mm and VESSEL_SIZE_MM[0] <= size_mm <= VESSEL_SIZE_MM[1]
 
 
 def _guessed(size: float, diameter: float, path: Path) -> str:
-    fitting = [unit for unit, mm in MM_PER.items() if _fits(size * mm, diameter * mm)]
+    usual, giant = (
+        [unit for unit, mm in MM_PER.items() if _fits(size * mm, diameter * mm, widest_mm)]
+        for widest_mm in (VESSEL_DIAMETER_MM[1], GIANT_DIAMETER_MM)
+    )
+    fitting = usual or giant
     if not fitting:
         raise UnitError(
             f"{path.name} fits no unit: its extent is {size:.4g} and its mean diameter {diameter:.4g}, but vessels "
-            f"of the brain are {VESSEL_DIAMETER_MM[0]:g} to {VESSEL_DIAMETER_MM[1]:g} mm wide; scale it to mm."
+            f"of the brain are {VESSEL_DIAMETER_MM[0]:g} to {GIANT_DIAMETER_MM:g} mm wide; scale it to mm."
         )
     return min(fitting, key=lambda unit: abs(np.log(diameter * MM_PER[unit] / TYPICAL_DIAMETER_MM)))
 
 
 def _accepted(unit: str, size: float, diameter: float, path: Path) -> str:
-    if not _fits(size * MM_PER[unit], diameter * MM_PER[unit]):
+    if not _fits(size * MM_PER[unit], diameter * MM_PER[unit], GIANT_DIAMETER_MM):
         raise UnitError(
             f"{path.name} read in {unit} would be {size * MM_PER[unit]:.4g} mm long with a mean diameter of "
             f"{diameter * MM_PER[unit]:.4g} mm, which no vessel of the brain has; give another --units."

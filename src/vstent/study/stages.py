@@ -87,7 +87,8 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
     else:
         image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape)
         vessel = segment(image, threshold=settings.threshold, at_mm=_array(settings.at_mm))
-    lumen, repairs = repair(vessel.lumen)
+    near_mm = settings.inlet_mm if settings.at_mm is None else settings.at_mm
+    lumen, repairs = repair(vessel.lumen, at_mm=_array(near_mm))
     return replace(vessel, lumen=lumen, notes=(*vessel.notes, *repairs))
 
 
