@@ -22,6 +22,8 @@ FEWEST_VOXELS: Final = 300
 NOTABLE_PIECE: Final = 0.02
 """Pieces with less than this fraction of the voxels of the largest about the point given are not taken for the vessel
 there."""
+BAND: Final = 0.05
+"""The threshold is told to be known to within this fraction of the step from tissue to lumen."""
 FARTHEST_MM: Final = 5.0
 """How far from the point given the lumen may be."""
 AROUND_MM: Final = 15.0
@@ -78,8 +80,11 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     size = " x ".join(f"{h:.3g}" for h in image.spacing_mm)
     share = lumen.n_voxels / lumen.n_above
     found = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all above the threshold."
-    band_mm = 2 * 0.05 * abs(lumen.threshold) / profile.slope_per_mm
-    band = f"Threshold +-5 % changes diameters by -+{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
+    # Not of the threshold itself: where a scan's intensities begin is arbitrary.
+    off = BAND * (profile.lumen - profile.tissue)
+    band_mm = 2 * off / profile.slope_per_mm
+    band = f"A threshold {off:.3g} lower or higher, {BAND:.0%} of the step from tissue to lumen, changes diameters by "
+    band += f"+-{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
     all_notes = (*image.notes, *notes, band, found, smooth_note, *decimation_notes)
     return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm, blur_mm=profile.blur_mm)
 

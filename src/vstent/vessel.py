@@ -83,8 +83,8 @@ class Vessel:
     notes: tuple[str, ...] = ()
     """What was found, guessed or repaired on the way, one sentence each."""
     threshold_band_mm: float = 0.0
-    """By how much a diameter grows where the scan's threshold is 5 % lower, and shrinks where it is 5 % higher; 0 for a
-    vessel that is no scan's."""
+    """By how much a diameter grows where the scan's threshold is lower by 5 % of the step from tissue to lumen, and
+    shrinks where it is higher by as much; 0 for a vessel that is no scan's."""
     blur_mm: float | None = None
     """Standard deviation of the point spread through which the scan shows the wall; None where it is not known."""
 

@@ -50,7 +50,9 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "aspect_ratio": Definition("Aspect ratio", "Sac height divided by the mean diameter of the neck.", _DHAR),
     "size_ratio": Definition("Size ratio", "Longest sac height divided by the parent artery's diameter.", _DHAR),
     "diameter_threshold_band_mm": Definition(
-        "Diameter band", "Every diameter grows by this where the scan's threshold is 5 % lower, shrinks if 5 % higher."
+        "Diameter band",
+        "Every diameter grows by this where the scan's threshold is lower by 5 % of the step from tissue to lumen, and "
+        "shrinks by it where higher.",
     ),
     "parent_mean_curvature_per_mm": Definition(
         "Parent curvature, mean", "Mean curvature of the parent axis, its ends left out.", _PICCINELLI

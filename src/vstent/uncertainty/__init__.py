@@ -55,7 +55,7 @@ class Ranges:
     flow_samples: int = 0
     """Of them, so many get their flows computed too, before and after: as dear as so many studies."""
     threshold_mm: float | None = None
-    """Change of every diameter; None: the vessel's own band for a threshold 5 % lower or higher, 0 for a surface."""
+    """Change of every diameter; None: the vessel's own `threshold_band_mm`, 0 for a surface."""
     landing_mm: float = 1.0
     """Of the landing point along the axis."""
     device_mm: float = 0.1
