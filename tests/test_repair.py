@@ -161,6 +161,18 @@ def test_loose_piece_is_dropped_and_its_size_told():
     )
 
 
+def test_an_opening_that_looks_sideways_out_of_the_wall_is_told_with_its_place():
+    wall = tube(line(15.0, 0.25), 2.0, 2.0, around=48).landing_surface
+    keep = np.linalg.norm(wall.corners_mm.mean(axis=1) - [2.0, 0, 7.5], axis=1) > 1.2
+    surface, notes = repair(Surface(wall.vertices_mm, wall.faces[keep]))
+    assert len(surface.boundary_loops) == 3
+    (note,) = notes
+    assert note.endswith(" mm looks sideways out of the wall: fill it in the surface if no artery leaves there.")
+    np.testing.assert_allclose(
+        [float(x) for x in note.split(" at ")[1].split(" mm")[0].split(",")], [1.8, 0, 7.5], atol=0.25
+    )
+
+
 def test_the_piece_at_a_point_is_kept_however_small_but_for_debris():
     other = Surface(SOUND.vertices_mm * 0.5 + [20.0, 0, 0], SOUND.faces)
     both = with_faces(SOUND, other.faces + len(SOUND.vertices_mm), other.vertices_mm)

@@ -84,3 +84,18 @@ def test_a_trim_that_would_cut_the_sac_is_refused_with_the_least_length(sac_on_a
         restore(sac_on_a_tube).aneurysms[0].neck.area_mm2,
         rtol=0.05,
     )
+
+
+def test_a_fusiform_aneurysm_is_told_and_stays_part_of_the_landing_surface() -> None:
+    middle = np.array([0.0, 0.0, 15.0])
+    bulb = phantoms.Sac(middle, np.array([0.0, 0.0, 1.0]), 3.5, 3.5)
+    anatomy = restore(traced(replace(phantoms.tube(length_mm=30.0), sac=bulb)))
+    assert anatomy.aneurysms == ()
+    assert anatomy.section_radius_mm.max() == pytest.approx(3.5, rel=0.02)
+    (note,) = (note for note in anatomy.notes if "fusiform" in note)
+    assert note.startswith("The artery is 7.0 mm wide at ")
+    np.testing.assert_allclose([float(x) for x in note.split(" at ")[1].split(" mm")[0].split(",")], middle, atol=0.2)
+
+
+def test_an_artery_with_a_sac_is_not_called_fusiform(demo) -> None:
+    assert not any("fusiform" in note for note in demo.notes)

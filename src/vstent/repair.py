@@ -177,29 +177,55 @@ def _filled(mesh: _Mesh) -> _Mesh:
     vertices, faces = triangles.cap(mesh.vertices, mesh.faces, loops)
     diameter = 4 * triangles.volume(vertices[faces]) / float(triangles.areas(mesh.vertices[mesh.faces]).sum())
     wall_normal = triangles.vertex_normals(mesh.vertices, mesh.faces)
-    holes = [loop for loop in loops if _is_hole(mesh.vertices[loop], wall_normal[loop], diameter)]
-    if not holes:
-        return mesh
-    widest = max(triangles.perimeter(mesh.vertices[loop]) for loop in holes) / np.pi
+    is_hole = [_is_hole(mesh.vertices[loop], wall_normal[loop], diameter) for loop in loops]
+    holes = [loop for loop, hole in zip(loops, is_hole, strict=True) if hole]
+    sideways = [
+        mesh.vertices[loop]
+        for loop, hole in zip(loops, is_hole, strict=True)
+        if not hole and _is_in_wall(mesh.vertices[loop], wall_normal[loop])
+    ]
     filled_vertices, filled_faces = mesh.vertices, mesh.faces
     for loop in holes:
         filled_vertices, filled_faces = _fill(filled_vertices, filled_faces, loop)
-    note = f"{_count(len(holes), 'hole')} in the wall filled (the widest {np.pi * widest:.2g} mm round)."
-    return mesh.after(filled_vertices, filled_faces, note)
+    notes = [_hole_note([mesh.vertices[loop] for loop in holes])] if holes else []
+    notes += [_sideways_note(points) for points in sideways]
+    return mesh.after(filled_vertices, filled_faces, " ".join(notes))
+
+
+def _hole_note(holes_mm: list[Floats]) -> str:
+    widest_mm = max(triangles.perimeter(points) for points in holes_mm)
+    return f"{_count(len(holes_mm), 'hole')} in the wall filled (the widest {widest_mm:.2g} mm round)."
+
+
+def _sideways_note(points: Floats) -> str:
+    x, y, z = triangles.polygon_centroid(points)
+    return (
+        f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm looks sideways "
+        "out of the wall: fill it in the surface if no artery leaves there."
+    )
 
 
 def _is_hole(points: Floats, wall_normal: Floats, diameter: float) -> bool:
     """Tell a hole in the wall from an end: it is tiny, or a slit, or it is small and the wall lies in its plane."""
     width = triangles.perimeter(points) / np.pi
-    smooth = points if len(points) < 8 else _rounded(_rounded(points))
-    area = triangles.polygon_area_vector(smooth)
-    size = float(np.linalg.norm(area))
+    smooth = _without_teeth(points)
+    size = float(np.linalg.norm(triangles.polygon_area_vector(smooth)))
     if (
         width < ALWAYS_HOLE_OF_DIAMETER * diameter
         or 4 * np.pi * size < SLIT_ROUNDNESS * triangles.perimeter(smooth) ** 2
     ):
         return True
-    return width < WALL_HOLE_OF_DIAMETER * diameter and float(np.abs(wall_normal @ area).mean()) > 0.7 * size
+    return width < WALL_HOLE_OF_DIAMETER * diameter and _is_in_wall(points, wall_normal)
+
+
+def _is_in_wall(points: Floats, wall_normal: Floats) -> bool:
+    """Tell whether the wall around a loop (n, 3) lies in its plane; at an end it stands on it."""
+    area = triangles.polygon_area_vector(_without_teeth(points))
+    return float(np.abs(wall_normal @ area).mean()) > 0.7 * float(np.linalg.norm(area))
+
+
+def _without_teeth(points: Floats) -> Floats:
+    return points if len(points) < 8 else _rounded(_rounded(points))
 
 
 def _rounded(points: Floats) -> Floats:

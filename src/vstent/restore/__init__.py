@@ -36,6 +36,10 @@ PASSING: Final = 2.0
 """A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
 ON_SAC_MM: Final = 0.05
 """A bulge whose dome is not further outside a sac than this is a lobe of it."""
+FUSIFORM: Final = 1.5
+"""An artery that is wider by this factor than at both its ends is told..."""
+END_MM: Final = 2.0
+"""... which are as wide as they are over this length."""
 NEAR_SAC_MM: Final = 4.0
 """An opening so near to a sac's wall is told."""
 
@@ -83,7 +87,11 @@ def restore(
         landing.surface,
         landing.is_restored.ravel(),
         aneurysms,
-        (*_notes(vessel, path, aneurysms, bulges), *_near_sacs(vessel, bulges)),
+        (
+            *_notes(vessel, path, aneurysms, bulges),
+            *_near_sacs(vessel, bulges),
+            *_fusiform(vessel.centerlines[path], [bulge for bulge in bulges if _is_in_one(bulge, aneurysms)]),
+        ),
     )
 
 
@@ -168,6 +176,22 @@ def _notes(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], bulges: l
     if len(bulges) > n_left + len(aneurysms):
         notes.append(f"{len(bulges) - n_left - len(aneurysms)} more bulges are lobes of a sac and measured with it.")
     return tuple(notes)
+
+
+def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
+    """A sentence where the artery along a centerline widens all round, off its sacs."""
+    radius = np.where(np.all([_is_off_sac(line, [bulge]) for bulge in bulges], axis=0), line.inscribed_radius_mm, 0.0)
+    at_end = np.minimum(line.abscissa_mm, line.length_mm - line.abscissa_mm) < END_MM
+    is_first = line.abscissa_mm < 0.5 * line.length_mm
+    ends_mm = max(float(np.median(line.inscribed_radius_mm[at_end & side])) for side in (is_first, ~is_first))
+    widest = int(np.argmax(radius))
+    if radius[widest] < FUSIFORM * ends_mm:
+        return ()
+    x, y, z = line.points_mm[widest]
+    return (
+        f"The artery is {2 * radius[widest]:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm and {2 * ends_mm:.1f} mm at "
+        "its wider end: a fusiform aneurysm is no sac here, has no neck, and stays part of the landing surface.",
+    )
 
 
 def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
