@@ -5,6 +5,7 @@ import pytest
 
 from vstent.io.surfaces import read_surface
 from vstent.kernels import smoothing
+from vstent.kernels.arrays import Floats
 from vstent.repair import repair
 from vstent.restore import _width_beyond_fork, restore
 from vstent.restore.axis import Tube, _fit, _Necks
@@ -32,8 +33,8 @@ def _shaken(wall: Surface, kind: str, seed: int) -> Surface:
     return Surface(wall.vertices_mm + (NOISE_MM / height.std()) * height[:, None] * wall.vertex_normals, wall.faces)
 
 
-def _anatomy(wall: Surface) -> Anatomy:
-    return restore(trim(trace(Vessel(wall))))
+def _anatomy(wall: Surface, outlet_mm: Floats | None = None) -> Anatomy:
+    return restore(trim(trace(Vessel(wall))), outlet_mm=outlet_mm)
 
 
 # What a tenth of a voxel does to necks. C0038 and beta have triangles of 0.15 to 0.2 mm, which white noise crumples.
@@ -50,10 +51,11 @@ def _anatomy(wall: Surface) -> Anatomy:
 )
 def test_real_necks_and_sacs_stand_noise(shared_data, name: str, kinds: tuple[str, ...], area: float) -> None:
     wall = repair(read_surface(shared_data / name)[0])[0]
-    still = _anatomy(wall).aneurysms[0]
+    anatomy = _anatomy(wall)
+    still, outlet_mm = anatomy.aneurysms[0], anatomy.axis.points_mm[-1]  # the challenge's fork is one of equals
     for kind in kinds:
         for seed in (1, 2, 3):
-            moved = _anatomy(_shaken(wall, kind, seed)).aneurysms[0]
+            moved = _anatomy(_shaken(wall, kind, seed), outlet_mm).aneurysms[0]
             print(name, kind, seed, moved.sac.volume_mm3, moved.neck.area_mm2)  # noqa: T201
             assert moved.sac.volume_mm3 == pytest.approx(still.sac.volume_mm3, rel=0.05)
             assert moved.neck.area_mm2 == pytest.approx(still.neck.area_mm2, rel=area)

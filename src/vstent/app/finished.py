@@ -65,9 +65,9 @@ def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
 
 def _paths(folder: Path, source: str, settings: "Settings") -> dict[str, Path]:
     """Where a study keeps its flows."""
-    from vstent.device import find_design
+    from vstent.device import BARE, find_design
     from vstent.study import CACHE
-    from vstent.study.stages import BARE, flow_key
+    from vstent.study.stages import flow_key
 
     if settings.flow is None:
         return {}

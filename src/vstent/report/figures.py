@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vstent.device import BARE
 from vstent.kernels import raster
 from vstent.kernels.arrays import Floats
-from vstent.report.scene import BARE, LineLayer, MeshLayer, Scene, View
+from vstent.report.scene import LineLayer, MeshLayer, Scene, View
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from vstent.device import BARE
 from vstent.kernels.arrays import Floats, Ints
 from vstent.report.figures import Picture, Shot, sheet
-from vstent.report.scene import BARE, LineLayer, MeshLayer, Scene, curves_layer, round_up
+from vstent.report.scene import LineLayer, MeshLayer, Scene, curves_layer, round_up
 from vstent.report.thinning import some_frames, thin_frames
 from vstent.stent import Deployment, tube_faces
 from vstent.surface import Surface

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from markupsafe import Markup
 
+from vstent.device import BARE
 from vstent.flow.types import LATTICE, OPENFOAM
 from vstent.report.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
 from vstent.report.figures import Picture, pictures
 from vstent.report.method import method_pictures
 from vstent.report.packing import pack
 from vstent.report.quantities import Change, Quantity, base_of, compare, flatten, format_change, opening_rows, unit_of
-from vstent.report.scene import BARE, Scene, device_title, scene_of
+from vstent.report.scene import Scene, device_title, scene_of
 from vstent.report.uncertainty import Varied, uncertainty_of
 from vstent.stent import Deployment
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from vstent.device import BARE
 from vstent.flow.streamlines import inlet_seeds_mm, neck_seeds_mm, streamlines
 from vstent.flow.types import FlowField
 from vstent.kernels.arrays import Floats, Ints, freeze
@@ -28,8 +29,6 @@ FRONTAL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """From the front: the patient's left is to the right, the head is up."""
 LATERAL = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 """From the left."""
-BARE = "bare"
-"""Pane of the artery without a device."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ FLARE: Final = 0.06
 MARGIN_MM: Final = 0.3
 """The closed part reaches this far beyond."""
 PRIOR: Final = 0.02
-"""Weight of the fitted oval tube beside the wall's 1: decides where there is no wall at all."""
+"""Weight of the fitted tube beside the wall's 1: decides where there is no wall at all."""
 SAME_MM: Final = 1e-3
 """A ray that goes on for less than this has met the same wall."""
 N_PASSES: Final = 12
@@ -111,13 +111,14 @@ class Landing:
 
 def close_landing(lumen: Surface, tube: Tube, own: Surface | None = None) -> Landing:
     """Close the necks and ostia of the lumen's wall along a tube; with `own`, all of it that is not this wall too."""
-    rho, oval = section_rays(lumen, tube.points_mm, N_RAYS), tube.rho_mm(N_RAYS)
-    radius = tube.radius_mm[:, None]
+    rho = section_rays(lumen, tube.points_mm, N_RAYS)
+    radius = np.repeat(tube.radius_mm[:, None], N_RAYS, axis=1)
+    # Plates are as stiff against an oval as against other waves across: they are laid on what remains of a round tube.
+    oval = tube.rho_mm(N_RAYS) - radius
     has_wall = np.isfinite(rho) & (rho < 4.0 * radius)
     if own is not None:
         has_wall &= section_rays(own, tube.points_mm, N_RAYS) < rho + SAME_MM
-    # Plates are laid on the fitted tube: they are as stiff against its ovals as against any short wave.
-    wall = np.where(has_wall, rho - oval, 0.0)
+    wall = np.where(has_wall, rho - oval, radius)
     scale = float(np.median(tube.radius_mm))
     baseline = _baseline(wall, has_wall, radius, scale)
     out = (wall - baseline) / radius
@@ -131,14 +132,14 @@ def _baseline(wall: Floats, has_wall: Bools, radius: Floats, scale_mm: float) ->
 
     What the baseline can follow is longer than three radii: half the grid holds it, at an eighth of the cost.
     """
-    fine, wall, has_wall, radius = wall, wall[::2, ::2], has_wall[::2, ::2], radius[::2]
+    fine, wall, has_wall, radius = wall, wall[::2, ::2], has_wall[::2, ::2], radius[::2, ::2]
     stiffness = _thin_plate(wall.shape[0], wall.shape[1], scale_mm / (2 * STEP_MM))
-    baseline = np.zeros_like(wall)
+    baseline = radius
     for _ in range(N_PASSES):
         out = (wall - baseline) / radius
         weight = np.where(has_wall, 1.0 / (1.0 + np.maximum(out / FLARE, 0.0) ** 4), 0.0)
         system = csc_matrix(diags((weight + PRIOR).ravel()) + stiffness)
-        baseline = _solve(system, (weight * wall).ravel(), 2 * wall.shape[1]).reshape(wall.shape)
+        baseline = _solve(system, (weight * wall + PRIOR * radius).ravel(), 2 * wall.shape[1]).reshape(wall.shape)
     grid = np.meshgrid(np.arange(fine.shape[0]) / 2, np.arange(fine.shape[1]) / 2, indexing="ij")
     wrapped = np.concatenate([baseline, baseline[:, :1]], axis=1)
     return np.asarray(map_coordinates(wrapped, grid, order=1, mode="nearest"))
