@@ -131,6 +131,11 @@ def _domed(vessel: Vessel, loop: np.ndarray) -> Surface:
     return Surface(np.concatenate(vertices), np.concatenate(faces))
 
 
+def test_a_thin_branch_with_a_coarse_cap_is_opened() -> None:
+    capped = phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.8).closed
+    assert len(open_ends(Vessel(repair(capped)[0]))[0].outlets) == 2
+
+
 def test_a_sphere_has_no_way_in() -> None:
     with pytest.raises(VesselError, match=r"about .* has \d openings.*may be bone: give --at"):
         open_ends(Vessel(sphere(3.0)))

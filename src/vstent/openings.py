@@ -21,7 +21,9 @@ CAP_ANGLE_RAD: Final = np.radians(6.0)
 CAP_RIM_RAD: Final = np.radians(35.0)
 """Along its rim a cap meets the wall at more than this on average."""
 CAP_RIM_EDGES: Final = 8
-"""A cap's outline has at least this many edges: fewer make a large triangle of a coarse wall, not a cap."""
+"""A cap's outline has at least this many edges: fewer may make a large triangle of a coarse wall, not a cap..."""
+FEWEST_RIM_EDGES: Final = 6
+"""... but for a cap of at least this many behind which the lumen is no wider than it."""
 CAP_AREA_MM2: Final = 0.3
 """The smallest cap: a vessel 0.6 mm wide."""
 ARM_SLENDERNESS: Final = 6.0
@@ -145,9 +147,10 @@ def _without_caps(lumen: Surface) -> tuple[Surface, int]:
     rim = label[pairs[:, 0]] != label[pairs[:, 1]]
     edges = np.bincount(label[pairs[rim]].ravel(), minlength=n_patches)
     sharp = np.bincount(label[pairs[rim & (turn > CAP_RIM_RAD)]].ravel(), minlength=n_patches)
-    candidates = np.flatnonzero((area > CAP_AREA_MM2) & (edges >= CAP_RIM_EDGES) & (sharp > 0.8 * edges))
+    candidates = np.flatnonzero((area > CAP_AREA_MM2) & (edges >= FEWEST_RIM_EDGES) & (sharp > 0.8 * edges))
+    discs = [patch for patch in candidates if _is_disc(lumen, label == patch)]
     is_cap = np.zeros(n_patches, dtype=bool)
-    is_cap[[patch for patch in candidates if _is_disc(lumen, label == patch)]] = True
+    is_cap[[k for k in discs if edges[k] >= CAP_RIM_EDGES or _is_across_lumen(lumen, label == k)]] = True
     if not is_cap.any():
         return lumen, 0
     vertices, faces = triangles.compact(lumen.vertices_mm, lumen.faces[~is_cap[label]])
@@ -161,6 +164,15 @@ def _is_disc(lumen: Surface, member: Bools) -> bool:
     edges = triangles.open_edges(lumen.faces[member])
     perimeter = np.linalg.norm(np.diff(lumen.vertices_mm[edges], axis=1), axis=2).sum()
     return bool(np.linalg.norm(mean) > np.cos(CAP_ANGLE_RAD) and 4 * np.pi * weight.sum() > 0.6 * perimeter**2)
+
+
+def _is_across_lumen(lumen: Surface, member: Bools) -> bool:
+    """Tell whether two of its radii behind a flat patch the lumen is as narrow as the patch."""
+    weight = lumen.areas_mm2[member]
+    radius = float(np.sqrt(weight.sum() / np.pi))
+    center = weight @ lumen.corners_mm[member].mean(axis=1) / weight.sum()
+    behind = center - 2.0 * radius * (weight @ lumen.normals[member] / weight.sum())
+    return bool(lumen.closest(behind[None])[1][0] < 1.5 * radius)
 
 
 def _with_open_arms(lumen: Surface) -> tuple[Surface, int]:
