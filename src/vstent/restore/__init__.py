@@ -35,7 +35,7 @@ IN_SAC: Final = 1.2
 PASSING: Final = 2.0
 """A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
 ON_SAC_MM: Final = 0.05
-"""A bulge whose dome is not further outside a sac than this is a lobe of it."""
+"""What lies for the most part no further outside a sac than this is a part of it."""
 FUSIFORM: Final = 1.5
 """An artery that is wider by this factor than at both its ends is told..."""
 END_MM: Final = 2.0
@@ -88,9 +88,9 @@ def restore(
         landing.is_restored.ravel(),
         aneurysms,
         (
-            *_notes(vessel, path, aneurysms, bulges),
+            *_notes(vessel, path, aneurysms, len(bulges)),
             *_near_sacs(vessel, bulges),
-            *_fusiform(vessel.centerlines[path], [bulge for bulge in bulges if _is_in_one(bulge, aneurysms)]),
+            *_fusiform(vessel.centerlines[path], [bulge for bulge in bulges if _is_in_one(bulge.points_mm, aneurysms)]),
         ),
     )
 
@@ -99,15 +99,15 @@ def _sacs(vessel: Vessel, landing: Landing, side_lines: list[Centerline], bulges
     """The sacs of those bulges that hang on the parent artery and are not flat."""
     found: list[Aneurysm] = []
     for bulge in bulges:
+        sac = cut_sac(vessel, landing, side_lines, bulge)
         # Bulges apart above the tubes may be one sac above the landing surface, which lies lower.
-        sac = None if _is_in_one(bulge, found) else cut_sac(vessel, landing, side_lines, bulge)
-        found += [] if sac is None else [sac]
+        found += [] if sac is None or _is_in_one(sac.sac.vertices_mm, found) else [sac]
     return found
 
 
-def _is_in_one(bulge: Bulge, aneurysms: Sequence[Aneurysm]) -> bool:
-    """Tell whether a bulge's dome belongs to one of the sacs."""
-    return any(one.sac.signed_distance(bulge.dome_mm[None])[0] < ON_SAC_MM for one in aneurysms)
+def _is_in_one(points_mm: Floats, aneurysms: Sequence[Aneurysm]) -> bool:
+    """Tell whether most of the points (n, 3) of a sac or bulge lie in or on one of the sacs."""
+    return any(np.median(one.sac.signed_distance(points_mm)) < ON_SAC_MM for one in aneurysms)
 
 
 def _parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -> int:
@@ -164,17 +164,14 @@ def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> fl
     return float(np.median(line.inscribed_radius_mm[own]))
 
 
-def _notes(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], bulges: list[Bulge]) -> tuple[str, ...]:
+def _notes(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges: int) -> tuple[str, ...]:
     outlet = vessel.outlets[path]
     notes = [f"The parent artery runs from the inlet to {outlet.role} (diameter {outlet.diameter_mm:.1f} mm)."]
     if not aneurysms:
         notes.append("No sac was found: the landing surface is the artery's own wall with its side branches closed.")
-        return tuple(notes)
-    n_left = sum(not _is_in_one(bulge, aneurysms) for bulge in bulges)
-    if n_left:
-        notes.append(f"{n_left} more bulges are flat or hang on other branches: left in the lumen.")
-    if len(bulges) > n_left + len(aneurysms):
-        notes.append(f"{len(bulges) - n_left - len(aneurysms)} more bulges are lobes of a sac and measured with it.")
+    if n_bulges > len(aneurysms) > 0:
+        n_other = n_bulges - len(aneurysms)
+        notes.append(f"{n_other} more bulges are flat, lobes of a sac, or on other branches: no sacs of their own.")
     return tuple(notes)
 
 
