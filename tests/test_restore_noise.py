@@ -42,10 +42,10 @@ def _anatomy(wall: Surface, outlet_mm: Floats | None = None) -> Anatomy:
 @pytest.mark.parametrize(
     ("name", "kinds", "area"),
     [
-        ("visc2011_metres.stl", ("white", "smooth"), 0.05),
+        ("visc2011_metres.stl", ("white", "smooth"), 0.06),
         ("bifurcation_coarse.vtp", ("white",), 0.05),
         ("siphon_dirty.stl", ("white",), 0.08),
-        ("aneurisk_C0038.vtp", ("smooth",), 0.05),
+        ("aneurisk_C0038.vtp", ("smooth",), 0.06),
         ("aneurisk_beta.vtp", ("smooth",), 0.05),
     ],
 )
