@@ -81,7 +81,8 @@ def killed(moment: str, path: Path, out: Path, cell: str = "") -> int:
 def written(out: Path) -> dict[str, bytes]:
     """Return what lies in a case folder by now, times taken aside."""
     files = (path for path in out.rglob("*") if path.is_file() and path.name not in ("run.json", "lock"))
-    return {str(path.relative_to(out)): path.read_bytes() for path in files if path.suffix != ".npz"}
+    untimed = (path for path in files if path.suffix != ".npz" and not path.with_suffix(".npz").exists())
+    return {str(path.relative_to(out)): path.read_bytes() for path in untimed}
 
 
 BRIEF = ["writing contour.vtp"]

@@ -182,9 +182,9 @@ def test_a_record_keeps_that_a_run_was_on_a_gpu_and_on_which(monkeypatch: pytest
     module = sys.modules["vstent.study.provenance"]  # its function goes by the same name
     with monkeypatch.context() as on_gpu:
         on_gpu.setattr(module, "gpu_name", lambda: "A100")
-        told = provenance(Path("a.stl"), "0", Settings(flow=ASKED), {})
+        told = provenance(Path("a.stl"), "0", Settings(flow=ASKED))
     assert told["machine"]["gpu"] == "A100"
-    again = repeat._settings(json.loads(json.dumps(told["settings"])))
+    again = repeat.settings_of(json.loads(json.dumps(told["settings"])))
     assert again.flow is not None
     assert again.flow.device_gpu
     monkeypatch.setattr(gpus, "find_spec", lambda name: None)

@@ -124,7 +124,7 @@ def test_settings_come_back_from_json_to_the_last_bit(tmp_path):
         devices=("silk",), at_mm=(0.1, 1e-17, -2 / 3), flow=flow, placings={"silk": Placing(4.0)}, uncertainty=Ranges(7)
     )
     write_json(tmp_path / "s.json", asdict(settings), is_exact=True)
-    back = repeating._settings(json.loads((tmp_path / "s.json").read_text()))
+    back = repeating.settings_of(json.loads((tmp_path / "s.json").read_text()))
     assert asdict(back) == asdict(settings)
 
 
