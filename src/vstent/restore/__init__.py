@@ -192,9 +192,9 @@ def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
 
 
 def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
-    """Sentences on the openings that lie on a sac or beside one: holes in it, or branches cut off at their mouth."""
+    """Sentences on the outlets that lie on a sac or beside one: holes in it, or branches cut off at their mouth."""
     notes = []
-    for opening in vessel.openings:
+    for opening in vessel.outlets:
         gap_mm = min((float(bulge.distances_mm(opening.center_mm[None])[0]) for bulge in bulges), default=np.inf)
         if gap_mm < NEAR_SAC_MM:
             x, y, z = opening.center_mm
