@@ -6,6 +6,7 @@ is the shortest whose *deployed* length covers the neck and a margin on both sid
 becomes longer than its label says.
 """
 
+from functools import cache, partial
 from itertools import chain
 from math import inf
 from typing import Final
@@ -68,10 +69,11 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
     wider_mm = max(landing_diameters_mm(anatomy))
     labels = sorted({size.diameter_mm for size in design.sizes})
     zone = next((i for i, label in enumerate(labels) if label >= wider_mm - DIAMETER_SLACK_MM), len(labels) - 1)
+    of_label = cache(partial(_of_label, design, anatomy))
     # No size follows a bulge: where the next one would stand off too, the label of the landing zone stays.
-    held = (_of_label(design, anatomy, label, lying=True) for label in labels[zone : zone + 2])
-    any_of_label = (_of_label(design, anatomy, label) for label in reversed(labels[: zone + 1]))
-    proposed = next((size for size in chain(held, any_of_label) if size is not None), None)
+    held = (size for label in labels[zone : zone + 2] if (size := of_label(label)) and _lies(design, anatomy, size))
+    fitting = (size for label in reversed(labels[: zone + 1]) if (size := of_label(label)))
+    proposed = next(chain(held, fitting), None)
     if proposed is not None:
         return proposed
     tried_mm = labels[: zone + 2][-1]
@@ -106,26 +108,26 @@ def reach_mm(design: Design, anatomy: Anatomy, size: Size) -> float:
     return _margin(anatomy, first_mm, last_mm) if _fits(anatomy, first_mm, last_mm) else -inf
 
 
-def _of_label(design: Design, anatomy: Anatomy, label_mm: float, *, lying: bool = False) -> Size | None:
-    """The shortest size of a label that reaches far enough, or the longest that fits; `lying`: against the wall."""
+def _of_label(design: Design, anatomy: Anatomy, label_mm: float) -> Size | None:
+    """The shortest size of a label that reaches far enough, or the longest that fits."""
     same = sorted((size for size in design.sizes if size.diameter_mm == label_mm), key=lambda size: size.length_mm)
     spans = {size: _span(design, anatomy, size) for size in same}
     fitting = [size for size in same if _fits(anatomy, *spans[size])]
     if not fitting:
         return None
     wanted_mm = wanted_margin_mm(anatomy)
-    chosen = next((size for size in fitting if _margin(anatomy, *spans[size]) >= wanted_mm), fitting[-1])
-    return chosen if not lying or _loose_fraction(design, anatomy, chosen, *spans[chosen]) <= LOOSE_FRACTION else None
+    return next((size for size in fitting if _margin(anatomy, *spans[size]) >= wanted_mm), fitting[-1])
 
 
-def _loose_fraction(design: Design, anatomy: Anatomy, size: Size, first_mm: float, last_mm: float) -> float:
-    """How much of the device beside the neck will stand off the wall, as it finds it there."""
+def _lies(design: Design, anatomy: Anatomy, size: Size) -> bool:
+    """Tell whether a size, landed as proposed, will lie against the wall beside the neck, as it finds it there."""
+    first_mm, last_mm = _span(design, anatomy, size)
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     found = bed(design, size, anatomy)
     along_mm = found.abscissa_mm
     is_under = (along_mm >= first_mm) & (along_mm <= last_mm)
     is_loose = found.gap_mm[is_under & ((along_mm <= proximal_mm) | (along_mm >= distal_mm))] > APPOSED_GAP_MM
-    return float(is_loose.mean()) if is_loose.size else 0.0
+    return not is_loose.size or bool(is_loose.mean() <= LOOSE_FRACTION)
 
 
 def _span(design: Design, anatomy: Anatomy, size: Size) -> tuple[float, float]:
