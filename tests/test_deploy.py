@@ -552,6 +552,16 @@ def test_a_device_too_short_for_the_neck_asks_for_a_longer_one_where_that_helps(
     assert ", 0.5 mm short of the neck's proximal end, and" in deploy(SILK, at_the_end, size=SILK_SIZE).advice
 
 
+def test_a_device_labelled_for_far_wider_arteries_says_so():
+    thin, wider = tube(line(60), 0.9), tube(line(60), 1.2)
+    assert "labelled" not in deploy(SILK, wider, size=SILK_SIZE).advice
+    said = ", labelled 2.2 times as wide as the artery there (choose a narrower size), and "
+    assert said in deploy(SILK, thin, size=SILK_SIZE).advice
+    enterprise = device.find_design("enterprise")
+    said = ", labelled 2.5 times as wide as the artery there (choose a device for narrower arteries), and "
+    assert said in deploy(enterprise, thin).advice
+
+
 @pytest.mark.parametrize("anatomy", [straight(), beside_a_neck()])
 def test_of_a_device_that_is_as_it_should_be_no_more_is_said(anatomy):
     form = (

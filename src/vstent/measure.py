@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from vstent.deploy import APPOSED_GAP_MM
-from vstent.deploy.sizing import landing_diameters_mm, neck_span_mm
+from vstent.deploy.sizing import landing_diameters_mm, neck_span_mm, oversizing_fraction
 from vstent.device import coverage_fraction, grid, piece_length_mm, pore_density_per_mm2
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats
@@ -60,14 +60,13 @@ def _position(anatomy: Anatomy, stent: Stent) -> Measures:
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     before_mm, after_mm = proximal_mm - stent.proximal_abscissa_mm, stent.distal_abscissa_mm - distal_mm
     diameter_mm = stent.row_diameter_mm
-    artery_mm = 2 * np.interp(stent.row_abscissa_mm, anatomy.axis.abscissa_mm, anatomy.section_radius_mm)
     found: Measures = {
         "device": stent.design.name,
         "size": stent.size.label,
         "label_diameter_mm": stent.size.diameter_mm,
         "label_length_mm": stent.size.length_mm,
         "deployed_length_mm": stent.deployed_length_mm,
-        "oversizing_fraction": stent.size.diameter_mm / float(artery_mm.mean()) - 1,
+        "oversizing_fraction": oversizing_fraction(anatomy, stent),
         "proximal_end_abscissa_mm": stent.proximal_abscissa_mm,
         "distal_end_abscissa_mm": stent.distal_abscissa_mm,
         "min_diameter_mm": float(diameter_mm.min()),

@@ -6,7 +6,15 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from vstent.deploy.method import Course
-from vstent.deploy.sizing import APPOSED_GAP_MM, LOOSE_FRACTION, neck_span_mm, reach_mm, wanted_margin_mm
+from vstent.deploy.sizing import (
+    APPOSED_GAP_MM,
+    LOOSE_FRACTION,
+    OVERSIZED_FRACTION,
+    neck_span_mm,
+    oversizing_fraction,
+    reach_mm,
+    wanted_margin_mm,
+)
 from vstent.device import LaserCut
 from vstent.kernels.arrays import Bools, Floats
 from vstent.stent import Stent
@@ -31,7 +39,7 @@ def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
     lies = (
         f"{stent.design.name} {stent.size.label} lies from {stent.proximal_abscissa_mm:.1f} to "
         f"{stent.distal_abscissa_mm:.1f} mm of the parent artery, {stent.deployed_length_mm:.1f} mm long"
-        f"{_reach(anatomy, stent)}"
+        f"{_width(anatomy, stent)}{_reach(anatomy, stent)}"
     )
     if course.outcome == "iteration_limit":
         done = course.terminated_fraction[-1]
@@ -44,6 +52,16 @@ def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
         return f"{lies}, and {1 - loose:.0%} of it lies against the wall."
     off = f"{loose:.0%} of it stands off the wall, by up to {gap_mm[is_at_patient].max():.2f} mm"
     return f"{lies}, and {off}: {_remedy(anatomy, stent, gap_mm, is_loose)}"
+
+
+def _width(anatomy: Anatomy, stent: Stent) -> str:
+    """A clause that begins with a comma where a device is labelled for far wider arteries; else nothing."""
+    over = oversizing_fraction(anatomy, stent)
+    if over <= OVERSIZED_FRACTION:
+        return ""
+    has_narrower = any(size.diameter_mm < stent.size.diameter_mm for size in stent.design.sizes)
+    narrower = "narrower size" if has_narrower else "device for narrower arteries"
+    return f", labelled {1 + over:.1f} times as wide as the artery there (choose a {narrower})"
 
 
 def _reach(anatomy: Anatomy, stent: Stent) -> str:

@@ -17,7 +17,7 @@ from vstent.deploy.braid import expected_profile, march
 from vstent.deploy.sketch import bed
 from vstent.device import Design, Size
 from vstent.errors import LandingError
-from vstent.stent import Landing
+from vstent.stent import Landing, Stent
 from vstent.vessel import Anatomy
 
 ZONE_MM: Final = 5.0
@@ -32,6 +32,8 @@ APPOSED_GAP_MM: Final = 0.1
 """A node is apposed when the device's outer face is nearer to the wall than this."""
 LOOSE_FRACTION: Final = 0.05
 """Less of a device than this may stand off the wall without a word, and without a wider one being proposed."""
+OVERSIZED_FRACTION: Final = 0.8
+"""A label may be this much wider than the artery without a word: Enterprise's, 4.5 mm, is from 2.5 mm on."""
 
 
 def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
@@ -56,6 +58,12 @@ def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
 def wanted_margin_mm(anatomy: Anatomy) -> float:
     """How far a device is to reach beyond the neck, on either side."""
     return max(MARGIN_MM, *landing_diameters_mm(anatomy))
+
+
+def oversizing_fraction(anatomy: Anatomy, stent: Stent) -> float:
+    """Label diameter over the artery's mean diameter where the device lies, less one."""
+    artery_mm = 2 * np.interp(stent.row_abscissa_mm, anatomy.axis.abscissa_mm, anatomy.section_radius_mm)
+    return stent.size.diameter_mm / float(artery_mm.mean()) - 1
 
 
 def propose_size(design: Design, anatomy: Anatomy) -> Size:
