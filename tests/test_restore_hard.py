@@ -51,6 +51,14 @@ def test_an_opening_on_a_sac_is_told_with_its_place(length_mm: float, radius_mm:
     assert note.startswith(f"outlet_2, {2 * radius_mm:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm, lies ")
 
 
+@pytest.mark.parametrize("anatomy", ["demo", "a branch from the dome"])
+def test_a_branch_that_leaves_from_the_sac_is_told(anatomy: str, demo) -> None:
+    from_dome = demo_with_a_stub_in_its_dome(length_mm=8.0, radius_mm=0.7)
+    found = demo if anatomy == "demo" else restore(traced(from_dome))
+    told = [note.split(",")[0] for note in found.notes if "leaves from a sac" in note]
+    assert told == ([] if anatomy == "demo" else ["outlet_2"])
+
+
 def test_openings_far_from_the_sac_are_not_told(demo) -> None:
     assert not any("from a sac's wall" in note for note in demo.notes)
 

@@ -45,6 +45,8 @@ N_RINGS: Final = 12
 """Rings of the neck's triangles."""
 N_SKIRT: Final = 4
 """Strips of triangles between the flank and the neck."""
+ON_SAC_MM: Final = 0.05
+"""What lies for the most part no further outside a sac than this is a part of it."""
 
 
 def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], bulge: Bulge) -> Aneurysm | None:
@@ -74,6 +76,11 @@ def _low_mm(vessel: Vessel, landing: Landing, bulge: Bulge) -> float:
     """Height above the artery from which on a bulge's flank is believed."""
     most_mm = FLANK * float(np.median(landing.section_radius_mm[landing.nearest_sections(bulge.foot_mm)]))
     return believed_from_mm(vessel.lumen, bulge.foot_mm, most_mm, vessel.blur_mm)
+
+
+def is_in_one(points_mm: Floats, aneurysms: Sequence[Aneurysm]) -> bool:
+    """Tell whether most of the points (n, 3) of a sac or bulge lie in or on one of the sacs."""
+    return any(np.median(one.sac.signed_distance(points_mm)) < ON_SAC_MM for one in aneurysms)
 
 
 def drawn_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], drawn: Drawn) -> Aneurysm:

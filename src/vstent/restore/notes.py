@@ -1,0 +1,91 @@
+"""What is told of an anatomy: one sentence on everything that was found, assumed, or would be taken for a mistake."""
+
+from typing import Final
+
+import numpy as np
+
+from vstent.restore.bulges import Bulge
+from vstent.restore.path import is_off_sac
+from vstent.restore.sac import is_in_one
+from vstent.vessel import Aneurysm, Centerline, Opening, Vessel
+
+FUSIFORM: Final = 1.5
+"""An artery that is wider by this factor than at both its ends is told..."""
+END_MM: Final = 2.0
+"""... which are as wide as they are over this length."""
+NEAR_SAC_MM: Final = 4.0
+"""An opening so near to a sac's wall is told."""
+
+
+def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
+    """Sentences on the sacs cut off from the bulges found, and on the parent artery, along the centerline `path`."""
+    line, sacs = vessel.centerlines[path], [bulge for bulge in bulges if is_in_one(bulge.points_mm, aneurysms)]
+    return (
+        *_found(vessel, path, aneurysms, len(bulges)),
+        *_near_sacs(vessel, bulges),
+        *_from_sacs(vessel, path, aneurysms),
+        *_fusiform(line, sacs),
+    )
+
+
+def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges: int) -> tuple[str, ...]:
+    """Sentences on where the parent artery runs and how many sacs hang on it."""
+    outlet = vessel.outlets[path]
+    notes = [f"The parent artery runs from the inlet to {outlet.role} (diameter {outlet.diameter_mm:.1f} mm)."]
+    if not aneurysms:
+        notes.append("No sac was found: the landing surface is the artery's own wall with its side branches closed.")
+    if n_bulges > len(aneurysms) > 0:
+        n_other = n_bulges - len(aneurysms)
+        notes.append(f"{n_other} more bulges are flat, lobes of a sac, or on other branches: no sacs of their own.")
+    return tuple(notes)
+
+
+def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
+    """A sentence where the artery along a centerline widens all round, off its sacs."""
+    radius = np.where(np.all([is_off_sac(line, [bulge]) for bulge in bulges], axis=0), line.inscribed_radius_mm, 0.0)
+    at_end = np.minimum(line.abscissa_mm, line.length_mm - line.abscissa_mm) < END_MM
+    is_first = line.abscissa_mm < 0.5 * line.length_mm
+    ends_mm = max(float(np.median(line.inscribed_radius_mm[at_end & side])) for side in (is_first, ~is_first))
+    widest = int(np.argmax(radius))
+    if radius[widest] < FUSIFORM * ends_mm:
+        return ()
+    x, y, z = line.points_mm[widest]
+    return (
+        f"The artery is {2 * radius[widest]:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm and {2 * ends_mm:.1f} mm at "
+        "its wider end: a fusiform aneurysm is no sac here, has no neck, and stays part of the landing surface.",
+    )
+
+
+def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
+    """Sentences on the outlets that lie on a sac or beside one: holes in it, or branches cut off at their mouth."""
+    notes = []
+    for opening in vessel.outlets:
+        gap_mm = min((float(bulge.distances_mm(opening.center_mm[None])[0]) for bulge in bulges), default=np.inf)
+        if gap_mm < NEAR_SAC_MM:
+            notes.append(
+                f"{_named(opening)}, lies {gap_mm:.1f} mm from a sac's wall: close it where it is a hole; give "
+                "--outlet where the parent artery leads elsewhere."
+            )
+    return tuple(notes)
+
+
+def _from_sacs(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
+    """Sentences on the branches that leave from a sac: blood for them goes on passing through it behind a device."""
+    branches = [k for k in range(len(vessel.outlets)) if k != path]
+    return tuple(
+        f"{_named(vessel.outlets[k])}, leaves from a sac: what it carries goes on through the sac behind any device."
+        for k in branches
+        if any(_leaves(vessel.centerlines[k], one) for one in aneurysms)
+    )
+
+
+def _leaves(line: Centerline, aneurysm: Aneurysm) -> bool:
+    """Tell whether a centerline comes out of a sac by another way than its neck: farther from it than it is wide."""
+    inside = np.flatnonzero(aneurysm.sac.signed_distance(line.points_mm) < 0)
+    last = inside[-1:]
+    return bool((aneurysm.neck.closest(line.points_mm[last])[1] > line.inscribed_radius_mm[last]).any())
+
+
+def _named(opening: Opening) -> str:
+    x, y, z = opening.center_mm
+    return f"{opening.role}, {opening.diameter_mm:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm"

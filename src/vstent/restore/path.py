@@ -1,0 +1,63 @@
+"""The centerline that the parent artery follows: past the sac, and at every fork the wider way."""
+
+from functools import reduce
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.kernels import curves
+from vstent.kernels.arrays import Bools, Floats
+from vstent.restore.bulges import Bulge
+from vstent.trace import parent_radius_mm
+from vstent.vessel import Centerline, Vessel
+
+REACH_MM: Final = 10.0
+"""At a fork, the parent artery goes on where the vessel is wider over this length."""
+IN_SAC: Final = 1.2
+"""A sphere reaches into a sac whose wall is within this many of its radii."""
+PASSING: Final = 2.0
+"""A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
+
+
+def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -> int:
+    """Number of the centerline that the parent artery follows: past the sac, and at every fork the wider way."""
+    lines = vessel.centerlines
+    if outlet_mm is not None:
+        ends = np.array([opening.center_mm for opening in vessel.outlets])
+        return int(np.argmin(np.linalg.norm(ends - np.asarray(outlet_mm), axis=1)))
+    reach = np.array([_reach(line, bulges[0]) if bulges else 0.0 for line in lines])
+    passing = np.flatnonzero(reach <= max(PASSING, 1.25 * reach.min()))
+    off = [is_off_sac(line, bulges) for line in lines]
+    return int(reduce(lambda i, k: i if _is_wider(lines[i], lines[k], off[i], off[k]) else k, passing))
+
+
+def is_off_sac(line: Centerline, bulges: list[Bulge]) -> Bools:
+    """Tell the points (n,) of a centerline whose inscribed spheres do not reach into a sac: it makes them wide."""
+    if not bulges:
+        return np.ones(len(line.points_mm), dtype=bool)
+    return np.asarray(bulges[0].distances_mm(line.points_mm) > IN_SAC * line.inscribed_radius_mm)
+
+
+def _reach(line: Centerline, bulge: Bulge) -> float:
+    """Least distance between a centerline and the foot of a bulge, in parent radii; the wall itself is at 1."""
+    radius = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
+    return float((cKDTree(bulge.foot_mm).query(line.points_mm)[0] / radius).min())
+
+
+def _is_wider(one: Centerline, other: Centerline, one_is_off: Bools, other_is_off: Bools) -> bool:
+    """Tell whether the first of two centerlines is the wider over `REACH_MM` beyond their fork."""
+    return _width_beyond_fork(one, other, one_is_off) >= _width_beyond_fork(other, one, other_is_off)
+
+
+def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> float:
+    """Median radius of a centerline over `REACH_MM` beyond its fork from another; 0 where it parts in the sac alone."""
+    distance = curves.project(other.points_mm, line.points_mm)[1]
+    apart = np.flatnonzero((distance > line.inscribed_radius_mm) & is_off)
+    if not len(apart):
+        return 0.0
+    fork_mm = line.abscissa_mm[apart[0]]
+    beyond = (line.abscissa_mm >= fork_mm) & (line.abscissa_mm <= fork_mm + REACH_MM)
+    # A way that is mostly in the sac is a branch of the sac: the sac's own width is none of its.
+    own = beyond & is_off if (beyond & is_off).sum() < 0.5 * beyond.sum() else beyond
+    return float(np.median(line.inscribed_radius_mm[own]))
