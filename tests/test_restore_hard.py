@@ -70,7 +70,7 @@ def test_a_lobe_of_a_sac_is_no_sac_of_its_own(demo, monkeypatch) -> None:
     monkeypatch.setattr(import_module("vstent.restore"), "find_bulges", lambda *_: [bulge, lobe])
     anatomy = restore(demo.vessel)
     assert len(anatomy.aneurysms) == 1
-    assert anatomy.notes[1:] == ("1 more bulges are flat, lobes of a sac, or on other branches: no sacs of their own.",)
+    assert anatomy.notes[1:] == ("1 more bulge, flat, a sac's lobe, or on another branch: no sac of its own.",)
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,12 @@ from vstent.io.surfaces import read_surface
 from vstent.kernels import smoothing
 from vstent.kernels.arrays import Floats
 from vstent.repair import repair
-from vstent.restore import _width_beyond_fork, restore
+from vstent.restore import restore
 from vstent.restore.axis import Tube, _fit, _Necks
 from vstent.restore.bulges import Bulge
 from vstent.restore.landing import Landing
 from vstent.restore.neck import MOUTH, apart_mm
+from vstent.restore.path import _width_beyond_fork
 from vstent.restore.tubes import Tubes
 from vstent.surface import Surface
 from vstent.trace import trace

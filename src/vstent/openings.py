@@ -15,6 +15,7 @@ from vstent.kernels import curves, medial, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.surface import Surface
 from vstent.vessel import Opening, Vessel
+from vstent.words import counted
 
 CAP_ANGLE_RAD: Final = np.radians(6.0)
 """Neighbouring faces of a flat cap differ by less than this."""
@@ -50,14 +51,14 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
         When fewer than two ends can be found.
     """
     lumen, n_caps = _without_caps(vessel.lumen)
-    notes = [f"{n_caps} flat caps were taken off to open the vessel."] if n_caps else []
+    notes = [f"{counted(n_caps, 'flat cap')} taken off to open the vessel."] if n_caps else []
     if not len(lumen.faces):
         raise VesselError("the surface has flat sides only, and no round wall between them: it is not a vessel's")
     spheres = lumen.medial
     lumen, n_arms = _with_open_arms(lumen)
     if n_arms:
         spheres = medial.within(spheres, lumen.closed.tree)
-        notes.append(f"{n_arms} arms that end blind were cut open square to their axis.")
+        notes.append(f"{counted(n_arms, 'blind arm')} cut open square to the axis.")
     loops = lumen.boundary_loops
     if len(loops) < 2:
         x, y, z = lumen.vertices_mm.mean(axis=0)

@@ -10,6 +10,7 @@ from vstent.errors import VesselError
 from vstent.kernels import topology, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.surface import Surface
+from vstent.words import counted
 
 WELD_OF_EXTENT: Final = 1e-6
 """Vertices closer than this fraction of the bounding box's diagonal are one."""
@@ -81,17 +82,13 @@ def _once(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
     return mesh
 
 
-def _count(n: int, one: str, many: str = "") -> str:
-    return f"{n} {one if n == 1 else many or one + 's'}"
-
-
 def _welded(mesh: _Mesh) -> _Mesh:
     vertices, faces = triangles.compact(mesh.vertices, mesh.faces)
     extent = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     welded, faces = topology.weld(vertices, faces, WELD_OF_EXTENT * extent)
     n = len(vertices) - len(welded)
     note = (
-        f"{_count(n, 'duplicate vertex', 'duplicate vertices')} welded (closer than {WELD_OF_EXTENT * extent:.1g} mm)."
+        f"{counted(n, 'duplicate vertex', 'duplicate vertices')} welded (closer than {WELD_OF_EXTENT * extent:.1g} mm)."
     )
     return mesh.after(welded, faces, note if n else "")
 
@@ -102,8 +99,8 @@ def _cleaned(mesh: _Mesh) -> _Mesh:
     is_sound = topology.sound_faces(mesh.faces)
     n_degenerate = int(is_degenerate.sum())
     n_duplicate = int((~is_sound).sum()) - n_degenerate
-    done = [_count(n_duplicate, "duplicate face")] * (n_duplicate > 0)
-    done += [_count(n_degenerate, "degenerate face")] * (n_degenerate > 0)
+    done = [counted(n_duplicate, "duplicate face")] * (n_duplicate > 0)
+    done += [counted(n_degenerate, "degenerate face")] * (n_degenerate > 0)
     return mesh.after(mesh.vertices, mesh.faces[is_sound], f"{' and '.join(done)} dropped." if done else "")
 
 
@@ -115,17 +112,17 @@ def _opened(mesh: _Mesh) -> _Mesh:
         faces = faces[~is_inner]
         total += int(is_inner.sum())
     return mesh.after(
-        mesh.vertices, faces, f"{_count(total, 'face')} of sheets inside the lumen dropped." if total else ""
+        mesh.vertices, faces, f"{counted(total, 'face')} of sheets inside the lumen dropped." if total else ""
     )
 
 
 def _turned(mesh: _Mesh) -> _Mesh:
     faces, turned = topology.oriented(mesh.faces)
     n = int(turned.sum())
-    mesh = mesh.after(mesh.vertices, faces, f"{_count(n, 'face')} turned to agree with the others." if n else "")
+    mesh = mesh.after(mesh.vertices, faces, f"{counted(n, 'face')} turned to agree with the others." if n else "")
     is_clash = topology.clashing(faces)
     n = int(is_clash.sum())
-    note = f"{_count(n, 'face')} dropped that no orientation fits."
+    note = f"{counted(n, 'face')} dropped that no orientation fits."
     return mesh.after(mesh.vertices, faces[~is_clash], note if n else "")
 
 
@@ -135,9 +132,9 @@ def _unzipped(mesh: _Mesh) -> _Mesh:
     while (is_bad := topology.overused(faces)).any():
         vertices, faces = topology.unzipped(vertices, faces[~is_bad])
     n_vertices, n_faces = len(np.unique(faces)) - len(np.unique(mesh.faces)), len(mesh.faces) - len(faces)
-    what = _count(n_edges, "non-manifold edge") if n_edges else "Pinched vertices"
-    dropped = f", {_count(n_faces, 'face')} dropped" if n_faces else ""
-    note = f"{what} cut apart ({_count(n_vertices, 'vertex', 'vertices')} doubled{dropped})."
+    what = counted(n_edges, "non-manifold edge") if n_edges else "Pinched vertices"
+    dropped = f", {counted(n_faces, 'face')} dropped" if n_faces else ""
+    note = f"{what} cut apart ({counted(n_vertices, 'vertex', 'vertices')} doubled{dropped})."
     return mesh.after(vertices, faces, note if n_edges or n_vertices > 0 else "")
 
 
@@ -151,7 +148,7 @@ def _one_piece(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
     notable = [k for k in order if k == order[0] or area[k] > NOTABLE_OF_AREA * area.sum()]
     kept = notable[0] if at_mm is None else min(notable, key=lambda k: _gap_mm(mesh, label == k, at_mm))
     left = [f"{area[k]:.1f} mm2 about {_middle(mesh, label == k)} mm" for k in notable if k != kept]
-    note = f"{_count(len(area) - 1, 'loose piece')} dropped ({area[kept] / area.sum():.1%} of the area kept)"
+    note = f"{counted(len(area) - 1, 'loose piece')} dropped ({area[kept] / area.sum():.1%} of the area kept)"
     note += f", the notable of {', '.join(left)}: give --at to keep another one." if left else "."
     return mesh.after(mesh.vertices, mesh.faces[label == kept], note)
 
@@ -194,7 +191,7 @@ def _filled(mesh: _Mesh) -> _Mesh:
 
 def _hole_note(holes_mm: list[Floats]) -> str:
     widest_mm = max(triangles.perimeter(points) for points in holes_mm)
-    return f"{_count(len(holes_mm), 'hole')} in the wall filled (the widest {widest_mm:.2g} mm round)."
+    return f"{counted(len(holes_mm), 'hole')} in the wall filled (the widest {widest_mm:.2g} mm round)."
 
 
 def _sideways_note(points: Floats) -> str:

@@ -17,6 +17,7 @@ from vstent.report.thinning import some_frames, thin_frames
 from vstent.stent import Deployment, tube_faces
 from vstent.surface import Surface
 from vstent.vessel import Anatomy
+from vstent.words import counted
 
 if TYPE_CHECKING:
     from vstent.study import CaseResult
@@ -124,7 +125,7 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
         surface = replace(contour.surface, vertices_mm=nodes_mm)
         layer = replace(contour, surface=surface, values=gap_mm, frames_mm=None, frame_values=None)
         words = (
-            f"after {_iterations(number)}, {100 * reached[number]:.0f} % of the nodes at rest"
+            f"after {counted(number, 'iteration')}, {100 * reached[number]:.0f} % of the nodes at rest"
             if number
             else "before the first"
         )
@@ -136,13 +137,9 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
     title = f"Expansion of {dict(scene.panes)[name]}"
     caption = (
         f"The active contour on its way to the wall of the parent artery (glass) in "
-        f"{_iterations(len(deployment.history_mm) - 1)}, coloured by the gap that is left."
+        f"{counted(len(deployment.history_mm) - 1, 'iteration')}, coloured by the gap that is left."
     )
     return Picture(f"expansion-{name}", title, caption, sheet(shown, shots, "wall_gap"))
-
-
-def _iterations(count: int) -> str:
-    return f"{count} iteration{'' if count == 1 else 's'}"
 
 
 def _fitted(scene: Scene) -> Picture:

@@ -8,6 +8,7 @@ from vstent.restore.bulges import Bulge
 from vstent.restore.path import is_off_sac
 from vstent.restore.sac import is_in_one
 from vstent.vessel import Aneurysm, Centerline, Opening, Vessel
+from vstent.words import counted
 
 FUSIFORM: Final = 1.5
 """An artery that is wider by this factor than at both its ends is told..."""
@@ -35,8 +36,8 @@ def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges:
     if not aneurysms:
         notes.append("No sac was found: the landing surface is the artery's own wall with its side branches closed.")
     if n_bulges > len(aneurysms) > 0:
-        n_other = n_bulges - len(aneurysms)
-        notes.append(f"{n_other} more bulges are flat, lobes of a sac, or on other branches: no sacs of their own.")
+        more = counted(n_bulges - len(aneurysms), "more bulge")
+        notes.append(f"{more}, flat, a sac's lobe, or on another branch: no sac of its own.")
     return tuple(notes)
 
 
