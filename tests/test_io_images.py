@@ -172,6 +172,33 @@ def test_rescale_gives_the_stored_intensities(oblique, series):
     np.testing.assert_allclose(read_image(series).voxels, expected, rtol=1e-6)
 
 
+def padded(file, is_padding, *, value, limit=None):
+    """Write `value` where `is_padding` (rows, columns), and that it stands for what is outside the field of view."""
+    dataset = pydicom.dcmread(file)
+    stored = dataset.pixel_array
+    dataset.PixelData = np.where(is_padding, np.int16(value), stored).tobytes()
+    dataset.add_new("PixelPaddingValue", "SS", value if limit is None else min(value, limit) - 5)
+    if limit is not None:
+        dataset.add_new("PixelPaddingRangeLimit", "SS", limit)
+    dataset.save_as(file)
+    return np.where(is_padding, stored[~is_padding].min(initial=0 if is_padding.all() else 9999), stored)
+
+
+@pytest.mark.parametrize("limit", [None, 3001])
+def test_padding_is_not_brighter_than_contrast(series, limit):
+    is_padding = np.hypot(*np.mgrid[-4:4, -4:5]) > 4.5
+    expected = [padded(file, is_padding, value=3000, limit=limit) for file in slices(series)]
+    found = read_image(series).voxels.T
+    assert found.max() <= 1500
+    assert {plane.tobytes() for plane in found} == {plane.tobytes() for plane in expected}
+
+
+def test_a_slice_of_padding_alone_is_zero(oblique, series):
+    for file in slices(series)[:2]:
+        padded(file, np.ones((8, 9), dtype=bool), value=3000)
+    assert (read_image(series).voxels == 0).all(axis=(0, 1)).sum() == 2
+
+
 def test_compressed_pixels_are_read(oblique, series):
     for file in slices(series):
         dataset = pydicom.dcmread(file)

@@ -41,6 +41,8 @@ class _Slice:
     """(2,) distance between columns and between rows."""
     slope: float
     intercept: float
+    padding: tuple[int, int] | None
+    """Least and largest stored value of what is outside the field of view, where that is stated."""
 
     @property
     def name(self) -> str:
@@ -241,7 +243,16 @@ def _plane(file: Path, dataset: Any, frame: int | None, places: list[Any]) -> _S
         np.asarray(pixel, dtype=np.float64).reshape(2)[::-1],
         float(_value(places, "RescaleSlope") or 1.0),
         float(_value(places, "RescaleIntercept") or 0.0),
+        _padding(dataset),
     )
+
+
+def _padding(dataset: Any) -> tuple[int, int] | None:
+    value = getattr(dataset, "PixelPaddingValue", None)
+    if value is None:
+        return None
+    ends = int(value), int(getattr(dataset, "PixelPaddingRangeLimit", value))
+    return min(ends), max(ends)
 
 
 # -- geometry ----------------------------------------------------------------------------------------------------------
@@ -336,11 +347,23 @@ def _pixels(plane: _Slice) -> NDArray[Any]:
         raise ReadError(
             f"Slice {plane.name} holds {pixels.shape} values where {plane.size} were announced; export it again."
         )
+    if plane.padding:
+        pixels = _without_padding(pixels, plane.padding)
     if plane.slope == 1.0 and plane.intercept == 0.0:
         return pixels
     if plane.slope.is_integer() and plane.intercept.is_integer() and pixels.dtype.kind in "iu":
         return pixels.astype(np.int32) * int(plane.slope) + int(plane.intercept)
     return (pixels * plane.slope + plane.intercept).astype(np.float32)
+
+
+def _without_padding(stored: NDArray[Any], padding: tuple[int, int]) -> NDArray[Any]:
+    """Stored values (rows, columns), with the least of the others, or 0, where there is padding and no tissue.
+
+    What stands for "outside the field of view" may be above all contrast (DICOM PS3.3, C.7.5.1.1.2).
+    """
+    is_padding = (stored >= padding[0]) & (stored <= padding[1])
+    rest = stored[~is_padding]
+    return np.where(is_padding, rest.min() if rest.size else stored.dtype.type(0), stored)
 
 
 def _decoded(plane: _Slice) -> NDArray[Any]:
