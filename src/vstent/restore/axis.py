@@ -8,7 +8,8 @@ one side of it, and its sac is lost.)
 """
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from itertools import product
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.sparse import bmat, csc_matrix, diags
@@ -171,37 +172,56 @@ def _fit(rho: Floats, weight: Floats, necks: _Necks, medial_mm: Floats) -> Tube:
     wall of which a wide neck has left a slope is one along which a circle rolls, and the medial line bulges into the
     sac, but not to its side.
     """
-    (points, oval), (n, n_rays) = necks.tube, rho.shape
+    points, (n, n_rays) = necks.tube.points_mm, rho.shape
+    frames = curves.parallel_frames(points)
+    normal, right = _equations(rho, weight, necks, frames, medial_mm)
+    blocks, bent = _stiffness(necks.tube, frames, n_rays)
+    for i, j in product(range(5), repeat=2):
+        blocks[i][j] = blocks[i][j] + diags(normal[i, j])
+    ridge = 1e-6 * n_rays * diags(np.ones(5 * n))
+    solution = spsolve(csc_matrix(bmat(blocks) + ridge), (right - bent).ravel()).reshape(5, n)
+    moved = points + solution[1][:, None] * frames[:, 1] + solution[2][:, None] * frames[:, 2]
+    evenly = curves.resample_evenly(moved, n)
+    return Tube(evenly, _turned(_bounded(solution[[0, 3, 4]].T), frames, curves.parallel_frames(evenly)))
+
+
+def _equations(rho: Floats, weight: Floats, necks: _Necks, frames: Floats, medial_mm: Floats) -> tuple[Floats, Floats]:
+    """Normal equations (5, 5, n) and their right side (5, n): of every section's rays, and of what is known beside."""
+    (points, oval), n_rays = necks.tube, rho.shape[1]
     basis = _waves(n_rays)
     normal = np.einsum("ik,nk,jk->ijn", basis, weight, basis)
     right = np.einsum("ik,nk,nk->in", basis, weight, rho)
     for i, value in zip((0, 3, 4), oval.T, strict=True):
         normal[i, i] += necks.trust + (ROUND_TRUST * n_rays if i else 0.0)
         right[i] += necks.trust * value
-    frames = curves.parallel_frames(points)
     aside = SIDE_TRUST * n_rays * np.einsum("nk,nkd,nd->n", necks.across, frames[:, 1:], _toward(medial_mm, points))
     right[1:3] += aside * necks.across.T
     normal[1:3, 1:3] += SIDE_TRUST * n_rays * np.einsum("ni,nj->ijn", necks.across, necks.across)
-    wave = WAVELENGTH * 2.0 * float(np.median(oval[:, 0])) / (2 * np.pi * STEP_MM)
-    stiff_radius = n_rays * wave**4 * curves.roughness(n, 2)
-    stiff_axis = n_rays / 2 * wave**6 * curves.roughness(n, 3)
-    blocks = [[diags(normal[i, j]) for j in range(5)] for i in range(5)]
+    return normal, right
+
+
+def _stiffness(tube: Tube, frames: Floats, n_rays: int) -> tuple[list[list[Any]], Floats]:
+    """Stiffness (5 by 5 sparse blocks) of the oval and of the axis against short waves, and how (5, n) it bends now."""
+    n = len(tube.points_mm)
+    wave = WAVELENGTH * 2.0 * float(np.median(tube.radius_mm)) / (2 * np.pi * STEP_MM)
+    radius, axis = n_rays * wave**4 * curves.roughness(n, 2), n_rays / 2 * wave**6 * curves.roughness(n, 3)
+    blocks: list[list[Any]] = [[csc_matrix((n, n)) for _ in range(5)] for _ in range(5)]
+    bent = np.zeros((5, n))
     for i, times in ((0, 1.0), (3, OVAL_WAVES**4), (4, OVAL_WAVES**4)):
-        blocks[i][i] = blocks[i][i] + times * stiff_radius
-    for i in (1, 2):
-        for axis in range(3):
-            side = diags(frames[:, i, axis])
-            right[i] -= side @ (stiff_axis @ points[:, axis])
-            for j in (1, 2):
-                blocks[i][j] = blocks[i][j] + side @ stiff_axis @ diags(frames[:, j, axis])
-    ridge = 1e-6 * n_rays * diags(np.ones(5 * n))
-    solution = spsolve(csc_matrix(bmat(blocks) + ridge), right.ravel()).reshape(5, n)
-    moved = points + solution[1][:, None] * frames[:, 1] + solution[2][:, None] * frames[:, 2]
-    radius = np.maximum(solution[0], 0.1)
-    most = OVAL_MOST * radius / np.maximum(np.hypot(*solution[3:]), 1e-12)
-    oval = np.stack([radius, *(solution[3:] * np.minimum(most, 1.0))], axis=1)
-    evenly = curves.resample_evenly(moved, n)
-    return Tube(evenly, _turned(oval, frames, curves.parallel_frames(evenly)))
+        blocks[i][i] = times * radius
+    for i, side in product((1, 2), range(3)):
+        across = diags(frames[:, i, side])
+        bent[i] += across @ (axis @ tube.points_mm[:, side])
+        for j in (1, 2):
+            blocks[i][j] = blocks[i][j] + across @ axis @ diags(frames[:, j, side])
+    return blocks, bent
+
+
+def _bounded(oval: Floats) -> Floats:
+    """Ovals (n, 3) as far from round as `OVAL_MOST` allows, none of them without width."""
+    radius = np.maximum(oval[:, 0], 0.1)
+    most = OVAL_MOST * radius / np.maximum(np.hypot(oval[:, 1], oval[:, 2]), 1e-12)
+    return np.column_stack([radius, oval[:, 1:] * np.minimum(most, 1.0)[:, None]])
 
 
 def _turned(oval: Floats, frames: Floats, others: Floats) -> Floats:
