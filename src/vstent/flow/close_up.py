@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -211,6 +212,39 @@ def _window(chosen: CloseUp, cell_size_mm: float) -> Window:
     return Window(corner_mm, fine)
 
 
+class _Patchwork(NamedTuple):
+    """How a close-up and the wide cells round about it become one field."""
+
+    outer: FlowField
+    """The flow in the wide cells."""
+    around_mm: Floats
+    """(k, 3) middles of the cells of the close-up's size that the wide ones outside it hold."""
+    order: Ints
+    """(n,) numbers of the close-up's cells, and after them of those, in the order of the field's."""
+    is_fine: Bools
+    """(v,) whether a vertex of the wall has the close-up's cells all about it."""
+
+    def at_moment(self, fine: Phase | FlowField, wide: FlowField) -> tuple[Floats, Floats, Floats]:
+        """Velocity (n, 3) and pressure (n,) in all cells and stress (v, 3) on the wall, at a moment."""
+        around = sampling.values_at(wide, self.around_mm)
+        within = fine.velocity_m_s, fine.pressure_Pa
+        velocity_m_s, pressure_Pa = (np.concatenate(pair)[self.order] for pair in zip(within, around, strict=True))
+        stress_Pa = np.where(self.is_fine[:, None], fine.wall_shear_stress_Pa, wide.wall_shear_stress_Pa)
+        return velocity_m_s, pressure_Pa, stress_Pa
+
+    def swing(self, fine: Swing) -> Swing:
+        """That of the close-up, and elsewhere what the wide cells have."""
+        speed_m_s = np.concatenate([fine.speed_m_s, sampling.speed_at(self.outer, self.around_mm)])[self.order]
+        return Swing(speed_m_s, np.where(self.is_fine, fine.shear_Pa, self.outer.shear_Pa), fine.neck_inflow_mL_s)
+
+    def phases(self, inner: FlowField) -> tuple[Phase, ...]:
+        """Those of a pulse, with the openings' flows of the wide cells."""
+        return tuple(
+            Phase(fine.time_s, wide.inlet_mL_s, wide.outlets_mL_s, *self.at_moment(fine, self.outer.at_phase(wide)))
+            for fine, wide in zip(inner.phases, self.outer.phases, strict=True)
+        )
+
+
 def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
     """The flow of the close-up, and round about it that of the wide cells, all on cells of the close-up's size."""
     outer = chosen.outer
@@ -220,23 +254,9 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
     shift = np.rint((inner.origin_mm - corner_mm) / inner.cell_size_mm).astype(np.int32)
     cells = np.concatenate([inner.cells + shift, children])
     order = np.lexsort(cells.T[::-1])
-    around_mm = corner_mm + children * inner.cell_size_mm
     is_fine = _is_well_within(chosen, inner.wall)
-
-    def joined(fine: Phase | FlowField, wide: FlowField) -> tuple[Floats, Floats, Floats]:
-        """Velocity and pressure in all cells and stress on the wall, at a moment."""
-        around = sampling.values_at(wide, around_mm)
-        within = fine.velocity_m_s, fine.pressure_Pa
-        velocity_m_s, pressure_Pa = (np.concatenate(pair)[order] for pair in zip(within, around, strict=True))
-        stress_Pa = np.where(is_fine[:, None], fine.wall_shear_stress_Pa, wide.wall_shear_stress_Pa)
-        return velocity_m_s, pressure_Pa, stress_Pa
-
-    def swinging(swing: Swing) -> Swing:
-        """That of the close-up, and elsewhere what the wide cells have."""
-        speed_m_s = np.concatenate([swing.speed_m_s, sampling.speed_at(outer, around_mm)])[order]
-        return Swing(speed_m_s, np.where(is_fine, swing.shear_Pa, outer.shear_Pa), swing.neck_inflow_mL_s)
-
-    velocity_m_s, pressure_Pa, stress_Pa = joined(inner, outer)
+    whole = _Patchwork(outer, corner_mm + children * inner.cell_size_mm, order, is_fine)
+    velocity_m_s, pressure_Pa, stress_Pa = whole.at_moment(inner, outer)
     return replace(
         inner,
         cells=cells[order],
@@ -245,11 +265,8 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
         pressure_Pa=pressure_Pa,
         wall_shear_stress_Pa=stress_Pa,
         wall_pressure_Pa=np.where(is_fine, inner.wall_pressure_Pa, outer.wall_pressure_Pa),
-        phases=tuple(
-            Phase(fine.time_s, wide.inlet_mL_s, wide.outlets_mL_s, *joined(fine, outer.at_phase(wide)))
-            for fine, wide in zip(inner.phases, outer.phases, strict=True)
-        ),
-        swing=None if inner.swing is None else swinging(inner.swing),
+        phases=whole.phases(inner),
+        swing=None if inner.swing is None else whole.swing(inner.swing),
         inlet_mL_s=outer.inlet_mL_s,
         outlets_mL_s=outer.outlets_mL_s,
         inlet_pressure_Pa=outer.inlet_pressure_Pa,
