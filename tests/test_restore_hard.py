@@ -107,3 +107,41 @@ def test_a_fusiform_aneurysm_is_told_and_stays_part_of_the_landing_surface() -> 
 
 def test_an_artery_with_a_sac_is_not_called_fusiform(demo) -> None:
     assert not any("fusiform" in note for note in demo.notes)
+
+
+@pytest.fixture(scope="module")
+def sac_that_touches_its_artery_again() -> tuple[phantoms.Phantom, Vessel]:
+    """A hairpin 18 mm apart; a sac of 12 mm on one leg, by a wide stalk, whose dome runs 0.4 mm into the other."""
+    turn = np.linspace(0.35, np.pi - 0.35, 7)
+    legs = [(0.0, 0.0, z) for z in (-16.0, -10.0, -4.0, 2.0)], [(0.0, 18.0, z) for z in (2.0, -4.0, -10.0, -16.0)]
+    bend = [(0.0, 9.0 - 9.0 * np.cos(t), 2.0 + 9.0 * np.sin(t)) for t in turn]
+    points = phantoms.spline(np.array([*legs[0], *bend, *legs[1]]))
+    artery = Centerline(points, np.linspace(2.0, 1.75, len(points)))
+    sac = phantoms.Sac(np.array([0.5, 10.6, -4.0]), np.array([0.0, 1.0, 0.0]), 6.0, 6.0)
+    stalk = phantoms.Sac(np.array([0.2, 3.3, -4.0]), np.array([0.0, 1.0, 0.0]), 2.6, 2.6)
+    phantom = phantoms.Phantom("hairpin", artery, sac=sac, blebs=(stalk,))
+    return phantom, traced(phantom)
+
+
+def test_a_sac_that_touches_its_artery_again_is_no_short_cut(sac_that_touches_its_artery_again) -> None:
+    phantom, vessel = sac_that_touches_its_artery_again
+    assert any("opens into the artery at two places" in note for note in vessel.notes)
+    anatomy = restore(trim(vessel))
+    np.testing.assert_allclose(anatomy.axis.length_mm, phantom.parent.length_mm, rtol=0.01)
+    np.testing.assert_allclose(anatomy.aneurysms[0].sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.02)
+    wall_mm = phantoms.tube_implicit_mm(phantom.parent, anatomy.landing_surface.vertices_mm)[0]
+    assert np.abs(wall_mm).max() < 0.15
+
+
+def test_the_wider_of_two_openings_of_a_sac_is_its_neck(sac_that_touches_its_artery_again) -> None:
+    _, vessel = sac_that_touches_its_artery_again
+    neck = restore(vessel).aneurysms[0]
+    assert neck.neck_mm[:, 1].max() < 3.0
+    assert 11.0 < neck.neck.area_mm2 < 14.5
+
+
+def test_a_sac_is_not_trimmed_off_with_an_artery_that_it_touches(sac_that_touches_its_artery_again) -> None:
+    _, vessel = sac_that_touches_its_artery_again
+    trimmed = trim(vessel)
+    assert len(trimmed.outlets) == 1
+    assert trimmed.inlet.diameter_mm < 4.2

@@ -26,6 +26,8 @@ DOWNSTREAM_MM: Final = 25.0
 """Length of every way kept beyond the sac's middle."""
 SPARE_MM: Final = 5.0
 """Nothing is cut for less than this."""
+SAME_MM: Final = 1e-6
+"""Vertices nearer than this are the same."""
 STRIDE_MM: Final = 1.0
 """The direction of a cut is that of the centerline over this length."""
 
@@ -75,8 +77,10 @@ def trim(
         direction = (ahead - center) / np.linalg.norm(ahead - center)
         radius = float(np.interp(abscissa_mm, line.abscissa_mm, line.inscribed_radius_mm))
         cut = cut_square(lumen, center, direction, radius)
-        if cut is not None:
-            lumen = Surface(*triangles.part_at(cut.vertices_mm, cut.faces, bulges[0].dome_mm))
+        part = None if cut is None else Surface(*triangles.part_at(cut.vertices_mm, cut.faces, bulges[0].dome_mm))
+        # What lies beyond a cut may hang on the sac as well, where the sac touches its artery a second time.
+        if part is not None and _holds(part, bulges[0]):
+            lumen = part
             inlet_mm = center if sense < 0 else inlet_mm
     if lumen is vessel.lumen:
         return vessel
@@ -84,6 +88,11 @@ def trim(
     note += "beyond it, cut square."
     notes = (*vessel.notes, note, *_left_out(lumen, bulges[1:]))
     return trace(replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=notes), inlet_mm=inlet_mm)
+
+
+def _holds(lumen: Surface, bulge: Bulge) -> bool:
+    """Tell whether a lumen still has all of a bulge's vertices."""
+    return bool(np.asarray(cKDTree(lumen.vertices_mm).query(bulge.points_mm)[0]).max() < SAME_MM)
 
 
 def _kept(upstream_mm: float | None, downstream_mm: float | None) -> _Kept:

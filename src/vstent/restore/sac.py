@@ -65,11 +65,22 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     flank, other_loops = _flank(lumen, height_mm, low_mm, core.dome_mm, landing)
     if flank is None:
         return None
-    flank = unblurred(flank, vessel.blur_mm) if vessel.blur_mm else flank
-    rings = skirt(flank.levelled(low_mm), artery, vessel.closed, n_rings=N_SKIRT)
-    found = _aneurysm(artery, flank, other_loops, rings)
+    found = _cut_off(vessel, artery, flank, other_loops, low_mm)
+    for k, loop in enumerate(other_loops):
+        # A sac that touches its artery opens into it at two places, and the touch has the longer flare at times.
+        if np.median(landing.surface.closest(flank.vertices_mm[loop])[1]) < low_mm + ON_ARTERY_MM:
+            mouths = [flank.rim, *other_loops[:k], *other_loops[k + 1 :]]
+            other = _cut_off(vessel, artery, flank._replace(rim=loop), mouths, low_mm)
+            found = max(found, other, key=lambda one: one.neck.area_mm2)
     is_flat = found.sac.volume_mm3 < FLAT * found.neck.area_mm2**1.5
     return None if is_flat or _roundness(found.sac) < ROUND else found
+
+
+def _cut_off(vessel: Vessel, artery: Artery, flank: Flank, other_loops: list[Ints], low_mm: float) -> Aneurysm:
+    """The sac above a flank's rim, continued down to the artery."""
+    flank = unblurred(flank, vessel.blur_mm) if vessel.blur_mm else flank
+    rings = skirt(flank.levelled(low_mm), artery, vessel.closed, n_rings=N_SKIRT)
+    return _aneurysm(artery, flank, other_loops, rings)
 
 
 def _low_mm(vessel: Vessel, landing: Landing, bulge: Bulge) -> float:
