@@ -8,10 +8,10 @@ at `SPEED_CAP` times the radius that the artery has on both sides, so that a sac
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import percentile_filter
 from scipy.spatial import cKDTree
 
 from vstent.contacts import find_contact, part
@@ -19,6 +19,7 @@ from vstent.errors import VesselError
 from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
 from vstent.openings import open_ends, with_inlet
+from vstent.short_cuts import around_sacs
 from vstent.spheres import centered
 from vstent.surface import Surface
 from vstent.vessel import Centerline, Opening, Vessel
@@ -36,19 +37,6 @@ THIN: Final = 0.3
 """An outlet narrower than this fraction of the inlet may be left closed where the lumen to it is interrupted."""
 MOST_CONTACTS: Final = 12
 """No more contacts between arteries than this are parted."""
-WIDE: Final = 1.3
-"""Where a path is wider by this factor than the artery around, it may run through a sac..."""
-WIDE_WINDOW_MM: Final = 60.0
-WIDE_PERCENTILE: Final = 25.0
-"""... the artery being as wide as this percentile within this length: longer than a giant sac."""
-SHUN: Final = 3.0
-"""A way around a sac is sought at a speed that falls with this power of the width beyond that."""
-AS_WIDE: Final = 0.75
-"""... and is the artery where it is nowhere narrower than this fraction of it..."""
-SAC: Final = 1.5
-"""... the sac wider by this factor than all of it..."""
-BESIDE: Final = 0.5
-"""... and its axis somewhere outside the sac by this many of its radii."""
 
 
 def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
@@ -84,8 +72,8 @@ def _paths(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.Media
     vessel, graph = _reachable(vessel, _graph(vessel, spheres))
     paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
     paths = _shortest(vessel, graph, _radius_cap(graph, paths))
-    found = [_around_sacs(graph, path) for path in paths]
-    notes = dict.fromkeys([*vessel.notes, *(note for _, notes in found for note in notes)])
+    found = [around_sacs(graph, path, SPEED_CAP) for path in paths]
+    notes = dict.fromkeys([*vessel.notes, *chain(*(told for _, told in found))])
     return replace(vessel, notes=tuple(notes)), graph, [path for path, _ in found]
 
 
@@ -102,11 +90,7 @@ def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
     A running low percentile of the inscribed radii (n,), evenly spaced, over `PARENT_WINDOW_MM`.
     """
     step = float(abscissa_mm[-1]) / max(len(abscissa_mm) - 1, 1)
-    return _percentile(radius_mm, PARENT_PERCENTILE, round(PARENT_WINDOW_MM / step))
-
-
-def _percentile(radius_mm: Floats, percentile: float, size: int) -> Floats:
-    return np.asarray(percentile_filter(radius_mm, percentile, size=max(3, size), mode="nearest"))
+    return curves.running_percentile(radius_mm, PARENT_PERCENTILE, round(PARENT_WINDOW_MM / step))
 
 
 def _graph(vessel: Vessel, spheres: medial.Medial) -> medial.Medial:
@@ -152,55 +136,6 @@ def _shortest(vessel: Vessel, graph: medial.Medial, radius_cap: Floats) -> list[
     inlet = len(graph.points) - n_outlets - 1
     _, before = medial.shortest_paths(medial.cost_graph(graph, radius_cap), inlet)
     return [medial.path_to(before, outlet) for outlet in range(inlet + 1, inlet + 1 + n_outlets)]
-
-
-def _around_sacs(graph: medial.Medial, path: Ints) -> tuple[Ints, list[str]]:
-    """The way around the sacs that a path (k,) runs through, where the artery has one, and a sentence on each of them.
-
-    A sac that touches its artery a second time, or whose scan joins them, is a short cut from the one place to the
-    other, and the artery between them would be lost.
-    """
-    abscissa, radius = curves.arc_length(graph.points[path]), graph.radius[path]
-    even = np.linspace(0.0, abscissa[-1], max(2, round(abscissa[-1] / STEP_MM)))
-    artery = _percentile(np.interp(even, abscissa, radius), WIDE_PERCENTILE, round(WIDE_WINDOW_MM / STEP_MM))
-    if not (radius > WIDE * np.interp(abscissa, even, artery)).any():
-        return path, []
-    nearest = cKDTree(curves.interpolate(abscissa, graph.points[path], even)).query(graph.points)[1]
-    parent = artery[nearest]
-    speed = SPEED_CAP * parent * np.minimum(1.0, WIDE * parent / graph.radius) ** SHUN
-    _, before = medial.shortest_paths(medial.cost_graph(graph, speed), int(path[0]))
-    around = medial.path_to(before, int(path[-1]))
-    place = {int(vertex): k for k, vertex in enumerate(path)}
-    joined, notes, left, here = [path[:1]], [], 0, 0
-    for k, vertex in enumerate(around):
-        there = place.get(int(vertex), 0)
-        if there > here:
-            through, other = path[here : there + 1], around[left : k + 1]
-            goes_around = _is_artery(graph, through, other, parent)
-            joined.append((other if goes_around else through)[1:])
-            notes += [_short_cut(graph, through)] if goes_around else []
-            left, here = k, there
-    return np.concatenate(joined), notes
-
-
-def _is_artery(graph: medial.Medial, through: Ints, around: Ints, parent_mm: Floats) -> bool:
-    """Tell whether, where a path runs through a sac, a way around (k,) is an artery (n,) beside it."""
-    taken_mm = graph.radius[around]
-    if graph.radius[through].max() < SAC * taken_mm.max():
-        return False
-    if taken_mm.min() < AS_WIDE * parent_mm[around].min():
-        return False
-    apart_mm = np.linalg.norm(graph.points[around, None] - graph.points[through], axis=2) - graph.radius[through]
-    return bool((apart_mm.min(axis=1) > BESIDE * taken_mm).any())
-
-
-def _short_cut(graph: medial.Medial, through: Ints) -> str:
-    widest = through[graph.radius[through].argmax()]
-    place = ", ".join(f"{x:.0f}" for x in graph.points[widest])
-    return (
-        f"The sac {2 * graph.radius[widest]:.0f} mm wide about {place} mm opens into the artery at two places, or "
-        "touches it: the artery is taken to go around, and the wider opening for the neck; part them in the surface."
-    )
 
 
 def _unreachable(inlet: Opening, outlet: Opening) -> str:

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from scipy.ndimage import percentile_filter
 from scipy.signal import savgol_filter
 from scipy.sparse import csc_matrix, diags, eye
 from scipy.sparse.linalg import spsolve
@@ -142,6 +143,11 @@ def any_perpendicular(direction: Floats) -> Floats:
     helper = np.eye(3)[np.argmin(np.abs(direction))]
     normal = np.cross(direction, helper)
     return normal / np.linalg.norm(normal)
+
+
+def running_percentile(values: Floats, percentile: float, size: int) -> Floats:
+    """Percentile (n,) of values (n,) within a window of so many, three at least, about each of them."""
+    return np.asarray(percentile_filter(values, percentile, size=max(3, size), mode="nearest"))
 
 
 def project(polyline: Floats, points: Floats) -> tuple[Floats, Floats]:
