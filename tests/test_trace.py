@@ -161,6 +161,29 @@ def test_a_point_far_from_every_opening_chooses_none(fork: Vessel) -> None:
     assert trace(untraced, inlet_mm=near).notes == untraced.notes
 
 
+@pytest.mark.parametrize(("daughter_radius_mm", "is_told"), [(1.45, True), (1.35, False)])
+def test_an_outlet_nearly_as_wide_as_the_inlet_is_told_once_with_both_places(
+    daughter_radius_mm: float, is_told: bool
+) -> None:
+    untraced = Vessel(phantoms.phantom_surface(phantoms.bifurcation(daughter_radius_mm=daughter_radius_mm)))
+    vessel = trace(untraced)
+    told = [note for note in vessel.notes if "is a guess" in note]
+    assert len(told) == is_told
+    assert not any("is a guess" in note for note in trace(untraced, inlet_mm=vessel.inlet.center_mm).notes)
+    for note in told:
+        places = [[float(x) for x in place.split(")")[0].split(",")] for place in note.split("(")[1:]]
+        np.testing.assert_allclose(places, [vessel.inlet.center_mm, vessel.outlets[0].center_mm], atol=0.05)
+        widths = [float(width.split()[-1]) for width in note.split(" mm wide")[:-1]]
+        np.testing.assert_allclose(widths, [vessel.inlet.diameter_mm, vessel.outlets[0].diameter_mm], atol=0.05)
+
+
+def test_a_guess_of_the_inlet_is_not_made_anew_by_trimming() -> None:
+    phantom = phantoms.with_sac(phantoms.tube(length_mm=40.0), abscissa_mm=20.0, width_mm=5.0, neck_mm=3.5)
+    whole = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.35)))
+    trimmed = trim(whole, upstream_mm=10.0, downstream_mm=10.0)
+    assert [note for note in trimmed.notes if "is a guess" in note] == [whole.notes[-1]]
+
+
 def test_real_centerlines_agree_with_vmtk(shared_data) -> None:
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader

@@ -38,6 +38,8 @@ ARM_RADIUS_MM: Final = 0.5
 FARTHEST_MM: Final = 5.0
 FARTHEST_DIAMETERS: Final = 2.0
 """How far from an opening a point beside it may lie: the greater of the two."""
+NEARLY: Final = 0.8
+"""An outlet wider than this fraction of an inlet that was not given may be the inlet."""
 
 
 def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
@@ -97,6 +99,21 @@ def with_inlet(vessel: Vessel, inlet_mm: Floats) -> Vessel:
     note = f"The inlet, {_place(inlet)}, is {_away_mm(inlet, inlet_mm):.0f} mm from the point given."
     notes = (*vessel.notes, note) if _is_far(inlet, inlet_mm) else vessel.notes
     return replace(vessel, openings=_named(inlet, list(vessel.openings)), centerlines=(), notes=notes)
+
+
+def guessed(vessel: Vessel) -> Vessel:
+    """Return the vessel; where an outlet is nearly as wide as its inlet, which is only the widest end, a note says so.
+
+    The outlet is named by its place: its number changes where ends are trimmed off.
+    """
+    widest = vessel.outlets[0]
+    if widest.diameter_mm <= NEARLY * vessel.inlet.diameter_mm:
+        return vessel
+    note = (
+        f"The inlet, {_place(vessel.inlet)}, is a guess: the opening {_place(widest)} is nearly as wide; give --inlet "
+        "if blood comes from there."
+    )
+    return replace(vessel, notes=(*vessel.notes, note))
 
 
 def _away_mm(opening: Opening, point_mm: Floats) -> float:

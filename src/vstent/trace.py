@@ -18,7 +18,7 @@ from vstent.contacts import find_contact, part
 from vstent.errors import VesselError
 from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
-from vstent.openings import open_ends, with_inlet
+from vstent.openings import guessed, open_ends, with_inlet
 from vstent.short_cuts import around_sacs
 from vstent.spheres import centered
 from vstent.surface import Surface
@@ -45,7 +45,8 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
     Parameters
     ----------
     vessel : a repaired lumen, open or closed by flat caps, ends found or not.
-    inlet_mm : (3,) a point near the opening to take as inlet; the widest opening otherwise.
+    inlet_mm : (3,) a point near the opening to take as inlet; the widest opening otherwise, with a note where another
+        is nearly as wide.
 
     Raises
     ------
@@ -54,6 +55,7 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
     VesselError
         When fewer than two ends are found, or an outlet cannot be reached from the inlet.
     """
+    is_guess = not vessel.openings and inlet_mm is None
     vessel, spheres = (vessel, vessel.lumen.medial) if vessel.openings else open_ends(vessel)
     if inlet_mm is not None:
         vessel = with_inlet(vessel, np.asarray(inlet_mm, dtype=np.float64))
@@ -64,6 +66,7 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
             break
         vessel, graph, paths = _paths(parted, parted.lumen.medial)
     lines = tuple(_centerline(vessel.lumen, graph.points[path], graph.radius[path]) for path in paths)
+    vessel = guessed(vessel) if is_guess else vessel
     return replace(vessel, centerlines=lines)
 
 
