@@ -145,3 +145,41 @@ def test_a_sac_is_not_trimmed_off_with_an_artery_that_it_touches(sac_that_touche
     trimmed = trim(vessel)
     assert len(trimmed.outlets) == 1
     assert trimmed.inlet.diameter_mm < 4.2
+
+
+def with_a_dome(phantom: phantoms.Phantom, *, beyond_mm: float, radius_mm: float) -> phantoms.Phantom:
+    """A straight artery along z and a small sphere on the middle of its wall, its middle so far beyond it."""
+    artery = phantom.parent
+    middle = np.array([0.0, artery.inscribed_radius_mm.max() + beyond_mm, 0.5 * artery.length_mm])
+    return replace(phantom, sac=phantoms.Sac(middle, np.array([0.0, 1.0, 0.0]), radius_mm, radius_mm))
+
+
+@pytest.mark.parametrize(("beyond_mm", "radius_mm"), [(0.2, 1.05), (0.35, 1.35)])
+def test_a_blister_is_named_where_no_sac_is_found_and_is_found_where_it_is_named(
+    beyond_mm: float, radius_mm: float
+) -> None:
+    phantom = with_a_dome(phantoms.tube(length_mm=30.0), beyond_mm=beyond_mm, radius_mm=radius_mm)
+    vessel = traced(phantom)
+    anatomy = restore(vessel)
+    assert anatomy.aneurysms == ()
+    (note,) = (note for note in anatomy.notes if "too flat" in note)
+    height_mm, place = float(note.split()[2]), note.split(" at ")[1].split(" mm")[0]
+    assert height_mm == pytest.approx(beyond_mm + radius_mm, abs=0.15)
+    at_mm = np.array([float(x) for x in place.split(",")])
+    asked = restore(vessel, at_mm=at_mm)
+    assert asked.aneurysms[0].sac.volume_mm3 == pytest.approx(phantom.sac_volume_mm3, rel=0.15)
+    assert not any("too flat" in note for note in asked.notes)
+
+
+@pytest.mark.parametrize(
+    "phantom",
+    [
+        phantoms.siphon(),
+        phantoms.bifurcation(half_angle_rad=1.2),
+        phantoms.with_branch(phantoms.tube(length_mm=30.0), abscissa_mm=15.0, direction=np.ones(3), radius_mm=1.2),
+        with_a_dome(phantoms.tube(length_mm=30.0), beyond_mm=-0.6, radius_mm=1.4),
+    ],
+    ids=["siphon", "bifurcation", "branch", "a bump of 0.8 mm"],
+)
+def test_no_blister_is_named_on_a_healthy_artery(phantom: phantoms.Phantom) -> None:
+    assert not any("too flat" in note for note in restore(traced(phantom)).notes)

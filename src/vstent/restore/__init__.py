@@ -14,10 +14,10 @@ import numpy as np
 from vstent.errors import InputError, VesselError
 from vstent.kernels.arrays import Floats
 from vstent.restore.axis import Mouth, fit_axis
-from vstent.restore.bulges import Bulge, find_bulges
+from vstent.restore.bulges import Bulge, find_bulges, flat_bulges
 from vstent.restore.drawn import cut_along
 from vstent.restore.landing import Landing, close_landing
-from vstent.restore.notes import told
+from vstent.restore.notes import flat_told, told
 from vstent.restore.path import parent_path
 from vstent.restore.sac import cut_sac, drawn_sac, is_in_one
 from vstent.restore.tubes import tubes_of
@@ -25,6 +25,8 @@ from vstent.vessel import Anatomy, Aneurysm, Centerline, Vessel
 
 ON_FOOT: Final = 1.5
 """A foot, which rises to half a radius above the nearest artery, is an artery's own up to this many of its radii."""
+MOST_FLAT: Final = 5
+"""No more flat bulges than this are looked into: each takes as long as restoring the artery does."""
 
 __all__ = ["restore"]
 
@@ -63,6 +65,7 @@ def restore(
     side_lines = [line for k, line in enumerate(vessel.centerlines) if k != path]
     sacs = [drawn_sac(vessel, landing, side_lines, drawn)] if drawn else _sacs(vessel, landing, side_lines, bulges)
     aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
+    flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm)
     return Anatomy(
         vessel,
         landing.axis,
@@ -70,8 +73,15 @@ def restore(
         landing.surface,
         landing.is_restored.ravel(),
         aneurysms,
-        told(vessel, path, bulges, aneurysms),
+        (*told(vessel, path, bulges, aneurysms), *flat_told(flat)),
     )
+
+
+def _flat_sac(vessel: Vessel, outlet_mm: Floats | None) -> Bulge | None:
+    """The highest bulge too flat to be taken for a sac of which one is cut off where it is asked for: a blister."""
+    flat = flat_bulges(vessel.lumen, tubes_of(vessel.centerlines))[:MOST_FLAT]
+    # Forks and bends bulge as high as a blister does: they turn out to be the artery once it is restored.
+    return next((b for b in flat if restore(vessel, at_mm=b.dome_mm, outlet_mm=outlet_mm).aneurysms), None)
 
 
 def _sacs(vessel: Vessel, landing: Landing, side_lines: list[Centerline], bulges: list[Bulge]) -> list[Aneurysm]:

@@ -1,7 +1,7 @@
 """Bulges: connected pieces of wall that stand out of the tubes far enough to be a sac."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,6 +17,8 @@ HEIGHT: Final = 1.0
 """A sac stands out by at least this many parent radii..."""
 HEIGHT_MM: Final = 1.5
 """... and by at least this much."""
+LOW_MM: Final = 1.0
+"""What stands out by less than this is an uneven wall, and not told."""
 SHOULDER: Final = 3.0
 """A bulge goes no farther than this many parent radii from where it stands out by one: the wide sides of an oval
 artery, which stand out of round tubes all along it, are no part of a sac on them."""
@@ -57,26 +59,51 @@ class Bulge:
         return np.asarray(cKDTree(self.points_mm).query(points_mm)[0])
 
 
+class _Standing(NamedTuple):
+    """A bulge that may be a sac."""
+
+    bulge: Bulge
+    is_high: bool
+    """It stands out far enough for a sac."""
+    is_wide: bool
+    """It is wide enough for one, and neither a twig nor a branch that ends blind."""
+
+
 def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> list[Bulge]:
     """Sacs on the lumen's wall, the highest first; with `at_mm` (3,) only the bulge nearest to it, however flat."""
+    found = _standing_out(lumen, tubes)
+    if at_mm is None:
+        return _highest_first([one.bulge for one in found if one.is_wide and one.is_high])
+    point = np.asarray(at_mm, dtype=np.float64)[None]
+    bulges = [one.bulge for one in found]
+    near = [b for b in bulges if float(b.distances_mm(point)[0]) < max(2.0 * b.height_mm, 1.0)]
+    return sorted(near, key=lambda bulge: float(bulge.distances_mm(point)[0]))[:1]
+
+
+def flat_bulges(lumen: Surface, tubes: Tubes) -> list[Bulge]:
+    """Bulges as wide as sacs on the lumen's wall that are too flat or too low for one, the highest first."""
+    found = [one.bulge for one in _standing_out(lumen, tubes) if one.is_wide and not one.is_high]
+    return _highest_first([bulge for bulge in found if bulge.height_mm > LOW_MM])
+
+
+def _standing_out(lumen: Surface, tubes: Tubes) -> list[_Standing]:
+    """All bulges on the lumen's wall."""
     height, sphere = tubes.height_mm(lumen.vertices_mm)
     parent = tubes.radius_mm[sphere]
     thickness = _thickness_mm(lumen)
-    found, sacs = [], []
+    found = []
     for member in _patches(lumen, height > FLANK * parent):
         typical = float(np.median(parent[member]))
         member = _about_dome(lumen.vertices_mm[member], height[member] / typical, SHOULDER * typical, member)
         bulge = _bulge(lumen, height, member)
-        found.append(bulge)
         width_mm = max(float(np.median(thickness[member])), 1e-6)
         is_high = bulge.height_mm > max(HEIGHT * typical, HEIGHT_MM)
-        if is_high and width_mm > WIDTH * typical and bulge.height_mm < LENGTH * width_mm:
-            sacs.append(bulge)
-    if at_mm is None:
-        return sorted(sacs, key=lambda bulge: -bulge.height_mm)
-    point = np.asarray(at_mm, dtype=np.float64)[None]
-    near = [b for b in found if float(b.distances_mm(point)[0]) < max(2.0 * b.height_mm, 1.0)]
-    return sorted(near, key=lambda bulge: float(bulge.distances_mm(point)[0]))[:1]
+        found.append(_Standing(bulge, is_high, width_mm > WIDTH * typical and bulge.height_mm < LENGTH * width_mm))
+    return found
+
+
+def _highest_first(bulges: list[Bulge]) -> list[Bulge]:
+    return sorted(bulges, key=lambda bulge: -bulge.height_mm)
 
 
 def _about_dome(points_mm: Floats, rise: Floats, reach_mm: float, member: Ints) -> Ints:

@@ -29,6 +29,17 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
     )
 
 
+def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
+    """A sentence on a bulge that is a sac only for whoever asks for it."""
+    if bulge is None:
+        return ()
+    x, y, z = bulge.dome_mm
+    return (
+        f"A bulge {bulge.height_mm:.1f} mm high at {x:.1f}, {y:.1f}, {z:.1f} mm is too flat to be taken for a sac "
+        "unasked: give --at there.",
+    )
+
+
 def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges: int) -> tuple[str, ...]:
     """Sentences on where the parent artery runs and how many sacs hang on it."""
     outlet = vessel.outlets[path]
