@@ -94,6 +94,33 @@ def test_a_trim_that_would_cut_the_sac_is_refused_with_the_least_length(sac_on_a
     )
 
 
+@pytest.mark.parametrize(("side", "usual"), [("before", "UPSTREAM_MM"), ("beyond", "DOWNSTREAM_MM")])
+def test_a_length_that_was_not_given_grows_until_the_cut_clears_the_sac(
+    sac_on_a_tube, monkeypatch, side: str, usual: str
+) -> None:
+    monkeypatch.setattr(import_module("vstent.trim"), usual, 2.0)
+    trimmed = trim(sac_on_a_tube)
+    (note,) = (note for note in trimmed.notes if "not 2: the neck reaches" in note)
+    assert f"mm {side} the sac's middle" in note
+    kept_mm = float(note.split()[2])
+    assert 2.0 + 2.0 < kept_mm < 2.0 + 2.0 + 1.5
+    low, high = sorted(opening.center_mm[2] for opening in trimmed.openings)
+    assert (20.0 - low if side == "before" else high - 20.0) == pytest.approx(kept_mm, abs=0.3)
+    np.testing.assert_allclose(
+        restore(trimmed).aneurysms[0].neck.area_mm2, restore(sac_on_a_tube).aneurysms[0].neck.area_mm2, rtol=0.05
+    )
+    with pytest.raises(InputError, match="through the sac or beside it"):
+        trim(sac_on_a_tube, **{"upstream_mm" if side == "before" else "downstream_mm": 2.0})
+
+
+def test_nothing_is_cut_or_told_where_the_artery_is_hardly_longer_than_a_length_that_grew(
+    sac_on_a_tube, monkeypatch
+) -> None:
+    monkeypatch.setattr(import_module("vstent.trim"), "DOWNSTREAM_MM", 2.0)
+    monkeypatch.setattr(import_module("vstent.trim"), "SPARE_MM", 18.0)
+    assert trim(sac_on_a_tube) is sac_on_a_tube
+
+
 def test_a_fusiform_aneurysm_is_told_and_stays_part_of_the_landing_surface() -> None:
     middle = np.array([0.0, 0.0, 15.0])
     bulb = phantoms.Sac(middle, np.array([0.0, 0.0, 1.0]), 3.5, 3.5)

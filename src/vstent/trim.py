@@ -32,15 +32,59 @@ STRIDE_MM: Final = 1.0
 """The direction of a cut is that of the centerline over this length."""
 
 
-class _Kept(NamedTuple):
-    """What is kept of the artery."""
+class _Way(NamedTuple):
+    """The artery on one side of the sac's middle."""
 
-    upstream_mm: float
-    """Length before the sac's middle."""
-    downstream_mm: float
-    """Length of every way beyond it."""
-    spare_mm: tuple[float, float]
-    """Nothing is cut for less than this, before and beyond the sac."""
+    side: str
+    """Which: before or beyond the sac."""
+    option: str
+    """What gives the length to keep of it."""
+    usual_mm: float
+    """The length kept where none is given."""
+    given_mm: float | None
+    """The length given."""
+    neck_mm: float
+    """How far the sac's neck reaches."""
+    clear_mm: float
+    """A cut comes no nearer to the neck than this."""
+    whole_mm: float
+    """How long the artery is."""
+
+    @property
+    def is_short(self) -> bool:
+        """Whether the length given, or the usual one, would cut the sac or beside it."""
+        length_mm = self.usual_mm if self.given_mm is None else self.given_mm
+        return length_mm < min(self.neck_mm + self.clear_mm, self.whole_mm)
+
+    @property
+    def least_mm(self) -> float:
+        """The least length that clears the neck, in full tenths."""
+        return float(np.ceil(10 * (self.neck_mm + self.clear_mm)) / 10)
+
+    @property
+    def kept_mm(self) -> float:
+        """The length to keep."""
+        if self.given_mm is not None:
+            return self.given_mm
+        return self.least_mm if self.is_short else self.usual_mm
+
+    @property
+    def spare_mm(self) -> float:
+        """Nothing is cut for less than this."""
+        return SPARE_MM if self.given_mm is None else 0.0
+
+
+class _Site(NamedTuple):
+    """Where the sac hangs on its artery."""
+
+    parent: Centerline
+    """The artery's centerline."""
+    sac_mm: float
+    """Abscissa of the sac's middle on it."""
+    before: _Way
+    """The artery before it."""
+    beyond: _Way
+    """The artery beyond it."""
 
 
 def trim(
@@ -65,14 +109,16 @@ def trim(
     Raises
     ------
     InputError
-        When a length is not above zero, or so short that the cut would come within an artery's radius of the sac.
+        When a length is not above zero, or so short that the cut would come within an artery's radius of the sac; one
+        that is not given grows by what it needs, and a note says so.
     """
-    kept = _kept(upstream_mm, downstream_mm)
+    _refuse_none(upstream_mm, downstream_mm)
     bulges = find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
     if not bulges:
         return vessel
+    site = _site(vessel, bulges[0], upstream_mm, downstream_mm)
     lumen, inlet_mm = vessel.lumen, vessel.inlet.center_mm
-    for line, abscissa_mm, sense in _cuts(vessel, bulges[0], kept):
+    for line, abscissa_mm, sense in _cuts(vessel, site):
         center, ahead = line.at(np.array([abscissa_mm, abscissa_mm + sense * STRIDE_MM]))
         direction = (ahead - center) / np.linalg.norm(ahead - center)
         radius = float(np.interp(abscissa_mm, line.abscissa_mm, line.inscribed_radius_mm))
@@ -84,9 +130,7 @@ def trim(
             inlet_mm = center if sense < 0 else inlet_mm
     if lumen is vessel.lumen:
         return vessel
-    note = f"Trimmed to {kept.upstream_mm:.4g} mm of vessel before the sac's middle and {kept.downstream_mm:.4g} mm "
-    note += "beyond it, cut square."
-    notes = (*vessel.notes, note, *_left_out(lumen, bulges[1:]))
+    notes = (*vessel.notes, *_trimmed(site), *_left_out(lumen, bulges[1:]))
     return trace(replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=notes), inlet_mm=inlet_mm)
 
 
@@ -95,15 +139,28 @@ def _holds(lumen: Surface, bulge: Bulge) -> bool:
     return bool(np.asarray(cKDTree(lumen.vertices_mm).query(bulge.points_mm)[0]).max() < SAME_MM)
 
 
-def _kept(upstream_mm: float | None, downstream_mm: float | None) -> _Kept:
-    given = [length_mm for length_mm in (upstream_mm, downstream_mm) if length_mm is not None]
-    if not all(0 < length_mm < np.inf for length_mm in given):
-        raise InputError(f"the artery cannot be trimmed to {given[0]:g} mm beside the sac: give a length above zero")
-    return _Kept(
-        UPSTREAM_MM if upstream_mm is None else upstream_mm,
-        DOWNSTREAM_MM if downstream_mm is None else downstream_mm,
-        (SPARE_MM if upstream_mm is None else 0.0, SPARE_MM if downstream_mm is None else 0.0),
-    )
+def _refuse_none(*lengths_mm: float | None) -> None:
+    """Refuse lengths that are not above zero."""
+    for length_mm in lengths_mm:
+        if length_mm is not None and not 0 < length_mm < np.inf:
+            raise InputError(
+                f"the artery cannot be trimmed to {length_mm:g} mm beside the sac: give a length above zero"
+            )
+
+
+def _trimmed(site: _Site) -> list[str]:
+    """Sentences on what is kept."""
+    before, beyond = site.before, site.beyond
+    return [
+        f"Trimmed to {before.kept_mm:.4g} mm of vessel before the sac's middle and {beyond.kept_mm:.4g} mm beyond it, "
+        "cut square.",
+        *(
+            f"It is {way.kept_mm:.4g} mm {way.side} the sac's middle, not {way.usual_mm:g}: the neck reaches "
+            f"{way.neck_mm:.1f} mm from there."
+            for way in (before, beyond)
+            if way.given_mm is None and way.is_short
+        ),
+    ]
 
 
 def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
@@ -116,45 +173,54 @@ def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
     ]
 
 
-def _cuts(vessel: Vessel, bulge: Bulge, kept: _Kept) -> list[tuple[Centerline, float, int]]:
-    """Where to cut: a centerline, the abscissa on it, and whether the part behind (-1) or ahead (1) comes off."""
+def _site(vessel: Vessel, bulge: Bulge, upstream_mm: float | None, downstream_mm: float | None) -> _Site:
+    """Where a sac hangs on its artery, and what is to be kept of it on both sides: the lengths given, if any.
+
+    Raises
+    ------
+    InputError
+        When with a length given a cut would come within a radius of the sac's foot.
+    """
     foot = cKDTree(bulge.foot_mm)
     gaps = [np.asarray(foot.query(line.points_mm)[0]) for line in vessel.centerlines]
-    main = int(np.argmin([gap.min() for gap in gaps]))
-    parent = vessel.centerlines[main]
-    sac_mm = float(parent.nearest_abscissa_mm(bulge.foot_mm).mean())
-    _refuse_short(parent, bulge, sac_mm, kept)
-    cuts = [(parent, sac_mm - kept.upstream_mm, -1)] if sac_mm > kept.upstream_mm + kept.spare_mm[0] else []
+    parent = vessel.centerlines[int(np.argmin([gap.min() for gap in gaps]))]
+    foot_mm = parent.nearest_abscissa_mm(bulge.foot_mm)
+    sac_mm = float(foot_mm.mean())
+    radius_mm = parent_radius_mm(parent.abscissa_mm, parent.inscribed_radius_mm)
+    clear_mm = float(np.interp(sac_mm, parent.abscissa_mm, radius_mm))
+    first_mm, last_mm = float(sac_mm - foot_mm.min()), float(foot_mm.max() - sac_mm)
+    beyond_mm = parent.length_mm - sac_mm
+    before = _Way("before", "--upstream", UPSTREAM_MM, upstream_mm, first_mm, clear_mm, sac_mm)
+    beyond = _Way("beyond", "--downstream", DOWNSTREAM_MM, downstream_mm, last_mm, clear_mm, beyond_mm)
+    for way in (before, beyond):
+        if way.given_mm is not None and way.is_short:
+            raise InputError(_short(way, bulge))
+    return _Site(parent, sac_mm, before, beyond)
+
+
+def _short(way: _Way, bulge: Bulge) -> str:
+    x, y, z = bulge.foot_mm.mean(axis=0)
+    return (
+        f"{way.given_mm:g} mm of artery {way.side} the middle of the sac at {x:.1f}, {y:.1f}, {z:.1f} mm would be cut "
+        f"through the sac or beside it: its neck reaches {way.neck_mm:.1f} mm from there; give {way.option} "
+        f"{way.least_mm:.1f} or more"
+    )
+
+
+def _cuts(vessel: Vessel, site: _Site) -> list[tuple[Centerline, float, int]]:
+    """Where to cut: a centerline, the abscissa on it, and whether the part behind (-1) or ahead (1) comes off."""
+    parent, sac_mm, before, beyond = site
+    cuts = [(parent, sac_mm - before.kept_mm, -1)] if sac_mm > before.kept_mm + before.spare_mm else []
     for line in vessel.centerlines:
         fork_mm = min(_fork_mm(line, parent), line.length_mm)
         # A branch that leaves before the sac has run from the sac back to its fork already.
-        way_mm = kept.downstream_mm
+        way_mm = beyond.kept_mm
         abscissa_mm = sac_mm + way_mm if fork_mm >= sac_mm else 2 * fork_mm - sac_mm + way_mm
         root_mm = fork_mm + 4.0 * float(np.interp(fork_mm, line.abscissa_mm, line.inscribed_radius_mm))
         abscissa_mm = max(abscissa_mm, root_mm) if line is not parent else abscissa_mm
-        if line.length_mm > abscissa_mm + kept.spare_mm[1]:
+        if line.length_mm > abscissa_mm + beyond.spare_mm:
             cuts.append((line, abscissa_mm, 1))
     return cuts
-
-
-def _refuse_short(parent: Centerline, bulge: Bulge, sac_mm: float, kept: _Kept) -> None:
-    """Refuse lengths from the sac's middle, at `sac_mm`, with which a cut would come within a radius of its foot."""
-    foot_mm = parent.nearest_abscissa_mm(bulge.foot_mm)
-    radius_mm = parent_radius_mm(parent.abscissa_mm, parent.inscribed_radius_mm)
-    clear_mm = float(np.interp(sac_mm, parent.abscissa_mm, radius_mm))
-    sides = (
-        ("before", "--upstream", kept.upstream_mm, sac_mm - foot_mm.min(), sac_mm),
-        ("beyond", "--downstream", kept.downstream_mm, foot_mm.max() - sac_mm, parent.length_mm - sac_mm),
-    )
-    for side, option, length_mm, half_mm, whole_mm in sides:
-        least_mm = half_mm + clear_mm
-        if length_mm < min(least_mm, whole_mm):
-            x, y, z = bulge.foot_mm.mean(axis=0)
-            raise InputError(
-                f"{length_mm:g} mm of artery {side} the middle of the sac at {x:.1f}, {y:.1f}, {z:.1f} mm would be cut "
-                f"through the sac or beside it: its neck reaches {half_mm:.1f} mm from there; give {option} "
-                f"{np.ceil(10 * least_mm) / 10:.1f} or more"
-            )
 
 
 def _fork_mm(line: Centerline, parent: Centerline) -> float:
