@@ -65,9 +65,9 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
     if len(loops) < 2:
         x, y, z = lumen.vertices_mm.mean(axis=0)
         raise VesselError(
-            f"the surface about ({x:.1f}, {y:.1f}, {z:.1f}) mm has {len(loops)} openings, but blood needs a way in and "
-            "a way out: cut the vessel open at its ends, or give a longer piece of it; in a scan it may be bone: give "
-            "--at with a point in the artery"
+            f"the surface about ({x:.1f}, {y:.1f}, {z:.1f}) mm has {counted(len(loops), 'opening')}, but blood needs a "
+            "way in and a way out: cut the vessel open at its ends, or give a longer piece of it; in a scan it may be "
+            "bone: give --at with a point in the artery, or crop the scan where the two touch"
         )
     found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
     widest = max(found, key=lambda opening: opening.area_mm2)

@@ -72,7 +72,7 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     Smoothing is that of Taubin 1995; what volume it takes is measured, said and given back.
     """
     lumen, notes, profile = propose(image, at_mm=at_mm) if threshold is None else _at(image, float(threshold), at_mm)
-    _refuse_wide(image, lumen, profile)
+    _refuse_wide(lumen, profile)
     surface, smooth_note = _smooth(_wall(lumen))
     if threshold is None:
         surface = _unblurred(surface, profile)
@@ -139,14 +139,15 @@ def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tu
     return lumen, (note,), profile
 
 
-def _refuse_wide(image: Image, lumen: Lumen, profile: "Profile") -> None:
+def _refuse_wide(lumen: Lumen, profile: "Profile") -> None:
     if 2 * profile.radius_mm <= GIANT_DIAMETER_MM:
         return
     x, y, z = lumen.affine_mm[:3] @ [*(0.5 * (np.array(lumen.field.shape) - 1)), 1.0]
     raise VesselError(
         f"What is brighter than threshold {lumen.threshold:.4g} about ({x:.1f}, {y:.1f}, {z:.1f}) mm is "
         f"{2 * profile.radius_mm:.0f} mm wide, and no artery is wider than {GIANT_DIAMETER_MM:g} mm: it is a head, "
-        "bone or the field of view; give --threshold, or --at with a point in the artery."
+        "bone or the field of view; give --threshold, or --at with a point in the artery, or crop the scan where the "
+        "two touch."
     )
 
 
