@@ -25,7 +25,7 @@ from vstent.vessel import Anatomy, Aneurysm, Centerline, Vessel
 
 ON_FOOT: Final = 1.5
 """A foot, which rises to half a radius above the nearest artery, is an artery's own up to this many of its radii."""
-MOST_FLAT: Final = 5
+MOST_FLAT: Final = 3
 """No more flat bulges than this are looked into: each takes as long as restoring the artery does."""
 
 __all__ = ["restore"]
