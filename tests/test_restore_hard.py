@@ -210,3 +210,31 @@ def test_a_blister_is_named_where_no_sac_is_found_and_is_found_where_it_is_named
 )
 def test_no_blister_is_named_on_a_healthy_artery(phantom: phantoms.Phantom) -> None:
     assert not any("too flat" in note for note in restore(traced(phantom)).notes)
+
+
+def sac_beside_a_stenosis(lost: float, throat_mm: float) -> phantoms.Phantom:
+    """A tube of radius 2 mm with a sac at 20 mm; it loses a share of its width `throat_mm` further on, over 6 mm."""
+    tube = phantoms.tube(length_mm=40.0)
+    points = np.column_stack([np.zeros((2, 401)).T, np.linspace(0.0, 40.0, 401)])
+    beyond = np.clip((points[:, 2] - 20.0 - throat_mm) / 3.0, -1.0, 1.0)
+    parent = Centerline(points, 2.0 * (1.0 - lost * 0.5 * (1.0 + np.cos(np.pi * beyond))))
+    return phantoms.with_sac(replace(tube, parent=parent), abscissa_mm=20.0, width_mm=6.4, neck_mm=3.6)
+
+
+@pytest.mark.parametrize(("lost", "throat_mm"), [(0.5, -6.0), (0.5, 6.0), (0.5, -8.0), (0.6, 8.0), (0.4, -6.0)])
+def test_a_stenosis_beside_a_neck_is_no_measure_of_the_artery_across_it(lost: float, throat_mm: float) -> None:
+    healthy, phantom = sac_beside_a_stenosis(0.0, throat_mm), sac_beside_a_stenosis(lost, throat_mm)
+    sac, same = restore(traced(phantom)).aneurysms[0], restore(traced(healthy)).aneurysms[0]
+    np.testing.assert_allclose(sac.neck.area_mm2, same.neck.area_mm2, rtol=0.25)  # 1.4 to 4 times as large without
+    np.testing.assert_allclose(sac.sac.volume_mm3, same.sac.volume_mm3, rtol=0.02)
+
+
+@pytest.mark.parametrize(("lost", "throat_mm"), [(0.5, -6.0), (0.6, 5.0), (0.0, 6.0), (0.2, 6.0)])
+def test_a_stenosis_beside_a_neck_is_told_with_its_place(lost: float, throat_mm: float) -> None:
+    notes = [note for note in restore(traced(sac_beside_a_stenosis(lost, throat_mm))).notes if "stenosed" in note]
+    assert len(notes) == (lost > 0.3)
+    for note in notes:
+        width_mm, rest = note.removeprefix("The artery is ").split(" mm wide at ")
+        assert float(width_mm) == pytest.approx(4.0 * (1.0 - lost), abs=0.15)
+        place = [float(x) for x in rest.split(" mm")[0].split(",")]
+        np.testing.assert_allclose(place, [0.0, 0.0, 20.0 + throat_mm], atol=0.5)

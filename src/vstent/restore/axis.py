@@ -37,6 +37,12 @@ SIDE_TRUST: Final = 0.1
 """Across the way into a neck the medial line counts as this fraction of all rays of a section."""
 NECK_TRUST: Final = 10.0
 """Weight of the interpolated oval across a neck against all rays of a section."""
+THROAT: Final = 0.85
+"""An artery narrower by this factor beside a neck than further off on both its sides is stenosed there..."""
+THROAT_REACH: Final = 2.0
+"""... and how wide it is without that is sought over this many diameters."""
+THROAT_TRUST: Final = 1.0
+"""Weight of the interpolated oval there: the artery regains its width within the neck, the far wall says where."""
 OVAL_WAVES: Final = 4.0
 """Ovals follow waves this many times as long: a fork widens a section in one direction too."""
 OVAL_MOST: Final = 0.4
@@ -116,6 +122,7 @@ def _across_necks(tube: Tube, mouths: Sequence[Mouth]) -> _Necks:
     abscissa, healthy = curves.arc_length(points), np.ones(len(points), dtype=bool)
     sacward = np.zeros((len(points), N_RAYS), dtype=bool)
     across = np.zeros((len(points), 2))
+    spans: list[tuple[Bools, float]] = []
     frames = curves.parallel_frames(points)
     directions = section_directions(points, N_RAYS)
     for foot_mm, inward in mouths:
@@ -133,11 +140,34 @@ def _across_necks(tube: Tube, mouths: Sequence[Mouth]) -> _Necks:
         square = np.einsum("nkd,nd->nk", frames[:, :0:-1], into) * [-1.0, 1.0]
         across = np.where(beside, square / np.maximum(np.linalg.norm(square, axis=1, keepdims=True), 1e-12), across)
         healthy &= ~neck
+        spans.append((neck, 2.0 * typical))
     if not healthy.any():
         return _Necks(tube, np.zeros(len(points)), sacward, across)
-    trust = np.where(healthy, 0.0, NECK_TRUST * N_RAYS)
-    between = curves.interpolate(abscissa[healthy], tube.oval_mm[healthy], abscissa)
-    return _Necks(Tube(points, between), trust, sacward, across)
+    trust, telling = np.where(healthy, 0.0, NECK_TRUST * N_RAYS), healthy
+    for neck, diameter_mm in spans:
+        throat = _throat_beside(tube, neck, healthy, THROAT_REACH * diameter_mm)
+        telling = telling & ~throat
+        trust = np.where(neck & throat.any(), THROAT_TRUST * N_RAYS, trust)
+    between = curves.interpolate(abscissa[telling], tube.oval_mm[telling], abscissa)
+    return _Necks(Tube(points, np.where(healthy[:, None], tube.oval_mm, between)), trust, sacward, across)
+
+
+def _throat_beside(tube: Tube, neck: Bools, healthy: Bools, reach_mm: float) -> Bools:
+    """Tell the healthy stations (n,) of a stenosis that a neck begins in: no measure of the artery across that neck.
+
+    An artery that tapers, or is thinner behind a fork, is no narrower there than on both sides.
+    """
+    abscissa, (first, last) = curves.arc_length(tube.points_mm), np.flatnonzero(neck)[[0, -1]]
+    upstream = healthy & (abscissa < abscissa[first]) & (abscissa > abscissa[first] - reach_mm)
+    downstream = healthy & (abscissa > abscissa[last]) & (abscissa < abscissa[last] + reach_mm)
+    throat = np.zeros(len(abscissa), dtype=bool)
+    if not (upstream.any() and downstream.any()):
+        return throat
+    width_mm = min(float(tube.radius_mm[upstream].max()), float(tube.radius_mm[downstream].max()))
+    for side, edge in ((upstream, -1), (downstream, 0)):
+        is_narrow = tube.radius_mm[side] < THROAT * width_mm
+        throat[side] = is_narrow & is_narrow[edge]
+    return throat
 
 
 def section_rays(lumen: Surface, points_mm: Floats, n_rays: int) -> Floats:

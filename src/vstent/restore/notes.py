@@ -4,9 +4,11 @@ from typing import Final
 
 import numpy as np
 
+from vstent.kernels import curves
 from vstent.restore.bulges import Bulge
 from vstent.restore.path import is_off_sac
 from vstent.restore.sac import is_in_one
+from vstent.trace import parent_radius_mm
 from vstent.vessel import Aneurysm, Centerline, Opening, Vessel
 from vstent.words import counted
 
@@ -17,6 +19,11 @@ END_MM: Final = 2.0
 NEAR_SAC_MM: Final = 4.0
 """An opening so near to a sac's wall is told."""
 
+STENOSED: Final = 0.7
+"""An artery narrower by this factor beside a neck than further off on both its sides is told..."""
+STENOSED_REACH: Final = 2.0
+"""... where that is within this many diameters of the neck."""
+
 
 def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
     """Sentences on the sacs cut off from the bulges found, and on the parent artery, along the centerline `path`."""
@@ -26,6 +33,7 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
         *_near_sacs(vessel, bulges),
         *_from_sacs(vessel, path, aneurysms),
         *_fusiform(line, sacs),
+        *(note for sac in aneurysms for note in _stenosed(line, sac)),
     )
 
 
@@ -65,6 +73,32 @@ def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
     return (
         f"The artery is {2 * radius[widest]:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm and {2 * ends_mm:.1f} mm at "
         "its wider end: a fusiform aneurysm is no sac here, has no neck, and stays part of the landing surface.",
+    )
+
+
+def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
+    """A sentence where the artery along a centerline narrows beside a neck and is wide again on both sides.
+
+    How wide the artery is under a neck is told by how wide it is beside it: little is, where it is stenosed there.
+    """
+    abscissa, radius = line.abscissa_mm, line.inscribed_radius_mm
+    at_neck = curves.project(line.points_mm, aneurysm.neck_mm)[0]
+    gap_mm = np.maximum(at_neck.min() - abscissa, abscissa - at_neck.max())
+    is_near = gap_mm < STENOSED_REACH * 2.0 * parent_radius_mm(abscissa, radius)[np.argmin(gap_mm)]
+    upstream, downstream = (
+        is_near & (gap_mm > 0) & side for side in (abscissa < at_neck.min(), abscissa > at_neck.max())
+    )
+    if not (upstream.any() and downstream.any()):
+        return ()
+    around_mm = min(float(radius[upstream].max()), float(radius[downstream].max()))
+    throat = int(np.argmin(np.where(upstream | downstream, radius, np.inf)))
+    if radius[throat] > STENOSED * around_mm:
+        return ()
+    x, y, z = line.points_mm[throat]
+    return (
+        f"The artery is {2 * radius[throat]:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm, {gap_mm[throat]:.1f} mm from "
+        f"a neck, and {2 * around_mm:.1f} mm further off: it is stenosed. The landing surface may lie inside its wall "
+        "between there and the neck: look at it, and give --neck where the neck found is too large.",
     )
 
 
