@@ -238,3 +238,10 @@ def test_a_stenosis_beside_a_neck_is_told_with_its_place(lost: float, throat_mm:
         assert float(width_mm) == pytest.approx(4.0 * (1.0 - lost), abs=0.15)
         place = [float(x) for x in rest.split(" mm")[0].split(",")]
         np.testing.assert_allclose(place, [0.0, 0.0, 20.0 + throat_mm], atol=0.5)
+
+
+def test_an_artery_that_goes_on_narrow_beyond_a_neck_is_not_called_stenosed() -> None:
+    phantom = sac_beside_a_stenosis(0.5, 6.0)
+    radius = np.minimum.accumulate(phantom.parent.inscribed_radius_mm)
+    tapered = replace(phantom, parent=replace(phantom.parent, inscribed_radius_mm=radius))
+    assert not any("stenosed" in note for note in restore(traced(tapered)).notes)

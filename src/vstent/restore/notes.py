@@ -18,9 +18,8 @@ END_MM: Final = 2.0
 """... which are as wide as they are over this length."""
 NEAR_SAC_MM: Final = 4.0
 """An opening so near to a sac's wall is told."""
-
 STENOSED: Final = 0.7
-"""An artery narrower by this factor beside a neck than further off on both its sides is told..."""
+"""An artery narrower by this factor beside a neck than beyond that and across the neck is told..."""
 STENOSED_REACH: Final = 2.0
 """... where that is within this many diameters of the neck."""
 
@@ -77,29 +76,33 @@ def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
 
 
 def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
-    """A sentence where the artery along a centerline narrows beside a neck and is wide again on both sides.
+    """Sentences where the artery along a centerline narrows beside a neck, and is wide again beyond and across it.
 
     How wide the artery is under a neck is told by how wide it is beside it: little is, where it is stenosed there.
     """
     abscissa, radius = line.abscissa_mm, line.inscribed_radius_mm
     at_neck = curves.project(line.points_mm, aneurysm.neck_mm)[0]
     gap_mm = np.maximum(at_neck.min() - abscissa, abscissa - at_neck.max())
-    is_near = gap_mm < STENOSED_REACH * 2.0 * parent_radius_mm(abscissa, radius)[np.argmin(gap_mm)]
+    reach_mm = STENOSED_REACH * 2.0 * parent_radius_mm(abscissa, radius)[np.argmin(gap_mm)]
     upstream, downstream = (
-        is_near & (gap_mm > 0) & side for side in (abscissa < at_neck.min(), abscissa > at_neck.max())
+        side & (gap_mm > 0) & (gap_mm < reach_mm) for side in (abscissa < at_neck.min(), abscissa > at_neck.max())
     )
     if not (upstream.any() and downstream.any()):
         return ()
-    around_mm = min(float(radius[upstream].max()), float(radius[downstream].max()))
-    throat = int(np.argmin(np.where(upstream | downstream, radius, np.inf)))
-    if radius[throat] > STENOSED * around_mm:
-        return ()
-    x, y, z = line.points_mm[throat]
-    return (
-        f"The artery is {2 * radius[throat]:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm, {gap_mm[throat]:.1f} mm from "
-        f"a neck, and {2 * around_mm:.1f} mm further off: it is stenosed. The landing surface may lie inside its wall "
-        "between there and the neck: look at it, and give --neck where the neck found is too large.",
-    )
+    notes = []
+    for side, other in ((upstream, downstream), (downstream, upstream)):
+        throat = int(np.argmin(np.where(side, radius, np.inf)))
+        beyond_mm = float(radius[side & (gap_mm > gap_mm[throat])].max(initial=0.0))
+        around_mm = min(beyond_mm, float(radius[other].max()))
+        if radius[throat] < STENOSED * around_mm:
+            x, y, z = line.points_mm[throat]
+            notes.append(
+                f"The artery is {2 * radius[throat]:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm, "
+                f"{gap_mm[throat]:.1f} mm from a neck, and {2 * around_mm:.1f} mm on both sides of that: it is "
+                "stenosed. The landing surface may lie inside its wall between there and the neck: look at it, and "
+                "give --neck where the neck found is too large."
+            )
+    return tuple(notes)
 
 
 def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
