@@ -116,48 +116,66 @@ class _Necks(NamedTuple):
     """(n, 2) unit vector in the section, along its two normals, square to the way into the neck; zero off necks."""
 
 
+class _Neck(NamedTuple):
+    is_under: Bools
+    """(n,) sections under a neck and its flares."""
+    diameter_mm: float
+    """The artery's there."""
+    is_sacward: Bools
+    """(n, rays) rays into it."""
+    across: Floats
+    """(n, 2) unit vector in the section square to the way into it; zero elsewhere."""
+
+
 def _across_necks(tube: Tube, mouths: Sequence[Mouth]) -> _Necks:
     """Where the necks are, and what the healthy stations on both sides of them say."""
-    points, radius = tube.points_mm, tube.radius_mm
-    abscissa, healthy = curves.arc_length(points), np.ones(len(points), dtype=bool)
-    sacward = np.zeros((len(points), N_RAYS), dtype=bool)
-    across = np.zeros((len(points), 2))
-    spans: list[tuple[Bools, float]] = []
-    frames = curves.parallel_frames(points)
-    directions = section_directions(points, N_RAYS)
-    for foot_mm, inward in mouths:
-        place, distance = curves.project(points, foot_mm)
-        at_foot = place[distance < 3.0 * np.interp(place, abscissa, radius)]
-        if not len(at_foot):
-            continue
-        typical = float(np.median(np.interp(at_foot, abscissa, radius)))
-        neck = (abscissa > at_foot.min() - FLARE_LENGTH * typical) & (abscissa < at_foot.max() + FLARE_LENGTH * typical)
-        into = foot_mm.mean(axis=0) + INTO * typical * inward - points
-        to_sac = np.einsum("nrd,nd->nr", directions, into)
-        reach = to_sac.max(axis=1, keepdims=True)
-        beside = neck[:, None] & (reach > 0.5 * typical)
-        sacward |= beside & (to_sac > FAR_SIDE * reach)
-        square = np.einsum("nkd,nd->nk", frames[:, :0:-1], into) * [-1.0, 1.0]
-        across = np.where(beside, square / np.maximum(np.linalg.norm(square, axis=1, keepdims=True), 1e-12), across)
-        healthy &= ~neck
-        spans.append((neck, 2.0 * typical))
+    n = len(tube.points_mm)
+    healthy, sacward, across = np.ones(n, dtype=bool), np.zeros((n, N_RAYS), dtype=bool), np.zeros((n, 2))
+    necks = [neck for mouth in mouths if (neck := _neck(tube, mouth))]
+    for neck in necks:
+        healthy &= ~neck.is_under
+        sacward |= neck.is_sacward
+        across = np.where(neck.across.any(axis=1, keepdims=True), neck.across, across)
     if not healthy.any():
-        return _Necks(tube, np.zeros(len(points)), sacward, across)
+        return _Necks(tube, np.zeros(n), sacward, across)
     trust, telling = np.where(healthy, 0.0, NECK_TRUST * N_RAYS), healthy
-    for neck, diameter_mm in spans:
-        throat = _throat_beside(tube, neck, healthy, THROAT_REACH * diameter_mm)
+    for neck in necks:
+        throat = _throat_beside(tube, neck, healthy)
         telling = telling & ~throat
-        trust = np.where(neck & throat.any(), THROAT_TRUST * N_RAYS, trust)
+        trust = np.where(neck.is_under & throat.any(), THROAT_TRUST * N_RAYS, trust)
+    abscissa = curves.arc_length(tube.points_mm)
     between = curves.interpolate(abscissa[telling], tube.oval_mm[telling], abscissa)
-    return _Necks(Tube(points, np.where(healthy[:, None], tube.oval_mm, between)), trust, sacward, across)
+    oval = np.where(healthy[:, None], tube.oval_mm, between)
+    return _Necks(Tube(tube.points_mm, oval), trust, sacward, across)
 
 
-def _throat_beside(tube: Tube, neck: Bools, healthy: Bools, reach_mm: float) -> Bools:
+def _neck(tube: Tube, mouth: Mouth) -> _Neck | None:
+    """The neck of a sac on a tube; None where its mouth is not on it."""
+    (points, radius), (foot_mm, inward) = (tube.points_mm, tube.radius_mm), mouth
+    abscissa = curves.arc_length(points)
+    place, distance = curves.project(points, foot_mm)
+    at_foot = place[distance < 3.0 * np.interp(place, abscissa, radius)]
+    if not len(at_foot):
+        return None
+    typical = float(np.median(np.interp(at_foot, abscissa, radius)))
+    flare = FLARE_LENGTH * typical
+    under = (abscissa > at_foot.min() - flare) & (abscissa < at_foot.max() + flare)
+    into = foot_mm.mean(axis=0) + INTO * typical * inward - points
+    to_sac = np.einsum("nrd,nd->nr", section_directions(points, N_RAYS), into)
+    reach = to_sac.max(axis=1, keepdims=True)
+    beside = under[:, None] & (reach > 0.5 * typical)
+    square = np.einsum("nkd,nd->nk", curves.parallel_frames(points)[:, :0:-1], into) * [-1.0, 1.0]
+    across = np.where(beside, square / np.maximum(np.linalg.norm(square, axis=1, keepdims=True), 1e-12), 0.0)
+    return _Neck(under, 2.0 * typical, beside & (to_sac > FAR_SIDE * reach), across)
+
+
+def _throat_beside(tube: Tube, neck: _Neck, healthy: Bools) -> Bools:
     """Tell the healthy stations (n,) of a stenosis that a neck begins in: no measure of the artery across that neck.
 
     An artery that tapers, or is thinner behind a fork, is no narrower there than on both sides.
     """
-    abscissa, (first, last) = curves.arc_length(tube.points_mm), np.flatnonzero(neck)[[0, -1]]
+    abscissa, (first, last) = curves.arc_length(tube.points_mm), np.flatnonzero(neck.is_under)[[0, -1]]
+    reach_mm = THROAT_REACH * neck.diameter_mm
     upstream = healthy & (abscissa < abscissa[first]) & (abscissa > abscissa[first] - reach_mm)
     downstream = healthy & (abscissa > abscissa[last]) & (abscissa < abscissa[last] + reach_mm)
     throat = np.zeros(len(abscissa), dtype=bool)
