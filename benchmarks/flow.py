@@ -1,12 +1,12 @@
 """Print how fast the lattice-Boltzmann kernel is beside the memory's bandwidth, and how exact Poiseuille's flow.
 
-Usage: python benchmarks/flow.py [--cost [SURFACE]] [--pulse] [CELL_MM ...]
+Usage: python benchmarks/flow.py [--cost] [--pulse] [SURFACE] [CELL_MM ...]
 
 Besides: how a step's time grows with its cells, and what other machines would need (computed). Seconds of the clock
 depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo is computed, steady,
 bare and with Silk and Enterprise as screens, in cells of 0.1 mm, all over and then in the sac and near it only
-(`FlowSettings.close_up`); with a surface file that artery, in the latter way alone. With ``--pulse`` the bare demo is
-computed for two cycles of a pulse, in both ways.
+(`FlowSettings.close_up`). With ``--pulse`` it is computed bare for two cycles of a pulse, in both ways. With a surface
+file, in mm, that artery is, in the latter way alone.
 """
 
 import resource
@@ -122,22 +122,27 @@ def cost(surface: Path | None, *, close_up: bool) -> None:
     began, began_core = time.perf_counter(), time.process_time()
     fields = simulate(anatomy, stents, settings)
     clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
-    name = "demo" if surface is None else surface.stem
-    print(f"\n{name}, cells of 0.1 mm{' in the sac and near it' if close_up else ''}:\n")
+    print(f"\n{named(surface, close_up=close_up)}:\n")
     case = flow_case(anatomy, None, settings)
     table(case, dict(zip(("bare", "silk", "enterprise"), fields, strict=True)), clock_s, core_s)
 
 
-def pulse(*, close_up: bool) -> None:
-    """Print what two cycles take in the demo."""
+def pulse(surface: Path | None, *, close_up: bool) -> None:
+    """Print what two cycles take in an artery."""
     settings = FlowSettings(cell_size_mm=0.1, waveform=OLDER_ADULT_ICA, max_cycles=2, close_up=close_up)
-    case = flow_case(anatomy_of(None), None, settings)
+    case = flow_case(anatomy_of(surface), None, settings)
     began, began_core = time.perf_counter(), time.process_time()
     field = simulate_case(case)
     clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
-    print(f"\ndemo, two cycles of a pulse, cells of 0.1 mm{' in the sac and near it' if close_up else ''}:\n")
+    print(f"\n{named(surface, close_up=close_up)}, two cycles of a pulse:\n")
     table(case, {"bare, mean of the second": field}, clock_s, core_s)
     print(field.advice)
+
+
+def named(surface: Path | None, *, close_up: bool) -> str:
+    """What is computed, in words."""
+    name = "demo" if surface is None else surface.stem
+    return f"{name}, cells of 0.1 mm{' in the sac and near it' if close_up else ''}"
 
 
 def table(case: FlowCase, fields: dict[str, FlowField], clock_s: float, core_s: float) -> None:
@@ -195,9 +200,8 @@ if __name__ == "__main__":
     print("\n| cells a diameter | velocity | pressure gradient | WSS | mass | seconds |\n|---|---|---|---|---|---|")
     for cell_mm in cells_mm:
         poiseuille(cell_mm)
-    if "--cost" in sys.argv:
-        for close_up in (False, True) if surface is None else (True,):
+    for close_up in (False, True) if surface is None else (True,):
+        if "--cost" in sys.argv:
             cost(surface, close_up=close_up)
-    if "--pulse" in sys.argv:
-        for close_up in (False, True):
-            pulse(close_up=close_up)
+        if "--pulse" in sys.argv:
+            pulse(surface, close_up=close_up)
