@@ -51,10 +51,19 @@ class _Way(NamedTuple):
     """How long the artery is."""
 
     @property
+    def asked_mm(self) -> float:
+        """The length given, or the usual one."""
+        return self.usual_mm if self.given_mm is None else self.given_mm
+
+    @property
     def is_short(self) -> bool:
-        """Whether the length given, or the usual one, would cut the sac or beside it."""
-        length_mm = self.usual_mm if self.given_mm is None else self.given_mm
-        return length_mm < min(self.neck_mm + self.clear_mm, self.whole_mm)
+        """Whether that would cut the sac or beside it."""
+        return self.asked_mm < min(self.neck_mm + self.clear_mm, self.whole_mm)
+
+    @property
+    def has_grown(self) -> bool:
+        """Whether the usual length is too short, and the least is kept in its place."""
+        return self.given_mm is None and self.is_short
 
     @property
     def least_mm(self) -> float:
@@ -64,9 +73,7 @@ class _Way(NamedTuple):
     @property
     def kept_mm(self) -> float:
         """The length to keep."""
-        if self.given_mm is not None:
-            return self.given_mm
-        return self.least_mm if self.is_short else self.usual_mm
+        return self.least_mm if self.has_grown else self.asked_mm
 
     @property
     def spare_mm(self) -> float:
@@ -158,7 +165,7 @@ def _trimmed(site: _Site) -> list[str]:
             f"It is {way.kept_mm:.4g} mm {way.side} the sac's middle, not {way.usual_mm:g}: the neck reaches "
             f"{way.neck_mm:.1f} mm from there."
             for way in (before, beyond)
-            if way.given_mm is None and way.is_short
+            if way.has_grown
         ),
     ]
 
@@ -193,7 +200,7 @@ def _site(vessel: Vessel, bulge: Bulge, upstream_mm: float | None, downstream_mm
     before = _Way("before", "--upstream", UPSTREAM_MM, upstream_mm, first_mm, clear_mm, sac_mm)
     beyond = _Way("beyond", "--downstream", DOWNSTREAM_MM, downstream_mm, last_mm, clear_mm, beyond_mm)
     for way in (before, beyond):
-        if way.given_mm is not None and way.is_short:
+        if way.is_short and not way.has_grown:
             raise InputError(_short(way, bulge))
     return _Site(parent, sac_mm, before, beyond)
 
@@ -201,7 +208,7 @@ def _site(vessel: Vessel, bulge: Bulge, upstream_mm: float | None, downstream_mm
 def _short(way: _Way, bulge: Bulge) -> str:
     x, y, z = bulge.foot_mm.mean(axis=0)
     return (
-        f"{way.given_mm:g} mm of artery {way.side} the middle of the sac at {x:.1f}, {y:.1f}, {z:.1f} mm would be cut "
+        f"{way.asked_mm:g} mm of artery {way.side} the middle of the sac at {x:.1f}, {y:.1f}, {z:.1f} mm would be cut "
         f"through the sac or beside it: its neck reaches {way.neck_mm:.1f} mm from there; give {way.option} "
         f"{way.least_mm:.1f} or more"
     )

@@ -6,7 +6,7 @@ import numpy as np
 
 from vstent.kernels import curves
 from vstent.restore.bulges import Bulge
-from vstent.restore.path import is_off_sac
+from vstent.restore.path import is_off_sacs
 from vstent.restore.sac import is_in_one
 from vstent.trace import parent_radius_mm
 from vstent.vessel import Aneurysm, Centerline, Opening, Vessel
@@ -61,7 +61,7 @@ def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges:
 
 def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
     """A sentence where the artery along a centerline widens all round, off its sacs."""
-    radius = np.where(np.all([is_off_sac(line, [bulge]) for bulge in bulges], axis=0), line.inscribed_radius_mm, 0.0)
+    radius = np.where(is_off_sacs(line, bulges), line.inscribed_radius_mm, 0.0)
     at_end = np.minimum(line.abscissa_mm, line.length_mm - line.abscissa_mm) < END_MM
     is_first = line.abscissa_mm < 0.5 * line.length_mm
     ends_mm = max(float(np.median(line.inscribed_radius_mm[at_end & side])) for side in (is_first, ~is_first))

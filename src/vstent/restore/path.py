@@ -28,15 +28,16 @@ def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -
         return int(np.argmin(np.linalg.norm(ends - np.asarray(outlet_mm), axis=1)))
     reach = np.array([_reach(line, bulges[0]) if bulges else 0.0 for line in lines])
     passing = np.flatnonzero(reach <= max(PASSING, 1.25 * reach.min()))
-    off = [is_off_sac(line, bulges) for line in lines]
+    off = [is_off_sacs(line, bulges[:1]) for line in lines]
     return int(reduce(lambda i, k: i if _is_wider(lines[i], lines[k], off[i], off[k]) else k, passing))
 
 
-def is_off_sac(line: Centerline, bulges: list[Bulge]) -> Bools:
-    """Tell the points (n,) of a centerline whose inscribed spheres do not reach into a sac: it makes them wide."""
-    if not bulges:
-        return np.ones(len(line.points_mm), dtype=bool)
-    return np.asarray(bulges[0].distances_mm(line.points_mm) > IN_SAC * line.inscribed_radius_mm)
+def is_off_sacs(line: Centerline, bulges: list[Bulge]) -> Bools:
+    """Tell the points (n,) of a centerline whose inscribed spheres reach into none of the sacs: they make them wide."""
+    off = np.ones(len(line.points_mm), dtype=bool)
+    for bulge in bulges:
+        off &= bulge.distances_mm(line.points_mm) > IN_SAC * line.inscribed_radius_mm
+    return off
 
 
 def _reach(line: Centerline, bulge: Bulge) -> float:
