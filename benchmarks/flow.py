@@ -182,7 +182,7 @@ def poiseuille(cell_mm: float, length_mm: float = 12.0) -> None:
     velocity, pressure, stress = errors(field, length_mm)
     print(
         f"| {2 * RADIUS_MM / cell_mm:.0f} | {100 * velocity:.2f} % | {100 * pressure:+.2f} % | {100 * stress:+.2f} % "
-        f"| {100 * (field.outlets_mL_s.sum() / field.inlet_mL_s - 1):+.4f} % | {field.seconds:.0f} |"
+        f"| {100 * (field.outlets_mL_s.sum() / field.inflow_mL_s - 1):+.4f} % | {field.seconds:.0f} |"
     )
 
 

@@ -273,6 +273,11 @@ def run(*options: str) -> Maker:
     return make
 
 
+def inlets_all_over() -> list[str]:
+    """Name every opening of the artery as an inlet."""
+    return [f"--inlet={','.join(map(str, center_mm))}" for center_mm, _, _ in phantoms.demo_phantom().ends]
+
+
 def linked(folder: Path) -> list[str]:
     """Trace a link that leads to itself."""
     (folder / "loop.stl").symlink_to(folder / "loop.stl")
@@ -614,6 +619,8 @@ FAULTS: tuple[Fault, ...] = (
     Fault(OPTION, "cells of no size", run("--cell-size", "0"), INPUT, "not above zero"),
     Fault(OPTION, "inflow below zero", run("--flow-rate", "-3"), INPUT, "not above zero"),
     Fault(OPTION, "point of two numbers", run("--at", "1,2"), INPUT, "2 numbers, not 3"),
+    Fault(OPTION, "an inlet given twice", run("--inlet", "0,0,0", "--inlet", "0,1,0"), INPUT, "the same opening"),
+    Fault(OPTION, "inlets wherever there is an opening", run(*inlets_all_over()), INPUT, "leaves through none"),
     Fault(OPTION, "device that does not exist", run("--device", "slik"), INPUT, "Did you mean silk"),
     Fault(OPTION, "size that is not made", run("--diameter", "17"), INPUT, "is not made in"),
     Fault(OPTION, "device beyond the artery", run("--center", "900"), INPUT, "is not on the parent artery"),

@@ -506,7 +506,12 @@ def vstent_image(voxels):
 def test_a_cut_lies_in_one_plane_and_has_the_flows_speed_at_a_moment_or_in_the_mean():
     anatomy, mean = report_case.anatomy(), report_case.field(1.0)
     fast = Phase(
-        0.25, 7.0, 2 * mean.outlets_mL_s, 2 * mean.velocity_m_s, mean.pressure_Pa, 3 * mean.wall_shear_stress_Pa
+        0.25,
+        2 * mean.inlets_mL_s,
+        2 * mean.outlets_mL_s,
+        2 * mean.velocity_m_s,
+        mean.pressure_Pa,
+        3 * mean.wall_shear_stress_Pa,
     )
     pulsing = replace(mean, phases=(fast,))
     layers = [cuts.cut("bare", field, anatomy) for field in (mean, cuts.at_phase(pulsing, 0))]

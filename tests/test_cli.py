@@ -200,7 +200,7 @@ def test_a_number_may_begin_with_a_minus() -> None:
         command.add(commands)
     words = ["--at", "-1.5,-8.0,20", "--inlet", "-.5,0,0", "--outlet", "-1e1,2,3", "--center", "-1e1", "-j", "2"]
     given = parser.parse_args(["run", "scan.nii", "--out", "out", *words])
-    assert (given.at, given.inlet, given.outlet) == ((-1.5, -8.0, 20.0), (-0.5, 0.0, 0.0), (-10.0, 2.0, 3.0))
+    assert (given.at, given.inlet, given.outlet) == ((-1.5, -8.0, 20.0), [(-0.5, 0.0, 0.0)], (-10.0, 2.0, 3.0))
     assert (given.center, given.processes) == (-10.0, 2)
     assert parser.parse_args(["rank", "scan.nii", "--out", "out", "--shift", "-2,0,2"]).shift == [-2.0, 0.0, 2.0]
 

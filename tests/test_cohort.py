@@ -224,6 +224,7 @@ BAD_LISTS = {
     "an endless size": ("input,diameter\na.stl,inf\n", "diameter is 'inf', which cannot be used: a finite number"),
     "a point that is nowhere": ("input,at\na.stl,1 nan 3\n", "at is '1 nan 3', which cannot be used: a finite"),
     "a size below zero": ("input,length\na.stl,-4\n", "length is '-4', which cannot be used: it must be above zero"),
+    "half an inlet": ("input,inlet\na.stl,1 2 3; 4\n", "inlet is '1 2 3; 4', which cannot be used: three numbers"),
     "voxels without an edge": ("input,spacing\na.raw,0.1 0 1\n", "spacing is '0.1 0 1', which cannot be used: it must"),
     "no voxels": ("input,shape\na.raw,10 0 10\n", "shape is '10 0 10', which cannot be used: it must"),
     "a unit of fields": ("input,units\na.stl,furlong\n", "units is 'furlong', which cannot be used: give one of m, cm"),
@@ -245,12 +246,12 @@ def test_a_bad_list_is_refused_before_anything_is_done(name, tmp_path, capsys):
 
 def test_a_list_says_what_each_case_is_told(tmp_path):
     (tmp_path / "list.csv").write_text(
-        "input,units,threshold,at,spacing,shape,diameter,center\n"
-        'a.stl,cm,-5.5,"-1.5, 0; 3",0.1 0.2 0.3,5 6 7,4.5,-2\nb.stl,,,,,,,\n'
+        "input,units,threshold,at,inlet,spacing,shape,diameter,center\n"
+        'a.stl,cm,-5.5,"-1.5, 0; 3",1 2 3; 4 5 -6,0.1 0.2 0.3,5 6 7,4.5,-2\nb.stl,,,,,,,,\n'
     )
     first, second = find_cases(tmp_path / "list.csv", SETTINGS)
     told = {"units": "cm", "threshold": -5.5, "at_mm": (-1.5, 0.0, 3.0), "spacing_mm": (0.1, 0.2, 0.3)}
-    told |= {"shape": (5, 6, 7), "diameter_mm": 4.5, "center_mm": -2.0}
+    told |= {"inlet_mm": ((1.0, 2.0, 3.0), (4.0, 5.0, -6.0)), "shape": (5, 6, 7), "diameter_mm": 4.5, "center_mm": -2.0}
     assert first.settings.__dict__ == replace(SETTINGS, **told).__dict__
     assert second.settings.__dict__ == SETTINGS.__dict__
 

@@ -61,6 +61,24 @@ def test_of_two_arteries_that_touch_the_one_with_the_inlet_is_kept() -> None:
     assert vessel.lumen.vertices_mm[:, 1].max() < 2.1
 
 
+def test_arteries_that_touch_are_not_parted_where_blood_is_said_to_come_from_both() -> None:
+    crossed = pair(-0.1)
+    ends_mm = np.array([crossed.ends[k][0] for k in (0, 2)])
+    vessel = trace(Vessel(phantoms.phantom_surface(crossed, edge_mm=0.3)), inlet_mm=ends_mm)
+    np.testing.assert_allclose([inlet.center_mm for inlet in vessel.inlets], ends_mm, atol=0.05)
+    assert len(vessel.outlets) == 2
+    assert not any("touch" in note for note in vessel.notes)
+
+
+def test_openings_keep_their_roles_where_a_vessel_is_parted() -> None:
+    fed = phantoms.with_branch(loop(0.1), abscissa_mm=4.0, direction=np.array([0, 0, -1]), radius_mm=0.9, length_mm=7.0)
+    ends_mm = np.array([fed.ends[k][0] for k in (0, 2)])
+    vessel = trace(Vessel(phantoms.phantom_surface(fed, edge_mm=0.3)), inlet_mm=ends_mm)
+    assert "touch at" in vessel.notes[-1]
+    assert [opening.role for opening in vessel.openings] == ["inlet", "inlet_2", "outlet_1"]
+    np.testing.assert_allclose([inlet.center_mm for inlet in vessel.inlets], ends_mm, atol=0.05)
+
+
 def test_arteries_joined_by_a_communicating_one_stay_together() -> None:
     bridge = Centerline(np.linspace([0.0, 0.0, 12.0], [0.0, 6.5, 12.0], 164), np.full(164, 0.9))
     far = pair(3.0)

@@ -124,8 +124,8 @@ def test_the_profile_in_the_throat_is_inside_the_spread_of_the_experiments(
 ) -> None:
     settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.5)
     field = simulate_case(FlowCase(nozzle(-4.0), settings=settings))
-    assert field.outlets_mL_s[0] == pytest.approx(field.inlet_mL_s, rel=1e-3)
-    assert field.inlet_mL_s == pytest.approx(INFLOW_ML_S, rel=5e-3)
+    assert field.outlets_mL_s[0] == pytest.approx(field.inflow_mL_s, rel=1e-3)
+    assert field.inflow_mL_s == pytest.approx(INFLOW_ML_S, rel=5e-3)
     assert outside(field, experiments, -20.0)[2] < BEYOND
 
 
@@ -162,7 +162,7 @@ def test_the_axis_of_the_jet_is_inside_the_spread_of_the_experiments(
             f"z {z_mm:5.0f} mm: outside the spread by {profile:.1%} of the peak (profile), {around:.1%} (mean around "
             f"the axis), {axis:.1%} (axis)"
         )
-    assert jet.outlets_mL_s[0] == pytest.approx(jet.inlet_mL_s, rel=1e-3)
+    assert jet.outlets_mL_s[0] == pytest.approx(jet.inflow_mL_s, rel=1e-3)
     assert max(worst) < BEYOND
 
 

@@ -46,8 +46,8 @@ def along(field: FlowField) -> float:
 def test_blood_is_neither_made_nor_lost() -> None:
     field = poiseuille()
     assert field.is_converged
-    assert field.inlet_mL_s == pytest.approx(INFLOW_ML_S, rel=1e-3)
-    assert field.outlets_mL_s.sum() == pytest.approx(field.inlet_mL_s, rel=1e-3)
+    assert field.inflow_mL_s == pytest.approx(INFLOW_ML_S, rel=1e-3)
+    assert field.outlets_mL_s.sum() == pytest.approx(field.inflow_mL_s, rel=1e-3)
 
 
 def test_velocity_is_poiseuilles() -> None:

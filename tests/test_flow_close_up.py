@@ -56,9 +56,9 @@ def at_rest(case: FlowCase, grid: domain.Domain) -> FlowField:
     """A flow of one outlet of which nothing but what goes through it is known."""
     still, lumen = np.zeros((len(grid.cells), 3)), case.vessel.lumen
     stress = np.zeros((len(lumen.vertices_mm), 3))
-    values = still, still[:, 0], lumen, stress, stress[:, 0], case.inflow_mL_s, np.array([case.inflow_mL_s])
+    values = still, still[:, 0], lumen, stress, stress[:, 0], case.inlets_mL_s, case.inlets_mL_s, np.zeros(1)
     told = case.blood, True, 0.0, "", np.zeros(1), 1, 1.0, 1.0
-    return FlowField(grid.cells, grid.origin_mm, grid.cell_size_mm, *values, 0.0, np.zeros(1), *told)
+    return FlowField(grid.cells, grid.origin_mm, grid.cell_size_mm, *values, np.zeros(1), *told)
 
 
 @cache
@@ -108,7 +108,7 @@ def test_a_close_up_of_womersleys_flow_is_womersleys_flow() -> None:
     within = (z > 15) & (z < 25)
     peak_m_s = womersley_m_s(np.zeros(1), 0.0).max()
     for phase in field.phases:
-        assert phase.inlet_mL_s == pytest.approx(inflow_mL_s * PULSE.factor(np.array([phase.time_s]))[0], rel=2e-3)
+        assert phase.inflow_mL_s == pytest.approx(inflow_mL_s * PULSE.factor(np.array([phase.time_s]))[0], rel=2e-3)
         exact = womersley_m_s(1e-3 * np.hypot(x, y), phase.time_s)[:, None] * [0, 0, 1]
         error = (phase.velocity_m_s - exact)[within] / peak_m_s
         assert np.sqrt((error**2).sum(axis=1).mean()) < 0.004
@@ -135,7 +135,7 @@ def test_at_every_phase_cuts_let_through_what_the_flow_around_has_there() -> Non
         np.testing.assert_allclose(flow_mL_s[row][is_flow], expected[is_flow], rtol=1e-9)
         assert moments[row, int(moments[row, 2] > 0.5)] == phase
     inlet = ends[:, 0] == lattice.INFLOW
-    waveform = outer.inlet_mL_s * OLDER_ADULT_ICA.factor(steps * state.scales.step_s)
+    waveform = outer.inflow_mL_s * OLDER_ADULT_ICA.factor(steps * state.scales.step_s)
     np.testing.assert_allclose(flow_mL_s[:, inlet][:, 0], waveform, rtol=5e-3)
 
 
@@ -177,14 +177,14 @@ def test_through_every_cut_passes_what_the_openings_beyond_it_take() -> None:
     engine = LatticeBoltzmann(0.25, None, outer)
     state = engine.init(replace(case, settings=settings), outer)
     close_up = close_ups.close_up(case, outer)
-    assert close_up.inflow_mL_s.sum() == pytest.approx(0, abs=1e-3 * outer.inlet_mL_s)
-    assert (np.sort(close_up.inflow_mL_s) == np.sort([outer.inlet_mL_s, *-outer.outlets_mL_s])).all()
+    assert close_up.inflow_mL_s.sum() == pytest.approx(0, abs=1e-3 * outer.inflow_mL_s)
+    assert (np.sort(close_up.inflow_mL_s) == np.sort([*outer.inlets_mL_s, *-outer.outlets_mL_s])).all()
     while state.steps < 3000:
         state = engine.step(state)
     inflow_mL_s = -state.snapshots[-1].outflow * state.scales.flow_mL_s
     order = state.links.patch - len(case.vessel.openings) - 1
-    assert inflow_mL_s == pytest.approx(close_up.inflow_mL_s[order], abs=0.003 * outer.inlet_mL_s)
-    assert inflow_mL_s.sum() == pytest.approx(0, abs=0.002 * outer.inlet_mL_s)
+    assert inflow_mL_s == pytest.approx(close_up.inflow_mL_s[order], abs=0.003 * outer.inflow_mL_s)
+    assert inflow_mL_s.sum() == pytest.approx(0, abs=0.002 * outer.inflow_mL_s)
 
 
 def test_blood_may_be_thick_in_and_near_a_cut_and_behind_openings_only() -> None:

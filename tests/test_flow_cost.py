@@ -90,7 +90,7 @@ def test_a_narrow_place_inside_is_computed_with_a_shorter_time_step(monkeypatch)
     field = simulate_case(case)
     asked = case.settings.lattice_speed
     assert tried == pytest.approx([asked, 0.5 * asked, 0.25 * asked])
-    assert field.outlets_mL_s.sum() == pytest.approx(field.inlet_mL_s, rel=0.02)
+    assert field.outlets_mL_s.sum() == pytest.approx(field.inflow_mL_s, rel=0.02)
 
 
 def test_a_guess_that_diverges_is_done_without(monkeypatch):

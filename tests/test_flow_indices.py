@@ -1,5 +1,6 @@
 """Indices of flows that are written down, against their integrals."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -39,7 +40,7 @@ def wall() -> Surface:
     return Surface(np.concatenate([first.vertices_mm, second.vertices_mm]), faces)
 
 
-def flow(velocity_m_s: Floats, inlet_mL_s: float = 10.0) -> FlowField:
+def flow(velocity_m_s: Floats, inlets_mL_s: Sequence[float] = (10.0,)) -> FlowField:
     """A flow in a cube of cells; the wall's stress is 2 Pa on the sac, elsewhere 1 Pa more a mm from the neck."""
     surface = wall()
     beyond_mm = np.maximum(np.abs(surface.vertices_mm[:, :2]) - NECK_HALF_MM, 0.0)
@@ -48,8 +49,9 @@ def flow(velocity_m_s: Floats, inlet_mL_s: float = 10.0) -> FlowField:
     stress_Pa = size_Pa[:, None] * np.eye(3)[0]
     told = Blood(), True, 0.0, "", np.zeros(1), 1, 1.0, 1.0
     cells, pressure_Pa = places()[0], np.zeros(len(velocity_m_s))
-    values = velocity_m_s, pressure_Pa, surface, stress_Pa, 0 * size_Pa, inlet_mL_s, np.array([inlet_mL_s])
-    return FlowField(cells, np.full(3, -HALF_MM), CELL_MM, *values, 0.0, np.zeros(1), *told)
+    through_mL_s = np.array(inlets_mL_s), np.array([sum(inlets_mL_s)])
+    values = velocity_m_s, pressure_Pa, surface, stress_Pa, 0 * size_Pa, *through_mL_s, 100.0 * through_mL_s[0]
+    return FlowField(cells, np.full(3, -HALF_MM), CELL_MM, *values, np.zeros(1), *told)
 
 
 def places() -> tuple[np.ndarray, Floats]:
@@ -100,10 +102,12 @@ def test_quotients_of_a_pulse_are_of_its_means() -> None:
     neck, steady = plate(NECK_HALF_MM, 0.2), flow(through_neck(0.1, 0.0))
     stress_Pa, still_Pa = steady.wall_shear_stress_Pa, np.zeros(len(steady.cells))
     phases = tuple(
-        Phase(k, share * 10.0, np.array([share * 10.0]), through_neck(share * 0.1, 0.0), still_Pa, stress_Pa)
+        Phase(
+            k, np.array([share * 10.0]), np.array([share * 10.0]), through_neck(share * 0.1, 0.0), still_Pa, stress_Pa
+        )
         for k, share in enumerate((1.9, 1.0, 0.1, 1e-6))
     )
-    mean = replace(steady, inlet_mL_s=7.5, outlets_mL_s=np.array([7.5]), phases=phases)
+    mean = replace(steady, inlets_mL_s=np.array([7.5]), outlets_mL_s=np.array([7.5]), phases=phases)
     found, of_steady = (indices(one, sac(), neck) for one in (mean, steady))
     assert found["neck_inflow_mL_s"] == pytest.approx(0.75 * of_steady["neck_inflow_mL_s"], rel=1e-3)
     assert found["turnover_time_s"] == pytest.approx(of_steady["turnover_time_s"] / 0.75, rel=1e-3)
@@ -115,7 +119,14 @@ def test_the_largest_of_a_pulse_is_that_of_its_moments_and_the_rest_its_mean() -
     steady, shares = flow(through_neck(0.1, 0.0)), np.array([1.9, 1.0, 0.1])
     still_Pa, stress_Pa = np.zeros(len(steady.cells)), steady.wall_shear_stress_Pa
     phases = tuple(
-        Phase(k, share * 10.0, np.array([share * 10.0]), through_neck(share * 0.1, 0.0), still_Pa, share * stress_Pa)
+        Phase(
+            k,
+            np.array([share * 10.0]),
+            np.array([share * 10.0]),
+            through_neck(share * 0.1, 0.0),
+            still_Pa,
+            share * stress_Pa,
+        )
         for k, share in enumerate(shares)
     )
     pulse, of_steady = (

@@ -154,7 +154,7 @@ def test_cycles_that_go_on_differing_are_told_from_those_that_become_alike() -> 
 def test_inflow_is_the_waveforms() -> None:
     field = pulsing()
     time_s = np.array([phase.time_s for phase in field.phases])
-    found = np.array([phase.inlet_mL_s for phase in field.phases])
+    found = np.array([phase.inflow_mL_s for phase in field.phases])
     np.testing.assert_allclose(time_s, PULSE.period_s * np.arange(1, PHASES + 1) / PHASES)
     np.testing.assert_allclose(found / found.mean(), PULSE.factor(time_s), atol=0.002)
 

@@ -180,6 +180,30 @@ def test_the_inlet_carries_the_flow_that_was_asked_for() -> None:
     np.testing.assert_allclose(shape, expected, atol=0.05)
 
 
+@pytest.mark.parametrize("is_pulse", [False, True])
+def test_every_inlet_has_a_patch_and_a_profile_of_its_own(is_pulse: bool) -> None:
+    former = case("murray", is_pulse=is_pulse)
+    inlets_mm = np.array([former.vessel.openings[k].center_mm for k in (0, 2)])
+    several = replace(former, vessel=trace(replace(former.vessel, centerlines=()), inlet_mm=inlets_mm))
+    com, org = (foam_case(several, replace(SETUP, flavour=flavour)).files for flavour in ("com", "org"))
+    velocity, pressure = (parse(com[f"0/{name}"])["boundaryField"] for name in ("U", "p"))
+    area_mm2 = {one.name: one.area_mm2 for one in named_patches(several)[0]}
+    cubes = np.array([inlet.diameter_mm**3 for inlet in several.vessel.inlets])
+    for inlet, flow_mL_s in zip(several.vessel.inlets, FLOW_ML_S * cubes / cubes.sum(), strict=True):
+        mean_m_s = -vectors(com[f"constant/boundaryData/{inlet.role}/0/U"])[-1] @ inlet.normal
+        assert mean_m_s * area_mm2[inlet.role] == pytest.approx(flow_mL_s, rel=1e-6)
+        assert velocity[inlet.role]["type"] == ["scaledFixedValue" if is_pulse else "timeVaryingMappedFixedValue"]
+        assert pressure[inlet.role] == {"type": ["zeroGradient"]}
+        flow = parse(org["0/U"])["boundaryField"][inlet.role]["volumetricFlowRate"]
+        if is_pulse:
+            assert pairs(com[f"constant/flow_{inlet.role}"])[0, 1] == pytest.approx(OLDER_ADULT_ICA.factor(0.0))
+            flow_mL_s *= OLDER_ADULT_ICA.factor(0.0)
+            assert pairs(" ".join(flow["values"]))[0, 1] == pytest.approx(flow_mL_s * 1e-6)
+        else:
+            assert float(flow[1]) == pytest.approx(flow_mL_s * 1e-6)
+    assert "Patches: wall, inlet, inlet_2, outlet_1, ..." in com["README"]
+
+
 def pairs(text: str) -> np.ndarray:
     """A table (t, 2) of time and value."""
     return np.array(text.replace("(", " ").replace(")", " ").split(), dtype=float).reshape(-1, 2)

@@ -9,7 +9,7 @@ import pytest
 
 from vstent import phantoms
 from vstent.errors import FlowError, ReadError
-from vstent.flow import FlowCase, FlowSettings, Screen, sampling
+from vstent.flow import FlowCase, FlowSettings, Screen, sampling, simulate_case
 from vstent.flow.engines import Progress, run
 from vstent.flow.engines.openfoam import OpenFoam, swing_of
 from vstent.flow.openfoam import program, results, scatter
@@ -136,8 +136,8 @@ def test_openfoams_flow_in_a_tube_is_poiseuilles(tmp_path: Path) -> None:
     case = FlowCase(tube(), settings=FlowSettings(inflow_mL_s=FLOW_ML_S))
     field = run(engine, case)
     assert field.is_converged
-    assert field.inlet_mL_s == pytest.approx(FLOW_ML_S, rel=1e-4)
-    assert field.outlets_mL_s.sum() == pytest.approx(field.inlet_mL_s, rel=1e-3)
+    assert field.inflow_mL_s == pytest.approx(FLOW_ML_S, rel=1e-4)
+    assert field.outlets_mL_s.sum() == pytest.approx(field.inflow_mL_s, rel=1e-3)
     along = np.sign(field.velocity_m_s[:, 2].mean())
     pressure = sampling.values_at(field, np.array([[0, 0, 4.0], [0, 0, 10.0]]))[1]
     gradient = 8 * 0.004 * FLOW_ML_S * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 4)
@@ -149,6 +149,25 @@ def test_openfoams_flow_in_a_tube_is_poiseuilles(tmp_path: Path) -> None:
     assert np.abs(stress / expected - 1).max() < 0.05
     # The same case goes on from the last time written: nothing is left to do.
     assert run(engine, case).steps <= field.steps / 2
+
+
+@pytest.mark.validation
+@pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")
+def test_openfoams_flow_from_two_inlets_is_the_embedded_engines(tmp_path: Path) -> None:
+    fork = phantoms.bifurcation()
+    legs_mm = np.array([fork.ends[k][0] for k in (1, 2)])
+    vessel = trace(Vessel(phantoms.phantom_surface(fork, edge_mm=0.3)), inlet_mm=legs_mm)
+    case = FlowCase(vessel, settings=FlowSettings(inflow_mL_s=FLOW_ML_S, cell_size_mm=0.2))
+    foam, own = run(OpenFoam(0.25, tmp_path / "case"), case), simulate_case(case)
+    assert foam.is_converged
+    np.testing.assert_allclose(foam.inlets_mL_s, case.inlets_mL_s, rtol=1e-4)
+    assert foam.outlets_mL_s.sum() == pytest.approx(foam.inflow_mL_s, rel=1e-4)
+    for found, expected in zip(foam.inlet_pressure_Pa, own.inlet_pressure_Pa, strict=True):
+        assert found == pytest.approx(expected, rel=0.05)
+    near = np.abs(own.centers_mm[:, 2] - 10.0) < 6.0
+    velocity = sampling.values_at(foam, own.centers_mm[near])[0]
+    apart = np.linalg.norm(velocity - own.velocity_m_s[near]) / np.linalg.norm(own.velocity_m_s[near])
+    assert apart < 0.08
 
 
 def test_what_goes_to_and_fro_from_check_to_check_is_told_by_its_size() -> None:
@@ -183,5 +202,5 @@ def test_a_pulse_that_openfoam_stopped_in_goes_on_in_the_same_cycle(tmp_path: Pa
     assert field.residual[-1] < 0.05
     time_s = np.array([phase.time_s for phase in field.phases])
     np.testing.assert_allclose(time_s, 0.4 * np.arange(1, PHASES + 1) / PHASES)
-    inflow_mL_s = np.array([phase.inlet_mL_s for phase in field.phases])
+    inflow_mL_s = np.array([phase.inflow_mL_s for phase in field.phases])
     np.testing.assert_allclose(inflow_mL_s, FLOW_ML_S * pulse.factor(time_s), rtol=0.02)

@@ -11,7 +11,6 @@ from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 import report_case
@@ -165,7 +164,9 @@ def test_of_a_pulse_it_is_said_which_numbers_are_means(page):
     assert OF_PULSE in Page(as_html(pulse)).text.partition("In three dimensions")[0]
     assert contents_of(bare_case()).is_pulse is False
     flow = report_case.field(1.0)
-    moment = Phase(0.0, 3.4, np.array([3.4]), flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa)
+    moment = Phase(
+        0.0, flow.inlets_mL_s, flow.outlets_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa
+    )
     assert contents_of(bare_case(fields={"bare": replace(flow, phases=(moment,))})).is_pulse is True
 
 
@@ -273,12 +274,14 @@ def test_how_sure_a_flow_is_is_no_change_but_told():
     assert "Left to settle 0.762 %" in text
 
 
-def test_ratios_and_outlets_go_by_the_words_of_what_they_are_of():
+def test_ratios_and_openings_go_by_the_words_of_what_they_are_of():
     named = {
         "mean_wss_Pa_ratio": "Wall shear stress, mean, after / before",
         "relative_low_shear_area_fraction_ratio": "Low shear area, relative, after / before",
         "outlet_3_flow_mL_s": "Outlet flow, outlet 3",
         "outlet_3_flow_mL_s_ratio": "Outlet flow, outlet 3, after / before",
+        "inlet_2_flow_mL_s": "Inlet flow, inlet 2",
+        "inlet_2_pressure_Pa_ratio": "Inlet pressure, inlet 2, after / before",
         "aspect_ratio": "Aspect ratio",
     }
     for key, name in named.items():

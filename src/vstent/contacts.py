@@ -142,7 +142,7 @@ def part(vessel: Vessel, contact: Contact, *, holds_inlet: bool) -> Vessel | Non
     Returns
     -------
     vessel : with a note of what was cut and where, to be traced anew; None where there is no clean cut, where it
-        would leave fewer than two openings, or take off what a window feeds that is not small.
+        would leave fewer than two openings, or take off an inlet, or what a window feeds that is not small.
     """
     lumen = vessel.lumen
     ring = _ring(lumen, contact)
@@ -159,7 +159,9 @@ def part(vessel: Vessel, contact: Contact, *, holds_inlet: bool) -> Vessel | Non
     whole = replace(vessel, lumen=Surface(*triangles.compact(vertices, faces[kept])))
     share = float(1 - triangles.areas(vertices[faces[kept]]).sum() / triangles.areas(vertices[faces]).sum())
     parted = still_open(replace(whole, notes=(*vessel.notes, _note(contact, share))))
-    if parted is None or kept.all() or contact.radius_mm < SMALL * contact.artery_mm:
+    if parted is None or len(parted.inlets) < len(vessel.inlets):
+        return None
+    if kept.all() or contact.radius_mm < SMALL * contact.artery_mm:
         return parted
     return parted if len(vessel.openings) - len(parted.openings) >= 2 else None
 

@@ -198,7 +198,7 @@ def _stretch(stent: Stent) -> Measures:
 def branch_abscissas_mm(anatomy: Anatomy) -> Floats:
     """Where on the parent axis (b,) branches leave the parent artery.
 
-    Centerlines of outlets that leave it at one place, within the branch's radius, go through one branch.
+    Centerlines that leave it at one place, within the branch's radius, go through one branch.
     """
     axis, left_mm = anatomy.axis, []
     ostia_mm: list[Floats] = []

@@ -4,6 +4,7 @@ A lumen comes from three kinds of sources and ends in three ways: an exported su
 flat caps; a surface from a scan is open where the vessel leaves the image, and blunt where the contrast fades.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -14,7 +15,7 @@ from vstent.errors import InputError, VesselError
 from vstent.kernels import curves, medial, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.surface import Surface
-from vstent.vessel import Opening, Vessel
+from vstent.vessel import Opening, Vessel, roles
 from vstent.words import counted
 
 CAP_ANGLE_RAD: Final = np.radians(6.0)
@@ -38,6 +39,8 @@ ARM_RADIUS_MM: Final = 0.5
 FARTHEST_MM: Final = 5.0
 FARTHEST_DIAMETERS: Final = 2.0
 """How far from an opening a point beside it may lie: the greater of the two."""
+STILL: Final = 0.1
+"""An end whose middle is within this many diameters of an opening's is that opening still."""
 NEARLY: Final = 0.8
 """An outlet wider than this fraction of an inlet that was not given may be the inlet."""
 
@@ -71,7 +74,7 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
         )
     found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
     widest = max(found, key=lambda opening: opening.area_mm2)
-    openings = _named(widest, found)
+    openings = _named([widest], found)
     return replace(vessel, lumen=lumen, openings=openings, centerlines=(), notes=(*vessel.notes, *notes)), spheres
 
 
@@ -93,12 +96,40 @@ def opening_at(vessel: Vessel, point_mm: Floats) -> Opening:
     return nearest
 
 
-def with_inlet(vessel: Vessel, inlet_mm: Floats) -> Vessel:
-    """Return the vessel with the opening at `inlet_mm` (3,), see `opening_at`, as its inlet; a note tells a far one."""
-    inlet = opening_at(vessel, inlet_mm)
-    note = f"The inlet, {_place(inlet)}, is {_away_mm(inlet, inlet_mm):.0f} mm from the point given."
-    notes = (*vessel.notes, note) if _is_far(inlet, inlet_mm) else vessel.notes
-    return replace(vessel, openings=_named(inlet, list(vessel.openings)), centerlines=(), notes=notes)
+def with_inlets(vessel: Vessel, inlets_mm: Floats) -> Vessel:
+    """Return the vessel with the openings at `inlets_mm` (k, 3), see `opening_at`, as its inlets; notes tell far ones.
+
+    Raises
+    ------
+    InputError
+        When a point is near no opening, two are at the same one, or no opening is left for blood to leave through.
+    """
+    inlets = [opening_at(vessel, inlet_mm) for inlet_mm in inlets_mm]
+    _refuse_twice(inlets, inlets_mm)
+    if len(inlets) == len(vessel.openings):
+        raise InputError(
+            f"blood enters through all {len(inlets)} openings of the vessel and leaves through none: leave out the "
+            f"inlet {_place(inlets[-1])}, or another one"
+        )
+    notes = (
+        f"The inlet, {_place(inlet)}, is {_away_mm(inlet, inlet_mm):.0f} mm from the point given."
+        for inlet, inlet_mm in zip(inlets, inlets_mm, strict=True)
+        if _is_far(inlet, inlet_mm)
+    )
+    openings = _named(inlets, vessel.openings)
+    return replace(vessel, openings=openings, centerlines=(), notes=(*vessel.notes, *notes))
+
+
+def _refuse_twice(inlets: Sequence[Opening], inlets_mm: Floats) -> None:
+    """Refuse points (k, 3) of which two are nearest to the same opening."""
+    for k, inlet in enumerate(inlets):
+        first = inlets.index(inlet)
+        if first < k:
+            places = (", ".join(f"{x:.1f}" for x in inlets_mm[one]) for one in (first, k))
+            raise InputError(
+                f"two inlets are the same opening, {_place(inlet)}, the nearest to both ({') and ('.join(places)}) mm: "
+                "give one point beside each opening that brings blood"
+            )
 
 
 def guessed(vessel: Vessel) -> Vessel:
@@ -111,7 +142,7 @@ def guessed(vessel: Vessel) -> Vessel:
         return vessel
     note = (
         f"The inlet, {_place(vessel.inlet)}, is a guess: the opening {_place(widest)} is nearly as wide; give --inlet "
-        "if blood comes from there."
+        "if blood comes from there, and again for each further opening that brings blood."
     )
     return replace(vessel, notes=(*vessel.notes, note))
 
@@ -130,16 +161,16 @@ def _place(opening: Opening) -> str:
 
 
 def still_open(vessel: Vessel) -> Vessel | None:
-    """Return the vessel with those of its openings that its lumen still has; None where fewer than two are left.
+    """Return the vessel with those of its openings that its lumen still has; None where no way in and out is left.
 
-    The inlet is the widest of them where the old one is gone.
+    The inlet is the widest of them where all old ones are gone.
     """
     tree = cKDTree(vessel.lumen.loop_centers_mm) if len(vessel.lumen.boundary_loops) else None
-    left = [o for o in vessel.openings if tree is not None and tree.query(o.center_mm)[0] < 0.1 * o.diameter_mm]
-    if len(left) < 2:
+    left = [o for o in vessel.openings if tree is not None and tree.query(o.center_mm)[0] < STILL * o.diameter_mm]
+    if len(left) < 2 or all(opening.is_inlet for opening in left):
         return None
-    inlet = vessel.inlet if vessel.inlet in left else max(left, key=lambda opening: opening.area_mm2)
-    return replace(vessel, openings=_named(inlet, left), centerlines=())
+    inlets = [o for o in left if o.is_inlet] or [max(left, key=lambda opening: opening.area_mm2)]
+    return replace(vessel, openings=_named(inlets, left), centerlines=())
 
 
 def _opening(loop_mm: Floats) -> Opening:
@@ -149,10 +180,11 @@ def _opening(loop_mm: Floats) -> Opening:
     return Opening(triangles.polygon_centroid(loop_mm), vector / max(area, 1e-300), area, "outlet")
 
 
-def _named(inlet: Opening, openings: list[Opening]) -> tuple[Opening, ...]:
-    outlets = sorted((o for o in openings if o is not inlet), key=lambda opening: -opening.area_mm2)
-    roles = ["inlet", *(f"outlet_{k}" for k in range(1, len(outlets) + 1))]
-    return tuple(replace(o, role=role) for o, role in zip([inlet, *outlets], roles, strict=True))
+def _named(inlets: Sequence[Opening], openings: Sequence[Opening]) -> tuple[Opening, ...]:
+    """The openings with their roles, the inlets in this order."""
+    outlets = sorted((o for o in openings if o not in inlets), key=lambda opening: -opening.area_mm2)
+    named = roles(len(inlets), len(outlets))
+    return tuple(replace(o, role=role) for o, role in zip([*inlets, *outlets], named, strict=True))
 
 
 def _without_caps(lumen: Surface) -> tuple[Surface, int]:

@@ -1,6 +1,6 @@
 """Trace a vessel: from a wall to openings, centerlines and maximum inscribed spheres.
 
-A centerline is the path from the inlet to an outlet, along the Voronoi vertices inside the lumen, of the shortest
+A centerline is the path from the inlet to another opening, along the Voronoi vertices inside the lumen, of the shortest
 travel time at the speed of the inscribed radius (Antiga et al. 2003, IEEE Trans. Med. Imaging 22:674; Piccinelli et
 al. 2009, IEEE Trans. Med. Imaging 28:1141). There the wide spheres of a sac attract the path; here the speed is capped
 at `SPEED_CAP` times the radius that the artery has on both sides, so that a sac is not worth a detour.
@@ -18,7 +18,7 @@ from vstent.contacts import find_contact, part
 from vstent.errors import VesselError
 from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
-from vstent.openings import guessed, open_ends, with_inlet
+from vstent.openings import guessed, open_ends, with_inlets
 from vstent.short_cuts import around_sacs
 from vstent.spheres import centered
 from vstent.surface import Surface
@@ -40,25 +40,25 @@ MOST_CONTACTS: Final = 12
 
 
 def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
-    """Return the vessel with its ends opened and a centerline from the inlet to every outlet.
+    """Return the vessel with its ends opened and a centerline from the inlet to every other opening.
 
     Parameters
     ----------
     vessel : a repaired lumen, open or closed by flat caps, ends found or not.
-    inlet_mm : (3,) a point near the opening to take as inlet; the widest opening otherwise, with a note where another
-        is nearly as wide.
+    inlet_mm : (3,) a point near the opening to take as inlet, or (k, 3) one near each opening that brings blood, first
+        that where the parent artery begins; the widest opening otherwise, with a note where another is nearly as wide.
 
     Raises
     ------
     InputError
-        When no opening is near `inlet_mm`.
+        When no opening is near a point of `inlet_mm`, two are near the same, or none is left to be an outlet.
     VesselError
-        When fewer than two ends are found, or an outlet cannot be reached from the inlet.
+        When fewer than two ends are found, or an opening cannot be reached from the inlet.
     """
     is_guess = not vessel.openings and inlet_mm is None
     vessel, spheres = (vessel, vessel.lumen.medial) if vessel.openings else open_ends(vessel)
     if inlet_mm is not None:
-        vessel = with_inlet(vessel, np.asarray(inlet_mm, dtype=np.float64))
+        vessel = with_inlets(vessel, np.atleast_2d(np.asarray(inlet_mm, dtype=np.float64)))
     vessel, graph, paths = _paths(vessel, spheres)
     for _ in range(MOST_CONTACTS):
         parted = _parted(vessel, graph, paths, holds_inlet=inlet_mm is not None)
@@ -71,7 +71,7 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
 
 
 def _paths(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.Medial, list[Ints]]:
-    """The vessel with the outlets that can be reached, the medial graph, and the path to each of them."""
+    """The vessel with the openings that can be reached, the medial graph, and the path to each of them."""
     vessel, graph = _reachable(vessel, _graph(vessel, spheres))
     paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
     paths = _shortest(vessel, graph, _radius_cap(graph, paths))
@@ -104,13 +104,14 @@ def _graph(vessel: Vessel, spheres: medial.Medial) -> medial.Medial:
 
 
 def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Medial]:
-    """Leave thin outlets that the inlet does not reach closed; complain of wide ones."""
+    """Leave thin outlets that the inlet does not reach closed; complain of wide ones, and of further inlets."""
     first = len(graph.points) - len(vessel.openings)
     cost, _ = medial.shortest_paths(medial.cost_graph(graph, np.full(len(graph.radius), np.inf)), first)
     is_reached = np.isfinite(cost[first:])
     lost = [opening for opening, reached in zip(vessel.openings, is_reached, strict=True) if not reached]
+    leads_out = any(outlet not in lost for outlet in vessel.outlets)
     for opening in lost:
-        if opening.diameter_mm > THIN * vessel.inlet.diameter_mm or is_reached.sum() < 2:
+        if opening.is_inlet or opening.diameter_mm > THIN * vessel.inlet.diameter_mm or not leads_out:
             raise VesselError(_unreachable(vessel.inlet, opening))
     kept = np.ones(len(graph.points), dtype=bool)
     kept[first:] = is_reached
@@ -134,18 +135,17 @@ def _radius_cap(graph: medial.Medial, paths: Sequence[Ints]) -> Floats:
 
 
 def _shortest(vessel: Vessel, graph: medial.Medial, radius_cap: Floats) -> list[Ints]:
-    """Path from the inlet to each outlet, as vertices of the graph."""
-    n_outlets = len(vessel.outlets)
-    inlet = len(graph.points) - n_outlets - 1
+    """Path from the inlet to each far end, as vertices of the graph."""
+    inlet = len(graph.points) - len(vessel.openings)
     _, before = medial.shortest_paths(medial.cost_graph(graph, radius_cap), inlet)
-    return [medial.path_to(before, outlet) for outlet in range(inlet + 1, inlet + 1 + n_outlets)]
+    return [medial.path_to(before, end) for end in range(inlet + 1, len(graph.points))]
 
 
-def _unreachable(inlet: Opening, outlet: Opening) -> str:
-    x, y, z = outlet.center_mm
+def _unreachable(inlet: Opening, opening: Opening) -> str:
+    x, y, z = opening.center_mm
     return (
-        f"{outlet.role} (diameter {outlet.diameter_mm:.1f} mm at {x:.1f}, {y:.1f}, {z:.1f} mm) is not connected to the "
-        f"inlet (diameter {inlet.diameter_mm:.1f} mm): the lumen is interrupted between them; lower the threshold, "
+        f"{opening.role} (diameter {opening.diameter_mm:.1f} mm at {x:.1f}, {y:.1f}, {z:.1f} mm) is not connected to "
+        f"the inlet (diameter {inlet.diameter_mm:.1f} mm): the lumen is interrupted between them; lower the threshold, "
         "or cut that part away"
     )
 

@@ -1,7 +1,8 @@
 """Trim the vessel to what the device and the flow need: a stated length of artery on both sides of the sac.
 
 A scan shows the whole tree; blood far from the sac costs time and tells nothing. Every way out of the sac's
-neighbourhood is cut square to its centerline where it has run the stated length, branches included.
+neighbourhood is cut square to its centerline where it has run the stated length, branches included. Through a cut goes
+what the openings beyond it brought or took: it is an inlet where, by Murray's law, they brought more.
 """
 
 from dataclasses import replace
@@ -13,17 +14,17 @@ from scipy.spatial import cKDTree
 from vstent.errors import InputError
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
-from vstent.openings import cut_square
+from vstent.openings import STILL, cut_square
 from vstent.restore.bulges import Bulge, find_bulges
 from vstent.restore.tubes import tubes_of
 from vstent.surface import Surface
 from vstent.trace import parent_radius_mm, trace
-from vstent.vessel import Centerline, Vessel
+from vstent.vessel import Centerline, Vessel, murray_shares
 
 UPSTREAM_MM: Final = 35.0
 """Length of artery kept before the sac's middle: half of the longest device, five diameters for the flow to develop."""
 DOWNSTREAM_MM: Final = 25.0
-"""Length of every way kept beyond the sac's middle."""
+"""Length of every other way kept, beyond the sac's middle or to another inlet."""
 SPARE_MM: Final = 5.0
 """Nothing is cut for less than this."""
 SAME_MM: Final = 1e-6
@@ -81,6 +82,17 @@ class _Way(NamedTuple):
         return SPARE_MM if self.given_mm is None else 0.0
 
 
+class _Cut(NamedTuple):
+    """Where the artery was cut."""
+
+    center_mm: Floats
+    """(3,) on a centerline."""
+    radius_mm: float
+    """Radius of the artery there."""
+    sense: int
+    """Whether the part behind (-1) or ahead (1) came off."""
+
+
 class _Site(NamedTuple):
     """Where the sac hangs on its artery."""
 
@@ -124,7 +136,8 @@ def trim(
     if not bulges:
         return vessel
     site = _site(vessel, bulges[0], upstream_mm, downstream_mm)
-    lumen, inlet_mm = vessel.lumen, vessel.inlet.center_mm
+    lumen = vessel.lumen
+    cuts: list[_Cut] = []
     for line, abscissa_mm, sense in _cuts(vessel, site):
         center, ahead = line.at(np.array([abscissa_mm, abscissa_mm + sense * STRIDE_MM]))
         direction = (ahead - center) / np.linalg.norm(ahead - center)
@@ -134,11 +147,50 @@ def trim(
         # What lies beyond a cut may hang on the sac as well, where the sac touches its artery a second time.
         if part is not None and _holds(part, bulges[0]):
             lumen = part
-            inlet_mm = center if sense < 0 else inlet_mm
-    if lumen is vessel.lumen:
+            cuts.append(_Cut(center, radius, sense))
+    if not cuts:
         return vessel
-    notes = (*vessel.notes, *_trimmed(site), *_left_out(lumen, bulges[1:]))
+    inlet_mm, told = _inlets_of(vessel, _ends_mm(vessel, cuts, lumen), lumen)
+    notes = (*vessel.notes, *_trimmed(site), *told, *_left_out(lumen, bulges[1:]))
     return trace(replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=notes), inlet_mm=inlet_mm)
+
+
+def _ends_mm(vessel: Vessel, cuts: list[_Cut], lumen: Surface) -> Floats:
+    """Where (k, 3) the blood of every opening of a vessel passes an end of what the cuts leave of it, the lumen.
+
+    That is the first cut along the opening's centerline; the one before the sac, where it lies behind that.
+    """
+    loops = cKDTree(lumen.loop_centers_mm)
+    before = [cut.center_mm for cut in cuts if cut.sense < 0]
+    ahead = [cut for cut in cuts if cut.sense > 0]
+    centers_mm = np.array([cut.center_mm for cut in ahead]).reshape(-1, 3)
+    ends_mm = [*before, vessel.inlet.center_mm][:1]
+    for opening, line in zip(vessel.far_ends, vessel.centerlines, strict=True):
+        place_mm, off_mm = curves.project(line.points_mm, centers_mm)
+        through = np.flatnonzero(off_mm < [cut.radius_mm for cut in ahead])
+        is_left = loops.query(opening.center_mm)[0] < STILL * opening.diameter_mm
+        first = centers_mm[through[np.argsort(place_mm[through])]]
+        ends_mm += [*first, *([] if is_left else before), opening.center_mm][:1]
+    return np.array(ends_mm)
+
+
+def _inlets_of(vessel: Vessel, ends_mm: Floats, lumen: Surface) -> tuple[Floats, list[str]]:
+    """Middles (i, 3) of a lumen's inlets, and sentences on those of the vessel that are no openings of their own.
+
+    Blood of each opening of the vessel passes an end of the lumen at `ends_mm` (k, 3).
+    """
+    loop = np.asarray(cKDTree(lumen.loop_centers_mm).query(ends_mm)[1])
+    brought = np.bincount(loop, np.concatenate([murray_shares(vessel.inlets), -murray_shares(vessel.outlets)]))
+    of_inlets = dict.fromkeys(loop[: len(vessel.inlets)].tolist())
+    inlets = [k for k in of_inlets if k == loop[0] or brought[k] > 0]
+    told = [
+        f"{opening.role}, {opening.diameter_mm:.1f} mm wide at {', '.join(f'{x:.1f}' for x in opening.center_mm)} mm, "
+        "lies beyond that: "
+        f"{'its blood enters by another inlet' if k in inlets else 'through that cut more leaves than enters'}."
+        for n, (opening, k) in enumerate(zip(vessel.inlets, loop, strict=False))
+        if k in loop[:n] or k not in inlets
+    ]
+    return lumen.loop_centers_mm[inlets], told
 
 
 def _holds(lumen: Surface, bulge: Bulge) -> bool:

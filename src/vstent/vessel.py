@@ -1,5 +1,6 @@
 """The artery's nouns: Opening, Centerline, Vessel, Aneurysm, Anatomy."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,7 +22,8 @@ class Opening:
     area_mm2: float
     """Area of the section."""
     role: str
-    """``inlet``, or ``outlet_1``, ``outlet_2``, ... from the widest outlet to the narrowest."""
+    """``inlet``, where the parent artery begins; ``inlet_2``, ``inlet_3``, ... in the order given; ``outlet_1``,
+    ``outlet_2``, ... from the widest outlet to the narrowest."""
 
     def __post_init__(self) -> None:
         freeze(self, "center_mm", np.float64, (3,))
@@ -32,13 +34,30 @@ class Opening:
         """Diameter of the circle of the same area."""
         return float(2 * np.sqrt(self.area_mm2 / np.pi))
 
+    @property
+    def is_inlet(self) -> bool:
+        """Whether blood enters through it."""
+        return self.role.startswith("inlet")
+
+
+def roles(n_inlets: int, n_outlets: int) -> list[str]:
+    """Roles of so many openings in a vessel's order."""
+    inlets = ["inlet", *(f"inlet_{k}" for k in range(2, n_inlets + 1))]
+    return [*inlets, *(f"outlet_{k}" for k in range(1, n_outlets + 1))]
+
+
+def murray_shares(openings: Sequence[Opening]) -> Floats:
+    """Return the parts (k,) of a flow that openings take: as diameter cubed (Murray 1926, PNAS 12, 207)."""
+    cubes = np.array([opening.diameter_mm**3 for opening in openings])
+    return np.asarray(cubes / cubes.sum())
+
 
 @dataclass(frozen=True, eq=False)
 class Centerline:
     """A curve along the lumen with the maximum inscribed sphere at every point."""
 
     points_mm: Floats
-    """(n, 3) points, from the inlet towards an outlet."""
+    """(n, 3) points, from the inlet towards another opening."""
     inscribed_radius_mm: Floats
     """(n,) radius of the maximum inscribed sphere."""
 
@@ -77,9 +96,10 @@ class Vessel:
     lumen: Surface
     """The wall, open at every opening."""
     openings: tuple[Opening, ...] = ()
-    """The inlet first, then the outlets from the widest to the narrowest; empty before tracing."""
+    """The inlet, further inlets as they were given, the outlets from the widest to the narrowest; empty before
+    tracing."""
     centerlines: tuple[Centerline, ...] = ()
-    """One from the inlet to each outlet, in the order of the outlets; empty before tracing."""
+    """One from the inlet to each of `far_ends`, in their order; empty before tracing."""
     notes: tuple[str, ...] = ()
     """What was found, guessed or repaired on the way, one sentence each."""
     threshold_band_mm: float = 0.0
@@ -95,13 +115,23 @@ class Vessel:
 
     @property
     def inlet(self) -> Opening:
-        """The opening through which blood enters."""
+        """The opening where the parent artery begins, and the centerlines."""
         return self.openings[0]
+
+    @property
+    def far_ends(self) -> tuple[Opening, ...]:
+        """The openings that the centerlines lead to: all but the inlet."""
+        return self.openings[1:]
+
+    @property
+    def inlets(self) -> tuple[Opening, ...]:
+        """The openings through which blood enters: the inlet, and those given besides."""
+        return tuple(opening for opening in self.openings if opening.is_inlet)
 
     @property
     def outlets(self) -> tuple[Opening, ...]:
         """The openings through which blood leaves."""
-        return self.openings[1:]
+        return tuple(opening for opening in self.openings if not opening.is_inlet)
 
 
 @dataclass(frozen=True, eq=False)

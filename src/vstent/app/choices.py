@@ -63,7 +63,8 @@ class Choices(Strict):
     shape: tuple[Count, Count, Count] | None = None
     threshold: Annotated[float, Field(allow_inf_nan=False)] | None = None
     at_mm: Point | None = None
-    inlet_mm: Point | None = None
+    inlet_mm: Point | Annotated[tuple[Point, ...], Field(min_length=1, max_length=50)] | None = None
+    """Near the inlet; or near each opening that brings blood, first near that where the parent artery begins."""
     outlet_mm: Point | None = None
     neck_mm: Annotated[tuple[Point, ...], Field(min_length=3, max_length=1000)] | None = None
     """A neck drawn by hand: a closed curve near the wall."""

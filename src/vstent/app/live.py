@@ -66,7 +66,7 @@ OPENING_COLOURS: Final = (
     (0.80, 0.47, 0.65),
     (0.34, 0.71, 0.91),
 )
-"""Okabe and Ito's colours, told apart by the colour-blind; the inlet has the first."""
+"""Okabe and Ito's colours, told apart by the colour-blind; the inlets have the first."""
 
 
 class Live:
@@ -268,7 +268,7 @@ def _axis(anatomy: Anatomy) -> dict[str, list[float]]:
 
 def _peak(field: FlowField) -> int | None:
     """The moment of the largest inflow; None for a steady flow."""
-    return max(range(len(field.phases)), key=lambda k: field.phases[k].inlet_mL_s) if field.phases else None
+    return max(range(len(field.phases)), key=lambda k: field.phases[k].inflow_mL_s) if field.phases else None
 
 
 def _moments(field: FlowField, moment: int | None) -> dict[str, Any]:
@@ -287,7 +287,7 @@ def _said(opening: Opening) -> dict[str, Any]:
 
 
 def _opening_colour(opening: Opening) -> tuple[float, float, float]:
-    number = 0 if opening.role == "inlet" else int(opening.role.rpartition("_")[2])
+    number = 0 if opening.is_inlet else int(opening.role.rpartition("_")[2])
     return OPENING_COLOURS[number] if number < len(OPENING_COLOURS) else (0.45, 0.50, 0.54)
 
 

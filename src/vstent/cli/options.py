@@ -78,7 +78,13 @@ def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
     given.add_argument("--shape", type=_shape, metavar="I,J,K", help="voxel counts of a raw volume")
     given.add_argument("--threshold", type=number, metavar="T", help="intensity of the lumen's wall in a scan")
     given.add_argument("--at", type=_point, metavar="X,Y,Z", help="a point near the sac, mm")
-    given.add_argument("--inlet", type=_point, metavar="X,Y,Z", help="a point near the inlet, mm")
+    given.add_argument(
+        "--inlet",
+        type=_point,
+        action="append",
+        metavar="X,Y,Z",
+        help="a point near the inlet, mm; again for each further opening that brings blood",
+    )
     return given
 
 
@@ -107,7 +113,7 @@ def add_problem(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
     """Add which flow it is, whatever computes it; return the group."""
     flow = parser.add_argument_group("flow")
     flow.add_argument(
-        "--flow-rate", type=positive, metavar="ML_S", help="mean inflow (0.27 m/s times the inlet's area)"
+        "--flow-rate", type=positive, metavar="ML_S", help="mean inflow, all inlets' (0.27 m/s times their area)"
     )
     flow.add_argument("--cell-size", type=positive, metavar="MM", help="edge of a flow cell")
     pulse = flow.add_mutually_exclusive_group()
@@ -260,7 +266,7 @@ def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
         "shape": arguments.shape,
         "threshold": arguments.threshold,
         "at_mm": arguments.at,
-        "inlet_mm": arguments.inlet,
+        "inlet_mm": tuple(arguments.inlet) if arguments.inlet else None,
         "outlet_mm": getattr(arguments, "outlet", None),
         "upstream_mm": getattr(arguments, "upstream", None),
         "downstream_mm": getattr(arguments, "downstream", None),

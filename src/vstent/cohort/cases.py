@@ -46,8 +46,8 @@ def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:
     ----------
     cohort : a folder, or a CSV file with titles. Its column ``input`` holds paths (relative ones from the file's
         folder), ``case`` names (else the file's), ``devices`` names parted by blanks; the other columns are settings:
-        ``units``, ``threshold``, ``at``, ``inlet``, ``outlet``, ``spacing``, ``shape``, ``diameter``, ``length``,
-        ``center``. An empty cell takes what `settings` says.
+        ``units``, ``threshold``, ``at``, ``inlet`` (a point, or several parted by semicolons), ``outlet``, ``spacing``,
+        ``shape``, ``diameter``, ``length``, ``center``. An empty cell takes what `settings` says.
     settings : for every case.
 
     Raises
@@ -146,6 +146,13 @@ def _three(kind: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
     return read
 
 
+def _points(text: str) -> tuple[tuple[float, ...], ...]:
+    values = [finite(word) for word in text.replace(",", " ").replace(";", " ").split()]
+    if len(values) % 3:
+        raise ValueError("three numbers are needed for every point")
+    return tuple(tuple(values[k : k + 3]) for k in range(0, len(values), 3))
+
+
 def _devices(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(text.replace(",", " ").replace(";", " ").split()))
 
@@ -155,7 +162,7 @@ COLUMNS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
     "units": ("units", _units),
     "threshold": ("threshold", finite),
     "at": ("at_mm", _three(finite)),
-    "inlet": ("inlet_mm", _three(finite)),
+    "inlet": ("inlet_mm", _points),
     "outlet": ("outlet_mm", _three(finite)),
     "spacing": ("spacing_mm", _three(_size)),
     "shape": ("shape", _three(_count)),

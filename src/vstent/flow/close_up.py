@@ -53,7 +53,7 @@ class CloseUp:
     @cached_property
     def inflow_mL_s(self) -> Floats:
         """(p,) flow from each part into the close-up."""
-        through_mL_s = np.r_[self.outer.inlet_mL_s, -self.outer.outlets_mL_s]
+        through_mL_s = np.r_[self.outer.inlets_mL_s, -self.outer.outlets_mL_s]
         leads_out = self.part_of_opening >= 0
         return np.bincount(self.part_of_opening[leads_out], through_mL_s[leads_out]).astype(np.float64)
 
@@ -240,7 +240,7 @@ class _Patchwork(NamedTuple):
     def phases(self, inner: FlowField) -> tuple[Phase, ...]:
         """Those of a pulse, with the openings' flows of the wide cells."""
         return tuple(
-            Phase(fine.time_s, wide.inlet_mL_s, wide.outlets_mL_s, *self.at_moment(fine, self.outer.at_phase(wide)))
+            Phase(fine.time_s, wide.inlets_mL_s, wide.outlets_mL_s, *self.at_moment(fine, self.outer.at_phase(wide)))
             for fine, wide in zip(inner.phases, self.outer.phases, strict=True)
         )
 
@@ -267,7 +267,7 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
         wall_pressure_Pa=np.where(is_fine, inner.wall_pressure_Pa, outer.wall_pressure_Pa),
         phases=whole.phases(inner),
         swing=None if inner.swing is None else whole.swing(inner.swing),
-        inlet_mL_s=outer.inlet_mL_s,
+        inlets_mL_s=outer.inlets_mL_s,
         outlets_mL_s=outer.outlets_mL_s,
         inlet_pressure_Pa=outer.inlet_pressure_Pa,
         outlet_pressure_Pa=outer.outlet_pressure_Pa,

@@ -18,7 +18,7 @@ from vstent.units import M_PER_MM
 from vstent.vessel import Opening, Vessel
 
 INLET_EXTENSION = 0.5
-"""Length of the straight tube before the inlet, in inlet diameters: the imposed profile is developed already."""
+"""Length of the straight tube before an inlet, in its diameters: the imposed profile is developed already."""
 OUTLET_EXTENSION = 1.5
 """Length of the straight tube behind an outlet, in outlet diameters: swirl and backflow decay in it."""
 MIN_CELLS = 2_000
@@ -122,11 +122,16 @@ def too_narrow(case: FlowCase, cell_size_mm: float) -> str:
 
 def unreached(vessel: Vessel, grid: Domain) -> str:
     """Say which outlets no cell of a whole vessel's grid reaches; nothing where there is none."""
-    closed = [outlet for k, outlet in enumerate(vessel.outlets) if not (grid.link_patch == k + 2).any()]
+    closed = [opening for opening in _unlinked(vessel, grid.link_patch) if not opening.is_inlet]
     if not closed:
         return ""
     named = ", ".join(f"{outlet.role} ({outlet.diameter_mm:.2g} mm)" for outlet in closed)
     return f" No cell of {grid.cell_size_mm:.3g} mm reaches {named}, where no blood leaves: set a smaller cell size."
+
+
+def _unlinked(vessel: Vessel, link_patch: Ints) -> list[Opening]:
+    """Openings that no link of a whole vessel's grid meets."""
+    return [opening for k, opening in enumerate(vessel.openings) if not (link_patch == k + 1).any()]
 
 
 def cells_of_sac(case: FlowCase, grid: Domain) -> Ints:
@@ -204,7 +209,7 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
     Raises
     ------
     CoarseGridError
-        When no blood connects to the inlet, or far too few cells do.
+        When no blood connects to the inlet, or far too few cells do, or none to another inlet.
     """
     surface, face_patch, sections = extend(vessel)
     origin_mm, shape = _box(surface, cell_size_mm) if window is None else (window.origin_mm, window.mask.shape)
@@ -225,8 +230,20 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
     neighbour = neighbours(index, cells)
     is_beyond = filled & ~inside & (window is not None)
     links = _links(surface, face_patch, neighbour, cells, is_beyond, origin_mm, cell_size_mm)
+    if window is None:
+        _refuse_unreached_inlet(vessel, links[3], cell_size_mm)
     parted = septa(surface, neighbour, cells, origin_mm, cell_size_mm)
     return Domain(cell_size_mm, origin_mm, cells, *links, *parted, surface, sections)
+
+
+def _refuse_unreached_inlet(vessel: Vessel, link_patch: Ints, cell_size_mm: float) -> None:
+    """Refuse a grid in which less blood would enter than is to: an outlet without cells is told, see `unreached`."""
+    for opening in _unlinked(vessel, link_patch):
+        if opening.is_inlet:
+            raise CoarseGridError(
+                f"no cell of {cell_size_mm:.3g} mm reaches {opening.role} ({opening.diameter_mm:.2g} mm wide at "
+                f"{place(opening.center_mm)}), where blood is to enter: set a smaller cell size"
+            )
 
 
 def _box(surface: Surface, cell_size_mm: float) -> tuple[Floats, tuple[int, int, int]]:
@@ -313,7 +330,8 @@ def extended_volume_mm3(vessel: Vessel) -> float:
 
 
 def _extension_mm(vessel: Vessel, k: int) -> float:
-    return vessel.openings[k].diameter_mm * (OUTLET_EXTENSION if k else INLET_EXTENSION)
+    opening = vessel.openings[k]
+    return opening.diameter_mm * (INLET_EXTENSION if opening.is_inlet else OUTLET_EXTENSION)
 
 
 def _opening_of(vessel: Vessel, ring: Floats) -> int | None:

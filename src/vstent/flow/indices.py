@@ -10,6 +10,7 @@ from vstent.kernels import lattice_sampling
 from vstent.kernels.arrays import Bools, Floats
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
+from vstent.vessel import roles
 
 LOW_SHEAR_PA = 0.4
 """Below this wall shear stress endothelium degenerates (Malek, Alper and Izumo 1999, JAMA 282, 2035)."""
@@ -33,7 +34,8 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
     """Every index of a flow, its unit in its key.
 
     Of the vessel: ``inlet_flow_mL_s``, ``outlet_K_flow_mL_s``, ``inlet_pressure_Pa``, ``pressure_drop_Pa`` (inlet to
-    widest outlet), ``mean_wss_Pa``. With a sac (closed) and its ostium (normals into the sac), besides:
+    widest outlet), ``mean_wss_Pa``; where there are several inlets, ``inlet_K_flow_mL_s`` and ``inlet_K_pressure_Pa``
+    too. With a sac (closed) and its ostium (normals into the sac), besides:
 
     - ``neck_inflow_mL_s`` = integral over the ostium of max(u.n, 0), ``neck_outflow_mL_s`` of max(-u.n, 0);
       ``inflow_area_fraction`` = part of the ostium where u.n > 0; ``turnover_time_s`` = sac volume / inflow;
@@ -42,7 +44,8 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
     - ``mean_sac_wss_Pa``, ``max_sac_wss_Pa`` over the sac's wall; ``parent_wss_Pa`` over the other wall within 10 mm of
       the neck; ``low_shear_area_fraction`` of the sac's wall below 0.4 Pa, ``relative_low_shear_area_fraction`` below a
       tenth of the parent's mean;
-    - ``inflow_concentration_index`` = (inflow / inlet flow) / inflow area fraction (Cebral et al. 2011, AJNR 32, 145).
+    - ``inflow_concentration_index`` = (inflow / flow of all inlets) / inflow area fraction (Cebral et al. 2011, AJNR
+      32, 145).
 
     Of a pulsatile flow, the means over its cycle, and quotients of these, but the largest of all its moments where one
     is called ``max``; wall shear stress is then its magnitude's time average (TAWSS), and
@@ -56,7 +59,7 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
         moments = (field.at_phase(phase) for phase in field.phases) if field.phases else (field,)
         of_moments = [_of_ostium(now, ostium) | _of_sac(now, sac) for now in moments]
         result |= {key: _over_cycle(key, [one[key] for one in of_moments]) for key in of_moments[0]}
-        result |= _quotients(result, sac) | _of_sac_wall(field, sac, ostium)
+        result |= _quotients(result, field.inflow_mL_s, sac) | _of_sac_wall(field, sac, ostium)
     return result
 
 
@@ -71,12 +74,12 @@ def compare(bare: dict[str, float], stented: dict[str, float]) -> dict[str, floa
 
 
 def _of_vessel(field: FlowField) -> dict[str, float]:
-    outlets = {f"outlet_{k + 1}_flow_mL_s": float(flow) for k, flow in enumerate(field.outlets_mL_s)}
+    openings = roles(len(field.inlets_mL_s), len(field.outlets_mL_s))
+    through_mL_s = np.concatenate([field.inlets_mL_s, field.outlets_mL_s]).tolist()
     return {
-        "inlet_flow_mL_s": field.inlet_mL_s,
-        **outlets,
-        "inlet_pressure_Pa": field.inlet_pressure_Pa,
-        "pressure_drop_Pa": field.inlet_pressure_Pa - float(field.outlet_pressure_Pa[0]),
+        **{f"{role}_flow_mL_s": flow for role, flow in zip(openings, through_mL_s, strict=True)},
+        **{f"{role}_pressure_Pa": mean for role, mean in zip(openings, field.inlet_pressure_Pa.tolist(), strict=False)},
+        "pressure_drop_Pa": float(field.inlet_pressure_Pa[0] - field.outlet_pressure_Pa[0]),
         "mean_wss_Pa": float(np.average(field.shear_Pa, weights=_vertex_areas_mm2(field.wall))),
     }
 
@@ -95,12 +98,12 @@ def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
     }
 
 
-def _quotients(mean: dict[str, float], sac: Surface) -> dict[str, float]:
+def _quotients(mean: dict[str, float], entering_mL_s: float, sac: Surface) -> dict[str, float]:
     """Quotients of means over the cycle: those of moments are without bound where the flow stands still."""
     inflow_mL_s, share = mean["neck_inflow_mL_s"], mean["inflow_area_fraction"]
     return {
         "turnover_time_s": abs(sac.volume_mm3) * 1e-3 / max(inflow_mL_s, 1e-12),
-        "inflow_concentration_index": inflow_mL_s / mean["inlet_flow_mL_s"] / max(share, 1e-12),
+        "inflow_concentration_index": inflow_mL_s / entering_mL_s / max(share, 1e-12),
     }
 
 

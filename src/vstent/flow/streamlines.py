@@ -58,13 +58,14 @@ def _lines(points: Floats, count: Ints) -> list[Floats]:
 
 
 def inlet_seeds_mm(field: FlowField, vessel: Vessel, count: int) -> Floats:
-    """About `count` cell centres (s, 3), evenly drawn from the inlet's section."""
-    inlet = vessel.inlet
-    offset = field.centers_mm - inlet.center_mm
-    along = offset @ inlet.normal
-    near = (np.abs(along + field.cell_size_mm) < 0.5 * field.cell_size_mm) & (
-        np.linalg.norm(offset, axis=1) < inlet.diameter_mm
-    )
+    """About `count` cell centres (s, 3), evenly drawn from the sections of all inlets."""
+    near = np.zeros(len(field.cells), dtype=bool)
+    for inlet in vessel.inlets:
+        offset = field.centers_mm - inlet.center_mm
+        along = offset @ inlet.normal
+        near |= (np.abs(along + field.cell_size_mm) < 0.5 * field.cell_size_mm) & (
+            np.linalg.norm(offset, axis=1) < inlet.diameter_mm
+        )
     return _drawn(field.centers_mm[near], count)
 
 

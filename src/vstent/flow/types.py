@@ -10,7 +10,7 @@ from vstent.kernels import voxels
 from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.stent import Stent
 from vstent.surface import Surface
-from vstent.vessel import Vessel
+from vstent.vessel import Vessel, murray_shares
 
 LATTICE: Final = "lattice_boltzmann"
 """Name of the engine that vstent brings along."""
@@ -93,7 +93,7 @@ class FlowSettings:
     """How the flow is to be computed."""
 
     inflow_mL_s: float | None = None
-    """Mean flow through the inlet; None: 0.27 m/s times the inlet's area."""
+    """Mean flow through all inlets; None: 0.27 m/s times the area of each."""
     blood: Blood = field(default_factory=Blood)
     """The fluid."""
     waveform: Waveform | None = None
@@ -184,19 +184,25 @@ class FlowCase:
         return self.settings.blood
 
     @property
-    def inflow_mL_s(self) -> float:
-        """Flow through the inlet: the one set, or 0.27 m/s times the inlet's area (design.md section 5)."""
+    def inlets_mL_s(self) -> Floats:
+        """(i,) mean flow through each inlet: Murray's part of the one set, or 0.27 m/s times its area (design.md)."""
+        inlets = self.vessel.inlets
         if self.settings.inflow_mL_s is not None:
-            return self.settings.inflow_mL_s
-        return MEAN_INLET_SPEED_M_S * self.vessel.inlet.area_mm2
+            return self.settings.inflow_mL_s * murray_shares(inlets)
+        return MEAN_INLET_SPEED_M_S * np.array([inlet.area_mm2 for inlet in inlets])
 
     @property
-    def held_shares(self) -> dict[int, float]:
-        """Murray's part of the inflow, by the outlet's number from 0; the first, the widest, takes what is left."""
-        if self.settings.outlets == "zero_pressure":
-            return {}
-        cubes = np.array([outlet.diameter_mm**3 for outlet in self.vessel.outlets])
-        return {k: float(cubes[k] / cubes.sum()) for k in range(1, len(cubes))}
+    def inflow_mL_s(self) -> float:
+        """Mean flow through all inlets."""
+        return float(self.inlets_mL_s.sum())
+
+    @property
+    def held_mL_s(self) -> Floats:
+        """(k,) mean flow that each outlet is held to by Murray's law; nan at zero pressure: the widest, or all."""
+        outlets = self.vessel.outlets
+        held = self.inflow_mL_s * murray_shares(outlets)
+        held[: 1 if self.settings.outlets == "murray" else len(outlets)] = np.nan
+        return held
 
 
 MEAN_INLET_SPEED_M_S = 0.27
@@ -213,8 +219,8 @@ class Phase:
 
     time_s: float
     """Time since the waveform's beginning."""
-    inlet_mL_s: float
-    """Flow in through the inlet."""
+    inlets_mL_s: Floats
+    """(i,) flow in through each inlet."""
     outlets_mL_s: Floats
     """(k,) flow out through each outlet."""
     velocity_m_s: Floats
@@ -225,10 +231,16 @@ class Phase:
     """(v, 3) at the lumen's vertices."""
 
     def __post_init__(self) -> None:
+        freeze(self, "inlets_mL_s", np.float64, (-1,))
         freeze(self, "outlets_mL_s", np.float64, (-1,))
         freeze(self, "velocity_m_s", np.float32, (-1, 3))
         freeze(self, "pressure_Pa", np.float32, (len(self.velocity_m_s),))
         freeze(self, "wall_shear_stress_Pa", np.float32, (-1, 3))
+
+    @property
+    def inflow_mL_s(self) -> float:
+        """Flow in through all inlets."""
+        return float(self.inlets_mL_s.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,12 +279,12 @@ class FlowField:
     """(v, 3) traction of the flow along the wall at the lumen's vertices."""
     wall_pressure_Pa: Floats
     """(v,) pressure at the lumen's vertices."""
-    inlet_mL_s: float
-    """Flow in through the inlet."""
+    inlets_mL_s: Floats
+    """(i,) flow in through each inlet."""
     outlets_mL_s: Floats
     """(k,) flow out through each outlet."""
-    inlet_pressure_Pa: float
-    """Mean pressure on the inlet's section."""
+    inlet_pressure_Pa: Floats
+    """(i,) mean pressure on each inlet's section."""
     outlet_pressure_Pa: Floats
     """(k,) mean pressure on each outlet's section."""
     blood: Blood
@@ -306,9 +318,16 @@ class FlowField:
         freeze(self, "pressure_Pa", np.float64, (n,))
         freeze(self, "wall_shear_stress_Pa", np.float64, (v, 3))
         freeze(self, "wall_pressure_Pa", np.float64, (v,))
+        freeze(self, "inlets_mL_s", np.float64, (-1,))
         freeze(self, "outlets_mL_s", np.float64, (-1,))
+        freeze(self, "inlet_pressure_Pa", np.float64, (len(self.inlets_mL_s),))
         freeze(self, "outlet_pressure_Pa", np.float64, (len(self.outlets_mL_s),))
         freeze(self, "residual", np.float64, (-1,))
+
+    @property
+    def inflow_mL_s(self) -> float:
+        """Flow in through all inlets."""
+        return float(self.inlets_mL_s.sum())
 
     @cached_property
     def centers_mm(self) -> Floats:
@@ -350,7 +369,7 @@ class FlowField:
             velocity_m_s=phase.velocity_m_s,
             pressure_Pa=phase.pressure_Pa,
             wall_shear_stress_Pa=phase.wall_shear_stress_Pa,
-            inlet_mL_s=phase.inlet_mL_s,
+            inlets_mL_s=phase.inlets_mL_s,
             outlets_mL_s=phase.outlets_mL_s,
             phases=(),
             swing=None,

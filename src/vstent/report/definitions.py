@@ -181,7 +181,7 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "inflow_area_fraction": Definition("Inflow area", "Part of the neck where blood enters the sac."),
     "inflow_concentration_index": Definition(
         "Inflow concentration",
-        "(Neck inflow / inlet flow) / (inflow area / neck area).",
+        "(Neck inflow / flow of all inlets) / (inflow area / neck area).",
         "Cebral et al. 2011, AJNR 32:145",
     ),
     "relative_low_shear_area_fraction": Definition(

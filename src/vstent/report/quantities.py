@@ -52,8 +52,8 @@ NOTHING = 1e-9
 """What is smaller is what rounding leaves of zero."""
 RATIO = "_ratio"
 """End of the key of a quantity after over before."""
-OUTLET = re.compile(r"outlet_(\d+)_(\w+)")
-"""Key of a quantity of one of several outlets."""
+OPENING = re.compile(r"(inlet|outlet)_(\d+)_(\w+)")
+"""Key of a quantity of one of several inlets or outlets."""
 ERRORS = ("unsettled_fraction",)
 """How far numbers are to be relied on: that one changes says nothing of a device."""
 
@@ -75,7 +75,7 @@ class Quantity:
 
     @property
     def definition(self) -> Definition:
-        """Name, meaning and source: of a ratio, or of one of several outlets, those of what it is a ratio or one of."""
+        """Name, meaning and source: of a ratio, or of one of several openings, those of what that is of."""
         key, more = base_of(self.key)
         known = DEFINITIONS.get(key) or Definition(_spell(split_unit(key)[0]), "", "")
         return known._replace(name=known.name + more)
@@ -118,8 +118,8 @@ def base_of(key: str) -> tuple[str, str]:
     if key.endswith(RATIO):
         base, more = base_of(key.removesuffix(RATIO))
         return base, f"{more}, after / before"
-    outlet = OUTLET.fullmatch(key)
-    return (f"outlet_{outlet[2]}", f", outlet {outlet[1]}") if outlet else (key, "")
+    opening = OPENING.fullmatch(key)
+    return (f"{opening[1]}_{opening[3]}", f", {opening[1]} {opening[2]}") if opening else (key, "")
 
 
 def unit_of(key: str) -> str:

@@ -18,7 +18,7 @@ from vstent.surface import Surface
 from vstent.vessel import Anatomy
 
 N_INLET, N_NECK = 70, 60
-"""Streamlines through the inlet and through the neck."""
+"""Streamlines through the inlets and through the neck."""
 BESIDE_SAC_MM = 1.0
 """What is this near to the sac says how wide the scales of the flow are."""
 
@@ -266,7 +266,7 @@ def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer
 
 
 def _seeds_mm(field: FlowField, anatomy: Anatomy) -> Floats:
-    """Points (s, 3) on the inlet's section and on the neck."""
+    """Points (s, 3) on the inlets' sections and on the neck."""
     seeds = [inlet_seeds_mm(field, anatomy.vessel, N_INLET)]
     seeds += [neck_seeds_mm(field, sac.neck, N_NECK) for sac in anatomy.aneurysms[:1]]
     return np.concatenate(seeds)

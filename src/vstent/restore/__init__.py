@@ -40,7 +40,7 @@ def restore(
     ----------
     vessel : a vessel with centerlines.
     at_mm : (3,) a point near the sac wanted; all sacs otherwise.
-    outlet_mm : (3,) a point near the outlet that the parent artery leads to; the widest way on otherwise.
+    outlet_mm : (3,) a point near the opening that the parent artery leads to; the widest way on to an outlet otherwise.
     neck_mm : (k, 3) a neck drawn by hand, a closed curve near the wall: what it parts from the inlet is a sac, and
         the only one; necks are found otherwise.
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from vstent.kernels import curves
 from vstent.restore.bulges import Bulge
-from vstent.restore.path import is_off_sacs
+from vstent.restore.path import PASSING, is_off_sacs, reach_of
 from vstent.restore.sac import is_in_one
 from vstent.trace import parent_radius_mm
 from vstent.vessel import Aneurysm, Centerline, Opening, Vessel
@@ -29,6 +29,7 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
     line, sacs = vessel.centerlines[path], [bulge for bulge in bulges if is_in_one(bulge.points_mm, aneurysms)]
     return (
         *_found(vessel, path, aneurysms, len(bulges)),
+        *_before_another(vessel, path, bulges[:1]),
         *_near_sacs(vessel, bulges),
         *_from_sacs(vessel, path, aneurysms),
         *_fusiform(line, sacs),
@@ -49,14 +50,26 @@ def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
 
 def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges: int) -> tuple[str, ...]:
     """Sentences on where the parent artery runs and how many sacs hang on it."""
-    outlet = vessel.outlets[path]
-    notes = [f"The parent artery runs from the inlet to {outlet.role} (diameter {outlet.diameter_mm:.1f} mm)."]
+    end = vessel.far_ends[path]
+    notes = [f"The parent artery runs from the inlet to {end.role} (diameter {end.diameter_mm:.1f} mm)."]
     if not aneurysms:
         notes.append("No sac was found: the landing surface is the artery's own wall with its side branches closed.")
     if n_bulges > len(aneurysms) > 0:
         more = counted(n_bulges - len(aneurysms), "more bulge")
         notes.append(f"{more}, flat, a sac's lobe, or on another branch: no sac of its own.")
     return tuple(notes)
+
+
+def _before_another(vessel: Vessel, path: int, highest: list[Bulge]) -> tuple[str, ...]:
+    """A sentence where the highest bulge hangs on the artery from another inlet, before the parent artery."""
+    lines = vessel.centerlines
+    return tuple(
+        f"The bulge {bulge.height_mm:.1f} mm high at {', '.join(f'{x:.1f}' for x in bulge.dome_mm)} mm hangs on the "
+        f"artery from {_named(end)}: give that as the first --inlet."
+        for bulge in highest
+        for end, line in zip(vessel.far_ends, lines, strict=True)
+        if end.is_inlet and reach_of(line, bulge) <= PASSING < reach_of(lines[path], bulge)
+    )
 
 
 def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
@@ -106,9 +119,9 @@ def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
 
 
 def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
-    """Sentences on the outlets that lie on a sac or beside one: holes in it, or branches cut off at their mouth."""
+    """Sentences on the openings that lie on a sac or beside one: holes in it, or branches cut off at their mouth."""
     notes = []
-    for opening in vessel.outlets:
+    for opening in vessel.far_ends:
         gap_mm = min((float(bulge.distances_mm(opening.center_mm[None])[0]) for bulge in bulges), default=np.inf)
         if gap_mm < NEAR_SAC_MM:
             notes.append(
@@ -119,12 +132,13 @@ def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
 
 
 def _from_sacs(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
-    """Sentences on the branches that leave from a sac: blood for them goes on passing through it behind a device."""
-    branches = [k for k in range(len(vessel.outlets)) if k != path]
+    """Sentences on the branches that leave from a sac: their blood goes on passing through it behind a device."""
+    branches = [one for k, one in enumerate(zip(vessel.far_ends, vessel.centerlines, strict=True)) if k != path]
     return tuple(
-        f"{_named(vessel.outlets[k])}, leaves from a sac: what it carries goes on through the sac behind any device."
-        for k in branches
-        if any(_leaves(vessel.centerlines[k], one) for one in aneurysms)
+        f"{_named(opening)}, {'opens into' if opening.is_inlet else 'leaves from'} a sac: what it carries goes on "
+        f"through the sac behind any device{', and is none of the neck inflow' if opening.is_inlet else ''}."
+        for opening, line in branches
+        if any(_leaves(line, one) for one in aneurysms)
     )
 
 

@@ -1,4 +1,4 @@
-"""The centerline that the parent artery follows: past the sac, and at every fork the wider way."""
+"""The centerline that the parent artery follows: past the sac to an outlet, and at every fork the wider way."""
 
 from functools import reduce
 from typing import Final
@@ -21,12 +21,17 @@ PASSING: Final = 2.0
 
 
 def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -> int:
-    """Number of the centerline that the parent artery follows: past the sac, and at every fork the wider way."""
+    """Number of the centerline that the parent artery follows: past the sac to an outlet, at every fork the wider way.
+
+    To another inlet it leads only where `outlet_mm` (3,) is there.
+    """
     lines = vessel.centerlines
     if outlet_mm is not None:
-        ends = np.array([opening.center_mm for opening in vessel.outlets])
+        ends = np.array([opening.center_mm for opening in vessel.far_ends])
         return int(np.argmin(np.linalg.norm(ends - np.asarray(outlet_mm), axis=1)))
-    reach = np.array([_reach(line, bulges[0]) if bulges else 0.0 for line in lines])
+    leads_out = [not opening.is_inlet for opening in vessel.far_ends]
+    reach = np.array([reach_of(line, bulges[0]) if bulges else 0.0 for line in lines])
+    reach = np.where(leads_out, reach, np.inf)
     passing = np.flatnonzero(reach <= max(PASSING, 1.25 * reach.min()))
     off = [is_off_sacs(line, bulges[:1]) for line in lines]
     return int(reduce(lambda i, k: i if _is_wider(lines[i], lines[k], off[i], off[k]) else k, passing))
@@ -40,8 +45,8 @@ def is_off_sacs(line: Centerline, bulges: list[Bulge]) -> Bools:
     return off
 
 
-def _reach(line: Centerline, bulge: Bulge) -> float:
-    """Least distance between a centerline and the foot of a bulge, in parent radii; the wall itself is at 1."""
+def reach_of(line: Centerline, bulge: Bulge) -> float:
+    """Return the least distance between a centerline and a bulge's foot, in parent radii; the wall itself is at 1."""
     radius = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
     return float((cKDTree(bulge.foot_mm).query(line.points_mm)[0] / radius).min())
 

@@ -12,7 +12,17 @@ import numpy as np
 from vstent.deploy import deploy, propose_size
 from vstent.device import BARE, Design, Size, find_sizes
 from vstent.errors import InputError
-from vstent.flow import FlowField, FlowSettings, compare, flow_case, foretell_cost, indices, ostium, simulate_case
+from vstent.flow import (
+    FlowCase,
+    FlowField,
+    FlowSettings,
+    compare,
+    flow_case,
+    foretell_cost,
+    indices,
+    ostium,
+    simulate_case,
+)
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
@@ -74,7 +84,8 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
         tell(" ".join(vessel.notes))
     with ledger.stage("trace") as tell:
         traced = trace(vessel, inlet_mm=_array(settings.inlet_mm))
-        found = f"{len(traced.outlets)} outlets; inlet {traced.inlet.diameter_mm:.1f} mm wide."
+        widths = ", ".join(f"{inlet.role} {inlet.diameter_mm:.1f} mm wide" for inlet in traced.inlets)
+        found = f"{len(traced.outlets)} outlets; {widths}."
         tell(" ".join([found, *traced.notes[len(vessel.notes) :]]))
     ledger.hold("vessel", key, traced)
     return traced
@@ -87,8 +98,8 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
     else:
         image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape)
         vessel = segment(image, threshold=settings.threshold, at_mm=_array(settings.at_mm))
-    near_mm = settings.inlet_mm if settings.at_mm is None else settings.at_mm
-    lumen, repairs = repair(vessel.lumen, at_mm=_array(near_mm))
+    near_mm = _array(settings.inlet_mm if settings.at_mm is None else settings.at_mm)
+    lumen, repairs = repair(vessel.lumen, at_mm=None if near_mm is None else np.atleast_2d(near_mm)[0])
     return replace(vessel, lumen=lumen, notes=(*vessel.notes, *repairs))
 
 
@@ -130,14 +141,15 @@ def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
     """Refuse a mean inflow with which no blood flows: another unit was meant."""
     if flow is None or flow.inflow_mL_s is None:
         return
-    inlet = anatomy.vessel.inlet
-    speed_m_s = flow.inflow_mL_s / inlet.area_mm2
-    if not SLOWEST_M_S <= speed_m_s <= FASTEST_M_S:
-        raise InputError(
-            f"a mean inflow of {flow.inflow_mL_s:g} mL/s through an inlet {inlet.diameter_mm:.1f} mm wide flows at "
-            f"{speed_m_s:.2g} m/s, and blood in arteries at {SLOWEST_M_S:g} to {FASTEST_M_S:g}: give mL/s (240 mL/min "
-            "are 4), or another inlet"
-        )
+    vessel = anatomy.vessel
+    for inlet, part_mL_s in zip(vessel.inlets, FlowCase(vessel, settings=flow).inlets_mL_s, strict=True):
+        speed_m_s = part_mL_s / inlet.area_mm2
+        if not SLOWEST_M_S <= speed_m_s <= FASTEST_M_S:
+            raise InputError(
+                f"a mean inflow of {part_mL_s:g} mL/s through an inlet {inlet.diameter_mm:.1f} mm wide flows at "
+                f"{speed_m_s:.2g} m/s, and blood in arteries at {SLOWEST_M_S:g} to {FASTEST_M_S:g}: give mL/s (240 "
+                "mL/min are 4), or another inlet"
+            )
 
 
 def engine_folders(out: Path, settings: Settings) -> dict[str, Path]:
@@ -258,5 +270,5 @@ def measure_all(
     return {"vessel": morphology(anatomy), "stents": stents} | ({BARE: flow[BARE] | left[BARE]} if flow else {})
 
 
-def _array(point_mm: Point | None) -> Floats | None:
-    return None if point_mm is None else np.array(point_mm, dtype=np.float64)
+def _array(points_mm: Point | tuple[Point, ...] | None) -> Floats | None:
+    return None if points_mm is None else np.array(points_mm, dtype=np.float64)

@@ -39,8 +39,8 @@ class Settings:
     """Intensity of the lumen's wall in a scan."""
     at_mm: Point | None = None
     """A point near the sac."""
-    inlet_mm: Point | None = None
-    """A point near the inlet."""
+    inlet_mm: Point | tuple[Point, ...] | None = None
+    """A point near the inlet; or one near each opening that brings blood, first that where the parent artery begins."""
     outlet_mm: Point | None = None
     """A point near the outlet that the parent artery leads to."""
     neck_mm: tuple[Point, ...] | None = None

@@ -15,7 +15,7 @@ from vstent.kernels import lattice
 from vstent.kernels.arrays import Floats, Ints
 
 SOUND_MEMORY = 0.002
-"""Rate per step pair at which the inlet forgets the pressure that it takes for the mean, in steady flow. In pulsatile
+"""Rate per step pair at which an inlet forgets the pressure that it takes for the mean, in steady flow. In pulsatile
 flow it takes every new pressure for the mean at once (1): the flow is the waveform's, whatever answers it."""
 
 
@@ -67,18 +67,18 @@ class Ends:
 
     def _opening(self, k: int, links: Ints) -> tuple[Floats, Floats]:
         opening = self.case.vessel.openings[k]
-        share = 1.0 if k == 0 else self.case.held_shares.get(k - 1)
-        kind = lattice.INFLOW if k == 0 else lattice.PRESSURE if share is None else lattice.OUTFLOW
-        speed = self.case.inflow_mL_s * (share or 0.0) / opening.area_mm2 / self.scales.speed_m_s
+        flow_mL_s = np.concatenate([self.case.inlets_mL_s, self.case.held_mL_s])[k]
+        kind = lattice.INFLOW if opening.is_inlet else lattice.PRESSURE if np.isnan(flow_mL_s) else lattice.OUTFLOW
+        speed = np.nan_to_num(flow_mL_s) / opening.area_mm2 / self.scales.speed_m_s
         area = opening.area_mm2 / self.domain.cell_size_mm**2
         row = np.array([kind, speed, 0.0, self._rate(kind), *opening.normal, area, 0.0])
-        return row, self._developed(links, area) if k == 0 else np.zeros((len(links), 2))
+        return row, self._developed(k, links, area) if opening.is_inlet else np.zeros((len(links), 2))
 
-    def _developed(self, links: Ints, area: float) -> Floats:
-        """What links of the inlet send back, (l, 2): developed flow."""
-        normal = self.case.vessel.inlet.normal
+    def _developed(self, k: int, links: Ints, area: float) -> Floats:
+        """What links of inlet k send back, (l, 2): developed flow."""
+        normal = self.case.vessel.openings[k].normal
         places_mm = np.concatenate([self._along(links, part)[2] for part in (0.0, 0.5, 1.0)])
-        speed = developed_profile(self.domain.sections[0], normal, places_mm)
+        speed = developed_profile(self.domain.sections[k], normal, places_mm)
         return _sent(self.domain.link_direction[links], normal, area, *(-speed.reshape(3, -1, 1) * normal))
 
     def _rate(self, kind: float) -> float:
@@ -121,7 +121,8 @@ class Ends:
     def _takes_the_rest(self, part: int) -> bool:
         """Tell whether no more leaves anywhere else, at a cut or an outlet."""
         outside = self._outside
-        within = [k for k in range(len(self.case.vessel.outlets)) if (self.domain.link_patch == k + 2).any()]
+        first = len(self.case.vessel.inlets) + 1
+        within = [k for k in range(len(self.case.vessel.outlets)) if (self.domain.link_patch == first + k).any()]
         most_mL_s = float(np.concatenate([-outside.inflow_mL_s, outside.outer.outlets_mL_s[within]]).max())
         return bool(-outside.inflow_mL_s[part] >= most_mL_s * (1 - 1e-9))
 

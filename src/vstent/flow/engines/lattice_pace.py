@@ -41,8 +41,9 @@ def peak_speed_m_s(case: FlowCase, start: FlowField | None, close_up: CloseUp | 
         within = slice(None) if close_up is None else close_up.part < 0
         speed_m_s = start.speed_m_s[within]
         return FASTER * float(max(np.quantile(speed_m_s, 1 - FEW), speed_m_s.max() / HASTE))
-    narrowest_mm2 = min(case.vessel.inlet.area_mm2, sum(outlet.area_mm2 for outlet in case.vessel.outlets))
-    return 3.0 * case.inflow_mL_s / narrowest_mm2
+    at_inlets = (3.0 * flow / inlet.area_mm2 for inlet, flow in zip(case.vessel.inlets, case.inlets_mL_s, strict=True))
+    at_outlets = 3.0 * case.inflow_mL_s / sum(outlet.area_mm2 for outlet in case.vessel.outlets)
+    return float(max(*at_inlets, at_outlets))
 
 
 def longest_step_s(case: FlowCase, cell_size_mm: float, peak_m_s: float) -> float:
@@ -65,7 +66,7 @@ def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up:
     peak_m_s = pulse.peaks_m_s(case, start, close_up)
     step_s = np.array([longest_step_s(case, cell_size_mm, peak) for peak in peak_m_s])
     shortest_s = step_s.min()
-    way_mm = extended_volume_mm3(case.vessel) / case.vessel.inlet.area_mm2
+    way_mm = extended_volume_mm3(case.vessel) / sum(inlet.area_mm2 for inlet in case.vessel.inlets)
     by_sound_s = pulse.sound_s() * lattice.SOUND * cell_size_mm / way_mm
     step_s = np.clip(np.minimum(step_s, by_sound_s), shortest_s, LONGEST * shortest_s)
     return (2 * np.ceil(0.5 * pulse.phase_s / step_s)).astype(np.int32)

@@ -28,8 +28,10 @@ class Reading:
     """(v, 3)."""
     wall_pressure_Pa: Floats
     """(v,)."""
-    outflow_mL_s: Floats
-    """(k,) through every opening; nan where a close-up does not reach it, 0 where no cell of all does."""
+    inlets_mL_s: Floats
+    """(i,) in through every inlet; nan where a close-up does not reach it."""
+    outlets_mL_s: Floats
+    """(k,) out through every outlet; nan likewise, 0 where no cell of all reaches it."""
     swing: Swing | None = None
     """What it is the mean of, where a steady flow moves."""
 
@@ -46,7 +48,9 @@ def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     is_opening = state.links.patch <= len(outflow_mL_s)
     through = _mean(snapshots, (one.outflow_mL_s for one in snapshots))
     outflow_mL_s[state.links.patch[is_opening] - 1] = through[is_opening]
-    return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, outflow_mL_s)
+    n_inlets = len(state.case.vessel.inlets)
+    through_mL_s = -outflow_mL_s[:n_inlets], outflow_mL_s[n_inlets:]
+    return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, *through_mL_s)
 
 
 def read_moving(state: State, snapshots: Sequence[Snapshot]) -> Reading:
@@ -72,6 +76,7 @@ def field_of(
     """Put a flow together with how it was reached, and what it has `left` to go."""
     domain, vessel = state.domain, state.case.vessel
     section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
+    n_inlets = len(vessel.inlets)
     field = FlowField(
         cells=domain.cells,
         origin_mm=domain.origin_mm,
@@ -81,10 +86,10 @@ def field_of(
         wall=vessel.lumen,
         wall_shear_stress_Pa=flow.wall_shear_stress_Pa,
         wall_pressure_Pa=flow.wall_pressure_Pa,
-        inlet_mL_s=-flow.outflow_mL_s[0],
-        outlets_mL_s=flow.outflow_mL_s[1:],
-        inlet_pressure_Pa=section_Pa[0],
-        outlet_pressure_Pa=section_Pa[1:],
+        inlets_mL_s=flow.inlets_mL_s,
+        outlets_mL_s=flow.outlets_mL_s,
+        inlet_pressure_Pa=section_Pa[:n_inlets],
+        outlet_pressure_Pa=section_Pa[n_inlets:],
         blood=state.case.blood,
         is_converged=outcome.is_converged,
         unsettled_fraction=left,

@@ -38,10 +38,10 @@ def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
             f"the time step is too long, for that is {speed[fastest]:.2g} cells a step; halve the lattice speed "
             f"({state.case.settings.lattice_speed:.3g})"
         )
-    openings = range(1, len(state.case.vessel.openings))
-    coming_back = [k for k in openings if _backflow(state, last, k) > FAST * speed[fastest]]
+    outlets = [(k, one) for k, one in enumerate(state.case.vessel.openings) if not one.is_inlet]
+    coming_back = [one.role for k, one in outlets if _backflow(state, last, k) > FAST * speed[fastest]]
     if coming_back:
-        role = state.case.vessel.openings[coming_back[0]].role
+        role = coming_back[0]
         return f"blood comes back through {role}; cut the vessel further from there, or share the outflow (murray)"
     otherwise = "" if state.close_up is None else ", or leave out --close-up (close_up)"
     cell_reynolds = speed[fastest] / last.scales.viscosity
@@ -53,6 +53,6 @@ def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
 
 
 def _backflow(state: State, last: Snapshot, k: int) -> float:
-    """Fastest blood that enters through outlet k, in cells a step."""
+    """Fastest blood that enters through opening k, in cells a step."""
     cell = state.domain.link_cell[state.domain.link_patch == k + 1]
     return float(-(last.velocity[cell] @ state.case.vessel.openings[k].normal).min()) if len(cell) else 0.0

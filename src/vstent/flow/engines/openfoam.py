@@ -34,7 +34,7 @@ CHECK_ITERATIONS: Final = 50
 CHECKS_AVERAGED: Final = 8
 """Checks whose mean is the result where a steady flow does not settle."""
 CHECKS_HELD: Final = 3
-"""Checks at which the inflow is corrected for the inlet's meshed area."""
+"""Checks at which the inflow is corrected for every inlet's meshed area."""
 
 
 @dataclass(eq=False)
@@ -214,13 +214,18 @@ def _monitored(state: State, now: Snapshot) -> Floats:
 
 
 def _correct_inflow(state: State) -> bool:
-    """Correct the inlet's mean speed for its meshed area, less than its section's; tell whether that was due."""
-    settings, now = state.case.settings, state.snapshots[-1]
-    wanted_mL_s = state.case.inflow_mL_s * float(settings.inflow_factor(np.array([float(now.time)]))[0])
-    if len(state.history) > CHECKS_HELD or abs(wanted_mL_s) < 0.2 * state.case.inflow_mL_s:
+    """Correct the inlets' mean speeds for their meshed areas, less than the sections'; tell whether that was due."""
+    case, now = state.case, state.snapshots[-1]
+    share = float(case.settings.inflow_factor(np.array([float(now.time)]))[0])
+    if len(state.history) > CHECKS_HELD or abs(share) < 0.2:
         return False
-    factor = -wanted_mL_s / now.outflow_mL_s[0]
-    return abs(factor - 1) > 1e-5 and folders.scale_inflow(state.folder, factor)
+    factors = -share * case.inlets_mL_s / now.outflow_mL_s[: len(case.vessel.inlets)]
+    scaled = [
+        folders.scale_inflow(state.folder, inlet.role, factor)
+        for inlet, factor in zip(case.vessel.inlets, factors, strict=True)
+        if abs(factor - 1) > 1e-5
+    ]
+    return any(scaled)
 
 
 def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField:
@@ -230,6 +235,7 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
     vessel, domain = state.case.vessel, state.domain
     pressure_Pa, outflow_mL_s = mean("pressure_Pa"), mean("outflow_mL_s")
     section_Pa = domains.section_pressure_Pa(vessel, domain, pressure_Pa)
+    n_inlets = len(vessel.inlets)
     steps = len(state.history) * (1 if state.is_pulse else CHECK_ITERATIONS)
     return FlowField(
         cells=domain.cells,
@@ -240,10 +246,10 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
         wall=vessel.lumen,
         wall_shear_stress_Pa=mean("wall_shear_stress_Pa"),
         wall_pressure_Pa=mean("wall_pressure_Pa"),
-        inlet_mL_s=-outflow_mL_s[0],
-        outlets_mL_s=outflow_mL_s[1:],
-        inlet_pressure_Pa=section_Pa[0],
-        outlet_pressure_Pa=section_Pa[1:],
+        inlets_mL_s=-outflow_mL_s[:n_inlets],
+        outlets_mL_s=outflow_mL_s[n_inlets:],
+        inlet_pressure_Pa=section_Pa[:n_inlets],
+        outlet_pressure_Pa=section_Pa[n_inlets:],
         blood=state.case.blood,
         is_converged=outcome.is_converged,
         unsettled_fraction=outcome.residual[-1],
@@ -266,10 +272,10 @@ def swing_of(kept: list[Snapshot]) -> Swing:
 
 def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
     """The last cycle; its times are those of the waveform."""
-    phase_s = waveform_of(case).period_s / PHASES
+    phase_s, n_inlets = waveform_of(case).period_s / PHASES, len(case.vessel.inlets)
 
     def phase(k: int, one: Snapshot) -> Phase:
-        through_mL_s = -float(one.outflow_mL_s[0]), one.outflow_mL_s[1:]
+        through_mL_s = -one.outflow_mL_s[:n_inlets], one.outflow_mL_s[n_inlets:]
         return Phase((k + 1) * phase_s, *through_mL_s, one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa)
 
     return tuple(phase(k, one) for k, one in enumerate(cycle))

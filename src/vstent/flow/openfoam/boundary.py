@@ -1,5 +1,6 @@
-"""Boundary conditions: the developed profile at the inlet, zero pressure or a share of the flow at the outlets."""
+"""Boundary conditions: the developed profile at every inlet, zero pressure or a held flow at the outlets."""
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +14,7 @@ from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
 
 PROFILE_POINTS: Final = 81
-"""Points across the inlet at which its profile is written."""
+"""Points across an inlet at which its profile is written."""
 TABLE_POINTS: Final = 100
 """Times of a cycle in a table of flow."""
 
@@ -21,17 +22,19 @@ TABLE_POINTS: Final = 100
 def velocity(case: FlowCase, setup: FoamSetup, walls: list[str]) -> str:
     """0/U."""
     patches: dict[str, Any] = {name: {"type": "noSlip"} for name in walls}
-    patches["inlet"] = _inlet(case, setup)
-    for k, outlet in enumerate(case.vessel.outlets):
-        patches[outlet.role] = _outlet_velocity(case, setup, k)
+    for inlet, flow_mL_s in zip(case.vessel.inlets, case.inlets_mL_s, strict=True):
+        patches[inlet.role] = _inlet(case, setup, inlet.role, flow_mL_s)
+    for outlet, flow_mL_s in zip(case.vessel.outlets, case.held_mL_s, strict=True):
+        patches[outlet.role] = _outlet_velocity(case, setup, outlet.role, flow_mL_s)
     return _field("U", "volVectorField", "[0 1 -1 0 0 0 0]", "(0 0 0)", patches)
 
 
 def pressure(case: FlowCase, walls: list[str]) -> str:
     """0/p."""
-    patches: dict[str, Any] = {name: {"type": "zeroGradient"} for name in (*walls, "inlet")}
-    for k, outlet in enumerate(case.vessel.outlets):
-        is_held = k in case.held_shares
+    inlets = (inlet.role for inlet in case.vessel.inlets)
+    patches: dict[str, Any] = {name: {"type": "zeroGradient"} for name in (*walls, *inlets)}
+    for outlet, flow_mL_s in zip(case.vessel.outlets, case.held_mL_s, strict=True):
+        is_held = not np.isnan(flow_mL_s)
         patches[outlet.role] = {"type": "zeroGradient"} if is_held else {"type": "fixedValue", "value": "uniform 0"}
     return _field("p", "volScalarField", "[0 2 -2 0 0 0 0]", "0", patches)
 
@@ -45,60 +48,69 @@ def tables(case: FlowCase) -> dict[str, str]:
     """Files of functions of time that the boundary conditions name: one cycle, time in s."""
     if case.settings.waveform is None:
         return {}
-    shares = {"inlet": 1.0 / case.inflow_mL_s / M3_PER_ML}  # the inlet's profile is that of the mean flow
-    shares |= {case.vessel.outlets[k].role: share for k, share in case.held_shares.items()}
-    return {f"flow_{name}": _cycle(case, share) for name, share in shares.items()}
+    means = {inlet.role: 1.0 for inlet in case.vessel.inlets}  # an inlet's profile is that of its mean flow
+    held = zip(case.vessel.outlets, case.held_mL_s, strict=True)
+    means |= {outlet.role: flow_mL_s * M3_PER_ML for outlet, flow_mL_s in held if not np.isnan(flow_mL_s)}
+    return {f"flow_{name}": _cycle(case, mean) for name, mean in means.items()}
 
 
-def _cycle(case: FlowCase, share: float) -> str:
-    """A share of the flow in m3/s over one cycle, as a list of pairs."""
+def _cycle(case: FlowCase, mean: float) -> str:
+    """What has a mean, over one cycle, as a list of pairs."""
     waveform = case.settings.waveform
     assert waveform is not None
     time_s = np.linspace(0.0, waveform.period_s, TABLE_POINTS + 1)
-    flow_m3_s = share * case.inflow_mL_s * M3_PER_ML * waveform.factor(time_s)
-    return "(" + " ".join(f"({t:.9g} {q:.9g})" for t, q in zip(time_s, flow_m3_s, strict=True)) + ")\n"
+    values = mean * waveform.factor(time_s)
+    return "(" + " ".join(f"({t:.9g} {q:.9g})" for t, q in zip(time_s, values, strict=True)) + ")\n"
 
 
-def _over_time(case: FlowCase, setup: FoamSetup, key: str, patch: str, share: float) -> dict[str, Any]:
-    """Entry of a share of the flow in m3/s: constant, or a cycle that repeats."""
+def _over_time(case: FlowCase, setup: FoamSetup, key: str, patch: str, mean: float) -> dict[str, Any]:
+    """Entry of what has a mean: constant, or a cycle that repeats."""
     if case.settings.waveform is None:
-        return {key: f"constant {share * case.inflow_mL_s * M3_PER_ML:.9g}"}
+        return {key: f"constant {mean:.9g}"}
     if setup.flavour == "org":
-        return {key: {"type": "table", "values": _cycle(case, share).strip(), "outOfBounds": "repeat"}}
+        return {key: {"type": "table", "values": _cycle(case, mean).strip(), "outOfBounds": "repeat"}}
     # 1912 takes a table apart from its options only from a file.
     return {key: "tableFile", f"{key}Coeffs": {"file": f'"<constant>/flow_{patch}"', "outOfBounds": "repeat"}}
 
 
-def _inlet(case: FlowCase, setup: FoamSetup) -> dict[str, Any]:
+def _inlet(case: FlowCase, setup: FoamSetup, role: str, flow_mL_s: float) -> dict[str, Any]:
     """The developed profile of the inlet's own shape (.com), or of its distance to the wall (.org), times the flow."""
     start = {"value": "uniform (0 0 0)"}
     if setup.flavour == "org":
-        flow = _over_time(case, setup, "volumetricFlowRate", "inlet", 1.0)
+        flow = _over_time(case, setup, "volumetricFlowRate", role, flow_mL_s * M3_PER_ML)
         return {"type": "flowRateInletVelocity", **flow, "profile": "laminarBL"} | start
     # By the nearest point: OpenFOAM's own interpolation in the plane fails on sections of a few millimetres.
     mapped = {"type": "timeVaryingMappedFixedValue", "mapMethod": "nearest", "setAverage": True} | start
     if case.settings.waveform is None:
         return mapped
-    return {"type": "scaledFixedValue", **_over_time(case, setup, "scale", "inlet", 1.0), "refValue": mapped} | start
+    return {"type": "scaledFixedValue", **_over_time(case, setup, "scale", role, 1.0), "refValue": mapped} | start
 
 
-def _outlet_velocity(case: FlowCase, setup: FoamSetup, k: int) -> dict[str, Any]:
-    share = case.held_shares.get(k)
-    if share is None:
+def _outlet_velocity(case: FlowCase, setup: FoamSetup, role: str, flow_mL_s: float) -> dict[str, Any]:
+    if np.isnan(flow_mL_s):
         return {"type": "inletOutlet", "inletValue": "uniform (0 0 0)", "value": "uniform (0 0 0)"}
-    flow = _over_time(case, setup, "volumetricFlowRate", case.vessel.outlets[k].role, share)
+    flow = _over_time(case, setup, "volumetricFlowRate", role, flow_mL_s * M3_PER_ML)
     return {"type": "flowRateOutletVelocity", **flow, "value": "uniform (0 0 0)"}
 
 
-def inlet_profile(case: FlowCase, section_mm: Floats) -> dict[str, str]:
-    """Files of constant/boundaryData/inlet: points in m, and there the developed profile whose mean is the mean flow's.
+def inlet_profiles(case: FlowCase, sections: Sequence[Floats]) -> dict[str, str]:
+    """Files of constant/ for every inlet: points in m, and there the developed profile whose mean is the mean flow's.
 
     The mean that OpenFOAM holds the patch to stands behind the values (`setAverage`).
     """
-    inward = -case.vessel.inlet.normal
+    inlets = zip(case.vessel.inlets, sections, case.inlets_mL_s, strict=False)  # the outlets' sections follow
+    return {
+        f"boundaryData/{inlet.role}/{name}": text
+        for inlet, section_mm, flow_mL_s in inlets
+        for name, text in _profile(section_mm, -inlet.normal, flow_mL_s).items()
+    }
+
+
+def _profile(section_mm: Floats, inward: Floats, flow_mL_s: float) -> dict[str, str]:
+    """Files of one inlet's folder."""
     points_mm = _section_points_mm(section_mm, inward)
     shape = developed_profile(section_mm, inward, points_mm)
-    mean_m_s = case.inflow_mL_s / _polygon_area_mm2(section_mm, inward)
+    mean_m_s = flow_mL_s / _polygon_area_mm2(section_mm, inward)
     speed_m_s = shape * mean_m_s / max(float(shape[shape > 0].mean()), 1e-300)
     return {
         "points": _vectors(points_mm * M_PER_MM),

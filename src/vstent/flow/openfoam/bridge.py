@@ -69,7 +69,8 @@ def bridge(case: FlowCase, domain: Domain, folder: Path) -> Bridge:
     centers = results.read_field(folder, "0", "C")
     inside_mm = centers.inside / M_PER_MM
     at_rest = {name: centers.patches[name] / M_PER_MM for name in ("wall", "sac", STRUTS) if name in centers.patches}
-    known_mm = np.concatenate([inside_mm, *at_rest.values(), centers.patches["inlet"] / M_PER_MM])
+    at_inlets_mm = [centers.patches[inlet.role] / M_PER_MM for inlet in case.vessel.inlets]
+    known_mm = np.concatenate([inside_mm, *at_rest.values(), *at_inlets_mm])
     ostium_mm, area_mm2 = np.zeros((0, 3)), np.zeros((0, 3))
     if case.ostium is not None:
         ostium_mm, area_mm2 = sampling.surface_samples(case.ostium, domain.cell_size_mm)
@@ -105,7 +106,7 @@ def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
     density = case.blood.density_kg_m3
     velocity = results.read_field(folder, time, "U")
     at_rest = np.zeros((sum(across.walls.values()), 3))
-    known = np.concatenate([velocity.inside, at_rest, velocity.patches["inlet"]])
+    known = np.concatenate([velocity.inside, at_rest, *(velocity.patches[inlet.role] for inlet in case.vessel.inlets)])
     pressure_Pa = density * results.read_field(folder, time, "p").inside[:, 0]
     stress = results.read_field(folder, time, "wallShearStress").patches
     # OpenFOAM's is what the wall does to the blood, over density.

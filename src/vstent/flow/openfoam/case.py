@@ -24,7 +24,7 @@ OpenFOAM case written by vstent (research use only). Lengths are metres: the ves
   sbatch submit.slurm  the same on a cluster
   ./Allclean           back to what was exported
 
-Patches: wall{sac}, inlet, outlet_1, ... (from the widest to the narrowest), each outlet at the end of a straight
+Patches: wall{sac}, {inlets}, outlet_1, ... (from the widest to the narrowest), each outlet at the end of a straight
 extension. p is pressure over density ({density:.6g} kg/m3). wallShearStress is what the wall does to the blood, over
 density: the wall's own stress is its negative times the density.
 Mean inflow: {inflow:.6g} mL/s.
@@ -75,7 +75,10 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         "Allclean": scripts.all_clean(),
         "submit.slurm": scripts.slurm(setup),
         "README": README.format(
-            sac=", sac" if "sac" in kinds else "", density=case.blood.density_kg_m3, inflow=case.inflow_mL_s
+            sac=", sac" if "sac" in kinds else "",
+            inlets=", ".join(inlet.role for inlet in case.vessel.inlets),
+            density=case.blood.density_kg_m3,
+            inflow=case.inflow_mL_s,
         ),
         "vstent.foam": "",
     }
@@ -84,8 +87,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
     files |= {f"{folder}/{name}.stl": text for name, text in _surfaces(case, setup, patches).items()}
     if setup.flavour == "com":
         files |= {f"constant/{name}": text for name, text in boundary.tables(case).items()}
-        profile = boundary.inlet_profile(case, sections[0])
-        files |= {f"constant/boundaryData/inlet/{name}": text for name, text in profile.items()}
+        files |= {f"constant/{name}": text for name, text in boundary.inlet_profiles(case, sections).items()}
     return FoamCase(files, ("Allrun", "Allclean", "submit.slurm"), application)
 
 
@@ -109,8 +111,8 @@ def _system(
     case: FlowCase, setup: FoamSetup, patches: tuple[Patch, ...], walls: list[str], sections: tuple[Floats, ...]
 ) -> dict[str, str]:
     is_steady = case.settings.waveform is None
-    speed_m_s = 2 * case.inflow_mL_s / case.vessel.inlet.area_mm2
-    step_s = 0.2 * setup.cell_size_mm * M_PER_MM / speed_m_s
+    speed_m_s = max(2 * flow / inlet.area_mm2 for inlet, flow in zip(case.vessel.inlets, case.inlets_mL_s, strict=True))
+    step_s = 0.2 * setup.cell_size_mm * M_PER_MM / float(speed_m_s)
     return {
         "system/controlDict": control.control(case, setup, step_s, walls=walls, has_neck=case.ostium is not None),
         "system/fvSchemes": control.schemes(is_steady=is_steady),

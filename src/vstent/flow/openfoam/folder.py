@@ -101,9 +101,9 @@ def flow_mL_s(folder: Path, patch: str, time: str) -> float:
     return float(rows[np.abs(rows[:, 0] - float(time)).argmin(), 1]) / M3_PER_ML
 
 
-def scale_inflow(folder: Path, factor: float) -> bool:
-    """Multiply the mean speed that the inlet is held to; False where the inlet is held to its flow anyway."""
-    path = folder / "constant" / "boundaryData" / "inlet" / "0" / "U"
+def scale_inflow(folder: Path, inlet: str, factor: float) -> bool:
+    """Multiply the mean speed that an inlet is held to; False where it is held to its flow anyway."""
+    path = folder / "constant" / "boundaryData" / inlet / "0" / "U"
     if not path.exists():
         return False
     lines = path.read_text().splitlines()

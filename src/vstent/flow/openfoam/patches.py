@@ -18,7 +18,7 @@ class Patch:
     """A named part of a closed surface."""
 
     name: str
-    """``wall``, ``sac``, ``inlet``, ``outlet_1``, ..."""
+    """``wall``, ``sac``, or the role of an opening: ``inlet``, ``outlet_1``, ..."""
     surface: Surface
     """The whole boundary; shared by all patches."""
     face_id: Ints
