@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import app_case
+from vstent import phantoms
 from vstent.io.writers import write_stl
 from vstent.study import CACHE
 
@@ -120,6 +121,29 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         assert place_of(page, "distal") == pytest.approx(after, abs=0.11)
         page.keyboard.press("Control+z")
         page.wait_for_function("() => document.querySelector('button[aria-label=Undo]').disabled")
+
+
+def test_a_tick_lets_blood_enter_by_an_opening_as_well(artery, tmp_path):
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        drop(page, artery)
+        page.wait_for_selector(".step.done:nth-child(3)")
+        step(page, "Vessel")
+        boxes, rows = page.locator(".brings input"), page.locator(".opening-row")
+        assert [boxes.nth(k).is_checked() for k in range(3)] == [True, False, False]
+        assert boxes.nth(0).is_disabled()
+        boxes.nth(2).check()
+        page.get_by_role("button", name="Find the vessel again").click()
+        page.get_by_role("heading", name="Sac and parent").wait_for()
+        step(page, "Vessel")
+        playwright.expect(rows.nth(1)).to_contain_text("Inlet 2", timeout=120 * SECOND)
+        assert [boxes.nth(k).is_checked() for k in range(3)] == [True, True, False]
+        playwright.expect(page.locator(".given")).to_contain_text("; ")
+        view = client.get(f"/api/cases/{client.get('/api/cases').json()['cases'][0]['id']}").json()
+        ends_mm = [phantoms.demo_phantom().ends[k][0] for k in (0, 2)]
+        np.testing.assert_allclose(view["choices"]["inlet_mm"], ends_mm, atol=0.05)
+        boxes.nth(1).uncheck()
+        playwright.expect(page.locator(".given")).not_to_contain_text("; ")
+        assert boxes.nth(1).is_checked() is False
 
 
 CENTER_MM = np.array([10.0, -20.0, 30.0])

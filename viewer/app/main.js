@@ -6,7 +6,7 @@ import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js
 import { Deploying } from "./deploy.js";
 import { Neck } from "./neck.js";
 import { changeSheet, neckWords, placeWords, plainSheet, sureSheet } from "./numbers.js";
-import { panels } from "./panels.js";
+import { panels, placeOf, spokenRole } from "./panels.js";
 import { Picture } from "./picture.js";
 import { rankingTable } from "./ranking.js";
 import { Slices } from "./slices.js";
@@ -379,15 +379,14 @@ class Page {
 
   openingMarks() {
     return this.anatomy.openings.map(({ role, center_mm, area_mm2, diameter_mm, colour }) => {
-      const title = role === "inlet" ? "Inlet" : role.replace("outlet_", "Outlet ");
       const dot = make("i");
       dot.style.background = `rgb(${colour})`;
-      const element = make("button", { type: "button", className: "opening", title: role === "inlet" ? "Blood enters here" : "Click to let blood enter here" }, [
+      const element = make("button", { type: "button", className: "opening", title: role.startsWith("inlet") ? "Blood enters here" : "Click to let blood enter here" }, [
         dot,
-        make("b", {}, [title]),
+        make("b", {}, [spokenRole(role)]),
         make("span", {}, [`${area_mm2.toFixed(1)} mm² · ⌀ ${diameter_mm.toFixed(1)} mm`]),
       ]);
-      element.addEventListener("click", () => role !== "inlet" && this.choose({ inlet_mm: center_mm.map((x) => Number(x.toFixed(2))) }));
+      element.addEventListener("click", () => role !== "inlet" && this.choose({ inlet_mm: placeOf({ center_mm }) }));
       return { element, isLabel: true, point: () => center_mm };
     });
   }

@@ -2,6 +2,12 @@
 import { make } from "../src/dom.js";
 import { placeWords } from "./numbers.js";
 
+/** Where an opening lies, as it is told to a study. */
+export const placeOf = ({ center_mm }) => center_mm.map((x) => Number(x.toFixed(2)));
+
+/** What an opening is called: Inlet, Inlet 2, Outlet 1. */
+export const spokenRole = (role) => role[0].toUpperCase() + role.slice(1).replace("_", " ");
+
 const title = (words, text) => [make("h2", {}, [words]), make("p", { className: "lead" }, [text])];
 
 function failure(page) {
@@ -65,12 +71,18 @@ function notes(page, count) {
   return [count ? list(all.slice(0, count)) : details];
 }
 
+/** The points that are given under a key: none, one, or several. */
+function points(page, key) {
+  const given = page.view.choices[key] ?? [];
+  return typeof given[0] === "number" ? [given] : given;
+}
+
 function point(page, key, label) {
-  const value = page.view.choices[key];
-  if (!value) return [];
+  const places = points(page, key).map((place) => place.map((x) => x.toFixed(1)).join(", "));
+  if (!places.length) return [];
   return [
     make("div", { className: "given" }, [
-      make("span", {}, [`${label}: ${value.map((x) => x.toFixed(1)).join(", ")} mm`]),
+      make("span", {}, [`${label}: ${places.join("; ")} mm`]),
       make("button", { type: "button", className: "link", onClick: () => page.choose({ [key]: null }) }, ["Propose again"]),
     ]),
   ];
@@ -98,7 +110,7 @@ export const panels = {
   },
 
   vessel(page) {
-    const parts = [...title("Vessel", "Blood enters through the inlet: click another opening to change it. Drag the handles on the artery to keep less of it.")];
+    const parts = [...title("Vessel", "Blood enters through the inlet: click another opening to change it, tick those that bring blood as well. Drag the handles on the artery to keep less of it.")];
     if (page.anatomy) parts.push(openings(page));
     if (page.anatomy?.neck.length) parts.push(...kept(page));
     parts.push(...point(page, "inlet_mm", "Inlet near"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
@@ -234,19 +246,38 @@ function threshold(page) {
 }
 
 function openings(page) {
-  const rows = page.anatomy.openings.map(({ role, area_mm2, diameter_mm, colour, center_mm }) => {
+  const entered = inlets(page);
+  const rows = page.anatomy.openings.flatMap((opening) => {
+    const { role, area_mm2, diameter_mm, colour } = opening;
     const dot = make("i", { className: "dot" });
     dot.style.background = `rgb(${colour})`;
-    const isInlet = role === "inlet";
-    return make("button", { type: "button", className: `opening-row ${isInlet ? "inlet" : ""}`, onClick: () => !isInlet && page.choose({ inlet_mm: center_mm.map((x) => Number(x.toFixed(2))) }) }, [
+    const isFirst = opening === entered[0];
+    const box = make("input", { type: "checkbox", checked: entered.includes(opening), title: `${spokenRole(role)}: blood enters here` });
+    box.disabled = isFirst;
+    box.dataset.key = `brings-${role}`;
+    box.addEventListener("change", () => {
+      const others = entered.filter((one) => one !== opening);
+      page.choose({ inlet_mm: (box.checked ? [...others, opening] : others).map(placeOf) });
+    });
+    const row = make("button", { type: "button", className: `opening-row ${isFirst ? "inlet" : ""}`, onClick: () => !isFirst && page.choose({ inlet_mm: placeOf(opening) }) }, [
       dot,
-      make("span", {}, [isInlet ? "Inlet" : role.replace("outlet_", "Outlet ")]),
+      make("span", {}, [spokenRole(role)]),
       make("b", {}, [`${area_mm2.toFixed(1)} mm²`]),
       make("small", {}, [`⌀ ${diameter_mm.toFixed(1)} mm`]),
     ]);
+    return [row, make("label", { className: "brings" }, [box])];
   });
   return make("div", { className: "openings" }, rows);
 }
+
+/** The openings through which blood is to enter, first that of the parent artery: as they are given, or were found. */
+function inlets(page) {
+  const { openings } = page.anatomy;
+  const given = points(page, "inlet_mm").map((point) => nearest(openings, point));
+  return given.length ? given : openings.filter(({ role }) => role.startsWith("inlet"));
+}
+
+const nearest = (openings, point) => openings.map((one) => [Math.hypot(...one.center_mm.map((x, i) => x - point[i])), one]).sort(([a], [b]) => a - b)[0]?.[1];
 
 /** How much of the vessel is kept beside the sac. */
 function kept(page) {
@@ -261,18 +292,17 @@ function drawn(page) {
   return [make("div", { className: "given" }, [make("span", {}, ["The neck was drawn by hand."]), make("button", { type: "button", className: "link", onClick: () => page.choose({ neck_mm: null }) }, ["Propose again"])])];
 }
 
-const outlets = (page) => page.anatomy.openings.filter(({ role }) => role !== "inlet").map(({ role, diameter_mm }) => [role, `${role.replace("outlet_", "outlet ")} (⌀ ${diameter_mm.toFixed(1)} mm)`]);
+const farEnds = (page) => page.anatomy.openings.filter(({ role }) => role !== "inlet");
+const outlets = (page) => farEnds(page).map(({ role, diameter_mm }) => [role, `${role.replace("_", " ")} (⌀ ${diameter_mm.toFixed(1)} mm)`]);
 
 function center(page, role) {
   const opening = page.anatomy.openings.find((one) => one.role === role);
-  return opening ? opening.center_mm.map((x) => Number(x.toFixed(2))) : null;
+  return opening ? placeOf(opening) : null;
 }
 
 function near(page) {
   const given = page.view.choices.outlet_mm;
-  if (!given) return "";
-  const distance = ({ center_mm }) => Math.hypot(...center_mm.map((x, i) => x - given[i]));
-  return page.anatomy.openings.filter(({ role }) => role !== "inlet").sort((a, b) => distance(a) - distance(b))[0]?.role || "";
+  return (given && nearest(farEnds(page), given)?.role) || "";
 }
 
 function deviceBox(page, design, chosen) {
