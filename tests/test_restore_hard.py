@@ -10,6 +10,7 @@ from vstent import phantoms
 from vstent.errors import InputError
 from vstent.repair import repair
 from vstent.restore import restore
+from vstent.restore.axis import fit_axis
 from vstent.restore.bulges import find_bulges
 from vstent.restore.tubes import tubes_of
 from vstent.trace import trace
@@ -174,6 +175,27 @@ def test_a_sac_is_not_trimmed_off_with_an_artery_that_it_touches(sac_that_touche
     assert trimmed.inlet.diameter_mm < 4.2
 
 
+@pytest.mark.parametrize(("half_angle_rad", "sac_mm"), [(0.6, 16.5), (0.9, 15.0)])
+def test_a_sac_in_the_crotch_of_a_fork_is_the_same_from_any_end(half_angle_rad: float, sac_mm: float) -> None:
+    fork = phantoms.bifurcation(radius_mm=1.65, daughter_radius_mm=1.3, half_angle_rad=half_angle_rad)
+    phantom = replace(fork, sac=phantoms.Sac(np.array([0.0, 0.4, sac_mm]), np.array([0.0, 0.0, 1.0]), 2.6, 2.6))
+    wall = Vessel(phantoms.phantom_surface(phantom, edge_mm=0.3))
+    trunk, *arms = (restore(trace(wall, inlet_mm=end[0])).aneurysms[0] for end in phantom.ends)
+    for sac in arms:  # 1.3 times as large from an arm, or none, where the line to the other arm cuts through it
+        np.testing.assert_allclose(sac.sac.volume_mm3, trunk.sac.volume_mm3, rtol=0.01)
+        np.testing.assert_allclose(sac.neck.area_mm2, trunk.neck.area_mm2, rtol=0.1)
+
+
+@pytest.mark.parametrize(("trunk_mm", "end"), [(1.65, 0), (1.2, 2)])
+def test_the_parent_artery_turns_back_into_an_arm_only_where_that_is_much_wider(trunk_mm: float, end: int) -> None:
+    phantom = phantoms.bifurcation(radius_mm=trunk_mm, daughter_radius_mm=1.75, half_angle_rad=0.5)
+    is_arm = phantom.parent.points_mm[:, 2] > 11.0
+    radius_mm = np.where(is_arm, 1.3, phantom.parent.inscribed_radius_mm)
+    phantom = replace(phantom, parent=replace(phantom.parent, inscribed_radius_mm=radius_mm))
+    vessel = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.3)), inlet_mm=phantom.ends[1][0])
+    np.testing.assert_allclose(restore(vessel).axis.points_mm[-1], phantom.ends[end][0], atol=0.2)
+
+
 def with_a_dome(phantom: phantoms.Phantom, *, beyond_mm: float, radius_mm: float) -> phantoms.Phantom:
     """A straight artery along z and a small sphere on the middle of its wall, its middle so far beyond it."""
     artery = phantom.parent
@@ -196,6 +218,14 @@ def test_a_blister_is_named_where_no_sac_is_found_and_is_found_where_it_is_named
     asked = restore(vessel, at_mm=at_mm)
     assert asked.aneurysms[0].sac.volume_mm3 == pytest.approx(phantom.sac_volume_mm3, rel=0.15)
     assert not any("too flat" in note for note in asked.notes)
+
+
+def test_a_flat_bulge_is_looked_into_on_the_landing_surface_at_hand(monkeypatch) -> None:
+    vessel = traced(with_a_dome(phantoms.tube(length_mm=30.0), beyond_mm=0.2, radius_mm=1.05))
+    restored, fit = [], fit_axis
+    monkeypatch.setattr(import_module("vstent.restore"), "fit_axis", lambda *of: restored.append(of) or fit(*of))
+    assert any("too flat" in note for note in restore(vessel).notes)
+    assert len(restored) == 1
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,13 @@ from shapes import sphere
 from vstent import phantoms
 from vstent.errors import InputError, VesselError
 from vstent.kernels import curves, triangles
+from vstent.kernels.medial import Medial, cost_graph, path_to, shortest_paths
 from vstent.measure import morphology
 from vstent.openings import open_ends, opening_at
 from vstent.repair import repair
 from vstent.restore import restore
 from vstent.segment import segment
+from vstent.short_cuts import along_arms
 from vstent.surface import Surface
 from vstent.trace import trace
 from vstent.trim import trim
@@ -91,6 +93,51 @@ def test_rigid_motion_moves_the_centerline(torus: Vessel) -> None:
     )
     there = torus.centerlines[0].points_mm @ turn.T + shift
     assert curves.project(there, moved.centerlines[0].points_mm)[1].max() < 0.02
+
+
+@pytest.mark.parametrize("crotch", ["a sac", "joined walls"])
+def test_a_fork_has_the_same_lines_from_any_of_its_ends(crotch: str) -> None:
+    phantom = phantoms.bifurcation(
+        radius_mm=1.65, daughter_radius_mm=1.3, half_angle_rad=0.6 if crotch == "a sac" else 0.35
+    )
+    if crotch == "a sac":
+        phantom = replace(phantom, sac=phantoms.Sac(np.array([0.0, 0.4, 16.5]), np.array([0.0, 0.0, 1.0]), 2.6, 2.6))
+    wall = Vessel(phantoms.phantom_surface(phantom, edge_mm=0.3))
+    trunk, *arms = (trace(wall, inlet_mm=end[0]).centerlines for end in phantom.ends)
+    for line in (line for lines in arms for line in lines):
+        off_mm = np.min([curves.project(other.points_mm, line.points_mm)[1] for other in trunk], axis=0)
+        assert off_mm.max() < 0.05  # 2.8 and 0.9 mm through the crotch
+
+
+def ring_of_arteries(*, is_filled: bool) -> Medial:
+    """Spheres along the sides of a triangle, one of them thin, and along an arm at each corner; or with its middle."""
+    sides = np.array([[np.cos(turn), np.sin(turn), 0.0] for turn in np.pi * np.array([0.5, 7 / 6, 11 / 6])])
+    share = np.linspace(0.0, 1.0, 80, endpoint=False)[:, None]
+    corners = 5.0 * sides
+    limbs = [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    arms = [corner * (1.0 + share) for corner in corners]
+    radius = np.full(480, 1.3)
+    radius[161:240] = 0.8
+    loop, along = np.arange(240), np.arange(240).reshape(3, 80) + 240
+    edges = [np.stack([loop, np.roll(loop, -1)], axis=1)]
+    edges += [np.stack([np.append(80 * k, row[1:-1]), row[1:]], axis=1) for k, row in enumerate(along)]
+    middle = np.random.default_rng(0).uniform(-4.0, 4.0, (900 * is_filled, 3)) * [1.0, 1.0, 0.0]
+    points = np.concatenate([*limbs, *arms, middle])
+    return Medial(points, np.append(radius, np.ones(len(middle))), np.concatenate(edges).astype(np.int32))
+
+
+@pytest.mark.parametrize("is_filled", [True, False])
+def test_a_path_leaves_a_thin_limb_for_two_wide_ones_in_a_fork_and_not_in_a_ring(is_filled: bool) -> None:
+    graph = ring_of_arteries(is_filled=is_filled)
+    cap_mm = np.full(len(graph.radius), np.inf)
+    inlet, *outlets = 319, 399, 479
+    _, before = shortest_paths(cost_graph(graph, cap_mm), inlet)
+    wide, thin = paths = [path_to(before, outlet) for outlet in outlets]
+    assert 200 in thin
+    led = along_arms(graph, paths, cap_mm)
+    np.testing.assert_array_equal(led[0], wide)
+    assert (80 in led[1]) == is_filled
+    assert (200 in led[1]) != is_filled
 
 
 def test_flat_caps_are_taken_off() -> None:

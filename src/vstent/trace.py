@@ -19,7 +19,7 @@ from vstent.errors import VesselError
 from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
 from vstent.openings import guessed, open_ends, with_inlets
-from vstent.short_cuts import around_sacs
+from vstent.short_cuts import along_arms, around_sacs
 from vstent.spheres import centered
 from vstent.surface import Surface
 from vstent.vessel import Centerline, Opening, Vessel
@@ -74,7 +74,8 @@ def _paths(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.Media
     """The vessel with the openings that can be reached, the medial graph, and the path to each of them."""
     vessel, graph = _reachable(vessel, _graph(vessel, spheres))
     paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
-    paths = _shortest(vessel, graph, _radius_cap(graph, paths))
+    cap_mm = _radius_cap(graph, paths)
+    paths = along_arms(graph, _shortest(vessel, graph, cap_mm), cap_mm)
     found = [around_sacs(graph, path, SPEED_CAP) for path in paths]
     notes = dict.fromkeys([*vessel.notes, *chain(*(told for _, told in found))])
     return replace(vessel, notes=tuple(notes)), graph, [path for path, _ in found]

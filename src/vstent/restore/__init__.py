@@ -7,6 +7,7 @@ is closed by the smoothest surface through the wall around them (`landing`). Wha
 and holds the sac's dome is the sac (`sac`).
 """
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -21,12 +22,13 @@ from vstent.restore.notes import flat_told, told
 from vstent.restore.path import parent_path
 from vstent.restore.sac import cut_sac, drawn_sac, is_in_one
 from vstent.restore.tubes import tubes_of
+from vstent.surface import Surface
 from vstent.vessel import Anatomy, Aneurysm, Centerline, Vessel
 
 ON_FOOT: Final = 1.5
 """A foot, which rises to half a radius above the nearest artery, is an artery's own up to this many of its radii."""
 MOST_FLAT: Final = 3
-"""No more flat bulges than this are looked into: each takes as long as restoring the artery does."""
+"""No more flat bulges than this are looked into: one on a branch takes as long as restoring the artery does."""
 
 __all__ = ["restore"]
 
@@ -59,13 +61,11 @@ def restore(
         x, y, z = np.asarray(at_mm, dtype=float)
         raise InputError(f"no sac stands out of the artery near {x:.1f}, {y:.1f}, {z:.1f} mm: give a point in its dome")
     path = parent_path(vessel, bulges, outlet_mm)
-    mouths = [Mouth(_foot_on(vessel.centerlines[path], bulge), bulge.inward) for bulge in bulges]
-    tube = fit_axis(vessel.lumen, vessel.centerlines[path], mouths)
-    landing = close_landing(vessel.lumen, tube, drawn.artery if drawn else None)
-    side_lines = [line for k, line in enumerate(vessel.centerlines) if k != path]
+    landing = _landing(vessel, path, bulges, drawn.artery if drawn else None)
+    side_lines = _all_but(path, vessel.centerlines)
     sacs = [drawn_sac(vessel, landing, side_lines, drawn)] if drawn else _sacs(vessel, landing, side_lines, bulges)
     aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
-    flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm)
+    flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm, path, landing)
     return Anatomy(
         vessel,
         landing.axis,
@@ -77,11 +77,30 @@ def restore(
     )
 
 
-def _flat_sac(vessel: Vessel, outlet_mm: Floats | None) -> Bulge | None:
-    """The highest bulge too flat to be taken for a sac of which one is cut off where it is asked for: a blister."""
+def _landing(vessel: Vessel, path: int, bulges: Sequence[Bulge], own: Surface | None = None) -> Landing:
+    """The landing surface along a centerline, with the necks of bulges closed; `own`: see `close_landing`."""
+    line = vessel.centerlines[path]
+    mouths = [Mouth(_foot_on(line, bulge), bulge.inward) for bulge in bulges]
+    return close_landing(vessel.lumen, fit_axis(vessel.lumen, line, mouths), own)
+
+
+def _flat_sac(vessel: Vessel, outlet_mm: Floats | None, path: int, landing: Landing) -> Bulge | None:
+    """The highest bulge too flat to be taken for a sac of which one is cut off where it is asked for: a blister.
+
+    It hardly bears on the fit of the artery, so that the landing surface along a path holds for all bulges on it.
+    """
     flat = flat_bulges(vessel.lumen, tubes_of(vessel.centerlines))[:MOST_FLAT]
+    ways = [parent_path(vessel, [bulge], outlet_mm) for bulge in flat]
+    landings = {way: landing if way == path else _landing(vessel, way, ()) for way in set(ways)}
     # Forks and bends bulge as high as a blister does: they turn out to be the artery once it is restored.
-    return next((b for b in flat if restore(vessel, at_mm=b.dome_mm, outlet_mm=outlet_mm).aneurysms), None)
+    for bulge, way in zip(flat, ways, strict=True):
+        if cut_sac(vessel, landings[way], _all_but(way, vessel.centerlines), bulge):
+            return bulge
+    return None
+
+
+def _all_but(path: int, lines: Sequence[Centerline]) -> list[Centerline]:
+    return [line for k, line in enumerate(lines) if k != path]
 
 
 def _sacs(vessel: Vessel, landing: Landing, side_lines: list[Centerline], bulges: list[Bulge]) -> list[Aneurysm]:

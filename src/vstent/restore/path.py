@@ -1,4 +1,4 @@
-"""The centerline that the parent artery follows: past the sac to an outlet, and at every fork the wider way."""
+"""The centerline that the parent artery follows: past the sac to an outlet, at every fork the wider way on."""
 
 from functools import reduce
 from typing import Final
@@ -16,6 +16,12 @@ REACH_MM: Final = 10.0
 """At a fork, the parent artery goes on where the vessel is wider over this length."""
 IN_SAC: Final = 1.2
 """A sphere reaches into a sac whose wall is within this many of its radii."""
+BACK_RAD: Final = np.radians(100.0)
+"""A way that turns by more than this at a fork turns back: where two arteries join, it is the other one..."""
+BACK: Final = 0.8
+"""... which is no wider than the one that both feed (Murray 1926), or hardly: it counts as this much of its width."""
+SHARED: Final = 2.0
+"""Two lines are one up to this many radii before they part."""
 PASSING: Final = 2.0
 """A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
 
@@ -57,7 +63,10 @@ def _is_wider(one: Centerline, other: Centerline, one_is_off: Bools, other_is_of
 
 
 def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> float:
-    """Median radius of a centerline over `REACH_MM` beyond its fork from another; 0 where it parts in the sac alone."""
+    """Median radius of a centerline over `REACH_MM` beyond its fork from another, less where it turns back there.
+
+    0 where it parts in the sac alone.
+    """
     distance = curves.project(other.points_mm, line.points_mm)[1]
     apart = np.flatnonzero((distance > line.inscribed_radius_mm) & is_off)
     if not len(apart):
@@ -66,4 +75,16 @@ def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> fl
     beyond = (line.abscissa_mm >= fork_mm) & (line.abscissa_mm <= fork_mm + REACH_MM)
     # A way that is mostly in the sac is a branch of the sac: the sac's own width is none of its.
     own = beyond & is_off if (beyond & is_off).sum() < 0.5 * beyond.sum() else beyond
-    return float(np.median(line.inscribed_radius_mm[own]))
+    share = BACK if _turns_back(line, float(fork_mm)) else 1.0
+    return share * float(np.median(line.inscribed_radius_mm[own]))
+
+
+def _turns_back(line: Centerline, fork_mm: float) -> bool:
+    """Tell whether a centerline that parts from another at an abscissa turns back: over `REACH_MM` on both sides of it.
+
+    Lines part where the one leaves the other's sphere, some way behind the fork.
+    """
+    shared_mm = fork_mm - SHARED * float(np.interp(fork_mm, line.abscissa_mm, line.inscribed_radius_mm))
+    places_mm = np.array([shared_mm - REACH_MM, shared_mm, fork_mm, fork_mm + REACH_MM])
+    before, _, beyond = np.diff(line.at(np.clip(places_mm, 0.0, line.length_mm)), axis=0)
+    return bool(before @ beyond < np.cos(BACK_RAD) * np.linalg.norm(before) * np.linalg.norm(beyond))
