@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from told import place_in
 from vstent import phantoms
 from vstent.kernels import curves
 from vstent.phantoms import Phantom, Scanner
@@ -39,7 +40,7 @@ def test_a_loop_that_touches_itself_is_followed_all_the_way() -> None:
     assert line.length_mm == pytest.approx(phantom.parent.length_mm, rel=0.01)
     assert curves.project(phantom.parent.points_mm, line.points_mm)[1].mean() < 0.02
     assert "touch at" in vessel.notes[-1]
-    place_mm = np.array([float(x) for x in vessel.notes[-1].split("touch at ")[1].split(" mm")[0].split(", ")])
+    place_mm = place_in(vessel.notes[-1])
     assert np.linalg.norm(place_mm) < 0.5  # the axes cross above the origin
     assert len(vessel.lumen.boundary_loops) == 2
 

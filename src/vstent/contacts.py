@@ -18,6 +18,7 @@ from vstent.kernels.medial import Medial
 from vstent.openings import still_open
 from vstent.surface import Surface
 from vstent.vessel import Vessel
+from vstent.words import place
 
 STEP_MM: Final = 0.05
 """Paths are looked at in steps of this length."""
@@ -194,6 +195,8 @@ def _kept(vertices: Floats, faces: Ints, inlet_mm: Floats | None) -> Bools:
 
 
 def _note(contact: Contact, lost: float) -> str:
-    place = ", ".join(f"{x:.1f}" for x in contact.center_mm)
     left = f"; what hung on it alone ({lost:.0%} of the wall) was left out" if lost > 0 else ""
-    return f"Two arteries touch at {place} mm through a window {2 * contact.radius_mm:.2f} mm wide: parted there{left}."
+    return (
+        f"Two arteries touch at {place(contact.center_mm)} through a window "
+        f"{2 * contact.radius_mm:.2f} mm wide: parted there{left}."
+    )

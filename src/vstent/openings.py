@@ -16,7 +16,7 @@ from vstent.kernels import curves, medial, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.surface import Surface
 from vstent.vessel import Opening, Vessel, roles
-from vstent.words import counted
+from vstent.words import counted, place
 
 CAP_ANGLE_RAD: Final = np.radians(6.0)
 """Neighbouring faces of a flat cap differ by less than this."""
@@ -66,11 +66,10 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
         notes.append(f"{counted(n_arms, 'blind arm')} cut open square to the axis.")
     loops = lumen.boundary_loops
     if len(loops) < 2:
-        x, y, z = lumen.vertices_mm.mean(axis=0)
         raise VesselError(
-            f"the surface about ({x:.1f}, {y:.1f}, {z:.1f}) mm has {counted(len(loops), 'opening')}, but blood needs a "
-            "way in and a way out: cut the vessel open at its ends, or give a longer piece of it; in a scan it may be "
-            "bone: give --at with a point in the artery, or crop the scan where the two touch"
+            f"the surface about {place(lumen.vertices_mm.mean(axis=0))} has {counted(len(loops), 'opening')}, but "
+            "blood needs a way in and a way out: cut the vessel open at its ends, or give a longer piece of it; in a "
+            "scan it may be bone: give --at with a point in the artery, or crop the scan where the two touch"
         )
     found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
     widest = max(found, key=lambda opening: opening.area_mm2)
@@ -88,9 +87,8 @@ def opening_at(vessel: Vessel, point_mm: Floats) -> Opening:
     """
     nearest = min(vessel.openings, key=lambda opening: _away_mm(opening, point_mm))
     if _is_far(nearest, point_mm) and vessel.lumen.closed.signed_distance(point_mm[None])[0] > 0:
-        x, y, z = point_mm
         raise InputError(
-            f"no opening of the vessel is near ({x:.1f}, {y:.1f}, {z:.1f}) mm: the nearest, {_place(nearest)}, is "
+            f"no opening of the vessel is near {place(point_mm)}: the nearest, {nearest.described}, is "
             f"{_away_mm(nearest, point_mm):.0f} mm away; give a point beside an opening, in LPS mm"
         )
     return nearest
@@ -109,10 +107,10 @@ def with_inlets(vessel: Vessel, inlets_mm: Floats) -> Vessel:
     if len(inlets) == len(vessel.openings):
         raise InputError(
             f"blood enters through all {len(inlets)} openings of the vessel and leaves through none: leave out the "
-            f"inlet {_place(inlets[-1])}, or another one"
+            f"inlet {inlets[-1].described}, or another one"
         )
     notes = (
-        f"The inlet, {_place(inlet)}, is {_away_mm(inlet, inlet_mm):.0f} mm from the point given."
+        f"The inlet, {inlet.described}, is {_away_mm(inlet, inlet_mm):.0f} mm from the point given."
         for inlet, inlet_mm in zip(inlets, inlets_mm, strict=True)
         if _is_far(inlet, inlet_mm)
     )
@@ -125,10 +123,9 @@ def _refuse_twice(inlets: Sequence[Opening], inlets_mm: Floats) -> None:
     for k, inlet in enumerate(inlets):
         first = inlets.index(inlet)
         if first < k:
-            places = (", ".join(f"{x:.1f}" for x in inlets_mm[one]) for one in (first, k))
             raise InputError(
-                f"two inlets are the same opening, {_place(inlet)}, the nearest to both ({') and ('.join(places)}) mm: "
-                "give one point beside each opening that brings blood"
+                f"two inlets are the same opening, {inlet.described}, the nearest to both {place(inlets_mm[first])} "
+                f"and {place(inlets_mm[k])}: give one point beside each opening that brings blood"
             )
 
 
@@ -141,8 +138,8 @@ def guessed(vessel: Vessel) -> Vessel:
     if widest.diameter_mm <= NEARLY * vessel.inlet.diameter_mm:
         return vessel
     note = (
-        f"The inlet, {_place(vessel.inlet)}, is a guess: the opening {_place(widest)} is nearly as wide; give --inlet "
-        "if blood comes from there, and again for each further opening that brings blood."
+        f"The inlet, {vessel.inlet.described}, is a guess: the opening {widest.described} is nearly as wide; give "
+        "--inlet if blood comes from there, and again for each further opening that brings blood."
     )
     return replace(vessel, notes=(*vessel.notes, note))
 
@@ -153,11 +150,6 @@ def _away_mm(opening: Opening, point_mm: Floats) -> float:
 
 def _is_far(opening: Opening, point_mm: Floats) -> bool:
     return _away_mm(opening, point_mm) > max(FARTHEST_MM, FARTHEST_DIAMETERS * opening.diameter_mm)
-
-
-def _place(opening: Opening) -> str:
-    x, y, z = opening.center_mm
-    return f"{opening.diameter_mm:.1f} mm wide at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
 
 
 def still_open(vessel: Vessel) -> Vessel | None:

@@ -10,7 +10,7 @@ from vstent.errors import VesselError
 from vstent.kernels import topology, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.surface import Surface
-from vstent.words import counted
+from vstent.words import counted, place
 
 WELD_OF_EXTENT: Final = 1e-6
 """Vertices closer than this fraction of the bounding box's diagonal are one."""
@@ -147,7 +147,7 @@ def _one_piece(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
     order = np.argsort(-area)
     notable = [k for k in order if k == order[0] or area[k] > NOTABLE_OF_AREA * area.sum()]
     kept = notable[0] if at_mm is None else min(notable, key=lambda k: _gap_mm(mesh, label == k, at_mm))
-    left = [f"{area[k]:.1f} mm2 about {_middle(mesh, label == k)} mm" for k in notable if k != kept]
+    left = [f"{area[k]:.1f} mm2 about {_middle(mesh, label == k)}" for k in notable if k != kept]
     note = f"{counted(len(area) - 1, 'loose piece')} dropped ({area[kept] / area.sum():.1%} of the area kept)"
     note += f", the notable of {', '.join(left)}: give --at to keep another one." if left else "."
     return mesh.after(mesh.vertices, mesh.faces[label == kept], note)
@@ -159,7 +159,7 @@ def _gap_mm(mesh: _Mesh, member: Bools, at_mm: Floats) -> float:
 
 
 def _middle(mesh: _Mesh, member: Bools) -> str:
-    return ", ".join(f"{x:.1f}" for x in mesh.vertices[np.unique(mesh.faces[member])].mean(axis=0))
+    return place(mesh.vertices[np.unique(mesh.faces[member])].mean(axis=0))
 
 
 def _outward(mesh: _Mesh) -> _Mesh:
@@ -195,10 +195,9 @@ def _hole_note(holes_mm: list[Floats]) -> str:
 
 
 def _sideways_note(points: Floats) -> str:
-    x, y, z = triangles.polygon_centroid(points)
     return (
-        f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm looks sideways "
-        "out of the wall: fill it in the surface if no artery leaves there."
+        f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at {place(triangles.polygon_centroid(points))} "
+        "looks sideways out of the wall: fill it in the surface if no artery leaves there."
     )
 
 

@@ -16,6 +16,7 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.isosurface import isosurface
 from vstent.surface import Surface
 from vstent.vessel import Vessel
+from vstent.words import place
 
 FEWEST_VOXELS: Final = 300
 """A lumen of fewer voxels is noise."""
@@ -142,9 +143,9 @@ def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tu
 def _refuse_wide(lumen: Lumen, profile: "Profile") -> None:
     if 2 * profile.radius_mm <= GIANT_DIAMETER_MM:
         return
-    x, y, z = lumen.affine_mm[:3] @ [*(0.5 * (np.array(lumen.field.shape) - 1)), 1.0]
+    middle_mm = lumen.affine_mm[:3] @ [*(0.5 * (np.array(lumen.field.shape) - 1)), 1.0]
     raise VesselError(
-        f"What is brighter than threshold {lumen.threshold:.4g} about ({x:.1f}, {y:.1f}, {z:.1f}) mm is "
+        f"What is brighter than threshold {lumen.threshold:.4g} about {place(middle_mm)} is "
         f"{2 * profile.radius_mm:.0f} mm wide, and no artery is wider than {GIANT_DIAMETER_MM:g} mm: it is a head, "
         "bone or the field of view; give --threshold, or --at with a point in the artery, or crop the scan where the "
         "two touch."

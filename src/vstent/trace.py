@@ -143,11 +143,10 @@ def _shortest(vessel: Vessel, graph: medial.Medial, radius_cap: Floats) -> list[
 
 
 def _unreachable(inlet: Opening, opening: Opening) -> str:
-    x, y, z = opening.center_mm
     return (
-        f"{opening.role} (diameter {opening.diameter_mm:.1f} mm at {x:.1f}, {y:.1f}, {z:.1f} mm) is not connected to "
-        f"the inlet (diameter {inlet.diameter_mm:.1f} mm): the lumen is interrupted between them; lower the threshold, "
-        "or cut that part away"
+        f"{opening.role}, {opening.described}, is not connected to the inlet (diameter "
+        f"{inlet.diameter_mm:.1f} mm): the lumen is interrupted between them; lower the threshold, or cut that part "
+        "away"
     )
 
 

@@ -20,6 +20,7 @@ from vstent.restore.tubes import tubes_of
 from vstent.surface import Surface
 from vstent.trace import parent_radius_mm, trace
 from vstent.vessel import Centerline, Vessel, murray_shares
+from vstent.words import place
 
 UPSTREAM_MM: Final = 35.0
 """Length of artery kept before the sac's middle: half of the longest device, five diameters for the flow to develop."""
@@ -184,8 +185,7 @@ def _inlets_of(vessel: Vessel, ends_mm: Floats, lumen: Surface) -> tuple[Floats,
     of_inlets = dict.fromkeys(loop[: len(vessel.inlets)].tolist())
     inlets = [k for k in of_inlets if k == loop[0] or brought[k] > 0]
     told = [
-        f"{opening.role}, {opening.diameter_mm:.1f} mm wide at {', '.join(f'{x:.1f}' for x in opening.center_mm)} mm, "
-        "lies beyond that: "
+        f"{opening.role}, {opening.described}, lies beyond that: "
         f"{'its blood enters by another inlet' if k in inlets else 'through that cut more leaves than enters'}."
         for n, (opening, k) in enumerate(zip(vessel.inlets, loop, strict=False))
         if k in loop[:n] or k not in inlets
@@ -225,8 +225,7 @@ def _trimmed(site: _Site) -> list[str]:
 def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
     """Sentences on the sacs that are not in what is left of the lumen."""
     return [
-        f"Another sac, {bulge.height_mm:.1f} mm high, lies beyond that at "
-        f"{', '.join(f'{x:.1f}' for x in bulge.dome_mm)} mm: give it with --at."
+        f"Another sac, {bulge.height_mm:.1f} mm high, lies beyond that at {place(bulge.dome_mm)}: give it with --at."
         for bulge in bulges
         if lumen.closest(bulge.dome_mm[None])[1][0] > bulge.height_mm / 2
     ]
@@ -258,10 +257,9 @@ def _site(vessel: Vessel, bulge: Bulge, upstream_mm: float | None, downstream_mm
 
 
 def _short(way: _Way, bulge: Bulge) -> str:
-    x, y, z = bulge.foot_mm.mean(axis=0)
     return (
-        f"{way.asked_mm:g} mm of artery {way.side} the middle of the sac at {x:.1f}, {y:.1f}, {z:.1f} mm would be cut "
-        f"through the sac or beside it: its neck reaches {way.neck_mm:.1f} mm from there; give {way.option} "
+        f"{way.asked_mm:g} mm of artery {way.side} the middle of the sac at {place(bulge.foot_mm.mean(axis=0))} would "
+        f"be cut through the sac or beside it: its neck reaches {way.neck_mm:.1f} mm from there; give {way.option} "
         f"{way.least_mm:.1f} or more"
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats, freeze
 from vstent.surface import Surface
+from vstent.words import place
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,11 @@ class Opening:
     def diameter_mm(self) -> float:
         """Diameter of the circle of the same area."""
         return float(2 * np.sqrt(self.area_mm2 / np.pi))
+
+    @property
+    def described(self) -> str:
+        """Width and place in words: ``3.5 mm wide at (1.0, -2.5, 30.2) mm``."""
+        return f"{self.diameter_mm:.1f} mm wide at {place(self.center_mm)}"
 
     @property
     def is_inlet(self) -> bool:

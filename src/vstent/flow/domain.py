@@ -16,6 +16,7 @@ from vstent.kernels.lattice import VELOCITIES
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
 from vstent.vessel import Opening, Vessel
+from vstent.words import place
 
 INLET_EXTENSION = 0.5
 """Length of the straight tube before an inlet, in its diameters: the imposed profile is developed already."""
@@ -258,11 +259,6 @@ def _largest(inside: Bools) -> Bools:
     """Keep the largest connected part."""
     label, _ = ndimage.label(inside)
     return np.asarray(label == 1 + np.bincount(label.ravel())[1:].argmax())
-
-
-def place(point_mm: Floats) -> str:
-    """Say where a point (3,) is."""
-    return "(" + ", ".join(f"{x:.1f}" for x in point_mm) + ") mm"
 
 
 def _connected(

@@ -10,8 +10,6 @@ and holds the sac's dome is the sac (`sac`).
 from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
-
 from vstent.errors import InputError, VesselError
 from vstent.kernels.arrays import Floats
 from vstent.restore.axis import Mouth, fit_axis
@@ -24,6 +22,7 @@ from vstent.restore.sac import cut_sac, drawn_sac, is_in_one
 from vstent.restore.tubes import tubes_of
 from vstent.surface import Surface
 from vstent.vessel import Anatomy, Aneurysm, Centerline, Vessel
+from vstent.words import place
 
 ON_FOOT: Final = 1.5
 """A foot, which rises to half a radius above the nearest artery, is an artery's own up to this many of its radii."""
@@ -58,8 +57,7 @@ def restore(
     drawn = None if neck_mm is None else cut_along(vessel, neck_mm)
     bulges = [drawn.bulge] if drawn else find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
     if at_mm is not None and not bulges:
-        x, y, z = np.asarray(at_mm, dtype=float)
-        raise InputError(f"no sac stands out of the artery near {x:.1f}, {y:.1f}, {z:.1f} mm: give a point in its dome")
+        raise InputError(f"no sac stands out of the artery near {place(at_mm)}: give a point in its dome")
     path = parent_path(vessel, bulges, outlet_mm)
     landing = _landing(vessel, path, bulges, drawn.artery if drawn else None)
     side_lines = _all_but(path, vessel.centerlines)

@@ -11,6 +11,7 @@ from vstent.restore.bulges import FLANK, Bulge, bulge_at
 from vstent.restore.tubes import tubes_of
 from vstent.surface import Surface
 from vstent.vessel import Vessel
+from vstent.words import place
 
 FAR_MM: Final = 1.5
 """A neck that is drawn further than this from the wall is not of this vessel."""
@@ -83,9 +84,8 @@ def _on_wall(lumen: Surface, curve_mm: Floats) -> Floats:
     points, distance, _ = lumen.closest(curve_mm)
     worst = int(distance.argmax())
     if distance[worst] > FAR_MM:
-        x, y, z = curve_mm[worst]
         raise InputError(
-            f"the neck lies {distance[worst]:.1f} mm off the wall at {x:.1f}, {y:.1f}, {z:.1f} mm: "
+            f"the neck lies {distance[worst]:.1f} mm off the wall at {place(curve_mm[worst])}: "
             f"draw it no more than {FAR_MM:g} mm off"
         )
     return points

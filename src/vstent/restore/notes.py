@@ -10,7 +10,7 @@ from vstent.restore.path import PASSING, is_off_sacs, reach_of
 from vstent.restore.sac import is_in_one
 from vstent.trace import parent_radius_mm
 from vstent.vessel import Aneurysm, Centerline, Opening, Vessel
-from vstent.words import counted
+from vstent.words import counted, place
 
 FUSIFORM: Final = 1.5
 """An artery that is wider by this factor than at both its ends is told..."""
@@ -41,9 +41,8 @@ def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
     """A sentence on a bulge that is a sac only for whoever asks for it."""
     if bulge is None:
         return ()
-    x, y, z = bulge.dome_mm
     return (
-        f"A bulge {bulge.height_mm:.1f} mm high at {x:.1f}, {y:.1f}, {z:.1f} mm is too flat to be taken for a sac "
+        f"A bulge {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)} is too flat to be taken for a sac "
         "unasked: give --at there.",
     )
 
@@ -64,8 +63,8 @@ def _before_another(vessel: Vessel, path: int, highest: list[Bulge]) -> tuple[st
     """A sentence where the highest bulge hangs on the artery from another inlet, before the parent artery."""
     lines = vessel.centerlines
     return tuple(
-        f"The bulge {bulge.height_mm:.1f} mm high at {', '.join(f'{x:.1f}' for x in bulge.dome_mm)} mm hangs on the "
-        f"artery from {_named(end)}: give that as the first --inlet."
+        f"The bulge {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)} hangs on the "
+        f"artery from {end.role}, {end.described}: give that as the first --inlet."
         for bulge in highest
         for end, line in zip(vessel.far_ends, lines, strict=True)
         if end.is_inlet and reach_of(line, bulge) <= PASSING < reach_of(lines[path], bulge)
@@ -81,10 +80,9 @@ def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
     widest = int(np.argmax(radius))
     if radius[widest] < FUSIFORM * ends_mm:
         return ()
-    x, y, z = line.points_mm[widest]
     return (
-        f"The artery is {2 * radius[widest]:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm and {2 * ends_mm:.1f} mm at "
-        "its wider end: a fusiform aneurysm is no sac here, has no neck, and stays part of the landing surface.",
+        f"The artery is {2 * radius[widest]:.1f} mm wide at {place(line.points_mm[widest])} and {2 * ends_mm:.1f} mm "
+        "at its wider end: a fusiform aneurysm is no sac here, has no neck, and stays part of the landing surface.",
     )
 
 
@@ -108,9 +106,8 @@ def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
         beyond_mm = float(radius[side & (gap_mm > gap_mm[throat])].max(initial=0.0))
         around_mm = min(beyond_mm, float(radius[other].max()))
         if radius[throat] < STENOSED * around_mm:
-            x, y, z = line.points_mm[throat]
             notes.append(
-                f"The artery is {2 * radius[throat]:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm, "
+                f"The artery is {2 * radius[throat]:.1f} mm wide at {place(line.points_mm[throat])}, "
                 f"{gap_mm[throat]:.1f} mm from a neck, and {2 * around_mm:.1f} mm on both sides of that: it is "
                 "stenosed. The landing surface may lie inside its wall between there and the neck: look at it, and "
                 "give --neck where the neck found is too large."
@@ -125,8 +122,8 @@ def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
         gap_mm = min((float(bulge.distances_mm(opening.center_mm[None])[0]) for bulge in bulges), default=np.inf)
         if gap_mm < NEAR_SAC_MM:
             notes.append(
-                f"{_named(opening)}, lies {gap_mm:.1f} mm from a sac's wall: close it where it is a hole; give "
-                "--outlet where the parent artery leads elsewhere."
+                f"{opening.role}, {opening.described}, lies {gap_mm:.1f} mm from a sac's wall: close it where it is a "
+                "hole; give --outlet where the parent artery leads elsewhere."
             )
     return tuple(notes)
 
@@ -134,11 +131,14 @@ def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
 def _from_sacs(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
     """Sentences on the branches that leave from a sac: their blood goes on passing through it behind a device."""
     branches = [one for k, one in enumerate(zip(vessel.far_ends, vessel.centerlines, strict=True)) if k != path]
-    return tuple(
-        f"{_named(opening)}, {'opens into' if opening.is_inlet else 'leaves from'} a sac: what it carries goes on "
-        f"through the sac behind any device{', and is none of the neck inflow' if opening.is_inlet else ''}."
-        for opening, line in branches
-        if any(_leaves(line, one) for one in aneurysms)
+    return tuple(_through_sac(opening) for opening, line in branches if any(_leaves(line, one) for one in aneurysms))
+
+
+def _through_sac(opening: Opening) -> str:
+    way, beside = ("opens into", ", and is none of the neck inflow") if opening.is_inlet else ("leaves from", "")
+    return (
+        f"{opening.role}, {opening.described}, {way} a sac: what it carries goes on through the sac behind any "
+        f"device{beside}."
     )
 
 
@@ -147,8 +147,3 @@ def _leaves(line: Centerline, aneurysm: Aneurysm) -> bool:
     inside = np.flatnonzero(aneurysm.sac.signed_distance(line.points_mm) < 0)
     last = inside[-1:]
     return bool((aneurysm.neck.closest(line.points_mm[last])[1] > line.inscribed_radius_mm[last]).any())
-
-
-def _named(opening: Opening) -> str:
-    x, y, z = opening.center_mm
-    return f"{opening.role}, {opening.diameter_mm:.1f} mm wide at {x:.1f}, {y:.1f}, {z:.1f} mm"

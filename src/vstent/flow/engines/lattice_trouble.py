@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from vstent.flow.domain import place
 from vstent.flow.engines.lattice_setup import CELL_REYNOLDS, CELL_REYNOLDS_AT_END
 from vstent.flow.engines.lattice_state import Snapshot, State
 from vstent.kernels.arrays import Floats
+from vstent.words import place
 
 FAST = 0.4
 """Speed from which the sound is too near."""
