@@ -18,7 +18,7 @@ from vstent.flow import Blood, FlowSettings
 from vstent.flow.types import CarreauYasuda, Phase
 from vstent.report import report
 from vstent.report.definitions import DEFINITIONS, HEADLINES, OF_PULSE
-from vstent.report.page import as_html, contents_of
+from vstent.report.page import as_html, contents_of, limits_of
 from vstent.report.quantities import compare, flatten, format_change, format_number, format_value, split_unit
 
 
@@ -195,6 +195,17 @@ def test_limits_are_those_of_the_flow_that_was_computed(settings, told, untold):
     assert not any(one in words for one in untold)
     assert "does not give way" in limits[0]
     assert "Research use only" in limits[-1]
+
+
+@pytest.mark.parametrize("n_inlets", [1, 2])
+def test_that_a_flow_was_shared_among_inlets_is_told(n_inlets):
+    anatomy = report_case.case().anatomy
+    vessel = anatomy.vessel
+    feeding = tuple(replace(one, role="inlet_2") for one in vessel.openings[1:n_inlets])
+    fed = replace(vessel, openings=(vessel.inlet, *feeding, *vessel.openings[n_inlets:]))
+    settings = {"flow": asdict(FlowSettings())}
+    case = bare_case(anatomy=replace(anatomy, vessel=fed), provenance={"settings": settings})
+    assert any("each of the inlets" in one for one in limits_of(case)) == (n_inlets > 1)
 
 
 def test_provenance_is_whole(page):

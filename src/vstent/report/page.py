@@ -37,6 +37,7 @@ AT_OUTLETS: Final = {
     "murray": "the flow was split among the outlets by the cube of their radius, not measured in a patient",
 }
 """Setting of the outlets -> what it leaves out."""
+AT_INLETS: Final = "What each of the inlets brings was set, not measured in a patient."
 OF_DEVICE: Final = {
     LATTICE: "In the flow a device is a thin resistance computed from its wires.",
     OPENFOAM: "In the flow a device is its struts over the neck, meshed.",
@@ -123,15 +124,18 @@ def contents_of(case: "CaseResult") -> Contents:
         openings=opening_rows(case.anatomy.vessel.openings),
         is_pulse=any(field.phases for field in case.fields.values()),
         notes=tuple(case.notes),
-        limits=limits_of(case.provenance),
+        limits=limits_of(case),
         provenance=_provenance(case.provenance),
     )
 
 
-def limits_of(provenance: Mapping[str, Any]) -> tuple[str, ...]:
+def limits_of(case: "CaseResult") -> tuple[str, ...]:
     """Return what a result leaves out, a sentence each: of a flow, where there is one, by its own settings."""
-    flow = provenance.get("settings", {}).get("flow")
-    return (OF_CONTOUR, *([] if flow is None else _limits_of_flow(flow)), OF_USE)
+    flow = case.provenance.get("settings", {}).get("flow")
+    if flow is None:
+        return OF_CONTOUR, OF_USE
+    of_inlets = [AT_INLETS] if len(case.anatomy.vessel.inlets) > 1 else []
+    return OF_CONTOUR, *_limits_of_flow(flow), *of_inlets, OF_USE
 
 
 def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
