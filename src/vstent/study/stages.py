@@ -42,6 +42,7 @@ from vstent.trace import trace
 from vstent.trim import trim
 from vstent.uncertainty import Uncertainty, vary
 from vstent.vessel import Anatomy, Vessel
+from vstent.words import counted
 
 SLOWEST_M_S: Final = 0.01
 FASTEST_M_S: Final = 2.0
@@ -85,7 +86,7 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
     with ledger.stage("trace") as tell:
         traced = trace(vessel, inlet_mm=_array(settings.inlet_mm))
         widths = ", ".join(f"{inlet.role} {inlet.diameter_mm:.1f} mm wide" for inlet in traced.inlets)
-        found = f"{len(traced.outlets)} outlets; {widths}."
+        found = f"{counted(len(traced.outlets), 'outlet')}; {widths}."
         tell(" ".join([found, *traced.notes[len(vessel.notes) :]]))
     ledger.hold("vessel", key, traced)
     return traced
