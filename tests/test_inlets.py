@@ -87,16 +87,31 @@ def test_inlets_that_cannot_be_are_refused(points_mm: Floats, said: str) -> None
         trace(Vessel(wall()), inlet_mm=points_mm)
 
 
+def with_interrupted_branch(phantom: Phantom) -> Phantom:
+    """A branch 1 mm wide and 10 mm up, through which nothing comes."""
+    thin = phantoms.with_branch(phantom, abscissa_mm=10.0, direction=np.array([1, 0, 0]), radius_mm=0.5)
+    *others, last = thin.branches
+    throat = np.where(np.abs(last.abscissa_mm - 5.0) < 0.5, 0.05, 0.5)
+    return replace(thin, branches=(*others, replace(last, inscribed_radius_mm=throat)))
+
+
 def test_an_inlet_that_nothing_connects_is_refused_however_thin() -> None:
     """A thin outlet would be closed."""
-    thin = phantoms.with_branch(phantoms.tube(), abscissa_mm=10.0, direction=np.array([1, 0, 0]), radius_mm=0.5)
-    place = thin.branches[0].abscissa_mm
-    throat = np.where(np.abs(place - 5.0) < 0.5, 0.05, 0.5)
-    thin = replace(thin, branches=(replace(thin.branches[0], inscribed_radius_mm=throat),))
+    thin = with_interrupted_branch(phantoms.tube())
     ends_mm = [thin.ends[k][0] for k in (0, 2)]
     cut = Vessel(phantoms.phantom_surface(thin, edge_mm=0.25))
     with pytest.raises(VesselError, match=r"inlet_2, .* is not connected to the inlet"):
         trace(cut, inlet_mm=np.array(ends_mm))
+
+
+def test_outlets_are_numbered_by_those_that_are_left() -> None:
+    """The flow of one is named by its number: there is no gap where a wider one is closed."""
+    side = np.array([-1, 0, 0])
+    tube = phantoms.with_branch(phantoms.tube(), abscissa_mm=16.0, direction=side, radius_mm=0.4)
+    vessel = trace(Vessel(phantoms.phantom_surface(with_interrupted_branch(tube), edge_mm=0.2)))
+    assert [opening.role for opening in vessel.openings] == ["inlet", "outlet_1", "outlet_2"]
+    assert vessel.outlets[1].center_mm[0] < -5.0
+    assert any("is cut off from the inlet: closed" in note for note in vessel.notes)
 
 
 # -- geometry ----------------------------------------------------------------------------------------------------------

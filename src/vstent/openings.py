@@ -73,7 +73,7 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
         )
     found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
     widest = max(found, key=lambda opening: opening.area_mm2)
-    openings = _named([widest], found)
+    openings = named([widest], found)
     return replace(vessel, lumen=lumen, openings=openings, centerlines=(), notes=(*vessel.notes, *notes)), spheres
 
 
@@ -114,7 +114,7 @@ def with_inlets(vessel: Vessel, inlets_mm: Floats) -> Vessel:
         for inlet, inlet_mm in zip(inlets, inlets_mm, strict=True)
         if _is_far(inlet, inlet_mm)
     )
-    openings = _named(inlets, vessel.openings)
+    openings = named(inlets, vessel.openings)
     return replace(vessel, openings=openings, centerlines=(), notes=(*vessel.notes, *notes))
 
 
@@ -162,7 +162,7 @@ def still_open(vessel: Vessel) -> Vessel | None:
     if len(left) < 2 or all(opening.is_inlet for opening in left):
         return None
     inlets = [o for o in left if o.is_inlet] or [max(left, key=lambda opening: opening.area_mm2)]
-    return replace(vessel, openings=_named(inlets, left), centerlines=())
+    return replace(vessel, openings=named(inlets, left), centerlines=())
 
 
 def _opening(loop_mm: Floats) -> Opening:
@@ -172,8 +172,8 @@ def _opening(loop_mm: Floats) -> Opening:
     return Opening(triangles.polygon_centroid(loop_mm), vector / max(area, 1e-300), area, "outlet")
 
 
-def _named(inlets: Sequence[Opening], openings: Sequence[Opening]) -> tuple[Opening, ...]:
-    """The openings with their roles, the inlets in this order."""
+def named(inlets: Sequence[Opening], openings: Sequence[Opening]) -> tuple[Opening, ...]:
+    """Return the openings with their roles, the inlets in this order."""
     outlets = sorted((o for o in openings if o not in inlets), key=lambda opening: -opening.area_mm2)
     named = roles(len(inlets), len(outlets))
     return tuple(replace(o, role=role) for o, role in zip([*inlets, *outlets], named, strict=True))

@@ -18,7 +18,7 @@ from vstent.contacts import find_contact, part
 from vstent.errors import VesselError
 from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
-from vstent.openings import guessed, open_ends, with_inlets
+from vstent.openings import guessed, named, open_ends, with_inlets
 from vstent.short_cuts import along_arms, around_sacs
 from vstent.spheres import centered
 from vstent.surface import Surface
@@ -116,10 +116,8 @@ def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Med
             raise VesselError(_unreachable(vessel.inlet, opening))
     kept = np.ones(len(graph.points), dtype=bool)
     kept[first:] = is_reached
-    notes = tuple(
-        f"{opening.role} ({opening.diameter_mm:.1f} mm) is cut off from the inlet: closed." for opening in lost
-    )
-    openings = tuple(opening for opening in vessel.openings if opening not in lost)
+    notes = tuple(f"An opening {opening.described} is cut off from the inlet: closed." for opening in lost)
+    openings = named(vessel.inlets, [opening for opening in vessel.openings if opening not in lost])
     return replace(vessel, openings=openings, notes=(*vessel.notes, *notes)), medial.keep(graph, kept)
 
 
