@@ -175,8 +175,8 @@ def _opening(loop_mm: Floats) -> Opening:
 def named(inlets: Sequence[Opening], openings: Sequence[Opening]) -> tuple[Opening, ...]:
     """Return the openings with their roles, the inlets in this order."""
     outlets = sorted((o for o in openings if o not in inlets), key=lambda opening: -opening.area_mm2)
-    named = roles(len(inlets), len(outlets))
-    return tuple(replace(o, role=role) for o, role in zip([*inlets, *outlets], named, strict=True))
+    in_order = zip([*inlets, *outlets], roles(len(inlets), len(outlets)), strict=True)
+    return tuple(replace(opening, role=role) for opening, role in in_order)
 
 
 def _without_caps(lumen: Surface) -> tuple[Surface, int]:

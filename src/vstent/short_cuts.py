@@ -51,13 +51,13 @@ def along_arms(graph: medial.Medial, paths: Sequence[Ints], radius_cap: Floats) 
     paths : (k,) vertices each, of the paths of least time from the inlet to every outlet.
     radius_cap : (n,) cap on the travel speed on them.
     """
-    times, tree, led = medial.cost_graph(graph, radius_cap), cKDTree(graph.points), []
+    times, led = medial.cost_graph(graph, radius_cap), []
     for path in paths:
         _, before = medial.shortest_paths(times, int(path[-1]))
         found = path
         for other in paths:
             way = _by_way_of(other, medial.path_to(before, int(other[-1]))[::-1])
-            found = _led(found, [both for both in _apart(found, way) if _is_crotch(graph, tree, *both)])
+            found = _led(found, [both for both in _apart(found, way) if _is_crotch(graph, *both)])
         led.append(found)
     return led
 
@@ -133,16 +133,12 @@ def _is_artery(graph: medial.Medial, through: Ints, around: Ints, parent_mm: Flo
     return _is_beside(graph, through, around)
 
 
-def _is_crotch(graph: medial.Medial, tree: cKDTree, through: Ints, around: Ints) -> bool:
+def _is_crotch(graph: medial.Medial, through: Ints, around: Ints) -> bool:
     """Tell whether a path runs through the crotch of a fork that a way around (k,) goes by along its arms."""
     cut_mm, taken_mm = graph.radius[through], graph.radius[around]
     is_sac = cut_mm.max() > CROTCH_SAC * taken_mm.max() and taken_mm.min() > AS_WIDE * cut_mm.min()
     is_between = taken_mm.min() > CROTCH * cut_mm.min() and taken_mm.max() < SAC * cut_mm.max()
-    return (
-        (is_sac or is_between)
-        and _is_beside(graph, through, around)
-        and _is_lumen_between(graph, tree, through, around)
-    )
+    return (is_sac or is_between) and _is_beside(graph, through, around) and _is_lumen_between(graph, through, around)
 
 
 def _is_beside(graph: medial.Medial, through: Ints, around: Ints) -> bool:
@@ -151,12 +147,12 @@ def _is_beside(graph: medial.Medial, through: Ints, around: Ints) -> bool:
     return bool((apart_mm.min(axis=1) > BESIDE * graph.radius[around]).any())
 
 
-def _is_lumen_between(graph: medial.Medial, tree: cKDTree, through: Ints, around: Ints) -> bool:
+def _is_lumen_between(graph: medial.Medial, through: Ints, around: Ints) -> bool:
     """Tell whether lumen lies between two ways: in a ring of arteries tissue does."""
     ends = graph.points[around], graph.points[through]
     across = ends[1][cKDTree(ends[1]).query(ends[0])[1]] - ends[0]
     between = ends[0] + np.linspace(0.0, 1.0, N_BETWEEN + 2)[1:-1, None, None] * across
-    distance, sphere = tree.query(between)
+    distance, sphere = cKDTree(graph.points).query(between)
     return bool((distance < graph.radius[sphere]).mean() > LUMEN)
 
 

@@ -165,13 +165,14 @@ def _ends_mm(vessel: Vessel, cuts: list[_Cut], lumen: Surface) -> Floats:
     before = [cut.center_mm for cut in cuts if cut.sense < 0]
     ahead = [cut for cut in cuts if cut.sense > 0]
     centers_mm = np.array([cut.center_mm for cut in ahead]).reshape(-1, 3)
-    ends_mm = [*before, vessel.inlet.center_mm][:1]
+    ends_mm = [before[0] if before else vessel.inlet.center_mm]
     for opening, line in zip(vessel.far_ends, vessel.centerlines, strict=True):
         place_mm, off_mm = curves.project(line.points_mm, centers_mm)
         through = np.flatnonzero(off_mm < [cut.radius_mm for cut in ahead])
         is_left = loops.query(opening.center_mm)[0] < STILL * opening.diameter_mm
         first = centers_mm[through[np.argsort(place_mm[through])]]
-        ends_mm += [*first, *([] if is_left else before), opening.center_mm][:1]
+        passed = [*first, *([] if is_left else before), opening.center_mm]
+        ends_mm.append(passed[0])
     return np.array(ends_mm)
 
 

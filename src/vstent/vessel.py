@@ -139,6 +139,11 @@ class Vessel:
         """The openings through which blood leaves."""
         return tuple(opening for opening in self.openings if not opening.is_inlet)
 
+    def of_inlets_and_outlets(self, values: Floats) -> tuple[Floats, Floats]:
+        """Part values (k,) of all openings into those of the inlets (i,) and those of the outlets."""
+        n_inlets = len(self.inlets)
+        return values[:n_inlets], values[n_inlets:]
+
 
 @dataclass(frozen=True, eq=False)
 class Aneurysm:

@@ -136,9 +136,13 @@ def _units(text: str) -> str:
     return text
 
 
+def _words(text: str) -> list[str]:
+    return text.replace(",", " ").replace(";", " ").split()
+
+
 def _three(kind: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
     def read(text: str) -> tuple[Any, ...]:
-        values = tuple(kind(word) for word in text.replace(",", " ").replace(";", " ").split())
+        values = tuple(kind(word) for word in _words(text))
         if len(values) != 3:
             raise ValueError("three numbers are needed")
         return values
@@ -147,14 +151,14 @@ def _three(kind: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
 
 
 def _points(text: str) -> tuple[tuple[float, ...], ...]:
-    values = [finite(word) for word in text.replace(",", " ").replace(";", " ").split()]
+    values = [finite(word) for word in _words(text)]
     if len(values) % 3:
         raise ValueError("three numbers are needed for every point")
     return tuple(tuple(values[k : k + 3]) for k in range(0, len(values), 3))
 
 
 def _devices(text: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(text.replace(",", " ").replace(";", " ").split()))
+    return tuple(dict.fromkeys(_words(text)))
 
 
 COLUMNS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {

@@ -88,10 +88,12 @@ def _flat_sac(vessel: Vessel, outlet_mm: Floats | None, path: int, landing: Land
     It hardly bears on the fit of the artery, so that the landing surface along a path holds for all bulges on it.
     """
     flat = flat_bulges(vessel.lumen, tubes_of(vessel.centerlines))[:MOST_FLAT]
-    ways = [parent_path(vessel, [bulge], outlet_mm) for bulge in flat]
-    landings = {way: landing if way == path else _landing(vessel, way, ()) for way in set(ways)}
+    landings = {path: landing}
     # Forks and bends bulge as high as a blister does: they turn out to be the artery once it is restored.
-    for bulge, way in zip(flat, ways, strict=True):
+    for bulge in flat:
+        way = parent_path(vessel, [bulge], outlet_mm)
+        if way not in landings:
+            landings[way] = _landing(vessel, way, ())
         if cut_sac(vessel, landings[way], _all_but(way, vessel.centerlines), bulge):
             return bulge
     return None

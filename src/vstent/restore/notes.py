@@ -29,7 +29,7 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
     line, sacs = vessel.centerlines[path], [bulge for bulge in bulges if is_in_one(bulge.points_mm, aneurysms)]
     return (
         *_found(vessel, path, aneurysms, len(bulges)),
-        *_before_another(vessel, path, bulges[:1]),
+        *_before_another(vessel, path, bulges),
         *_near_sacs(vessel, bulges),
         *_from_sacs(vessel, path, aneurysms),
         *_fusiform(line, sacs),
@@ -59,15 +59,15 @@ def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges:
     return tuple(notes)
 
 
-def _before_another(vessel: Vessel, path: int, highest: list[Bulge]) -> tuple[str, ...]:
+def _before_another(vessel: Vessel, path: int, bulges: list[Bulge]) -> tuple[str, ...]:
     """A sentence where the highest bulge hangs on the artery from another inlet, before the parent artery."""
-    lines = vessel.centerlines
+    if not bulges or reach_of(vessel.centerlines[path], bulges[0]) <= PASSING:
+        return ()
     return tuple(
-        f"The bulge {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)} hangs on the "
+        f"The bulge {bulges[0].height_mm:.1f} mm high at {place(bulges[0].dome_mm)} hangs on the "
         f"artery from {end.role}, {end.described}: give that as the first --inlet."
-        for bulge in highest
-        for end, line in zip(vessel.far_ends, lines, strict=True)
-        if end.is_inlet and reach_of(line, bulge) <= PASSING < reach_of(lines[path], bulge)
+        for end, line in zip(vessel.far_ends, vessel.centerlines, strict=True)
+        if end.is_inlet and reach_of(line, bulges[0]) <= PASSING
     )
 
 

@@ -48,9 +48,8 @@ def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     is_opening = state.links.patch <= len(outflow_mL_s)
     through = _mean(snapshots, (one.outflow_mL_s for one in snapshots))
     outflow_mL_s[state.links.patch[is_opening] - 1] = through[is_opening]
-    n_inlets = len(state.case.vessel.inlets)
-    through_mL_s = -outflow_mL_s[:n_inlets], outflow_mL_s[n_inlets:]
-    return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, *through_mL_s)
+    backwards_mL_s, outlets_mL_s = state.case.vessel.of_inlets_and_outlets(outflow_mL_s)
+    return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, -backwards_mL_s, outlets_mL_s)
 
 
 def read_moving(state: State, snapshots: Sequence[Snapshot]) -> Reading:
@@ -76,7 +75,7 @@ def field_of(
     """Put a flow together with how it was reached, and what it has `left` to go."""
     domain, vessel = state.domain, state.case.vessel
     section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
-    n_inlets = len(vessel.inlets)
+    inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
     field = FlowField(
         cells=domain.cells,
         origin_mm=domain.origin_mm,
@@ -88,8 +87,8 @@ def field_of(
         wall_pressure_Pa=flow.wall_pressure_Pa,
         inlets_mL_s=flow.inlets_mL_s,
         outlets_mL_s=flow.outlets_mL_s,
-        inlet_pressure_Pa=section_Pa[:n_inlets],
-        outlet_pressure_Pa=section_Pa[n_inlets:],
+        inlet_pressure_Pa=inlet_Pa,
+        outlet_pressure_Pa=outlet_Pa,
         blood=state.case.blood,
         is_converged=outcome.is_converged,
         unsettled_fraction=left,

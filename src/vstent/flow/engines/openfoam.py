@@ -219,7 +219,7 @@ def _correct_inflow(state: State) -> bool:
     share = float(case.settings.inflow_factor(np.array([float(now.time)]))[0])
     if len(state.history) > CHECKS_HELD or abs(share) < 0.2:
         return False
-    factors = -share * case.inlets_mL_s / now.outflow_mL_s[: len(case.vessel.inlets)]
+    factors = -share * case.inlets_mL_s / case.vessel.of_inlets_and_outlets(now.outflow_mL_s)[0]
     scaled = [
         folders.scale_inflow(state.folder, inlet.role, factor)
         for inlet, factor in zip(case.vessel.inlets, factors, strict=True)
@@ -234,8 +234,8 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
 
     vessel, domain = state.case.vessel, state.domain
     pressure_Pa, outflow_mL_s = mean("pressure_Pa"), mean("outflow_mL_s")
-    section_Pa = domains.section_pressure_Pa(vessel, domain, pressure_Pa)
-    n_inlets = len(vessel.inlets)
+    inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(domains.section_pressure_Pa(vessel, domain, pressure_Pa))
+    backwards_mL_s, outlets_mL_s = vessel.of_inlets_and_outlets(outflow_mL_s)
     steps = len(state.history) * (1 if state.is_pulse else CHECK_ITERATIONS)
     return FlowField(
         cells=domain.cells,
@@ -246,10 +246,10 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
         wall=vessel.lumen,
         wall_shear_stress_Pa=mean("wall_shear_stress_Pa"),
         wall_pressure_Pa=mean("wall_pressure_Pa"),
-        inlets_mL_s=-outflow_mL_s[:n_inlets],
-        outlets_mL_s=outflow_mL_s[n_inlets:],
-        inlet_pressure_Pa=section_Pa[:n_inlets],
-        outlet_pressure_Pa=section_Pa[n_inlets:],
+        inlets_mL_s=-backwards_mL_s,
+        outlets_mL_s=outlets_mL_s,
+        inlet_pressure_Pa=inlet_Pa,
+        outlet_pressure_Pa=outlet_Pa,
         blood=state.case.blood,
         is_converged=outcome.is_converged,
         unsettled_fraction=outcome.residual[-1],
@@ -272,11 +272,12 @@ def swing_of(kept: list[Snapshot]) -> Swing:
 
 def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
     """The last cycle; its times are those of the waveform."""
-    phase_s, n_inlets = waveform_of(case).period_s / PHASES, len(case.vessel.inlets)
+    phase_s = waveform_of(case).period_s / PHASES
 
     def phase(k: int, one: Snapshot) -> Phase:
-        through_mL_s = -one.outflow_mL_s[:n_inlets], one.outflow_mL_s[n_inlets:]
-        return Phase((k + 1) * phase_s, *through_mL_s, one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa)
+        backwards_mL_s, outlets_mL_s = case.vessel.of_inlets_and_outlets(one.outflow_mL_s)
+        moment = one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa
+        return Phase((k + 1) * phase_s, -backwards_mL_s, outlets_mL_s, *moment)
 
     return tuple(phase(k, one) for k, one in enumerate(cycle))
 
