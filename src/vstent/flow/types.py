@@ -192,6 +192,11 @@ class FlowCase:
         return MEAN_INLET_SPEED_M_S * np.array([inlet.area_mm2 for inlet in inlets])
 
     @property
+    def inlet_speeds_m_s(self) -> Floats:
+        """(i,) mean speed in each inlet."""
+        return self.inlets_mL_s / np.array([inlet.area_mm2 for inlet in self.vessel.inlets])
+
+    @property
     def inflow_mL_s(self) -> float:
         """Mean flow through all inlets."""
         return float(self.inlets_mL_s.sum())

@@ -142,9 +142,8 @@ def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
     """Refuse a mean inflow with which no blood flows: another unit was meant."""
     if flow is None or flow.inflow_mL_s is None:
         return
-    vessel = anatomy.vessel
-    for inlet, part_mL_s in zip(vessel.inlets, FlowCase(vessel, settings=flow).inlets_mL_s, strict=True):
-        speed_m_s = part_mL_s / inlet.area_mm2
+    case = FlowCase(anatomy.vessel, settings=flow)
+    for inlet, part_mL_s, speed_m_s in zip(case.vessel.inlets, case.inlets_mL_s, case.inlet_speeds_m_s, strict=True):
         if not SLOWEST_M_S <= speed_m_s <= FASTEST_M_S:
             raise InputError(
                 f"a mean inflow of {part_mL_s:g} mL/s through an inlet {inlet.diameter_mm:.1f} mm wide flows at "

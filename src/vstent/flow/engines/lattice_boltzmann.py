@@ -117,9 +117,7 @@ class LatticeBoltzmann(AbstractLattice):
 
 
 def _steps_per_check(case: FlowCase, step_s: float) -> int:
-    inlet = case.vessel.inlet
-    speed_m_s = float(case.inlets_mL_s[0]) / inlet.area_mm2
-    steps = CHECK_DIAMETERS * inlet.diameter_mm * M_PER_MM / speed_m_s / step_s
+    steps = CHECK_DIAMETERS * case.vessel.inlet.diameter_mm * M_PER_MM / float(case.inlet_speeds_m_s[0]) / step_s
     return 2 * max(1, round(0.5 * min(steps, case.settings.max_steps / LEAST_CHECKS)))
 
 

@@ -111,8 +111,7 @@ def _system(
     case: FlowCase, setup: FoamSetup, patches: tuple[Patch, ...], walls: list[str], sections: tuple[Floats, ...]
 ) -> dict[str, str]:
     is_steady = case.settings.waveform is None
-    speed_m_s = max(2 * flow / inlet.area_mm2 for inlet, flow in zip(case.vessel.inlets, case.inlets_mL_s, strict=True))
-    step_s = 0.2 * setup.cell_size_mm * M_PER_MM / float(speed_m_s)
+    step_s = 0.2 * setup.cell_size_mm * M_PER_MM / (2 * float(case.inlet_speeds_m_s.max()))
     return {
         "system/controlDict": control.control(case, setup, step_s, walls=walls, has_neck=case.ostium is not None),
         "system/fvSchemes": control.schemes(is_steady=is_steady),
