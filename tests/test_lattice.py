@@ -108,6 +108,21 @@ def test_a_band_is_done_when_all_that_it_needs_is(threads):
     np.testing.assert_array_equal(*found)
 
 
+def test_whole_vectors_reach_into_no_other_layer():
+    """Beyond a segment they write again what they have read there, while another thread may be at the next layer."""
+    arc = phantoms.torus_arc(bend_radius_mm=5.0, angle_rad=1.0, radius_mm=2.0)
+    case = FlowCase(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), settings=FlowSettings(inflow_mL_s=3.0))
+    state = LatticeBoltzmann(0.3).init(case, None)
+    domain, a = state.domain, state.addressing
+    beyond = domain.cells[domain.link_cell] + lattice.VELOCITIES[domain.link_direction]
+    layer = np.concatenate([domain.cells[:, 0], beyond[:, 0]])
+    place = np.concatenate([a.place, a.link_address[:, 3] % a.stride])
+    first, last = (np.array([side(place[layer == x]) for x in np.unique(layer)]) for side in (np.min, np.max))
+    assert len(first) > 20
+    assert (first[1:] - last[:-1]).min() == lanes.COUNT + 1
+    assert a.stride - last[-1] >= lanes.COUNT
+
+
 @pytest.mark.parametrize("threads", [1, 2, 3, 7])
 def test_threads_share_cells_links_and_screens_alike(threads):
     """Half of the bands have twice the cells, the screen or the links: no share is off the mean by more than a band."""

@@ -25,7 +25,9 @@ _THIRD, _AXIS, _DIAGONAL = np.float32(1 / 3), np.float32(1 / 18), np.float32(1 /
 _ZERO, _HALF, _ONE, _TWO, _THREE, _FOUR, _SIX, _EIGHT = (
     np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 )
-_THREE_HALVES, _QUARTER, _SIXTH, _EIGHTH, _TWELFTH = (np.float32(x) for x in (3 / 2, 1 / 4, 1 / 6, 1 / 8, 1 / 12))
+_THREE_HALVES, _QUARTER, _EIGHTH, _TWELFTH, _TWENTY_FOURTH = (
+    np.float32(x) for x in (3 / 2, 1 / 4, 1 / 8, 1 / 12, 1 / 24)
+)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -65,65 +67,96 @@ def _plus_square(n: Any, u: Any) -> tuple[Any, ...]:
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _relaxed_pair(a: Any, b: Any, even: Any, odd: Any, kept: Any) -> tuple[Any, Any]:
+def _third(u: Any, n: Any, part: Any) -> tuple[Any, ...]:
+    """Third moments xyy, xzz, xxy, yzz, xxz, yyz of velocity and stress, in the place of a moment <xxyz>.
+
+    A `part` of them, in quarters: what each adds to the odd half of four diagonal pairs.
+    """
+    part = _TWENTY_FOURTH * part
+    x, y, z = part * u[0], part * u[1], part * u[2]
+    xx, yy, zz, xy, xz, yz = n
+    by_x, by_y, by_z = x + x, y + y, z + z
+    return (
+        x * zz + by_z * xz,
+        x * yy + by_y * xy,
+        y * zz + by_z * yz,
+        y * xx + by_x * xy,
+        z * yy + by_y * yz,
+        z * xx + by_x * xz,
+    )
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _even(density: Any, u: Any, flux: Any) -> tuple[Any, ...]:
+    """What the rest population and, in each of the nine pairs, half of both are to be (10): see `relaxed_pair`.
+
+    From the density deviation, the velocity (3) and the second moments wanted (6).
+    """
+    xx, yy, zz, xy, xz, yz = flux
+    isotropic = density - _THREE_HALVES * (xx + yy + zz)
+    wx, wy, wz = _THREE_HALVES * u[0] * u[0], _THREE_HALVES * u[1] * u[1], _THREE_HALVES * u[2] * u[2]
+    pxy = _DIAGONAL * (isotropic + wz) + _EIGHTH * (xx + yy)
+    pxz = _DIAGONAL * (isotropic + wy) + _EIGHTH * (xx + zz)
+    pyz = _DIAGONAL * (isotropic + wx) + _EIGHTH * (yy + zz)
+    return (
+        _THIRD * (isotropic + _THIRD * (wx + wy + wz)),
+        _AXIS * (isotropic - wy - wz) + _QUARTER * xx,
+        _AXIS * (isotropic - wx - wz) + _QUARTER * yy,
+        _AXIS * (isotropic - wx - wy) + _QUARTER * zz,
+        pxy + _QUARTER * xy,
+        pxy - _QUARTER * xy,
+        pxz + _QUARTER * xz,
+        pxz - _QUARTER * xz,
+        pyz + _QUARTER * yz,
+        pyz - _QUARTER * yz,
+    )
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _odd(momentum: Any, third: Any) -> tuple[Any, ...]:
+    """What is added to half the difference of each of the nine pairs: see `relaxed_pair`.
+
+    From the momentum (3) added, and the third moments, in quarters (6).
+    """
+    x, y, z = _TWELFTH * momentum[0], _TWELFTH * momentum[1], _TWELFTH * momentum[2]
+    xyy, xzz, xxy, yzz, xxz, yyz = third
+    return (
+        _TWO * (x - (xyy + xzz)),
+        _TWO * (y - (xxy + yzz)),
+        _TWO * (z - (xxz + yyz)),
+        (x + y) + (xyy + xxy),
+        (x - y) + (xyy - xxy),
+        (x + z) + (xzz + xxz),
+        (x - z) + (xzz - xxz),
+        (y + z) + (yzz + yyz),
+        (y - z) + (yzz - yyz),
+    )
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def relaxed_pair(a: Any, b: Any, even: Any, odd: Any, half_kept: Any) -> tuple[Any, Any]:
     """Return collided populations in place of a and b, its opposite: already swapped.
 
-    `even` is the whole even part, `odd` the equilibrium's odd part with its share of the force, `kept` how much of the
-    departure from it is kept.
+    `even` and `odd` are the pair's of what `collided` returns, `half_kept` is half of how much of the odd part is kept.
     """
-    new = odd + kept * (_HALF * (a - b) - odd)
+    new = odd + half_kept * (a - b)
     return even - new, even + new
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _third(u: Any, n: Any) -> tuple[Any, ...]:
-    """Third moments xyy, xzz, xxy, yzz, xxz, yyz of velocity and stress, in the place of a moment <xxyz>."""
-    ux, uy, uz = u
-    xx, yy, zz, xy, xz, yz = n
-    by_xy, by_xz, by_yz = xy + xy, xz + xz, yz + yz
-    return (
-        _SIXTH * (ux * zz + uz * by_xz),
-        _SIXTH * (ux * yy + uy * by_xy),
-        _SIXTH * (uy * zz + uz * by_yz),
-        _SIXTH * (uy * xx + ux * by_xy),
-        _SIXTH * (uz * yy + uy * by_yz),
-        _SIXTH * (uz * xx + ux * by_xz),
-    )
-
-
-@njit(cache=True, forceinline=True, error_model="numpy")
-def _relaxed(f: Any, density: Any, u: Any, flux: Any, third: Any, push: Any, kept: Any) -> tuple[Any, ...]:
-    """Return the 19 collided populations, each in the place of its opposite.
-
-    Parameters
-    ----------
-    f : what they were; density, u (3) : deviation and velocity.
-    flux, third : second (6) and third (6) moments wanted; push : (3) the odd part's share of the force.
-    """
-    xx, yy, zz, xy, xz, yz = flux
-    xyy, xzz, xxy, yzz, xxz, yyz = third
-    isotropic = density - _THREE_HALVES * (xx + yy + zz)
-    wx, wy, wz = _THREE_HALVES * u[0] * u[0], _THREE_HALVES * u[1] * u[1], _THREE_HALVES * u[2] * u[2]
-    ax, ay, az = u[0] + push[0], u[1] + push[1], u[2] + push[2]
-    pxy, pxz, pyz = _DIAGONAL * (isotropic + wz), _DIAGONAL * (isotropic + wy), _DIAGONAL * (isotropic + wx)
-    pxy, pxz, pyz = pxy + _EIGHTH * (xx + yy), pxz + _EIGHTH * (xx + zz), pyz + _EIGHTH * (yy + zz)
-    one = _relaxed_pair(
-        f[1], f[2], _AXIS * (isotropic - wy - wz) + _QUARTER * xx, _SIXTH * ax - _HALF * (xyy + xzz), kept
-    )
-    two = _relaxed_pair(
-        f[3], f[4], _AXIS * (isotropic - wx - wz) + _QUARTER * yy, _SIXTH * ay - _HALF * (xxy + yzz), kept
-    )
-    three = _relaxed_pair(
-        f[5], f[6], _AXIS * (isotropic - wx - wy) + _QUARTER * zz, _SIXTH * az - _HALF * (xxz + yyz), kept
-    )
-    four = _relaxed_pair(f[7], f[8], pxy + _QUARTER * xy, _TWELFTH * (ax + ay) + _QUARTER * (xyy + xxy), kept)
-    five = _relaxed_pair(f[9], f[10], pxy - _QUARTER * xy, _TWELFTH * (ax - ay) + _QUARTER * (xyy - xxy), kept)
-    six = _relaxed_pair(f[11], f[12], pxz + _QUARTER * xz, _TWELFTH * (ax + az) + _QUARTER * (xzz + xxz), kept)
-    seven = _relaxed_pair(f[13], f[14], pxz - _QUARTER * xz, _TWELFTH * (ax - az) + _QUARTER * (xzz - xxz), kept)
-    eight = _relaxed_pair(f[15], f[16], pyz + _QUARTER * yz, _TWELFTH * (ay + az) + _QUARTER * (yzz + yyz), kept)
-    nine = _relaxed_pair(f[17], f[18], pyz - _QUARTER * yz, _TWELFTH * (ay - az) + _QUARTER * (yzz - yyz), kept)
-    rest = _THIRD * (isotropic + _THIRD * (wx + wy + wz))
-    return rest, *one, *two, *three, *four, *five, *six, *seven, *eight, *nine
+def relaxed(f: Any, even: Any, odd: Any, kept: Any) -> tuple[Any, ...]:
+    """Return the 19 collided populations, each in the place of its opposite (see `relaxed_pair`)."""
+    half = _HALF * kept
+    one = relaxed_pair(f[1], f[2], even[1], odd[0], half)
+    two = relaxed_pair(f[3], f[4], even[2], odd[1], half)
+    three = relaxed_pair(f[5], f[6], even[3], odd[2], half)
+    four = relaxed_pair(f[7], f[8], even[4], odd[3], half)
+    five = relaxed_pair(f[9], f[10], even[5], odd[4], half)
+    six = relaxed_pair(f[11], f[12], even[6], odd[5], half)
+    seven = relaxed_pair(f[13], f[14], even[7], odd[6], half)
+    eight = relaxed_pair(f[15], f[16], even[8], odd[7], half)
+    nine = relaxed_pair(f[17], f[18], even[9], odd[8], half)
+    return even[0], *one, *two, *three, *four, *five, *six, *seven, *eight, *nine
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -222,31 +255,28 @@ def resist(normal: Any, entry: Any, u: Any, blood: Any) -> tuple[Any, Any]:
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def collided(f: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, ...]:
-    """Return populations collided freely."""
-    kept = _ONE - odd_rate
+def collided(f: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any]:
+    """Return what `relaxed` makes populations of that collide freely: the even parts (10) and the odd ones (9)."""
     density, u, flux = moments_of(f)
     keep = _kept(u, time, limit)
     n = departure(flux, u)
-    third = _third(u, _times((keep - kept) / odd_rate, n))
-    zero = u[0] - u[0]
-    return _relaxed(f, density, u, _plus_square(_times(keep, n), u), third, (zero, zero, zero), kept)
+    momentum = odd_rate * u[0], odd_rate * u[1], odd_rate * u[2]
+    third = _third(u, n, keep - (_ONE - odd_rate))
+    return _even(density, u, _plus_square(_times(keep, n), u)), _odd(momentum, third)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any, entry: Any) -> tuple[Any, ...]:
-    """Return populations collided in a screen (see `resist`).
+def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any, entry: Any) -> tuple[Any, Any]:
+    """Return the same of populations in a screen (see `resist`).
 
     The force of Guo, Zheng and Shi 2002 (Phys. Rev. E 65, 046308, eq. 19 and 20): velocity with half the force, and the
     force's first and second moment with the factors 1 - rate / 2.
     """
-    kept, half_odd = _ONE - odd_rate, (_ONE - _HALF * odd_rate) / odd_rate
     density, bare, flux = moments_of(f)
     u, force = resist(normal, entry, bare, rates(time, odd_rate))
     keep = _kept(u, time, limit)
-    half = _HALF + _HALF * keep
+    half, half_odd = _HALF + _HALF * keep, _ONE - _HALF * odd_rate
     n = departure(flux, u)
-    third = _third(u, _times((keep - kept) / odd_rate, n))
     xx, yy, zz, xy, xz, yz = _plus_square(_times(keep, n), u)
     (x, y, z), (fx, fy, fz) = u, (half * force[0], half * force[1], half * force[2])
     pushed = (
@@ -257,7 +287,12 @@ def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any,
         xz + x * fz + z * fx,
         yz + y * fz + z * fy,
     )
-    return _relaxed(f, density, u, pushed, third, (half_odd * force[0], half_odd * force[1], half_odd * force[2]), kept)
+    momentum = (
+        odd_rate * x + half_odd * force[0],
+        odd_rate * y + half_odd * force[1],
+        odd_rate * z + half_odd * force[2],
+    )
+    return _even(density, u, pushed), _odd(momentum, _third(u, n, keep - (_ONE - odd_rate)))
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -272,7 +307,7 @@ def rescaled(f: Any, stretch: Any, stress: Any) -> tuple[Any, ...]:
     density, u, flux = moments_of(f)
     held = _times(stress, departure(flux, u))
     faster = stretch * u[0], stretch * u[1], stretch * u[2]
+    added = (_ONE - stretch) * faster[0], (_ONE - stretch) * faster[1], (_ONE - stretch) * faster[2]
     zero = u[0] - u[0]
-    none = zero, zero, zero
-    flux = _plus_square(held, faster)
-    return _relaxed(stretch * f, stretch * stretch * density, faster, flux, (*none, *none), none, stretch)
+    even = _even(stretch * stretch * density, faster, _plus_square(held, faster))
+    return relaxed(f, even, _odd(added, (zero, zero, zero, zero, zero, zero)), stretch * stretch)

@@ -21,8 +21,6 @@ COUNT: Final = 16 if get_host_cpu_features().get("avx512f") else 8
 _FLOAT: Final = ir.FloatType()
 _VECTOR: Final = ir.VectorType(_FLOAT, COUNT)
 _FAST: Final = ("fast",)
-_LINE: Final = 16
-"""Numbers that a processor fetches together: 64 bytes."""
 
 
 class Lanes(types.Type):
@@ -132,6 +130,23 @@ def _root_chosen(a: Any) -> Any:
     return of_lanes if a == LANES else of_number
 
 
+@intrinsic
+def upto(_: Any, count: Any, a: Any, b: Any) -> Any:
+    """Return Lanes that are a in the first `count` places and b in the others."""
+
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        number = ir.IntType(32)
+        places = ir.Constant(ir.VectorType(number, COUNT), list(range(COUNT)))
+        counts = builder.insert_element(
+            ir.Constant(places.type, ir.Undefined), builder.trunc(arguments[0], number), number(0)
+        )
+        zeros = ir.Constant(places.type, [0] * COUNT)
+        counts = builder.shuffle_vector(counts, ir.Constant(places.type, ir.Undefined), zeros)
+        return builder.select(builder.icmp_signed("<", places, counts), arguments[1], arguments[2])
+
+    return LANES(types.intp, a, b), generate
+
+
 def _at(context: Any, builder: Any, array: Any, value: Any, place: Any) -> Any:
     """Pointer to the numbers of an array from a place on."""
     data = context.make_array(array)(context, builder, value).data
@@ -139,38 +154,28 @@ def _at(context: Any, builder: Any, array: Any, value: Any, place: Any) -> Any:
 
 
 def _runs(context: Any, builder: Any, signature: Any, arguments: Any) -> list[Any]:
-    """Pointers to the numbers of an array (n,) from each address[row, q] + offset on, q = 0 to 18."""
-    array, addresses, row, offset = arguments[:4]
-    held = context.make_array(signature.args[1])(context, builder, addresses)
-    entry = builder.gep(held.data, [builder.mul(row, builder.extract_value(held.shape, 1))])
-    starts = [builder.load(builder.gep(entry, [cgutils.intp_t(q)])) for q in range(19)]
-    places = [builder.add(builder.sext(start, cgutils.intp_t), offset) for start in starts]
+    """Pointers to the numbers of an array (n,) from each start + offset on, `starts` being a tuple."""
+    array, starts, offset = arguments[:3]
+    places = [builder.add(start, offset) for start in cgutils.unpack_tuple(builder, starts)]
     return [_at(context, builder, signature.args[0], array, place) for place in places]
 
 
 @intrinsic
-def fetch(_: Any, array: Any, address: Any, row: Any, count: Any) -> Any:
-    """Have `count` numbers of a float32 array (n,) from each address[row, q] on, q = 0 to 18, brought to the cache.
+def starts(_: Any, address: Any, row: Any) -> Any:
+    """Return a row (19,) of addresses as a tuple, which stores to other arrays cannot change: it is read once.
 
-    Nineteen short runs at once are more than a processor sees coming by itself.
+    Rows must be contiguous.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array, addresses, row, count = arguments
-        number = ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number])
-        prefetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        to_write_soon_data = [number(k) for k in (1, 3, 1)]
-        line = cgutils.intp_t(_LINE)
-        lines = builder.udiv(builder.add(count, cgutils.intp_t(_LINE - 1)), line)
-        with cgutils.for_range(builder, lines) as loop:
-            for run in _runs(context, builder, signature, (array, addresses, row, builder.mul(loop.index, line))):
-                builder.call(prefetch, [builder.bitcast(run, cgutils.voidptr_t), *to_write_soon_data])
-        return context.get_dummy_value()
+        held = context.make_array(signature.args[0])(context, builder, arguments[0])
+        entry = builder.gep(held.data, [builder.mul(arguments[1], builder.extract_value(held.shape, 1))])
+        numbers = [builder.load(builder.gep(entry, [cgutils.intp_t(q)])) for q in range(19)]
+        return cgutils.pack_array(builder, [builder.sext(number, cgutils.intp_t) for number in numbers])
 
     if address.layout != "C":
         return None
-    return types.void(array, address, types.intp, types.intp), generate
+    return types.containers.UniTuple(types.intp, 19)(address, types.intp), generate
 
 
 @intrinsic
@@ -184,34 +189,14 @@ def load(_: Any, array: Any, place: Any) -> Any:
 
 
 @intrinsic
-def gather(_: Any, array: Any, address: Any, row: Any, offset: Any) -> Any:
-    """Return Lanes of a float32 array (n,) from each address[row, q] + offset on, q = 0 to 18, as a tuple.
-
-    Rows of addresses must be contiguous.
-    """
+def gather(_: Any, array: Any, starts: Any, offset: Any) -> Any:
+    """Return Lanes of a float32 array (n,) from each start + offset on, as a tuple."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         runs = _runs(context, builder, signature, arguments)
         return cgutils.pack_array(builder, [builder.load(run, align=4) for run in runs])
 
-    if address.layout != "C":
-        return None
-    return types.containers.UniTuple(LANES, 19)(array, address, types.intp, types.intp), generate
-
-
-@intrinsic
-def scatter(_: Any, array: Any, address: Any, row: Any, offset: Any, lanes: Any) -> Any:
-    """Write a tuple of Lanes to where `gather` reads them."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        runs = _runs(context, builder, signature, arguments)
-        for run, one in zip(runs, cgutils.unpack_tuple(builder, arguments[4]), strict=True):
-            builder.store(one, run, align=4)
-        return context.get_dummy_value()
-
-    if address.layout != "C":
-        return None
-    return types.void(array, address, types.intp, types.intp, lanes), generate
+    return types.containers.UniTuple(LANES, len(starts))(array, starts, types.intp), generate
 
 
 @intrinsic

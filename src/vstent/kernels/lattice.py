@@ -23,8 +23,17 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from vstent.kernels.arrays import Floats, Ints
-from vstent.kernels.collision import collided, collided_screened, rates, rescaled, resist, stress_size, thinned
-from vstent.kernels.lanes import COUNT, fetch, gather, load, scatter, store
+from vstent.kernels.collision import (
+    collided,
+    collided_screened,
+    rates,
+    relaxed_pair,
+    rescaled,
+    resist,
+    stress_size,
+    thinned,
+)
+from vstent.kernels.lanes import COUNT, gather, load, starts, store, upto
 
 VELOCITIES: Final[Ints] = np.array(
     [[0, 0, 0]]
@@ -53,14 +62,12 @@ SLOWLY: Final = 0.1
 """Part of the way that an outlet's pressure goes in a step pair; at once, it would chase its own answer."""
 SEGMENT: Final = 128
 """Longest segment, in cells."""
-AHEAD: Final = 2
-"""Segments by which their populations are fetched before they are needed."""
-LINK_WORK, SCREENED_WORK = 0.035, 2.0
+LINK_WORK, SCREENED_WORK = 0.06, 2.0
 """Time that a link takes, and a vector of a segment with screened cells, over that of a vector without."""
 ENTRY: Final = 7
 """Numbers that say what a cell of a screen resists (see `resist`): the unit normal and four of the resistance."""
 
-_ZERO = np.float32(0.0)
+_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _ROOT_THREE: Final = float(np.sqrt(3.0))
 _U = np.uint64
 _WIDE = SEGMENT + COUNT
@@ -86,53 +93,81 @@ def even_part(q: int, density: float, ux: float, uy: float, uz: float) -> float:
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _thin(f: Any, address: Any, s: int, n: int, time: float, law: Any, times: Any) -> None:
+def _thin(f: Any, start: Any, n: int, time: float, law: Any, times: Any) -> None:
     """Relaxation times of a segment of n cells whose blood thins with the shear rate, from the stress they hold."""
     for k in range(0, n, COUNT):
-        store(times, k, stress_size(gather(f, address, s, k)))
+        store(times, k, stress_size(gather(f, start, k)))
     for k in range(n):
         times[k] = thinned(times[k], time, law)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _collide(f: Any, address: Any, s: int, k: int, settings: Any, to: Any) -> None:
-    """Collide so many cells as Lanes hold of segment s, from its cell k on; `to` says where `scatter` puts them."""
-    times, limit, odd_rate = settings
-    target, places, row, at = to
-    scatter(target, places, row, at, collided(gather(f, address, s, k), load(times, k), limit, odd_rate))
+def _relax_pair(pair: int, f: Any, start: Any, k: int, cells: int, parts: Any, half_kept: Any) -> None:
+    """Relax the populations of a pair of opposite velocities (see `_relax`)."""
+    here, opposite = start[2 * pair - 1] + k, start[2 * pair] + k
+    a, b = load(f, here), load(f, opposite)
+    new_a, new_b = relaxed_pair(a, b, parts[0][pair], parts[1][pair - 1], half_kept)
+    store(f, here, upto(cells, new_a, a))
+    store(f, opposite, upto(cells, new_b, b))
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _collide_screened(f: Any, address: Any, s: int, k: int, settings: Any, resistance: Any, to: Any) -> None:
+def _relax(f: Any, start: Any, k: int, cells: int, parts: Any, odd_rate: Any) -> None:
+    """Relax a segment's cells from k on, as many as Lanes hold but no more than `cells`, by what `collided` returns.
+
+    Populations are read a second time for it, pair by pair: a processor's registers hold neither all of them nor all
+    that they become, and what lies in the cache anyway need not be put aside besides.
+    """
+    half_kept = _HALF * (_ONE - odd_rate)
+    _relax_pair(1, f, start, k, cells, parts, half_kept)
+    _relax_pair(2, f, start, k, cells, parts, half_kept)
+    _relax_pair(3, f, start, k, cells, parts, half_kept)
+    _relax_pair(4, f, start, k, cells, parts, half_kept)
+    _relax_pair(5, f, start, k, cells, parts, half_kept)
+    _relax_pair(6, f, start, k, cells, parts, half_kept)
+    _relax_pair(7, f, start, k, cells, parts, half_kept)
+    _relax_pair(8, f, start, k, cells, parts, half_kept)
+    _relax_pair(9, f, start, k, cells, parts, half_kept)
+    store(f, start[0] + k, upto(cells, parts[0][0], load(f, start[0] + k)))
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _collide(f: Any, start: Any, k: int, cells: int, settings: Any) -> None:
+    """Collide a segment's cells from k on, as many as Lanes hold but no more than `cells`."""
+    times, limit, odd_rate = settings
+    parts = collided(gather(f, start, k), load(times, k), limit, odd_rate)
+    _relax(f, start, k, cells, parts, odd_rate)
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _collide_screened(f: Any, start: Any, k: int, cells: int, settings: Any, resistance: Any) -> None:
     """Do what `_collide` does, where there are cells of a screen among them."""
     times, limit, odd_rate = settings
-    target, places, row, at = to
     normal = load(resistance, k), load(resistance, k + _WIDE), load(resistance, k + 2 * _WIDE)
     linear = load(resistance, k + 3 * _WIDE), load(resistance, k + 4 * _WIDE)
     entry = *linear, load(resistance, k + 5 * _WIDE), load(resistance, k + 6 * _WIDE)
-    held, time = gather(f, address, s, k), load(times, k)
-    scatter(target, places, row, at, collided_screened(held, time, limit, odd_rate, normal, entry))
+    parts = collided_screened(gather(f, start, k), load(times, k), limit, odd_rate, normal, entry)
+    _relax(f, start, k, cells, parts, odd_rate)
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
-def _collide_across(f: Any, address: Any, s: int, last: int, settings: Any, screen: Any, scratch: Any) -> None:
-    """Collide the cells of segment s, which a screen crosses: those from `last` on into `few`.
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _collide_across(f: Any, start: Any, s: int, cells: int, settings: Any, screen: Any, scratch: Any) -> None:
+    """Collide the cells of segment s, which a screen crosses.
 
     Free and screened cells have a loop each: with both in one, a compiler keeps too little of either in registers.
     """
     screen_start, screen_place, entry = screen
-    few, places, resistance, marked, _ = scratch
+    resistance, marked, _ = scratch
     for e in range(screen_start[s], screen_start[s + 1]):
         marked[screen_place[e] // COUNT] = True
         for k in range(ENTRY):
             resistance[k * _WIDE + screen_place[e]] = entry[e, k]
-    _collide_screened(f, address, s, last, settings, resistance, (few, places, 0, 0))
-    for k in range(0, last, COUNT):
+    for k in range(0, cells, COUNT):
         if not marked[k // COUNT]:
-            _collide(f, address, s, k, settings, (f, address, s, k))
-    for k in range(0, last, COUNT):
+            _collide(f, start, k, cells - k, settings)
+    for k in range(0, cells, COUNT):
         if marked[k // COUNT]:
-            _collide_screened(f, address, s, k, settings, resistance, (f, address, s, k))
+            _collide_screened(f, start, k, cells - k, settings, resistance)
     for e in range(screen_start[s], screen_start[s + 1]):
         marked[screen_place[e] // COUNT] = False
         for k in range(ENTRY):
@@ -145,35 +180,28 @@ def _update_some(
 ) -> None:
     """Do what `update` does to the segments from `begin` on, before `end`."""
     time, law, limit, odd_rate = relaxation
-    few, places, _, _, times = scratch
+    times = scratch[2]
     for s in range(begin, end):
-        cells = length[s]
-        if s + AHEAD < end:
-            fetch(f, address, s + AHEAD, length[s + AHEAD])
+        cells, start = length[s], starts(address, s)
         if law[0] > 0.0:
-            _thin(f, address, s, cells, time, law, times)
+            _thin(f, start, cells, time, law, times)
         settings = times, limit[s], odd_rate
-        # The last cells are read before the others are written and written after them: whole vectors only.
-        last = max(0, cells - COUNT)
         if screen[0][s] < screen[0][s + 1]:
-            _collide_across(f, address, s, last, settings, screen, scratch)
+            _collide_across(f, start, s, cells, settings, screen, scratch)
         else:
-            _collide(f, address, s, last, settings, (few, places, 0, 0))
-            for k in range(0, last, COUNT):
-                _collide(f, address, s, k, settings, (f, address, s, k))
-        if cells >= COUNT:
-            scatter(f, address, s, last, gather(few, places, 0, 0))
-        else:
-            for q in range(19):
-                for k in range(cells):
-                    f[address[s, q] + k] = few[COUNT * q + k]
+            whole = cells // COUNT * COUNT
+            for k in range(0, whole, COUNT):
+                _collide(f, start, k, COUNT, settings)
+            if whole < cells:
+                _collide(f, start, whole, cells - whole, settings)
 
 
 @njit(cache=True, fastmath=True, forceinline=True)
 def _reflect(f: Any, path: Any, weight: Any, source: Any, k: int) -> None:
     """Send back what crosses link k: a weighted sum of two and a source."""
-    first, second, target = _U(path[k, 0]), _U(path[k, 1]), _U(path[k, 2])
-    f[target] = weight[k, 0] * f[first] + weight[k, 1] * f[second] + source[k]
+    link = _U(k)
+    first, second, target = _U(path[link, 0]), _U(path[link, 1]), _U(path[link, 2])
+    f[target] = weight[link, 0] * f[first] + weight[link, 1] * f[second] + source[link]
 
 
 @njit(cache=True)
@@ -217,9 +245,8 @@ def _of_itself(stage: int, first: int, last: int, count: int) -> tuple[int, int]
 @njit(cache=True)
 def _scratch(time: float) -> tuple[Any, ...]:
     """Return what one thread's collisions need: see `_collide_across` and `_thin`."""
-    few, places = np.zeros(19 * COUNT, np.float32), COUNT * np.arange(19, dtype=np.int32).reshape(1, 19)
     resistance, marked = np.zeros(ENTRY * _WIDE, np.float32), np.zeros(_WIDE // COUNT + 1, np.bool_)
-    return few, places, resistance, marked, np.full(_WIDE, time)
+    return resistance, marked, np.full(_WIDE, time)
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
@@ -233,7 +260,8 @@ def update(f: Any, cells: Any, links: Any, bands: Any, shares: Any) -> None:
 
     Parameters
     ----------
-    f : (19 * stride + COUNT,) float32 populations, in place; they may be read up to COUNT - 1 places beyond a segment.
+    f : (19 * stride + COUNT,) float32 populations, in place; up to COUNT - 1 places beyond a segment they may be read
+        and written again as they were: between the storage places of two bands lie as many that are no cell's.
     cells : a tuple of
 
         - (steps, segments, 19) int32, where the populations of each segment begin: its own in an even step, its

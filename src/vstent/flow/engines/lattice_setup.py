@@ -13,7 +13,7 @@ from vstent.flow.engines.lattice_ends import Ends
 from vstent.flow.engines.lattice_scales import ODD_RATE, Scales
 from vstent.flow.screen import on_grid
 from vstent.flow.types import FlowCase
-from vstent.kernels import lattice, voxels
+from vstent.kernels import lanes, lattice, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 CELL_REYNOLDS_AT_END = 25.0
@@ -177,9 +177,10 @@ def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
     inside[tuple(cells.T)] = True
     stored = voxels.dilate(inside, lattice.VELOCITIES[1:])
     number = np.full(inside.shape, -1, dtype=np.int32)
-    count = int(stored.sum())
+    # What a vector holds beyond its segment is written again as it was: of another layer, another thread may be there.
+    number[stored] = np.arange(stored.sum()) + lanes.COUNT * np.nonzero(stored)[0]
+    count = int(number.max()) + lanes.COUNT
     stride = count + (OFF_PAGE - count) % PAGE
-    number[stored] = np.arange(count, dtype=np.int32)
     place = number[tuple(cells.T)]
     is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(limit) != 0)
     first: Ints = np.flatnonzero(np.r_[True, is_new])
