@@ -19,14 +19,16 @@ from vstent.vessel import Opening, Vessel
 
 BLOOD = Blood(density_kg_m3=1056.0, viscosity_Pa_s=0.0035)
 INFLOW_ML_S = 5.20624
+"""The nominal flow. What the five carry is less: see `own_flow_mL_s`."""
 INLET_MM, CONE_MM, THROAT_MM, WIDE_RADIUS_MM, RADIUS_MM = 4.0, 22.685, 40.0, 6.0, 2.0
 AROUND, EDGE_MM = 96, 0.5
+BEFORE_THE_CONE_MM = (-88.0, -64.0)
 BEHIND_THE_STEP_MM = (8.0, 16.0, 24.0, 32.0, 60.0, 80.0)
 BEYOND = 0.03
 """How far outside the spread of the five a velocity may be, as a fraction of the section's peak."""
-ROUND_BEYOND, LEANING_BEYOND = 0.045, 0.1
-"""The same behind the step, of the mean around the axis (an axisymmetric solution leaves the spread as far) and of one
-profile: there the jet leaves the axis by 0.06 degrees, 0.1 mm at the end, and its edge is steep."""
+LEANING_BEYOND = 0.075
+"""The same behind the step, of one profile: there the jet leaves the axis by 0.06 degrees, 0.1 mm at the end, and its
+edge is steep. The profile that lies along the lean is the furthest outside."""
 
 
 def narrowing(end_mm: float) -> list[tuple[float, float]]:
@@ -86,6 +88,22 @@ def _plots(text: str) -> dict[str, np.ndarray]:
     return found
 
 
+def own_flow_mL_s(experiments: list[dict[str, np.ndarray]]) -> float:
+    """Mean flow that the five carry by their profiles in the inlet tube: 4.7 to 5.1 mL/s, 5 % less than nominal.
+
+    What passes there passes behind the step too: with the nominal flow no solution can be inside the spread there.
+    """
+    r_mm = np.linspace(-WIDE_RADIUS_MM, WIDE_RADIUS_MM, 2001)
+    flows_mL_s = []
+    for one in experiments:
+        for z_mm in BEFORE_THE_CONE_MM:
+            r_m, speed_m_s = np.array(sorted(map(tuple, one[f"profile-axial-velocity-at-z {1e-3 * z_mm:.5f}"]))).T
+            within = np.abs(r_m) < 1e-3 * WIDE_RADIUS_MM
+            speed = np.interp(r_mm, np.r_[r_mm[0], 1e3 * r_m[within], r_mm[-1]], np.r_[0.0, speed_m_s[within], 0.0])
+            flows_mL_s.append(np.pi * np.trapezoid(np.abs(r_mm) * speed, r_mm))
+    return float(np.mean(flows_mL_s))
+
+
 def spread(experiments: list[dict[str, np.ndarray]], name: str, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest velocity (n,) of the experiments that have this plot, at places (n,) in m."""
     measured = [one[name] for one in experiments if name in one]
@@ -143,9 +161,10 @@ def test_a_round_jet_stays_round() -> None:
 
 
 @pytest.fixture(scope="module")
-def jet() -> FlowField:
-    """The whole nozzle in cells of a quarter of a millimetre, 16 across the throat."""
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.25, max_steps=100_000)
+def jet(experiments: list[dict[str, np.ndarray]]) -> FlowField:
+    """The whole nozzle in cells of a quarter of a millimetre, 16 across the throat, at the flow that the five carry."""
+    inflow_mL_s = own_flow_mL_s(experiments)
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=inflow_mL_s, cell_size_mm=0.25, max_steps=100_000)
     return simulate_case(FlowCase(nozzle(95.0), settings=settings))
 
 
@@ -154,6 +173,7 @@ def test_the_axis_of_the_jet_is_inside_the_spread_of_the_experiments(
     jet: FlowField, experiments: list[dict[str, np.ndarray]]
 ) -> None:
     print(f"\n{len(jet.cells)} cells, {jet.steps} steps, {jet.seconds:.0f} s: {jet.advice}")  # noqa: T201
+    print(f"flow of the five: {own_flow_mL_s(experiments):.2f} mL/s")  # noqa: T201
     worst = []
     for z_mm in (-20.0, -8.0, 0.0, *BEHIND_THE_STEP_MM):
         profile, around, axis = outside(jet, experiments, z_mm)
@@ -176,27 +196,29 @@ def test_the_profiles_up_to_the_step_are_inside_the_spread(
 
 @pytest.mark.validation
 @pytest.mark.parametrize("z_mm", BEHIND_THE_STEP_MM)
-def test_the_profiles_behind_the_step_are_nearly_inside_the_spread(
+def test_the_profiles_behind_the_step_are_inside_the_spread_but_for_a_lean(
     jet: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: float
 ) -> None:
     profile, around, _ = outside(jet, experiments, z_mm)
-    assert around < ROUND_BEYOND
+    assert around < BEYOND
     assert profile < LEANING_BEYOND
 
 
 @pytest.mark.validation
 @pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")
-def test_an_axisymmetric_solution_leaves_the_spread_as_far(
-    experiments: list[dict[str, np.ndarray]], tmp_path: Path
+@pytest.mark.parametrize("is_nominal", [True, False])
+def test_an_axisymmetric_solution_is_inside_the_spread_at_the_flow_of_the_five_alone(
+    experiments: list[dict[str, np.ndarray]], tmp_path: Path, is_nominal: bool
 ) -> None:
-    """The nominal nozzle's flow itself is outside by more than 3 % of the peak, whoever computes it."""
+    """At the nominal flow it is outside by more than 3 % of the peak behind the step, whoever computes it."""
+    inflow_mL_s = INFLOW_ML_S if is_nominal else own_flow_mL_s(experiments)
     wide = 95.0, WIDE_RADIUS_MM
-    speed = axial_speed(tmp_path, narrowing(0.0), wide, INFLOW_ML_S, BLOOD, edge_mm=0.2)
+    speed = axial_speed(tmp_path, narrowing(0.0), wide, inflow_mL_s, BLOOD, edge_mm=0.2)
     found = []
-    for z_mm in BEHIND_THE_STEP_MM:
+    for z_mm in (-20.0, -8.0, 0.0, *BEHIND_THE_STEP_MM):
         found.append(beyond(speed(np.full(37, z_mm), radii_mm(z_mm)), experiments, z_mm).max())
-        print(f"z {z_mm:5.0f} mm: outside the spread by {found[-1]:.1%} of the peak")  # noqa: T201
-    assert BEYOND < max(found) < ROUND_BEYOND
+        print(f"z {z_mm:5.0f} mm, {inflow_mL_s:.2f} mL/s: outside by {found[-1]:.1%} of the peak")  # noqa: T201
+    assert (max(found) > BEYOND) == is_nominal
 
 
 @pytest.mark.validation
