@@ -19,6 +19,7 @@ from numba.extending import intrinsic, models, overload, register_model
 COUNT: Final = 16 if get_host_cpu_features().get("avx512f") else 8
 """Numbers in one."""
 _FLOAT: Final = ir.FloatType()
+_WHOLE: Final = ir.IntType(32)
 _VECTOR: Final = ir.VectorType(_FLOAT, COUNT)
 _FAST: Final = ("fast",)
 
@@ -39,13 +40,16 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, kind, _VECTOR)
 
 
+def _everywhere(builder: Any, number: Any) -> Any:
+    """Vector of the same number in every place."""
+    undefined = ir.Constant(ir.VectorType(number.type, COUNT), ir.Undefined)
+    first = builder.insert_element(undefined, number, _WHOLE(0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_WHOLE, COUNT), [0] * COUNT))
+
+
 def _widened(builder: Any, kind: Any, value: Any) -> Any:
     """The same number in every place, unless it is Lanes already."""
-    if kind == LANES:
-        return value
-    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    order = ir.Constant(ir.VectorType(ir.IntType(32), COUNT), [0] * COUNT)
-    return builder.shuffle_vector(one, ir.Constant(_VECTOR, ir.Undefined), order)
+    return value if kind == LANES else _everywhere(builder, value)
 
 
 def _is_pair(a: Any, b: Any) -> bool:
@@ -135,13 +139,8 @@ def upto(_: Any, count: Any, a: Any, b: Any) -> Any:
     """Return Lanes that are a in the first `count` places and b in the others."""
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        number = ir.IntType(32)
-        places = ir.Constant(ir.VectorType(number, COUNT), list(range(COUNT)))
-        counts = builder.insert_element(
-            ir.Constant(places.type, ir.Undefined), builder.trunc(arguments[0], number), number(0)
-        )
-        zeros = ir.Constant(places.type, [0] * COUNT)
-        counts = builder.shuffle_vector(counts, ir.Constant(places.type, ir.Undefined), zeros)
+        places = ir.Constant(ir.VectorType(_WHOLE, COUNT), list(range(COUNT)))
+        counts = _everywhere(builder, builder.trunc(arguments[0], _WHOLE))
         return builder.select(builder.icmp_signed("<", places, counts), arguments[1], arguments[2])
 
     return LANES(types.intp, a, b), generate
