@@ -24,12 +24,14 @@ INFLOW_ML_S = 5.20624
 INLET_MM, CONE_MM, THROAT_MM, WIDE_RADIUS_MM, RADIUS_MM = 4.0, 22.685, 40.0, 6.0, 2.0
 AROUND, EDGE_MM = 96, 0.5
 BEFORE_THE_CONE_MM = (-88.0, -64.0)
+UP_TO_THE_STEP_MM = (-20.0, -8.0, 0.0)
 BEHIND_THE_STEP_MM = (8.0, 16.0, 24.0, 32.0, 60.0, 80.0)
+SECTIONS_MM = (*UP_TO_THE_STEP_MM, *BEHIND_THE_STEP_MM)
 BEYOND = 0.03
 """How far outside the spread of the five a velocity may be, as a fraction of the section's peak."""
-LEANING_BEYOND = 0.075
-"""The same behind the step, of one profile: there the jet leaves the axis by 0.06 degrees, 0.1 mm at the end, and its
-edge is steep. The profile that lies along the lean is the furthest outside."""
+NOMINAL_BEYOND, LEANING_BEYOND = 0.045, 0.075
+"""The same behind the step, of any profile at the nominal flow, and of one at their own: there the jet leaves the axis
+by 0.06 degrees, 0.1 mm at the end, and its edge is steep. The one that lies along the lean is the furthest outside."""
 
 
 def narrowing(end_mm: float) -> list[tuple[float, float]]:
@@ -69,7 +71,7 @@ def _tube_faces(rings: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def experiments(shared_data: Path) -> list[dict[str, np.ndarray]]:
-    """Every experiment: arrays (n, 2) of a place and an axial velocity by the name of the plot."""
+    """Every experiment: arrays (n, 2) of a place and an axial velocity, by place, by the name of the plot."""
     archive = shared_data.parent / "reference" / "fda_nozzle" / "SE_exp_0500.zip"
     if not archive.exists():
         pytest.skip("the PIV data (../shared/reference) are not on this machine")
@@ -85,8 +87,13 @@ def _plots(text: str) -> dict[str, np.ndarray]:
         r"^plot-(\S*axial-velocity\S*(?: -?[\d.]+)?)[^\n]*\n(\d+)\n((?:[-+\d].*\n?)*)", text, re.M
     ):
         rows = [[float(x) for x in line.split()[:2]] for line in body.splitlines()[: int(count)]]
-        found[name.removesuffix(" 0")] = np.array(rows)
+        found[name.removesuffix(" 0")] = np.array(sorted(rows))
     return found
+
+
+def profile(z_mm: float) -> str:
+    """Name of the plot of a profile."""
+    return f"profile-axial-velocity-at-z {1e-3 * z_mm:.5f}"
 
 
 def own_flow_mL_s(experiments: list[dict[str, np.ndarray]]) -> float:
@@ -98,7 +105,7 @@ def own_flow_mL_s(experiments: list[dict[str, np.ndarray]]) -> float:
     flows_mL_s = []
     for one in experiments:
         for z_mm in BEFORE_THE_CONE_MM:
-            r_m, speed_m_s = np.array(sorted(map(tuple, one[f"profile-axial-velocity-at-z {1e-3 * z_mm:.5f}"]))).T
+            r_m, speed_m_s = one[profile(z_mm)].T
             within = np.abs(r_m) < 1e-3 * WIDE_RADIUS_MM
             speed = np.interp(r_mm, np.r_[r_mm[0], 1e3 * r_m[within], r_mm[-1]], np.r_[0.0, speed_m_s[within], 0.0])
             flows_mL_s.append(np.pi * np.trapezoid(np.abs(r_mm) * speed, r_mm))
@@ -109,7 +116,7 @@ def spread(experiments: list[dict[str, np.ndarray]], name: str, at: np.ndarray) 
     """Least and largest velocity (n,) of the experiments that have this plot, at places (n,) in m."""
     measured = [one[name] for one in experiments if name in one]
     assert len(measured) >= 3
-    values = [np.interp(at, *np.array(sorted(map(tuple, one))).T) for one in measured]
+    values = [np.interp(at, *one.T) for one in measured]
     return np.min(values, axis=0), np.max(values, axis=0)
 
 
@@ -120,7 +127,7 @@ def radii_mm(z_mm: float) -> np.ndarray:
 
 def beyond(speed: np.ndarray, experiments: list[dict[str, np.ndarray]], z_mm: float) -> np.ndarray:
     """How far a profile (37,) at z is outside the spread (37,), as fractions of the measured peak."""
-    low, high = spread(experiments, f"profile-axial-velocity-at-z {1e-3 * z_mm:.5f}", 1e-3 * radii_mm(z_mm))
+    low, high = spread(experiments, profile(z_mm), 1e-3 * radii_mm(z_mm))
     return np.maximum(np.maximum(low - speed, speed - high), 0.0) / high.max()
 
 
@@ -193,7 +200,7 @@ def test_the_axis_of_the_jet_is_inside_the_spread_of_the_experiments(
 ) -> None:
     print(f"\n{len(jet.cells)} cells, {jet.steps} steps, {jet.seconds:.0f} s: {jet.advice}")  # noqa: T201
     print(f"flow of the five: {own_flow_mL_s(experiments):.2f} mL/s")  # noqa: T201
-    found = {z_mm: outside(jet, experiments, z_mm) for z_mm in (-20.0, -8.0, 0.0, *BEHIND_THE_STEP_MM)}
+    found = {z_mm: outside(jet, experiments, z_mm) for z_mm in SECTIONS_MM}
     for z_mm, one in found.items():
         print(f"z {z_mm:5.0f} mm: {one}")  # noqa: T201
     assert jet.outlets_mL_s[0] == pytest.approx(jet.inflow_mL_s, rel=1e-3)
@@ -201,7 +208,7 @@ def test_the_axis_of_the_jet_is_inside_the_spread_of_the_experiments(
 
 
 @pytest.mark.validation
-@pytest.mark.parametrize("z_mm", [-20.0, -8.0, 0.0])
+@pytest.mark.parametrize("z_mm", UP_TO_THE_STEP_MM)
 def test_the_profiles_up_to_the_step_are_inside_the_spread(
     jet: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: float
 ) -> None:
@@ -230,24 +237,24 @@ def test_an_axisymmetric_solution_is_inside_the_spread_at_the_flow_of_the_five_a
     wide = 95.0, WIDE_RADIUS_MM
     speed = axial_speed(tmp_path, narrowing(0.0), wide, inflow_mL_s, BLOOD, edge_mm=0.2)
     found = []
-    for z_mm in (-20.0, -8.0, 0.0, *BEHIND_THE_STEP_MM):
+    for z_mm in SECTIONS_MM:
         found.append(beyond(speed(np.full(37, z_mm), radii_mm(z_mm)), experiments, z_mm).max())
         print(f"z {z_mm:5.0f} mm, {inflow_mL_s:.2f} mL/s: outside by {found[-1]:.1%} of the peak")  # noqa: T201
-    assert (max(found) > BEYOND) == is_nominal
+    least, most = (BEYOND, NOMINAL_BEYOND) if is_nominal else (0.0, BEYOND)
+    assert least < max(found) < most
 
 
 @pytest.mark.validation
 @pytest.mark.parametrize("cell_size_mm", [0.47, 0.5, 0.53])
 def test_a_jet_leaves_a_lip_straight_however_it_lies_on_the_grid(cell_size_mm: float) -> None:
-    """With blood sent back where links clip its corner: 12 and 17 % of the peak, once and twice around (0.5 mm).
+    """With blood sent back where links clip its corner: 8, 9 and 4 % of the peak.
 
-    Blood is too fast for 4 to 5 % of these cells, and computed thicker there: without that 3.2 % for 4.8 at 0.5 mm, but
-    at 0.53 mm the flow does not settle.
+    At the nominal flow blood is too fast for 4 to 5 % of these cells, and computed thicker there: 4.8 % for 2.8.
     """
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=cell_size_mm)
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=0.6 * INFLOW_ML_S, cell_size_mm=cell_size_mm)
     field = simulate_case(FlowCase(nozzle(14.0), settings=settings))
     angle = np.pi / 12 * np.arange(24)
     ring = np.stack([1.8 * np.cos(angle), 1.8 * np.sin(angle), np.full(24, 8.0)], axis=1)
     harmonics = np.abs(np.fft.rfft(sampling.values_at(field, ring)[0][:, 2])) / 12 / field.speed_m_s.max()
     print(f"\nonce to four times around: {100 * harmonics[1:5]} %")  # noqa: T201
-    assert harmonics[1:4].max() < 0.05
+    assert harmonics[1:4].max() < 0.035
