@@ -19,7 +19,7 @@ import numpy as np
 
 import vstent
 from vstent import phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, flow_case, indices, simulate, simulate_case
+from vstent.flow import FlowCase, FlowField, FlowSettings, Progress, flow_case, indices, simulate, simulate_case
 from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
 from vstent.flow.engines.lattice_state import advance
 from vstent.flow.waveform import OLDER_ADULT_ICA
@@ -120,7 +120,7 @@ def cost(surface: Path | None, *, close_up: bool) -> None:
     stents = [None, *(vstent.deploy(vstent.find_design(name), anatomy).stent for name in ("silk", "enterprise"))]
     settings = FlowSettings(cell_size_mm=0.1, close_up=close_up)
     began, began_core = time.perf_counter(), time.process_time()
-    fields = simulate(anatomy, stents, settings)
+    fields = simulate(anatomy, stents, settings, progress=tell)
     clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
     print(f"\n{named(surface, close_up=close_up)}:\n")
     case = flow_case(anatomy, None, settings)
@@ -132,11 +132,16 @@ def pulse(surface: Path | None, *, close_up: bool) -> None:
     settings = FlowSettings(cell_size_mm=0.1, waveform=OLDER_ADULT_ICA, max_cycles=2, close_up=close_up)
     case = flow_case(anatomy_of(surface), None, settings)
     began, began_core = time.perf_counter(), time.process_time()
-    field = simulate_case(case)
+    field = simulate_case(case, progress=tell)
     clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
     print(f"\n{named(surface, close_up=close_up)}, two cycles of a pulse:\n")
     table(case, {"bare, mean of the second": field}, clock_s, core_s)
     print(field.advice)
+
+
+def tell(now: Progress) -> None:
+    """Say on the screen how far a flow has come; the tables go elsewhere."""
+    print(f"\r{now.fraction:4.0%}, {now.seconds_left / 60:.1f} min left ", end="", file=sys.stderr, flush=True)
 
 
 def named(surface: Path | None, *, close_up: bool) -> str:

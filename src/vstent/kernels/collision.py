@@ -5,8 +5,8 @@ and numbered as in `vstent.kernels.lattice`.
 
 Regularised: of the even part only the stress survives (Latt and Chopard 2006, Math. Comput. Simul. 72:165, eq 12),
 without its trace, which only carries sound. The odd part has its own rate (Ginzburg, Verhaeghe and d'Humieres 2008,
-Commun. Comput. Phys. 3, 427). Equilibrium of incompressible flow (He and Luo 1997, J. Stat. Phys. 88, 927, eq. 20):
-the steady state is free of divergence, whatever the lattice speed.
+Commun. Comput. Phys. 3, 427), in fast blood a higher one (`_stable_rate`). Equilibrium of incompressible flow (He and
+Luo 1997, J. Stat. Phys. 88, 927, eq. 20): the steady state is free of divergence, whatever the lattice speed.
 
 Two moments that nineteen velocities lack are made up for, and both bend a round jet along the grid's diagonals. The
 fourth moments are those that the second ones ask for, <xxyy> = density / 9 + (ux ux + uy uy) / 3 (Bauer and Ruede 2018,
@@ -25,8 +25,8 @@ _THIRD, _AXIS, _DIAGONAL = np.float32(1 / 3), np.float32(1 / 18), np.float32(1 /
 _ZERO, _HALF, _ONE, _TWO, _THREE, _FOUR, _SIX, _EIGHT = (
     np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 )
-_THREE_HALVES, _QUARTER, _EIGHTH, _TWELFTH, _TWENTY_FOURTH = (
-    np.float32(x) for x in (3 / 2, 1 / 4, 1 / 8, 1 / 12, 1 / 24)
+_THREE_HALVES, _QUARTER, _EIGHTH, _TWELFTH, _TWENTY_FOURTH, _TINY = (
+    np.float32(x) for x in (3 / 2, 1 / 4, 1 / 8, 1 / 12, 1 / 24, 1e-12)
 )
 
 
@@ -137,33 +137,46 @@ def _odd(momentum: Any, third: Any) -> tuple[Any, ...]:
 def relaxed_pair(a: Any, b: Any, even: Any, odd: Any, half_kept: Any) -> tuple[Any, Any]:
     """Return collided populations in place of a and b, its opposite: already swapped.
 
-    `even` and `odd` are the pair's of what `collided` returns, `half_kept` is half of how much of the odd part is kept.
+    `even` and `odd` are the pair's of what `collided` returns, `half_kept` what it returns besides.
     """
     new = odd + half_kept * (a - b)
     return even - new, even + new
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def relaxed(f: Any, even: Any, odd: Any, kept: Any) -> tuple[Any, ...]:
+def relaxed(f: Any, even: Any, odd: Any, half_kept: Any) -> tuple[Any, ...]:
     """Return the 19 collided populations, each in the place of its opposite (see `relaxed_pair`)."""
-    half = _HALF * kept
-    one = relaxed_pair(f[1], f[2], even[1], odd[0], half)
-    two = relaxed_pair(f[3], f[4], even[2], odd[1], half)
-    three = relaxed_pair(f[5], f[6], even[3], odd[2], half)
-    four = relaxed_pair(f[7], f[8], even[4], odd[3], half)
-    five = relaxed_pair(f[9], f[10], even[5], odd[4], half)
-    six = relaxed_pair(f[11], f[12], even[6], odd[5], half)
-    seven = relaxed_pair(f[13], f[14], even[7], odd[6], half)
-    eight = relaxed_pair(f[15], f[16], even[8], odd[7], half)
-    nine = relaxed_pair(f[17], f[18], even[9], odd[8], half)
+    one = relaxed_pair(f[1], f[2], even[1], odd[0], half_kept)
+    two = relaxed_pair(f[3], f[4], even[2], odd[1], half_kept)
+    three = relaxed_pair(f[5], f[6], even[3], odd[2], half_kept)
+    four = relaxed_pair(f[7], f[8], even[4], odd[3], half_kept)
+    five = relaxed_pair(f[9], f[10], even[5], odd[4], half_kept)
+    six = relaxed_pair(f[11], f[12], even[6], odd[5], half_kept)
+    seven = relaxed_pair(f[13], f[14], even[7], odd[6], half_kept)
+    eight = relaxed_pair(f[15], f[16], even[8], odd[7], half_kept)
+    nine = relaxed_pair(f[17], f[18], even[9], odd[8], half_kept)
     return even[0], *one, *two, *three, *four, *five, *six, *seven, *eight, *nine
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _kept(u: Any, time: Any, limit: Any) -> Any:
-    """Part of the stress kept: by the blood's relaxation time, or that of blood at the largest cell Reynolds number."""
-    speed = root(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-    return _ONE - _ONE / larger(time, _HALF + _THREE / limit * speed)
+def _stable_rate(squared: Any, time: Any, odd_rate: Any) -> Any:
+    """Relaxation rate of the odd part: `odd_rate`, or as much higher as blood of this squared speed is stable with.
+
+    Waves on a uniform flow grow where its squared speed times (1 / rate - 1/2) passes some twice the viscosity: there
+    an eigenvalue of collision and streaming passes 1 (von Neumann's analysis, rates from 0.7 to 1.7; along the grid's
+    axes first). Up to three quarters of that are allowed, with which nothing grows up to a speed of 0.2.
+    """
+    slow = _ONE / odd_rate
+    excess = larger((slow - _HALF) * squared - _HALF * (time - _HALF), _ZERO)
+    return squared / (slow * squared - excess)
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _kept_and_rate(u: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any]:
+    """Part of the stress kept, by the blood's relaxation time or at the largest cell Reynolds number, and odd rate."""
+    squared = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + _TINY
+    time = larger(time, _HALF + _THREE / limit * root(squared))
+    return _ONE - _ONE / time, _stable_rate(squared, time, odd_rate)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -255,18 +268,21 @@ def resist(normal: Any, entry: Any, u: Any, blood: Any) -> tuple[Any, Any]:
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def collided(f: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any]:
-    """Return what `relaxed` makes populations of that collide freely: the even parts (10) and the odd ones (9)."""
+def collided(f: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any, Any]:
+    """Return what `relaxed` makes populations of that collide freely.
+
+    The even parts (10), the odd ones (9), and half of how much of the odd part is kept.
+    """
     density, u, flux = moments_of(f)
-    keep = _kept(u, time, limit)
+    keep, rate = _kept_and_rate(u, time, limit, odd_rate)
     n = departure(flux, u)
-    momentum = odd_rate * u[0], odd_rate * u[1], odd_rate * u[2]
-    third = _third(u, n, keep - (_ONE - odd_rate))
-    return _even(density, u, _plus_square(_times(keep, n), u)), _odd(momentum, third)
+    momentum = rate * u[0], rate * u[1], rate * u[2]
+    third = _third(u, n, keep - (_ONE - rate))
+    return _even(density, u, _plus_square(_times(keep, n), u)), _odd(momentum, third), _HALF * (_ONE - rate)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any, entry: Any) -> tuple[Any, Any]:
+def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any, entry: Any) -> tuple[Any, Any, Any]:
     """Return the same of populations in a screen (see `resist`).
 
     The force of Guo, Zheng and Shi 2002 (Phys. Rev. E 65, 046308, eq. 19 and 20): velocity with half the force, and the
@@ -274,8 +290,8 @@ def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any,
     """
     density, bare, flux = moments_of(f)
     u, force = resist(normal, entry, bare, rates(time, odd_rate))
-    keep = _kept(u, time, limit)
-    half, half_odd = _HALF + _HALF * keep, _ONE - _HALF * odd_rate
+    keep, rate = _kept_and_rate(u, time, limit, odd_rate)
+    half, half_odd = _HALF + _HALF * keep, _ONE - _HALF * rate
     n = departure(flux, u)
     xx, yy, zz, xy, xz, yz = _plus_square(_times(keep, n), u)
     (x, y, z), (fx, fy, fz) = u, (half * force[0], half * force[1], half * force[2])
@@ -288,11 +304,11 @@ def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any,
         yz + y * fz + z * fy,
     )
     momentum = (
-        odd_rate * x + half_odd * force[0],
-        odd_rate * y + half_odd * force[1],
-        odd_rate * z + half_odd * force[2],
+        rate * x + half_odd * force[0],
+        rate * y + half_odd * force[1],
+        rate * z + half_odd * force[2],
     )
-    return _even(density, u, pushed), _odd(momentum, _third(u, n, keep - (_ONE - odd_rate)))
+    return _even(density, u, pushed), _odd(momentum, _third(u, n, keep - (_ONE - rate))), _HALF * (_ONE - rate)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -310,4 +326,4 @@ def rescaled(f: Any, stretch: Any, stress: Any) -> tuple[Any, ...]:
     added = (_ONE - stretch) * faster[0], (_ONE - stretch) * faster[1], (_ONE - stretch) * faster[2]
     zero = u[0] - u[0]
     even = _even(stretch * stretch * density, faster, _plus_square(held, faster))
-    return relaxed(f, even, _odd(added, (zero, zero, zero, zero, zero, zero)), stretch * stretch)
+    return relaxed(f, even, _odd(added, (zero, zero, zero, zero, zero, zero)), _HALF * stretch * stretch)

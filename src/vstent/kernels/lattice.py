@@ -102,32 +102,31 @@ def _thin(f: Any, start: Any, n: int, time: float, law: Any, times: Any) -> None
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _relax_pair(pair: int, f: Any, start: Any, k: int, cells: int, parts: Any, half_kept: Any) -> None:
+def _relax_pair(pair: int, f: Any, start: Any, k: int, cells: int, parts: Any) -> None:
     """Relax the populations of a pair of opposite velocities (see `_relax`)."""
     here, opposite = start[2 * pair - 1] + k, start[2 * pair] + k
     a, b = load(f, here), load(f, opposite)
-    new_a, new_b = relaxed_pair(a, b, parts[0][pair], parts[1][pair - 1], half_kept)
+    new_a, new_b = relaxed_pair(a, b, parts[0][pair], parts[1][pair - 1], parts[2])
     store(f, here, upto(cells, new_a, a))
     store(f, opposite, upto(cells, new_b, b))
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _relax(f: Any, start: Any, k: int, cells: int, parts: Any, odd_rate: Any) -> None:
+def _relax(f: Any, start: Any, k: int, cells: int, parts: Any) -> None:
     """Relax a segment's cells from k on, as many as Lanes hold but no more than `cells`, by what `collided` returns.
 
     Populations are read a second time for it, pair by pair: a processor's registers hold neither all of them nor all
     that they become, and what lies in the cache anyway need not be put aside besides.
     """
-    half_kept = _HALF * (_ONE - odd_rate)
-    _relax_pair(1, f, start, k, cells, parts, half_kept)
-    _relax_pair(2, f, start, k, cells, parts, half_kept)
-    _relax_pair(3, f, start, k, cells, parts, half_kept)
-    _relax_pair(4, f, start, k, cells, parts, half_kept)
-    _relax_pair(5, f, start, k, cells, parts, half_kept)
-    _relax_pair(6, f, start, k, cells, parts, half_kept)
-    _relax_pair(7, f, start, k, cells, parts, half_kept)
-    _relax_pair(8, f, start, k, cells, parts, half_kept)
-    _relax_pair(9, f, start, k, cells, parts, half_kept)
+    _relax_pair(1, f, start, k, cells, parts)
+    _relax_pair(2, f, start, k, cells, parts)
+    _relax_pair(3, f, start, k, cells, parts)
+    _relax_pair(4, f, start, k, cells, parts)
+    _relax_pair(5, f, start, k, cells, parts)
+    _relax_pair(6, f, start, k, cells, parts)
+    _relax_pair(7, f, start, k, cells, parts)
+    _relax_pair(8, f, start, k, cells, parts)
+    _relax_pair(9, f, start, k, cells, parts)
     store(f, start[0] + k, upto(cells, parts[0][0], load(f, start[0] + k)))
 
 
@@ -136,7 +135,7 @@ def _collide(f: Any, start: Any, k: int, cells: int, settings: Any) -> None:
     """Collide a segment's cells from k on, as many as Lanes hold but no more than `cells`."""
     times, limit, odd_rate = settings
     parts = collided(gather(f, start, k), load(times, k), limit, odd_rate)
-    _relax(f, start, k, cells, parts, odd_rate)
+    _relax(f, start, k, cells, parts)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -147,7 +146,7 @@ def _collide_screened(f: Any, start: Any, k: int, cells: int, settings: Any, res
     linear = load(resistance, k + 3 * _WIDE), load(resistance, k + 4 * _WIDE)
     entry = *linear, load(resistance, k + 5 * _WIDE), load(resistance, k + 6 * _WIDE)
     parts = collided_screened(gather(f, start, k), load(times, k), limit, odd_rate, normal, entry)
-    _relax(f, start, k, cells, parts, odd_rate)
+    _relax(f, start, k, cells, parts)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")

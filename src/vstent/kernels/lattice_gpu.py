@@ -27,7 +27,7 @@ from vstent.kernels.lattice import (
 
 THREADS: Final = 128
 """Threads of a block."""
-_U, _ONE = np.uint64, np.float32(1.0)
+_U = np.uint64
 
 
 @njit(forceinline=True)
@@ -95,12 +95,12 @@ def update(
         time = thinned(stress_size(held), time, law)
     e = _entry_of(s, k, screen_start, screen_place)
     if e < 0:
-        even, odd = collided(held, time, limit[s], odd_rate)
+        even, odd, half_kept = collided(held, time, limit[s], odd_rate)
     else:
         normal = screen[e, 0], screen[e, 1], screen[e, 2]
         entry = screen[e, 3], screen[e, 4], screen[e, 5], screen[e, 6]
-        even, odd = collided_screened(held, time, limit[s], odd_rate, normal, entry)
-    new = relaxed(held, even, odd, _ONE - odd_rate)
+        even, odd, half_kept = collided_screened(held, time, limit[s], odd_rate, normal, entry)
+    new = relaxed(held, even, odd, half_kept)
     for q in range(19):
         f[_U(address[s, q] + k)] = new[q]
 

@@ -9,7 +9,8 @@ from vstent.flow.types import Blood
 from vstent.units import M3_PER_ML
 
 ODD_RATE = 0.7
-"""Relaxation rate of the odd part: lower is more isotropic, higher is more stable and leaks less."""
+"""Relaxation rate of the odd part: lower is more isotropic, higher is more stable and leaks less. Where blood is fast
+it is as much higher as is stable (`vstent.kernels.collision`)."""
 
 
 @dataclass(frozen=True)
