@@ -30,8 +30,8 @@ SECTIONS_MM = (*UP_TO_THE_STEP_MM, *BEHIND_THE_STEP_MM)
 BEYOND = 0.03
 """How far outside the spread of the five a velocity may be, as a fraction of the section's peak."""
 NOMINAL_BEYOND, ALONG_X_BEYOND = 0.045, 0.075
-"""The same behind the step, of any profile at the nominal flow, and of one at their own: there the jet is not
-quite round and leaves the axis by 0.06 degrees, 0.08 mm at the end, and its edge is steep."""
+"""The same behind the step, of any profile at the nominal flow, and of one at their own: there the jet is not quite
+round and leaves the axis by 0.06 degrees, 0.08 mm at the end, and its edge is steep."""
 
 
 def narrowing(end_mm: float) -> list[tuple[float, float]]:
@@ -255,8 +255,8 @@ def test_an_axisymmetric_solution_is_inside_the_spread_at_the_flow_of_the_five_a
 
 
 @pytest.mark.validation
-@pytest.mark.parametrize("cell_size_mm", [0.47, 0.5, 0.53])
-def test_a_jet_leaves_a_lip_straight_however_it_lies_on_the_grid(cell_size_mm: float) -> None:
+@pytest.mark.parametrize(("cell_size_mm", "most"), [(0.47, 0.035), (0.5, 0.045), (0.53, 0.035)])
+def test_a_jet_leaves_a_lip_straight_however_it_lies_on_the_grid(cell_size_mm: float, most: float) -> None:
     """As it lies, 1.9, 3.8 and 2.2 % of the peak; with blood sent back where links clip its corner, 8, 9 and 4 %.
 
     At the nominal flow blood is too fast for 4 to 5 % of these cells, and computed thicker there: 4.8 % for 2.8.
@@ -267,4 +267,4 @@ def test_a_jet_leaves_a_lip_straight_however_it_lies_on_the_grid(cell_size_mm: f
     ring = np.stack([1.8 * np.cos(angle), 1.8 * np.sin(angle), np.full(24, 8.0)], axis=1)
     harmonics = np.abs(np.fft.rfft(sampling.values_at(field, ring)[0][:, 2])) / 12 / field.speed_m_s.max()
     print(f"\nonce to four times around: {100 * harmonics[1:5]} %")  # noqa: T201
-    assert harmonics[1:4].max() < 0.045
+    assert harmonics[1:4].max() < most
