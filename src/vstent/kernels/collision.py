@@ -289,6 +289,7 @@ def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any,
     force's first and second moment with the factors 1 - rate / 2.
     """
     density, bare, flux = moments_of(f)
+    # With the rate of slow blood, as `lattice.resisted` reads it: the product of both times is near zero with either.
     u, force = resist(normal, entry, bare, rates(time, odd_rate))
     keep, rate = _kept_and_rate(u, time, limit, odd_rate)
     half, half_odd = _HALF + _HALF * keep, _ONE - _HALF * rate

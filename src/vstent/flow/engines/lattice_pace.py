@@ -23,8 +23,9 @@ FEW: Final = 1e-3
 """Part of the blood that may be faster than what time steps go by, as in one narrow branch: its Mach number harms no
 other."""
 HASTE: Final = 2.0
-"""How many times as fast that may be at most. In C0038 at systole steps half as long change the sac's mean speed by 0.3
-per cent and the speed that all but a thousandth of its blood keep below by 0.2."""
+"""How many times as fast that may be at most. In C0038 steps half as long change the sac's mean speed by 0.3 per
+cent at the peak of systole and by 2 a phase later, when its vortices differ, and the speed that all but a thousandth of
+the blood keep below by 0.3 at most."""
 LONGEST: Final = 3.0
 """A pulse's longest time step over its shortest."""
 STORED: Final = 0.005
