@@ -24,14 +24,11 @@ INFLOW_ML_S = 5.20624
 INLET_MM, CONE_MM, THROAT_MM, WIDE_RADIUS_MM, RADIUS_MM = 4.0, 22.685, 40.0, 6.0, 2.0
 AROUND, EDGE_MM = 96, 0.5
 BEFORE_THE_CONE_MM = (-88.0, -64.0)
-UP_TO_THE_STEP_MM = (-20.0, -8.0, 0.0)
-BEHIND_THE_STEP_MM = (8.0, 16.0, 24.0, 32.0, 60.0, 80.0)
-SECTIONS_MM = (*UP_TO_THE_STEP_MM, *BEHIND_THE_STEP_MM)
+SECTIONS_MM = (-20.0, -8.0, 0.0, 8.0, 16.0, 24.0, 32.0, 60.0, 80.0)
 BEYOND = 0.03
 """How far outside the spread of the five a velocity may be, as a fraction of the section's peak."""
-NOMINAL_BEYOND, ALONG_X_BEYOND = 0.045, 0.075
-"""The same behind the step, of any profile at the nominal flow, and of one at their own: there the jet is not quite
-round and leaves the axis by 0.06 degrees, 0.08 mm at the end, and its edge is steep."""
+NOMINAL_BEYOND = 0.045
+"""The same at the nominal flow."""
 
 
 def narrowing(end_mm: float) -> list[tuple[float, float]]:
@@ -197,9 +194,12 @@ def test_a_round_jet_stays_round() -> None:
 
 @pytest.fixture(scope="module")
 def jet(experiments: list[dict[str, np.ndarray]]) -> FlowField:
-    """The whole nozzle in cells of a quarter of a millimetre, 16 across the throat, at the flow that the five carry."""
+    """The whole nozzle, 20 cells across the throat, at the flow that the five carry.
+
+    With 16 the jet is not quite round, and profiles along x are outside by up to 6.7 % of the peak.
+    """
     inflow_mL_s = own_flow_mL_s(experiments)
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=inflow_mL_s, cell_size_mm=0.25, max_steps=100_000)
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=inflow_mL_s, cell_size_mm=0.2, max_steps=200_000)
     return simulate_case(FlowCase(nozzle(95.0), settings=settings))
 
 
@@ -218,22 +218,12 @@ def test_the_axis_of_the_jet_is_inside_the_spread_of_the_experiments(
 
 
 @pytest.mark.validation
-@pytest.mark.parametrize("z_mm", UP_TO_THE_STEP_MM)
-def test_the_profiles_up_to_the_step_are_inside_the_spread(
+@pytest.mark.parametrize("z_mm", SECTIONS_MM)
+def test_every_profile_of_the_jet_is_inside_the_spread_of_the_experiments(
     jet: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: float
 ) -> None:
     found = outside(jet, experiments, z_mm)
     assert max(found.along_x, found.along_y, found.around) < BEYOND
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize("z_mm", BEHIND_THE_STEP_MM)
-def test_the_profiles_behind_the_step_are_inside_the_spread_but_for_one_across_the_jet(
-    jet: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: float
-) -> None:
-    found = outside(jet, experiments, z_mm)
-    assert max(found.around, min(found.along_x, found.along_y)) < BEYOND
-    assert max(found.along_x, found.along_y) < ALONG_X_BEYOND
 
 
 @pytest.mark.validation
