@@ -36,7 +36,7 @@ from vstent.units import M_PER_MM
 if TYPE_CHECKING:
     from vstent.flow.engines.lattice_gpu import Device
 
-DEFER_PAIRS = 16
+DEFER_PAIRS = 8
 """Step pairs between updates of what is deferred."""
 DEFER_PART = 0.15
 """Part of the way that each update goes."""
