@@ -309,16 +309,16 @@ def test_a_close_ups_time_step_goes_by_its_own_fastest_blood() -> None:
         faster = replace(outer, velocity_m_s=velocity_m_s)
         step_s = [LatticeBoltzmann(0.25, None, one).init(case, one).scales.step_s for one in (outer, faster)]
         assert step_s[0] == pytest.approx(times * step_s[1])
-        assert step_s[0] * 1.1 * np.quantile(outer.speed_m_s[part < 0], 0.99) == pytest.approx(0.15 * 0.25e-3)
+        assert step_s[0] * 1.1 * np.quantile(outer.speed_m_s[part < 0], 0.999) == pytest.approx(0.15 * 0.25e-3)
 
 
 def test_a_little_blood_may_be_twice_as_fast_as_time_steps_go_by() -> None:
     """As in one narrow branch, which would cost all the vessel its time steps."""
     case, outer = outer_of_demo()
-    usual_m_s = np.quantile(outer.speed_m_s, 0.99)
+    usual_m_s = np.quantile(outer.speed_m_s, 0.999)
     few = np.zeros(len(outer.cells), dtype=bool)
-    few[np.argsort(outer.speed_m_s)[-len(few) // 150 :]] = True
-    assert few.mean() < 1e-2
+    few[np.argsort(outer.speed_m_s)[-len(few) // 1500 :]] = True
+    assert few.mean() < 1e-3
     for times, longer in ((1.9, 1.0), (4.0, 0.5)):
         speed_m_s = np.where(few, times * usual_m_s, outer.speed_m_s)
         velocity_m_s = outer.velocity_m_s * (speed_m_s / np.maximum(outer.speed_m_s, 1e-12))[:, None]

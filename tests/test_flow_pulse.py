@@ -68,8 +68,8 @@ def test_a_pulse_that_begins_from_a_coarser_one_soon_repeats(monkeypatch: pytest
 
 
 def fast(speed_m_s: np.ndarray) -> float:
-    """What all but a hundredth keep below."""
-    return float(np.quantile(speed_m_s, 0.99))
+    """What all but a thousandth keep below."""
+    return float(np.quantile(speed_m_s, 0.999))
 
 
 SWING_OF_HALF = Waveform(1.0, (0.5,), (0.0,))

@@ -19,8 +19,8 @@ from vstent.units import M_PER_MM
 
 FASTER: Final = 1.1
 """The fastest blood over the fastest on the wider cells that it is foretold from."""
-FEW: Final = 1e-2
-"""Part of the blood that may be faster than what time steps go by, as in narrow branches: its Mach number harms no
+FEW: Final = 1e-3
+"""Part of the blood that may be faster than what time steps go by, as in one narrow branch: its Mach number harms no
 other."""
 HASTE: Final = 2.0
 """How many times as fast that may be at most. In C0038 steps half as long change the sac's mean speed by 0.3 per
