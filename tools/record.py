@@ -14,7 +14,6 @@ import sys
 import tempfile
 import xml.etree.ElementTree as ET
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -23,23 +22,22 @@ LONGEST = 4000
 """Characters of one test's words that are kept."""
 
 
-@cache
-def code() -> str:
-    """Say on what commit this began, and whether its sources were changed: it may take an hour."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    changed = subprocess.run(
-        ["git", "status", "--porcelain", "src"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    return (commit.stdout.strip() or "unknown") + (" with changes" if changed.stdout.strip() else "")
+def _git(*words: str) -> str:
+    """What git says, nothing where it cannot."""
+    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout.strip()
+
+
+CHANGED = " with changes" if _git("status", "--porcelain", "src") else ""
+COMMIT = f"{_git('rev-parse', '--short', 'HEAD') or 'unknown'}{CHANGED}"
+"""What is measured: the commit that this began on, for it may take an hour, and whether its sources were changed."""
 
 
 def circumstances(command: str) -> str:
     """Say when, where and on what code this was measured."""
     return (
         f":Recorded: {datetime.now(UTC):%Y-%m-%d %H:%M} UTC\n"
-        f":Commit: {code()}\n"
+        f":Commit: {COMMIT}\n"
         f":Machine: {os.cpu_count()} cores, {_processor()}, Python {platform.python_version()}\n"
         f":Command: ``{command}``\n\n"
     )
@@ -117,5 +115,4 @@ def benchmark(commands: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    code()
     sys.exit({"validation": validation, "benchmark": benchmark}[sys.argv[1]](sys.argv[2:]))
