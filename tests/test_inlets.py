@@ -15,7 +15,7 @@ from vstent.app.reopening import reopened
 from vstent.cli import main
 from vstent.errors import InputError, VesselError
 from vstent.flow import FlowCase, FlowField, FlowSettings, domain, flow_case, indices, sampling, simulate_case
-from vstent.flow.streamlines import inlet_seeds_mm
+from vstent.flow.streamlines import STEP_CELLS, inlet_seeds_mm, streamlines
 from vstent.flow.types import Waveform
 from vstent.io.writers import write_stl
 from vstent.kernels.arrays import Floats
@@ -243,6 +243,22 @@ def test_every_inlet_has_a_number_and_streamlines_of_its_own() -> None:
     right, left = ((sign * seeds_mm[:, 0] > 2).sum() for sign in (1, -1))
     assert right + left == len(seeds_mm) == 70
     assert abs(right - left) <= 4
+
+
+def test_streamlines_go_from_opening_to_opening() -> None:
+    vessel, field = joined(), joined_flow()
+    lines = streamlines(field, inlet_seeds_mm(field, vessel, 70))
+    first, last = lines.points_mm[lines.starts[:-1]], lines.points_mm[lines.starts[1:] - 1]
+    beyond_mm = [(lines.points_mm - opening.center_mm) @ opening.normal for opening in vessel.openings]
+    assert len(first) == 70
+    assert np.max(beyond_mm) < 1e-3
+    step_mm = STEP_CELLS * field.cell_size_mm
+    into, out = (
+        np.max([(ends - opening.center_mm) @ opening.normal for opening in openings], axis=0)
+        for ends, openings in ((first, vessel.inlets), (last, vessel.outlets))
+    )
+    assert (into > -step_mm).all()
+    assert (out > -step_mm).mean() > 0.9  # beside the wall some end in blood that stands
 
 
 def test_a_pulse_enters_by_all_inlets_at_once() -> None:

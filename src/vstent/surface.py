@@ -95,6 +95,11 @@ class Surface:
         return Surface(*triangles.cap(self.vertices_mm, self.faces, self.boundary_loops))
 
     @cached_property
+    def caps(self) -> "Surface":
+        """What closes the boundary loops: the openings of a vessel's wall, facing outward."""
+        return Surface(self.closed.vertices_mm, self.closed.faces[len(self.faces) :])
+
+    @cached_property
     def medial(self) -> medial.Medial:
         """Centres and radii of the maximum inscribed spheres, and which are neighbours.
 

@@ -37,24 +37,36 @@ class Streamlines:
 
 
 def streamlines(field: FlowField, seeds_mm: Floats) -> Streamlines:
-    """Trace the flow through every seed (s, 3), upstream and downstream, to the vessel's ends.
+    """Trace the flow through every seed (s, 3), upstream and downstream, to the vessel's openings.
 
-    Fourth-order Runge-Kutta in arc length on trilinear velocity; seeds outside the blood give no line.
+    Fourth-order Runge-Kutta in arc length on trilinear velocity; seeds outside the blood give no line. What blood does
+    in the extensions beyond the openings is no part of the vessel.
     """
-    seeds = np.ascontiguousarray((seeds_mm - field.origin_mm) / field.cell_size_mm)
-    most = int(LONGEST_MM / field.cell_size_mm / STEP_CELLS)
-    trace = lattice_sampling.trace_all
-    up = trace(field.index, field.velocity_m_s, seeds, -STEP_CELLS, SLOWEST_M_S, most)
-    down = trace(field.index, field.velocity_m_s, seeds, STEP_CELLS, SLOWEST_M_S, most)
-    lines = [np.concatenate([back[:0:-1], ahead]) for back, ahead in zip(_lines(*up), _lines(*down), strict=True)]
+    up, down = _ways(field, seeds_mm, -STEP_CELLS), _ways(field, seeds_mm, STEP_CELLS)
+    lines = [np.concatenate([back[:0:-1], ahead]) for back, ahead in zip(up, down, strict=True)]
     lines = [line for line in lines if len(line) > 2]
     starts = np.cumsum([0, *map(len, lines)])
     joined = np.concatenate(lines) if lines else np.zeros((0, 4))
-    return Streamlines(field.origin_mm + joined[:, :3] * field.cell_size_mm, starts, joined[:, 3])
+    return Streamlines(joined[:, :3], starts, joined[:, 3])
 
 
-def _lines(points: Floats, count: Ints) -> list[Floats]:
-    return [points[k, : count[k]] for k in range(len(count))]
+def _ways(field: FlowField, seeds_mm: Floats, step_cells: float) -> list[Floats]:
+    """Points in mm and speed (p, 4) from every seed (s, 3) on, as far as the blood stays in the vessel."""
+    seeds = np.ascontiguousarray((seeds_mm - field.origin_mm) / field.cell_size_mm)
+    most = int(LONGEST_MM / field.cell_size_mm / STEP_CELLS)
+    path, count = lattice_sampling.trace_all(field.index, field.velocity_m_s, seeds, step_cells, SLOWEST_M_S, most)
+    path[..., :3] = field.origin_mm + path[..., :3] * field.cell_size_mm
+    return [_within(field.wall, points[:n]) for points, n in zip(path, count, strict=True)]
+
+
+def _within(wall: Surface, way: Floats) -> Floats:
+    """A way (p, 4) as far as the last point before it leaves through an opening, for the first time."""
+    step_mm = np.diff(way[:, :3], axis=0)
+    length_mm = np.linalg.norm(step_mm, axis=1)
+    ahead = step_mm / np.maximum(length_mm, 1e-12)[:, None]
+    distance_mm, face = wall.caps.first_hits(way[:-1, :3], ahead)
+    leaves = (distance_mm <= length_mm) & (np.einsum("ij,ij->i", wall.caps.normals[face], ahead) > 0)
+    return way[: int(np.argmax(leaves)) + 1] if leaves.any() else way
 
 
 def inlet_seeds_mm(field: FlowField, vessel: Vessel, count: int) -> Floats:
