@@ -51,6 +51,10 @@ COARSE_SHARE = 0.12
 OUTER_SHARE = 0.35
 """Part of the whole time that the flow around a close-up takes, for the progress."""
 
+OUTER_TOLERANCE = 2.0
+"""Tolerance of the steady flow around a close-up over the answer's: what swings does so in the sac, which is computed
+anew, and moves the pressure and the vessel's mean speed less than half as much."""
+
 CALMER_TRIES = 3
 """Times that a run which diverged is tried again with a shorter time step."""
 
@@ -207,7 +211,8 @@ class _Runs:
     def _close_up(self, case: FlowCase, start: FlowField | None, cell_size_mm: float) -> FlowField:
         """Compute the vessel on wide cells, and then the sac and its neck on fine ones in it."""
         require_sac(case)
-        outer = self._coarse(case, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
+        around = replace(case, settings=replace(case.settings, tolerance=OUTER_TOLERANCE * case.settings.tolerance))
+        outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
         engine = self.engine(cell_size_mm, self.folder, outer)
         return self._run(engine, case, lambda: outer, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))
 

@@ -72,7 +72,9 @@ def estimate(case: FlowCase) -> Cost:
     cell_size_mm = default_cell_size_mm(case)
     cells, memory_bytes = _size(case, cell_size_mm)
     steps = _steps(case, cell_size_mm)
-    updates = (cells + _wide_cells(case, cell_size_mm)) * steps
+    updates = cells * steps
+    if case.settings.close_up:
+        updates += _wide_cells(case, cell_size_mm) * _steps_all_over(case, cell_size_mm)
     seconds = updates / block_rate(on_gpu=case.settings.device_gpu) * WHOLE_OVER_BLOCK
     return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds)
 
@@ -138,11 +140,18 @@ def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
 
 def _wide_cells(case: FlowCase, cell_size_mm: float) -> float:
     """Cells of the flow around a close-up."""
-    return abs(case.vessel.closed.volume_mm3) / (close_up.WIDTH * cell_size_mm) ** 3 if case.settings.close_up else 0.0
+    return abs(case.vessel.closed.volume_mm3) / (close_up.WIDTH * cell_size_mm) ** 3
 
 
 def _steps(case: FlowCase, cell_size_mm: float) -> int:
-    """Most time steps."""
+    """Most time steps on the finest grid."""
+    steps = _steps_all_over(case, cell_size_mm)
+    is_steady_close_up = case.settings.close_up and case.settings.waveform is None
+    return int(steps * close_up.SHARE_OF_STEPS) if is_steady_close_up else steps
+
+
+def _steps_all_over(case: FlowCase, cell_size_mm: float) -> int:
+    """Most time steps of a flow that is no close-up."""
     settings = case.settings
     if settings.waveform is None:
         return settings.max_steps

@@ -115,7 +115,7 @@ class FlowSettings:
     tolerance: float = 0.01
     """Converged when every monitored quantity has less than this fraction of itself left to go, and the sac's velocity
     less than twice that (root mean square); where they swing, when the standard error of every mean is less."""
-    max_steps: int = 48_000
+    max_steps: int = 96_000
     """Most time steps on the fine grid."""
     lattice_speed: float = 0.15
     """Peak speed in cells per time step: sets the time step. Of steady flow the grid's error, not the time step's, is
