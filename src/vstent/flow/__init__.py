@@ -13,7 +13,7 @@ import numpy as np
 from vstent import plugins
 from vstent.errors import InputError
 from vstent.flow import sampling
-from vstent.flow.close_up import WIDTH, require_sac
+from vstent.flow.close_up import SHARE_AROUND, WIDTH, require_sac
 from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
 from vstent.flow.indices import compare, indices
@@ -50,10 +50,6 @@ COARSE_SHARE = 0.12
 
 OUTER_SHARE = 0.35
 """Part of the whole time that the flow around a close-up takes, for the progress."""
-
-OUTER_TOLERANCE = 2.0
-"""Tolerance of the steady flow around a close-up over the answer's: what swings does so in the sac, which is computed
-anew, and moves the pressure and the vessel's mean speed less than half as much."""
 
 CALMER_TRIES = 3
 """Times that a run which diverged is tried again with a shorter time step."""
@@ -211,7 +207,8 @@ class _Runs:
     def _close_up(self, case: FlowCase, start: FlowField | None, cell_size_mm: float) -> FlowField:
         """Compute the vessel on wide cells, and then the sac and its neck on fine ones in it."""
         require_sac(case)
-        around = replace(case, settings=replace(case.settings, tolerance=OUTER_TOLERANCE * case.settings.tolerance))
+        steps = int(SHARE_AROUND * case.settings.max_steps)
+        around = replace(case, settings=replace(case.settings, max_steps=steps))
         outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
         engine = self.engine(cell_size_mm, self.folder, outer)
         return self._run(engine, case, lambda: outer, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))

@@ -71,10 +71,10 @@ def estimate(case: FlowCase) -> Cost:
     """Estimate what a flow takes, from the vessel's volume and a rate measured here and now."""
     cell_size_mm = default_cell_size_mm(case)
     cells, memory_bytes = _size(case, cell_size_mm)
-    steps = _steps(case, cell_size_mm)
+    steps = _steps(case, cell_size_mm, close_up.SHARE_WITHIN if case.settings.close_up else 1)
     updates = cells * steps
     if case.settings.close_up:
-        updates += _wide_cells(case, cell_size_mm) * _steps_all_over(case, cell_size_mm)
+        updates += _wide_cells(case, cell_size_mm) * _steps(case, cell_size_mm, close_up.SHARE_AROUND)
     seconds = updates / block_rate(on_gpu=case.settings.device_gpu) * WHOLE_OVER_BLOCK
     return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds)
 
@@ -143,18 +143,11 @@ def _wide_cells(case: FlowCase, cell_size_mm: float) -> float:
     return abs(case.vessel.closed.volume_mm3) / (close_up.WIDTH * cell_size_mm) ** 3
 
 
-def _steps(case: FlowCase, cell_size_mm: float) -> int:
-    """Most time steps on the finest grid."""
-    steps = _steps_all_over(case, cell_size_mm)
-    is_steady_close_up = case.settings.close_up and case.settings.waveform is None
-    return int(steps * close_up.SHARE_OF_STEPS) if is_steady_close_up else steps
-
-
-def _steps_all_over(case: FlowCase, cell_size_mm: float) -> int:
-    """Most time steps of a flow that is no close-up."""
+def _steps(case: FlowCase, cell_size_mm: float, share: float) -> int:
+    """Most time steps of a pulse, or of a steady flow that makes this share of those allowed."""
     settings = case.settings
     if settings.waveform is None:
-        return settings.max_steps
+        return int(share * settings.max_steps)
     return int(pace(case, cell_size_mm, None).sum()) * settings.max_cycles
 
 

@@ -21,7 +21,7 @@ from vstent.units import M_PER_MM
 
 CHECK_DIAMETERS = 0.5
 """Flow time between checks, in inlet diameters over mean inlet speed."""
-LEAST_CHECKS = 48
+LEAST_CHECKS = 24
 """The limit of time steps leaves room for at least this many checks: fewer cannot tell whether the flow has settled."""
 SLOWER: Final = 0.5
 """A run that diverged is tried again with a time step so much shorter."""
@@ -100,7 +100,7 @@ class LatticeBoltzmann(AbstractLattice):
 
     def max_checks(self, state: State) -> int:
         """Checks within the limit of time steps."""
-        steps = state.case.settings.max_steps * (1 if self.outer is None else close_ups.SHARE_OF_STEPS)
+        steps = state.case.settings.max_steps * (1 if self.outer is None else close_ups.SHARE_WITHIN)
         return max(4, int(steps // state.steps_per_check))
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
