@@ -33,9 +33,10 @@ WIDTH = 2
 UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 3.0, 1.0
 """How far the close-up reaches from the sac, in mean diameters 4 V / A of the vessel: towards the inlet, and to the
 others. What turns into the sac is made upstream: one diameter takes 9 % off the demo's neck inflow, two 2.4 %."""
-SHARE_WITHIN, SHARE_AROUND = 1 / 4, 1 / 2
-"""Parts of the time steps of a steady flow that a close-up makes at most, which begins from what surrounds it, and that
-this makes, whose sac is computed anew."""
+SHARE_WITHIN = 1 / 4
+"""Part of a steady flow's time steps that a close-up makes at most: it begins from what surrounds it."""
+SHARE_AROUND = 1 / 2
+"""Part of them that what surrounds it makes at most: the sac is computed anew."""
 RIM_CELLS = 4
 """Wide cells at the rim of the close-up where the wall's stress is still taken from the wide ones."""
 

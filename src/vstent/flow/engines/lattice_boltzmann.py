@@ -23,6 +23,7 @@ CHECK_DIAMETERS = 0.5
 """Flow time between checks, in inlet diameters over mean inlet speed."""
 LEAST_CHECKS = 24
 """The limit of time steps leaves room for at least this many checks: fewer cannot tell whether the flow has settled."""
+
 SLOWER: Final = 0.5
 """A run that diverged is tried again with a time step so much shorter."""
 
