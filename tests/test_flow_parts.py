@@ -25,6 +25,7 @@ from vstent.flow.screen import (
     on_grid,
     tangential_share,
 )
+from vstent.flow.types import CarreauYasuda
 from vstent.flow.wall_stress import mean_shear_Pa, wall_stress
 from vstent.stent import Stent
 from vstent.surface import Surface
@@ -153,8 +154,21 @@ def test_wall_stress_of_an_exact_poiseuille_flow_is_exact(cells_per_diameter):
     np.testing.assert_allclose(stress[middle, 2], 0.004 * 1.0 / 2e-3 * 2, rtol=0.005)
     np.testing.assert_allclose(pressure[middle], 3.0 - 2.0 * z[middle], atol=1e-6)
     # As much of a flow that goes to and fro: beside a wall the mean speed grows by the mean shear rate.
-    sizes_Pa = mean_shear_Pa(grid, 2 / np.pi * velocity[:, 2], lumen=vessel.lumen, blood=Blood())
+    speed = 2 / np.pi * velocity[:, 2]
+    sizes_Pa = mean_shear_Pa(grid, 0 * velocity, speed, lumen=vessel.lumen, blood=Blood())
     np.testing.assert_allclose(sizes_Pa[middle], 2 / np.pi * 0.004 * 1.0 / 2e-3 * 2, rtol=0.005)
+
+
+@pytest.mark.parametrize("thinning", [None, CarreauYasuda()])
+def test_what_does_not_move_has_the_stress_of_its_mean_where_it_turns_too(thinning):
+    """Along the wall it turns every 1.5 mm: of the speed alone the gradient would tell up to twice as much there."""
+    vessel, blood = tube(line(8.0), 2.0).vessel, Blood(thinning=thinning)
+    grid = domain.build(vessel, 0.3)
+    x, y, z = grid.centers_mm.T
+    velocity = np.stack([0 * x, 0 * x, (1 - (x**2 + y**2) / 4) * np.cos(np.pi * z / 1.5)], axis=1)
+    still_Pa, _ = wall_stress(grid, velocity, 0 * x, lumen=vessel.lumen, blood=blood)
+    found_Pa = mean_shear_Pa(grid, velocity, np.linalg.norm(velocity, axis=1), lumen=vessel.lumen, blood=blood)
+    np.testing.assert_allclose(found_Pa, np.linalg.norm(still_Pa, axis=1), rtol=1e-6, atol=1e-9)
 
 
 def test_the_grid_of_a_tube_has_its_volume_its_ends_and_exact_wall_distances():

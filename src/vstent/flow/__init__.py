@@ -208,7 +208,7 @@ class _Runs:
         """Compute the vessel on wide cells, and then the sac and its neck on fine ones in it."""
         require_sac(case)
         steps = int(SHARE_AROUND * case.settings.max_steps)
-        around = replace(case, settings=replace(case.settings, max_steps=steps))
+        around = replace(case, ostium=None, settings=replace(case.settings, max_steps=steps))
         outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
         engine = self.engine(cell_size_mm, self.folder, outer)
         return self._run(engine, case, lambda: outer, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))

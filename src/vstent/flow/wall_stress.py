@@ -27,21 +27,30 @@ def wall_stress(
     velocity_m_s, pressure_Pa : (n, 3), (n,) of the cells.
     lumen : the wall, open at its ends; its faces are outward.
     """
-    gradient_per_s, wall_pressure_Pa = _fit(domain, velocity_m_s, pressure_Pa, lumen)
-    normal = lumen.vertex_normals
-    shear_per_s = gradient_per_s - np.einsum("ij,ij->i", gradient_per_s, normal)[:, None] * normal
+    shear_per_s, wall_pressure_Pa = _shear(domain, velocity_m_s, pressure_Pa, lumen)
     viscosity_Pa_s = blood.viscosity_at_Pa_s(np.linalg.norm(shear_per_s, axis=1))
     return viscosity_Pa_s[:, None] * shear_per_s, wall_pressure_Pa
 
 
-def mean_shear_Pa(domain: Domain, speed_m_s: Floats, *, lumen: Surface, blood: Blood) -> Floats:
-    """Mean magnitude (v,) of the wall shear stress from the mean speed (n,) of the cells.
+def mean_shear_Pa(domain: Domain, velocity_m_s: Floats, speed_m_s: Floats, *, lumen: Surface, blood: Blood) -> Floats:
+    """Mean magnitude (v,) of the wall shear stress from the mean velocity (n, 3) and the mean speed (n,) of the cells.
 
-    Beside a wall speed is shear rate times distance at every moment: the mean speed's gradient is the mean shear rate.
+    Beside a wall speed is shear rate times distance at every moment. So what it has beyond the mean velocity's size,
+    from what goes to and fro, tells what the shear rate has beyond that of the mean flow. The gradient of the speed
+    itself would tell too much beside blood that turns on its way, where velocities cancel and speeds do not.
     """
-    speeds = speed_m_s[:, None] * np.eye(3)[0]
-    rate_per_s = np.abs(_fit(domain, speeds, np.zeros(len(speeds)), lumen)[0][:, 0])
+    shear_per_s, _ = _shear(domain, velocity_m_s, np.zeros(len(speed_m_s)), lumen)
+    beyond_m_s = speed_m_s - np.linalg.norm(velocity_m_s, axis=1)
+    beyond_per_s = _fit(domain, beyond_m_s[:, None] * np.eye(3)[0], np.zeros(len(speed_m_s)), lumen)[0][:, 0]
+    rate_per_s = np.linalg.norm(shear_per_s, axis=1) + np.maximum(beyond_per_s, 0.0)
     return blood.viscosity_at_Pa_s(rate_per_s) * rate_per_s
+
+
+def _shear(domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, lumen: Surface) -> tuple[Floats, Floats]:
+    """Shear rate (v, 3), as a vector along the wall, and pressure (v,) at the vertices of the lumen."""
+    gradient_per_s, wall_pressure_Pa = _fit(domain, velocity_m_s, pressure_Pa, lumen)
+    normal = lumen.vertex_normals
+    return gradient_per_s - np.einsum("ij,ij->i", gradient_per_s, normal)[:, None] * normal, wall_pressure_Pa
 
 
 def _fit(domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, lumen: Surface) -> tuple[Floats, Floats]:

@@ -77,9 +77,10 @@ class LatticeBoltzmann(AbstractLattice):
     """The sparse D3Q19 engine at constant inflow."""
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
-        """Choose the time step so that the fastest blood moves `lattice_speed` cells a step."""
+        """Choose the time step so that the fastest blood moves `lattice_speed` cells a step; in a close-up, more."""
         close_up = self.close_up(case)
-        step_s = longest_step_s(case, self.cell_size_mm, peak_speed_m_s(case, start, close_up))
+        stretch = 1 if close_up is None else close_ups.STRETCH
+        step_s = stretch * longest_step_s(case, self.cell_size_mm, peak_speed_m_s(case, start, close_up))
         steps = _steps_per_check(case, step_s)
         pace, kept = np.array([steps]), 2 * CHECKS_APART + 1
         return build(case, self.cell_size_mm, steps * step_s, pace, close_up=close_up, start=start, kept=kept)

@@ -56,11 +56,10 @@ def read_moving(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     """Return the mean of the last snapshots of a flow that moves, with what a mean does not tell."""
     flow, case = read(state, snapshots), state.case
     speed_m_s = _mean(snapshots, (one.speed_m_s for one in snapshots))
-    shear_Pa = mean_shear_Pa(state.domain, speed_m_s, lumen=case.vessel.lumen, blood=case.blood)
-    least_Pa = np.linalg.norm(flow.wall_shear_stress_Pa, axis=1)
+    shear_Pa = mean_shear_Pa(state.domain, flow.velocity_m_s, speed_m_s, lumen=case.vessel.lumen, blood=case.blood)
     checks = sum(one.checks for one in snapshots)
     inflow_mL_s = float(np.array(state.history)[-checks:, NECK_INFLOW:].mean(axis=0).sum())
-    return replace(flow, swing=Swing(speed_m_s, np.maximum(shear_Pa, least_Pa), inflow_mL_s))
+    return replace(flow, swing=Swing(speed_m_s, shear_Pa, inflow_mL_s))
 
 
 def _mean(snapshots: Sequence[Snapshot], values: Iterable[Floats | NDArray[np.float32]]) -> Floats:
