@@ -186,7 +186,10 @@ def test_a_screen_costs_the_pressure_of_its_law() -> None:
 
 
 def test_a_guess_has_a_guess_as_long_as_grids_hold_the_vessel(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bare from the coarsest up; behind a screen every grid first says what the screen changes there."""
+    """Bare from the coarsest up; behind a screen every grid first says what the screen changes there.
+
+    Behind another one only what that one changes is computed anew, with the same result as if all were.
+    """
     for module in (flow, domain):
         monkeypatch.setattr(module, "MIN_CELLS", 20)
     seen: list[tuple[float, bool, float | None]] = []
@@ -204,6 +207,15 @@ def test_a_guess_has_a_guess_as_long_as_grids_hold_the_vessel(monkeypatch: pytes
     simulate_case(FlowCase(tube(), screen=disc(100.0), settings=settings), start=bare)
     coarsest = [(1.0, False, 0.5), (1.0, True, 1.0)]
     assert seen == [(0.5, False, 0.25), *coarsest, (0.5, True, 0.5), (0.25, True, 0.25)]
+    seen.clear()
+    denser = FlowCase(tube(), screen=disc(200.0), settings=settings)
+    equal = replace(denser, settings=replace(settings))
+    shared, anew = (
+        simulate_case(case, start=start).velocity_m_s for case, start in ((equal, bare), (denser, replace(bare)))
+    )
+    assert seen[:3] == [(1.0, True, 1.0), (0.5, True, 0.5), (0.25, True, 0.25)]
+    assert len(seen) == 3 + 5
+    np.testing.assert_array_equal(shared, anew)
 
 
 @cache

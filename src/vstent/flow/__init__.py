@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -53,6 +54,10 @@ OUTER_SHARE = 0.35
 
 CALMER_TRIES = 3
 """Times that a run which diverged is tried again with a shorter time step."""
+
+_BARE_GUESSES: WeakKeyDictionary[FlowField, dict[tuple[float, FlowSettings], FlowField]] = WeakKeyDictionary()
+"""Bare flows on wide cells, by the flow that they begin from: what every device's guess is compared with is computed
+once, for the first."""
 
 OnProgress = Callable[[Progress], None]
 Guess = Callable[[], FlowField | None]
@@ -208,6 +213,7 @@ class _Runs:
         """Compute the vessel on wide cells, and then the sac and its neck on fine ones in it."""
         require_sac(case)
         steps = int(SHARE_AROUND * case.settings.max_steps)
+        # Without its ostium: where the neck inflow swings, its mean need not be known, for the neck is computed anew.
         around = replace(case, ostium=None, settings=replace(case.settings, max_steps=steps))
         outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
         engine = self.engine(cell_size_mm, self.folder, outer)
@@ -232,9 +238,19 @@ class _Runs:
         with suppress(DivergenceError, CoarseGridError):
             if start is None:
                 return self._coarse(case, coarse_mm, None, "guess", first, depth)
-            bare = self._coarse(replace(case, screen=None, stent=None), coarse_mm, start, "bare guess", first, depth)
+            bare = self._bare_guess(case, start, coarse_mm, first, depth)
             return _corrected(start, bare, self._coarse(case, coarse_mm, bare, "stented guess", second, depth))
         return start
+
+    def _bare_guess(
+        self, case: FlowCase, start: FlowField, coarse_mm: float, progress: OnProgress | None, depth: int
+    ) -> FlowField:
+        """Compute the bare flow on wide cells from the one on the cells wanted, unless that has been done."""
+        done, key = _BARE_GUESSES.setdefault(start, {}), (coarse_mm, case.settings)
+        if key not in done:
+            bare = replace(case, screen=None, stent=None)
+            done[key] = self._coarse(bare, coarse_mm, start, "bare guess", progress, depth)
+        return done[key]
 
     def _coarse(
         self,

@@ -40,7 +40,7 @@ class CarreauYasuda:
     """n."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Blood:
     """A fluid (design.md section 5: the paper's values), Newtonian unless its thinning is given."""
 
@@ -88,7 +88,7 @@ class Waveform:
         return 1 - harmonics.factor(time_s)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class FlowSettings:
     """How the flow is to be computed."""
 
