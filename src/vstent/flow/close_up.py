@@ -37,8 +37,9 @@ STRETCH = 4 / 3
 """Time steps of a steady close-up over those of a whole vessel: a fork they would cost 0.3 per cent of its blood, but
 what passes the ends of a close-up what surrounds it says. The means of C0038's sac and neck, bare and behind Silk and
 Enterprise, differ by 0.4 per cent at most from what shorter steps make of them in as much time, the demo's by 0.5."""
-SHARE_WITHIN = 1 / 4 / STRETCH
-"""Part of a steady flow's time steps that a close-up makes at most: it begins from what surrounds it."""
+SHARE_WITHIN = 1 / 6
+"""Part of a steady flow's time steps that a close-up makes at most: it begins from what surrounds it, and where it
+swings, which is what takes so many, the mean is over its last checks anyway (`lattice_settling.LATEST`)."""
 SHARE_AROUND = 1 / 2
 """Part of them that what surrounds it makes at most: the sac is computed anew."""
 RIM_CELLS = 4

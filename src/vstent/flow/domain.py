@@ -25,8 +25,8 @@ OUTLET_EXTENSION = 1.5
 MIN_CELLS = 2_000
 """Fewer cells than this are no vessel."""
 BRANCH_CELLS = 6.0
-"""Cells across that a branch needs: tubes at an angle to the grid resist 2 to 40 % more than they should with six
-(Re 10 to 340), 10 to 280 % with four, 1.4 to 12 times as much with three."""
+"""Cells across that a branch needs: tubes at an angle to the grid resist 2 to 70 % more than they should with six
+(Re 10 to 340), 10 to 310 % with four, 1.4 to 15 times as much with three."""
 WALL = 0
 """Patch number of the wall; opening k has k + 1."""
 BEYOND = -1

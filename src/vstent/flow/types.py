@@ -116,7 +116,7 @@ class FlowSettings:
     """Converged when every monitored quantity has less than this fraction of itself left to go, and the sac's velocity
     less than twice that (root mean square); where they swing, when the standard error of every mean is less."""
     max_steps: int = 96_000
-    """Most time steps of a steady flow on the fine grid; a close-up makes 3/16 of them, what surrounds it half."""
+    """Most time steps of a steady flow on the fine grid; a close-up makes a sixth of them, what surrounds it half."""
     lattice_speed: float = 0.15
     """Peak speed in cells per time step: sets the time step, a third longer in a steady close-up. Of steady flow the
     grid's error, not the time step's, is what it changes, through the relaxation times."""
