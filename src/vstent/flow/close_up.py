@@ -34,8 +34,8 @@ UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 3.0, 1.0
 """How far the close-up reaches from the sac, in mean diameters 4 V / A of the vessel: towards the inlet, and to the
 others. What turns into the sac is made upstream: one diameter takes 9 % off the demo's neck inflow, two 2.4 %."""
 STRETCH = 4 / 3
-"""Time steps of a steady close-up over those of a whole vessel: a fork they would cost 0.3 per cent of its blood, but
-what passes the ends of a close-up what surrounds it says. The means of C0038's sac and neck, bare and behind Silk and
+"""Time steps of a steady close-up over those of a whole vessel, where they would be too long: a fork lost 0.3 per cent
+of its blood. What passes the ends of a close-up is given. The means of C0038's sac and neck, bare and behind Silk and
 Enterprise, differ by 0.4 per cent at most from what shorter steps make of them in as much time, the demo's by 0.5."""
 SHARE_WITHIN = 1 / 6
 """Part of a steady flow's time steps that a close-up makes at most: it begins from what surrounds it, and where it
