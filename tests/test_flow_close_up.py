@@ -84,18 +84,21 @@ def test_a_close_up_of_poiseuille_flow_is_poiseuille_flow() -> None:
     assert stress_Pa == pytest.approx(4 * 0.004 * MEAN_M_S / (RADIUS_MM * 1e-3), rel=0.02)
 
 
-def test_what_surrounds_a_close_up_is_given_half_of_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_surrounds_a_close_up_is_given_half_of_the_steps_and_no_neck_to_watch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     seen = []
 
     def telling(engine: AbstractEngine[Any], case: FlowCase, **more: Any) -> FlowField:
-        seen.append((engine.cell_size_mm, case.settings.max_steps))
+        seen.append((engine.cell_size_mm, case.settings.max_steps, case.ostium))
         return run(engine, case, **more)
 
     monkeypatch.setattr(flow, "run", telling)
-    case = FlowCase(tube(line(40.0), RADIUS_MM).vessel, sac=ball((0.0, 0.0, 24.0)))
+    sac = ball((0.0, 0.0, 24.0))
+    case = FlowCase(tube(line(40.0), RADIUS_MM).vessel, sac=sac, ostium=sac)
     settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.3, close_up=True, max_steps=960)
     simulate_case(replace(case, settings=settings))
-    assert seen == [(0.6, 480), (0.3, 960)]
+    assert seen == [(0.6, 480, None), (0.3, 960, sac)]
 
 
 def test_the_flow_goes_on_across_the_cuts() -> None:

@@ -161,7 +161,7 @@ def test_wall_stress_of_an_exact_poiseuille_flow_is_exact(cells_per_diameter):
 
 @pytest.mark.parametrize("thinning", [None, CarreauYasuda()])
 def test_what_does_not_move_has_the_stress_of_its_mean_where_it_turns_too(thinning):
-    """Along the wall it turns every 1.5 mm: of the speed alone the gradient would tell up to twice as much there."""
+    """Along the wall it turns every 1.5 mm: the speed alone would tell half as much again in the mean."""
     vessel, blood = tube(line(8.0), 2.0).vessel, Blood(thinning=thinning)
     grid = domain.build(vessel, 0.3)
     x, y, z = grid.centers_mm.T

@@ -213,7 +213,7 @@ class _Runs:
         """Compute the vessel on wide cells, and then the sac and its neck on fine ones in it."""
         require_sac(case)
         steps = int(SHARE_AROUND * case.settings.max_steps)
-        # Without its ostium: where the neck inflow swings, its mean need not be known, for the neck is computed anew.
+        # Without its ostium, steady or in a pulse: what swings at the neck takes most of the steps, and is done anew.
         around = replace(case, ostium=None, settings=replace(case.settings, max_steps=steps))
         outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
         engine = self.engine(cell_size_mm, self.folder, outer)
