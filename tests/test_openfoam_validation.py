@@ -1,9 +1,10 @@
 """The embedded engine against OpenFOAM, bare, on the demo and on a real carotid; `docs/openfoam.md` keeps the table."""
 
+import os
 import resource
 import shutil
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +26,6 @@ pytestmark = [
     pytest.mark.validation,
     pytest.mark.skipif(
         shutil.which("simpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)"
-    ),
-    pytest.mark.xfail(
-        reason="on grids that a test can afford a sac's flow differs by more; finer ones agree (docs/openfoam.md)"
     ),
 ]
 LIMITS = {"mean_sac_velocity_m_s": 0.05, "neck_inflow_mL_s": 0.05, "mean_sac_wss_Pa": 0.10}
@@ -57,11 +55,10 @@ def agreement(case: FlowCase, embedded: FlowField, foam: FlowField) -> Agreement
     return Agreement(ratios, rms / float(speed.max()), rms / float(np.sqrt((speed**2).mean())))
 
 
-def compared(case: FlowCase, folder: Path, cell_size_mm: float) -> Agreement:
-    """Compute a bare flow both ways and print a row of the table."""
-    embedded = simulate_case(case)
+def compared(case: FlowCase, folder: Path, start: FlowField | None, embedded: FlowField) -> Agreement:
+    """Compute a bare flow by OpenFOAM in cells of the same size and print a row of the table."""
     began = time.perf_counter()
-    foam = run(OpenFoam(cell_size_mm, folder, grid_size_mm=embedded.cell_size_mm), case)
+    foam = run(OpenFoam(embedded.cell_size_mm, folder), case, start=start)
     seconds, peak = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     found = agreement(case, embedded, foam)
     print(f"{foam.advice} {seconds:.0f} s, {peak / 1e9:.2f} GB; embedded: {embedded.advice} {embedded.seconds:.0f} s")  # noqa: T201
@@ -75,18 +72,21 @@ def check(found: Agreement) -> None:
     assert found.nrmse < 0.05
 
 
-def restored(vessel: Vessel) -> FlowCase:
-    return flow_case(restore(trim(trace(vessel))), None, FlowSettings())
+def restored(vessel: Vessel, cell_size_mm: float) -> FlowCase:
+    settings = FlowSettings(cell_size_mm=cell_size_mm, processes=min(2, os.cpu_count() or 1))
+    return flow_case(restore(trim(trace(vessel))), None, settings)
 
 
 def test_the_demo(tmp_path: Path) -> None:
-    case = restored(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))
-    check(compared(case, tmp_path / "demo", 0.2))
+    # In wider cells OpenFOAM's sac is the slower one, by 6 % in 0.14 mm (docs/openfoam.md).
+    case = restored(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)), 0.1)
+    embedded = simulate_case(case)
+    # A flow that settles does not depend on where it begins.
+    check(compared(case, tmp_path / "demo", embedded, embedded))
 
 
-def test_a_real_carotid_at_half_its_flow(shared_data: Path, tmp_path: Path) -> None:
-    # At its mean flow the blood swings in this siphon and no steady solver settles; at half of it, it is steady.
+def test_a_real_carotid(shared_data: Path, tmp_path: Path) -> None:
+    # It swings: both engines' figures are means, and each begins for itself.
     lumen, _ = repair(read_surface(shared_data / "aneurisk_C0038.vtp")[0])
-    case = restored(Vessel(lumen))
-    half = replace(case, settings=replace(case.settings, inflow_mL_s=0.5 * case.inflow_mL_s))
-    check(compared(half, tmp_path / "C0038", 0.25))
+    case = restored(Vessel(lumen), 0.2)
+    check(compared(case, tmp_path / "C0038", None, simulate_case(case)))
