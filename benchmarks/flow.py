@@ -34,7 +34,7 @@ RADIUS_MM, INFLOW_ML_S, VISCOSITY_PA_S = 2.0, 0.5, 0.004
 STEPS = 20
 BYTES_PER_UPDATE = 19 * 4 * 2
 """Read and write every population once, in place; addresses are one per segment."""
-DEMO_CELLS, STEADY_STEPS, STEPS_PER_CYCLE = 830_000, 6_300, 84_000
+DEMO_CELLS, STEADY_STEPS, STEPS_PER_CYCLE = 830_000, 6_000, 78_000
 """The demo in cells of 0.1 mm: blood cells, steps of a bare flow that begins from a coarse one (`--cost` counts them),
 steps of a cycle (`--pulse` counts two)."""
 NODE_CORES, NODE_GB_S = 64, 300.0
