@@ -12,6 +12,7 @@ from vstent.errors import FlowError, ReadError
 from vstent.flow import FlowCase, FlowSettings, Screen, sampling, simulate_case
 from vstent.flow.engines import Progress, run
 from vstent.flow.engines.openfoam import OpenFoam, swing_of
+from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results, scatter
 from vstent.flow.openfoam.bridge import Snapshot
 from vstent.flow.types import PHASES, Waveform
@@ -55,6 +56,27 @@ def test_parts_are_put_together_in_the_order_of_their_numbers(tmp_path: Path) ->
     np.testing.assert_array_equal(results.read_field(tmp_path, "0.05", "p").inside[:, 0], np.arange(22) / 2)
     np.testing.assert_array_equal(results.read_field(tmp_path, "0.05", "U").patches["wall"], [[5.0]])
     assert results.times(tmp_path) == ["0.05"]  # 0.3 is not complete
+
+
+def test_a_flow_that_a_run_begins_from_leaves_no_blood_at_rest_between_the_parts(tmp_path: Path) -> None:
+    rest = "value uniform (0 0 0);"
+    field = simulate_case(
+        FlowCase(tube(), settings=FlowSettings(inflow_mL_s=FLOW_ML_S, cell_size_mm=0.5, max_steps=96))
+    )
+    parts = {name: field.centers_mm[chosen] for name, chosen in (("processor0", [9, 2]), ("processor1", [5, 70, 3]))}
+    for name, points_mm in parts.items():
+        rows = " ".join(f"({x:.9g} {y:.9g} {z:.9g})" for x, y, z in points_mm * 1e-3)
+        write(tmp_path / name / "0" / "C", f"nonuniform List<vector> {len(points_mm)}({rows})")
+        write(tmp_path / name / "0" / "U", "uniform (0 0 0)", inlet=rest, procBoundary0to1=rest, outlet_1=rest)
+        write(tmp_path / name / "0" / "p", "uniform 0", procBoundary0to1through2="value uniform 0;")
+    folders.begin_from(tmp_path, field)
+    for name, points_mm in parts.items():
+        velocity_m_s, pressure_Pa = sampling.values_at(field, points_mm)
+        speed, pressure = (results.read_field(tmp_path / name, "0", one) for one in ("U", "p"))
+        np.testing.assert_allclose(speed.inside, velocity_m_s, rtol=1e-5)
+        np.testing.assert_allclose(pressure.inside[:, 0], pressure_Pa / field.blood.density_kg_m3, rtol=1e-5)
+        assert sorted(speed.patches) == ["inlet", "outlet_1"]
+        assert not pressure.patches
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,8 @@ KEY: Final = "vstent.key"
 """File that names what a folder's run depends on."""
 MESHED: Final = "log.meshed"
 """File that says that the mesh is complete."""
+BETWEEN_PARTS: Final = re.compile(r"(procBoundary\w*\s*\{[^}]*?)\s*value\s[^;]*;")
+"""What a field's file says of a patch between two parts of the mesh, up to its value."""
 PRODUCTS: Final = ("constant/polyMesh", "postProcessing", "processor*", "log.*", "[0-9]*", KEY)
 """What a run leaves in a case folder."""
 
@@ -76,10 +78,14 @@ def begin_from(folder: Path, start: FlowField) -> None:
 
 
 def _put(path: Path, kind: str, row: str, values: Floats) -> None:
-    """Replace what a uniform field has inside by values (n, d)."""
+    """Replace what a uniform field has inside by values (n, d).
+
+    Between parts of a mesh the uniform value would stay, and blood at rest there dam the flow up: without one, OpenFOAM
+    takes that of the cells beside.
+    """
     rows = "\n".join(row % tuple(value) for value in values)
     head, _, tail = path.read_text().partition("internalField")
-    rest = tail.partition(";")[2]
+    rest = BETWEEN_PARTS.sub(r"\1", tail.partition(";")[2])
     write_text(path, f"{head}internalField nonuniform List<{kind}>\n{len(values)}\n(\n{rows}\n)\n;{rest}")
 
 
