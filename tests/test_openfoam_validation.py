@@ -61,7 +61,8 @@ def compared(case: FlowCase, folder: Path, start: FlowField | None, embedded: Fl
     foam = run(OpenFoam(embedded.cell_size_mm, folder), case, start=start)
     seconds, peak = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     found = agreement(case, embedded, foam)
-    print(f"{foam.advice} {seconds:.0f} s, {peak / 1e9:.2f} GB; embedded: {embedded.advice} {embedded.seconds:.0f} s")  # noqa: T201
+    told = foam.advice.replace(f" ({folder})", "")
+    print(f"{told} {seconds:.0f} s, {peak / 1e9:.2f} GB; embedded: {embedded.advice} {embedded.seconds:.0f} s")  # noqa: T201
     print(found)  # noqa: T201
     return found
 
