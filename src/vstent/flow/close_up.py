@@ -37,7 +37,7 @@ STRETCH = 4 / 3
 """Time steps of a steady close-up over those of a whole vessel, where they would be too long: a fork lost 0.3 per cent
 of its blood. What passes the ends of a close-up is given. The means of C0038's sac and neck, bare and behind Silk and
 Enterprise, differ by 0.4 per cent at most from what shorter steps make of them in as much time, the demo's by 0.5. A
-pulse's are as long as elsewhere: C0038's diverged in a close-up of 0.2 mm."""
+pulse's are as long as elsewhere: with longer ones C0038's diverged in a close-up of 0.2 mm."""
 SHARE_WITHIN = 1 / 6
 """Part of a steady flow's time steps that a close-up makes at most: it begins from what surrounds it, and where it
 swings, which is what takes so many, the mean is over its last checks anyway (`lattice_settling.LATEST`)."""

@@ -80,8 +80,8 @@ def begin_from(folder: Path, start: FlowField) -> None:
 def _put(path: Path, kind: str, row: str, values: Floats) -> None:
     """Replace what a uniform field has inside by values (n, d).
 
-    Between parts of a mesh the uniform value would stay, and blood at rest there dam the flow up: without one, OpenFOAM
-    takes that of the cells beside.
+    On the faces between parts of a mesh the uniform value would stay, and blood at rest there would dam the flow up:
+    it is taken away, and OpenFOAM takes that of the cells beside.
     """
     rows = "\n".join(row % tuple(value) for value in values)
     head, _, tail = path.read_text().partition("internalField")
