@@ -1,6 +1,6 @@
 """The screen beside resolved struts over the demo's neck: write `benchmarks/struts.json`, print it as a table.
 
-Usage: python benchmarks/struts.py [--cell MM] [--foam-cell MM] [--across CELLS] [--cases FOLDER] [DEVICE ...]
+Usage: python benchmarks/struts.py [--cell MM] [--foam-cell MM] [--across CELLS] [-j N] [--cases FOLDER] [DEVICE ...]
 
 The demo's artery, cut to 9 mm on either side of the sac, is computed twice with every device: by the embedded engine
 with the device as a screen, and by OpenFOAM with the struts over the neck meshed, at least so many cells across each,
@@ -93,11 +93,12 @@ if __name__ == "__main__":
     parser.add_argument("--cell", type=float, default=0.125)
     parser.add_argument("--foam-cell", type=float, default=0.2)
     parser.add_argument("--across", type=float, default=setup.ACROSS)
+    parser.add_argument("-j", dest="processes", type=int, default=1)
     parser.add_argument("--cases", type=Path)
     given = parser.parse_args()
     setup.ACROSS = given.across
     rows = json.loads(TABLE.read_text()) if TABLE.exists() else {}
-    foam = {"engine": OPENFOAM, "cell_size_mm": given.foam_cell}
+    foam = {"engine": OPENFOAM, "cell_size_mm": given.foam_cell, "processes": given.processes}
     bare: tuple[FlowField, dict[str, float]] | None = None
     for name, case in cases(given.devices).items():
         # The embedded engine takes its start for the bare flow; OpenFOAM begins from any in this vessel.

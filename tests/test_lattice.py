@@ -380,6 +380,23 @@ def test_interpolation_is_exact_for_linear_fields_inside():
         np.testing.assert_allclose(lattice_sampling.interpolate(index, values, points, is_zero_outside), expected)
 
 
+def test_cubic_interpolation_is_exact_for_cubics_and_at_rest_outside():
+    index = np.arange(7 * 8 * 9, dtype=np.int32).reshape(7, 8, 9)
+    points = np.random.default_rng(0).uniform(1, 4.9, (50, 3))
+
+    def cubic(at):
+        x, y, z = at.T
+        return np.stack([x**3 - 2 * y**2 * z + 1, (x - 2) ** 3 * (y - 3) ** 3 * z**3], axis=1)
+
+    found = lattice_sampling.interpolate_cubic(index, cubic(np.argwhere(index >= 0).astype(float)), points)
+    np.testing.assert_allclose(found, cubic(points), rtol=1e-9, atol=1e-9)
+    one = np.full((5, 5, 5), -1, np.int32)
+    one[2, 2, 2] = 0
+    beside = np.array([[2.5, 2, 2], [3.5, 2, 2], [2.5, 2.5, 2], [7, 2, 2]])
+    found = lattice_sampling.interpolate_cubic(one, np.ones((1, 1)), beside)
+    np.testing.assert_allclose(found[:, 0], [9 / 16, -1 / 16, 81 / 256, 0], atol=1e-15)
+
+
 def test_streamlines_of_a_rotation_are_circles():
     index = np.arange(40 * 40 * 3, dtype=np.int32).reshape(40, 40, 3)
     x, y, _ = np.argwhere(index >= 0).T - 19.5

@@ -168,6 +168,27 @@ def test_the_part_over_the_neck_is_the_part_over_the_neck():
     assert np.array_equal(is_over_neck(artery(), points_mm)[surely], expected[surely])
 
 
+def on_a_fork(off_mm):
+    """The artery, its neck that far off it: what lies between belongs to another branch."""
+    (sac,) = artery().aneurysms
+    farther = np.array([1 + off_mm / 1.9, 1 + off_mm / 1.9, 1])
+    neck = Surface(sac.neck.vertices_mm * farther, sac.neck.faces)
+    return replace(artery(), aneurysms=(replace(sac, neck=neck),))
+
+
+@pytest.mark.parametrize("design", [SILK, ENTERPRISE], ids=["silk", "enterprise"])
+def test_a_neck_off_the_artery_is_measured_on_what_faces_it_and_the_gap_told(design):
+    near, off = (deploy(design, there, size=SIZES[design.key]) for there in (artery(), on_a_fork(1.2)))
+    points_mm = near.stent.nodes_mm.reshape(-1, 3)
+    assert np.array_equal(is_over_neck(on_a_fork(1.2), points_mm), is_over_neck(artery(), points_mm))
+    found, usual = measure(on_a_fork(1.2), off), measure(artery(), near)
+    assert found["neck_metal_coverage_fraction"] == pytest.approx(usual["neck_metal_coverage_fraction"])
+    assert usual["max_neck_gap_mm"] == pytest.approx(usual["max_wall_gap_mm"], abs=0.01)
+    assert found["max_neck_gap_mm"] == pytest.approx(1.2 + usual["max_neck_gap_mm"], abs=0.01)
+    told = " The neck lies on a fork: it reaches up to 1.2 mm off this artery, where blood enters beside any device"
+    assert off.advice == f"{near.advice}{told} in it."
+
+
 def test_position_is_told_from_the_neck():
     found = measure(artery(), deployed(SILK))
     stent = deployed(SILK).stent

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from vstent.deploy import APPOSED_GAP_MM
-from vstent.deploy.sizing import landing_diameters_mm, neck_span_mm, oversizing_fraction
+from vstent.deploy.sizing import landing_diameters_mm, neck_points_mm, neck_span_mm, oversizing_fraction
 from vstent.device import coverage_fraction, grid, piece_length_mm, pore_density_per_mm2
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats
@@ -77,6 +77,8 @@ def _position(anatomy: Anatomy, stent: Stent) -> Measures:
         found["neck_to_proximal_end_mm"] = before_mm
         found["neck_to_distal_end_mm"] = after_mm
         found["neck_covered_fraction"] = float(before_mm >= 0 and after_mm >= 0)
+        from_axis_mm = stent.contour.closest(neck_points_mm(anatomy))[1].max()
+        found["max_neck_gap_mm"] = max(0.0, float(from_axis_mm) - stent.design.wall_offset_um * MM_PER_UM)
     return found
 
 
@@ -165,9 +167,16 @@ def _density(anatomy: Anatomy, stent: Stent) -> Measures:
     return found
 
 
-def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
-    """Tell for (n, 3) points on the device whether the landing surface next to them closes the largest aneurysm."""
+@lru_cache(maxsize=8)
+def _neck_on_landing(anatomy: Anatomy) -> Surface:
+    """The largest aneurysm's neck moved to the landing surface, which it faces from afar where a sac sits on a fork."""
     neck = anatomy.aneurysms[0].neck
+    return Surface(anatomy.landing_surface.closest(neck.vertices_mm)[0], neck.faces)
+
+
+def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
+    """Tell for (n, 3) points on the device whether the landing surface there closes or faces the largest neck."""
+    neck = _neck_on_landing(anatomy)
     at_most_mm = anatomy.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM
     low_mm, high_mm = neck.vertices_mm.min(axis=0), neck.vertices_mm.max(axis=0)
     is_over = curves.lengths(points_mm - np.clip(points_mm, low_mm, high_mm)) <= at_most_mm

@@ -1,5 +1,6 @@
-"""Advice: one sentence on where a device lies, and what to do when it does not fit."""
+"""Advice: where a device lies, what to do when it does not fit, and what no device there covers."""
 
+from functools import lru_cache
 from math import inf
 from typing import Final, NamedTuple
 
@@ -10,6 +11,7 @@ from vstent.deploy.sizing import (
     APPOSED_GAP_MM,
     LOOSE_FRACTION,
     OVERSIZED_FRACTION,
+    neck_points_mm,
     neck_span_mm,
     oversizing_fraction,
     reach_mm,
@@ -23,6 +25,9 @@ from vstent.vessel import Anatomy
 SHORT_MM: Final = 0.1
 """A device reaches far enough beyond the neck when no more than this is missing: its length was only foreseen."""
 
+OFF_MM: Final = 0.5
+"""A neck that reaches further than this off the parent artery opens into another branch besides."""
+
 
 class Gaps(NamedTuple):
     """How a device lies on the wall."""
@@ -34,7 +39,11 @@ class Gaps(NamedTuple):
 
 
 def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
-    """One sentence: where the device lies, what to do when it does not fit."""
+    """One sentence on where the device lies and what to do when it does not fit; one on a neck on a fork, if it is."""
+    return f"{_lies(anatomy, stent, course, gaps)}{_open(anatomy)}"
+
+
+def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
     gap_mm, is_at_patient = gaps
     lies = (
         f"{stent.design.name} {stent.size.label} lies from {stent.proximal_abscissa_mm:.1f} to "
@@ -52,6 +61,18 @@ def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
         return f"{lies}, and {1 - loose:.0%} of it lies against the wall."
     off = f"{loose:.0%} of it stands off the wall, by up to {gap_mm[is_at_patient].max():.2f} mm"
     return f"{lies}, and {off}: {_remedy(anatomy, stent, gap_mm, is_loose)}"
+
+
+@lru_cache(maxsize=8)
+def _open(anatomy: Anatomy) -> str:
+    """A sentence that begins with a space where the neck opens into more than the parent artery; else nothing."""
+    off_mm = anatomy.landing_surface.closest(neck_points_mm(anatomy))[1].max(initial=0.0)
+    if off_mm < OFF_MM:
+        return ""
+    return (
+        f" The neck lies on a fork: it reaches up to {off_mm:.1f} mm off this artery, where blood enters beside any "
+        "device in it."
+    )
 
 
 def _width(anatomy: Anatomy, stent: Stent) -> str:

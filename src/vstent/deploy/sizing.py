@@ -17,6 +17,7 @@ from vstent.deploy.braid import expected_profile, march
 from vstent.deploy.sketch import bed
 from vstent.device import Design, Size
 from vstent.errors import LandingError
+from vstent.kernels.arrays import Floats
 from vstent.stent import Landing, Stent
 from vstent.vessel import Anatomy
 
@@ -42,6 +43,14 @@ def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
         return anatomy.aneurysms[0].proximal_abscissa_mm, anatomy.aneurysms[0].distal_abscissa_mm
     middle_mm = 0.5 * anatomy.axis.length_mm
     return middle_mm, middle_mm
+
+
+def neck_points_mm(anatomy: Anatomy) -> Floats:
+    """Corners (n, 3) of the faces of the largest aneurysm's neck; none without one."""
+    if not anatomy.aneurysms:
+        return np.zeros((0, 3))
+    neck = anatomy.aneurysms[0].neck
+    return neck.vertices_mm[np.unique(neck.faces)]
 
 
 def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:

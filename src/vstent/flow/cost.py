@@ -35,7 +35,8 @@ BYTES_AT_LEAST = 4.5e8
 """Memory of the program itself, its compiled kernels and one surface."""
 WHOLE_OVER_BLOCK = 3.5
 """Time of a flow over that of its steps in a block of blood, which a cache holds: walls, openings, checks, the first
-guess, and memory (the demo in cells of 0.14 mm, with Silk: 87 million updates a second, the block 321)."""
+guess, and memory (the demo in cells of 0.14 mm, with Silk: 123 million updates a second, the block 440; 3.4 for C0038
+in 0.2 mm, 4.8 for a small bifurcation)."""
 BLOCK_ROWS = 4095
 """Rows of the block that the rate is measured on, an odd number (see `lattice_setup.OFF_PAGE`)."""
 BLOCK_BAND = 15

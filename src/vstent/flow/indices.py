@@ -37,7 +37,8 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
     widest outlet), ``mean_wss_Pa``; where there are several inlets, ``inlet_K_flow_mL_s`` and ``inlet_K_pressure_Pa``
     too. With a sac (closed) and its ostium (normals into the sac), besides:
 
-    - ``neck_inflow_mL_s`` = integral over the ostium of max(u.n, 0), ``neck_outflow_mL_s`` of max(-u.n, 0);
+    - ``neck_inflow_mL_s`` = integral over the ostium of max(u.n, 0), ``neck_outflow_mL_s`` of max(-u.n, 0), the
+      velocity tricubic between cells;
       ``inflow_area_fraction`` = part of the ostium where u.n > 0; ``turnover_time_s`` = sac volume / inflow;
     - ``mean_sac_velocity_m_s``, ``max_sac_velocity_m_s``, ``mean_sac_pressure_Pa`` over the sac's cells;
       ``sac_kinetic_energy_J`` = integral of rho u^2 / 2; ``fast_sac_volume_mm3`` where u > 0.08 m/s;
@@ -87,7 +88,7 @@ def _of_vessel(field: FlowField) -> dict[str, float]:
 def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
     points_mm, area_mm2 = sampling.surface_samples(ostium, field.cell_size_mm)
     points = (points_mm - field.origin_mm) / field.cell_size_mm
-    velocity_m_s = lattice_sampling.interpolate(field.index, field.velocity_m_s, points, True)
+    velocity_m_s = lattice_sampling.interpolate_cubic(field.index, field.velocity_m_s, points)
     through_mL_s = sampling.through_mL_s(velocity_m_s, area_mm2)
     sizes_mm2 = np.linalg.norm(area_mm2, axis=1)
     inflow_mL_s = sampling.inflow_mL_s(through_mL_s) if field.swing is None else field.swing.neck_inflow_mL_s

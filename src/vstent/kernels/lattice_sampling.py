@@ -64,6 +64,38 @@ def interpolate(index: Any, values: Any, points: Any, is_zero_outside: bool) -> 
 
 
 @njit(cache=True)
+def _cubic_weights(t: float, weights: Any) -> None:
+    """Fill the weights (4) of Lagrange's cubic through values at -1, 0, 1 and 2, at t."""
+    weights[0] = -t * (t - 1.0) * (t - 2.0) / 6.0
+    weights[1] = (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0
+    weights[2] = -(t + 1.0) * t * (t - 2.0) / 2.0
+    weights[3] = (t + 1.0) * t * (t - 1.0) / 6.0
+
+
+@njit(cache=True, parallel=True)
+def interpolate_cubic(index: Any, values: Any, points: Any) -> Any:
+    """Tricubic values (m, d) at points (m, 3), of the 64 cells around each; outside cells count as zero.
+
+    A chord lies below a jet's peak: of a narrow jet linear interpolation takes more than of the wide stream that goes
+    back.
+    """
+    result = np.zeros((len(points), values.shape[1]))
+    for m in prange(len(points)):
+        weights = np.zeros((3, 4))
+        for axis in range(3):
+            _cubic_weights(points[m, axis] - np.floor(points[m, axis]), weights[axis])
+        i, j, k = int(np.floor(points[m, 0])), int(np.floor(points[m, 1])), int(np.floor(points[m, 2]))
+        for n in range(64):
+            a, b, c = n >> 4, (n >> 2) & 3, n & 3
+            cell = _cell_at(index, i + a - 1, j + b - 1, k + c - 1)
+            if cell >= 0:
+                weight = weights[0, a] * weights[1, b] * weights[2, c]
+                for d in range(values.shape[1]):
+                    result[m, d] += weight * values[cell, d]
+    return result
+
+
+@njit(cache=True)
 def _speed_at(index: Any, velocity: Any, p: Any, v: Any, cells: Any, weights: Any) -> float:
     """Velocity v at p; its magnitude, or -1 outside."""
     v[:] = 0.0

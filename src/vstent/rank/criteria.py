@@ -28,6 +28,7 @@ MEASURES: Final = (
     "neck_to_proximal_end_mm",
     "neck_to_distal_end_mm",
     "neck_covered_fraction",
+    "max_neck_gap_mm",
     "apposed_fraction",
     "mean_wall_gap_mm",
     "max_wall_gap_mm",

@@ -95,6 +95,11 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "neck_covered_fraction": Definition(
         "Neck spanned", "100 % where the device begins before the neck and ends after it."
     ),
+    "max_neck_gap_mm": Definition(
+        "Neck gap, largest",
+        "Largest clearance between the device's outer face and the neck: large where the sac sits on a fork, of which "
+        "one branch alone is stented, or where the device stands off the wall.",
+    ),
     "apposed_fraction": Definition(
         "Apposed", "Part of the device's nodes beside the patient's own wall that are nearer to it than 0.1 mm."
     ),
@@ -117,7 +122,7 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "2 f for struts that meet without crossing.",
     ),
     "neck_metal_coverage_fraction": Definition(
-        "Metal coverage on the neck", "Part of the device over the neck under wires."
+        "Metal coverage on the neck", "Part of the device over the neck (on a fork: facing it) under wires."
     ),
     "pore_density_per_mm2": Definition(
         "Pore density", "Pores per area of the device, measured on the wires as they lie."

@@ -414,6 +414,6 @@ def _monitor(state: State, now: Snapshot) -> Floats:
     values = [speed_m_s[state.probe.cells].mean(), now.pressure_Pa[inlet].mean(), speed_m_s.mean()]
     if len(state.probe.ostium_points):
         index = state.domain.index
-        through = lattice_sampling.interpolate(index, velocity_m_s.astype(float), state.probe.ostium_points, True)
+        through = lattice_sampling.interpolate_cubic(index, velocity_m_s.astype(float), state.probe.ostium_points)
         values.append(sampling.inflow_mL_s(sampling.through_mL_s(through, state.probe.ostium_area_mm2)))
     return np.array(values, dtype=float)
