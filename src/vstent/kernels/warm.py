@@ -97,6 +97,7 @@ def flow() -> None:
     lattice.resisted(np.zeros((0, 3), np.float32), np.zeros((0, lattice.ENTRY), np.float32), times, np.float32(1.0))
     lattice.rescale(f, stride, none, links, np.float32(1.0), np.float32(1.0))
     index, numbers, points = np.zeros((2, 2, 2), np.int32), np.zeros(1), np.zeros((0, 3))
+    lattice_sampling.interpolate_cubic(index, np.zeros((1, 3)), points)
     lattice_sampling.fit_wall(index, numbers, np.zeros((1, 3)), numbers, points, points, 1)
     voxels.fill(np.zeros((0, 3, 3)), (1, 1, 1))
 
