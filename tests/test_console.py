@@ -1,6 +1,5 @@
 """What the terminal's tables say: every value with the unit and the digits of the report."""
 
-import pytest
 from rich.table import Table
 
 from vstent.console import comparison_table, flow_table, opening_table
@@ -48,9 +47,11 @@ def test_openings_are_told_with_their_units() -> None:
     assert columns(opening_table([opening])) == [["outlet 1"], ["4.00 mm"], ["12.6 mm²"], ["1.0, -2.2, 30.0 mm"]]
 
 
-@pytest.mark.parametrize("missing", ["bare", "apposed_fraction"])
-def test_what_is_missing_leaves_its_cell_empty(missing: str) -> None:
-    deployed = {key: value for key, value in DEPLOYED.items() if key != missing}
-    names, bare, silk = columns(comparison_table({"stents": {"silk": {"deployment": deployed}}}))
-    assert set(bare) == {""}
-    assert silk[names.index("Apposed")] == ("" if missing == "apposed_fraction" else "91.7 %")
+def test_what_one_device_lacks_leaves_its_cell_empty_and_what_all_lack_has_no_row() -> None:
+    stents = {
+        "silk": {"deployment": {key: DEPLOYED[key] for key in ("size", "apposed_fraction")}},
+        "enterprise": {"deployment": {"size": "4.5 x 22 mm"}},
+    }
+    names, *cells = columns(comparison_table({"stents": stents}))
+    assert names == ["Size (label)", "Apposed"]
+    assert cells == [["", ""], ["3.5 x 15 mm", "91.7 %"], ["4.5 x 22 mm", ""]]

@@ -81,7 +81,8 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
     stents = metrics["stents"]
     table = Table("", "bare", *stents)
     for title, key in DEVICE_ROWS:
-        table.add_row(title, "", *(_cell(key, stent["deployment"].get(key)) for stent in stents.values()))
+        if any(key in stent["deployment"] for stent in stents.values()):
+            table.add_row(title, "", *(_cell(key, stent["deployment"].get(key)) for stent in stents.values()))
     if "bare" not in metrics:
         return table
     table.add_section()
