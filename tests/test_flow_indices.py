@@ -77,6 +77,14 @@ def test_what_goes_through_the_neck_is_its_integral() -> None:
     assert found["inflow_concentration_index"] == pytest.approx(inflow / 10.0 / (5 / 8), rel=2e-3)
 
 
+def test_the_neck_is_read_to_the_peak_of_a_jet() -> None:
+    """In at 0.05 (1 - x x / 2) m/s where that is positive: linearly between cells it would be 0.8 % less."""
+    x = places()[1][:, 0]
+    found = indices(flow((0.05 * (1 - x**2 / 2))[:, None] * np.eye(3)[2]), sac(), plate(NECK_HALF_MM, 0.05))
+    assert found["neck_inflow_mL_s"] == pytest.approx(0.05 * 8 * 2 * np.sqrt(2) * 2 / 3, rel=5e-4)
+    assert found["neck_outflow_mL_s"] == pytest.approx(0.05 * 8 * 2 * (64 / 6 - 4 + np.sqrt(2) * 2 / 3), rel=5e-4)
+
+
 def test_what_the_sac_holds_is_its_integral() -> None:
     """Mean of (a + b x)^2 in a ball: a a + b b r r / 5."""
     found = indices(flow(through_neck(0.2, 0.02)), sac(), plate(NECK_HALF_MM, 0.2))

@@ -40,7 +40,7 @@ class Gaps(NamedTuple):
 
 def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
     """One sentence on where the device lies and what to do when it does not fit; one on a neck on a fork, if it is."""
-    return f"{_lies(anatomy, stent, course, gaps)}{_open(anatomy)}"
+    return f"{_lies(anatomy, stent, course, gaps)}{_of_fork(anatomy)}"
 
 
 def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
@@ -64,7 +64,7 @@ def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
 
 
 @lru_cache(maxsize=8)
-def _open(anatomy: Anatomy) -> str:
+def _of_fork(anatomy: Anatomy) -> str:
     """A sentence that begins with a space where the neck opens into more than the parent artery; else nothing."""
     off_mm = anatomy.landing_surface.closest(neck_points_mm(anatomy))[1].max(initial=0.0)
     if off_mm < OFF_MM:

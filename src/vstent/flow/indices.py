@@ -6,7 +6,6 @@ import numpy as np
 
 from vstent.flow import sampling
 from vstent.flow.types import FlowField
-from vstent.kernels import lattice_sampling
 from vstent.kernels.arrays import Bools, Floats
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
@@ -88,8 +87,7 @@ def _of_vessel(field: FlowField) -> dict[str, float]:
 def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
     points_mm, area_mm2 = sampling.surface_samples(ostium, field.cell_size_mm)
     points = (points_mm - field.origin_mm) / field.cell_size_mm
-    velocity_m_s = lattice_sampling.interpolate_cubic(field.index, field.velocity_m_s, points)
-    through_mL_s = sampling.through_mL_s(velocity_m_s, area_mm2)
+    through_mL_s = sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2)
     sizes_mm2 = np.linalg.norm(area_mm2, axis=1)
     inflow_mL_s = sampling.inflow_mL_s(through_mL_s) if field.swing is None else field.swing.neck_inflow_mL_s
     return {

@@ -46,6 +46,14 @@ def through_mL_s(velocity_m_s: Floats, area_mm2: Floats) -> Floats:
     return np.einsum("ij,ij->i", velocity_m_s, area_mm2)  # m/s times mm2 is mL/s
 
 
+def read_through_mL_s(index: Ints, velocity_m_s: Floats, points: Floats, area_mm2: Floats) -> Floats:
+    """Flow (p,) through points (p, 3), in grid units, with area vectors (p, 3), of velocities (n, 3) of cells.
+
+    Read by Lagrange's cubics of the 64 cells around: a chord lies below the peak of a jet, a bare neck's by 1 to 2 %.
+    """
+    return through_mL_s(lattice_sampling.interpolate_cubic(index, velocity_m_s, points), area_mm2)
+
+
 def inflow_mL_s(through_mL_s: Floats) -> float:
     """Sum of what goes through sample points (p,) the way of their area vectors; what comes back is left out."""
     return float(np.maximum(through_mL_s, 0.0).sum())

@@ -74,11 +74,7 @@ def _cubic_weights(t: float, weights: Any) -> None:
 
 @njit(cache=True, parallel=True)
 def interpolate_cubic(index: Any, values: Any, points: Any) -> Any:
-    """Tricubic values (m, d) at points (m, 3), of the 64 cells around each; outside cells count as zero.
-
-    A chord lies below a jet's peak: of a narrow jet linear interpolation takes more than of the wide stream that goes
-    back.
-    """
+    """Tricubic values (m, d) at points (m, 3), of the 64 cells around each; outside cells count as zero."""
     result = np.zeros((len(points), values.shape[1]))
     for m in prange(len(points)):
         weights = np.zeros((3, 4))

@@ -28,7 +28,7 @@ from vstent.flow.engines.lattice_setup import (
 )
 from vstent.flow.gpu import require_gpu, told
 from vstent.flow.types import FlowCase, FlowField
-from vstent.kernels import lanes, lattice, lattice_sampling
+from vstent.kernels import lanes, lattice
 from vstent.kernels.arrays import Floats, Ints
 from vstent.kernels.warm import keep_flow
 from vstent.units import M_PER_MM
@@ -413,7 +413,7 @@ def _monitor(state: State, now: Snapshot) -> Floats:
     inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
     values = [speed_m_s[state.probe.cells].mean(), now.pressure_Pa[inlet].mean(), speed_m_s.mean()]
     if len(state.probe.ostium_points):
-        index = state.domain.index
-        through = lattice_sampling.interpolate_cubic(index, velocity_m_s.astype(float), state.probe.ostium_points)
-        values.append(sampling.inflow_mL_s(sampling.through_mL_s(through, state.probe.ostium_area_mm2)))
+        at, area_mm2 = state.probe.ostium_points, state.probe.ostium_area_mm2
+        through_mL_s = sampling.read_through_mL_s(state.domain.index, velocity_m_s.astype(float), at, area_mm2)
+        values.append(sampling.inflow_mL_s(through_mL_s))
     return np.array(values, dtype=float)
