@@ -261,6 +261,18 @@ def test_streamlines_go_from_opening_to_opening() -> None:
     assert (out > -step_mm).mean() > 0.9  # beside the wall some end in blood that stands
 
 
+def test_streamlines_a_little_outside_the_wall_end_at_the_openings_too() -> None:
+    """Between cells velocity does not end at the wall: such a line passed an opening beside its rim, and went on."""
+    vessel, field = joined(), joined_flow()
+    wall = vessel.lumen
+    beside_mm = wall.vertices_mm + 0.2 * field.cell_size_mm * wall.vertex_normals
+    before_mm = np.min([(one.center_mm - beside_mm) @ one.normal for one in vessel.openings], axis=0)
+    lines = streamlines(field, beside_mm[(before_mm > 0.5) & (before_mm < 3.0)])
+    beyond_mm = [(lines.points_mm - one.center_mm) @ one.normal for one in vessel.openings]
+    assert len(lines.starts) > 100
+    assert np.max(beyond_mm) < 1e-3
+
+
 def test_a_pulse_enters_by_all_inlets_at_once() -> None:
     pulse = Waveform(0.4, (0.3,), (0.2,))
     settings = FlowSettings(inflow_mL_s=3.0, cell_size_mm=0.4, waveform=pulse, max_cycles=1)

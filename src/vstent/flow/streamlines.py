@@ -56,16 +56,26 @@ def _ways(field: FlowField, seeds_mm: Floats, step_cells: float) -> list[Floats]
     most = int(LONGEST_MM / field.cell_size_mm / STEP_CELLS)
     path, count = lattice_sampling.trace_all(field.index, field.velocity_m_s, seeds, step_cells, SLOWEST_M_S, most)
     path[..., :3] = field.origin_mm + path[..., :3] * field.cell_size_mm
-    return [_within(field.wall, points[:n]) for points, n in zip(path, count, strict=True)]
+    mouths = _mouths(field.wall, field.cell_size_mm)
+    return [_within(mouths, points[:n]) for points, n in zip(path, count, strict=True)]
 
 
-def _within(wall: Surface, way: Floats) -> Floats:
+def _mouths(wall: Surface, beyond_mm: float) -> Surface:
+    """What closes a vessel's openings, wider by as much as blood between cells may move outside the wall."""
+    vertices_mm = wall.caps.vertices_mm.copy()
+    for loop, center_mm in zip(wall.boundary_loops, wall.loop_centers_mm, strict=True):
+        outward_mm = vertices_mm[loop] - center_mm
+        vertices_mm[loop] += beyond_mm * outward_mm / np.linalg.norm(outward_mm, axis=1, keepdims=True)
+    return Surface(vertices_mm, wall.caps.faces)
+
+
+def _within(mouths: Surface, way: Floats) -> Floats:
     """A way (p, 4) as far as the last point before it leaves through an opening, for the first time."""
     step_mm = np.diff(way[:, :3], axis=0)
     length_mm = np.linalg.norm(step_mm, axis=1)
     ahead = step_mm / np.maximum(length_mm, 1e-12)[:, None]
-    distance_mm, face = wall.caps.first_hits(way[:-1, :3], ahead)
-    leaves = (distance_mm <= length_mm) & (np.einsum("ij,ij->i", wall.caps.normals[face], ahead) > 0)
+    distance_mm, face = mouths.first_hits(way[:-1, :3], ahead)
+    leaves = (distance_mm <= length_mm) & (np.einsum("ij,ij->i", mouths.normals[face], ahead) > 0)
     return way[: int(np.argmax(leaves)) + 1] if leaves.any() else way
 
 
