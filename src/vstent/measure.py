@@ -171,7 +171,8 @@ def _density(anatomy: Anatomy, stent: Stent) -> Measures:
 def _neck_on_landing(anatomy: Anatomy) -> Surface:
     """The largest aneurysm's neck moved to the landing surface, which it faces from afar where a sac sits on a fork."""
     neck = anatomy.aneurysms[0].neck
-    return Surface(anatomy.landing_surface.closest(neck.vertices_mm)[0], neck.faces)
+    vertices_mm, faces = triangles.compact(neck.vertices_mm, neck.faces)
+    return Surface(anatomy.landing_surface.closest(vertices_mm)[0], faces)
 
 
 def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:

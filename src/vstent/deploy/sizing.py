@@ -17,6 +17,7 @@ from vstent.deploy.braid import expected_profile, march
 from vstent.deploy.sketch import bed
 from vstent.device import Design, Size
 from vstent.errors import LandingError
+from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats
 from vstent.stent import Landing, Stent
 from vstent.vessel import Anatomy
@@ -50,7 +51,7 @@ def neck_points_mm(anatomy: Anatomy) -> Floats:
     if not anatomy.aneurysms:
         return np.zeros((0, 3))
     neck = anatomy.aneurysms[0].neck
-    return neck.vertices_mm[np.unique(neck.faces)]
+    return triangles.compact(neck.vertices_mm, neck.faces)[0]
 
 
 def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:

@@ -42,7 +42,8 @@ def streamlines(field: FlowField, seeds_mm: Floats) -> Streamlines:
     Fourth-order Runge-Kutta in arc length on trilinear velocity; seeds outside the blood give no line. What blood does
     in the extensions beyond the openings is no part of the vessel.
     """
-    up, down = _ways(field, seeds_mm, -STEP_CELLS), _ways(field, seeds_mm, STEP_CELLS)
+    mouths = _mouths(field.wall, field.cell_size_mm)
+    up, down = (_ways(field, mouths, seeds_mm, step_cells) for step_cells in (-STEP_CELLS, STEP_CELLS))
     lines = [np.concatenate([back[:0:-1], ahead]) for back, ahead in zip(up, down, strict=True)]
     lines = [line for line in lines if len(line) > 2]
     starts = np.cumsum([0, *map(len, lines)])
@@ -50,13 +51,12 @@ def streamlines(field: FlowField, seeds_mm: Floats) -> Streamlines:
     return Streamlines(joined[:, :3], starts, joined[:, 3])
 
 
-def _ways(field: FlowField, seeds_mm: Floats, step_cells: float) -> list[Floats]:
+def _ways(field: FlowField, mouths: Surface, seeds_mm: Floats, step_cells: float) -> list[Floats]:
     """Points in mm and speed (p, 4) from every seed (s, 3) on, as far as the blood stays in the vessel."""
     seeds = np.ascontiguousarray((seeds_mm - field.origin_mm) / field.cell_size_mm)
     most = int(LONGEST_MM / field.cell_size_mm / STEP_CELLS)
     path, count = lattice_sampling.trace_all(field.index, field.velocity_m_s, seeds, step_cells, SLOWEST_M_S, most)
     path[..., :3] = field.origin_mm + path[..., :3] * field.cell_size_mm
-    mouths = _mouths(field.wall, field.cell_size_mm)
     return [_within(mouths, points[:n]) for points, n in zip(path, count, strict=True)]
 
 
