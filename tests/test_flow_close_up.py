@@ -261,10 +261,10 @@ def test_what_a_swing_tells_is_the_close_ups_within_and_that_of_the_wide_cells_e
     chosen = close_ups.close_up(case, outer)
     inner = at_rest(case, close_ups.build(case, 0.25, chosen))
     of_wall = np.arange(len(vessel.lumen.vertices_mm), dtype=float)
-    swing = Swing(np.linspace(1.0, 2.0, len(inner.cells)), of_wall, 3.0)
-    found = close_ups.assembled(chosen, replace(inner, swing=swing))
+    swing = Swing(np.linspace(1.0, 2.0, len(inner.cells)), of_wall)
+    found = close_ups.assembled(chosen, replace(inner, swing=swing, neck_inflow_mL_s=3.0))
     assert found.swing is not None
-    assert found.swing.neck_inflow_mL_s == 3.0
+    assert found.neck_inflow_mL_s == 3.0
     nearest_mm, of_inner = cKDTree(inner.centers_mm).query(found.centers_mm)
     is_inner = nearest_mm < 1e-6
     np.testing.assert_array_equal(found.speed_m_s[is_inner], swing.speed_m_s[of_inner[is_inner]])

@@ -150,8 +150,8 @@ def test_the_largest_of_a_pulse_is_that_of_its_moments_and_the_rest_its_mean() -
 def test_of_a_flow_that_moves_sizes_are_meant_not_the_size_of_the_mean() -> None:
     """Its mean goes into the sac at 0.02 m/s; what goes to and fro besides is told by its swing."""
     still = flow(through_neck(0.02, 0.0))
-    swing = Swing(np.full(len(still.cells), 0.09), 3.0 * still.shear_Pa, 5.0)
-    found = indices(replace(still, swing=swing), sac(), plate(NECK_HALF_MM, 0.2))
+    swing = Swing(np.full(len(still.cells), 0.09), 3.0 * still.shear_Pa)
+    found = indices(replace(still, swing=swing, neck_inflow_mL_s=5.0), sac(), plate(NECK_HALF_MM, 0.2))
     assert found["mean_sac_velocity_m_s"] == pytest.approx(0.09)
     assert found["fast_sac_volume_mm3"] == pytest.approx(sac().volume_mm3)
     assert found["mean_sac_wss_Pa"] == pytest.approx(6.0)

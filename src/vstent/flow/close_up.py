@@ -245,7 +245,7 @@ class _Patchwork(NamedTuple):
     def swing(self, fine: Swing) -> Swing:
         """That of the close-up, and elsewhere what the wide cells have."""
         speed_m_s = np.concatenate([fine.speed_m_s, sampling.speed_at(self.outer, self.around_mm)])[self.order]
-        return Swing(speed_m_s, np.where(self.is_fine, fine.shear_Pa, self.outer.shear_Pa), fine.neck_inflow_mL_s)
+        return Swing(speed_m_s, np.where(self.is_fine, fine.shear_Pa, self.outer.shear_Pa))
 
     def phases(self, inner: FlowField) -> tuple[Phase, ...]:
         """Those of a pulse, with the openings' flows of the wide cells."""

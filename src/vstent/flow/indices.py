@@ -89,7 +89,8 @@ def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
     points = (points_mm - field.origin_mm) / field.cell_size_mm
     through_mL_s = sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2)
     sizes_mm2 = np.linalg.norm(area_mm2, axis=1)
-    inflow_mL_s = sampling.inflow_mL_s(through_mL_s) if field.swing is None else field.swing.neck_inflow_mL_s
+    told_mL_s = field.neck_inflow_mL_s
+    inflow_mL_s = sampling.inflow_mL_s(through_mL_s) if told_mL_s is None else told_mL_s
     return {
         "neck_inflow_mL_s": inflow_mL_s,
         "neck_outflow_mL_s": inflow_mL_s - float(through_mL_s.sum()),

@@ -234,6 +234,8 @@ class Phase:
     """(n,) pressure at the cell centres."""
     wall_shear_stress_Pa: Floats
     """(v, 3) at the lumen's vertices."""
+    neck_inflow_mL_s: float | None = None
+    """Into the sac, as `FlowField` has it."""
 
     def __post_init__(self) -> None:
         freeze(self, "inlets_mL_s", np.float64, (-1,))
@@ -256,8 +258,6 @@ class Swing:
     """(n,) mean speed at the cell centres."""
     shear_Pa: Floats
     """(v,) mean magnitude of the wall shear stress at the lumen's vertices."""
-    neck_inflow_mL_s: float
-    """Mean neck inflow; 0 where there is no neck."""
 
     def __post_init__(self) -> None:
         freeze(self, "speed_m_s", np.float64, (-1,))
@@ -314,6 +314,9 @@ class FlowField:
     """The last cycle of a pulsatile flow, at equal times; empty for a steady one."""
     swing: Swing | None = None
     """Of a steady flow that moves about its mean; None of any other."""
+    neck_inflow_mL_s: float | None = None
+    """Into the sac, where these cells do not tell it: the mean where the flow moves, and what a mesh with cells finer
+    than these about wires lets through. None: as they tell."""
 
     def __post_init__(self) -> None:
         freeze(self, "cells", np.int32, (-1, 3))
@@ -378,4 +381,5 @@ class FlowField:
             outlets_mL_s=phase.outlets_mL_s,
             phases=(),
             swing=None,
+            neck_inflow_mL_s=phase.neck_inflow_mL_s,
         )

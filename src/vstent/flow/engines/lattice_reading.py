@@ -34,6 +34,8 @@ class Reading:
     """(k,) out through every outlet; nan likewise, 0 where no cell of all reaches it."""
     swing: Swing | None = None
     """What it is the mean of, where a steady flow moves."""
+    neck_inflow_mL_s: float | None = None
+    """Its mean there."""
 
 
 def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
@@ -59,7 +61,7 @@ def read_moving(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     shear_Pa = mean_shear_Pa(state.domain, flow.velocity_m_s, speed_m_s, lumen=case.vessel.lumen, blood=case.blood)
     checks = sum(one.checks for one in snapshots)
     inflow_mL_s = float(np.array(state.history)[-checks:, NECK_INFLOW:].mean(axis=0).sum())
-    return replace(flow, swing=Swing(speed_m_s, shear_Pa, inflow_mL_s))
+    return replace(flow, swing=Swing(speed_m_s, shear_Pa), neck_inflow_mL_s=inflow_mL_s)
 
 
 def _mean(snapshots: Sequence[Snapshot], values: Iterable[Floats | NDArray[np.float32]]) -> Floats:
@@ -98,6 +100,7 @@ def field_of(
         updates_per_s=len(domain.cells) * state.steps / state.loop_seconds,
         phases=phases,
         swing=flow.swing,
+        neck_inflow_mL_s=flow.neck_inflow_mL_s,
     )
     return field if state.close_up is None else close_ups.assembled(state.close_up, field)
 
