@@ -159,5 +159,13 @@ def test_of_a_flow_that_moves_sizes_are_meant_not_the_size_of_the_mean() -> None
     assert found["neck_inflow_mL_s"] - found["neck_outflow_mL_s"] == pytest.approx(0.02 * 64)
 
 
+def test_of_a_pulse_on_a_finer_mesh_each_moments_inflow_is_what_that_mesh_told() -> None:
+    steady = flow(through_neck(0.02, 0.0))
+    moment = steady.inlets_mL_s, steady.outlets_mL_s, through_neck(0.02, 0.0), steady.pressure_Pa
+    phases = tuple(Phase(k, *moment, steady.wall_shear_stress_Pa, told) for k, told in enumerate((2.0, 5.0)))
+    found = indices(replace(steady, phases=phases, neck_inflow_mL_s=9.0), sac(), plate(NECK_HALF_MM, 0.2))
+    assert found["neck_inflow_mL_s"] == 3.5
+
+
 def test_ratios_are_of_what_both_have_and_nothing_is_divided_by_zero() -> None:
     assert compare({"a": 2.0, "b": 0.0, "c": 1.0}, {"a": 1.0, "b": 3.0}) == {"a_ratio": 0.5}
