@@ -514,7 +514,7 @@ def test_a_cut_lies_in_one_plane_and_has_the_flows_speed_at_a_moment_or_in_the_m
         3 * mean.wall_shear_stress_Pa,
     )
     pulsing = replace(mean, phases=(fast,))
-    layers = [cuts.cut("bare", field, anatomy) for field in (mean, cuts.at_phase(pulsing, 0))]
+    layers = [cuts.cut("bare", field, anatomy) for field in (mean, pulsing.at_phase(pulsing.phases[0]))]
     points = layers[0].surface.vertices_mm
     assert np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[2] < 1e-9
     # In the bend's plane the speed is Poiseuille's: its largest, on the axis, is 0.5 m/s.
@@ -523,7 +523,7 @@ def test_a_cut_lies_in_one_plane_and_has_the_flows_speed_at_a_moment_or_in_the_m
     assert on_axis.sum() > 10
     np.testing.assert_allclose(layers[0].values[on_axis], 0.5, rtol=0.08)
     np.testing.assert_allclose(layers[1].values, 2 * layers[0].values, rtol=1e-5)
-    np.testing.assert_allclose(cuts.at_phase(pulsing, 0).shear_Pa, 3 * mean.shear_Pa, rtol=1e-5)
+    np.testing.assert_allclose(pulsing.at_phase(pulsing.phases[0]).shear_Pa, 3 * mean.shear_Pa, rtol=1e-5)
 
 
 def test_the_interface_is_described_and_its_page_needs_no_network(client):

@@ -159,6 +159,7 @@ def test_what_goes_to_and_fro_is_told_by_its_size_and_not_by_its_mean() -> None:
     np.testing.assert_allclose(field.speed_m_s, size * speed_m_s, rtol=1e-4)
     steady_Pa = np.linalg.norm(read(state, [still]).wall_shear_stress_Pa, axis=1)
     np.testing.assert_allclose(field.shear_Pa, size * steady_Pa, atol=0.02 * size * steady_Pa.max())
+    assert field.swing is not None
     assert field.neck_inflow_mL_s == pytest.approx(2.0 + size)
 
 

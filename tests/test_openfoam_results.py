@@ -1,8 +1,11 @@
 """What comes back from OpenFOAM: fields read, brought to the grid, failures put into words, a tube's exact flow."""
 
 import shutil
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -10,11 +13,12 @@ import pytest
 from vstent import phantoms
 from vstent.errors import FlowError, ReadError
 from vstent.flow import FlowCase, FlowSettings, Screen, domain, sampling, simulate_case
-from vstent.flow.engines import Progress, run
-from vstent.flow.engines.openfoam import OpenFoam, swing_of
+from vstent.flow.engines import Outcome, Progress, run
+from vstent.flow.engines.openfoam import OpenFoam, State, swing_of
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results, scatter
 from vstent.flow.openfoam.bridge import Snapshot, bridge
+from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.types import PHASES, Waveform
 from vstent.surface import Surface
 from vstent.trace import trace
@@ -216,6 +220,21 @@ def test_what_goes_to_and_fro_from_check_to_check_is_told_by_its_size() -> None:
     found = swing_of([one, other])
     np.testing.assert_allclose(found.speed_m_s, [5, 1])
     np.testing.assert_allclose(found.shear_Pa, [2])
+
+
+def test_of_a_flow_that_does_not_settle_the_neck_inflow_is_the_mean_of_its_checks(tmp_path: Path) -> None:
+    case = FlowCase(tube(), settings=FlowSettings(inflow_mL_s=FLOW_ML_S))
+    grid = domain.build(case.vessel, 0.5)
+    n, v = len(grid.cells), len(case.vessel.lumen.vertices_mm)
+    one = Snapshot("50", np.zeros((n, 3)), np.zeros(n), np.zeros((v, 3)), np.zeros(v), np.zeros(2), 1.0)
+    unused = cast("Any", SimpleNamespace(n_cells=n))
+    kept = deque([one, replace(one, neck_inflow_mL_s=2.0)])
+    state = State(
+        case, FoamSetup(0.5), unused, "simpleFoam", tmp_path, grid, unused, np.arange(n, dtype=np.int32), kept
+    )
+    field = OpenFoam(0.5, tmp_path).result(state, Outcome(False, (0.5,), 1.0, 1.0))
+    assert field.swing is not None
+    assert field.neck_inflow_mL_s == 1.5
 
 
 @pytest.mark.skipif(shutil.which("pimpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")

@@ -1,6 +1,5 @@
-"""Cuts: a flow on the plane that the sac is seen in, and a pulsating flow at one moment."""
+"""Cuts: a flow on the plane that the sac is seen in."""
 
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -14,18 +13,6 @@ from vstent.vessel import Anatomy
 
 STEP_CELLS: Final = 0.6
 """Distance between the points of a cut, in cells of the flow."""
-
-
-def at_phase(field: FlowField, number: int) -> FlowField:
-    """Return a pulsating flow at one moment of its last cycle, as a flow of its own."""
-    phase = field.phases[number]
-    return replace(
-        field,
-        velocity_m_s=phase.velocity_m_s,
-        pressure_Pa=phase.pressure_Pa,
-        wall_shear_stress_Pa=phase.wall_shear_stress_Pa,
-        phases=(),
-    )
 
 
 def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:

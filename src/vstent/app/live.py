@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from vstent.app import necks, sheets
 from vstent.app.cases import Case
 from vstent.app.choices import DeviceChoice, placing_of
-from vstent.app.cuts import at_phase, cut
+from vstent.app.cuts import cut
 from vstent.app.finished import kept_flows
 from vstent.deploy import propose_landing
 from vstent.deploy.contour import planes
@@ -144,7 +144,7 @@ class Live:
     def _field(self, path: Path, moment: int | None) -> FlowField:
         """A flow: its mean, or a moment of its last cycle."""
         field = self.remembered(("flow", path, path.stat().st_mtime_ns), lambda: load_noun(path, FlowField))
-        return field if moment is None or not field.phases else at_phase(field, moment % len(field.phases))
+        return field if moment is None or not field.phases else field.at_phase(field.phases[moment % len(field.phases)])
 
     def _flow_layers(self, name: str, path: Path, moment: int | None) -> list[MeshLayer | LineLayer]:
         key = ("flow layers", path, path.stat().st_mtime_ns, self.case.state.anatomy, moment)

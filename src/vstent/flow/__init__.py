@@ -322,8 +322,14 @@ def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowFie
     if all(field.phases for field in fields):
         end_m_s, end_Pa = _changed(*(field.at_phase(field.phases[-1]) for field in fields))
         phases = (replace(start.phases[-1], velocity_m_s=end_m_s, pressure_Pa=end_Pa),)
-    changed = replace(start, velocity_m_s=velocity_m_s, pressure_Pa=pressure_Pa, phases=phases)
-    return replace(changed, swing=None, neck_inflow_mL_s=None)
+    return replace(
+        start,
+        velocity_m_s=velocity_m_s,
+        pressure_Pa=pressure_Pa,
+        phases=phases,
+        swing=None,
+        neck_inflow_mL_s=None,
+    )
 
 
 def _changed(start: FlowField, bare: FlowField, stented: FlowField) -> tuple[Floats, Floats]:

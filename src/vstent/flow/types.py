@@ -316,7 +316,7 @@ class FlowField:
     """Of a steady flow that moves about its mean; None of any other."""
     neck_inflow_mL_s: float | None = None
     """Into the sac, where these cells do not tell it: the mean where the flow moves, and what a mesh with cells finer
-    than these about wires lets through. None: as they tell."""
+    than these about wires lets through (0 where there is no neck). None: as they tell."""
 
     def __post_init__(self) -> None:
         freeze(self, "cells", np.int32, (-1, 3))

@@ -260,7 +260,7 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
         updates_per_s=state.bridge.n_cells * steps / max(state.loop_seconds, 1e-9),
         phases=_phases(state.case, kept) if state.is_pulse else (),
         swing=None if state.is_pulse or len(kept) == 1 else swing_of(kept),
-        neck_inflow_mL_s=None if state.case.ostium is None else float(np.mean([one.neck_inflow_mL_s for one in kept])),
+        neck_inflow_mL_s=float(mean("neck_inflow_mL_s")),
     )
 
 
@@ -278,8 +278,7 @@ def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
     def phase(k: int, one: Snapshot) -> Phase:
         backwards_mL_s, outlets_mL_s = case.vessel.of_inlets_and_outlets(one.outflow_mL_s)
         moment = one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa
-        neck_mL_s = None if case.ostium is None else one.neck_inflow_mL_s
-        return Phase((k + 1) * phase_s, -backwards_mL_s, outlets_mL_s, *moment, neck_mL_s)
+        return Phase((k + 1) * phase_s, -backwards_mL_s, outlets_mL_s, *moment, one.neck_inflow_mL_s)
 
     return tuple(phase(k, one) for k, one in enumerate(cycle))
 
