@@ -28,13 +28,14 @@ from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, flow_case, in
 from vstent.flow.engines import run
 from vstent.flow.engines.openfoam import OpenFoam
 from vstent.flow.openfoam import setup
-from vstent.flow.openfoam.case import STRUT_REACH_MM
 from vstent.flow.types import OPENFOAM
 from vstent.restore import restore
+from vstent.stent import Stent
+from vstent.struts import is_over_restored
 from vstent.surface import Surface
 from vstent.trace import trace
 from vstent.trim import trim
-from vstent.vessel import Vessel
+from vstent.vessel import Anatomy, Vessel
 
 TABLE = Path(__file__).with_suffix(".json")
 KEPT_MM = 9.0
@@ -49,18 +50,16 @@ def cases(names: list[str]) -> dict[str, FlowCase]:
     inflow_mL_s = flow_case(anatomy, None).inflow_mL_s
     settings = FlowSettings(inflow_mL_s=inflow_mL_s)
     stents = {"bare": None} | {name: vstent.deploy(vstent.find_design(name), anatomy).stent for name in names}
-    return {
-        name: near_neck(replace(flow_case(anatomy, stent, settings), vessel=short)) for name, stent in stents.items()
-    }
+    return {name: where_meshed(flow_case(anatomy, one, settings), one, anatomy, short) for name, one in stents.items()}
 
 
-def near_neck(case: FlowCase) -> FlowCase:
-    """The screen only where OpenFOAM meshes struts."""
-    if case.screen is None or case.ostium is None:
-        return case
-    screen = case.screen
-    chosen = case.ostium.closest(screen.points_mm)[1] < STRUT_REACH_MM
-    return replace(case, screen=Screen(**{one.name: getattr(screen, one.name)[chosen] for one in fields(screen)}))
+def where_meshed(case: FlowCase, stent: Stent | None, anatomy: Anatomy, short: Vessel) -> FlowCase:
+    """The screen only where OpenFOAM meshes struts, in a shorter vessel."""
+    if case.screen is None or stent is None:
+        return replace(case, vessel=short)
+    chosen = is_over_restored(stent, anatomy, case.screen.points_mm)
+    part = Screen(**{one.name: getattr(case.screen, one.name)[chosen] for one in fields(Screen)})
+    return replace(case, vessel=short, screen=part)
 
 
 def computed(

@@ -1,6 +1,7 @@
 """`vstent export`: what other solvers get, as a user asks for it."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,17 @@ def artery(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def studied(artery: Path) -> Path:
     out = artery.parent / "case"
-    run(artery, out, Settings(devices=("enterprise",), units="mm", flow=None), lambda *_: None)
+    run(artery, out, Settings(devices=("enterprise",), units="mm", center_mm=26.0, flow=None), lambda *_: None)
     return out
+
+
+def test_where_a_device_lies_is_not_guessed(studied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(studied, tmp_path / "case")
+    (tmp_path / "case" / "run.json").write_text("{")
+    words = ["export", "openfoam", str(tmp_path / "case"), "--device", "enterprise", "--out", str(tmp_path / "foam")]
+    assert main(words) == 2
+    assert "where a device lies is not known" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "foam").exists()
 
 
 def test_patches_of_a_studied_case_are_watertight(studied: Path, tmp_path: Path) -> None:
@@ -61,8 +71,8 @@ def test_an_openfoam_case_of_a_studied_case_has_its_device_over_the_neck(studied
     assert set(geometry) == {"lumen", "neck", "struts", "before_outlet_2"}  # the branch is narrow
     whole = Surface(*read_apart(studied / "stents" / "enterprise" / "struts.stl"))
     near = Surface(*read_apart(out / "constant" / "triSurface" / "struts.stl"))
-    assert 0 < near.area_mm2 * 1e6 <= whole.area_mm2 * 1.0001
-    assert whole.closest(near.vertices_mm * 1e3)[1].max() < 1e-4
+    assert 0.2 < near.area_mm2 * 1e6 / whole.area_mm2 < 0.5
+    assert whole.closest(near.vertices_mm * 1e3)[1].max() < 0.01  # the last section before a cut turns a little
     lumen, _ = read_surface(out / "constant" / "triSurface" / "lumen.stl", units="m")
     assert lumen.boundary_loops == ()
     mean = (out / "constant" / "boundaryData" / "inlet" / "0" / "U").read_text().splitlines()[-1]

@@ -1,6 +1,5 @@
 """The case handed to OpenFOAM: syntax, units, watertight patches, the flow that was asked for."""
 
-import itertools
 from dataclasses import replace
 from functools import cache
 
@@ -8,19 +7,18 @@ import numpy as np
 import pytest
 
 from shapes import sphere
-from tubes import line, tube
+from tubes import line, tube, with_neck
 from vstent import phantoms
 from vstent.deploy import deploy
 from vstent.device import find_design
-from vstent.errors import LandingError, ReadError
-from vstent.flow import Blood, FlowCase, FlowSettings
+from vstent.errors import FlowError, LandingError, ReadError
+from vstent.flow import Blood, FlowCase, FlowSettings, flow_case
 from vstent.flow.openfoam import FoamSetup, foam_case, named_patches
-from vstent.flow.openfoam.case import struts_near, wires_near
+from vstent.flow.openfoam.case import strut_solids
 from vstent.flow.openfoam.control import fluid
 from vstent.flow.openfoam.dictionary import foam_file, parse
 from vstent.flow.types import CarreauYasuda
 from vstent.flow.waveform import OLDER_ADULT_ICA
-from vstent.stent import Stent
 from vstent.struts import struts
 from vstent.surface import Surface
 from vstent.trace import trace
@@ -232,54 +230,18 @@ def test_a_pulse_repeats_and_keeps_its_mean() -> None:
     assert float(control["endTime"][0]) == pytest.approx(4 * OLDER_ADULT_ICA.period_s)
 
 
-def test_only_wires_at_the_neck_are_meshed_each_whole() -> None:
-    near, far = sphere(0.5), sphere(0.5)
-    both = Surface(
-        np.concatenate([near.vertices_mm + 1.2 * np.eye(3)[2], far.vertices_mm + 9.0 * np.eye(3)[2]]),
-        np.concatenate([near.faces, far.faces + len(near.vertices_mm)]),
-    )
-    kept = struts_near(both, sphere(0.4), 0.5)
-    assert len(kept.faces) == len(near.faces)
-    assert kept.volume_mm3 == pytest.approx(near.volume_mm3)
-    assert kept.corners_mm[..., 2].max() < 2.0
-    with pytest.raises(LandingError, match="of the neck"):
-        struts_near(Surface(both.vertices_mm + 5.0, both.faces), sphere(0.4), 0.5)
-
-
-def test_only_the_pieces_of_wire_near_the_neck_are_left() -> None:
-    design = find_design("silk")
-    rng = np.random.default_rng(5)
-    starts = np.array([0, 40, 41, 120, 300])  # a single point is a wire too
-    points_mm = 0.25 * np.cumsum(rng.normal(size=(300, 3)), axis=0)
-    diameter_um = np.array([30.0, 50.0, 30.0, 50.0])
-    stent = Stent(design, design.sizes[0], np.zeros((2, 3, 3)), np.zeros(2), points_mm, starts, diameter_um)
-    neck = sphere(1.0)
-    near = wires_near(stent, neck, 1.0)
-    distance = neck.closest(near.wire_points_mm)[1]
-    assert distance.max() < 1.0
-    whole, left = (_pieces(one) for one in (stent, near))
-    # Every piece between two near points of one wire is kept, with its diameter, and no other.
-    inside = neck.closest(whole[:, :3])[1] < 1.0
-    both = whole[inside & (neck.closest(whole[:, 3:6])[1] < 1.0)]
-    np.testing.assert_array_equal(left, both)
-    assert 10 < len(left) < 0.5 * len(whole)
-    ends = points_mm[0] + np.array([[0.0, 0, 0], [9, 9, 9]])
-    one_near = Stent(
-        design, design.sizes[0], np.zeros((2, 3, 3)), np.zeros(2), ends, np.array([0, 2]), np.array([30.0])
-    )
-    for lone in (replace(stent, wire_points_mm=points_mm + 99.0), one_near):
-        with pytest.raises(LandingError, match="within 1 mm of the neck"):
-            wires_near(lone, neck, 1.0)
-
-
-def _pieces(stent: Stent) -> np.ndarray:
-    """Every piece of wire: both ends and the diameter."""
-    rows = []
-    for k, (begin, end) in enumerate(itertools.pairwise(stent.wire_starts)):
-        points = stent.wire_points_mm[begin:end]
-        diameter = np.full((len(points) - 1, 1), stent.wire_diameter_um[k])
-        rows.append(np.hstack([points[:-1], points[1:], diameter]))
-    return np.concatenate(rows)
+def test_a_device_is_meshed_by_its_wires_over_an_ostium_or_refused() -> None:
+    healthy = tube(line(32), 1.9)
+    branched = replace(with_neck(healthy, 14, 18), aneurysms=())
+    stent = deploy(find_design("enterprise"), healthy).stent
+    solids = strut_solids(flow_case(branched, stent))
+    assert solids is not None
+    assert 0 < solids.volume_mm3 < 0.3 * struts(stent).volume_mm3
+    assert strut_solids(flow_case(branched, None)) is None
+    with pytest.raises(LandingError, match="over a neck or a branch's ostium"):
+        strut_solids(flow_case(healthy, stent))
+    with pytest.raises(FlowError, match="give the stent"):
+        strut_solids(replace(flow_case(branched, stent), stent=None))
 
 
 @pytest.mark.parametrize(("name", "across_mm"), [("silk", (0.030, 0.050)), ("enterprise", (0.078, 0.078))])

@@ -1,17 +1,18 @@
 """Wires woven on the contour, and their solids."""
 
 import itertools
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from tubes import arc, line, tube
+from tubes import arc, line, tube, with_neck
 from vstent import device
 from vstent.deploy import deploy, wires
 from vstent.errors import DeviceError
-from vstent.struts import blood, struts, united
+from vstent.struts import blood, over_restored, struts, united
 from vstent.surface import Surface
 
 SILK, ENTERPRISE = device.find_design("silk"), device.find_design("enterprise")
@@ -176,3 +177,54 @@ def test_an_open_solid_is_refused():
     solid = struts(stent(straight(), ENTERPRISE))
     with pytest.raises(DeviceError, match="is not closed"):
         united(Surface(solid.vertices_mm, solid.faces[1:]))
+
+
+def test_wires_over_a_neck_are_left_each_between_its_own_points():
+    artery = with_neck(straight(), 14, 18)
+    design = stent(straight(), SILK)
+    starts = np.array([0, 40, 41, 120, 300])  # a single point is a wire too
+    points_mm = np.array([1.9, 0.0, 16.0]) + 0.25 * np.cumsum(np.random.default_rng(5).normal(size=(300, 3)), axis=0)
+    walks = replace(design, wire_points_mm=points_mm, wire_starts=starts, wire_diameter_um=[30.0, 50.0, 30.0, 50.0])
+    left = over_restored(walks, artery)
+    is_over = over_by_samples(points_mm, artery, 0.5 * walks.spacing_mm)
+    here, *all_pieces = pieces(walks)
+    is_left = is_over[here] & is_over[here + 1]
+    for found, row in zip(pieces(left)[1:], all_pieces, strict=True):
+        np.testing.assert_array_equal(found, row[is_left])
+    assert 0.1 < is_left.mean() < 0.8
+
+
+@pytest.mark.parametrize("radius_mm", [1.9, 3.6], ids=["apposed", "standing off"])
+def test_what_stands_off_the_wall_is_over_the_neck_as_what_lies_on_it(radius_mm):
+    """Blood passes the wires there, however far from the neck they are."""
+    artery = with_neck(tube(line(32), radius_mm), 13, 19)
+    device_in_place = deploy(ENTERPRISE, artery, size=SIZES["enterprise"]).stent
+    points_mm = device_in_place.wire_points_mm
+    off_mm = artery.landing_surface.closest(points_mm)[1]
+    assert (off_mm.min() > 1.0) == (radius_mm > 2)
+    left = over_restored(device_in_place, artery).wire_points_mm
+    is_over = over_by_samples(points_mm, artery, 0.5 * device_in_place.spacing_mm)
+    assert 0.1 < len(left) / len(points_mm) < 0.6
+    assert len(left) == pytest.approx(is_over.sum(), abs=4)
+    assert len(over_restored(device_in_place, tube(line(32), radius_mm)).wire_points_mm) == 0
+
+
+def over_by_samples(points_mm, artery, within_mm):
+    """Whether the nearest of many points on the wall lies so near to one on the neck."""
+    wall, neck = (densely(one) for one in (artery.landing_surface, artery.aneurysms[0].neck))
+    foot_mm = wall[cKDTree(wall).query(points_mm)[1]]
+    return cKDTree(neck).query(foot_mm)[0] < within_mm
+
+
+def densely(surface):
+    steps = np.linspace(0, 1, 9)
+    weights = np.array([(a, b, 1 - a - b) for a in steps for b in steps if a + b <= 1 + 1e-9])
+    return np.einsum("wk,fkd->fwd", weights, surface.corners_mm).reshape(-1, 3)
+
+
+def pieces(device_in_place):
+    """First point (p,), both ends (p, 3) and diameter (p,) of every piece of wire."""
+    here = np.setdiff1d(np.arange(len(device_in_place.wire_points_mm) - 1), device_in_place.wire_starts[1:] - 1)
+    wire = np.searchsorted(device_in_place.wire_starts, here, "right") - 1
+    points_mm = device_in_place.wire_points_mm
+    return here, points_mm[here], points_mm[here + 1], device_in_place.wire_diameter_um[wire]

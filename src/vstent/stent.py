@@ -63,6 +63,13 @@ class Stent:
         rows, columns = self.nodes_mm.shape[:2]
         return Surface(self.nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
 
+    @property
+    def spacing_mm(self) -> float:
+        """Distance between neighbouring wires of one family, of two that share all wires: 2 area / length of wire."""
+        within = np.ones(len(self.wire_points_mm) - 1, dtype=bool)
+        within[self.wire_starts[1:-1] - 1] = False
+        return float(2 * self.contour.area_mm2 / curves.lengths(np.diff(self.wire_points_mm, axis=0)[within]).sum())
+
     @cached_property
     def row_diameter_mm(self) -> Floats:
         """(rows,) diameter of the circle of every row's perimeter, seen along the device: a row may be tilted."""

@@ -1,5 +1,6 @@
 """Struts: the wires of a deployed device as closed solids."""
 
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -34,6 +35,38 @@ def struts(stent: Stent) -> Surface:
     sides = section.shape[1]
     faces = [_side_faces(stent.wire_starts, is_joined, is_last, sides), _cap_faces(stent.wire_starts, is_joined, sides)]
     return _compacted(vertices.reshape(-1, 3), np.concatenate(faces))
+
+
+def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
+    """Return the pieces of a stent's wires through which blood passes: over necks and ostia; none where none is.
+
+    Wires on the patient's own wall have no flow across them. Half a spacing more is kept on every side, so that no
+    gap is left along the rim.
+    """
+    is_over = is_over_restored(stent, anatomy, stent.wire_points_mm)
+    wire = np.repeat(np.arange(len(stent.wire_starts) - 1), np.diff(stent.wire_starts))
+    first = is_over & ~np.r_[False, is_over[:-1] & (wire[1:] == wire[:-1])]
+    piece, kept = np.cumsum(first) - 1, np.flatnonzero(is_over)
+    kept = kept[np.bincount(piece[kept])[piece[kept]] > 1]  # a single point is no piece
+    is_first = np.diff(piece[kept], prepend=-1) > 0
+    return replace(
+        stent,
+        wire_points_mm=stent.wire_points_mm[kept],
+        wire_starts=np.r_[np.flatnonzero(is_first), len(kept)],
+        wire_diameter_um=stent.wire_diameter_um[wire[kept[is_first]]],
+    )
+
+
+def is_over_restored(stent: Stent, anatomy: Anatomy, points_mm: Floats) -> Bools:
+    """Tell of points (n, 3) on a stent whether the landing surface under them closes a neck or an ostium.
+
+    So it does also within half the spacing of the stent's wires around.
+    """
+    surface = anatomy.landing_surface
+    closing = Surface(surface.vertices_mm, surface.faces[anatomy.is_restored_face])
+    if not len(closing.faces):
+        return np.zeros(len(points_mm), dtype=bool)
+    return np.asarray(closing.closest(surface.closest(points_mm)[0])[1] < 0.5 * stent.spacing_mm)
 
 
 def united(solid: Surface) -> Surface:

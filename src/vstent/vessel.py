@@ -191,3 +191,8 @@ class Anatomy:
     def __post_init__(self) -> None:
         freeze(self, "section_radius_mm", np.float64, (len(self.axis.points_mm),))
         freeze(self, "is_restored", np.bool_, (len(self.landing_surface.vertices_mm),))
+
+    @cached_property
+    def is_restored_face(self) -> Bools:
+        """(f,) per landing-surface triangle: every corner of it is restored."""
+        return np.asarray(self.is_restored[self.landing_surface.faces].all(axis=1))

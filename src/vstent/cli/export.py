@@ -12,7 +12,7 @@ def add(commands: options.Commands) -> None:
     kinds = parser.add_subparsers(required=True, metavar="WHAT")
     foam = options.add_command(kinds, "openfoam", "an OpenFOAM case folder: mesh, boundary conditions, scripts")
     _add_input(foam)
-    foam.add_argument("--device", metavar="NAME", help="mesh this device's struts over the neck (none)")
+    foam.add_argument("--device", metavar="NAME", help="mesh this device's struts over necks and branch ostia (none)")
     options.add_problem(foam)
     group = foam.add_argument_group("OpenFOAM")
     options.add_processes(group)

@@ -95,7 +95,7 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = T
     """
     kind = TreeWall if search == TREE else plugins.load("vstent.walls", search, built_in=TREE)
     surface = anatomy.landing_surface
-    is_patient = np.logical_not(anatomy.is_restored[surface.faces].all(axis=1))
+    is_patient = ~anatomy.is_restored_face
     for stent in inside:
         foot_mm = curves.project(anatomy.axis.points_mm, surface.corners_mm.mean(axis=1))[0]
         first_mm, last_mm = stent.proximal_abscissa_mm + OVERLAP_MM, stent.distal_abscissa_mm - OVERLAP_MM

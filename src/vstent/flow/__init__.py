@@ -24,6 +24,7 @@ from vstent.flow.streamlines import Streamlines, streamlines
 from vstent.flow.types import LATTICE, OPENFOAM, Blood, FlowCase, FlowField, FlowSettings, Phase, Screen
 from vstent.kernels.arrays import Floats
 from vstent.stent import Stent
+from vstent.struts import over_restored
 from vstent.vessel import Anatomy
 
 __all__ = [
@@ -110,7 +111,7 @@ def flow_case(anatomy: Anatomy, stent: Stent | None, settings: FlowSettings | No
         sac=None if largest is None else largest.sac,
         ostium=None if largest is None else ostium(largest, anatomy.vessel.lumen),
         screen=None if stent is None else screen(stent, settings.blood),
-        stent=stent,
+        stent=None if stent is None else over_restored(stent, anatomy),
         settings=settings,
     )
 

@@ -90,7 +90,7 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     """
     points_mm, along_mm, diameter_mm = _pieces(stent)
     length_mm = np.linalg.norm(along_mm, axis=1)
-    reach_mm = SMOOTHING_PORES * 2 * stent.contour.area_mm2 / length_mm.sum()
+    reach_mm = SMOOTHING_PORES * stent.spacing_mm
     sheet = _sheet(stent.contour, points_mm, length_mm, reach_mm)
     nodes_mm = sheet.vertices_mm
     tree = cKDTree(nodes_mm)

@@ -174,7 +174,7 @@ class FlowCase:
     screen: Screen | None = None
     """The stent as a resistance, or None."""
     stent: Stent | None = None
-    """The stent's wires, for engines that resolve them, or None."""
+    """The stent's wires over necks and ostia, for engines that resolve them, or None."""
     settings: FlowSettings = field(default_factory=FlowSettings)
     """How to compute it."""
 

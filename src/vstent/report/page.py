@@ -40,7 +40,7 @@ AT_OUTLETS: Final = {
 AT_INLETS: Final = "What each of the inlets brings was set, not measured in a patient."
 OF_DEVICE: Final = {
     LATTICE: "In the flow a device is a thin resistance computed from its wires.",
-    OPENFOAM: "In the flow a device is its struts over the neck, meshed.",
+    OPENFOAM: "In the flow a device is its struts over the neck and over branches, meshed.",
 }
 """Engine -> what it makes of a device."""
 

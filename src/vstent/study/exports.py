@@ -1,5 +1,6 @@
 """A case, or an input not yet studied, handed over to other solvers: an OpenFOAM case folder, or named patches."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -8,22 +9,21 @@ from typing import Any, Final
 import numpy as np
 
 from vstent.device import find_design
-from vstent.errors import FlowError, InputError
+from vstent.errors import FlowError, InputError, ReadError
 from vstent.flow import FlowCase, FlowSettings, flow_case
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.openfoam import Flavour, FoamCase, FoamSetup, foam_case, named_patches, program, stl_text
-from vstent.flow.openfoam.case import STRUT_REACH_MM, struts_near
+from vstent.flow.openfoam.case import strut_solids
 from vstent.flow.openfoam.folder import write
 from vstent.io import writers
 from vstent.io.archive import load_noun
-from vstent.io.vtk_child import read_apart
-from vstent.stent import Deployment
-from vstent.struts import struts
+from vstent.stent import Stent
 from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, hash_of
-from vstent.study.stages import check_inflow, deploy_all, find_anatomy
+from vstent.study.provenance import RUN
+from vstent.study.repeat import UNTOLD, settings_of
+from vstent.study.stages import check_inflow, deploy_one, find_anatomy
 from vstent.study.types import Progress, Settings
-from vstent.surface import Surface
 from vstent.vessel import Anatomy
 
 GEOMETRY: Final = (
@@ -54,11 +54,9 @@ def export_openfoam(
     ledger = Ledger(out / CACHE, progress)
     anatomy = _anatomy(path, settings, ledger)
     check_inflow(anatomy, settings.flow)
-    case = flow_case(anatomy, None, settings.flow or FlowSettings())
+    case = flow_case(anatomy, _stent(path, anatomy, settings, ledger), settings.flow or FlowSettings())
     setup = FoamSetup(default_cell_size_mm(case))
-    setup = replace(
-        setup, **{"flavour": _flavour_here(), **foam}, struts=_struts(path, case, anatomy, settings, ledger)
-    )
+    setup = replace(setup, **{"flavour": _flavour_here(), **foam}, struts=strut_solids(case))
     with ledger.stage("export") as tell:
         written = foam_case(case, setup)
         write(out, written)
@@ -125,19 +123,28 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
     return anatomy
 
 
-def _struts(path: Path, case: FlowCase, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Surface | None:
-    """Solids of the first device that cross the neck: those in the case folder, or of a deployment made for this."""
+def _stent(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Stent | None:
+    """The first device, in the size and at the place that the case folder's own run gave it, or as proposed."""
     if not settings.devices:
         return None
-    if case.ostium is None:
-        raise InputError("struts are meshed over the neck, and this vessel has no sac: leave --device away")
     name = settings.devices[0]
-    file = path / "stents" / name / "struts.stl"
-    solids = read_apart(file) if file.exists() else None
-    if solids is not None:
-        return struts_near(Surface(*solids), case.ostium, STRUT_REACH_MM)
-    deployments: dict[str, Deployment] = deploy_all({name: find_design(name)}, anatomy, settings, ledger)
-    return struts_near(struts(deployments[name].stent), case.ostium, STRUT_REACH_MM)
+    with ledger.stage(f"deploy {name}") as tell:
+        deployment = deploy_one(find_design(name), anatomy, _told(path, settings).placing(name))
+        tell(deployment.advice)
+    return deployment.stent
+
+
+def _told(path: Path, settings: Settings) -> Settings:
+    """What the run of a case folder was told; the settings given where there has been none."""
+    run = path / RUN
+    if not run.exists():
+        return settings
+    try:
+        return settings_of(json.loads(run.read_text(encoding="utf-8"))["settings"])
+    except UNTOLD:
+        raise ReadError(
+            f"{run} is not of this version, so where a device lies is not known: do the run again."
+        ) from None
 
 
 def _flavour_here() -> Flavour:

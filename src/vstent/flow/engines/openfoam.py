@@ -21,13 +21,11 @@ from vstent.flow.engines.lattice_settling import quantities_left
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
-from vstent.flow.openfoam.case import STRUT_REACH_MM, foam_case, wires_near
+from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.types import PHASES, FlowCase, FlowField, Phase, Swing
 from vstent.kernels.arrays import Floats, Ints
-from vstent.struts import struts
-from vstent.surface import Surface
 
 CHECK_ITERATIONS: Final = 50
 """Iterations of a steady flow between checks."""
@@ -77,7 +75,7 @@ class OpenFoam(AbstractEngine[State]):
     """OpenFOAM's laminar solvers on a mesh by snappyHexMesh: simpleFoam, or pimpleFoam along a waveform.
 
     The cell size is that of the mesh in the vessel, before layers and refinement; a run of the same case that
-    stopped in the folder goes on from the last time written. A stent is meshed as the struts over the neck.
+    stopped in the folder goes on from the last time written. A stent is meshed as its struts over necks and ostia.
     """
 
     layers: int = 2
@@ -93,7 +91,7 @@ class OpenFoam(AbstractEngine[State]):
         """Find OpenFOAM, write the case, mesh it, and find the way from its cells to the grid."""
         if self.folder is None:
             raise FlowError("OpenFOAM needs a folder to work in: name one")
-        solids, found = _solids(case), program.find()
+        solids, found = strut_solids(case), program.find()
         setup = FoamSetup(
             self.cell_size_mm, found.flavour, self.layers, processes=case.settings.processes, struts=solids
         )
@@ -160,20 +158,6 @@ class OpenFoam(AbstractEngine[State]):
         """Return the last check, or the mean: of the last checks where the flow has not settled, of a pulse's cycle."""
         is_last = outcome.is_converged and not state.is_pulse
         return _field_of(state, [state.snapshots[-1]] if is_last else list(state.snapshots), outcome)
-
-
-def _solids(case: FlowCase) -> Surface | None:
-    """Pieces of the stent's wires over the neck, as solids."""
-    if case.stent is None and case.screen is None:
-        return None
-    if case.stent is None:
-        raise FlowError(
-            "OpenFOAM's porous zones resist alike in every cell, a screen does not: give the stent, whose struts are "
-            "meshed, or take the embedded engine"
-        )
-    if case.ostium is None:
-        raise FlowError("OpenFOAM meshes struts over the neck, and this vessel has no sac: leave the device away")
-    return struts(wires_near(case.stent, case.ostium, STRUT_REACH_MM))
 
 
 def _next_end(state: State, reached: float) -> float:

@@ -1,22 +1,20 @@
 """A flow case as OpenFOAM's case folder, in memory: relative path to text."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from vstent.errors import LandingError
+from vstent.errors import FlowError, LandingError
 from vstent.flow.openfoam import boundary, control, mesh, scripts
 from vstent.flow.openfoam.patches import Patch, named_patches, stl_text
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.types import FlowCase
 from vstent.kernels.arrays import Floats
-from vstent.stent import Stent
+from vstent.struts import struts
 from vstent.surface import Surface
 from vstent.units import M_PER_MM
 
-STRUT_REACH_MM: Final = 1.0
-"""Wires that come nearer to the neck than this are meshed."""
 README: Final = """\
 OpenFOAM case written by vstent (research use only). Lengths are metres: the vessel's millimetres, LPS, times 0.001.
 
@@ -41,6 +39,31 @@ class FoamCase:
     """Paths of the scripts."""
     application: str
     """The solver's program."""
+
+
+def strut_solids(case: FlowCase) -> Surface | None:
+    """Return the solids of a case's wires, or None where there is no device.
+
+    Raises
+    ------
+    FlowError
+        When there is a screen, and no wires for it.
+    LandingError
+        When no wire lies where blood passes it.
+    """
+    if case.stent is None and case.screen is None:
+        return None
+    if case.stent is None:
+        raise FlowError(
+            "OpenFOAM's porous zones resist alike in every cell, a screen does not: give the stent, whose struts are "
+            "meshed, or take the embedded engine"
+        )
+    if not len(case.stent.wire_points_mm):
+        raise LandingError(
+            "no wire of the device lies over a neck or a branch's ostium, where OpenFOAM meshes its struts: land it "
+            "across one, or leave it away"
+        )
+    return struts(case.stent)
 
 
 def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
@@ -136,62 +159,3 @@ def _inside_mm(case: FlowCase, sections: tuple[Floats, ...]) -> Floats:
     """A point in the inlet's straight extension, off every plane of the grid."""
     inlet = case.vessel.inlet
     return np.asarray(sections[0].mean(axis=0) - inlet.normal * 0.1137 * inlet.diameter_mm)
-
-
-def wires_near(stent: Stent, ostium: Surface, reach_mm: float) -> Stent:
-    """Return a stent of which only the pieces of wire are left that lie nearer to the ostium than `reach_mm`.
-
-    Raises
-    ------
-    LandingError
-        When none does.
-    """
-    wire = np.repeat(np.arange(len(stent.wire_starts) - 1), np.diff(stent.wire_starts))
-    is_near = ostium.closest(stent.wire_points_mm)[1] < reach_mm
-    first = is_near & ~np.r_[False, is_near[:-1] & (wire[1:] == wire[:-1])]
-    piece, kept = np.cumsum(first) - 1, np.flatnonzero(is_near)
-    kept = kept[np.bincount(piece[kept])[piece[kept]] > 1]  # a single point is no piece
-    if not len(kept):
-        raise _none_near(reach_mm)
-    starts = np.r_[np.flatnonzero(np.r_[True, np.diff(piece[kept]) > 0]), len(kept)]
-    return replace(
-        stent,
-        wire_points_mm=stent.wire_points_mm[kept],
-        wire_starts=starts,
-        wire_diameter_um=stent.wire_diameter_um[wire[kept[starts[:-1]]]],
-    )
-
-
-def struts_near(struts: Surface, ostium: Surface, reach_mm: float) -> Surface:
-    """Return the solids that come nearer to the ostium than `reach_mm`, each whole: only they change what enters.
-
-    Parameters
-    ----------
-    struts : closed solids that share no vertex with each other.
-
-    Raises
-    ------
-    LandingError
-        When none comes so near.
-    """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    a, b = struts.faces[:, [0, 1]].T
-    b2, c = struts.faces[:, [1, 2]].T
-    count = len(struts.vertices_mm)
-    rows, columns = np.concatenate([a, b2]), np.concatenate([b, c])
-    graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
-    _, solid = connected_components(graph, directed=False)
-    is_near = ostium.closest(struts.vertices_mm)[1] < reach_mm
-    if not is_near.any():
-        raise _none_near(reach_mm)
-    chosen = np.isin(solid[struts.faces[:, 0]], np.unique(solid[is_near]))
-    return Surface(struts.vertices_mm, struts.faces[chosen])
-
-
-def _none_near(reach_mm: float) -> LandingError:
-    return LandingError(
-        f"no wire of the device lies within {reach_mm:g} mm of the neck, where OpenFOAM meshes its struts: land it "
-        "across the neck, or leave it away"
-    )

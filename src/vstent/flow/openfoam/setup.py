@@ -34,7 +34,7 @@ class FoamSetup:
     iterations: int = 1000
     """Most iterations of a steady flow."""
     struts: Surface | None = None
-    """The device's solids (closed, in mm), meshed where they span the neck; None: the bare vessel."""
+    """The device's solids (closed, in mm), all meshed; None: the bare vessel."""
 
     @property
     def levels_at_struts(self) -> int:
