@@ -1,15 +1,15 @@
-"""The screen beside resolved struts over the demo's neck: write `benchmarks/struts.json`, print it as a table.
+"""The screen beside resolved struts, over the demo's neck and branch: write `struts.json`, print it as a table.
 
 Usage: python benchmarks/struts.py [--cell MM] [--foam-cell MM] [--across CELLS] [-j N] [--cases FOLDER] [DEVICE ...]
 
 The demo's artery, cut to 9 mm on either side of the sac, is computed twice with every device: by the embedded engine
-with the device as a screen, and by OpenFOAM with the struts over the neck meshed, at least so many cells across each,
-without layers along walls (on wires so fine they do not come to an end). Both have only the part of the device within
-1 mm of the neck: what lies on the artery's wall before it slows the blood there, and takes a fifth to a third off the
-sac's velocity besides. The two engines differ in the bare vessel already: what a device leaves of each engine's own
-bare value stands beside. `alignment` is the correlation of the two velocity fields in the sac, 1 where they are alike
-but for their size. A row is kept for every device; the rows of others stay as they are. With --cases, OpenFOAM's cases
-stay in that folder, and one that is there already is gone on with.
+with the device as a screen, and by OpenFOAM with its struts meshed, at least so many cells across each, without layers
+along walls (on wires so fine they do not come to an end). Both have only the part of the device that OpenFOAM meshes
+(see `vstent.struts.over_restored`); what the whole screen does, with what lies on the artery's wall, is kept besides.
+The two engines differ in the bare vessel already: what a device leaves of each engine's own bare value stands beside.
+`alignment` is the correlation of the two velocity fields in the sac, 1 where they are alike but for their size. A row
+is kept for every device; the rows of others stay as they are. With --cases, OpenFOAM's cases stay in that folder, and
+one that is there already is gone on with.
 """
 
 import argparse
@@ -42,24 +42,27 @@ KEPT_MM = 9.0
 INDICES = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
 
 
-def cases(names: list[str]) -> dict[str, FlowCase]:
-    """The bare vessel and every device in it, deployed in the whole one and computed in a short one."""
+def cases(names: list[str]) -> dict[str, tuple[FlowCase, FlowCase]]:
+    """The bare vessel and every device in it, deployed in the whole one and computed in a short one.
+
+    The first case of each has the whole screen, the second only as much as OpenFOAM meshes struts.
+    """
     whole = trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))
     anatomy = restore(trim(whole))
     short = trim(whole, upstream_mm=KEPT_MM, downstream_mm=KEPT_MM)
     inflow_mL_s = flow_case(anatomy, None).inflow_mL_s
     settings = FlowSettings(inflow_mL_s=inflow_mL_s)
     stents = {"bare": None} | {name: vstent.deploy(vstent.find_design(name), anatomy).stent for name in names}
-    return {name: where_meshed(flow_case(anatomy, one, settings), one, anatomy, short) for name, one in stents.items()}
+    whole_cases = {name: replace(flow_case(anatomy, one, settings), vessel=short) for name, one in stents.items()}
+    return {name: (case, where_meshed(case, stents[name], anatomy)) for name, case in whole_cases.items()}
 
 
-def where_meshed(case: FlowCase, stent: Stent | None, anatomy: Anatomy, short: Vessel) -> FlowCase:
-    """The screen only where OpenFOAM meshes struts, in a shorter vessel."""
+def where_meshed(case: FlowCase, stent: Stent | None, anatomy: Anatomy) -> FlowCase:
+    """The screen only where OpenFOAM meshes struts."""
     if case.screen is None or stent is None:
-        return replace(case, vessel=short)
+        return case
     chosen = is_over_restored(stent, anatomy, case.screen.points_mm)
-    part = Screen(**{one.name: getattr(case.screen, one.name)[chosen] for one in fields(Screen)})
-    return replace(case, vessel=short, screen=part)
+    return replace(case, screen=Screen(**{one.name: getattr(case.screen, one.name)[chosen] for one in fields(Screen)}))
 
 
 def computed(
@@ -99,7 +102,7 @@ if __name__ == "__main__":
     rows = json.loads(TABLE.read_text()) if TABLE.exists() else {}
     foam = {"engine": OPENFOAM, "cell_size_mm": given.foam_cell, "processes": given.processes}
     bare: tuple[FlowField, dict[str, float]] | None = None
-    for name, case in cases(given.devices).items():
+    for name, (whole_case, case) in cases(given.devices).items():
         # The embedded engine takes its start for the bare flow; OpenFOAM begins from any in this vessel.
         embedded, screened = computed(case, bare[0] if bare else None, cell_size_mm=given.cell)
         folder = None if given.cases is None else given.cases / name
@@ -111,6 +114,7 @@ if __name__ == "__main__":
         rows[name] = {
             "screen": screened,
             "struts": resolved,
+            "whole_screen": computed(whole_case, bare[0], cell_size_mm=given.cell)[1],
             "bare_embedded": bare[1],
             "bare_openfoam": bare_resolved,
             "left_with_screen": {key: round(one[0], 4) for key, one in left.items()},
@@ -121,10 +125,15 @@ if __name__ == "__main__":
             "openfoam_cells_across": given.across,
         }
         TABLE.write_text(json.dumps(rows, indent=2) + "\n")
-    print("\n| device | index | screen | struts | difference | left, screen | left, struts |\n" + 7 * "|---" + "|")
+    print(
+        "\n| device | index | screen | struts | difference | left, screen | left, struts | whole screen to its part |"
+    )
+    print(8 * "|---" + "|")
     for name, row in rows.items():
         for key in INDICES:
             screen, struts = row["screen"][key], row["struts"][key]
             left = f"{row['left_with_screen'][key]:.3f} | {row['left_with_struts'][key]:.3f}"
-            print(f"| {name} | {key} | {screen:.4g} | {struts:.4g} | {100 * (screen / struts - 1):+.1f} % | {left} |")
-        print(f"| {name} | alignment | {row['alignment']:.3f} | | | | |")
+            apart = f"{100 * (screen / struts - 1):+.1f} %"
+            whole = f"{100 * (row['whole_screen'][key] / screen - 1):+.1f} %"
+            print(f"| {name} | {key} | {screen:.4g} | {struts:.4g} | {apart} | {left} | {whole} |")
+        print(f"| {name} | alignment | {row['alignment']:.3f} | | | | | |")

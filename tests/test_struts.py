@@ -183,10 +183,10 @@ def test_wires_over_a_neck_are_left_each_between_its_own_points():
     artery = with_neck(straight(), 14, 18)
     design = stent(straight(), SILK)
     starts = np.array([0, 40, 41, 120, 300])  # a single point is a wire too
-    points_mm = np.array([1.9, 0.0, 16.0]) + 0.25 * np.cumsum(np.random.default_rng(5).normal(size=(300, 3)), axis=0)
+    points_mm = np.array([1.9, 0.0, 16.0]) + 0.5 * np.cumsum(np.random.default_rng(5).normal(size=(300, 3)), axis=0)
     walks = replace(design, wire_points_mm=points_mm, wire_starts=starts, wire_diameter_um=[30.0, 50.0, 30.0, 50.0])
     left = over_restored(walks, artery)
-    is_over = over_by_samples(points_mm, artery, 0.5 * walks.spacing_mm)
+    is_over = over_by_samples(points_mm, artery, walks.spacing_mm)
     here, *all_pieces = pieces(walks)
     is_left = is_over[here] & is_over[here + 1]
     for found, row in zip(pieces(left)[1:], all_pieces, strict=True):
@@ -203,7 +203,7 @@ def test_what_stands_off_the_wall_is_over_the_neck_as_what_lies_on_it(radius_mm)
     off_mm = artery.landing_surface.closest(points_mm)[1]
     assert (off_mm.min() > 1.0) == (radius_mm > 2)
     left = over_restored(device_in_place, artery).wire_points_mm
-    is_over = over_by_samples(points_mm, artery, 0.5 * device_in_place.spacing_mm)
+    is_over = over_by_samples(points_mm, artery, device_in_place.spacing_mm)
     assert 0.1 < len(left) / len(points_mm) < 0.6
     assert len(left) == pytest.approx(is_over.sum(), abs=4)
     assert len(over_restored(device_in_place, tube(line(32), radius_mm)).wire_points_mm) == 0

@@ -38,10 +38,11 @@ def struts(stent: Stent) -> Surface:
 
 
 def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
-    """Return the pieces of a stent's wires through which blood passes: over necks and ostia; none where none is.
+    """Return the pieces of a stent's wires through which blood passes: over necks and ostia, and one spacing around.
 
-    Wires on the patient's own wall have no flow across them. Half a spacing more is kept on every side, so that no
-    gap is left along the rim.
+    Those on the patient's own wall have no flow across them. Around a rim blood passes as well, along the wall where
+    wires stand off it and aslant through pores: with half a spacing, Enterprise's screen let 11 % more into the demo's
+    neck than the whole device, with one 1 %.
     """
     is_over = is_over_restored(stent, anatomy, stent.wire_points_mm)
     wire = np.repeat(np.arange(len(stent.wire_starts) - 1), np.diff(stent.wire_starts))
@@ -60,13 +61,13 @@ def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
 def is_over_restored(stent: Stent, anatomy: Anatomy, points_mm: Floats) -> Bools:
     """Tell of points (n, 3) on a stent whether the landing surface under them closes a neck or an ostium.
 
-    So it does also within half the spacing of the stent's wires around.
+    So it does also within the spacing of the stent's wires around.
     """
     surface = anatomy.landing_surface
     closing = Surface(surface.vertices_mm, surface.faces[anatomy.is_restored_face])
     if not len(closing.faces):
         return np.zeros(len(points_mm), dtype=bool)
-    return np.asarray(closing.closest(surface.closest(points_mm)[0])[1] < 0.5 * stent.spacing_mm)
+    return np.asarray(closing.closest(surface.closest(points_mm)[0])[1] < stent.spacing_mm)
 
 
 def united(solid: Surface) -> Surface:
