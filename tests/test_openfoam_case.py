@@ -1,5 +1,6 @@
 """The case handed to OpenFOAM: syntax, units, watertight patches, the flow that was asked for."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -16,6 +17,7 @@ from vstent.flow import Blood, FlowCase, FlowSettings, flow_case
 from vstent.flow.openfoam import FoamSetup, foam_case, named_patches
 from vstent.flow.openfoam.case import strut_solids
 from vstent.flow.openfoam.control import fluid
+from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.dictionary import foam_file, parse
 from vstent.flow.types import CarreauYasuda
 from vstent.flow.waveform import OLDER_ADULT_ICA
@@ -252,3 +254,28 @@ def test_two_cells_lie_across_a_strut_and_no_more_than_twice_as_many(name: str, 
     assert across_mm[0] / 5 < cell_mm < across_mm[1] / 2
     assert replace(setup, strut_levels=1).levels_at_struts == 1
     assert FoamSetup(0.25).levels_at_struts == 0
+
+
+def test_what_struts_cost_is_told_and_what_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    branched = replace(with_neck(tube(line(32), 1.9), 14, 18), aneurysms=())
+    cases = [flow_case(branched, deploy(find_design(name), branched).stent) for name in ("silk", "enterprise")]
+    for stented, times in zip(cases, (4.0, 2.0), strict=True):
+        bare, told = tell_cost(replace(stented, screen=None, stent=None), 0.2), tell_cost(stented, 0.2)
+        assert "struts" not in bare
+        assert told.startswith(bare.split(",")[0])
+        assert _thousands(told) > times * _thousands(bare)
+    silk = cases[0]
+    monkeypatch.setattr("vstent.flow.openfoam.cost.free_memory_bytes", lambda: 1.2e9)
+    with pytest.raises(FlowError, match=r"million cells of 0.2 mm and less needs .* set a cell size of") as refusal:
+        tell_cost(silk, 0.2)
+    fitting_mm = float(str(refusal.value).split("cell size of ")[1].split(" mm")[0])
+    assert 0.2 < fitting_mm < 0.4
+    tell_cost(silk, fitting_mm)
+    monkeypatch.setattr("vstent.flow.openfoam.cost.free_memory_bytes", lambda: 4e8)
+    with pytest.raises(FlowError, match="take the engine lattice_boltzmann"):
+        tell_cost(silk, 0.2)
+
+
+def _thousands(told: str) -> float:
+    """All cells of which a sentence on cost tells, in thousands."""
+    return sum(float(number.replace(",", "")) for number in re.findall(r"([\d,]+) thousand", told))

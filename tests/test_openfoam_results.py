@@ -1,5 +1,6 @@
 """What comes back from OpenFOAM: fields read, brought to the grid, failures put into words, a tube's exact flow."""
 
+import re
 import shutil
 from collections import deque
 from dataclasses import replace
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 
 from vstent import phantoms
+from vstent.deploy import deploy
+from vstent.device import find_design
 from vstent.errors import FlowError, ReadError
-from vstent.flow import FlowCase, FlowSettings, Screen, domain, sampling, simulate_case
+from vstent.flow import FlowCase, FlowSettings, Screen, domain, flow_case, sampling, simulate_case
 from vstent.flow.engines import Outcome, Progress, run
 from vstent.flow.engines.openfoam import OpenFoam, State, swing_of
 from vstent.flow.openfoam import folder as folders
@@ -20,6 +23,7 @@ from vstent.flow.openfoam import program, results, scatter
 from vstent.flow.openfoam.bridge import Snapshot, bridge
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.types import PHASES, Waveform
+from vstent.restore import restore
 from vstent.surface import Surface
 from vstent.trace import trace
 from vstent.vessel import Vessel
@@ -192,6 +196,32 @@ def test_openfoams_flow_in_a_tube_is_poiseuilles(tmp_path: Path) -> None:
     assert np.abs(stress / expected - 1).max() < 0.05
     # The same case goes on from the last time written: nothing is left to do.
     assert run(engine, case).steps <= field.steps / 2
+
+
+@pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")
+def test_struts_over_an_ostium_are_meshed_in_as_many_cells_as_told_and_hold_blood_up(tmp_path: Path) -> None:
+    """No sac is needed; the wires are five times as thick as a strut, so that few cells do, and run into each other."""
+    trunk = phantoms.tube(length_mm=18.0, radius_mm=1.6)
+    side = {"abscissa_mm": 9.0, "direction": np.array([1.0, 0, 1]), "radius_mm": 0.9, "length_mm": 5.0}
+    anatomy = restore(trace(Vessel(phantoms.phantom_surface(phantoms.with_branch(trunk, **side), edge_mm=0.3))))
+    stent = deploy(find_design("enterprise"), anatomy).stent
+    thick = replace(
+        stent,
+        design=replace(stent.design, strut_thickness_um=400.0),
+        wire_diameter_um=np.full_like(stent.wire_diameter_um, 400.0),
+    )
+    branch_mL_s = []
+    for name, device in (("bare", None), ("thick", thick)):
+        case = flow_case(anatomy, device, FlowSettings(inflow_mL_s=FLOW_ML_S, tolerance=0.02))
+        engine = OpenFoam(0.35, tmp_path / name, layers=0)
+        field = run(engine, case)
+        assert field.outlets_mL_s.sum() == pytest.approx(FLOW_ML_S, rel=1e-3)
+        branch_mL_s.append(field.outlets_mL_s[1])
+        told = [float(number.replace(",", "")) for number in re.findall(r"([\d,]+) thousand", engine.cost(case))]
+        meshed = float(re.findall(r"on (\d+) cells", field.advice)[0]) / 1e3
+        assert len(told) == 1 + (name == "thick")
+        assert meshed == pytest.approx(sum(told), rel=0.4)
+    assert branch_mL_s[1] < 0.9 * branch_mL_s[0]
 
 
 @pytest.mark.validation

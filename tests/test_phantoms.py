@@ -168,4 +168,7 @@ def test_branch_is_part_of_the_lumen_up_to_its_outlet():
     )
     value, _ = phantom.implicit_mm(np.array([[8.0, 0, 10.0], [8.0, 0.7, 10.0], [8.0, 0, 11.0]]))
     np.testing.assert_allclose(value, [-0.7, 0, 0.3], atol=1e-9)
-    assert capped_volume(phantom_surface(phantom)) == pytest.approx(np.pi * 4 * 20 + np.pi * 0.49 * (9 - 2), rel=0.01)
+    # The parent's wall stands sqrt(4 - y^2) off its axis, in the mean over the branch's section 2 - 0.49 / 16.
+    surface = phantom_surface(phantom)
+    assert capped_volume(surface) == pytest.approx(np.pi * 4 * 20 + np.pi * 0.49 * (9 - 2 + 0.49 / 16), rel=4e-3)
+    assert surface.vertices_mm[:, 0].min() > -2.001  # it does not come out behind the parent

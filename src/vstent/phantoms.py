@@ -90,10 +90,10 @@ class Phantom:
     def implicit_mm(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Signed distance (n,) to the wall of the union, negative in the lumen, and its unit gradient (n, 3).
 
-        Tubes are continued past their ends.
+        Tubes are continued past their ends, but for a branch's first, which lies in the parent artery.
         """
         value, gradient = tube_implicit_mm(self.parent, points_mm)
-        parts = [tube_implicit_mm(branch, points_mm) for branch in self.branches]
+        parts = [tube_implicit_mm(branch, points_mm, begins_inside=True) for branch in self.branches]
         for part_value, part_gradient in [*parts, *(sac.implicit_mm(points_mm) for sac in self.sacs)]:
             nearer = part_value < value
             value, gradient = np.where(nearer, part_value, value), np.where(nearer[:, None], part_gradient, gradient)
@@ -150,14 +150,14 @@ class Phantom:
         return volume, float(layer.sum() * step**3)
 
 
-def tube_implicit_mm(tube: Centerline, points_mm: Floats) -> tuple[Floats, Floats]:
+def tube_implicit_mm(tube: Centerline, points_mm: Floats, *, begins_inside: bool = False) -> tuple[Floats, Floats]:
     """Distance (n,) of points (n, 3) to a tube's axis less the radius at the foot, and the direction (n, 3) from it.
 
-    The ends are continued straight.
+    The ends are continued straight, the first not where it `begins_inside` of another tube.
     """
     points, radius = tube.points_mm, tube.inscribed_radius_mm
     reach = np.linspace(4.0, 0.0, 40, endpoint=False)[:, None] * radius.max()
-    head = points[0] - reach * curves.tangents(points[:3])[0]
+    head = points[:0] if begins_inside else points[0] - reach * curves.tangents(points[:3])[0]
     tail = points[-1] + reach[::-1] * curves.tangents(points[-3:])[-1]
     extended = np.concatenate([head, points, tail])
     abscissa, distance = curves.project(extended, points_mm)

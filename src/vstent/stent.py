@@ -64,11 +64,16 @@ class Stent:
         return Surface(self.nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
 
     @property
-    def spacing_mm(self) -> float:
-        """Distance between neighbouring wires of one family, of two that share all wires: 2 area / length of wire."""
+    def wire_length_mm(self) -> float:
+        """Length of all wires together."""
         within = np.ones(len(self.wire_points_mm) - 1, dtype=bool)
         within[self.wire_starts[1:-1] - 1] = False
-        return float(2 * self.contour.area_mm2 / curves.lengths(np.diff(self.wire_points_mm, axis=0)[within]).sum())
+        return float(curves.lengths(np.diff(self.wire_points_mm, axis=0)[within]).sum())
+
+    @property
+    def spacing_mm(self) -> float:
+        """Distance between neighbouring wires of one family, of two that share all wires: 2 area / length of wire."""
+        return 2 * self.contour.area_mm2 / self.wire_length_mm
 
     @cached_property
     def row_diameter_mm(self) -> Floats:

@@ -33,7 +33,8 @@ from vstent.openings import opening_at
 from vstent.repair import repair
 from vstent.restore import restore
 from vstent.segment import segment
-from vstent.stent import Deployment, Landing
+from vstent.stent import Deployment, Landing, Stent
+from vstent.struts import over_restored
 from vstent.study.checkpoint import FlowCheckpoint
 from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of, vessel_key
 from vstent.study.outputs import write_field
@@ -178,7 +179,7 @@ def compute_flows(
         field = ledger.recall(stage, key, FlowField)
         if field is None:
             if name == BARE:
-                _plan(anatomy, settings.flow, ledger)
+                _plan(anatomy, {name: one.stent for name, one in deployments.items()}, settings.flow, ledger)
             with ledger.stage(stage) as tell:
                 field = simulate_case(
                     flow_case(anatomy, stent, settings.flow),
@@ -203,7 +204,7 @@ def flow_key(source: str, settings: Settings, name: str, design: Design | None) 
 def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Sensitivity:
     """Compute the flow without a device on three grids, with three time steps and in three positions on the grid."""
     flow = settings.flow or FlowSettings()
-    _plan(anatomy, flow, ledger)
+    _plan(anatomy, {}, flow, ledger)
     with ledger.stage("convergence") as tell:
         done: list[str] = []
 
@@ -217,10 +218,13 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
     return found
 
 
-def _plan(anatomy: Anatomy, settings: FlowSettings, ledger: Ledger) -> None:
-    """Say what a flow will cost; refuse one that does not fit in the memory."""
+def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings, ledger: Ledger) -> None:
+    """Say what the flow will cost, and where a device's costs more; refuse one that does not fit in the memory."""
     with ledger.stage("plan flow") as tell:
-        tell(foretell_cost(flow_case(anatomy, None, settings)))
+        bare = flow_case(anatomy, None, settings)
+        said = foretell_cost(bare)
+        costs = {name: foretell_cost(replace(bare, stent=over_restored(one, anatomy))) for name, one in stents.items()}
+        tell(" ".join([said, *(f"With {name} {cost}" for name, cost in costs.items() if cost != said)]))
 
 
 def vary_all(

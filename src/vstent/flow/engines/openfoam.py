@@ -84,7 +84,7 @@ class OpenFoam(AbstractEngine[State]):
     """Edge of a cell of the result's grid; None: as OpenFOAM's."""
 
     def cost(self, case: FlowCase) -> str:
-        """Say how many cells, how much memory and time, before struts."""
+        """Say how many cells, how much memory and time; with a stent's struts where there is one."""
         return tell_cost(case, self.cell_size_mm)
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:

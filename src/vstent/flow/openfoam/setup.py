@@ -38,8 +38,12 @@ class FoamSetup:
 
     @property
     def levels_at_struts(self) -> int:
-        """Times that cells at the struts are halved: a long solid is four times its volume over its area thick."""
+        """Times that cells at the struts are halved."""
         if self.strut_levels is not None or self.struts is None:
             return self.strut_levels or 0
-        thickness_mm = 4 * abs(self.struts.volume_mm3) / self.struts.area_mm2
-        return max(0, math.ceil(math.log2(ACROSS * self.cell_size_mm / thickness_mm)))
+        return max(0, math.ceil(math.log2(ACROSS * self.cell_size_mm / self.strut_thickness_mm)))
+
+    @property
+    def strut_thickness_mm(self) -> float:
+        """Mean thickness of the struts, 0 without any: a long solid's is four times its volume over its area."""
+        return 0.0 if self.struts is None else 4 * abs(self.struts.volume_mm3) / self.struts.area_mm2
