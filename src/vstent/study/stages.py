@@ -224,7 +224,7 @@ def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings,
         bare = flow_case(anatomy, None, settings)
         said = foretell_cost(bare)
         costs = {name: foretell_cost(replace(bare, stent=over_restored(one, anatomy))) for name, one in stents.items()}
-        tell(" ".join([said, *(f"With {name} {cost}" for name, cost in costs.items() if cost != said)]))
+        tell(" ".join([said, *(f"Behind {name}, {cost}" for name, cost in costs.items() if cost != said)]))
 
 
 def vary_all(
