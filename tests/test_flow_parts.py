@@ -1,6 +1,8 @@
 """The parts of the flow floor whose answer is known without a run: screen, profile, wall stress, convergence."""
 
 import json
+from dataclasses import replace
+from math import gamma
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 
 from tubes import arc, line, tube
 from vstent import device
+from vstent.deploy import deploy
 from vstent.errors import FlowError
 from vstent.flow import Blood, FlowCase, FlowSettings, domain, screen
 from vstent.flow.engines import AbstractEngine, run
@@ -23,6 +26,7 @@ from vstent.flow.screen import (
     drag_per_length,
     inertial_loss,
     on_grid,
+    round_diameter,
     tangential_share,
 )
 from vstent.flow.types import CarreauYasuda
@@ -60,6 +64,26 @@ def test_drag_of_a_row_of_cylinders_is_tamada_and_fujikawas():
     )  # 10.744; the table of references rounds to 10.70
     far = drag_per_length(1.0, np.array([1e3, 1e4]))
     assert 8 * np.pi / far[1] - 8 * np.pi / far[0] == pytest.approx(2 * np.log(10), rel=1e-5)
+
+
+def test_a_square_strut_and_a_flat_one_have_the_round_diameters_known_of_them() -> None:
+    """Outer conformal radius: Gamma(1/4)^2 / (4 pi^(3/2)) of a square's side; a quarter of a flat strip's width."""
+    square = 2 * gamma(0.25) ** 2 / (4 * np.pi**1.5)
+    assert round_diameter(3.0, 3.0) == pytest.approx(3 * square)
+    assert round_diameter(1.0, 1e-6) == pytest.approx(0.5, rel=1e-4)
+    assert round_diameter(2.0, 1.0) == pytest.approx(round_diameter(1.0, 2.0))
+    assert 1.5 < round_diameter(2.0, 1.0) < 2 * square
+
+
+def test_the_screen_of_a_laser_cut_device_resists_as_its_round_wires_would() -> None:
+    stent = deploy(device.find_design("enterprise"), tube(line(26), 1.9)).stent
+    wide = round_diameter(78.0, 78.0)
+    thin = replace(stent.design, strut_thickness_um=1e-3)
+    flat = replace(stent, design=thin, wire_diameter_um=np.full_like(stent.wire_diameter_um, 2 * wide))
+    for name in ("normal_resistance_Pa_s_m", "tangential_resistance_Pa_s_m", "inertial_loss"):
+        np.testing.assert_allclose(
+            getattr(screen(stent, Blood()), name), getattr(screen(flat, Blood()), name), rtol=1e-3
+        )
 
 
 def test_the_inertial_loss_vanishes_without_wires():

@@ -3,9 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
+from scipy.special import ellipe, ellipk
 
+from vstent.device import LaserCut
 from vstent.flow import sampling
 from vstent.flow.types import Blood, Screen
 from vstent.kernels import lattice_sampling
@@ -45,6 +48,22 @@ def drag_per_length(diameter: Floats, spacing: Floats) -> Floats:
     """
     t = np.pi * np.minimum(diameter / spacing, 0.5) / 2
     return 8 * np.pi / (1 - 2 * np.log(2 * t) + 2 * t**2 / 3 - t**4 / 9)
+
+
+def round_diameter(width: float, thickness: float) -> float:
+    """Diameter of the round wire that drags as much as a strut of rectangular section; same unit for all lengths.
+
+    It is twice the radius r of the circle that the plane outside the section is mapped on, all that slow blood knows of
+    it from afar: width = 4 r (E(m) - (1 - m) K(m)), thickness = the same of 1 - m, K and E being the complete elliptic
+    integrals. A square strut drags as a wire 1.18 times as wide: resolved rows of either hold blood up alike within 1 %
+    (`tests/test_crossing_cell.py`).
+    """
+
+    def side(m: float) -> float:
+        return 2 * float(ellipe(m) - (1 - m) * ellipk(m))
+
+    m = brentq(lambda m: side(m) * thickness - side(1 - m) * width, 1e-12, 1 - 1e-12)
+    return width / side(m)
 
 
 def crossing_factor(diameter: Floats, spacing: Floats) -> Floats:
@@ -129,7 +148,10 @@ def _lengthwise(stent: Stent, nodes: cKDTree, points_mm: Floats, along_mm: Float
 
 
 def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
-    """Wires cut into pieces of at most `PIECE_MM`: midpoints (p, 3), ways along them (p, 3) and diameters (p,), mm."""
+    """Wires cut into pieces of at most `PIECE_MM`: midpoints (p, 3), ways along them (p, 3) and diameters (p,), mm.
+
+    A rectangular strut has the diameter of the round wire that drags as much.
+    """
     starts = stent.wire_starts
     wire = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     inner = np.flatnonzero(wire[1:] == wire[:-1])
@@ -139,8 +161,16 @@ def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
     owner = np.repeat(np.arange(len(a)), count)
     rank = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
     part = ((rank + 0.5) / count[owner])[:, None]
-    diameter = stent.wire_diameter_um[wire[inner]] * MM_PER_UM
+    diameter = _drag_diameters_um(stent)[wire[inner]] * MM_PER_UM
     return a[owner] + part * (b - a)[owner], ((b - a) / count[:, None])[owner], diameter[owner]
+
+
+def _drag_diameters_um(stent: Stent) -> Floats:
+    """Diameter (w,) of the round wires that drag as a stent's wires or struts do."""
+    if not isinstance(stent.design, LaserCut):
+        return stent.wire_diameter_um
+    widths_um, which = np.unique(stent.wire_diameter_um, return_inverse=True)
+    return np.array([round_diameter(width, stent.design.strut_thickness_um) for width in widths_um])[which]
 
 
 def _kernel(nodes: cKDTree, points_mm: Floats, reach_mm: float) -> csr_matrix:
