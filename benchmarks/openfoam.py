@@ -2,9 +2,9 @@
 
 Usage: python benchmarks/openfoam.py [--cell MM] [--struts-cell MM] [--cases FOLDER]
 
-Meshing is part of it. The wires are meshed over the neck, two cells across each at least. Flows are steady, from rest,
-with OpenFOAM's default layers; the second process takes part in the solver alone, for one meshes. Memory is the largest
-process's. With --cases the case folders stay in that folder.
+Meshing is part of it. The wires over neck and branch are meshed, two cells across each at least. Flows are steady, from
+rest, with OpenFOAM's default layers; the second process takes part in the solver alone, for one meshes. Memory is the
+largest process's. With --cases the case folders stay in that folder.
 """
 
 import argparse
