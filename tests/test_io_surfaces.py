@@ -91,6 +91,19 @@ def test_quads_are_cut_along_the_shorter_diagonal_and_larger_polygons_into_fans(
     np.testing.assert_allclose(surface.normals, np.broadcast_to([0, 0, 1], (7, 3)), atol=1e-12)
 
 
+def test_an_stl_text_that_breaks_off_is_told_at_whatever_length(tmp_path):
+    """Where 84 bytes and a whole number of fifties are left, VTK takes the letters for numbers."""
+    facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 3 0 0\nvertex 0 3 {}\nendloop\nendfacet\n"
+    whole = "solid a\n" + "".join(facet.format(k) for k in range(60)) + "endsolid a\n"
+    path = tmp_path / "a.stl"
+    path.write_text(whole)
+    assert len(read_apart(path)[1]) == 60
+    for lost in range(len("endsolid a\n"), len("endsolid a\n") + 50):
+        path.write_text(whole[:-lost])
+        with pytest.raises(ReadError, match="holds no triangles, or not all"):
+            read_surface(path, units="mm")
+
+
 @pytest.mark.parametrize("unit", ["m", "cm", "mm"])
 def test_unit_is_guessed_and_said(tmp_path, unit):
     scale = {"m": 1e-3, "cm": 0.1, "mm": 1.0}[unit]

@@ -33,7 +33,7 @@ SETUP = FoamSetup(0.25, processes=4)
 @cache
 def case(outlets: str = "zero_pressure", *, is_pulse: bool = False) -> FlowCase:
     straight = phantoms.tube(length_mm=14.0, radius_mm=RADIUS_MM)
-    phantom = phantoms.with_branch(straight, abscissa_mm=6.0, direction=[1, 0, 1], radius_mm=BRANCH_MM, length_mm=7.0)
+    phantom = phantoms.with_branch(straight, abscissa_mm=6.0, direction=[1, 0, 1], radius_mm=BRANCH_MM, length_mm=11.0)
     vessel = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.4)))
     waveform = OLDER_ADULT_ICA if is_pulse else None
     return FlowCase(vessel, settings=FlowSettings(inflow_mL_s=FLOW_ML_S, outlets=outlets, waveform=waveform))

@@ -90,14 +90,18 @@ class Phantom:
     def implicit_mm(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Signed distance (n,) to the wall of the union, negative in the lumen, and its unit gradient (n, 3).
 
-        Tubes are continued past their ends, but for a branch's first, which lies in the parent artery.
+        Tubes are continued past their ends, but not past one that lies in the parent artery.
         """
         value, gradient = tube_implicit_mm(self.parent, points_mm)
-        parts = [tube_implicit_mm(branch, points_mm, begins_inside=True) for branch in self.branches]
+        parts = [tube_implicit_mm(branch, points_mm, begins_inside=self._feeds(branch)) for branch in self.branches]
         for part_value, part_gradient in [*parts, *(sac.implicit_mm(points_mm) for sac in self.sacs)]:
             nearer = part_value < value
             value, gradient = np.where(nearer, part_value, value), np.where(nearer[:, None], part_gradient, gradient)
         return value, gradient
+
+    def _feeds(self, branch: Centerline) -> bool:
+        """Whether a branch begins in the parent artery."""
+        return bool(tube_implicit_mm(self.parent, branch.points_mm[:1])[0][0] < 0)
 
     @cached_property
     def ends(self) -> tuple[tuple[Floats, Floats, float], ...]:

@@ -1,5 +1,6 @@
 """Surface files -> Surface in mm."""
 
+import os
 from pathlib import Path
 from typing import Final, Literal, get_args
 
@@ -67,7 +68,7 @@ def _read(path: Path) -> Surface:
     if path.is_dir() or path.stat().st_size == 0:
         raise ReadError(f"{path.name} is {'a folder' if path.is_dir() else 'empty'}, not a surface file.")
     _refuse_mislabelled(path, kind)
-    mesh = read_apart(path)
+    mesh = None if kind == ".stl" and _is_torn_text(path) else read_apart(path)
     if mesh is None or len(mesh[1]) == 0:
         raise ReadError(
             f"{path.name} holds no triangles, or not all that it announces: it is empty, damaged or not a {kind} file; "
@@ -76,6 +77,8 @@ def _read(path: Path) -> Surface:
     return Surface(*mesh)
 
 
+TAIL_BYTES: Final = 4096
+"""So near its end an STL file in text has its last line."""
 _BEGINS: Final = {".vtp": (b"<",), ".vtk": (b"# vtk",), ".ply": (b"ply",)}
 
 
@@ -103,6 +106,15 @@ def _is_ascii_stl(head: bytes) -> bool:
 
 def _is_binary_stl(path: Path, head: bytes) -> bool:
     return len(head) >= 84 and path.stat().st_size >= 84 + 50 * _n_stl(head)
+
+
+def _is_torn_text(path: Path) -> bool:
+    """Whether an STL file in text lacks its end: VTK reads one torn file in fifty as if it were binary."""
+    with path.open("rb") as file:
+        head = file.read(512)
+        file.seek(-min(TAIL_BYTES, path.stat().st_size), os.SEEK_END)
+        tail = file.read().lower()
+    return _is_ascii_stl(head) and not _is_binary_stl(path, head) and b"endsolid" not in tail
 
 
 def _n_stl(head: bytes) -> int:
