@@ -21,7 +21,8 @@ export class Neck {
     this.curve = curve;
     this.count = count;
     this.handles = curve.length ? Array.from({ length: count }, (_, i) => this.handle(i)) : [];
-    if (curve.length) this.moves.ask(() => this.ask({}));
+    // This curve, not `this.curve`: an answer still under way is about to put another one there.
+    if (curve.length) this.moves.ask(() => this.ask({ curve_mm: curve }));
   }
 
   ask(more) {
