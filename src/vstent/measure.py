@@ -118,9 +118,7 @@ def coverage_fractions(stent: Stent) -> Floats:
     """Part (rows - 1, columns) of every quad of the contour under metal, seen square to the contour."""
     from vstent.kernels.coverage import covered_fractions  # compiles on first use
 
-    is_last = np.zeros(len(stent.wire_points_mm), dtype=bool)
-    is_last[stent.wire_starts[1:] - 1] = True
-    here = np.flatnonzero(~is_last)
+    here = stent.piece_starts
     radius_mm = 0.5 * np.repeat(stent.wire_diameter_um, np.diff(stent.wire_starts))[here] * MM_PER_UM
     points_mm = stent.wire_points_mm
     return covered_fractions(stent.nodes_mm, points_mm[here], points_mm[here + 1], radius_mm, SAMPLES_PER_QUAD)

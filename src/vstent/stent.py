@@ -64,11 +64,16 @@ class Stent:
         return Surface(self.nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
 
     @property
+    def piece_starts(self) -> Ints:
+        """(m,) points at which pieces of wire begin, each to the next point: all but the last of every wire."""
+        is_last = np.zeros(len(self.wire_points_mm), dtype=bool)
+        is_last[self.wire_starts[1:] - 1] = True
+        return np.flatnonzero(~is_last)
+
+    @property
     def wire_length_mm(self) -> float:
         """Length of all wires together."""
-        within = np.ones(len(self.wire_points_mm) - 1, dtype=bool)
-        within[self.wire_starts[1:-1] - 1] = False
-        return float(curves.lengths(np.diff(self.wire_points_mm, axis=0)[within]).sum())
+        return float(curves.lengths(np.diff(self.wire_points_mm, axis=0)[self.piece_starts]).sum())
 
     @property
     def spacing_mm(self) -> float:

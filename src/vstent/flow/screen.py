@@ -154,7 +154,7 @@ def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
     """
     starts = stent.wire_starts
     wire = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    inner = np.flatnonzero(wire[1:] == wire[:-1])
+    inner = stent.piece_starts
     a, b = stent.wire_points_mm[inner], stent.wire_points_mm[inner + 1]
     length = np.linalg.norm(b - a, axis=1)
     count = np.maximum(np.ceil(length / PIECE_MM).astype(int), 1)
