@@ -1,11 +1,13 @@
-"""The screen beside resolved struts, over the demo's neck and branch: write `struts.json`, print it as a table.
+"""The screen beside resolved struts, over necks and branches: write `struts.json`, print it as a table.
 
-Usage: python benchmarks/struts.py [--cell MM] [--foam-cell MM] [--across CELLS] [-j N] [--cases FOLDER] [DEVICE ...]
+Usage: python benchmarks/struts.py [--vessel demo|arc] [--cell MM] [--foam-cell MM] [--across CELLS] [-j N]
+                                   [--cases FOLDER] [DEVICE ...]
 
-The demo's artery, cut to 9 mm on either side of the sac, is computed twice with every device: by the embedded engine
-with the device as a screen, and by OpenFOAM with its struts meshed, at least so many cells across each, without layers
-along walls (on wires so fine they do not come to an end). Both have only the part of the device that OpenFOAM meshes
-(see `vstent.struts.over_restored`); what the whole screen does, with what lies on the artery's wall, is kept besides.
+The demo's artery, or an arc of one with a sac at its side, cut to 9 mm on either side of the sac, is computed twice
+with every device: by the embedded engine with the device as a screen, and by OpenFOAM with its struts meshed, at least
+so many cells across each, without layers along walls (on wires so fine they do not come to an end). Both have only the
+part of the device that OpenFOAM meshes (see `vstent.struts.over_restored`); what the whole screen does, with what lies
+on the artery's wall, is kept besides.
 The two engines differ in the bare vessel already: what a device leaves of each engine's own bare value stands beside.
 `alignment` is the correlation of the two velocity fields in the sac, 1 where they are alike but for their size. A row
 is kept for every device; the rows of others stay as they are. With --cases, OpenFOAM's cases stay in that folder, and
@@ -29,6 +31,7 @@ from vstent.flow.engines import run
 from vstent.flow.engines.openfoam import OpenFoam
 from vstent.flow.openfoam import setup
 from vstent.flow.types import OPENFOAM
+from vstent.phantoms import Phantom
 from vstent.restore import restore
 from vstent.stent import Stent
 from vstent.struts import is_over_restored
@@ -42,12 +45,23 @@ KEPT_MM = 9.0
 INDICES = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
 
 
-def cases(names: list[str]) -> dict[str, tuple[FlowCase, FlowCase]]:
+def arc() -> Phantom:
+    """An artery 3.4 mm wide that bends by 24 mm, with a sac of 6 mm beside the bend, neither outside nor inside it."""
+    artery = phantoms.torus_arc(bend_radius_mm=12.0, angle_rad=2.2, radius_mm=1.7)
+    sideways = np.array([0.0, 1.0, 0.0])
+    middle_mm = 0.5 * artery.parent.length_mm
+    return phantoms.with_sac(artery, abscissa_mm=middle_mm, width_mm=6.0, neck_mm=4.2, direction=sideways)
+
+
+VESSELS = {"demo": phantoms.demo_phantom, "arc": arc}
+
+
+def cases(names: list[str], phantom: Phantom) -> dict[str, tuple[FlowCase, FlowCase]]:
     """The bare vessel and every device in it, deployed in the whole one and computed in a short one.
 
     The first case of each has the whole screen, the second only as much as OpenFOAM meshes struts.
     """
-    whole = trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))
+    whole = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.2)))
     anatomy = restore(trim(whole))
     short = trim(whole, upstream_mm=KEPT_MM, downstream_mm=KEPT_MM)
     inflow_mL_s = flow_case(anatomy, None).inflow_mL_s
@@ -92,6 +106,7 @@ def alignment(screened: FlowField, resolved: FlowField, sac: Surface) -> float:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("devices", nargs="*", default=["enterprise", "silk"])
+    parser.add_argument("--vessel", choices=VESSELS, default="demo")
     parser.add_argument("--cell", type=float, default=0.125)
     parser.add_argument("--foam-cell", type=float, default=0.2)
     parser.add_argument("--across", type=float, default=setup.ACROSS)
@@ -102,7 +117,7 @@ if __name__ == "__main__":
     rows = json.loads(TABLE.read_text()) if TABLE.exists() else {}
     foam = {"engine": OPENFOAM, "cell_size_mm": given.foam_cell, "processes": given.processes}
     bare: tuple[FlowField, dict[str, float]] | None = None
-    for name, (whole_case, case) in cases(given.devices).items():
+    for name, (whole_case, case) in cases(given.devices, VESSELS[given.vessel]()).items():
         # The embedded engine takes its start for the bare flow; OpenFOAM begins from any in this vessel.
         embedded, screened = computed(case, bare[0] if bare else None, cell_size_mm=given.cell)
         folder = None if given.cases is None else given.cases / name
@@ -111,7 +126,7 @@ if __name__ == "__main__":
             bare, bare_resolved = (embedded, screened), resolved
             continue
         left = {key: (screened[key] / bare[1][key], resolved[key] / bare_resolved[key]) for key in INDICES}
-        rows[name] = {
+        rows[f"{given.vessel} {name}"] = {
             "screen": screened,
             "struts": resolved,
             "whole_screen": computed(whole_case, bare[0], cell_size_mm=given.cell)[1],
@@ -125,11 +140,9 @@ if __name__ == "__main__":
             "openfoam_cells_across": given.across,
         }
         TABLE.write_text(json.dumps(rows, indent=2) + "\n")
-    print(
-        "\n| device | index | screen | struts | difference | left, screen | left, struts | whole screen to its part |"
-    )
+    print("\n| | index | screen | struts | difference | left, screen | left, struts | whole screen to its part |")
     print(8 * "|---" + "|")
-    for name, row in rows.items():
+    for name, row in sorted(rows.items()):
         for key in INDICES:
             screen, struts = row["screen"][key], row["struts"][key]
             left = f"{row['left_with_screen'][key]:.3f} | {row['left_with_struts'][key]:.3f}"

@@ -170,8 +170,9 @@ def disc(resistance_Pa_s_m: float) -> Screen:
     n = len(x)
     normals = np.tile([0.0, 0.0, 1.0], (n, 1))
     points = np.stack([x, y, np.full(n, LENGTH_MM / 2)], axis=1)
-    across, loss = np.full(n, 0.5 * resistance_Pa_s_m), np.zeros(n)
-    return Screen(points, normals, np.full(n, 0.05**2), np.full(n, resistance_Pa_s_m), across, loss)
+    one = np.ones(n)
+    resistances = resistance_Pa_s_m * one, 0.5 * resistance_Pa_s_m * one, 0 * one
+    return Screen(points, normals, 0.05**2 * one, *resistances, one, one)
 
 
 def test_a_screen_without_resistance_changes_nothing() -> None:

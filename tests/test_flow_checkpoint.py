@@ -36,7 +36,8 @@ def screen() -> Screen:
     n = len(x)
     points = np.stack([x, y, np.full(n, 5.0)], axis=1)
     normals = np.tile([0.0, 0.0, 1.0], (n, 1))
-    return Screen(points, normals, np.full(n, 0.01), np.full(n, 300.0), np.full(n, 150.0), np.zeros(n))
+    one = np.ones(n)
+    return Screen(points, normals, 0.01 * one, 300 * one, 150 * one, 0 * one, one, one)
 
 
 class Stopping(FlowCheckpoint):

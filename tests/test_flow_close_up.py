@@ -162,7 +162,8 @@ def test_what_is_built_for_some_steps_serves_longer_ones_as_if_built_for_them() 
     case, _ = outer_of_demo()
     points_mm = demo().aneurysms[0].neck.vertices_mm
     ones = np.ones(len(points_mm))
-    screen = Screen(points_mm, ones[:, None] * [0.0, 0.6, 0.8], 0.1 * ones, 300 * ones, 150 * ones, 0.5 * ones)
+    resistances = 300 * ones, 150 * ones, 0.5 * ones
+    screen = Screen(points_mm, ones[:, None] * [0.0, 0.6, 0.8], 0.1 * ones, *resistances, ones, ones)
     settings = replace(case.settings, waveform=OLDER_ADULT_ICA, max_cycles=1, outlets="murray")
     pulse = replace(case, screen=screen, settings=settings)
     outer = simulate_case(pulse)

@@ -59,7 +59,8 @@ def screen() -> Screen:
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-1.0, 1.0, 0.1), np.arange(-1.0, 1.0, 0.1)))
     n = len(x)
     points, normals = np.stack([x, y, np.full(n, 0.5 * LENGTH_MM)], axis=1), np.tile([0.0, 0.6, 0.8], (n, 1))
-    return Screen(points, normals, np.full(n, 0.01), np.full(n, 300.0), np.full(n, 150.0), np.full(n, 0.5))
+    one = np.ones(n)
+    return Screen(points, normals, 0.01 * one, 300 * one, 150 * one, 0.5 * one, one, one)
 
 
 def everything() -> lattice_state.State:

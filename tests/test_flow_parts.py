@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from tubes import arc, line, tube
 from vstent import device
@@ -19,13 +20,16 @@ from vstent.flow.engines.lattice_settling import field_left, fraction_left, mean
 from vstent.flow.engines.lattice_state import Snapshot
 from vstent.flow.profile import developed_profile
 from vstent.flow.screen import (
+    BREADTH,
     CROSSING_PER_SOLIDITY,
     INERTIAL_LOSS,
     LEAST_SHARE,
+    concentration,
     crossing_factor,
     drag_per_length,
     inertial_loss,
     on_grid,
+    parted,
     round_diameter,
     tangential_share,
 )
@@ -121,6 +125,33 @@ def test_a_screen_lies_where_the_wires_are():
     radius_mm = np.hypot(*made.points_mm[:, :2].T)
     assert radius_mm.mean() == pytest.approx(0.5 * DIAMETER_MM + outside_mm, abs=0.003)
     assert made.area_mm2.sum() == pytest.approx(np.pi * (DIAMETER_MM + 2 * outside_mm) * LENGTH_MM, rel=0.005)
+
+
+def test_wires_so_near_that_their_bands_melt_are_a_sheet_and_far_ones_are_lines() -> None:
+    near_mm, far_mm = np.array([0.05, 0.15, 0.25]), np.array([2.0, 4.0])
+    np.testing.assert_array_equal(concentration(0.03, near_mm, 0.15), 1.0)
+    np.testing.assert_array_equal(parted(near_mm), 0.0)
+    np.testing.assert_array_equal(parted(far_mm), 1.0)
+    assert 0 < parted(0.8) < parted(1.0) < 1
+    assert concentration(0.09, 1.3, 0.2) < concentration(0.09, 1.3, 0.1)  # a finer grid slows blood more by itself
+    slender = tangential_share(0.07, 0.5, 1.0)
+    assert slender == pytest.approx(0.75)  # half along, half across
+    assert tangential_share(0.07, 0.5, 0.0) > tangential_share(0.07, 0.5, 0.5) > slender
+
+
+def test_struts_far_apart_leave_open_what_lies_between_them() -> None:
+    stent = deploy(device.find_design("enterprise"), tube(line(26), 1.9)).stent
+    made = screen(stent, Blood())
+    start = stent.piece_starts
+    part = np.linspace(0, 1, 20)[:, None, None]
+    axes_mm = (1 - part) * stent.wire_points_mm[start] + part * stent.wire_points_mm[start + 1]
+    away_mm = cKDTree(axes_mm.reshape(-1, 3)).query(made.points_mm)[0]
+    assert (away_mm < 0.5 * BREADTH * made.spacing_mm + 0.02).all()
+    lumen_mm = tube(line(26), 1.9).vessel.lumen.vertices_mm
+    along_mm = np.ptp(stent.nodes_mm[..., 2])
+    spanned = np.abs(lumen_mm[:, 2] - stent.nodes_mm[..., 2].mean()) < 0.4 * along_mm
+    to_band_mm = cKDTree(made.points_mm).query(lumen_mm[spanned])[0]
+    assert (to_band_mm > 0.2).mean() > 0.1
 
 
 def test_crossing_wires_resist_as_resolved_ones(resolved):

@@ -165,7 +165,7 @@ def test_without_openfoam_its_install_command_is_named(monkeypatch: pytest.Monke
 
 def test_a_screen_is_refused() -> None:
     one = np.ones(1)
-    screen = Screen(np.zeros((1, 3)), np.ones((1, 3)), one, one, one, one)
+    screen = Screen(np.zeros((1, 3)), np.ones((1, 3)), one, one, one, one, one, one)
     with pytest.raises(FlowError, match="struts"):
         OpenFoam(0.3, Path("nowhere")).init(FlowCase(tube(), screen=screen), None)
 

@@ -1,10 +1,10 @@
-"""A screen on the grid takes as much of blood that passes at an angle as the thin sheet that it stands for."""
+"""A screen on the grid takes as much of blood as the thin sheet, or the row of wires, that it stands for."""
 
 import numpy as np
 import pytest
 
 from vstent.flow.engines.lattice_scales import ODD_RATE
-from vstent.flow.screen import on_grid
+from vstent.flow.screen import bands, concentration, drag_per_length, on_grid
 from vstent.flow.types import Screen
 from vstent.kernels import lanes, lattice
 
@@ -25,7 +25,7 @@ def samples(normal: np.ndarray, resistance_Pa_s_m: float, offset: float) -> Scre
     z = (level - x * normal[0] / normal[2]) % SHAPE[2]
     points_mm = 1e3 * CELL_M * np.stack([x, y, z], axis=1)
     area_mm2, alike = np.full(len(x), (1e3 * CELL_M / 8) ** 2 / normal[2]), np.full(len(x), resistance_Pa_s_m)
-    return Screen(points_mm, np.tile(normal, (len(x), 1)), area_mm2, alike, alike, 0 * alike)
+    return Screen(points_mm, np.tile(normal, (len(x), 1)), area_mm2, alike, alike, 0 * alike, alike, alike)
 
 
 def entries(screen: Screen) -> tuple[np.ndarray, np.ndarray]:
@@ -41,6 +41,20 @@ def entries(screen: Screen) -> tuple[np.ndarray, np.ndarray]:
     total = np.stack([np.bincount(of, column) for column in linear.T], axis=1)
     mean /= total[:, 1:]
     return cell, np.column_stack([mean[:, :3], total, 0 * cell, mean[:, 3]]).astype(np.float32)
+
+
+def row(diameter_mm: float, spacing: int, offset: float) -> Screen:
+    """Wires along y across the box, so many cells apart, their axes so many off its cells' centres."""
+    cell_mm = 1e3 * CELL_M
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0, SHAPE[0], spacing) + offset, np.arange(0, SHAPE[1], 0.5)))
+    points_mm = cell_mm * np.stack([x, y, np.full(len(x), SHAPE[2] / 2 + offset)], axis=1)
+    along_mm, upwards = np.tile([0, 0.5 * cell_mm, 0], (len(x), 1)), np.tile([0.0, 0.0, 1.0], (len(x), 1))
+    band_mm, area_mm2 = bands(points_mm, along_mm, upwards, np.full(len(x), cell_mm * spacing))
+    # Beside wires so far apart lie none that cross them, but a screen gives either family half of its resistance.
+    drag = 2 * DENSITY_KG_M3 * VISCOSITY_M2_S * drag_per_length(diameter_mm, cell_mm * spacing) / (CELL_M * spacing)
+    one, n = np.ones(len(band_mm)), len(band_mm) // len(x)
+    lying = np.repeat(upwards, n, axis=0), area_mm2, drag * one, drag * one, 0 * one
+    return Screen(band_mm % (cell_mm * SHAPE), *lying, diameter_mm * one, cell_mm * spacing * one)
 
 
 class Box:
@@ -111,3 +125,28 @@ def test_blood_leaves_a_screen_as_it_would_leave_a_thin_sheet(
     assert slope == pytest.approx(gain, rel=0.03)
     assert found == pytest.approx(leaving, rel=within)
     np.testing.assert_allclose(box.velocity()[behind] @ n, through, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("diameter_mm", "spacing", "offset"),
+    [(0.09, 4, 0.0), (0.09, 8, 0.0), (0.09, 8, 0.25), (0.09, 8, 0.5), (0.03, 8, 0.25), (0.09, 16, 0.25)],
+)
+def test_wires_that_the_grid_tells_apart_hold_slow_blood_up_as_their_row_does(
+    diameter_mm: float, spacing: int, offset: float
+) -> None:
+    """The row's law (Tamada and Fujikawa) is of the mean velocity; a grid has blood slower at wires far apart."""
+    spacing_m = spacing * CELL_M
+    assert concentration(diameter_mm, 1e3 * spacing_m, 1e3 * CELL_M) > 1.1
+    expected = 1e-3 * STEP_S / CELL_M
+    force = VISCOSITY * drag_per_length(1e-3 * diameter_mm, spacing_m) / spacing * expected / SHAPE[2]
+    start = np.tile([0.0, 0.0, expected], (SHAPE.prod(), 1))
+    box = Box(row(diameter_mm, spacing, offset), np.array([0.0, 0.0, force]), start)
+    before, now = 0.0, expected
+    for _ in range(100):
+        if abs(now - before) < 1e-4 * expected:
+            break
+        box.advance(500)
+        before, now = now, box.velocity()[:, 2].mean()
+    else:
+        pytest.fail("the flow through the row has not settled")
+    assert now == pytest.approx(expected, rel=0.02)

@@ -1,6 +1,6 @@
 """The nouns of blood flow: Blood, FlowSettings, Screen, FlowCase, FlowField."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Final, Literal
 
@@ -153,12 +153,16 @@ class Screen:
     """(p,) shear stress per tangential velocity, Pa/(m/s)."""
     inertial_loss: Floats
     """(p,) K of the pressure drop K rho |u| u_n / 2, and of the shear stress K rho |u| u_t / 4."""
+    wire_diameter_mm: Floats
+    """(p,) diameter of the wire that the sample is of."""
+    spacing_mm: Floats
+    """(p,) how far such wires lie apart; as far as they are thick in a sheet without gaps."""
 
     def __post_init__(self) -> None:
         freeze(self, "points_mm", np.float64, (-1, 3))
-        for name in ("area_mm2", "normal_resistance_Pa_s_m", "tangential_resistance_Pa_s_m", "inertial_loss"):
-            freeze(self, name, np.float64, (len(self.points_mm),))
         freeze(self, "normals", np.float64, (len(self.points_mm), 3))
+        for one in fields(self)[2:]:
+            freeze(self, one.name, np.float64, (len(self.points_mm),))
 
 
 @dataclass(frozen=True, eq=False)
