@@ -7,11 +7,10 @@ The demo's artery, or an arc of one with a sac at its side, cut to 9 mm on eithe
 with every device: by the embedded engine with the device as a screen, and by OpenFOAM with its struts meshed, at least
 so many cells across each, without layers along walls (on wires so fine they do not come to an end). Both have only the
 part of the device that OpenFOAM meshes (see `vstent.struts.over_restored`); what the whole screen does, with what lies
-on the artery's wall, is kept besides.
-The two engines differ in the bare vessel already: what a device leaves of each engine's own bare value stands beside.
-`alignment` is the correlation of the two velocity fields in the sac, 1 where they are alike but for their size. A row
-is kept for every device; the rows of others stay as they are. With --cases, OpenFOAM's cases stay in that folder, and
-one that is there already is gone on with.
+on the artery's wall, is kept besides. The two engines differ in the bare vessel already: what a device leaves of each
+engine's own bare value stands beside. `alignment` is the correlation of the two velocity fields in the sac, 1 where
+they are alike but for their size. A row is kept for every device in every vessel; other rows stay as they are. With
+--cases, OpenFOAM's cases stay in that folder, by vessel and device, and one that is there already is gone on with.
 """
 
 import argparse
@@ -120,7 +119,7 @@ if __name__ == "__main__":
     for name, (whole_case, case) in cases(given.devices, VESSELS[given.vessel]()).items():
         # The embedded engine takes its start for the bare flow; OpenFOAM begins from any in this vessel.
         embedded, screened = computed(case, bare[0] if bare else None, cell_size_mm=given.cell)
-        folder = None if given.cases is None else given.cases / name
+        folder = None if given.cases is None else given.cases / given.vessel / name
         meshed, resolved = computed(case, embedded, folder, **foam)
         if bare is None or case.sac is None:
             bare, bare_resolved = (embedded, screened), resolved

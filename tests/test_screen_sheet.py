@@ -52,9 +52,10 @@ def row(diameter_mm: float, spacing: int, offset: float) -> Screen:
     band_mm, area_mm2 = bands(points_mm, along_mm, upwards, np.full(len(x), cell_mm * spacing))
     # Beside wires so far apart lie none that cross them, but a screen gives either family half of its resistance.
     drag = 2 * DENSITY_KG_M3 * VISCOSITY_M2_S * drag_per_length(diameter_mm, cell_mm * spacing) / (CELL_M * spacing)
-    one, n = np.ones(len(band_mm)), len(band_mm) // len(x)
-    lying = np.repeat(upwards, n, axis=0), area_mm2, drag * one, drag * one, 0 * one
-    return Screen(band_mm % (cell_mm * SHAPE), *lying, diameter_mm * one, cell_mm * spacing * one)
+    one, across = np.ones(band_mm[..., 0].size), band_mm.shape[1]
+    lying = np.repeat(upwards, across, axis=0), np.repeat(area_mm2, across), drag * one, drag * one, 0 * one
+    points_mm = band_mm.reshape(-1, 3) % (cell_mm * SHAPE)
+    return Screen(points_mm, *lying, diameter_mm * one, cell_mm * spacing * one)
 
 
 class Box:

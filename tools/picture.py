@@ -4,25 +4,23 @@ CASE is a folder that ``vstent demo --out CASE`` has filled (``demo``, where ``m
 there is computed first.
 """
 
-import json
 import sys
 from pathlib import Path
 
 from vstent import study
 from vstent.console import Console
-from vstent.demo import write_scan
 from vstent.report.figures import overview
 from vstent.report.scene import scene_of
 from vstent.study.provenance import RUN
-from vstent.study.repeat import settings_of
+from vstent.study.repeat import read_record
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "demo.png"
 
 
 def main(case: Path) -> None:
     """Go on with the demo in a case folder, and draw it."""
-    settings = settings_of(json.loads((case / RUN).read_text())["settings"])
-    result = study.run(write_scan(case / "scan"), case, settings, Console().progress)
+    record = read_record(case / RUN)
+    result = study.run(record.input, record.folder, record.settings, Console().progress)
     PICTURE.write_bytes(overview(scene_of(result)))
 
 

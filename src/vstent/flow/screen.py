@@ -134,11 +134,6 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     Every piece of wire resists as in a row of its spacing, across a band about it. So one law serves braids, laser-cut
     cells and their mixtures of diameters, wherever bends have opened or closed them: the bands of a braid's wires melt
     into a sheet, those of laser-cut struts leave open what lies between them.
-
-    Raises
-    ------
-    ValueError
-        When the stent has no wires.
     """
     pieces = _pieces(stent)
     points_mm, along_mm, diameter_mm = pieces
@@ -149,16 +144,14 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     drag = drag_per_length(diameter_mm, spacing_mm) * crossing_factor(diameter_mm, spacing_mm)
     normal_Pa_s_m = blood.viscosity_Pa_s * drag * 2 / (spacing_mm * M_PER_MM)
     tangential_Pa_s_m = normal_Pa_s_m * tangential_share(solidity, lengthwise, parted(spacing_mm))
-    band_mm, area_mm2 = bands(points_mm, along_mm, sheet.normals[face], spacing_mm)
-    resistances = normal_Pa_s_m, tangential_Pa_s_m, inertial_loss(solidity)
-    normals, *of_wire = (
-        np.repeat(one, ACROSS, axis=0) for one in (sheet.normals[face], *resistances, diameter_mm, spacing_mm)
-    )
-    return Screen(band_mm, normals, area_mm2, *of_wire)
+    normals = sheet.normals[face]
+    band_mm, area_mm2 = bands(points_mm, along_mm, normals, spacing_mm)
+    columns = normals, area_mm2, normal_Pa_s_m, tangential_Pa_s_m, inertial_loss(solidity), diameter_mm, spacing_mm
+    return Screen(band_mm.reshape(-1, 3), *(np.repeat(column, ACROSS, axis=0) for column in columns))
 
 
 def bands(points_mm: Floats, along_mm: Floats, normals: Floats, spacing_mm: Floats) -> tuple[Floats, Floats]:
-    """Spread pieces of wire over their bands: samples (`ACROSS` p, 3), piece by piece, and the area of each.
+    """Spread pieces of wire over their bands: samples (p, `ACROSS`, 3), and the area (p,) of each of a piece's.
 
     Of two families of wires so far apart either has half of it.
 
@@ -171,8 +164,7 @@ def bands(points_mm: Floats, along_mm: Floats, normals: Floats, spacing_mm: Floa
     length_mm = np.linalg.norm(along_mm, axis=1)
     sideways = np.cross(normals, along_mm) / length_mm[:, None]
     at_mm = BREADTH * spacing_mm[:, None] * ((np.arange(ACROSS) + 0.5) / ACROSS - 0.5)
-    band_mm = points_mm[:, None] + at_mm[:, :, None] * sideways[:, None]
-    return band_mm.reshape(-1, 3), np.repeat(0.5 * length_mm * spacing_mm / ACROSS, ACROSS)
+    return points_mm[:, None] + at_mm[:, :, None] * sideways[:, None], 0.5 * length_mm * spacing_mm / ACROSS
 
 
 def _net(
@@ -284,10 +276,8 @@ def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float)
     normal = np.stack([gathered(component) for component in screen.normals.T], axis=1)
     length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     factor = concentration(screen.wire_diameter_mm, screen.spacing_mm, cell_size_mm)
-    along, across_Pa_s_m = (
-        gathered(factor * screen.normal_resistance_Pa_s_m),
-        factor * screen.tangential_resistance_Pa_s_m,
-    )
+    along = gathered(factor * screen.normal_resistance_Pa_s_m)
+    across_Pa_s_m = factor * screen.tangential_resistance_Pa_s_m
     across, twice = gathered(across_Pa_s_m), _twice(at, screen.normals)
     kept = along > 0
     return GridResistance(
