@@ -110,8 +110,6 @@ def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
 
     A rectangular strut has the diameter of the round wire that drags as much.
     """
-    starts = stent.wire_starts
-    wire = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     inner = stent.piece_starts
     a, b = stent.wire_points_mm[inner], stent.wire_points_mm[inner + 1]
     length = np.linalg.norm(b - a, axis=1)
@@ -119,7 +117,7 @@ def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
     owner = np.repeat(np.arange(len(a)), count)
     rank = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
     part = ((rank + 0.5) / count[owner])[:, None]
-    diameter = _drag_diameters_um(stent)[wire[inner]] * MM_PER_UM
+    diameter = _drag_diameters_um(stent)[stent.point_wires[inner]] * MM_PER_UM
     return a[owner] + part * (b - a)[owner], ((b - a) / count[:, None])[owner], diameter[owner]
 
 
