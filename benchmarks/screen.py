@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from vstent.flow.crossing_cell import VISCOSITY, Wires, crossing_wires, flow_through, row_of_wires, sheet_speed
-from vstent.flow.screen import crossing_factor, drag_per_length, inertial_loss, tangential_share
+from vstent.flow.drag import crossing_factor, drag_per_length, inertial_loss, tangential_share
 
 TABLE = Path(__file__).with_suffix(".json")
 CELLS = (

@@ -12,7 +12,7 @@ from vstent.flow.crossing_cell import (
     row_of_wires,
     sheet_speed,
 )
-from vstent.flow.screen import drag_per_length, round_diameter
+from vstent.flow.drag import drag_per_length, round_diameter
 
 DIAMETER = 6
 

@@ -14,12 +14,7 @@ from vstent import device
 from vstent.deploy import deploy
 from vstent.errors import FlowError
 from vstent.flow import Blood, FlowCase, FlowSettings, domain, screen
-from vstent.flow.engines import AbstractEngine, run
-from vstent.flow.engines.lattice_scales import Scales
-from vstent.flow.engines.lattice_settling import field_left, fraction_left, mean_of, standard_error, swings, with_check
-from vstent.flow.engines.lattice_state import Snapshot
-from vstent.flow.profile import developed_profile
-from vstent.flow.screen import (
+from vstent.flow.drag import (
     BREADTH,
     CROSSING_PER_SOLIDITY,
     INERTIAL_LOSS,
@@ -28,11 +23,16 @@ from vstent.flow.screen import (
     crossing_factor,
     drag_per_length,
     inertial_loss,
-    on_grid,
     parted,
     round_diameter,
     tangential_share,
 )
+from vstent.flow.engines import AbstractEngine, run
+from vstent.flow.engines.lattice_scales import Scales
+from vstent.flow.engines.lattice_screen import on_grid
+from vstent.flow.engines.lattice_settling import field_left, fraction_left, mean_of, standard_error, swings, with_check
+from vstent.flow.engines.lattice_state import Snapshot
+from vstent.flow.profile import developed_profile
 from vstent.flow.types import CarreauYasuda
 from vstent.flow.wall_stress import mean_shear_Pa, wall_stress
 from vstent.stent import Stent

@@ -21,7 +21,7 @@ from vstent.flow.engines.openfoam import OpenFoam, State, swing_of
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results, scatter
 from vstent.flow.openfoam.bridge import Snapshot, bridge
-from vstent.flow.openfoam.setup import FoamSetup
+from vstent.flow.openfoam.setup import Flavour, FoamSetup
 from vstent.flow.types import PHASES, Waveform
 from vstent.restore import restore
 from vstent.surface import Surface
@@ -43,6 +43,7 @@ def test_fields_are_read_as_openfoam_writes_them(tmp_path: Path) -> None:
         "nonuniform List<vector>\n3\n(\n(1 2 3)\n(4 5 -6e-7)\n(7 8 9)\n)\n",
         wall="",
         inlet="value           nonuniform List<vector> 2((1 0 0) (0 1 0));",
+        inlet_2=f"refValue\n        {{\n{12 * ' '}value   nonuniform List<vector> 2((0 0 3) (0 0 4));\n        }}",
         outlet_1="value           uniform (0 0 2.5);",
         outlet_2="value           nonuniform List<vector> 2{(1 1 1)};",
     )
@@ -53,6 +54,7 @@ def test_fields_are_read_as_openfoam_writes_them(tmp_path: Path) -> None:
         "outlet_1": [[0, 0, 2.5]],
         "outlet_2": [[1, 1, 1]] * 2,
     }
+    assert {name: rows.tolist() for name, rows in found.references.items()} == {"inlet_2": [[0, 0, 3], [0, 0, 4]]}
     assert results.times(tmp_path) == ["7"]
 
 
@@ -147,12 +149,43 @@ def test_jets_thinner_than_a_cell_go_through_the_neck_as_the_mesh_has_them(tmp_p
     [
         ("Time = 3\n#0 Foam::sigFpe::sigHandler\nCourant Number mean: 2 max: 345.6\n", 136, "time step is too long"),
         ("Time = 3\n\nsigFpe\n", 136, "at 3: a cell of the mesh is too flat or blood rushes back"),
+        ("Time = 3s\n\nsigFpe\n", 136, "at 3: a cell"),
         ("--> FOAM FATAL ERROR: \nno such\nfield\n\n    From function x\n", 1, "no such field"),
         ("", -9, "want of memory"),
     ],
 )
 def test_a_failure_is_put_into_words(said: str, code: int, words: str) -> None:
     assert words in program.cause(said, code)
+
+
+def test_the_release_is_no_part_of_the_reason() -> None:
+    said = "--> FOAM FATAL ERROR: (openfoam-2406 patch=241206)\nno such field\n\n    From void Foam::f()\n"
+    assert program.cause(said, 1) == "no such field"
+
+
+@pytest.mark.parametrize(
+    ("installed", "found"),
+    [
+        ({"openfoam9": "surfaceFeatures", "openfoam11": "foamRun", "openfoam13": "foamRun"}, ("org", "openfoam13")),
+        ({"openfoam-dev": "foamRun", "openfoam10": "surfaceFeatures"}, ("org", "openfoam-dev")),
+        ({"openfoam2312": "surfaceFeatureExtract", "openfoam2406": "surfaceFeatureExtract"}, ("com", "openfoam2406")),
+        ({"openfoam9": "surfaceFeatures"}, None),
+    ],
+)
+def test_the_newest_release_is_found_and_one_too_old_is_not(
+    installed: dict[str, str], found: tuple[Flavour, str] | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name, tool in installed.items():
+        place = tmp_path / name / "platforms" / "linux64GccDPInt32Opt" / "bin"
+        place.mkdir(parents=True)
+        (place / tool).touch()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(program, "INSTALLED", (str(tmp_path / "openfoam*"),))
+    if found is None:
+        with pytest.raises(FlowError, match="was not found"):
+            program.find()
+    else:
+        assert program.find() == program.Program(found[0], tmp_path / found[1] / "etc" / "bashrc")
 
 
 def test_without_openfoam_its_install_command_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -289,3 +322,7 @@ def test_a_pulse_that_openfoam_stopped_in_goes_on_in_the_same_cycle(tmp_path: Pa
     np.testing.assert_allclose(time_s, 0.4 * np.arange(1, PHASES + 1) / PHASES)
     inflow_mL_s = np.array([phase.inflow_mL_s for phase in field.phases])
     np.testing.assert_allclose(inflow_mL_s, FLOW_ML_S * pulse.factor(time_s), rtol=0.02)
+    inlet = case.vessel.inlet
+    beside = (inlet.center_mm - field.centers_mm) @ inlet.normal < 0.3  # where the inlet's own faces are read
+    speed_m_s = np.array([phase.velocity_m_s[beside].mean(axis=0) @ -inlet.normal for phase in field.phases])
+    np.testing.assert_allclose(speed_m_s / inflow_mL_s, (speed_m_s / inflow_mL_s).mean(), rtol=0.02)

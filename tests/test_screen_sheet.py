@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from vstent.flow.drag import concentration, drag_per_length
 from vstent.flow.engines.lattice_scales import ODD_RATE
-from vstent.flow.screen import bands, concentration, drag_per_length, on_grid
+from vstent.flow.engines.lattice_screen import on_grid
+from vstent.flow.screen import bands
 from vstent.flow.types import Screen
 from vstent.kernels import lanes, lattice
 

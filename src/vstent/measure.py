@@ -119,7 +119,7 @@ def coverage_fractions(stent: Stent) -> Floats:
     from vstent.kernels.coverage import covered_fractions  # compiles on first use
 
     here = stent.piece_starts
-    radius_mm = 0.5 * np.repeat(stent.wire_diameter_um, np.diff(stent.wire_starts))[here] * MM_PER_UM
+    radius_mm = 0.5 * stent.wire_diameter_um[stent.point_wires[here]] * MM_PER_UM
     points_mm = stent.wire_points_mm
     return covered_fractions(stent.nodes_mm, points_mm[here], points_mm[here + 1], radius_mm, SAMPLES_PER_QUAD)
 

@@ -30,6 +30,8 @@ CAP_AREA_MM2: Final = 0.3
 """The smallest cap: a vessel 0.6 mm wide."""
 ARM_SLENDERNESS: Final = 6.0
 """A blind arm longer than this many of its mean radii is a vessel; shorter ones are sacs and bumps."""
+STUMP_SLENDERNESS: Final = 2.5
+"""The same where that leaves blood no way in and out: of a piece cut out close to a sac the ends are short."""
 ARM_SWELLING: Final = 1.35
 """An arm whose widest sphere exceeds its median by more than this factor near the tip is a sac on a stalk."""
 ARM_SHARE: Final = 0.15
@@ -59,11 +61,14 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
     notes = [f"{counted(n_caps, 'flat cap')} taken off to open the vessel."] if n_caps else []
     if not len(lumen.faces):
         raise VesselError("the surface has flat sides only, and no round wall between them: it is not a vessel's")
-    spheres = lumen.medial
-    lumen, n_arms = _with_open_arms(lumen)
+    closed = lumen
+    lumen, n_arms = _with_open_arms(lumen, ARM_SLENDERNESS)
     if n_arms:
-        spheres = medial.within(spheres, lumen.closed.tree)
         notes.append(f"{counted(n_arms, 'blind arm')} cut open square to the axis.")
+    if len(lumen.boundary_loops) < 2:
+        lumen, n_stumps = _with_open_arms(lumen, STUMP_SLENDERNESS)
+        notes.append(f"{counted(n_stumps, 'short blind arm')} cut open, for blood had no other way in and out.")
+    spheres = closed.medial if lumen is closed else medial.within(closed.medial, lumen.closed.tree)
     loops = lumen.boundary_loops
     if len(loops) < 2:
         raise VesselError(
@@ -217,14 +222,14 @@ def _is_across_lumen(lumen: Surface, member: Bools) -> bool:
     return bool(lumen.closest(behind[None])[1][0] < 1.5 * radius)
 
 
-def _with_open_arms(lumen: Surface) -> tuple[Surface, int]:
-    """Cut open the slender arms that end blind."""
+def _with_open_arms(lumen: Surface, slenderness: float) -> tuple[Surface, int]:
+    """Cut open the arms that end blind and are more than so many of their mean radii long."""
     graph = lumen.medial
     roots = np.asarray(cKDTree(graph.points).query(lumen.loop_centers_mm)[1], dtype=np.int32)
-    paths = medial.arms(graph, roots, ARM_SLENDERNESS, ARM_RADIUS_MM)
-    cuts = [_cut_of(graph.points[path], graph.radius[path]) if _is_blind(graph, path) else None for path in paths]
+    paths = medial.arms(graph, roots, slenderness, ARM_RADIUS_MM)
+    blind = [path for path in paths if _is_blind(graph, path)]
     n_cut = 0
-    for cut in cuts:
+    for cut in [_cut_of(graph.points[path], graph.radius[path], slenderness) for path in blind]:
         opened = None if cut is None else cut_square(lumen, *cut, ARM_SHARE)
         # A cut makes one end more; one that takes an end off has run into another artery.
         if opened is not None and len(opened.boundary_loops) > len(lumen.boundary_loops):
@@ -246,7 +251,7 @@ def _is_blind(graph: medial.Medial, path: Ints) -> bool:
     return bool(label[path[0]] != label[path[-1]])
 
 
-def _cut_of(points_mm: Floats, radius_mm: Floats) -> tuple[Floats, Floats, float] | None:
+def _cut_of(points_mm: Floats, radius_mm: Floats, slenderness: float) -> tuple[Floats, Floats, float] | None:
     """Where to cut an arm (path from the tree to its tip), where its tip lies, how wide it is; None for a sac."""
     abscissa = curves.arc_length(points_mm)
     outside = abscissa > 1.5 * radius_mm[0]
@@ -256,7 +261,7 @@ def _cut_of(points_mm: Floats, radius_mm: Floats) -> tuple[Floats, Floats, float
     body = outside & (radius_mm > 0.75 * typical)
     length = abscissa[body][-1] - abscissa[body][0]
     outer = body & (abscissa > abscissa[body][0] + 0.5 * length)
-    if length < ARM_SLENDERNESS * typical or radius_mm[outer].max() > ARM_SWELLING * typical:
+    if length < slenderness * typical or radius_mm[outer].max() > ARM_SWELLING * typical:
         return None
     end = float(abscissa[body][-1]) - typical
     center, behind = curves.interpolate(abscissa, points_mm, np.array([end, end - 2 * typical]))

@@ -64,6 +64,11 @@ class Stent:
         return Surface(self.nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
 
     @property
+    def point_wires(self) -> Ints:
+        """(p,) the wire that every point belongs to."""
+        return np.repeat(np.arange(len(self.wire_starts) - 1), np.diff(self.wire_starts))
+
+    @property
     def piece_starts(self) -> Ints:
         """(m,) points at which pieces of wire begin, each to the next point: all but the last of every wire."""
         is_last = np.zeros(len(self.wire_points_mm), dtype=bool)

@@ -45,7 +45,7 @@ def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
     neck than the whole device, with one 1 %.
     """
     is_over = is_over_restored(stent, anatomy, stent.wire_points_mm)
-    wire = np.repeat(np.arange(len(stent.wire_starts) - 1), np.diff(stent.wire_starts))
+    wire = stent.point_wires
     first = is_over & ~np.r_[False, is_over[:-1] & (wire[1:] == wire[:-1])]
     piece, kept = np.cumsum(first) - 1, np.flatnonzero(is_over)
     kept = kept[np.bincount(piece[kept])[piece[kept]] > 1]  # a single point is no piece
@@ -149,8 +149,7 @@ def _outward(stent: Stent, points_mm: Floats, tangent: Floats) -> Floats:
 
 def _sections_mm(stent: Stent) -> Floats:
     """Section (p, sides, 2) at every point: (sideways, outward), counter-clockwise about the tangent."""
-    counts = np.diff(stent.wire_starts)
-    width_mm = np.repeat(stent.wire_diameter_um * MM_PER_UM, counts)[:, None, None]
+    width_mm = (stent.wire_diameter_um * MM_PER_UM)[stent.point_wires][:, None, None]
     if isinstance(stent.design, LaserCut):
         corner = 0.5 * np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
         thickness_mm = np.full_like(width_mm, stent.design.strut_thickness_um * MM_PER_UM)

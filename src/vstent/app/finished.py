@@ -1,6 +1,5 @@
 """Finished: what the study last finished in a case folder has left there, by what its `run.json` says of it."""
 
-import json
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -54,11 +53,11 @@ def _flows_wanted(folder: Path, given: str) -> dict[str, Path]:
 @lru_cache(maxsize=REMEMBERED)
 def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
     """Where the flows are to be kept that a `run.json` tells of; nowhere where this version cannot read it."""
-    from vstent.study.repeat import UNTOLD, settings_of
+    from vstent.study.repeat import UNTOLD, told_in
 
     try:
-        told = json.loads(run.read_text(encoding="utf-8"))
-        return _paths(run.parent, str(told["input"]["sha256"]), settings_of(told["settings"]))
+        told, settings = told_in(run)
+        return _paths(run.parent, str(told["input"]["sha256"]), settings)
     except (*UNTOLD, InputError):
         return {}
 

@@ -39,11 +39,11 @@ def reopened(store: Store, folder: Path) -> Case:
         the page does not take.
     """
     from vstent.study import CACHE, INPUT
-    from vstent.study.repeat import UNTOLD, settings_of
+    from vstent.study.repeat import UNTOLD, told_in
 
     try:
-        told = json.loads((folder / RUN).read_text(encoding="utf-8"))
-        settings, source = settings_of(told["settings"]), told["input"]["sha256"]
+        told, settings = told_in(folder / RUN)
+        source = told["input"]["sha256"]
         where = json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"]
     except UNTOLD:
         raise ReadError(

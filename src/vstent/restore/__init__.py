@@ -50,7 +50,7 @@ def restore(
     InputError
         When nothing stands out of the artery near `at_mm`, or `neck_mm` does not part a sac from the artery.
     VesselError
-        When the vessel has no centerlines.
+        When the vessel has no centerlines, or its wall is no artery's along them.
     """
     if not vessel.centerlines:
         raise VesselError("the vessel has no centerlines: trace it before restoring its parent artery")

@@ -15,11 +15,13 @@ import numpy as np
 from scipy.sparse import bmat, csc_matrix, diags
 from scipy.sparse.linalg import spsolve
 
+from vstent.errors import VesselError
 from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats
 from vstent.surface import Surface
 from vstent.trace import parent_radius_mm
 from vstent.vessel import Centerline
+from vstent.words import place
 
 STEP_MM: Final = 0.25
 """Spacing of axis points."""
@@ -51,6 +53,9 @@ ROUND_TRUST: Final = 0.02
 """Weight of a circle beside all rays of a section: what few rays leave open is round."""
 TOLERANCE: Final = ((0.40, 1.00),) * 4 + ((0.20, 0.50),) * 4 + ((0.12, 0.35),) * 4
 """Per iteration: relative excess of a ray over the oval up to which it counts fully, and from which not at all."""
+
+ASTRAY: Final = 2.0
+"""An axis further from the centerline than this many of its widest radii is no artery's: real ones stay within 0.3."""
 
 
 class Tube(NamedTuple):
@@ -89,6 +94,11 @@ def fit_axis(lumen: Surface, line: Centerline, mouths: Sequence[Mouth] = ()) -> 
     line : where to begin from.
     mouths : of each sac: there the radius is interpolated between the healthy stations on both sides, because the wall
         that is left flares into the neck.
+
+    Raises
+    ------
+    VesselError
+        When the wall is no tube's.
     """
     points = curves.resample(line.points_mm, STEP_MM)
     abscissa = curves.arc_length(points)
@@ -102,7 +112,19 @@ def fit_axis(lumen: Surface, line: Centerline, mouths: Sequence[Mouth] = ()) -> 
         weight = np.clip((none - excess) / (none - full), 0.0, 1.0)
         weight = np.where(necks.is_sacward, 0.0, weight)
         tube = _fit(np.where(weight > 0, rho, 0.0), weight, necks, line.points_mm)
+        _refuse_astray(tube, line)
     return tube
+
+
+def _refuse_astray(tube: Tube, line: Centerline) -> None:
+    """Refuse a wall through which the axis of a tube runs away from the centerline that it was to follow."""
+    away_mm = np.linalg.norm(_toward(line.points_mm, tube.points_mm), axis=1)
+    worst = int(np.argmax(away_mm))
+    if away_mm[worst] > ASTRAY * line.inscribed_radius_mm.max():
+        raise VesselError(
+            f"no artery fits the wall: its axis would run {away_mm[worst]:.0f} mm off the centerline, to "
+            f"{place(tube.points_mm[worst])}; give a longer piece of the vessel, or one whose wall is whole"
+        )
 
 
 class _Necks(NamedTuple):

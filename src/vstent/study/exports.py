@@ -1,6 +1,5 @@
 """A case, or an input not yet studied, handed over to other solvers: an OpenFOAM case folder, or named patches."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from vstent.stent import Stent
 from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, hash_of
 from vstent.study.provenance import RUN
-from vstent.study.repeat import UNTOLD, settings_of
+from vstent.study.repeat import UNTOLD, told_in
 from vstent.study.stages import check_inflow, deploy_one, find_anatomy
 from vstent.study.types import Progress, Settings
 from vstent.vessel import Anatomy
@@ -140,7 +139,7 @@ def _told(path: Path, settings: Settings) -> Settings:
     if not run.exists():
         return settings
     try:
-        return settings_of(json.loads(run.read_text(encoding="utf-8"))["settings"])
+        return told_in(run)[1]
     except UNTOLD:
         raise ReadError(
             f"{run} is not of this version, so where a device lies is not known: do the run again."

@@ -60,8 +60,8 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
         The input is another one than then.
     """
     try:
-        told = json.loads(existing(path).read_text(encoding="utf-8"))
-        settings, sha256 = settings_of(told["settings"]), str(told["input"]["sha256"])
+        told, settings = told_in(existing(path))
+        sha256 = str(told["input"]["sha256"])
         differences = _differences(told, settings)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         raise ReadError(f"{path} is no run.json of this version: give the scan and the options again.") from None
@@ -97,6 +97,12 @@ def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
         former = json.loads((folder / RUN).read_text(encoding="utf-8"))
         return {key: former[key] for key in former if key != SECONDS} != json.loads(json.dumps(told))
     return former_source(folder) is not None
+
+
+def told_in(run: Path) -> tuple[dict[str, Any], Settings]:
+    """What a `run.json` tells, and the settings among it; one of `UNTOLD` where this version cannot read it."""
+    told = json.loads(run.read_text(encoding="utf-8"))
+    return told, settings_of(told["settings"])
 
 
 def settings_of(told: Mapping[str, Any]) -> Settings:

@@ -1,4 +1,4 @@
-"""What the lattice-Boltzmann engine needs before its first step: addresses, units, walls, openings, screen."""
+"""What the lattice-Boltzmann engine needs before its first step: addresses, units, walls and openings."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -11,7 +11,6 @@ from vstent.flow.close_up import CloseUp
 from vstent.flow.domain import Domain
 from vstent.flow.engines.lattice_ends import Ends
 from vstent.flow.engines.lattice_scales import ODD_RATE, Scales
-from vstent.flow.screen import on_grid
 from vstent.flow.types import FlowCase
 from vstent.kernels import lanes, lattice, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints
@@ -126,24 +125,6 @@ class Refill:
     """(l,) see `lattice.defer`."""
     refill: NDArray[np.float32]
     """(w,) added in every step."""
-
-
-@dataclass(frozen=True, eq=False)
-class ScreenEntries:
-    """A screen by segment (see `lattice.update`)."""
-
-    start: Ints
-    """(s + 1,)."""
-    place: Ints
-    """(e,) place within the segment."""
-    entry: NDArray[np.float32]
-    """(e, `lattice.ENTRY`)."""
-    cell: Ints
-    """(e,) cell."""
-
-    def stretched(self, stretch: float) -> "ScreenEntries":
-        """The same for time steps that are so many times as long: all that goes with a speed is so much more."""
-        return replace(self, entry=self.entry * np.array([1, 1, 1, stretch, stretch, 1, stretch], np.float32))
 
 
 def in_extensions(case: FlowCase, domain: Domain) -> Bools:
@@ -357,25 +338,3 @@ def _grouped(group: Ints) -> tuple[Ints, Ints]:
     order = np.argsort(group, kind="stable")
     starts = np.searchsorted(group[order], np.arange(group.max(initial=-1) + 2))
     return starts.astype(np.int32), order.astype(np.int32)
-
-
-def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales) -> ScreenEntries:
-    """The case's screen in lattice units."""
-    segments = len(addressing.length)
-    if case.screen is None:
-        return ScreenEntries(*lattice.no_screen(segments), np.zeros(0, np.int32))
-    spread = on_grid(case.screen, domain.index, domain.origin_mm, domain.cell_size_mm)
-    per_step = scales.step_s / case.blood.density_kg_m3
-    entry = np.column_stack(
-        [
-            spread.normal,
-            spread.along_Pa_s_m2 * per_step,
-            spread.across_Pa_s_m2 * per_step,
-            spread.inertial_per_m * scales.cell_m,
-            spread.spread_Pa_s_m / (case.blood.density_kg_m3 * scales.speed_m_s),
-        ]
-    )
-    segment = np.searchsorted(addressing.first_cell, spread.cell, side="right") - 1
-    start = np.searchsorted(segment, np.arange(segments + 1)).astype(np.int32)
-    place = (spread.cell - addressing.first_cell[segment]).astype(np.int32)
-    return ScreenEntries(start, place, entry.astype(np.float32), spread.cell)

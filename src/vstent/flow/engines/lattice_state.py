@@ -14,16 +14,15 @@ from vstent.flow import domain as domains
 from vstent.flow import sampling
 from vstent.flow.close_up import CloseUp
 from vstent.flow.engines.lattice_scales import ODD_RATE, Scales
+from vstent.flow.engines.lattice_screen import ScreenEntries, build_screen
 from vstent.flow.engines.lattice_setup import (
     Addressing,
     Links,
     Refill,
-    ScreenEntries,
     address,
     build_bands,
     build_links,
     build_refill,
-    build_screen,
     thickest,
 )
 from vstent.flow.gpu import require_gpu, told

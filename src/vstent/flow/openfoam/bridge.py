@@ -111,7 +111,7 @@ def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
     density = case.blood.density_kg_m3
     velocity = results.read_field(folder, time, "U")
     at_rest = np.zeros((sum(across.walls.values()), 3))
-    known = np.concatenate([velocity.inside, at_rest, *(velocity.patches[inlet.role] for inlet in case.vessel.inlets)])
+    known = np.concatenate([velocity.inside, at_rest, *_at_inlets(case, velocity, float(time))])
     pressure_Pa = density * results.read_field(folder, time, "p").inside[:, 0]
     stress = results.read_field(folder, time, "wallShearStress").patches
     # OpenFOAM's is what the wall does to the blood, over density.
@@ -127,3 +127,10 @@ def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
         np.array([folders.flow_mL_s(folder, opening.role, time) for opening in case.vessel.openings]),
         sampling.inflow_mL_s(through_mL_s),
     )
+
+
+def _at_inlets(case: FlowCase, velocity: results.VolumeField, time: float) -> list[Floats]:
+    """Velocity (f, 3) on every inlet's faces: a pulse is written as what its factor multiplies."""
+    factor = float(case.settings.inflow_factor(np.array([time]))[0])
+    multiples = {name: factor * values for name, values in velocity.references.items()}
+    return [(multiples | velocity.patches)[inlet.role] for inlet in case.vessel.inlets]

@@ -64,7 +64,8 @@ def mesh(found: program.Program, folder: Path, setup: FoamSetup) -> None:
         program.run(found, folder, words)
     if setup.processes > 1:
         program.run(found, folder, ["decomposePar", "-force"])
-    program.run(found, folder, ["postProcess", "-func", "writeCellCentres", "-time", "0"], processes=setup.processes)
+    after = "foamPostProcess" if found.flavour == "org" else "postProcess"
+    program.run(found, folder, [after, "-func", "writeCellCentres", "-time", "0"], processes=setup.processes)
     write_text(folder / MESHED, "")
 
 

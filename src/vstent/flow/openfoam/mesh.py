@@ -59,7 +59,7 @@ def block_mesh(vertices_mm: Floats, cell_size_mm: float) -> str:
 def feature_extract(setup: FoamSetup) -> tuple[str, str]:
     """Name and text of the dictionary that finds the rims of the flat ends."""
     if setup.flavour == "org":
-        entries: dict[str, Any] = {"surfaces": [f'"{ENDS}.stl"'], "includedAngle": 150}
+        entries: dict[str, Any] = {"surfaces": [f'"{ENDS}.stl"'], "includedAngle": 150, "geometricTestOnly": True}
         entries["subsetFeatures"] = {"nonManifoldEdges": False, "openEdges": True}
         return "surfaceFeaturesDict", foam_file("surfaceFeaturesDict", entries)
     extract = {"extractionMethod": "extractFromSurface", "includedAngle": 150, "geometricTestOnly": True}
@@ -136,8 +136,7 @@ def _castellated(
         for name, kind in patches.items()
     }
     surfaces: dict[str, Any] = {LUMEN: {"level": level, "regions": regions}}
-    inside: dict[str, Any] = {LUMEN: {"mode": "inside", "levels": [(1e15, BASE_LEVEL)], "level": BASE_LEVEL}}
-    inside |= {_before(name): {"mode": "inside", "levels": [(1e15, n)], "level": n} for name, n in finer.items()}
+    inside = {LUMEN: _inside(setup, BASE_LEVEL)} | {_before(name): _inside(setup, n) for name, n in finer.items()}
     if has_neck and setup.neck_levels:
         reach_m = NECK_REACH * setup.cell_size_mm * M_PER_MM
         inside[NECK] = {"mode": "distance", "levels": [(reach_m, BASE_LEVEL + setup.neck_levels)]}
@@ -158,6 +157,11 @@ def _castellated(
         "insidePoint" if setup.flavour == "org" else "locationInMesh": point,
         "allowFreeStandingZoneFaces": True,
     }
+
+
+def _inside(setup: FoamSetup, level: int) -> dict[str, Any]:
+    """Cells inside a surface halved so many times."""
+    return {"mode": "inside"} | ({"level": level} if setup.flavour == "org" else {"levels": [(1e15, level)]})
 
 
 def _snap() -> dict[str, Any]:

@@ -15,6 +15,8 @@ DEBIAN_FOLDER: Final = Path("/usr/share/openfoam")
 """Where Debian's package keeps the settings its programs look for."""
 INSTALLED: Final = ("/usr/lib/openfoam/openfoam*", "/opt/openfoam*", "/opt/OpenFOAM/OpenFOAM-*")
 """Where the packages of openfoam.com and openfoam.org lie; each has an etc/bashrc."""
+MARKS: Final[dict[str, Flavour]] = {"foamRun": "org", "surfaceFeatureExtract": "com"}
+"""A program of each one's current releases: those of openfoam.org before 11 have neither, and read other settings."""
 INSTALL: Final = "install it (Debian, Ubuntu: sudo apt-get install openfoam), or take the embedded engine"
 
 
@@ -35,26 +37,27 @@ class Program:
 
 
 def find() -> Program:
-    """Find OpenFOAM: on the path, or where its packages install it, the newest first.
+    """Find OpenFOAM: on the path, or where its packages install it, the newest of each kind of package first.
 
     Raises
     ------
     FlowError
         When there is none.
     """
-    if shutil.which("blockMesh"):
-        return Program("org" if shutil.which("foamRun") else "com", None)
+    for mark, flavour in MARKS.items():
+        if shutil.which(mark):
+            return Program(flavour, None)
     for pattern in INSTALLED:
-        for folder in sorted(Path("/").glob(pattern[1:]), reverse=True):
-            if (bashrc := folder / "etc" / "bashrc").exists():
-                return Program("org" if "applications/solvers/foamRun" in _solvers(folder) else "com", bashrc)
+        for folder in sorted(Path("/").glob(pattern[1:]), key=_release, reverse=True):
+            for mark, flavour in MARKS.items():
+                if any(folder.glob(f"platforms/*/bin/{mark}")):
+                    return Program(flavour, folder / "etc" / "bashrc")
     raise FlowError(f"OpenFOAM was not found: {INSTALL}")
 
 
-def _solvers(folder: Path) -> set[str]:
-    return {path.relative_to(folder).as_posix() for path in folder.glob("applications/solvers/*")} | {
-        "applications/solvers/foamRun" for _ in folder.glob("platforms/*/bin/foamRun")
-    }
+def _release(folder: Path) -> int:
+    """Number of a release in its folder's name, 0 where it has none: 13 is after 9."""
+    return int(re.sub(r"\D", "", folder.name) or 0)
 
 
 def run(program: Program, folder: Path, words: list[str], *, processes: int = 1) -> str:
@@ -110,7 +113,9 @@ def cause(said: str, code: int) -> str:
     """
     if code == -9 or "Killed" in said or "bad_alloc" in said:
         return "it was ended for want of memory; take a larger cell size or fewer processes"
-    if fatal := re.search(r"FOAM FATAL(?: IO)? ERROR:?\s*(.*?)(?:\n\s*\n\s*From|\n\nfile:|\Z)", said, re.DOTALL):
+    if fatal := re.search(
+        r"FOAM FATAL(?: IO)? ERROR:?\s*(?:\(openfoam-[^)]*\)\s*)?(.*?)(?:\n\s*\n\s*From|\n\nfile:|\Z)", said, re.DOTALL
+    ):
         return " ".join(fatal[1].split())[:300]
     if "sigFpe" in said or "Floating point exception" in said or code == 136:
         return f"the flow diverged, {_divergence(said)}"
@@ -122,7 +127,7 @@ def _divergence(said: str) -> str:
     courant = [float(number) for number in re.findall(r"Courant Number mean: \S+ max: (\S+)", said)]
     if courant and courant[-1] > 20:
         return f"the time step is too long (Courant number {courant[-1]:.0f}); shorten it or take a smaller cell size"
-    times = re.findall(r"^Time = (\S+)", said, re.MULTILINE)
+    times = re.findall(r"^Time = (\S+?)s?$", said, re.MULTILINE)
     return (
         f"at {times[-1] if times else 'the start'}: a cell of the mesh is too flat or blood rushes back through an "
         "outlet; change the cell size a little, take fewer layers, or lengthen the outlets"

@@ -13,7 +13,8 @@ from vstent.kernels.arrays import Floats
 _LIST: Final = re.compile(r"nonuniform\s+(?:List<(\w+)>\s*)?(\d+)\s*([({])")
 _UNIFORM: Final = re.compile(r"uniform\s+(\([^)]*\)|[^\s;]+)\s*;")
 _PATCH: Final = re.compile(r"^ {4}(\w+)\n {4}\{\n(.*?)^ {4}\}", re.DOTALL | re.MULTILINE)
-_ENTRY: Final = re.compile(r"^\s*value\s+", re.MULTILINE)
+_ENTRY: Final = re.compile(r"^ {8}value\s+", re.MULTILINE)
+_REFERENCE: Final = re.compile(r"^ {8}refValue\n.*?^ {12}value\s+", re.DOTALL | re.MULTILINE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +25,8 @@ class VolumeField:
     """(n, d) in the cells; (1, d) where it is uniform."""
     patches: dict[str, Floats]
     """(f, d) on the faces of every patch that has values; (1, d) where they are uniform."""
+    references: dict[str, Floats]
+    """(f, d) on those whose values are a multiple of others: the others."""
 
 
 def read_field(folder: Path, time: str, name: str) -> VolumeField:
@@ -36,9 +39,17 @@ def read_field(folder: Path, time: str, name: str) -> VolumeField:
     """
     parts = sorted(folder.glob("processor[0-9]*"), key=lambda part: int(part.name[9:])) or [folder]
     fields = [_parsed(part / time / name) for part in parts]
-    names = {patch for field in fields for patch in field.patches}
-    patches = {patch: _joined([f.patches[patch] for f in fields if patch in f.patches]) for patch in names}
-    return VolumeField(np.concatenate([field.inside for field in fields]), patches)
+    return VolumeField(
+        np.concatenate([field.inside for field in fields]),
+        _by_patch([field.patches for field in fields]),
+        _by_patch([field.references for field in fields]),
+    )
+
+
+def _by_patch(parts: list[dict[str, Floats]]) -> dict[str, Floats]:
+    """Values of all processes, by patch."""
+    names = {name for part in parts for name in part}
+    return {name: _joined([part[name] for part in parts if name in part]) for name in names}
 
 
 def _joined(parts: list[Floats]) -> Floats:
@@ -50,14 +61,16 @@ def _parsed(path: Path) -> VolumeField:
     try:
         text = path.read_text()
         inside, _, boundary = text.partition("boundaryField")
-        patches = {
-            name: _values(body[entry.end() :])
-            for name, body in _PATCH.findall(boundary)
-            if (entry := _ENTRY.search(body))
-        }
-        return VolumeField(_values(inside[inside.index("internalField") :]), patches)
+        values = _values(inside[inside.index("internalField") :])
+        return VolumeField(values, _entries(boundary, _ENTRY), _entries(boundary, _REFERENCE))
     except (OSError, ValueError) as error:
         raise ReadError(f"OpenFOAM's field {path} is missing or damaged ({error}): delete its folder's run") from error
+
+
+def _entries(boundary: str, entry: re.Pattern[str]) -> dict[str, Floats]:
+    """Values behind an entry, of the patches that have it."""
+    bodies = _PATCH.findall(boundary)
+    return {name: _values(body[found.end() :]) for name, body in bodies if (found := entry.search(body))}
 
 
 def _values(text: str) -> Floats:

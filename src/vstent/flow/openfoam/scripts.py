@@ -53,6 +53,6 @@ def all_clean() -> str:
     return """\
 #!/bin/sh
 cd "${0%/*}" || exit 1
-rm -rf constant/polyMesh constant/extendedFeatureEdgeMesh constant/triSurface/*.eMesh processor* postProcessing
-rm -rf log.* [1-9]* 0.[0-9]*
+rm -rf constant/polyMesh constant/extendedFeatureEdgeMesh constant/triSurface/*.eMesh constant/geometry/*.eMesh
+rm -rf processor* postProcessing log.* [1-9]* 0.[0-9]*
 """
