@@ -178,7 +178,9 @@ def test_the_newest_release_is_found_and_one_too_old_is_not(
     for name, tool in installed.items():
         place = tmp_path / name / "platforms" / "linux64GccDPInt32Opt" / "bin"
         place.mkdir(parents=True)
-        (place / tool).touch()
+        (place / tool).touch(0o755)
+        (tmp_path / name / "etc").mkdir()
+        (tmp_path / name / "etc" / "bashrc").touch()
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(program, "INSTALLED", (str(tmp_path / "openfoam*"),))
     if found is None:

@@ -11,7 +11,7 @@ import numpy as np
 from vstent.flow import sampling
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.case import FoamCase
-from vstent.flow.openfoam.setup import FoamSetup
+from vstent.flow.openfoam.setup import FEATURES, FoamSetup
 from vstent.flow.types import FlowField
 from vstent.io.writers import write_text
 from vstent.kernels.arrays import Floats
@@ -59,8 +59,12 @@ def mesh(found: program.Program, folder: Path, setup: FoamSetup) -> None:
     """
     if (folder / MESHED).exists():
         return
-    features = "surfaceFeatures" if found.flavour == "org" else "surfaceFeatureExtract"
-    for words in ([features], ["blockMesh"], ["snappyHexMesh", "-overwrite"], ["renumberMesh", "-overwrite"]):
+    for words in (
+        [FEATURES[found.flavour]],
+        ["blockMesh"],
+        ["snappyHexMesh", "-overwrite"],
+        ["renumberMesh", "-overwrite"],
+    ):
         program.run(found, folder, words)
     if setup.processes > 1:
         program.run(found, folder, ["decomposePar", "-force"])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vstent.flow.openfoam.dictionary import foam_file
-from vstent.flow.openfoam.setup import BASE_LEVEL, FoamSetup
+from vstent.flow.openfoam.setup import BASE_LEVEL, FEATURES, FoamSetup
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
@@ -58,14 +58,14 @@ def block_mesh(vertices_mm: Floats, cell_size_mm: float) -> str:
 
 def feature_extract(setup: FoamSetup) -> tuple[str, str]:
     """Name and text of the dictionary that finds the rims of the flat ends."""
+    rims = {"includedAngle": 150, "geometricTestOnly": True}
+    subset = {"subsetFeatures": {"nonManifoldEdges": False, "openEdges": True}}
     if setup.flavour == "org":
-        entries: dict[str, Any] = {"surfaces": [f'"{ENDS}.stl"'], "includedAngle": 150, "geometricTestOnly": True}
-        entries["subsetFeatures"] = {"nonManifoldEdges": False, "openEdges": True}
-        return "surfaceFeaturesDict", foam_file("surfaceFeaturesDict", entries)
-    extract = {"extractionMethod": "extractFromSurface", "includedAngle": 150, "geometricTestOnly": True}
-    subset = {"nonManifoldEdges": False, "openEdges": True}
-    entries = {f"{ENDS}.stl": extract | {"subsetFeatures": subset, "writeObj": False}}
-    return "surfaceFeatureExtractDict", foam_file("surfaceFeatureExtractDict", entries)
+        entries: dict[str, Any] = {"surfaces": [f'"{ENDS}.stl"']} | rims | subset
+    else:
+        entries = {f"{ENDS}.stl": {"extractionMethod": "extractFromSurface"} | rims | subset | {"writeObj": False}}
+    name = f"{FEATURES[setup.flavour]}Dict"
+    return name, foam_file(name, entries)
 
 
 def snappy(

@@ -4,18 +4,19 @@ import os
 import re
 import shutil
 import subprocess
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from vstent.errors import FlowError
-from vstent.flow.openfoam.setup import Flavour
+from vstent.flow.openfoam.setup import FEATURES, Flavour
 
 DEBIAN_FOLDER: Final = Path("/usr/share/openfoam")
 """Where Debian's package keeps the settings its programs look for."""
 INSTALLED: Final = ("/usr/lib/openfoam/openfoam*", "/opt/openfoam*", "/opt/OpenFOAM/OpenFOAM-*")
 """Where the packages of openfoam.com and openfoam.org lie; each has an etc/bashrc."""
-MARKS: Final[dict[str, Flavour]] = {"foamRun": "org", "surfaceFeatureExtract": "com"}
+MARKS: Final[dict[str, Flavour]] = {"foamRun": "org", FEATURES["com"]: "com"}
 """A program of each one's current releases: those of openfoam.org before 11 have neither, and read other settings."""
 INSTALL: Final = "install it (Debian, Ubuntu: sudo apt-get install openfoam), or take the embedded engine"
 
@@ -44,15 +45,20 @@ def find() -> Program:
     FlowError
         When there is none.
     """
-    for mark, flavour in MARKS.items():
-        if shutil.which(mark):
-            return Program(flavour, None)
+    if flavour := _flavour(None):
+        return Program(flavour, None)
     for pattern in INSTALLED:
         for folder in sorted(Path("/").glob(pattern[1:]), key=_release, reverse=True):
-            for mark, flavour in MARKS.items():
-                if any(folder.glob(f"platforms/*/bin/{mark}")):
-                    return Program(flavour, folder / "etc" / "bashrc")
+            flavour, bashrc = _flavour(folder.glob("platforms/*/bin")), folder / "etc" / "bashrc"
+            if flavour and bashrc.exists():
+                return Program(flavour, bashrc)
     raise FlowError(f"OpenFOAM was not found: {INSTALL}")
+
+
+def _flavour(folders: Iterable[Path] | None) -> Flavour | None:
+    """Whose current programs lie in folders, those of the path without any given; None where none do."""
+    path = None if folders is None else os.pathsep.join(map(str, folders))
+    return next((flavour for mark, flavour in MARKS.items() if shutil.which(mark, path=path)), None)
 
 
 def _release(folder: Path) -> int:

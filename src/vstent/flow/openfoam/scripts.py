@@ -1,6 +1,6 @@
 """Shell scripts beside a case: run it here, run it on a cluster, begin again."""
 
-from vstent.flow.openfoam.setup import FoamSetup
+from vstent.flow.openfoam.setup import FEATURES, FoamSetup
 
 _DEBIAN = """\
 # Debian's package has no folder of its own to source; its programs only need to know where their settings lie.
@@ -10,8 +10,7 @@ if [ -z "$WM_PROJECT_DIR" ] && [ -d /usr/share/openfoam/etc ]; then export WM_PR
 
 def all_run(setup: FoamSetup, application: str) -> str:
     """Allrun: mesh once, then compute; given again it goes on from the last time written."""
-    features = "surfaceFeatures" if setup.flavour == "org" else "surfaceFeatureExtract"
-    solve = application
+    features, solve = FEATURES[setup.flavour], application
     before = after = ""
     if setup.processes > 1:
         solve = f"mpirun -np {setup.processes} {application} -parallel"

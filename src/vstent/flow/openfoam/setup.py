@@ -2,12 +2,15 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 from vstent.surface import Surface
 
 Flavour: TypeAlias = Literal["com", "org"]
 """openfoam.com (Debian's 1912 and later) or openfoam.org (11 and later): their dictionaries differ in a few names."""
+
+FEATURES: Final[dict[Flavour, str]] = {"com": "surfaceFeatureExtract", "org": "surfaceFeatures"}
+"""Each one's program that finds sharp rims."""
 
 BASE_LEVEL = 2
 """Times that snappyHexMesh halves the background's cells to the vessel's: the background is this much coarser."""
