@@ -40,7 +40,7 @@ clean:
 	rm -rf $(VENV) demo docs/_build docs/examples docs/generated
 
 # Kernels that a test process compiles itself are other machine code than those kept, so changed ones are compiled before.
-$(VENV)/.ready: pyproject.toml $(wildcard src/vstent/kernels/*.py)
+$(VENV)/.ready: pyproject.toml $(wildcard src/vstent/kernels/*.py src/vstent/flow/lattice/kernels/*.py)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "vstent needs Python 3.11 or newer: install it, then give PYTHON=/path/to/python3"; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' || \
@@ -48,7 +48,7 @@ $(VENV)/.ready: pyproject.toml $(wildcard src/vstent/kernels/*.py)
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable ".[app]"
-	$(BIN)/python -m vstent.kernels.warm
+	$(BIN)/python -m vstent.cli.warm
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready

@@ -20,12 +20,13 @@ from numpy.random import Generator
 
 from vstent import phantoms
 from vstent.cli import main
-from vstent.cohort import Case, collect, find_cases, left_to_do, run_cohort
+from vstent.cohort.batch import collect, left_to_do, run_cohort
+from vstent.cohort.cases import Case, find_cases
 from vstent.cohort.crews import DaskCluster
 from vstent.cohort.work import COST, Row
 from vstent.io.writers import write_stl
 from vstent.phantoms import Phantom
-from vstent.study import Settings
+from vstent.study.types import Settings
 
 SEED = 7
 EDGE_MM = 0.3

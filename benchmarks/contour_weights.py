@@ -10,13 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from vstent import device
-from vstent.deploy import ActiveContour, Zhong2016, deploy
+from vstent.deployment.active_contour import ActiveContour
+from vstent.deployment.deploy import deploy
+from vstent.deployment.measure import measure
+from vstent.deployment.zhong2016 import Zhong2016
+from vstent.devices import design as device
+from vstent.devices.stent import Landing
 from vstent.errors import VstentError
-from vstent.measure import measure
-from vstent.stent import Landing
-from vstent.surface import Surface
-from vstent.vessel import Anatomy
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from tubes import arc, tube

@@ -12,22 +12,22 @@ from typing import Any
 
 import numpy as np
 
-from vstent import device
-from vstent.deploy import METHODS, ConstantWire, deploy, propose_landing
-from vstent.deploy.braid import Profile, bend, march
-from vstent.deploy.method import Placement, run
-from vstent.deploy.sketch import bed, sketch
-from vstent.deploy.wall import AbstractWall, Contact, landing_wall
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.deployment.braid import ConstantWire, Profile, bend, march
+from vstent.deployment.deploy import METHODS, deploy, propose_landing
+from vstent.deployment.measure import measure
+from vstent.deployment.method import Placement, run
+from vstent.deployment.sketch import bed, sketch
+from vstent.deployment.struts import struts
+from vstent.deployment.wall import AbstractWall, Contact, landing_wall
+from vstent.devices import design as device
+from vstent.devices.stent import Landing, Stent
+from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.kernels.arrays import Bools, Floats
-from vstent.measure import measure
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.stent import Landing, Stent
-from vstent.struts import struts
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Anatomy, Vessel
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from brute import BruteWall

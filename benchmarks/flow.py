@@ -19,16 +19,19 @@ import numpy as np
 
 import vstent
 from vstent import phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, Progress, flow_case, indices, simulate, simulate_case
-from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
-from vstent.flow.engines.lattice_state import advance
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.engines import Progress
+from vstent.flow.indices import indices
+from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.state import advance
+from vstent.flow.simulation import flow_case, simulate, simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
+from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Anatomy, Vessel
 
 RADIUS_MM, INFLOW_ML_S, VISCOSITY_PA_S = 2.0, 0.5, 0.004
 STEPS = 20

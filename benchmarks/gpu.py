@@ -12,13 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from vstent import phantoms
+from vstent.anatomy.trace import trace
 from vstent.errors import FlowError
-from vstent.flow import FlowCase, FlowSettings
-from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
-from vstent.flow.engines.lattice_state import State, advance
-from vstent.flow.gpu import gpu_name, require_gpu
-from vstent.trace import trace
-from vstent.vessel import Vessel
+from vstent.flow.case import FlowCase, FlowSettings
+from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.gpu import gpu_name, require_gpu
+from vstent.flow.lattice.state import State, advance
+from vstent.geometry.vessel import Vessel
 
 STEPS, ROUNDS = 200, 5
 BYTES_PER_UPDATE = 19 * 4 * 2
@@ -72,7 +72,7 @@ def difference(case: FlowCase, cell_mm: float) -> float:
 
 
 def _moments(state: State) -> np.ndarray:
-    from vstent.kernels import lattice
+    from vstent.flow.lattice.kernels import d3q19 as lattice
 
     return lattice.moments(state.populations, state.addressing.stride, state.addressing.place)
 

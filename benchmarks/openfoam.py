@@ -18,15 +18,17 @@ from tempfile import TemporaryDirectory
 
 import vstent
 from vstent import phantoms
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
 from vstent.errors import FlowError
-from vstent.flow import FlowCase, FlowSettings, flow_case, indices
+from vstent.flow.case import FlowCase, FlowSettings
 from vstent.flow.engines import run
-from vstent.flow.engines.openfoam import OpenFoam
+from vstent.flow.indices import indices
 from vstent.flow.openfoam import program
-from vstent.restore import restore
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Vessel
+from vstent.flow.openfoam.engine import OpenFoam
+from vstent.flow.simulation import flow_case
+from vstent.geometry.vessel import Vessel
 
 
 def row(name: str, case: FlowCase, cell_size_mm: float, processes: int, folder: Path) -> float:

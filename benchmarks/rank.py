@@ -8,14 +8,14 @@ import time
 from pathlib import Path
 
 from vstent import phantoms
-from vstent.device import find_design
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.devices.design import find_design
+from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
-from vstent.rank import rank
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Anatomy, Vessel
+from vstent.plan.rank import rank
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "aneurisk_C0038.vtp"
 DEVICES = ("silk", "pipeline", "enterprise")

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from vstent.image import Image
+from vstent.anatomy.repair import repair
+from vstent.anatomy.segment import segment
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
 from vstent.io.images import read_image
 from vstent.phantoms import Phantom, Scanner, phantom_surface, scan, siphon, torus_arc, tube
-from vstent.repair import repair
-from vstent.segment import segment
-from vstent.surface import Surface
 
 
 def seconds(function, *arguments: object) -> tuple[float, object]:  # noqa: ANN001

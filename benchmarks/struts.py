@@ -6,11 +6,11 @@ Usage: python benchmarks/struts.py [--vessel demo|arc] [--cell MM] [--foam-cell 
 The demo's artery, or an arc of one with a sac at its side, cut to 9 mm on either side of the sac, is computed twice
 with every device: by the embedded engine with the device as a screen, and by OpenFOAM with its struts meshed, at least
 so many cells across each, without layers along walls (on wires so fine they do not come to an end). Both have only the
-part of the device that OpenFOAM meshes (see `vstent.struts.over_restored`); what the whole screen does, with what lies
-on the artery's wall, is kept besides. The two engines differ in the bare vessel already: what a device leaves of each
-engine's own bare value stands beside. `alignment` is the correlation of the two velocity fields in the sac, 1 where
-they are alike but for their size. A row is kept for every device in every vessel; other rows stay as they are. With
---cases, OpenFOAM's cases stay in that folder, by vessel and device, and one that is there already is gone on with.
+part of the device that OpenFOAM meshes (`vstent.deployment.struts.over_restored`); what the whole screen does, with
+what lies on the artery's wall, is kept besides. The two engines differ in the bare vessel already: what a device
+leaves of each engine's own bare value stands beside. `alignment` is the correlation of the two velocity fields in the
+sac, 1 where they are alike but for their size. A row is kept for every device in every vessel; other rows stay as they
+are. With --cases, OpenFOAM's cases stay in that folder, by vessel and device, and one that is there already is gone on with.
 """
 
 import argparse
@@ -25,19 +25,21 @@ import numpy as np
 
 import vstent
 from vstent import phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, flow_case, indices, sampling, simulate_case
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.deployment.struts import is_over_restored
+from vstent.devices.stent import Stent
+from vstent.flow import sampling
+from vstent.flow.case import OPENFOAM, FlowCase, FlowField, FlowSettings, Screen
 from vstent.flow.engines import run
-from vstent.flow.engines.openfoam import OpenFoam
+from vstent.flow.indices import indices
 from vstent.flow.openfoam import setup
-from vstent.flow.types import OPENFOAM
+from vstent.flow.openfoam.engine import OpenFoam
+from vstent.flow.simulation import flow_case, simulate_case
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.phantoms import Phantom
-from vstent.restore import restore
-from vstent.stent import Stent
-from vstent.struts import is_over_restored
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Anatomy, Vessel
 
 TABLE = Path(__file__).with_suffix(".json")
 KEPT_MM = 9.0

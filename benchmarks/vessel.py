@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 
 from vstent import phantoms
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.segment import segment
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.deployment.measure import morphology
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Vessel
 from vstent.io.surfaces import read_surface
-from vstent.measure import morphology
 from vstent.phantoms import Scanner
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.segment import segment
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Vessel
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from sac_truth import (

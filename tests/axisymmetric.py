@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from vstent.flow import Blood
+from vstent.flow.case import Blood
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.dictionary import foam_file
 from vstent.io.writers import write_text

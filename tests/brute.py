@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vstent.deploy.wall import AbstractWall, Contact
+from vstent.deployment.wall import AbstractWall, Contact
 
 
 class BruteWall(AbstractWall):

@@ -26,12 +26,12 @@ import SimpleITK
 
 from vstent import phantoms
 from vstent.cli import main
-from vstent.image import Image
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.polydata import polydata_of
 from vstent.io.writers import write_stl, write_surface
 from vstent.study.folder import claimed
-from vstent.surface import Surface
 
 INPUT, FAILED, DONE = 2, 1, 0
 """Exit codes: what was given cannot be used; the machine did not allow it; done (what was wrong is mended and said)."""
@@ -380,7 +380,7 @@ def full_disk(_: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def no_gpu(_: Path) -> Iterator[None]:
     """Hide what it takes to use a GPU, where it is installed."""
-    with mock.patch("vstent.flow.gpu.find_spec", return_value=None):
+    with mock.patch("vstent.flow.lattice.gpu.find_spec", return_value=None):
         yield
 
 

@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from vstent.device import find_design
-from vstent.flow.types import Blood, FlowField
-from vstent.report.page import as_html, contents_of
-from vstent.report.scene import scene_of
-from vstent.stent import Deployment, Stent, tube_faces
-from vstent.surface import Surface
-from vstent.vessel import Anatomy, Aneurysm, Centerline, Opening, Vessel
+from vstent.devices.design import find_design
+from vstent.devices.stent import Deployment, Stent, tube_faces
+from vstent.flow.case import Blood, FlowField
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Opening, Vessel
+from vstent.reporting.page import as_html, contents_of
+from vstent.reporting.scene import scene_of
 
 BEND_MM, RADIUS_MM, SAC_MM = 9.0, 2.0, 3.0
 ANGLES = np.linspace(0.15, np.pi - 0.15, 90)

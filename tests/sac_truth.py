@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from vstent import phantoms
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.segment import segment
+from vstent.anatomy.trace import trace
+from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.kernels import curves
 from vstent.phantoms import Phantom, Scanner, torus_arc, tube, with_bleb, with_branch, with_sac
-from vstent.restore import restore
-from vstent.segment import segment
-from vstent.trace import trace
-from vstent.vessel import Anatomy, Vessel
 
 
 def _inside(angle_rad: float) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vstent.surface import Surface
+from vstent.geometry.surface import Surface
 
 
 def sphere(radius: float, rings: int = 24, sectors: int = 48) -> Surface:

@@ -22,23 +22,23 @@ from vstent.app.cases import STEPS, Store, load
 from vstent.app.desk import Desk
 from vstent.app.finished import kept_flows
 from vstent.cli import main
-from vstent.deploy import deploy
-from vstent.device import find_design
+from vstent.deployment.deploy import deploy
+from vstent.deployment.measure import measure
+from vstent.devices.design import find_design
+from vstent.devices.stent import Landing
 from vstent.errors import ReadError
-from vstent.flow import FlowSettings
-from vstent.flow.types import Blood, CarreauYasuda, Phase, Waveform
+from vstent.flow.case import Blood, CarreauYasuda, FlowSettings, Phase, Waveform
+from vstent.geometry.vessel import Anatomy
 from vstent.io.archive import load_noun
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
 from vstent.io.writers import write_stl
-from vstent.measure import measure
-from vstent.stent import Landing
-from vstent.study import CACHE, Settings
+from vstent.plan.uncertainty import Ranges
+from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger
 from vstent.study.repeat import settings_of
 from vstent.study.stages import flow_key
-from vstent.uncertainty import Ranges
-from vstent.vessel import Anatomy
+from vstent.study.types import Settings
 
 SILK = {"name": "silk"}
 
@@ -498,7 +498,7 @@ def test_slices_hold_the_scans_voxels_and_the_live_surface_is_its_wall(tmp_path)
 
 
 def vstent_image(voxels):
-    from vstent.image import Image
+    from vstent.geometry.image import Image
 
     return Image(voxels.astype(np.int16), np.diag([0.4, 0.4, 0.4, 1.0]), "XA")
 
@@ -562,7 +562,7 @@ def test_uncertainty_is_told_in_the_order_of_the_devices_with_its_causes():
 def test_the_first_page_waits_for_nothing_that_only_results_need():
     code = (
         "import sys; from vstent.app import server; [server.asset(name) for name in server.ASSETS]; "
-        "print(sorted({'vstent.report', 'vstent.study', 'vstent.flow'} & set(sys.modules)))"
+        "print(sorted({'vstent.reporting.page', 'vstent.study', 'vstent.flow'} & set(sys.modules)))"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"

@@ -17,7 +17,7 @@ import pytest
 import app_case
 from vstent import phantoms
 from vstent.io.writers import write_stl
-from vstent.study import CACHE
+from vstent.study.folder import CACHE
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: no test in a real browser")

@@ -8,9 +8,9 @@ import report_case
 from vstent.app import necks
 from vstent.app.cases import State, dependencies
 from vstent.app.choices import NECK_HANDLES, Choices
-from vstent.measure import morphology
-from vstent.study import Settings
-from vstent.uncertainty import Ranges
+from vstent.deployment.measure import morphology
+from vstent.plan.uncertainty import Ranges
+from vstent.study.types import Settings
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 
 import app_case
 from vstent.app import intake, security
-from vstent.image import Image
+from vstent.geometry.image import Image
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
 

@@ -17,12 +17,12 @@ from vstent import phantoms
 from vstent.cli import main, rank
 from vstent.cli import run as cli_run
 from vstent.errors import InputError
-from vstent.flow import FlowSettings
+from vstent.flow.case import FlowSettings
+from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
-from vstent.study import CACHE
+from vstent.study.folder import CACHE
 from vstent.study.stages import check_inflow
-from vstent.surface import Surface
 
 
 @pytest.fixture

@@ -11,11 +11,12 @@ from shapes import sphere
 from vstent import phantoms
 from vstent.cli import main
 from vstent.flow.openfoam.dictionary import parse
+from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.io.vtk_child import read_apart
 from vstent.io.writers import write_stl
-from vstent.study import Settings, run
-from vstent.surface import Surface
+from vstent.study.pipeline import run
+from vstent.study.types import Settings
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,8 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 from vstent import phantoms
 from vstent.cli import main, options
 from vstent.errors import FlowError
-from vstent.flow import Blood, FlowCase
-from vstent.flow.engines.openfoam import OpenFoam
-from vstent.flow.types import CarreauYasuda
+from vstent.flow.case import Blood, CarreauYasuda, FlowCase
+from vstent.flow.openfoam.engine import OpenFoam
 from vstent.io.writers import write_stl
 
 RADIUS_MM, LENGTH_MM, INFLOW_ML_S = 2.0, 16.0, 0.8

@@ -50,7 +50,7 @@ def _interrupted(package: str, done: list[str]) -> Callable[[object], int]:
         ("importlib._bootstrap", ["inner"]),
         ("numba.cuda.cudadrv.driver", []),
         ("numbat", []),
-        ("vstent.trace", []),
+        ("vstent.anatomy.trace", []),
     ],
 )
 def test_ctrl_c_waits_for_code_that_cannot_bear_it(

@@ -19,26 +19,17 @@ import pytest
 
 from vstent import phantoms
 from vstent.cli import main
-from vstent.cohort import (
-    LOST,
-    DaskCluster,
-    Processes,
-    Slurm,
-    collect,
-    estimate,
-    find_cases,
-    left_to_do,
-    run_cohort,
-)
-from vstent.cohort.estimate import START_CPU_S
-from vstent.cohort.work import COST, flat_metrics, read_row, row_path, work
+from vstent.cohort.batch import collect, left_to_do, run_cohort
+from vstent.cohort.cases import find_cases
+from vstent.cohort.crews import DaskCluster, Processes, Slurm
+from vstent.cohort.estimate import START_CPU_S, estimate
+from vstent.cohort.work import COST, LOST, flat_metrics, read_row, row_path, work
 from vstent.errors import FlowError, InputError, ReadError, VstentError
 from vstent.io.tables import write_parquet
 from vstent.io.writers import write_stl
-from vstent.report import cohort_report
-from vstent.report.cohort import modified_z_scores
-from vstent.study import Settings
-from vstent.study import run as run_study
+from vstent.reporting.cohort import cohort_report, modified_z_scores
+from vstent.study.pipeline import run as run_study
+from vstent.study.types import Settings
 
 SETTINGS = Settings(devices=("silk", "enterprise"), flow=None, units="mm")
 
@@ -118,7 +109,7 @@ def test_a_device_whose_flow_fails_leaves_the_files_of_the_others(scans, tmp_pat
             raise FlowError("it diverged")
         return {}
 
-    monkeypatch.setattr("vstent.study.compute_flows", failing)
+    monkeypatch.setattr("vstent.study.pipeline.compute_flows", failing)
     (case, *_) = find_cases(scans, SETTINGS)
     (task,) = left_to_do([case], tmp_path, keeps_files=True)
     work(task)

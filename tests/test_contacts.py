@@ -7,11 +7,11 @@ import pytest
 
 from told import place_in
 from vstent import phantoms
+from vstent.anatomy.segment import segment
+from vstent.anatomy.trace import trace
+from vstent.geometry.vessel import Centerline, Vessel
 from vstent.kernels import curves
 from vstent.phantoms import Phantom, Scanner
-from vstent.segment import segment
-from vstent.trace import trace
-from vstent.vessel import Centerline, Vessel
 
 
 def loop(overlap_mm: float) -> Phantom:

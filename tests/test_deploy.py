@@ -9,27 +9,19 @@ import pytest
 from scipy.optimize import brentq
 
 from tubes import arc, line, tube, with_neck
-from vstent import device
-from vstent.deploy import (
-    ActiveContour,
-    ConstantWire,
-    cells,
-    contour,
-    deploy,
-    pieces,
-    propose_landing,
-    propose_size,
-    sizing,
-)
-from vstent.deploy.braid import Profile, expected_profile, march
-from vstent.deploy.method import SPARE_MM, check_inside, laid_inside
-from vstent.deploy.sketch import bed, sketch
+from vstent.deployment import cells, contour, pieces, sizing
+from vstent.deployment.active_contour import ActiveContour
+from vstent.deployment.braid import ConstantWire, Profile, expected_profile, march
+from vstent.deployment.deploy import deploy, propose_landing, propose_size
+from vstent.deployment.measure import coverage_fractions, measure, quad_areas_mm2
+from vstent.deployment.method import SPARE_MM, check_inside, laid_inside
+from vstent.deployment.sketch import bed, sketch
+from vstent.devices import design as device
+from vstent.devices.stent import Landing
 from vstent.errors import LandingError
-from vstent.measure import coverage_fractions, measure, quad_areas_mm2
-from vstent.rank import rank
-from vstent.stent import Landing
-from vstent.surface import Surface
-from vstent.vessel import Centerline
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Centerline
+from vstent.plan.rank import rank
 
 SILK, ENTERPRISE = device.find_design("silk"), device.find_design("enterprise")
 SILK_SIZE = device.find_size(SILK, diameter_mm=4, length_mm=15)

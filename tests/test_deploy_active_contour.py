@@ -10,10 +10,10 @@ import pytest
 
 from brute import BruteWall
 from tubes import arc, line, tube
-from vstent.deploy import contour
-from vstent.deploy.active_contour import ActiveContour, State, Stiffness
-from vstent.deploy.method import AbstractMethod, Opened, run
-from vstent.deploy.wall import TreeWall
+from vstent.deployment import contour
+from vstent.deployment.active_contour import ActiveContour, State, Stiffness
+from vstent.deployment.method import AbstractMethod, Opened, run
+from vstent.deployment.wall import TreeWall
 from vstent.errors import InputError
 from vstent.kernels import triangles
 
@@ -194,7 +194,8 @@ def test_weights_that_blow_up_are_refused(artery):
 def test_the_energy_wakes_no_threads_whose_number_would_change_its_last_bits():
     """They would spin beside the threads that ask the wall, too."""
     work = (
-        "import numpy as np; from types import SimpleNamespace as S; from vstent.deploy import ActiveContour;"
+        "import numpy as np; from types import SimpleNamespace as S;"
+        "from vstent.deployment.active_contour import ActiveContour;"
         "r = np.random.default_rng(0);"
         "s = S(nodes_mm=r.normal(size=(400, 48, 3)), contact=S(distance_mm=np.zeros(1)));"
         "print(ActiveContour(a1=1, a2=0, a3=0, a4=0, a5=0).energy_mm2(s).hex())"

@@ -7,11 +7,12 @@ import pytest
 from scipy.optimize import minimize
 
 from tubes import arc, line, tube
-from vstent import device
-from vstent.deploy import cells, deploy, pieces
-from vstent.deploy.sketch import bed, sketch
-from vstent.device import grid, row_spacing_mm
-from vstent.measure import measure, wire_stretches
+from vstent.deployment import cells, pieces
+from vstent.deployment.deploy import deploy
+from vstent.deployment.measure import measure, wire_stretches
+from vstent.deployment.sketch import bed, sketch
+from vstent.devices import design as device
+from vstent.devices.design import grid, row_spacing_mm
 
 ENTERPRISE = device.find_design("enterprise")
 SIZE = device.find_size(ENTERPRISE, diameter_mm=4.5, length_mm=22)
@@ -129,7 +130,7 @@ def test_the_slopes_are_those_of_the_residuals(monkeypatch):
 
 def test_a_sketch_lifts_the_same_cells():
     ready = bed(ENTERPRISE, SIZE, bend())
-    from vstent.deploy import propose_landing
+    from vstent.deployment.deploy import propose_landing
 
     drawn = sketch(ready, propose_landing(ENTERPRISE, bend(), SIZE))
     assert drawn.gap_mm == pytest.approx(deployed().wall_gap_mm, abs=0.05)

@@ -7,22 +7,25 @@ import numpy as np
 import pytest
 
 from tubes import arc, line, tube
-from vstent import device
-from vstent.deploy import ActiveContour, ConstantWire, Zhong2016, deploy
-from vstent.deploy.contour import perimeters
-from vstent.deploy.wall import inner_face
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.segment import segment
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.deployment.active_contour import ActiveContour
+from vstent.deployment.braid import ConstantWire
+from vstent.deployment.contour import perimeters
+from vstent.deployment.deploy import deploy
+from vstent.deployment.measure import measure, wire_stretches
+from vstent.deployment.wall import inner_face
+from vstent.deployment.zhong2016 import Zhong2016
+from vstent.devices import design as device
+from vstent.devices.stent import Landing
 from vstent.errors import DeviceError, InputError, LandingError
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Centerline, Vessel
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
-from vstent.measure import measure, wire_stretches
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.segment import segment
-from vstent.stent import Landing
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Centerline, Vessel
 
 SILK, ENTERPRISE = device.find_design("silk"), device.find_design("enterprise")
 SIZE = device.find_size(SILK, diameter_mm=4, length_mm=15)

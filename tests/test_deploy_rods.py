@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tubes import arc, line, tube
-from vstent import device
-from vstent.deploy import deploy
-from vstent.stent import Landing
+from vstent.deployment.deploy import deploy
+from vstent.devices import design as device
+from vstent.devices.stent import Landing
 
 RODS = json.loads((Path(__file__).parent / "data" / "braid_rods.json").read_text())
 BRAID = device.Braid("reduced", "Reduced Silk", ((24, 50.0),), 1.152, (device.Size(4.0, 10.0, 4.2),))

@@ -4,9 +4,10 @@ import sys
 import numpy as np
 import pytest
 
-from vstent import device, device_schema
 from vstent.cli import main
-from vstent.device import Braid, LaserCut, Size
+from vstent.devices import design as device
+from vstent.devices import schema as device_schema
+from vstent.devices.design import Braid, LaserCut, Size
 from vstent.errors import DeviceError
 
 
@@ -157,7 +158,7 @@ def test_one_key_for_two_devices_is_refused():
 
 
 def test_importing_devices_does_not_load_pydantic():
-    code = "import sys, vstent.device; sys.exit('pydantic' in sys.modules)"
+    code = "import sys, vstent.devices.design; sys.exit('pydantic' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -9,7 +9,8 @@ import pytest
 
 from faults import DONE, FAULTS, Fault, artery, play
 from vstent.io.writers import write_stl
-from vstent.study import Settings, run
+from vstent.study.pipeline import run
+from vstent.study.types import Settings
 
 KEPT = {"disk full", "kept stages that unpack to 16 GB"}
 """Faults after which the case folder holds what was finished before."""

@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 
 from axisymmetric import axial_speed
-from vstent.flow import Blood, FlowCase, FlowField, FlowSettings, sampling, simulate_case
-from vstent.surface import Surface
-from vstent.vessel import Opening, Vessel
+from vstent.flow import sampling
+from vstent.flow.case import Blood, FlowCase, FlowField, FlowSettings
+from vstent.flow.simulation import simulate_case
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Opening, Vessel
 
 BLOOD = Blood(density_kg_m3=1056.0, viscosity_Pa_s=0.0035)
 INFLOW_ML_S = 5.20624

@@ -9,8 +9,8 @@ import threading
 import pytest
 from numba import njit
 
-from vstent import kernels
-from vstent.kernels import first_use, warm
+from vstent.cli import warm
+from vstent.kernels import cache
 from vstent.kernels.first_use import kept, telling
 
 
@@ -34,10 +34,10 @@ def test_a_helper_begins_with_the_first_compilation_and_ends_with_the_work(monke
     def half(x):
         return x / 2
 
-    monkeypatch.setattr(first_use, "HELP", (sys.executable, "-c", "import time; time.sleep(60)"))
+    helper = sys.executable, "-c", "import time; time.sleep(60)"
     started, begin = [], subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: started.append(begin(*a, **k)) or started[-1])
-    with telling(lambda: None, helped=True):
+    with telling(lambda: None, helper=helper):
         assert started == []
         half(1)
         half(1.0)
@@ -91,7 +91,7 @@ def test_while_one_thread_takes_kernels_from_the_cache_others_may_compile():
 def test_after_a_bare_installation_the_first_flow_has_the_bits_of_all_later_ones(tmp_path):
     work = (
         "from vstent import phantoms; from vstent.flow import FlowCase, FlowSettings, simulate_case;"
-        "from vstent.trace import trace; from vstent.vessel import Vessel; import hashlib;"
+        "from vstent.anatomy.trace import trace; from vstent.geometry.vessel import Vessel; import hashlib;"
         "v = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.5)));"
         "s = FlowSettings(inflow_mL_s=1.0, cell_size_mm=0.4, max_steps=200);"
         "print(hashlib.sha256(simulate_case(FlowCase(v, settings=s)).velocity_m_s.tobytes()).hexdigest())"
@@ -104,10 +104,10 @@ def test_after_a_bare_installation_the_first_flow_has_the_bits_of_all_later_ones
 
 def test_the_set_up_compiles_every_kernel_of_a_deployment():
     from tubes import line, tube
-    from vstent import device
-    from vstent.deploy import deploy
-    from vstent.measure import measure
-    from vstent.stent import Landing
+    from vstent.deployment.deploy import deploy
+    from vstent.deployment.measure import measure
+    from vstent.devices import design as device
+    from vstent.devices.stent import Landing
 
     warm.warm()
     said = []
@@ -120,10 +120,11 @@ def test_the_set_up_compiles_every_kernel_of_a_deployment():
 
 def test_the_set_up_compiles_what_takes_a_flows_time_so_that_all_processes_run_the_same_code():
     from vstent import phantoms
-    from vstent.flow import FlowCase, FlowSettings, simulate_case
-    from vstent.kernels import lattice
-    from vstent.trace import trace
-    from vstent.vessel import Vessel
+    from vstent.anatomy.trace import trace
+    from vstent.flow.case import FlowCase, FlowSettings
+    from vstent.flow.lattice.kernels import d3q19 as lattice
+    from vstent.flow.simulation import simulate_case
+    from vstent.geometry.vessel import Vessel
 
     warm.warm()
     kernels = lattice.update, lattice.defer
@@ -142,7 +143,8 @@ def test_a_kernel_is_compiled_anew_when_a_function_in_another_file_that_it_calls
         "from inner import part\nfrom numba import njit\n\n@njit(cache=True)\ndef whole():\n    return part()\n"
     )
     call = (
-        f"import vstent.kernels as k; k._forget_outdated(k.Path({str(package)!r})); import outer; print(outer.whole())"
+        f"from vstent.kernels import cache as k; k.forget_outdated(k.Path({str(package)!r}));"
+        "import outer; print(outer.whole())"
     )
     own = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     answers = []
@@ -163,6 +165,6 @@ def test_a_kernel_is_compiled_anew_when_a_function_in_another_file_that_it_calls
 def test_where_no_cache_can_be_written_kernels_are_kept_with_temporary_files(monkeypatch, writable, is_moved):
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr(os, "access", lambda path, mode: writable)
-    kernels._keep_compiled()
+    cache.choose_folder()
     assert ("NUMBA_CACHE_DIR" in os.environ) == is_moved
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)

@@ -9,20 +9,23 @@ import numpy as np
 import pytest
 
 from shapes import sphere
-from vstent import flow, phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, domain, sampling, simulate_case
-from vstent.flow.close_up import close_up
+from vstent import phantoms
+from vstent.anatomy.openings import open_ends
+from vstent.anatomy.trace import trace
+from vstent.flow import domain, sampling
+from vstent.flow import simulation as flow
+from vstent.flow.case import FlowCase, FlowField, FlowSettings, Screen
 from vstent.flow.engines import AbstractEngine, Outcome, run
-from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
-from vstent.flow.engines.lattice_reading import read
-from vstent.flow.engines.lattice_settling import SURE, mean_of, swings, with_check
-from vstent.flow.engines.lattice_state import State
-from vstent.kernels import lattice
+from vstent.flow.lattice.close_up import close_up
+from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.reading import read
+from vstent.flow.lattice.settling import SURE, mean_of, swings, with_check
+from vstent.flow.lattice.state import State
+from vstent.flow.simulation import simulate_case
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
-from vstent.openings import open_ends
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.vessel import Vessel
 
 RADIUS_MM, LENGTH_MM, INFLOW_ML_S = 2.0, 14.0, 3.0
 SETTINGS = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.2, tolerance=0.002)

@@ -12,13 +12,14 @@ import pytest
 
 from shapes import sphere
 from vstent import phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, engines, simulate_case
-from vstent.flow.engines import lattice_state
-from vstent.flow.types import Waveform
+from vstent.anatomy.trace import trace
+from vstent.flow import engines
+from vstent.flow.case import FlowCase, FlowField, FlowSettings, Screen, Waveform
+from vstent.flow.lattice import state as lattice_state
+from vstent.flow.simulation import simulate_case
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Vessel
 from vstent.study.checkpoint import FlowCheckpoint
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.vessel import Vessel
 
 SETTINGS = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.3, max_steps=800)
 PULSE = FlowSettings(

@@ -11,25 +11,28 @@ from scipy.spatial import cKDTree
 
 from shapes import sphere
 from tubes import arc, line, tube
-from vstent import flow, phantoms
+from vstent import phantoms
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
 from vstent.errors import FlowError, InputError
-from vstent.flow import FlowCase, FlowField, FlowSettings, Screen, domain, flow_case, indices, simulate_case
-from vstent.flow import close_up as close_ups
-from vstent.flow.cost import estimate
+from vstent.flow import domain
+from vstent.flow import simulation as flow
+from vstent.flow.case import OPENFOAM, FlowCase, FlowField, FlowSettings, Screen, Swing
 from vstent.flow.engines import AbstractEngine, run
-from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
-from vstent.flow.engines.lattice_pace import peak_speed_m_s
-from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
-from vstent.flow.engines.lattice_setup import thickest
-from vstent.flow.engines.lattice_state import build, imposed, take_pace
-from vstent.flow.types import OPENFOAM, Swing
+from vstent.flow.indices import indices
+from vstent.flow.lattice import close_up as close_ups
+from vstent.flow.lattice.cost import estimate
+from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.pace import peak_speed_m_s
+from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
+from vstent.flow.lattice.setup import thickest
+from vstent.flow.lattice.state import build, imposed, take_pace
+from vstent.flow.simulation import flow_case, simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
-from vstent.kernels import lattice
-from vstent.restore import restore
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Anatomy, Vessel
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Vessel
 from womersley import MEAN_MEAN_M_S, PULSE, RADIUS_M, womersley_m_s
 
 RADIUS_MM, INFLOW_ML_S = 2.0, 1.0

@@ -8,14 +8,15 @@ import pytest
 from shapes import sphere
 from tubes import line, tube
 from vstent.errors import FlowError
-from vstent.flow import FlowCase, FlowSettings, domain, simulate_case
-from vstent.flow.cost import MOST_CELLS, block_rate, estimate, free_memory_bytes, refuse_too_large
+from vstent.flow import domain
+from vstent.flow.case import PHASES, FlowCase, FlowSettings
 from vstent.flow.engines import DivergenceError
-from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
-from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
-from vstent.flow.types import PHASES
+from vstent.flow.lattice.cost import MOST_CELLS, block_rate, estimate, free_memory_bytes, refuse_too_large
+from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
+from vstent.flow.simulation import simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
-from vstent.surface import Surface
+from vstent.geometry.surface import Surface
 
 SETTINGS = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.2)
 
@@ -98,7 +99,7 @@ def test_a_guess_that_diverges_is_done_without(monkeypatch):
     monkeypatch.setattr(LatticeBoltzmann, "coarsening", None)
     wanted = simulate_case(case)
     monkeypatch.setattr(LatticeBoltzmann, "coarsening", 1.5)
-    monkeypatch.setattr("vstent.flow.MIN_CELLS", 100)
+    monkeypatch.setattr("vstent.flow.simulation.MIN_CELLS", 100)
     monkeypatch.setattr("vstent.flow.domain.MIN_CELLS", 100)
     tried = []
     real = LatticeBoltzmann.init
@@ -129,7 +130,7 @@ def test_a_guess_whose_grid_is_too_coarse_is_done_without(monkeypatch):
         return real(engine, case, start)
 
     monkeypatch.setattr(LatticeBoltzmann, "init", told)
-    monkeypatch.setattr("vstent.flow.MIN_CELLS", 500)
+    monkeypatch.setattr("vstent.flow.simulation.MIN_CELLS", 500)
     with pytest.raises(domain.CoarseGridError):
         domain.build(vessel, 0.44)
     assert simulate_case(case).cell_size_mm == 0.11
@@ -152,7 +153,7 @@ def test_what_diverges_after_it_was_resumed_begins_anew_from_the_guess(monkeypat
         def save(self, run, saved):
             pass
 
-    monkeypatch.setattr("vstent.flow.run", stub)
+    monkeypatch.setattr("vstent.flow.simulation.run", stub)
     assert simulate_case(case, checkpoint=Kept()) == "cells of 0.1 mm"
     speed = case.settings.lattice_speed
     assert tried == [(0.1, speed, None), (0.2, speed, None), (0.1, 0.5 * speed, "cells of 0.2 mm")]

@@ -14,17 +14,19 @@ import pytest
 from tubes import line, tube
 from vstent.cli import main
 from vstent.errors import FlowError, InputError
-from vstent.flow import Blood, FlowCase, FlowSettings, Screen, domain, engine_class, foretell_cost, simulate_case
-from vstent.flow import gpu as gpus
-from vstent.flow.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
-from vstent.flow.engines import lattice_state
-from vstent.flow.engines.lattice_checkpoint import pack
-from vstent.flow.engines.lattice_pulse import PulsatileLatticeBoltzmann
-from vstent.flow.engines.lattice_setup import build_bands
-from vstent.flow.types import CarreauYasuda, Waveform
-from vstent.kernels import lattice
-from vstent.study import Settings, repeat
+from vstent.flow import domain
+from vstent.flow.case import Blood, CarreauYasuda, FlowCase, FlowSettings, Screen, Waveform
+from vstent.flow.lattice import gpu as gpus
+from vstent.flow.lattice import state as lattice_state
+from vstent.flow.lattice.checkpoint import pack
+from vstent.flow.lattice.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
+from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
+from vstent.flow.lattice.setup import build_bands
+from vstent.flow.simulation import engine_class, foretell_cost, simulate_case
+from vstent.study import repeat
 from vstent.study.provenance import machine, provenance
+from vstent.study.types import Settings
 
 CELL_MM, RADIUS_MM, LENGTH_MM = 0.4, 0.8, 2.4
 SETTLED_PAIRS = 3 * lattice_state.DEFER_PAIRS
@@ -37,11 +39,11 @@ import pickle, sys
 from dataclasses import replace
 from pathlib import Path
 import numpy as np
-from vstent.flow.engines.lattice_checkpoint import pack
-from vstent.flow.engines.lattice_state import _read_here, advance, step
+from vstent.flow.lattice.checkpoint import pack
+from vstent.flow.lattice.state import _read_here, advance, step
 
 state = pickle.loads(Path(sys.argv[1]).read_bytes())
-assert "vstent.kernels.lattice_gpu" not in sys.modules  # who did not ask for a GPU does not load what it takes
+assert "vstent.flow.lattice.kernels.gpu" not in sys.modules  # who did not ask for a GPU does not load what it takes
 state.case = replace(state.case, settings=replace(state.case.settings, device_gpu=True))
 step(state)
 saved = pack(state)

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from shapes import sphere
-from vstent.flow import Blood, FlowField, compare, indices
-from vstent.flow.indices import NEAR_MM
-from vstent.flow.types import Phase, Swing
+from vstent.flow.case import Blood, FlowField, Phase, Swing
+from vstent.flow.indices import NEAR_MM, compare, indices
+from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats
-from vstent.surface import Surface
 
 CELL_MM, HALF_MM, SAC_RADIUS_MM = 0.25, 5.0, 2.0
 NECK_HALF_MM = 4.0

@@ -10,10 +10,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from tubes import arc, line, tube
-from vstent import device
-from vstent.deploy import deploy
+from vstent.deployment.deploy import deploy
+from vstent.devices import design as device
+from vstent.devices.stent import Stent
 from vstent.errors import FlowError
-from vstent.flow import Blood, FlowCase, FlowSettings, domain, screen
+from vstent.flow import domain
+from vstent.flow.case import Blood, CarreauYasuda, FlowCase, FlowSettings
 from vstent.flow.drag import (
     BREADTH,
     CROSSING_PER_SOLIDITY,
@@ -28,16 +30,15 @@ from vstent.flow.drag import (
     tangential_share,
 )
 from vstent.flow.engines import AbstractEngine, run
-from vstent.flow.engines.lattice_scales import Scales
-from vstent.flow.engines.lattice_screen import on_grid
-from vstent.flow.engines.lattice_settling import field_left, fraction_left, mean_of, standard_error, swings, with_check
-from vstent.flow.engines.lattice_state import Snapshot
+from vstent.flow.lattice.scales import Scales
+from vstent.flow.lattice.screen import on_grid
+from vstent.flow.lattice.settling import field_left, fraction_left, mean_of, standard_error, swings, with_check
+from vstent.flow.lattice.state import Snapshot
 from vstent.flow.profile import developed_profile
-from vstent.flow.types import CarreauYasuda
+from vstent.flow.screen import screen
 from vstent.flow.wall_stress import mean_shear_Pa, wall_stress
-from vstent.stent import Stent
-from vstent.surface import Surface
-from vstent.vessel import Opening, Vessel
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Opening, Vessel
 
 DIAMETER_MM, LENGTH_MM, N_WIRES = 4.0, 10.0, 48
 

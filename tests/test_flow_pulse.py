@@ -6,16 +6,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from vstent import flow, phantoms
+from vstent import phantoms
+from vstent.anatomy.trace import trace
 from vstent.errors import InputError
-from vstent.flow import FlowCase, FlowField, FlowSettings, domain, sampling, simulate_case
-from vstent.flow.engines import lattice_pace, lattice_pulse
-from vstent.flow.engines.lattice_pace import pace
-from vstent.flow.engines.lattice_pulse import cycle_change, cycles_advice
-from vstent.flow.types import PHASES, Waveform
+from vstent.flow import domain, sampling
+from vstent.flow import simulation as flow
+from vstent.flow.case import PHASES, FlowCase, FlowField, FlowSettings, Waveform
+from vstent.flow.lattice import pace as lattice_pace
+from vstent.flow.lattice import pulse as lattice_pulse
+from vstent.flow.lattice.pace import pace
+from vstent.flow.lattice.pulse import cycle_change, cycles_advice
+from vstent.flow.simulation import simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
-from vstent.trace import trace
-from vstent.vessel import Vessel
+from vstent.geometry.vessel import Vessel
 from womersley import MEAN_MEAN_M_S, OMEGA, PULSE, RADIUS_M, womersley_m_s, womersley_wss_Pa
 
 

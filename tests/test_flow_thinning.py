@@ -5,12 +5,13 @@ import pytest
 from scipy.optimize import brentq
 
 from vstent import phantoms
-from vstent.flow import Blood, FlowCase, FlowSettings, domain, sampling, simulate_case
-from vstent.flow.types import CarreauYasuda, Waveform
+from vstent.anatomy.trace import trace
+from vstent.flow import domain, sampling
+from vstent.flow.case import Blood, CarreauYasuda, FlowCase, FlowSettings, Waveform
+from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.simulation import simulate_case
 from vstent.flow.wall_stress import wall_stress
-from vstent.kernels import lattice
-from vstent.trace import trace
-from vstent.vessel import Vessel
+from vstent.geometry.vessel import Vessel
 
 RADIUS_M, LENGTH_MM, INFLOW_ML_S = 2e-3, 14.0, 0.3
 BLOOD = Blood(viscosity_Pa_s=0.00345, thinning=CarreauYasuda())

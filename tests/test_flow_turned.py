@@ -7,15 +7,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tubes import line, tube
-from vstent import flow as flows
 from vstent import phantoms
-from vstent.deploy import deploy
-from vstent.device import find_design
-from vstent.flow import Blood, FlowCase, FlowField, FlowSettings, domain, flow_case, sampling, simulate_case
+from vstent.anatomy.trace import trace
+from vstent.deployment.deploy import deploy
+from vstent.devices.design import find_design
+from vstent.flow import domain, sampling
+from vstent.flow import simulation as flows
+from vstent.flow.case import Blood, FlowCase, FlowField, FlowSettings
 from vstent.flow.positions import turned
-from vstent.trace import trace
+from vstent.flow.simulation import flow_case, simulate_case
+from vstent.geometry.vessel import Vessel
 from vstent.units import M_PER_MM
-from vstent.vessel import Vessel
 
 RADIUS_MM, BEND_MM, ANGLE, INFLOW_ML_S = 1.95, 5.0, 0.6 * np.pi, 3.7
 DIAGONAL = Rotation.from_euler("y", 45, degrees=True) * Rotation.from_euler("z", 45, degrees=True)

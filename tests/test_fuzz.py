@@ -14,17 +14,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from faults import image_file, scan, surface_file
-from vstent.device import Braid, LaserCut, deployed_length_mm, grid
-from vstent.device_schema import parse
+from vstent.devices.design import Braid, LaserCut, deployed_length_mm, grid
+from vstent.devices.schema import parse
 from vstent.errors import VstentError
 from vstent.flow.waveform import Waveform, waveform_of
-from vstent.image import Image
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
 from vstent.io.archive import load_noun, save_noun
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
 from vstent.io.tables import read_columns
-from vstent.surface import Surface
 
 LONGEST_MS = 10_000
 """No answer may take longer."""
@@ -181,7 +181,9 @@ def test_kept_stages(spoil: Callable[[bytes], bytes], tmp_path: Path) -> None:
         check(file, lambda path: load_noun(path, Surface))
 
 
-CATALOGUE = files("vstent").joinpath("devices.toml").read_bytes().partition(b'[[device]]\nkey = "pipeline"')[0]
+CATALOGUE = (
+    files("vstent.devices").joinpath("catalogue.toml").read_bytes().partition(b'[[device]]\nkey = "pipeline"')[0]
+)
 """A braid and a laser-cut device."""
 
 

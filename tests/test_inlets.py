@@ -10,21 +10,23 @@ import numpy as np
 import pytest
 
 from vstent import phantoms
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
 from vstent.app.cases import Store
 from vstent.app.reopening import reopened
 from vstent.cli import main
 from vstent.errors import InputError, VesselError
-from vstent.flow import FlowCase, FlowField, FlowSettings, domain, flow_case, indices, sampling, simulate_case
+from vstent.flow import domain, sampling
+from vstent.flow.case import FlowCase, FlowField, FlowSettings, Waveform
+from vstent.flow.indices import indices
+from vstent.flow.simulation import flow_case, simulate_case
 from vstent.flow.streamlines import STEP_CELLS, inlet_seeds_mm, streamlines
-from vstent.flow.types import Waveform
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Centerline, Vessel
 from vstent.io.writers import write_stl
 from vstent.kernels.arrays import Floats
 from vstent.phantoms import Phantom, Sac
-from vstent.restore import restore
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Centerline, Vessel
 
 SETTINGS = FlowSettings(inflow_mL_s=3.0, cell_size_mm=0.25, tolerance=0.002)
 TRUNK, RIGHT, LEFT = range(3)

@@ -7,14 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from vstent.device import catalogue
+from vstent.devices.design import catalogue
+from vstent.devices.stent import Landing
 from vstent.errors import ReadError
-from vstent.image import Image
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Opening, Vessel
 from vstent.io.archive import load_noun, save_noun
 from vstent.phantoms import Phantom, Scanner, demo_phantom
-from vstent.stent import Landing
-from vstent.surface import Surface
-from vstent.vessel import Anatomy, Aneurysm, Centerline, Opening, Vessel
 
 
 def same(a, b):
@@ -108,7 +108,7 @@ def test_other_things_cannot_be_archived(tmp_path):
         ("os", "stat_result"),
         (__name__, "Foreign"),
         ("vstent.errors", "ReadError"),
-        ("vstent.surface", "np"),
+        ("vstent.geometry.surface", "np"),
         ("vstent.gone", "X"),
     ],
 )

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vstent.errors import InputError, ReadError, UnitError
-from vstent.image import Image
+from vstent.geometry.image import Image
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import files_of, read_image
 

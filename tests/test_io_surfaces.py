@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vstent.devices.stent import tube_faces
 from vstent.errors import InputError, ReadError, UnitError
+from vstent.geometry.surface import Surface
 from vstent.io.polydata import polydata_of
 from vstent.io.surfaces import hydraulic_diameter, read_surface
 from vstent.io.vtk_child import read_apart
 from vstent.io.writers import write_stl, write_surface
-from vstent.stent import tube_faces
-from vstent.surface import Surface
 
 
 def cylinder(radius=2.0, length=24.0, rows=13, columns=24):

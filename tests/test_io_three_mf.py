@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from tubes import line, tube
-from vstent import device
-from vstent.deploy import deploy
+from vstent.deployment.deploy import deploy
+from vstent.deployment.struts import struts
+from vstent.devices import design as device
+from vstent.devices.stent import Landing
+from vstent.geometry.surface import Surface
 from vstent.io.three_mf import NAMESPACE, write_3mf
-from vstent.stent import Landing
-from vstent.struts import struts
-from vstent.surface import Surface
 
 
 def read_3mf(path):

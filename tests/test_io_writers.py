@@ -8,6 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Centerline
 from vstent.io.files import atomic, is_surface_file, suffix
 from vstent.io.writers import (
     grid_corners,
@@ -19,8 +21,6 @@ from vstent.io.writers import (
     write_surface,
     write_text,
 )
-from vstent.surface import Surface
-from vstent.vessel import Centerline
 
 TETRAHEDRON = Surface([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 

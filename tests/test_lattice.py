@@ -7,14 +7,17 @@ import pytest
 
 from shapes import sphere
 from vstent import phantoms
-from vstent.flow import FlowCase, FlowSettings
-from vstent.flow.engines.lattice_boltzmann import LatticeBoltzmann
-from vstent.flow.engines.lattice_scales import ODD_RATE as VESSEL_ODD_RATE
-from vstent.flow.engines.lattice_setup import address, build_bands, build_links, parabolic_weights, thickest
-from vstent.kernels import lanes, lattice, lattice_sampling, voxels
-from vstent.kernels.collision import collided, relaxed, squared_reach
-from vstent.trace import trace
-from vstent.vessel import Vessel
+from vstent.anatomy.trace import trace
+from vstent.flow.case import FlowCase, FlowSettings
+from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.kernels import lanes
+from vstent.flow.lattice.kernels.collision import collided, relaxed, squared_reach
+from vstent.flow.lattice.scales import ODD_RATE as VESSEL_ODD_RATE
+from vstent.flow.lattice.setup import address, build_bands, build_links, parabolic_weights, thickest
+from vstent.geometry.vessel import Vessel
+from vstent.kernels import sampling as lattice_sampling
+from vstent.kernels import voxels
 
 STRIDE = 40
 RATE, ODD_RATE, NO_LIMIT = 1.6, 0.7, 1e9

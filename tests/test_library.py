@@ -13,15 +13,18 @@ import pytest
 
 import vstent
 from faults import artery
-from vstent import device, plugins
-from vstent.deploy import ConstantWire, deploy
+from vstent import plugins
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.deployment.braid import ConstantWire
+from vstent.deployment.deploy import deploy
+from vstent.devices import design as device
+from vstent.devices.stent import Deployment, Landing
 from vstent.errors import DeviceError, PluginError
-from vstent.flow import FlowSettings, flow_case, foretell_cost, simulate_case
-from vstent.restore import restore
-from vstent.stent import Deployment, Landing
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Anatomy, Vessel
+from vstent.flow.case import FlowSettings
+from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
+from vstent.geometry.vessel import Anatomy, Vessel
 
 VERBS = (
     "catalogue",
@@ -68,7 +71,7 @@ def anatomy() -> Anatomy:
 
 
 PLUGIN = '''
-from vstent.deploy.wall import TreeWall
+from vstent.deployment.wall import TreeWall
 from vstent.flow.engines import AbstractEngine
 
 

@@ -8,12 +8,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from tubes import arc, line, tube, with_neck
-from vstent import device
-from vstent.deploy import deploy
-from vstent.measure import coverage_fractions, is_over_neck, measure, morphology, pore_areas_mm2
-from vstent.rank import rank
-from vstent.surface import Surface
-from vstent.vessel import Aneurysm, Centerline
+from vstent.deployment.deploy import deploy
+from vstent.deployment.measure import coverage_fractions, is_over_neck, measure, morphology, pore_areas_mm2
+from vstent.devices import design as device
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Aneurysm, Centerline
+from vstent.plan.rank import rank
 
 SILK, ENTERPRISE = device.find_design("silk"), device.find_design("enterprise")
 SIZES = {

@@ -10,21 +10,22 @@ import pytest
 from shapes import sphere
 from tubes import line, tube, with_neck
 from vstent import phantoms
-from vstent.deploy import deploy
-from vstent.device import find_design
+from vstent.anatomy.trace import trace
+from vstent.deployment.deploy import deploy
+from vstent.deployment.struts import struts
+from vstent.devices.design import find_design
 from vstent.errors import FlowError, LandingError, ReadError
-from vstent.flow import Blood, FlowCase, FlowSettings, flow_case
-from vstent.flow.openfoam import FoamSetup, foam_case, named_patches
-from vstent.flow.openfoam.case import strut_solids
+from vstent.flow.case import Blood, CarreauYasuda, FlowCase, FlowSettings
+from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.control import fluid
 from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.dictionary import foam_file, parse
-from vstent.flow.types import CarreauYasuda
+from vstent.flow.openfoam.patches import named_patches
+from vstent.flow.openfoam.setup import FoamSetup
+from vstent.flow.simulation import flow_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
-from vstent.struts import struts
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.vessel import Vessel
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Vessel
 
 RADIUS_MM, BRANCH_MM, FLOW_ML_S = 2.0, 1.2, 3.0
 SETUP = FoamSetup(0.25, processes=4)

@@ -12,21 +12,22 @@ import numpy as np
 import pytest
 
 from vstent import phantoms
-from vstent.deploy import deploy
-from vstent.device import find_design
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.deployment.deploy import deploy
+from vstent.devices.design import find_design
 from vstent.errors import FlowError, ReadError
-from vstent.flow import FlowCase, FlowSettings, Screen, domain, flow_case, sampling, simulate_case
+from vstent.flow import domain, sampling
+from vstent.flow.case import PHASES, FlowCase, FlowSettings, Screen, Waveform
 from vstent.flow.engines import Outcome, Progress, run
-from vstent.flow.engines.openfoam import OpenFoam, State, swing_of
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results, scatter
 from vstent.flow.openfoam.bridge import Snapshot, bridge
+from vstent.flow.openfoam.engine import OpenFoam, State, swing_of
 from vstent.flow.openfoam.setup import Flavour, FoamSetup
-from vstent.flow.types import PHASES, Waveform
-from vstent.restore import restore
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.vessel import Vessel
+from vstent.flow.simulation import flow_case, simulate_case
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Vessel
 
 HEADER = "FoamFile\n{\n    class volVectorField;\n}\ndimensions [0 1 -1 0 0 0 0];\n"
 

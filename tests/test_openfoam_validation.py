@@ -11,16 +11,19 @@ import numpy as np
 import pytest
 
 from vstent import phantoms
-from vstent.flow import FlowCase, FlowField, FlowSettings, flow_case, indices, sampling, simulate_case
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.flow import sampling
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.engines import run
-from vstent.flow.engines.openfoam import OpenFoam
+from vstent.flow.indices import indices
+from vstent.flow.openfoam.engine import OpenFoam
 from vstent.flow.sampling import cells_inside
+from vstent.flow.simulation import flow_case, simulate_case
+from vstent.geometry.vessel import Vessel
 from vstent.io.surfaces import read_surface
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Vessel
 
 pytestmark = [
     pytest.mark.validation,

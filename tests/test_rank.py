@@ -12,16 +12,17 @@ import numpy as np
 import pytest
 
 from tubes import arc, line, tube, with_neck
-from vstent import device, phantoms
+from vstent import phantoms
 from vstent.cli import main
-from vstent.deploy import deploy, propose_size
+from vstent.deployment.deploy import deploy, propose_size
+from vstent.deployment.measure import measure
+from vstent.devices import design as device
 from vstent.errors import InputError, VstentError
+from vstent.geometry.vessel import Centerline
 from vstent.io.writers import write_stl
-from vstent.measure import measure
-from vstent.rank import bend_ratios, default_criteria, landing_measures, rank, read_criteria
-from vstent.rank.criteria import MEASURES, Criterion, parse
-from vstent.vessel import Centerline
-from vstent.workers import spread
+from vstent.plan.criteria import MEASURES, Criterion, default_criteria, parse, read_criteria
+from vstent.plan.rank import bend_ratios, landing_measures, rank
+from vstent.plan.workers import spread
 
 SILK, ENTERPRISE = device.find_design("silk"), device.find_design("enterprise")
 
@@ -82,7 +83,7 @@ def test_scores_are_the_weighted_means_of_grades_of_what_was_measured():
 
 def test_measures_are_those_of_the_same_deployment_made_alone():
     best = ranking().candidates[0]
-    from vstent.deploy import propose_landing
+    from vstent.deployment.deploy import propose_landing
 
     landing = replace(propose_landing(best.design, artery(), best.size))
     assert best.shift_mm == 0.0
@@ -135,7 +136,7 @@ def test_a_killed_worker_ends_in_one_sentence():
 def test_workers_that_cannot_start_end_in_one_sentence_however_much_they_were_to_be_told():
     """A script read from a pipe cannot be imported again by new processes."""
     code = (
-        "import numpy as np\nfrom vstent.workers import spread\nfrom vstent.errors import VstentError\n"
+        "import numpy as np\nfrom vstent.plan.workers import spread\nfrom vstent.errors import VstentError\n"
         "try: list(spread(np.add, np.zeros(10**6), [1, 2], jobs=2))\n"
         "except VstentError as error: print('told:', error)\n"
     )

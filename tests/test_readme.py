@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 import vstent
-from vstent import cli, demo, flow
+from vstent import cli
+from vstent.flow import simulation as flow
+from vstent.study import demo
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 

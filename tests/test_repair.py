@@ -5,11 +5,11 @@ from hypothesis import strategies as st
 
 from told import place_in
 from tubes import line, tube
+from vstent.anatomy.repair import repair
 from vstent.errors import InputError, VesselError
+from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.kernels import topology, triangles
-from vstent.repair import repair
-from vstent.surface import Surface
 
 ROWS, AROUND = 31, 32
 SOUND = tube(line(15.0, 0.5), 2.0, 1.7, around=AROUND).landing_surface

@@ -13,12 +13,14 @@ import pytest
 
 from vstent import phantoms
 from vstent.cli import main
-from vstent.flow import FlowSettings
+from vstent.flow.case import FlowSettings
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.io.writers import write_json, write_stl
-from vstent.study import Placing, Settings, agreement, write_crate
+from vstent.plan.uncertainty import Ranges
 from vstent.study import repeat as repeating
-from vstent.uncertainty import Ranges
+from vstent.study.crate import write_crate
+from vstent.study.repeat import agreement
+from vstent.study.types import Placing, Settings
 
 
 @pytest.fixture(scope="module")

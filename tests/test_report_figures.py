@@ -7,8 +7,8 @@ import pytest
 
 import report_case
 from vstent.kernels import raster
-from vstent.report import figures
-from vstent.report.scene import LineLayer, MeshLayer, Scene, View
+from vstent.reporting import figures
+from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View
 
 RED, BLUE = [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
 SQUARE = np.array([[2.0, 2, 0], [14, 2, 0], [14, 14, 0], [2, 14, 0]])

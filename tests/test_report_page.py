@@ -14,12 +14,10 @@ from types import SimpleNamespace
 import pytest
 
 import report_case
-from vstent.flow import Blood, FlowSettings
-from vstent.flow.types import CarreauYasuda, Phase
-from vstent.report import report
-from vstent.report.definitions import DEFINITIONS, HEADLINES, OF_PULSE
-from vstent.report.page import as_html, contents_of, limits_of
-from vstent.report.quantities import compare, flatten, format_change, format_number, format_value, split_unit
+from vstent.flow.case import Blood, CarreauYasuda, FlowSettings, Phase
+from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE
+from vstent.reporting.page import as_html, contents_of, limits_of, report
+from vstent.reporting.quantities import compare, flatten, format_change, format_number, format_value, split_unit
 
 
 class Page(HTMLParser):
@@ -86,7 +84,7 @@ def test_policy_allows_these_scripts_and_nothing_else(page):
 def test_bundle_was_built_from_the_sources_beside_it():
     viewer = Path(__file__).resolve().parents[1] / "viewer"
     sources = [*sorted((viewer / "src").iterdir()), viewer / "package-lock.json"]
-    built = files("vstent.report").joinpath("assets", "viewer.js").read_text(encoding="utf-8")
+    built = files("vstent.reporting").joinpath("assets", "viewer.js").read_text(encoding="utf-8")
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
     assert f"sources {digest} */" in built[:300], "run `npm ci && npm run build` in viewer/"
     assert len(built.encode()) < 600_000

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import report_case
-from vstent.report import write_report
-from vstent.report.definitions import OF_PULSE
-from vstent.report.method import _bead_layer, _expansion, _unit_sphere
-from vstent.report.pdf import WIDTH, _Paper, _wrapped, as_pdf
-from vstent.report.scene import scene_of
-from vstent.report.thinning import some_frames, thin_frames
+from vstent.reporting.definitions import OF_PULSE
+from vstent.reporting.method import _bead_layer, _expansion, _unit_sphere
+from vstent.reporting.pdf import WIDTH, _Paper, _wrapped, as_pdf
+from vstent.reporting.scene import scene_of
+from vstent.reporting.thinning import some_frames, thin_frames
+from vstent.reporting.write import write_report
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_every_number_and_its_definition_stand_in_the_pdf(told, printed):
 
 
 def test_the_pdf_is_written_where_it_is_asked_for(told, tmp_path, monkeypatch):
-    monkeypatch.setattr(import_module("vstent.report"), "contents_of", lambda _: replace(told, pictures=()))
+    monkeypatch.setattr(import_module("vstent.reporting.write"), "contents_of", lambda _: replace(told, pictures=()))
     write_report(report_case.case(), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     write_report(report_case.case(), tmp_path, is_printed=True)

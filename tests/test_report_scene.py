@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import report_case
-from vstent.report.figures import pictures
-from vstent.report.packing import pack
-from vstent.report.scene import LineLayer, flow_layers, round_up, scales_of, scene_of
-from vstent.report.thinning import thin_frames, thin_lines, thin_surface
+from vstent.reporting.figures import pictures
+from vstent.reporting.packing import pack
+from vstent.reporting.scene import LineLayer, flow_layers, round_up, scales_of, scene_of
+from vstent.reporting.thinning import thin_frames, thin_lines, thin_surface
 
 
 def test_profile_shows_the_artery_level_and_the_sac_above_it():
@@ -42,7 +42,7 @@ def test_frontal_and_lateral_follow_radiology():
 
 
 def test_the_side_that_hides_less_is_chosen():
-    from vstent.report.scene import views_of
+    from vstent.reporting.scene import views_of
 
     case = report_case.case()
     free = report_case.scene().view("profile").axes[2]

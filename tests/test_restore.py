@@ -18,18 +18,18 @@ from sac_truth import (
 )
 from told import place_in
 from vstent import phantoms
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.neck import Flank, unblurred
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.restore.sac import _is_island
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.deployment.measure import morphology
 from vstent.errors import InputError
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.kernels import curves
-from vstent.measure import morphology
 from vstent.phantoms import tube, with_sac
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.restore.neck import Flank, unblurred
-from vstent.restore.sac import _is_island
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Anatomy, Vessel
 
 IN_BRIEF = ("wide on the inside of a bend", "beside a branch", "neck of 2 diameters", "tall")
 """Those that the default suite tries."""
@@ -377,8 +377,8 @@ def test_the_idealised_bifurcation_is_restored_to_the_one_without_its_sac(shared
 
 @pytest.mark.parametrize("name", ["aneurisk_C0015_no_sac.vtp", "healthy_siphon.vtk"])
 def test_a_real_healthy_artery_stays_as_it_is(shared_data, name: str) -> None:
+    from vstent.anatomy.repair import repair
     from vstent.io.surfaces import read_surface
-    from vstent.repair import repair
 
     anatomy = restore(trace(Vessel(repair(read_surface(shared_data / name)[0])[0])))  # the siphon comes inside out
     assert anatomy.aneurysms == ()

@@ -8,16 +8,16 @@ import pytest
 
 from told import place_in
 from vstent import phantoms
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.axis import fit_axis
+from vstent.anatomy.restore.bulges import find_bulges
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.restore.tubes import tubes_of
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
 from vstent.errors import InputError
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.restore.axis import fit_axis
-from vstent.restore.bulges import find_bulges
-from vstent.restore.tubes import tubes_of
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Anatomy, Centerline, Vessel
-from vstent.words import place
+from vstent.geometry.vessel import Anatomy, Centerline, Vessel
+from vstent.units import place
 
 
 def traced(phantom: phantoms.Phantom) -> Vessel:
@@ -69,7 +69,7 @@ def test_a_lobe_of_a_sac_is_no_sac_of_its_own(demo, monkeypatch) -> None:
     (bulge,) = find_bulges(demo.vessel.lumen, tubes_of(demo.vessel.centerlines))
     far_side = bulge.points_mm[np.argmax(np.linalg.norm(bulge.points_mm - bulge.dome_mm, axis=1))]
     lobe = replace(bulge, dome_mm=far_side)
-    monkeypatch.setattr(import_module("vstent.restore"), "find_bulges", lambda *_: [bulge, lobe])
+    monkeypatch.setattr(import_module("vstent.anatomy.restore.restore"), "find_bulges", lambda *_: [bulge, lobe])
     anatomy = restore(demo.vessel)
     assert len(anatomy.aneurysms) == 1
     assert anatomy.notes[1:] == ("1 more bulge, flat, a sac's lobe, or on another branch: no sac of its own.",)
@@ -100,7 +100,7 @@ def test_a_trim_that_would_cut_the_sac_is_refused_with_the_least_length(sac_on_a
 def test_a_length_that_was_not_given_grows_until_the_cut_clears_the_sac(
     sac_on_a_tube, monkeypatch, side: str, usual: str
 ) -> None:
-    monkeypatch.setattr(import_module("vstent.trim"), usual, 2.0)
+    monkeypatch.setattr(import_module("vstent.anatomy.trim"), usual, 2.0)
     trimmed = trim(sac_on_a_tube)
     (note,) = (note for note in trimmed.notes if "not 2: the neck reaches" in note)
     assert f"mm {side} the sac's middle" in note
@@ -118,8 +118,8 @@ def test_a_length_that_was_not_given_grows_until_the_cut_clears_the_sac(
 def test_nothing_is_cut_or_told_where_the_artery_is_hardly_longer_than_a_length_that_grew(
     sac_on_a_tube, monkeypatch
 ) -> None:
-    monkeypatch.setattr(import_module("vstent.trim"), "DOWNSTREAM_MM", 2.0)
-    monkeypatch.setattr(import_module("vstent.trim"), "SPARE_MM", 18.0)
+    monkeypatch.setattr(import_module("vstent.anatomy.trim"), "DOWNSTREAM_MM", 2.0)
+    monkeypatch.setattr(import_module("vstent.anatomy.trim"), "SPARE_MM", 18.0)
     assert trim(sac_on_a_tube) is sac_on_a_tube
 
 
@@ -223,7 +223,9 @@ def test_a_blister_is_named_where_no_sac_is_found_and_is_found_where_it_is_named
 def test_a_flat_bulge_is_looked_into_on_the_landing_surface_at_hand(monkeypatch) -> None:
     vessel = traced(with_a_dome(phantoms.tube(length_mm=30.0), beyond_mm=0.2, radius_mm=1.05))
     restored, fit = [], fit_axis
-    monkeypatch.setattr(import_module("vstent.restore"), "fit_axis", lambda *of: restored.append(of) or fit(*of))
+    monkeypatch.setattr(
+        import_module("vstent.anatomy.restore.restore"), "fit_axis", lambda *of: restored.append(of) or fit(*of)
+    )
     assert any("too flat" in note for note in restore(vessel).notes)
     assert len(restored) == 1
 

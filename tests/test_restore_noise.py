@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.axis import Tube, _fit, _Necks
+from vstent.anatomy.restore.bulges import Bulge
+from vstent.anatomy.restore.landing import Landing
+from vstent.anatomy.restore.neck import MOUTH, apart_mm
+from vstent.anatomy.restore.path import _width_beyond_fork
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.restore.tubes import Tubes
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Centerline, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.kernels import smoothing
 from vstent.kernels.arrays import Floats
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.restore.axis import Tube, _fit, _Necks
-from vstent.restore.bulges import Bulge
-from vstent.restore.landing import Landing
-from vstent.restore.neck import MOUTH, apart_mm
-from vstent.restore.path import _width_beyond_fork
-from vstent.restore.tubes import Tubes
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Anatomy, Centerline, Vessel
 
 NOISE_MM = 0.05
 

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from vstent.flow.case import Screen
 from vstent.flow.drag import concentration, drag_per_length
-from vstent.flow.engines.lattice_scales import ODD_RATE
-from vstent.flow.engines.lattice_screen import on_grid
+from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.kernels import lanes
+from vstent.flow.lattice.scales import ODD_RATE
+from vstent.flow.lattice.screen import on_grid
 from vstent.flow.screen import bands
-from vstent.flow.types import Screen
-from vstent.kernels import lanes, lattice
 
 SHAPE = np.array([32, 4, 32])
 """Cells of a box that repeats in all directions."""

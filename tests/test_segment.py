@@ -7,12 +7,12 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from shapes import sphere
+from vstent.anatomy.segment import segment
 from vstent.errors import VesselError
-from vstent.image import Image
+from vstent.geometry.image import Image
 from vstent.io.images import read_image
 from vstent.kernels import curves, smoothing, topology, triangles
 from vstent.phantoms import Scanner, demo_phantom, phantom_surface, scan, tube, with_branch
-from vstent.segment import segment
 
 
 def capped_volume(surface):
@@ -180,7 +180,7 @@ def test_smoothing_keeps_the_volume(demo):
     _, image, vessel = demo
     shrinkage = float(re.search(r"volume by ([+-][\d.]+)%", " ".join(vessel.notes))[1])
     assert abs(shrinkage) < 1.0
-    from vstent.segment import _wall, propose
+    from vstent.anatomy.segment import _wall, propose
 
     lumen = propose(image)[0]
     rough, vessel = _wall(lumen), segment(image, threshold=lumen.threshold)
@@ -269,7 +269,7 @@ def test_a_threshold_below_everything_is_refused(demo, below):
 
 def test_fine_meshes_are_decimated_without_losing_volume(demo, monkeypatch):
     phantom, image, whole = demo
-    monkeypatch.setattr(import_module("vstent.segment"), "MOST_FACES", 12_000)
+    monkeypatch.setattr(import_module("vstent.anatomy.segment"), "MOST_FACES", 12_000)
     vessel = segment(image)
     assert len(vessel.lumen.faces) <= 12_000 < len(whole.lumen.faces)
     assert f"{len(whole.lumen.faces)} triangles decimated to {len(vessel.lumen.faces)} (volume" in vessel.notes[-1]

@@ -9,11 +9,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from tubes import arc, line, tube, with_neck
-from vstent import device
-from vstent.deploy import deploy, wires
+from vstent.deployment import wires
+from vstent.deployment.deploy import deploy
+from vstent.deployment.struts import blood, over_restored, struts, united
+from vstent.devices import design as device
 from vstent.errors import DeviceError
-from vstent.struts import blood, over_restored, struts, united
-from vstent.surface import Surface
+from vstent.geometry.surface import Surface
 
 SILK, ENTERPRISE = device.find_design("silk"), device.find_design("enterprise")
 SIZES = {

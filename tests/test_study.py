@@ -11,19 +11,22 @@ import pytest
 from tubes import line, tube, with_neck
 from vstent import phantoms
 from vstent.cli import main
-from vstent.deploy import deploy, propose_size
-from vstent.device import Size, find_design, find_size
+from vstent.deployment.deploy import deploy, propose_size
+from vstent.devices.design import Size, find_design, find_size
 from vstent.errors import DeviceError, InputError, LandingError
-from vstent.flow import FlowCase, FlowField, FlowSettings
-from vstent.image import Image
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_json, write_stl
-from vstent.study import Placing, Settings, restore_vessel, run, stages, write_crate
+from vstent.study import stages
+from vstent.study.crate import write_crate
 from vstent.study.ledger import hash_of
 from vstent.study.outputs import write_anatomy
+from vstent.study.pipeline import restore_vessel, run
 from vstent.study.stages import deploy_one, engine_folders, size_of
-from vstent.surface import Surface
+from vstent.study.types import Placing, Settings
 
 
 def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path) -> None:
@@ -338,7 +341,7 @@ def test_a_device_whose_wires_change_does_not_get_the_flow_of_the_former(
     monkeypatch.setattr(stages, "simulate_case", computed_once)
     settings = Settings(devices=("silk",), flow=FlowSettings(cell_size_mm=0.35))
     run(artery, out, settings, lambda *_: None)
-    monkeypatch.setattr("vstent.study.find_design", lambda _: replace(design, wires=((48, 40.0),)))
+    monkeypatch.setattr("vstent.study.pipeline.find_design", lambda _: replace(design, wires=((48, 40.0),)))
     run(artery, out, settings, lambda *_: None)
     run(artery, out, settings, lambda *_: None)
     assert computed == [(), design.wires, ((48, 40.0),)]

@@ -13,19 +13,19 @@ from scipy.spatial.transform import Rotation
 
 from shapes import sphere
 from vstent import phantoms
+from vstent.anatomy.openings import open_ends, opening_at
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.segment import segment
+from vstent.anatomy.short_cuts import along_arms
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.deployment.measure import morphology
 from vstent.errors import InputError, VesselError
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.kernels import curves, triangles
 from vstent.kernels.medial import Medial, cost_graph, path_to, shortest_paths
-from vstent.measure import morphology
-from vstent.openings import open_ends, opening_at
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.segment import segment
-from vstent.short_cuts import along_arms
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.vessel import Anatomy, Vessel
 
 
 def traced(phantom: phantoms.Phantom) -> Vessel:

@@ -6,8 +6,8 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
 from shapes import sphere
+from vstent.geometry.surface import Surface
 from vstent.kernels import medial, tree, triangles
-from vstent.surface import Surface
 
 
 def random_soup(rng: np.random.Generator, n: int) -> Surface:

@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from vstent.devices.stent import tube_faces
+from vstent.geometry.surface import Surface
 from vstent.kernels import triangles
-from vstent.stent import tube_faces
-from vstent.surface import Surface
 
 
 def tube(radius: float = 2.0, length: float = 10.0, rows: int = 41, columns: int = 48) -> Surface:

@@ -7,20 +7,22 @@ import numpy as np
 import pytest
 
 from tubes import line, tube, with_neck
-from vstent import device, uncertainty
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
 from vstent.cli import main
-from vstent.deploy import deploy
+from vstent.deployment.deploy import deploy
+from vstent.devices import design as device
+from vstent.devices.stent import Landing
 from vstent.errors import InputError
-from vstent.flow import FlowSettings
+from vstent.flow.case import FlowSettings
+from vstent.geometry.vessel import Vessel
 from vstent.io.writers import write_stl
 from vstent.phantoms import demo_phantom, phantom_surface
-from vstent.restore import restore
-from vstent.stent import Landing
+from vstent.plan import uncertainty
+from vstent.plan.shares import first_order_shares
+from vstent.plan.uncertainty import CAUSES, Ranges, vary
+from vstent.plan.widening import widened
 from vstent.study.checkpoint import FlowCheckpoint
-from vstent.trace import trace
-from vstent.uncertainty import CAUSES, Ranges, vary, widened
-from vstent.uncertainty.shares import first_order_shares
-from vstent.vessel import Vessel
 
 SILK = device.find_design("silk")
 SIZE = device.find_size(SILK, diameter_mm=4, length_mm=15)
@@ -200,7 +202,7 @@ def test_inflow_and_flow_are_varied_where_the_flow_is_asked(monkeypatch):
     monkeypatch.setattr(uncertainty, "simulate_case", answer)
     monkeypatch.setattr(uncertainty, "indices", known)
     monkeypatch.setattr(uncertainty, "ostium", lambda *_: None)
-    monkeypatch.setattr("vstent.flow.ostium", lambda *_: None)
+    monkeypatch.setattr("vstent.flow.simulation.ostium", lambda *_: None)
     ranges = Ranges(8, flow_samples=8, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
     found = vary(artery(), deployed(), ranges, flow=FlowSettings(inflow_mL_s=4.0))
     ratio = found.values[:, found.names.index("neck_inflow_mL_s_ratio")]
@@ -219,7 +221,7 @@ def test_a_sample_whose_flow_is_done_is_not_computed_again(monkeypatch, tmp_path
         return {"neck_inflow_mL_s_ratio": flow.inflow_mL_s**2}
 
     monkeypatch.setattr(uncertainty, "_flow_ratios", ratios)
-    monkeypatch.setattr("vstent.flow.ostium", lambda *_: None)
+    monkeypatch.setattr("vstent.flow.simulation.ostium", lambda *_: None)
     ranges = Ranges(4, flow_samples=4, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
     begun, flow = FlowCheckpoint(tmp_path, "vary silk", "key"), FlowSettings(inflow_mL_s=4.0)
     with pytest.raises(KeyboardInterrupt):

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from vstent.stent import tube_faces
-from vstent.surface import Surface
-from vstent.vessel import Anatomy, Aneurysm, Centerline, Opening, Vessel
+from vstent.devices.stent import tube_faces
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Opening, Vessel
 
 
 def line(length_mm, step_mm=0.2):

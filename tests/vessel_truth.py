@@ -8,16 +8,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vstent import phantoms
-from vstent.image import Image
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.segment import segment
+from vstent.anatomy.trace import trace
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Centerline, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.kernels import curves, triangles
 from vstent.phantoms import Phantom, Scanner
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.segment import segment
-from vstent.surface import Surface
-from vstent.trace import trace
-from vstent.vessel import Centerline, Vessel
 
 PHANTOMS = (
     phantoms.tube(),

@@ -7,10 +7,10 @@ there is computed first.
 import sys
 from pathlib import Path
 
-from vstent import study
-from vstent.console import Console
-from vstent.report.figures import overview
-from vstent.report.scene import scene_of
+from vstent.cli.console import Console
+from vstent.reporting.figures import overview
+from vstent.reporting.scene import scene_of
+from vstent.study import pipeline as study
 from vstent.study.provenance import RUN
 from vstent.study.repeat import read_record
 

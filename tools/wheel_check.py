@@ -15,11 +15,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 CARRIED = (
     "vstent/py.typed",
-    "vstent/devices.toml",
-    "vstent/report/assets/viewer.js",
-    "vstent/report/assets/viewer.css",
-    "vstent/report/assets/report.html.j2",
-    "vstent/report/assets/LICENSES.txt",
+    "vstent/devices/catalogue.toml",
+    "vstent/reporting/assets/viewer.js",
+    "vstent/reporting/assets/viewer.css",
+    "vstent/reporting/assets/report.html.j2",
+    "vstent/reporting/assets/LICENSES.txt",
 )
 """Files without which an installed vstent does not work, or may not be handed on."""
 RESULTS = ("report.html", "metrics.json", "run.json", "stents/silk/wires.vtp")

@@ -3,7 +3,7 @@ import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { copyFile, readdir, readFile, writeFile } from "node:fs/promises";
 
-const assets = new URL("../src/vstent/report/assets/", import.meta.url);
+const assets = new URL("../src/vstent/reporting/assets/", import.meta.url);
 const page = new URL("../src/vstent/app/assets/", import.meta.url);
 
 /** The sources' hash goes into a bundle: a test tells when one was changed and the other was not. */

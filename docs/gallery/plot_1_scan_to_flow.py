@@ -12,7 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import vstent
-from vstent.flow import FlowSettings, compare, indices, ostium
+from vstent.flow.case import FlowSettings
+from vstent.flow.indices import compare, indices
+from vstent.flow.ostium import ostium
 from vstent.phantoms import Scanner, demo_phantom, scan
 
 phantom = demo_phantom()

@@ -9,7 +9,7 @@ follows the closed formula :math:`L(D)/L_0 = \\cos\\alpha(D)/\\cos\\alpha_0`.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from vstent.device import catalogue, deployed_length_mm, find_size
+from vstent.devices.design import catalogue, deployed_length_mm, find_size
 
 widths_mm = np.linspace(2.6, 4.0, 40)
 figure, axes = plt.subplots(figsize=(6, 4))

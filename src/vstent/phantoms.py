@@ -13,13 +13,13 @@ from numpy.random import Generator
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 
-from vstent.image import Image
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Centerline
 from vstent.kernels import curves, smoothing, triangles
 from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.kernels.clipping import clip
 from vstent.kernels.isosurface import isosurface
-from vstent.surface import Surface
-from vstent.vessel import Centerline
 
 AXIS_STEP_MM: Final = 0.04
 

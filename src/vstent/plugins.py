@@ -5,7 +5,7 @@
 ``vstent.engines``: a class of `vstent.flow.engines.AbstractEngine`, made with the cell size in mm and a folder of its
 own, in which it may write.
 
-``vstent.walls``: a class of `vstent.deploy.wall.AbstractWall`, made with the surface.
+``vstent.walls``: a class of `vstent.deployment.wall.AbstractWall`, made with the surface.
 """
 
 from importlib.metadata import EntryPoint, entry_points

@@ -1,6 +1,5 @@
-"""The page: a local server and a page in the browser, from a scan to a report, nothing from a network.
+"""The page in the browser: a case folder or a dropped scan in, an interactive plan and its report out.
 
-`server` answers HTTP, `security` keeps strangers out, `intake` takes files in, `cases` and `choices` hold what a user
-has chosen, `jobs` and `worker` run the long stages beside the server, `live` answers at once what a hand on the page
-asks.
+Open ``server.py`` first. ``security`` guards the server, ``intake`` receives files, ``cases`` and ``choices`` hold what
+the user has chosen, ``jobs`` and ``worker`` run the long stages, and ``live`` answers while a device is dragged.
 """

@@ -18,7 +18,7 @@ from vstent.errors import InputError, ReadError
 from vstent.io.files import atomic
 
 if TYPE_CHECKING:  # loaded when a study is to be told something, as in `vstent.app.choices`
-    from vstent.study import Settings
+    from vstent.study.types import Settings
 
 STATE: Final = "app.json"
 """File of a case folder that remembers the page's state."""
@@ -73,8 +73,8 @@ class State(BaseModel):
         ReadError
             They are of a study of another version.
         """
-        from vstent.study import Settings
         from vstent.study.repeat import settings_of
+        from vstent.study.types import Settings
 
         try:
             return settings_of(self.former) if self.former else Settings()
@@ -89,7 +89,7 @@ class State(BaseModel):
 
     def unseen(self) -> list[str]:
         """Return the settings, with their values, that cannot be chosen on the page and are not as it has them."""
-        from vstent.study import Settings
+        from vstent.study.types import Settings
 
         return list(_differences(asdict(self.settings()), asdict(self.choices.settings(Settings()))))
 

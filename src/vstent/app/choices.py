@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 if TYPE_CHECKING:  # a study's modules are loaded when it is to be told something: the page must be there at once
-    from vstent.flow import FlowSettings
-    from vstent.flow.types import Waveform
-    from vstent.study import Placing, Settings
+    from vstent.flow.case import FlowSettings, Waveform
+    from vstent.study.types import Placing, Settings
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
 Length = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
@@ -88,9 +87,9 @@ class Choices(Strict):
 
     def settings(self, former: "Settings") -> "Settings":
         """Return what a study is told; what cannot be chosen here stays as it was in `former`."""
-        from vstent.flow import FlowSettings
-        from vstent.study import Placing
-        from vstent.uncertainty import Ranges
+        from vstent.flow.case import FlowSettings
+        from vstent.plan.uncertainty import Ranges
+        from vstent.study.types import Placing
 
         samples = self.uncertainty_samples
         return replace(
@@ -124,6 +123,6 @@ def pulse_of(former: "FlowSettings") -> "Waveform":
 
 def placing_of(device: DeviceChoice) -> "Placing":
     """Return what a study is told of a device's size and place."""
-    from vstent.study import Placing
+    from vstent.study.types import Placing
 
     return Placing(device.diameter_mm, device.length_mm, device.center_mm)

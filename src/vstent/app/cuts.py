@@ -4,12 +4,12 @@ from typing import Final
 
 import numpy as np
 
-from vstent.flow import FlowField
+from vstent.flow.case import FlowField
 from vstent.flow.sampling import values_at
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints
-from vstent.report.scene import MeshLayer, views_of
-from vstent.surface import Surface
-from vstent.vessel import Anatomy
+from vstent.reporting.scene import MeshLayer, views_of
 
 STEP_CELLS: Final = 0.6
 """Distance between the points of a cut, in cells of the flow."""

@@ -93,7 +93,7 @@ class Desk:
 
     def demo(self) -> Case:
         """Make a case of the synthetic scan."""
-        from vstent.demo import write_scan
+        from vstent.study.demo import write_scan
 
         case = self.store.create("demo")
         write_scan(case.folder / intake.FOLDER / intake.SERIES)
@@ -218,8 +218,8 @@ class Desk:
         Two threads that import a package and a module of it at once may be given modules that are not whole.
         """
         with self._loading:
-            from vstent import demo, device_schema, study, uncertainty  # noqa: F401
             from vstent.app import live, scans, sheets  # noqa: F401
+            from vstent.devices import schema as device_schema  # noqa: F401
             from vstent.flow import waveform  # noqa: F401
 
     def close(self) -> None:
@@ -262,7 +262,7 @@ def end_upload(case: Case, partial: Path, name: str) -> None:
 
 def devices() -> list[dict[str, Any]]:
     """Return the catalogue, as the page lists it."""
-    from vstent.device import catalogue
+    from vstent.devices.design import catalogue
 
     return [
         {
@@ -280,7 +280,7 @@ def devices() -> list[dict[str, Any]]:
 
 def landing(abscissa_mm: float | None, anchor: Literal["proximal", "center", "distal"]) -> Any:
     """Return where a device is to lie, or None where nothing is said."""
-    from vstent.stent import Landing
+    from vstent.devices.stent import Landing
 
     return None if abscissa_mm is None else Landing(abscissa_mm, anchor)
 
@@ -300,7 +300,7 @@ def pulse(case: Case | None) -> dict[str, Any]:
     """Return the pulse that can be chosen, the published one unless a case has its own: times, flow over mean flow."""
     import numpy as np
 
-    from vstent.flow import FlowSettings
+    from vstent.flow.case import FlowSettings
 
     former = None if case is None else case.state.former_settings().flow
     waveform = pulse_of(former or FlowSettings())

@@ -8,7 +8,7 @@ from vstent.app.cases import State, dependencies
 from vstent.errors import InputError
 
 if TYPE_CHECKING:  # loaded when a folder is looked at, as in `vstent.app.choices`
-    from vstent.study import Settings
+    from vstent.study.types import Settings
 
 RUN: Final = "run.json"
 """What a study says of itself."""
@@ -64,8 +64,8 @@ def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
 
 def _paths(folder: Path, source: str, settings: "Settings") -> dict[str, Path]:
     """Where a study keeps its flows."""
-    from vstent.device import BARE, find_design
-    from vstent.study import CACHE
+    from vstent.devices.design import BARE, find_design
+    from vstent.study.folder import CACHE
     from vstent.study.stages import flow_key
 
     if settings.flow is None:

@@ -14,19 +14,22 @@ from vstent.app.cases import Case
 from vstent.app.choices import DeviceChoice, placing_of
 from vstent.app.cuts import cut
 from vstent.app.finished import kept_flows
-from vstent.deploy import propose_landing
-from vstent.deploy.contour import planes
-from vstent.deploy.method import laid_inside
-from vstent.deploy.sketch import Bed, Sketch, bed, sketch
-from vstent.device import BARE, coverage_fraction, find_design
+from vstent.deployment.contour import planes
+from vstent.deployment.deploy import propose_landing
+from vstent.deployment.measure import measure, morphology
+from vstent.deployment.method import laid_inside
+from vstent.deployment.sketch import Bed, Sketch, bed, sketch
+from vstent.devices.design import BARE, coverage_fraction, find_design
+from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import ReadError
-from vstent.flow import FlowField
+from vstent.flow.case import FlowField
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Opening
 from vstent.io.archive import load_noun
 from vstent.kernels import clipping
 from vstent.kernels.arrays import Floats
-from vstent.measure import measure, morphology
-from vstent.report.packing import message
-from vstent.report.scene import (
+from vstent.reporting.packing import message
+from vstent.reporting.scene import (
     LineLayer,
     MeshLayer,
     View,
@@ -39,11 +42,8 @@ from vstent.report.scene import (
     view_of,
     views_of,
 )
-from vstent.stent import Deployment, Landing, Stent
-from vstent.study import CACHE
+from vstent.study.folder import CACHE
 from vstent.study.stages import deploy_one, size_of
-from vstent.surface import Surface
-from vstent.vessel import Anatomy, Opening
 
 Colour = Literal["wall_gap", "coverage", "diameter"]
 Anchor = Literal["proximal", "center", "distal"]

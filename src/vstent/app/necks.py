@@ -5,10 +5,10 @@ from typing import Any, Final
 import numpy as np
 
 from vstent.app.choices import NECK_HANDLES
+from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
-from vstent.report.scene import LineLayer, curves_layer
-from vstent.vessel import Anatomy
+from vstent.reporting.scene import LineLayer, curves_layer
 
 POINTS: Final = 96
 """Points of a neck on the page."""

@@ -5,12 +5,13 @@ from typing import Any, Final
 
 from vstent.app.cases import Case
 from vstent.app.jobs import RANKING
-from vstent.device import find_design
+from vstent.devices.design import find_design
 from vstent.io.writers import write_json
-from vstent.rank import rank
-from vstent.study import CACHE, Progress
+from vstent.plan.rank import rank
+from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, anatomy_key
 from vstent.study.stages import find_anatomy
+from vstent.study.types import Progress
 
 MOST_PROCESSES: Final = 4
 WORTH_A_PROCESS: Final = 12

@@ -14,7 +14,7 @@ from vstent.errors import ReadError
 from vstent.io.files import suffix
 
 if TYPE_CHECKING:  # loaded when a folder is opened, as in `vstent.app.choices`
-    from vstent.study import Settings
+    from vstent.study.types import Settings
 
 GEOMETRY: Final = (
     *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
@@ -38,7 +38,8 @@ def reopened(store: Store, folder: Path) -> Case:
         The folder does not say how it was made, or not in a way that this version understands, or has a setting that
         the page does not take.
     """
-    from vstent.study import CACHE, INPUT
+    from vstent.study.folder import CACHE
+    from vstent.study.provenance import INPUT
     from vstent.study.repeat import UNTOLD, told_in
 
     try:

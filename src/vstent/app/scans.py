@@ -5,16 +5,16 @@ from typing import Any, Final
 
 import numpy as np
 
+from vstent.anatomy.segment import propose
 from vstent.errors import InputError
-from vstent.image import Image
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
 from vstent.kernels import topology, triangles
 from vstent.kernels.arrays import Floats
 from vstent.kernels.isosurface import isosurface
-from vstent.report.packing import Packer, message
-from vstent.report.scene import FRONTAL, MeshLayer, view_of
-from vstent.report.thinning import thin_surface
-from vstent.segment import propose
-from vstent.surface import Surface
+from vstent.reporting.packing import Packer, message
+from vstent.reporting.scene import FRONTAL, MeshLayer, view_of
+from vstent.reporting.thinning import thin_surface
 
 COARSE: Final = 2.5e6
 """Voxels in which the live surface is sought, at most."""

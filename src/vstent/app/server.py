@@ -24,7 +24,7 @@ from vstent.errors import ReadError, VstentError
 
 MEDIA: Final = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css"}
 BINARY: Final = "application/octet-stream"
-"""A manifest and its arrays, as `vstent.report.packing` says."""
+"""A manifest and its arrays, as `vstent.reporting.packing` says."""
 SHARED: Final = ("viewer.js", "viewer.css")
 """Files of the report that the page shares."""
 ASSETS: Final = ("index.html", "app.js", "app.css", "docs.html", "docs.js", *SHARED)
@@ -116,7 +116,7 @@ def _said(_: Request, error: Exception) -> JSONResponse:
 
 def asset(name: str) -> Response:
     """Return one of the page's files."""
-    folder = "report" if name in SHARED else "app"
+    folder = "reporting" if name in SHARED else "app"
     # The package of the report itself is not loaded for it: that takes longer than the first page may.
     text = files("vstent").joinpath(folder, "assets", name).read_bytes()
     return Response(text, media_type=MEDIA[Path(name).suffix])

@@ -2,9 +2,9 @@
 
 from typing import Any, Final
 
-from vstent.report.definitions import HEADLINES
-from vstent.report.quantities import Quantity, compare, flatten, format_change
-from vstent.report.uncertainty import uncertainty_of
+from vstent.reporting.definitions import HEADLINES
+from vstent.reporting.quantities import Quantity, compare, flatten, format_change
+from vstent.reporting.uncertainty import uncertainty_of
 
 Sheet = dict[str, Any]
 

@@ -16,8 +16,8 @@ from typing import Any, Final
 
 from vstent.app.cases import Case, State
 from vstent.errors import VstentError
-from vstent.study import run
 from vstent.study.ledger import anatomy_key, hash_of
+from vstent.study.pipeline import run
 
 
 def end_with_the_server() -> None:
@@ -41,7 +41,7 @@ def progress(stage: str, fraction: float, detail: str) -> None:
 
 def find_anatomy(case: Case) -> None:
     """Find vessel, sac, neck and parent artery."""
-    from vstent.study import restore_vessel
+    from vstent.study.pipeline import restore_vessel
 
     restore_vessel(case.input, case.folder, case.state.settings(), progress)
     tell(anatomy=_anatomy_key(case))
@@ -53,7 +53,7 @@ def _anatomy_key(case: Case) -> str:
 
 def compute(case: Case) -> None:
     """Deploy, compute the flow where it is wanted, and write the report: what `vstent run` does."""
-    from vstent.report import write_report
+    from vstent.reporting.write import write_report
 
     if _anatomy_key(case) != case.state.anatomy:
         find_anatomy(case)  # and told before the flow: a job that is stopped there has replaced the former one

@@ -17,6 +17,8 @@ COMMANDS: Final = (run, app, trace, restore, rank, batch, flow, export, demo, de
 BAD_INPUT: Final = 2
 FAILED: Final = 1
 INTERRUPTED: Final = 130
+HELPER: Final = (sys.executable, "-m", "vstent.cli.warm")
+"""Compiles the kernels that are needed last, while this process compiles those that it needs now."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,7 +36,7 @@ def _done(arguments: argparse.Namespace) -> int:
             return int(arguments.command(arguments))
         from vstent.kernels.first_use import telling
 
-        with telling(_first_use, helped=True):
+        with telling(_first_use, helper=HELPER):
             return int(arguments.command(arguments))
     except InputError as error:
         return _fail(str(error), BAD_INPUT)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from vstent.cli import options, run
 
 if TYPE_CHECKING:
-    from vstent.cohort import AbstractCrew, Estimate
+    from vstent.cohort.crews import AbstractCrew
+    from vstent.cohort.estimate import Estimate
 
 
 def add(commands: options.Commands) -> None:
@@ -28,8 +29,10 @@ def add(commands: options.Commands) -> None:
 
 
 def _batch(arguments: argparse.Namespace) -> int:
-    from vstent.cohort import collect, device_rows, estimate, find_cases, left_to_do, run_cohort, write_table
-    from vstent.console import Console, cohort_table
+    from vstent.cli.console import Console, cohort_table
+    from vstent.cohort.batch import collect, left_to_do, run_cohort, write_table
+    from vstent.cohort.cases import device_rows, find_cases
+    from vstent.cohort.estimate import estimate
 
     console = Console()
     settings = run.given_study(arguments, **options.given_geometry(arguments))
@@ -51,7 +54,7 @@ def _batch(arguments: argparse.Namespace) -> int:
 
 
 def _crew(arguments: argparse.Namespace, foreseen: "Estimate") -> "AbstractCrew":
-    from vstent.cohort import DaskCluster, Processes, Slurm
+    from vstent.cohort.crews import DaskCluster, Processes, Slurm
 
     if arguments.scheduler:
         return DaskCluster(arguments.scheduler)
@@ -74,6 +77,6 @@ def _seconds(rows: Sequence[dict[str, Any]]) -> str:
 
 def _report(out: Path, rows: Sequence[dict[str, Any]]) -> None:
     from vstent.io.writers import write_text
-    from vstent.report import cohort_report
+    from vstent.reporting.cohort import cohort_report
 
     write_text(out / "cohort.html", cohort_report(out.resolve().name, rows))

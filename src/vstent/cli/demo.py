@@ -16,8 +16,8 @@ def add(commands: options.Commands) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> int:
-    from vstent.console import Console, truth_table
-    from vstent.demo import truth, write_scan
+    from vstent.cli.console import Console, truth_table
+    from vstent.study.demo import truth, write_scan
 
     scan, settings = write_scan(arguments.out / "scan"), run.given_study(arguments)
     case = run.study(scan, arguments.out, settings, is_printed=arguments.pdf)

@@ -12,22 +12,22 @@ def add(commands: options.Commands) -> None:
     parser.set_defaults(command=_devices)
     adding = options.add_command(parser.add_subparsers(metavar="COMMAND"), "add", "add devices of your own")
     adding.add_argument(
-        "file", type=Path, help="TOML, written like vstent's devices.toml: every number with its source"
+        "file", type=Path, help="TOML, written like vstent's catalogue.toml: every number with its source"
     )
     adding.set_defaults(command=_add)
 
 
 def _devices(arguments: argparse.Namespace) -> int:
-    from vstent.console import Console, device_table
-    from vstent.device import catalogue
+    from vstent.cli.console import Console, device_table
+    from vstent.devices.design import catalogue
 
     Console().print(device_table(catalogue()))
     return 0
 
 
 def _add(arguments: argparse.Namespace) -> int:
-    from vstent.console import Console, device_table
-    from vstent.device import add_devices
+    from vstent.cli.console import Console, device_table
+    from vstent.devices.design import add_devices
 
     Console().print(device_table(add_devices(arguments.file)))
     return 0

@@ -37,9 +37,9 @@ def _layers(text: str) -> int:
 
 
 def _openfoam(arguments: argparse.Namespace) -> int:
-    from vstent.console import Console
-    from vstent.study import Settings
+    from vstent.cli.console import Console
     from vstent.study.exports import export_openfoam
+    from vstent.study.types import Settings
 
     devices = (arguments.device,) if arguments.device else ()
     settings = Settings(devices=devices, flow=options.given_problem(arguments), **options.given_geometry(arguments))
@@ -54,9 +54,9 @@ def _openfoam(arguments: argparse.Namespace) -> int:
 
 
 def _patches(arguments: argparse.Namespace) -> int:
-    from vstent.console import Console
-    from vstent.study import Settings
+    from vstent.cli.console import Console
     from vstent.study.exports import export_patches
+    from vstent.study.types import Settings
 
     settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
     console = Console()

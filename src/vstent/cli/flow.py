@@ -9,8 +9,8 @@ from vstent.cli import options
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from vstent.console import Console
-    from vstent.study import Settings
+    from vstent.cli.console import Console
+    from vstent.study.types import Settings
 
 
 def add(commands: options.Commands) -> None:
@@ -31,8 +31,8 @@ def add(commands: options.Commands) -> None:
 
 
 def _flow(arguments: argparse.Namespace) -> int:
-    from vstent.console import Console
-    from vstent.study import Settings
+    from vstent.cli.console import Console
+    from vstent.study.types import Settings
 
     devices = tuple(dict.fromkeys(arguments.device or ()))
     settings = Settings(devices=devices, flow=options.given_flow(arguments), **options.given_geometry(arguments))
@@ -45,8 +45,8 @@ def _flow(arguments: argparse.Namespace) -> int:
 
 
 def _compute(path: Path, out: Path, settings: "Settings", console: "Console") -> "list[Table]":
-    from vstent.console import flow_table
-    from vstent.study import run
+    from vstent.cli.console import flow_table
+    from vstent.study.pipeline import run
 
     with console.live():
         case = run(path, out, settings, console.progress)
@@ -54,8 +54,8 @@ def _compute(path: Path, out: Path, settings: "Settings", console: "Console") ->
 
 
 def _converge(path: Path, out: Path, settings: "Settings", console: "Console") -> "list[Table]":
-    from vstent.console import convergence_table, positions_table
-    from vstent.study import refine_flow
+    from vstent.cli.console import convergence_table, positions_table
+    from vstent.study.pipeline import refine_flow
 
     with console.live():
         found = refine_flow(path, out, settings, console.progress)

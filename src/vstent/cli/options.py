@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from vstent.errors import InputError
 
 if TYPE_CHECKING:
-    from vstent.flow.types import Blood, FlowSettings, Waveform
-    from vstent.uncertainty import Ranges
+    from vstent.flow.case import Blood, FlowSettings, Waveform
+    from vstent.plan.uncertainty import Ranges
 
 EPILOG: Final = (
     "Research use only: not cleared for diagnosis or treatment. Lengths in mm, flow in SI; coordinates are LPS."
@@ -223,7 +223,7 @@ def given_ranges(arguments: argparse.Namespace) -> "Ranges | None":
                 "--vary and --uncertain-flows say how --uncertainty is to be done: give --uncertainty N too"
             )
         return None
-    from vstent.uncertainty import Ranges
+    from vstent.plan.uncertainty import Ranges
 
     return Ranges(arguments.uncertainty, arguments.uncertain_flows, **dict(arguments.vary))
 
@@ -287,7 +287,7 @@ def given_devices(arguments: argparse.Namespace) -> tuple[str, ...]:
 
 def given_problem(arguments: argparse.Namespace) -> "FlowSettings":
     """Collect which flow it is."""
-    from vstent.flow import FlowSettings
+    from vstent.flow.case import FlowSettings
 
     return FlowSettings(
         inflow_mL_s=arguments.flow_rate,
@@ -300,8 +300,8 @@ def given_problem(arguments: argparse.Namespace) -> "FlowSettings":
 
 def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
     """Collect which flow it is and how it is computed."""
-    from vstent.flow import engine_class
-    from vstent.flow.gpu import require_gpu
+    from vstent.flow.lattice.gpu import require_gpu
+    from vstent.flow.simulation import engine_class
 
     settings = replace(
         given_problem(arguments),
@@ -317,8 +317,7 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
 
 
 def _blood(arguments: argparse.Namespace) -> "Blood":
-    from vstent.flow import Blood
-    from vstent.flow.types import HIGH_SHEAR_VISCOSITY_PA_S, CarreauYasuda
+    from vstent.flow.case import HIGH_SHEAR_VISCOSITY_PA_S, Blood, CarreauYasuda
 
     if not arguments.thinning:
         return Blood(arguments.density, arguments.viscosity or Blood.viscosity_Pa_s)

@@ -29,10 +29,13 @@ def add(commands: options.Commands) -> None:
 
 
 def _rank(arguments: argparse.Namespace) -> int:
-    from vstent.console import Console, ranking_reasons, ranking_table
-    from vstent.device import find_design
-    from vstent.rank import default_criteria, rank, read_criteria
-    from vstent.study import Settings, restore_vessel, write_ranking
+    from vstent.cli.console import Console, ranking_reasons, ranking_table
+    from vstent.devices.design import find_design
+    from vstent.plan.criteria import default_criteria, read_criteria
+    from vstent.plan.rank import rank
+    from vstent.study.outputs import write_ranking
+    from vstent.study.pipeline import restore_vessel
+    from vstent.study.types import Settings
 
     designs = [find_design(name) for name in options.given_devices(arguments)]
     criteria = read_criteria(arguments.criteria) if arguments.criteria else default_criteria()

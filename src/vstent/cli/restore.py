@@ -15,8 +15,9 @@ def add(commands: options.Commands) -> None:
 
 
 def _restore(arguments: argparse.Namespace) -> int:
-    from vstent.console import Console, morphology_table
-    from vstent.study import Settings, restore_vessel
+    from vstent.cli.console import Console, morphology_table
+    from vstent.study.pipeline import restore_vessel
+    from vstent.study.types import Settings
 
     console = Console()
     settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))

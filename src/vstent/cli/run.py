@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from vstent.cli import options
 
 if TYPE_CHECKING:
-    from vstent.study import CaseResult, Settings
+    from vstent.study.types import CaseResult, Settings
 
 
 def add(commands: options.Commands) -> None:
@@ -49,7 +49,7 @@ def add_pdf(parser: argparse.ArgumentParser) -> None:
 
 def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
     """Collect what a study is told; `given` are further settings."""
-    from vstent.study import Settings
+    from vstent.study.types import Settings
 
     flow = None if arguments.no_flow else options.given_flow(arguments)
     devices, ranges = options.given_devices(arguments), options.given_ranges(arguments)
@@ -58,14 +58,14 @@ def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
 
 def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool) -> "CaseResult":
     """Run a study with its progress shown; write the report, as a PDF too where asked, and print the table."""
-    from vstent.console import Console, comparison_table, uncertainty_table
-    from vstent.study import run
+    from vstent.cli.console import Console, comparison_table, uncertainty_table
+    from vstent.study.pipeline import run
 
     console = Console()
     with console.live():
         case = run(path, out, settings, console.progress)
         console.progress("report", 0.0, "")
-        from vstent.report import write_report
+        from vstent.reporting.write import write_report
 
         write_report(case, out, is_printed=is_printed)
         console.progress("report", 1.0, str(out / "report.html"))
@@ -92,9 +92,10 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _again(arguments: argparse.Namespace, given: "Settings") -> int:
     """Repeat a run from its run.json; say what is not as it was, and how far the results agree."""
-    from vstent.console import Console
+    from vstent.cli.console import Console
     from vstent.errors import InputError
-    from vstent.study import Settings, agreement, read_record
+    from vstent.study.repeat import agreement, read_record
+    from vstent.study.types import Settings
 
     if asdict(given) != asdict(Settings()):
         raise InputError(
@@ -112,7 +113,7 @@ def _again(arguments: argparse.Namespace, given: "Settings") -> int:
 
 
 def _finish(arguments: argparse.Namespace, case: "CaseResult") -> None:
-    from vstent.study import write_crate
+    from vstent.study.crate import write_crate
 
     if arguments.crate:
         write_crate(arguments.out, case.provenance, date.today().isoformat())

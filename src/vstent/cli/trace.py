@@ -13,8 +13,9 @@ def add(commands: options.Commands) -> None:
 
 
 def _trace(arguments: argparse.Namespace) -> int:
-    from vstent.console import Console, opening_table
-    from vstent.study import Settings, trace_vessel
+    from vstent.cli.console import Console, opening_table
+    from vstent.study.pipeline import trace_vessel
+    from vstent.study.types import Settings
 
     console = Console()
     settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))

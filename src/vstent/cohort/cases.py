@@ -7,12 +7,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from vstent.device import find_design
+from vstent.devices.design import find_design
 from vstent.errors import InputError, ReadError
 from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
 from vstent.io.tables import finite
-from vstent.study import Settings
 from vstent.study.ledger import hash_of, key_of, refuse_missing
+from vstent.study.types import Settings
 from vstent.units import MM_PER
 
 Number = TypeVar("Number", int, float)

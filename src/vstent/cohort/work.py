@@ -13,7 +13,8 @@ from typing import Any, Final
 from vstent.cohort.cases import Case
 from vstent.errors import VstentError
 from vstent.io.writers import write_json, write_text
-from vstent.study import Progress, Settings, restore_vessel, run
+from vstent.study.pipeline import restore_vessel, run
+from vstent.study.types import Progress, Settings
 
 Row = dict[str, Any]
 """One case with one device: names to values."""

@@ -7,11 +7,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from vstent.flow import engine_class, simulate_case
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.indices import QUANTITIES, indices
 from vstent.flow.positions import POSITIONS, Scatter, scatter, turned
-from vstent.flow.types import FlowCase, FlowField, FlowSettings
+from vstent.flow.simulation import engine_class, simulate_case
 
 RATIO: Final = 2**0.5
 """From one grid, or time step, to the next finer one."""

@@ -9,14 +9,13 @@ from scipy import ndimage
 
 from vstent.errors import FlowError
 from vstent.flow import sampling
-from vstent.flow.types import Blood, FlowCase
+from vstent.flow.case import Blood, FlowCase
+from vstent.flow.lattice.kernels.d3q19 import VELOCITIES
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Opening, Vessel
 from vstent.kernels import triangles, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
-from vstent.kernels.lattice import VELOCITIES
-from vstent.surface import Surface
-from vstent.units import M_PER_MM
-from vstent.vessel import Opening, Vessel
-from vstent.words import place
+from vstent.units import M_PER_MM, place
 
 INLET_EXTENSION = 0.5
 """Length of the straight tube before an inlet, in its diameters: the imposed profile is developed already."""

@@ -5,11 +5,11 @@ from typing import Final
 import numpy as np
 
 from vstent.flow import sampling
-from vstent.flow.types import FlowField
+from vstent.flow.case import FlowField
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import roles
 from vstent.kernels.arrays import Bools, Floats
-from vstent.surface import Surface
 from vstent.units import M_PER_MM
-from vstent.vessel import roles
 
 LOW_SHEAR_PA = 0.4
 """Below this wall shear stress endothelium degenerates (Malek, Alper and Izumo 1999, JAMA 282, 2035)."""

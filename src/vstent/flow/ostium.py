@@ -3,9 +3,9 @@
 import numpy as np
 
 from vstent.errors import FlowError
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Aneurysm
 from vstent.kernels import triangles
-from vstent.surface import Surface
-from vstent.vessel import Aneurysm
 
 ON_WALL_MM = 1e-3
 """Faces of a sac nearer to the lumen's wall than this are wall: they were cut from it."""

@@ -6,10 +6,10 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vstent.flow.types import FlowCase
+from vstent.flow.case import FlowCase
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
-from vstent.surface import Surface
-from vstent.vessel import Vessel
 
 POSITIONS: Final = {
     "as it lies": Rotation.identity(),

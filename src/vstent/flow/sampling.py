@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from vstent.flow.types import FlowField
-from vstent.kernels import lattice_sampling, voxels
+from vstent.flow.case import FlowField
+from vstent.geometry.surface import Surface
+from vstent.kernels import sampling as lattice_sampling
+from vstent.kernels import voxels
 from vstent.kernels.arrays import Floats, Ints
-from vstent.surface import Surface
 
 
 def values_at(field: FlowField, points_mm: Floats) -> tuple[Floats, Floats]:

@@ -4,8 +4,10 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from vstent.device import LaserCut
+from vstent.devices.design import LaserCut
+from vstent.devices.stent import Stent
 from vstent.flow import sampling
+from vstent.flow.case import Blood, Screen
 from vstent.flow.drag import (
     BREADTH,
     crossing_factor,
@@ -15,10 +17,8 @@ from vstent.flow.drag import (
     round_diameter,
     tangential_share,
 )
-from vstent.flow.types import Blood, Screen
+from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats, Ints
-from vstent.stent import Stent
-from vstent.surface import Surface
 from vstent.units import M_PER_MM, MM_PER_UM
 
 SMOOTHING_PORES = 1.5

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from vstent.flow import sampling
-from vstent.flow.types import FlowField
-from vstent.kernels import lattice_sampling
+from vstent.flow.case import FlowField
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Vessel
+from vstent.kernels import sampling as lattice_sampling
 from vstent.kernels.arrays import Floats, Ints, freeze
-from vstent.surface import Surface
-from vstent.vessel import Vessel
 
 STEP_CELLS = 0.4
 """Length of a step, in cells."""

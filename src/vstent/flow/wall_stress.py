@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from vstent.flow.case import Blood
 from vstent.flow.domain import Domain
-from vstent.flow.types import Blood
-from vstent.kernels import lattice_sampling
+from vstent.geometry.surface import Surface
+from vstent.kernels import sampling as lattice_sampling
 from vstent.kernels.arrays import Floats
-from vstent.surface import Surface
 from vstent.units import M_PER_MM
 
 REACH = 4

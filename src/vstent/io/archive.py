@@ -22,6 +22,19 @@ Noun = TypeVar("Noun")
 
 _ROOT: Final = "vstent."
 _KIND: Final = "is"
+_FORMER_HOMES: Final = {
+    "vstent.device": "vstent.devices.design",
+    "vstent.flow.types": "vstent.flow.case",
+    "vstent.image": "vstent.geometry.image",
+    "vstent.rank": "vstent.plan.rank",
+    "vstent.rank.criteria": "vstent.plan.criteria",
+    "vstent.segment": "vstent.anatomy.segment",
+    "vstent.stent": "vstent.devices.stent",
+    "vstent.surface": "vstent.geometry.surface",
+    "vstent.uncertainty": "vstent.plan.uncertainty",
+    "vstent.vessel": "vstent.geometry.vessel",
+}
+"""Modules that archives of version 0.1 name -> modules that hold the same classes."""
 DAMAGE: Final = (
     OSError,
     ValueError,
@@ -124,7 +137,8 @@ def _unpacked(value: Any, archive: Any) -> Any:
 def _noun_class(module: str, name: str) -> type:
     if not module.startswith(_ROOT):
         raise ValueError(f"{module}.{name} is no noun of vstent")
-    found = getattr(importlib.import_module(module), name)
-    if not (isinstance(found, type) and dataclasses.is_dataclass(found) and found.__module__ == module):
+    home = _FORMER_HOMES.get(module, module)
+    found = getattr(importlib.import_module(home), name)
+    if not (isinstance(found, type) and dataclasses.is_dataclass(found) and found.__module__ == home):
         raise ValueError(f"{module}.{name} is no noun of vstent")
     return found

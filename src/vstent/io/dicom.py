@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.errors import ReadError, UnitError
-from vstent.image import Image
+from vstent.geometry.image import Image
 from vstent.io.files import silenced
 from vstent.kernels.arrays import Floats
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.image import Image
+from vstent.geometry.image import Image
 
 CT_IMAGE_STORAGE: Final = "1.2.840.10008.5.1.4.1.1.2"
 """Reconstructed rotational angiograms are commonly exported in this class; every viewer opens it as a volume."""

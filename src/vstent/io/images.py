@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from vstent.errors import ReadError, UnitError
-from vstent.image import Image
+from vstent.geometry.image import Image
 from vstent.io import dicom
 from vstent.io.files import IMAGE_SUFFIXES, RAW_SUFFIXES, existing, is_surface_file, silenced, suffix
 

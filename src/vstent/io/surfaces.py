@@ -7,10 +7,10 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from vstent.errors import ReadError, UnitError
+from vstent.geometry.surface import Surface
 from vstent.io.files import SURFACE_SUFFIXES, existing, suffix
 from vstent.io.vtk_child import read_apart
 from vstent.kernels import topology, triangles
-from vstent.surface import Surface
 from vstent.units import MM_PER
 
 Unit = Literal["m", "cm", "mm"]

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Final
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
+from vstent.geometry.surface import Surface
 from vstent.io.files import atomic
-from vstent.surface import Surface
 
 NAMESPACE: Final = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 _TYPES: Final = """<?xml version="1.0" encoding="UTF-8"?>

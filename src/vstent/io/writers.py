@@ -11,11 +11,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Centerline
 from vstent.io.files import atomic, silenced
 from vstent.io.polydata import cells_of, points_of, polydata_of, ragged_cells
 from vstent.kernels.arrays import Floats, Ints
-from vstent.surface import Surface
-from vstent.vessel import Centerline
 
 Arrays = Mapping[str, NDArray[Any]]
 

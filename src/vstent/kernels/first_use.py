@@ -1,25 +1,21 @@
 """First use: tell that kernels are being compiled, where none are kept from before, and have help with it."""
 
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from numba.core import event
 
-HELP = (sys.executable, "-m", "vstent.kernels.warm")
-"""Compiles the kernels that are needed last, while this process compiles those that it needs now."""
-
 
 @contextmanager
-def telling(tell: Callable[[], None], *, helped: bool = False) -> Iterator[None]:
+def telling(tell: Callable[[], None], *, helper: Sequence[str] = ()) -> Iterator[None]:
     """Have `tell` called once, when a kernel is about to be compiled for want of a kept one.
 
-    Helped, a second process then compiles others, as far as it gets before this ends: numba takes from its cache what
-    is there by the time that it is needed, and threads of one process cannot compile at once.
+    `helper` is the command of a second process that then compiles others, as far as it gets before this ends: numba
+    takes from its cache what is there by the time that it is needed, and threads of one process cannot compile at once.
     """
-    once = _Once(tell, HELP if helped else ())
+    once = _Once(tell, tuple(helper))
     try:
         with event.install_listener("numba:compile", once):
             yield

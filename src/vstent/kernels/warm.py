@@ -1,35 +1,15 @@
-"""Compile kernels ahead of their first use: ``python -m vstent.kernels.warm``, in the set-up.
-
-All that take time to compile. A process that has compiled a flow's kernels itself runs other machine code than numba
-keeps of them, slower and different in the last bits from that of every later process: `keep_flow`.
-"""
-
-import sys
-from functools import cache
+"""Compile the shared kernels ahead of their first use, in the set-up: all that take time to compile."""
 
 import numpy as np
 
-from vstent.kernels import (
-    coverage,
-    curves,
-    lanes,
-    lattice,
-    lattice_sampling,
-    medial,
-    net,
-    raster,
-    tree,
-    triangles,
-    voxels,
-)
-from vstent.kernels.first_use import kept
+from vstent.kernels import coverage, curves, medial, net, raster, sampling, tree, triangles, voxels
 
 
 def warm() -> None:
-    """Call every kernel once on next to nothing, the last ones first; numba keeps what it compiles."""
+    """Call every kernel once on next to nothing, numba keeps what it compiles."""
     row, column = np.meshgrid(np.arange(3.0), np.arange(4.0), indexing="ij")
     nodes = np.stack([np.cos(np.pi / 2 * column), np.sin(np.pi / 2 * column), row], axis=-1)
-    flow()
+    _sample()
     _slide(nodes)
     coverage.covered_fractions(nodes, nodes[0], nodes[1], np.full(4, 0.01), 2)
     _search()
@@ -37,12 +17,6 @@ def warm() -> None:
     curves.parallel_frames(np.eye(3))
     curves.closed_lengths(nodes)
     medial.widest_in_section(np.ones((1, 2)), np.ones((1, 2, 2)), 1.0, np.ones(1))
-
-
-@cache
-def keep_flow() -> None:
-    """See that a flow runs the machine code that every process runs: if need be another one compiles it."""
-    kept(flow, (sys.executable, "-c", "from vstent.kernels.warm import flow; flow()"))
 
 
 def _search() -> None:
@@ -77,30 +51,9 @@ def _slide(nodes_mm: np.ndarray) -> None:
     net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1), net.Descent(1, 0.1, 0.1))
 
 
-def flow() -> None:
-    """Call every kernel of a flow on one cell at rest, with every argument of the type that a flow has."""
-    stride = lanes.COUNT
-    f, none = np.zeros(20 * stride, np.float32), np.zeros(0, np.int32)
-    relaxation = np.float32(1.0), np.zeros(4, np.float32), np.full(1, np.inf, np.float32), np.float32(1.0)
-    address = stride * np.arange(19, dtype=np.int32)[None, None]
-    lattice.update(
-        f, (address, np.ones(1, np.int32), relaxation, lattice.no_screen(1)), lattice.NO_LINKS, *lattice.undivided(1)
-    )
-    links, source = np.zeros((0, 6), np.int32), np.zeros(0, np.float32)
-    nowhere = np.zeros(1, np.int32)
-    of_openings = nowhere, links, none, none, np.zeros((1, 0, 2))
-    lattice.drive(f, stride, np.zeros((0, 9)), of_openings, np.zeros(3), source)
-    lattice.defer(f, links, np.zeros((0, 5), np.float32), source, source, np.float32(1.0))
-    lattice.balance(source, (nowhere, none, nowhere, none), source, np.float32(1.0))
-    lattice.moments(f, stride, none)
-    times = lattice.relaxation_times(f, stride, none, relaxation[0], relaxation[1])
-    lattice.resisted(np.zeros((0, 3), np.float32), np.zeros((0, lattice.ENTRY), np.float32), times, np.float32(1.0))
-    lattice.rescale(f, stride, none, links, np.float32(1.0), np.float32(1.0))
+def _sample() -> None:
+    """Read a field on a grid of one cell."""
     index, numbers, points = np.zeros((2, 2, 2), np.int32), np.zeros(1), np.zeros((0, 3))
-    lattice_sampling.interpolate_cubic(index, np.zeros((1, 3)), points)
-    lattice_sampling.fit_wall(index, numbers, np.zeros((1, 3)), numbers, points, points, 1)
+    sampling.interpolate_cubic(index, np.zeros((1, 3)), points)
+    sampling.fit_wall(index, numbers, np.zeros((1, 3)), numbers, points, points, 1)
     voxels.fill(np.zeros((0, 3, 3)), (1, 1, 1))
-
-
-if __name__ == "__main__":
-    warm()

@@ -7,23 +7,26 @@ from typing import Any, Final
 
 import numpy as np
 
-from vstent.device import find_design
+from vstent.devices.design import find_design
+from vstent.devices.stent import Stent
 from vstent.errors import FlowError, InputError, ReadError
-from vstent.flow import FlowCase, FlowSettings, flow_case
+from vstent.flow.case import FlowCase, FlowSettings
 from vstent.flow.domain import default_cell_size_mm
-from vstent.flow.openfoam import Flavour, FoamCase, FoamSetup, foam_case, named_patches, program, stl_text
-from vstent.flow.openfoam.case import strut_solids
+from vstent.flow.openfoam import program
+from vstent.flow.openfoam.case import FoamCase, foam_case, strut_solids
 from vstent.flow.openfoam.folder import write
+from vstent.flow.openfoam.patches import named_patches, stl_text
+from vstent.flow.openfoam.setup import Flavour, FoamSetup
+from vstent.flow.simulation import flow_case
+from vstent.geometry.vessel import Anatomy
 from vstent.io import writers
 from vstent.io.archive import load_noun
-from vstent.stent import Stent
 from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, hash_of
 from vstent.study.provenance import RUN
 from vstent.study.repeat import UNTOLD, told_in
 from vstent.study.stages import check_inflow, deploy_one, find_anatomy
 from vstent.study.types import Progress, Settings
-from vstent.vessel import Anatomy
 
 GEOMETRY: Final = (
     *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),

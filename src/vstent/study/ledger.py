@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from vstent.errors import ReadError
-from vstent.flow import Progress as FlowProgress
+from vstent.flow.engines import Progress as FlowProgress
 from vstent.io.archive import load_noun, save_noun
 from vstent.io.images import files_of
 from vstent.io.writers import write_json

@@ -10,17 +10,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.flow import FlowField
+from vstent.deployment.struts import struts
+from vstent.devices.stent import Deployment
+from vstent.flow.case import FlowField
 from vstent.flow.openfoam.folder import KEY
+from vstent.geometry.vessel import Anatomy, Centerline, Vessel
 from vstent.io import writers
 from vstent.io.tables import write_rows
 from vstent.io.three_mf import write_3mf
-from vstent.rank import Ranking
-from vstent.stent import Deployment
-from vstent.struts import struts
+from vstent.plan.rank import Ranking
 from vstent.study.crate import NAME as CRATE
 from vstent.study.provenance import METRICS, RUN
-from vstent.vessel import Anatomy, Centerline, Vessel
 
 STENT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
 FIELD: Final = ("field.vtu", "wall.vtp")

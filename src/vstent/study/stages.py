@@ -9,41 +9,34 @@ from typing import Any, Final
 
 import numpy as np
 
-from vstent.deploy import deploy, propose_size
-from vstent.device import BARE, Design, Size, find_sizes
+from vstent.anatomy.openings import opening_at
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.segment import segment
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.deployment.deploy import deploy, propose_size
+from vstent.deployment.measure import measure, morphology
+from vstent.deployment.struts import over_restored
+from vstent.devices.design import BARE, Design, Size, find_sizes
+from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import InputError
-from vstent.flow import (
-    FlowCase,
-    FlowField,
-    FlowSettings,
-    compare,
-    flow_case,
-    foretell_cost,
-    indices,
-    ostium,
-    simulate_case,
-)
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.convergence import Sensitivity, convergence
+from vstent.flow.indices import compare, indices
+from vstent.flow.ostium import ostium
+from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
+from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
 from vstent.kernels.arrays import Floats
-from vstent.measure import measure, morphology
-from vstent.openings import opening_at
-from vstent.repair import repair
-from vstent.restore import restore
-from vstent.segment import segment
-from vstent.stent import Deployment, Landing, Stent
-from vstent.struts import over_restored
+from vstent.plan.uncertainty import Uncertainty, vary
 from vstent.study.checkpoint import FlowCheckpoint
 from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of, vessel_key
 from vstent.study.outputs import write_field
 from vstent.study.types import Placing, Point, Settings
-from vstent.trace import trace
-from vstent.trim import trim
-from vstent.uncertainty import Uncertainty, vary
-from vstent.vessel import Anatomy, Vessel
-from vstent.words import counted
+from vstent.units import counted
 
 SLOWEST_M_S: Final = 0.01
 FASTEST_M_S: Final = 2.0

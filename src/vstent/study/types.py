@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-from vstent.flow import FlowField, FlowSettings
-from vstent.stent import Deployment
-from vstent.uncertainty import Ranges
-from vstent.vessel import Anatomy
+from vstent.devices.stent import Deployment
+from vstent.flow.case import FlowField, FlowSettings
+from vstent.geometry.vessel import Anatomy
+from vstent.plan.uncertainty import Ranges
 
 Point = tuple[float, float, float]
 

@@ -1,11 +1,5 @@
-"""OpenFOAM: a flow as a case folder that its users know, and its results read back.
+"""OpenFOAM as an engine: a `FlowCase` in, a case folder that OpenFOAM runs, and a `FlowField` read back.
 
-`foam_case` states a `FlowCase` as text files in OpenFOAM's own syntax. Only `folder` writes them, `program` runs
-OpenFOAM there, and `results` and `bridge` read what it wrote.
+Open ``engine.py`` first; ``case.py`` states the flow in OpenFOAM's syntax, ``folder.py`` writes it, and ``bridge.py``
+reads the results.
 """
-
-from vstent.flow.openfoam.case import FoamCase, foam_case
-from vstent.flow.openfoam.patches import Patch, named_patches, stl_text
-from vstent.flow.openfoam.setup import Flavour, FoamSetup
-
-__all__ = ["Flavour", "FoamCase", "FoamSetup", "Patch", "foam_case", "named_patches", "stl_text"]

@@ -5,10 +5,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from vstent.flow.case import FlowCase
 from vstent.flow.openfoam.dictionary import foam_file
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.profile import developed_profile
-from vstent.flow.types import FlowCase
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM

@@ -5,14 +5,14 @@ from typing import Final
 
 import numpy as np
 
+from vstent.deployment.struts import struts
 from vstent.errors import FlowError, LandingError
+from vstent.flow.case import FlowCase
 from vstent.flow.openfoam import boundary, control, mesh, scripts
 from vstent.flow.openfoam.patches import Patch, named_patches, stl_text
 from vstent.flow.openfoam.setup import FoamSetup
-from vstent.flow.types import FlowCase
+from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats
-from vstent.struts import struts
-from vstent.surface import Surface
 from vstent.units import M_PER_MM
 
 README: Final = """\

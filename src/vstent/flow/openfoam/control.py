@@ -5,10 +5,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from vstent.flow.case import PHASES, Blood, FlowCase
 from vstent.flow.openfoam.dictionary import foam_file
 from vstent.flow.openfoam.mesh import NECK
 from vstent.flow.openfoam.setup import FoamSetup
-from vstent.flow.types import PHASES, Blood, FlowCase
 from vstent.kernels.arrays import Floats
 
 MAX_COURANT: Final = 2.0

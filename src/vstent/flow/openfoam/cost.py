@@ -5,11 +5,11 @@ from typing import Final
 import numpy as np
 
 from vstent.errors import FlowError
-from vstent.flow.cost import free_memory_bytes
+from vstent.flow.case import LATTICE, FlowCase
 from vstent.flow.domain import extended_volume_mm3
+from vstent.flow.lattice.cost import free_memory_bytes
 from vstent.flow.openfoam.case import strut_solids
 from vstent.flow.openfoam.setup import FoamSetup
-from vstent.flow.types import LATTICE, FlowCase
 
 CELLS_PER_CUBE: Final = 1.6
 """Cells of the mesh over the blood's volume in cells: layers and the refined neck (1.5 to 1.65 measured)."""

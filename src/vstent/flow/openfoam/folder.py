@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 
 from vstent.flow import sampling
+from vstent.flow.case import FlowField
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.case import FoamCase
 from vstent.flow.openfoam.setup import FEATURES, FoamSetup
-from vstent.flow.types import FlowField
 from vstent.io.writers import write_text
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vstent.flow.case import FlowCase
 from vstent.flow.domain import extend
-from vstent.flow.types import FlowCase
+from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats, Ints, freeze
-from vstent.surface import Surface
 
 ON_SAC_MM = 1e-3
 """Faces of the wall nearer to the sac's surface than this are the sac's."""

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
-from vstent.surface import Surface
+from vstent.geometry.surface import Surface
 
 Flavour: TypeAlias = Literal["com", "org"]
 """openfoam.com (Debian's 1912 and later) or openfoam.org (11 and later): their dictionaries differ in a few names."""

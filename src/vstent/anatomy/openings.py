@@ -1,0 +1,299 @@
+"""Find the vessel's ends and open them: open loops, flat caps, and arms that end blind.
+
+A lumen comes from three kinds of sources and ends in three ways: an exported surface is open at its ends or closed by
+flat caps; a surface from a scan is open where the vessel leaves the image, and blunt where the contrast fades.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.errors import InputError, VesselError
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Opening, Vessel, roles
+from vstent.kernels import curves, medial, triangles
+from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.units import counted, place
+
+CAP_ANGLE_RAD: Final = np.radians(6.0)
+"""Neighbouring faces of a flat cap differ by less than this."""
+CAP_RIM_RAD: Final = np.radians(35.0)
+"""Along its rim a cap meets the wall at more than this on average."""
+CAP_RIM_EDGES: Final = 8
+"""A cap's outline has at least this many edges: fewer may make a large triangle of a coarse wall, not a cap..."""
+FEWEST_RIM_EDGES: Final = 6
+"""... but for a cap of at least this many behind which the lumen is no wider than it."""
+CAP_AREA_MM2: Final = 0.3
+"""The smallest cap: a vessel 0.6 mm wide."""
+ARM_SLENDERNESS: Final = 6.0
+"""A blind arm longer than this many of its mean radii is a vessel; shorter ones are sacs and bumps."""
+STUMP_SLENDERNESS: Final = 2.5
+"""The same where that leaves blood no way in and out: of a piece cut out close to a sac the ends are short."""
+ARM_SWELLING: Final = 1.35
+"""An arm whose widest sphere exceeds its median by more than this factor near the tip is a sac on a stalk."""
+ARM_SHARE: Final = 0.15
+"""Opening an arm takes off its tip and the twigs on it: no more than this fraction of the wall."""
+ARM_RADIUS_MM: Final = 0.5
+"""Thinner blind arms are left closed: no flow worth computing leaves through them."""
+FARTHEST_MM: Final = 5.0
+FARTHEST_DIAMETERS: Final = 2.0
+"""How far from an opening a point beside it may lie: the greater of the two."""
+STILL: Final = 0.1
+"""An end whose middle is within this many diameters of an opening's is that opening still."""
+NEARLY: Final = 0.8
+"""An outlet wider than this fraction of an inlet that was not given may be the inlet."""
+
+
+def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
+    """Return the vessel with its ends cut open and listed, and its inscribed spheres.
+
+    The widest end is the inlet; the outlets are numbered by width.
+
+    Raises
+    ------
+    VesselError
+        When fewer than two ends can be found.
+    """
+    lumen, n_caps = _without_caps(vessel.lumen)
+    notes = [f"{counted(n_caps, 'flat cap')} taken off to open the vessel."] if n_caps else []
+    if not len(lumen.faces):
+        raise VesselError("the surface has flat sides only, and no round wall between them: it is not a vessel's")
+    closed = lumen
+    lumen, n_arms = _with_open_arms(lumen, ARM_SLENDERNESS)
+    if n_arms:
+        notes.append(f"{counted(n_arms, 'blind arm')} cut open square to the axis.")
+    if len(lumen.boundary_loops) < 2:
+        lumen, n_stumps = _with_open_arms(lumen, STUMP_SLENDERNESS)
+        notes.append(f"{counted(n_stumps, 'short blind arm')} cut open, for blood had no other way in and out.")
+    spheres = closed.medial if lumen is closed else medial.within(closed.medial, lumen.closed.tree)
+    loops = lumen.boundary_loops
+    if len(loops) < 2:
+        raise VesselError(
+            f"the surface about {place(lumen.vertices_mm.mean(axis=0))} has {counted(len(loops), 'opening')}, but "
+            "blood needs a way in and a way out: cut the vessel open at its ends, or give a longer piece of it; in a "
+            "scan it may be bone: give --at with a point in the artery, or crop the scan where the two touch"
+        )
+    found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
+    widest = max(found, key=lambda opening: opening.area_mm2)
+    openings = named([widest], found)
+    return replace(vessel, lumen=lumen, openings=openings, centerlines=(), notes=(*vessel.notes, *notes)), spheres
+
+
+def opening_at(vessel: Vessel, point_mm: Floats) -> Opening:
+    """Return the opening nearest to a point (3,) beside it, or within the lumen that leads to it.
+
+    Raises
+    ------
+    InputError
+        When the point lies outside the lumen, farther than 5 mm and two diameters from every opening.
+    """
+    nearest = min(vessel.openings, key=lambda opening: _away_mm(opening, point_mm))
+    if _is_far(nearest, point_mm) and vessel.lumen.closed.signed_distance(point_mm[None])[0] > 0:
+        raise InputError(
+            f"no opening of the vessel is near {place(point_mm)}: the nearest, {nearest.described}, is "
+            f"{_away_mm(nearest, point_mm):.0f} mm away; give a point beside an opening, in LPS mm"
+        )
+    return nearest
+
+
+def with_inlets(vessel: Vessel, inlets_mm: Floats) -> Vessel:
+    """Return the vessel with the openings at `inlets_mm` (k, 3), see `opening_at`, as its inlets; notes tell far ones.
+
+    Raises
+    ------
+    InputError
+        When a point is near no opening, two are at the same one, or no opening is left for blood to leave through.
+    """
+    inlets = [opening_at(vessel, inlet_mm) for inlet_mm in inlets_mm]
+    _refuse_twice(inlets, inlets_mm)
+    if len(inlets) == len(vessel.openings):
+        raise InputError(
+            f"blood enters through all {len(inlets)} openings of the vessel and leaves through none: leave out the "
+            f"inlet {inlets[-1].described}, or another one"
+        )
+    notes = (
+        f"The inlet, {inlet.described}, is {_away_mm(inlet, inlet_mm):.0f} mm from the point given."
+        for inlet, inlet_mm in zip(inlets, inlets_mm, strict=True)
+        if _is_far(inlet, inlet_mm)
+    )
+    openings = named(inlets, vessel.openings)
+    return replace(vessel, openings=openings, centerlines=(), notes=(*vessel.notes, *notes))
+
+
+def _refuse_twice(inlets: Sequence[Opening], inlets_mm: Floats) -> None:
+    """Refuse points (k, 3) of which two are nearest to the same opening."""
+    for k, inlet in enumerate(inlets):
+        first = inlets.index(inlet)
+        if first < k:
+            raise InputError(
+                f"two inlets are the same opening, {inlet.described}, the nearest to both {place(inlets_mm[first])} "
+                f"and {place(inlets_mm[k])}: give one point beside each opening that brings blood"
+            )
+
+
+def guessed(vessel: Vessel) -> Vessel:
+    """Return the vessel; where an outlet is nearly as wide as its inlet, which is only the widest end, a note says so.
+
+    The outlet is named by its place: its number changes where ends are trimmed off.
+    """
+    widest = vessel.outlets[0]
+    if widest.diameter_mm <= NEARLY * vessel.inlet.diameter_mm:
+        return vessel
+    note = (
+        f"The inlet, {vessel.inlet.described}, is a guess: the opening {widest.described} is nearly as wide; give "
+        "--inlet if blood comes from there, and again for each further opening that brings blood."
+    )
+    return replace(vessel, notes=(*vessel.notes, note))
+
+
+def _away_mm(opening: Opening, point_mm: Floats) -> float:
+    return float(np.linalg.norm(opening.center_mm - point_mm))
+
+
+def _is_far(opening: Opening, point_mm: Floats) -> bool:
+    return _away_mm(opening, point_mm) > max(FARTHEST_MM, FARTHEST_DIAMETERS * opening.diameter_mm)
+
+
+def still_open(vessel: Vessel) -> Vessel | None:
+    """Return the vessel with those of its openings that its lumen still has; None where no way in and out is left.
+
+    The inlet is the widest of them where all old ones are gone.
+    """
+    tree = cKDTree(vessel.lumen.loop_centers_mm) if len(vessel.lumen.boundary_loops) else None
+    left = [o for o in vessel.openings if tree is not None and tree.query(o.center_mm)[0] < STILL * o.diameter_mm]
+    if len(left) < 2 or all(opening.is_inlet for opening in left):
+        return None
+    inlets = [o for o in left if o.is_inlet] or [max(left, key=lambda opening: opening.area_mm2)]
+    return replace(vessel, openings=named(inlets, left), centerlines=())
+
+
+def _opening(loop_mm: Floats) -> Opening:
+    # A loop runs with the faces beside it: seen from outside the opening it runs clockwise.
+    vector = -triangles.polygon_area_vector(loop_mm)
+    area = float(np.linalg.norm(vector))
+    return Opening(triangles.polygon_centroid(loop_mm), vector / max(area, 1e-300), area, "outlet")
+
+
+def named(inlets: Sequence[Opening], openings: Sequence[Opening]) -> tuple[Opening, ...]:
+    """Return the openings with their roles, the inlets in this order."""
+    outlets = sorted((o for o in openings if o not in inlets), key=lambda opening: -opening.area_mm2)
+    in_order = zip([*inlets, *outlets], roles(len(inlets), len(outlets)), strict=True)
+    return tuple(replace(opening, role=role) for opening, role in in_order)
+
+
+def _without_caps(lumen: Surface) -> tuple[Surface, int]:
+    """Take off the flat caps: round patches of coplanar faces that meet the wall in a sharp rim."""
+    pairs = triangles.face_neighbours(lumen.faces)
+    turn = np.arccos(np.clip(np.einsum("ij,ij->i", lumen.normals[pairs[:, 0]], lumen.normals[pairs[:, 1]]), -1, 1))
+    label = triangles.joined(pairs[turn < CAP_ANGLE_RAD], len(lumen.faces))
+    n_patches = int(label.max()) + 1
+    area = np.bincount(label, lumen.areas_mm2)
+    rim = label[pairs[:, 0]] != label[pairs[:, 1]]
+    edges = np.bincount(label[pairs[rim]].ravel(), minlength=n_patches)
+    sharp = np.bincount(label[pairs[rim & (turn > CAP_RIM_RAD)]].ravel(), minlength=n_patches)
+    candidates = np.flatnonzero((area > CAP_AREA_MM2) & (edges >= FEWEST_RIM_EDGES) & (sharp > 0.8 * edges))
+    discs = [patch for patch in candidates if _is_disc(lumen, label == patch)]
+    is_cap = np.zeros(n_patches, dtype=bool)
+    is_cap[[k for k in discs if edges[k] >= CAP_RIM_EDGES or _is_across_lumen(lumen, label == k)]] = True
+    if not is_cap.any():
+        return lumen, 0
+    vertices, faces = triangles.compact(lumen.vertices_mm, lumen.faces[~is_cap[label]])
+    return Surface(vertices, faces), int(is_cap.sum())
+
+
+def _is_disc(lumen: Surface, member: Bools) -> bool:
+    """Tell whether the faces lie in a plane and fill a nearly round outline."""
+    weight = lumen.areas_mm2[member]
+    mean = weight @ lumen.normals[member] / weight.sum()
+    edges = triangles.open_edges(lumen.faces[member])
+    perimeter = np.linalg.norm(np.diff(lumen.vertices_mm[edges], axis=1), axis=2).sum()
+    return bool(np.linalg.norm(mean) > np.cos(CAP_ANGLE_RAD) and 4 * np.pi * weight.sum() > 0.6 * perimeter**2)
+
+
+def _is_across_lumen(lumen: Surface, member: Bools) -> bool:
+    """Tell whether two of its radii behind a flat patch the lumen is as narrow as the patch."""
+    weight = lumen.areas_mm2[member]
+    radius = float(np.sqrt(weight.sum() / np.pi))
+    center = weight @ lumen.corners_mm[member].mean(axis=1) / weight.sum()
+    behind = center - 2.0 * radius * (weight @ lumen.normals[member] / weight.sum())
+    return bool(lumen.closest(behind[None])[1][0] < 1.5 * radius)
+
+
+def _with_open_arms(lumen: Surface, slenderness: float) -> tuple[Surface, int]:
+    """Cut open the arms that end blind and are more than so many of their mean radii long."""
+    graph = lumen.medial
+    roots = np.asarray(cKDTree(graph.points).query(lumen.loop_centers_mm)[1], dtype=np.int32)
+    paths = medial.arms(graph, roots, slenderness, ARM_RADIUS_MM)
+    blind = [path for path in paths if _is_blind(graph, path)]
+    n_cut = 0
+    for cut in [_cut_of(graph.points[path], graph.radius[path], slenderness) for path in blind]:
+        opened = None if cut is None else cut_square(lumen, *cut, ARM_SHARE)
+        # A cut makes one end more; one that takes an end off has run into another artery.
+        if opened is not None and len(opened.boundary_loops) > len(lumen.boundary_loops):
+            lumen, n_cut = opened, n_cut + 1
+    return (Surface(*triangles.largest_part(lumen.vertices_mm, lumen.faces)) if n_cut else lumen), n_cut
+
+
+def _is_blind(graph: medial.Medial, path: Ints) -> bool:
+    """Tell whether an arm's tip is reached along its path (k,) only: a loop of an artery has two ways to its middle.
+
+    Ways less than half as wide as the arm, or too thin for an arm, are no way for blood.
+    """
+    abscissa, typical = curves.arc_length(graph.points[path]), float(np.median(graph.radius[path]))
+    behind = graph.points[path[np.searchsorted(abscissa, abscissa[-1] - 3.0 * typical)]]
+    passable = graph.radius > max(0.5 * typical, ARM_RADIUS_MM)
+    passable &= np.linalg.norm(graph.points - behind, axis=1) > 1.25 * typical
+    passable[path[[0, -1]]] = True
+    label = triangles.joined(graph.edges[passable[graph.edges].all(axis=1)], len(passable))
+    return bool(label[path[0]] != label[path[-1]])
+
+
+def _cut_of(points_mm: Floats, radius_mm: Floats, slenderness: float) -> tuple[Floats, Floats, float] | None:
+    """Where to cut an arm (path from the tree to its tip), where its tip lies, how wide it is; None for a sac."""
+    abscissa = curves.arc_length(points_mm)
+    outside = abscissa > 1.5 * radius_mm[0]
+    if outside.sum() < 3:
+        return None
+    typical = float(np.median(radius_mm[outside]))
+    body = outside & (radius_mm > 0.75 * typical)
+    length = abscissa[body][-1] - abscissa[body][0]
+    outer = body & (abscissa > abscissa[body][0] + 0.5 * length)
+    if length < slenderness * typical or radius_mm[outer].max() > ARM_SWELLING * typical:
+        return None
+    end = float(abscissa[body][-1]) - typical
+    center, behind = curves.interpolate(abscissa, points_mm, np.array([end, end - 2 * typical]))
+    return center, (center - behind) / np.linalg.norm(center - behind), typical
+
+
+def cut_square(
+    lumen: Surface, center_mm: Floats, direction: Floats, radius_mm: float, most: float = 1.0
+) -> Surface | None:
+    """Take off the wall beyond the plane through `center_mm` (3,) that hangs together with the section there.
+
+    Parameters
+    ----------
+    lumen : the wall.
+    center_mm, direction : (3,) a point of the plane and its unit normal, out of what is kept.
+    radius_mm : radius of the vessel there.
+    most : nothing is cut if more than this fraction of the wall would come off.
+
+    Returns
+    -------
+    lumen : what is left; None where nothing is cut.
+    """
+    height = (lumen.vertices_mm - center_mm) @ direction
+    distance = np.linalg.norm(lumen.vertices_mm - center_mm, axis=1)
+    beyond = height > 0
+    if not (beyond & (distance < 2.0 * radius_mm)).any():
+        return None
+    edges = triangles.directed_edges(lumen.faces)
+    label = triangles.joined(edges[beyond[edges].all(axis=1)], len(height))
+    tip = beyond & (label == label[np.argmin(np.where(beyond, distance, np.inf))])
+    if tip.mean() > most:
+        return None
+    level = np.where(tip, height, np.minimum(height, -1e-9))
+    vertices, faces, _ = triangles.clip(lumen.vertices_mm, lumen.faces, level)
+    return Surface(vertices, faces)

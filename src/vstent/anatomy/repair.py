@@ -1,0 +1,249 @@
+"""Repair: a surface as it comes from a file -> one oriented manifold whose open loops are the vessel's ends."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from vstent.errors import VesselError
+from vstent.geometry.surface import Surface
+from vstent.kernels import topology, triangles
+from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.units import counted, place
+
+WELD_OF_EXTENT: Final = 1e-6
+"""Vertices closer than this fraction of the bounding box's diagonal are one."""
+ALWAYS_HOLE_OF_DIAMETER: Final = 0.1
+"""Loops shorter round than a circle of this fraction of the vessel's mean diameter are holes."""
+WALL_HOLE_OF_DIAMETER: Final = 0.5
+"""Loops up to this size are holes where the wall lies in the plane of the loop (at an end it stands on that plane)."""
+SLIT_ROUNDNESS: Final = 0.4
+"""Loops of less area than this fraction of the circle as long as they are slits: no artery is cut so."""
+LONGEST_PATCHED: Final = 120
+"""Holes of more vertices are closed by a fan: the better patch costs the cube of their number."""
+NOTABLE_OF_AREA: Final = 0.02
+"""Components dropped are told one by one from this fraction of the area on."""
+
+
+def repair(surface: Surface, *, at_mm: Floats | None = None) -> tuple[Surface, tuple[str, ...]]:
+    """Make a sound surface of a faulty one, and say what was done.
+
+    Duplicate vertices are welded, degenerate and duplicate faces dropped, faces turned to agree and then outward,
+    non-manifold edges and vertices cut apart, one piece kept, holes in the wall filled. Nothing is moved. The result
+    is a manifold with boundary, outward oriented; its open loops are the vessel's ends.
+
+    Parameters
+    ----------
+    surface : any triangles, in mm.
+    at_mm : (3,) a point near the piece to keep, debris left out; the piece of largest area where not given.
+
+    Returns
+    -------
+    surface : the repaired one.
+    notes : one sentence for each thing that was done; empty for a sound surface.
+
+    Raises
+    ------
+    VesselError
+        Nothing is left of the surface.
+    """
+    if not len(surface.faces):
+        raise VesselError("The surface has no triangles; check the file.")
+    mesh = _once(_Mesh(surface.vertices_mm, surface.faces, ()), at_mm)
+    if mesh.notes:  # filling a hole that a pinched vertex runs through leaves needles: a second pass finds them
+        mesh = _Mesh(*_once(_Mesh(mesh.vertices, mesh.faces, ()), at_mm).geometry, mesh.notes)
+    vertices, faces = triangles.compact(mesh.vertices, mesh.faces)
+    return Surface(vertices, faces), mesh.notes
+
+
+@dataclass(frozen=True, eq=False)
+class _Mesh:
+    vertices: Floats
+    faces: Ints
+    notes: tuple[str, ...]
+
+    @property
+    def geometry(self) -> tuple[Floats, Ints]:
+        """Vertices and faces."""
+        return self.vertices, self.faces
+
+    def after(self, vertices: Floats, faces: Ints, note: str = "") -> "_Mesh":
+        """Return the mesh after a step, with what the step did."""
+        return _Mesh(vertices, faces, (*self.notes, note) if note else self.notes)
+
+
+def _once(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
+    one_piece = partial(_one_piece, at_mm=at_mm)
+    for step in (_welded, _cleaned, _opened, _turned, _unzipped, one_piece, _outward, _filled):
+        mesh = step(mesh)
+        if len(mesh.faces) < 4:
+            raise VesselError("No surface is left after repair: its faces are all degenerate or loose; check the file.")
+    return mesh
+
+
+def _welded(mesh: _Mesh) -> _Mesh:
+    vertices, faces = triangles.compact(mesh.vertices, mesh.faces)
+    extent = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    welded, faces = topology.weld(vertices, faces, WELD_OF_EXTENT * extent)
+    n = len(vertices) - len(welded)
+    note = (
+        f"{counted(n, 'duplicate vertex', 'duplicate vertices')} welded (closer than {WELD_OF_EXTENT * extent:.1g} mm)."
+    )
+    return mesh.after(welded, faces, note if n else "")
+
+
+def _cleaned(mesh: _Mesh) -> _Mesh:
+    ordered = np.sort(mesh.faces, axis=1)
+    is_degenerate = (ordered[:, :-1] == ordered[:, 1:]).any(axis=1)
+    is_sound = topology.sound_faces(mesh.faces)
+    n_degenerate = int(is_degenerate.sum())
+    n_duplicate = int((~is_sound).sum()) - n_degenerate
+    done = [counted(n_duplicate, "duplicate face")] * (n_duplicate > 0)
+    done += [counted(n_degenerate, "degenerate face")] * (n_degenerate > 0)
+    return mesh.after(mesh.vertices, mesh.faces[is_sound], f"{' and '.join(done)} dropped." if done else "")
+
+
+def _opened(mesh: _Mesh) -> _Mesh:
+    """Drop membranes across the lumen, and fins."""
+    total = 0
+    faces = mesh.faces
+    while (is_inner := topology.inner_sheets(mesh.vertices, faces)).any():
+        faces = faces[~is_inner]
+        total += int(is_inner.sum())
+    return mesh.after(
+        mesh.vertices, faces, f"{counted(total, 'face')} of sheets inside the lumen dropped." if total else ""
+    )
+
+
+def _turned(mesh: _Mesh) -> _Mesh:
+    faces, turned = topology.oriented(mesh.faces)
+    n = int(turned.sum())
+    mesh = mesh.after(mesh.vertices, faces, f"{counted(n, 'face')} turned to agree with the others." if n else "")
+    is_clash = topology.clashing(faces)
+    n = int(is_clash.sum())
+    note = f"{counted(n, 'face')} dropped that no orientation fits."
+    return mesh.after(mesh.vertices, faces[~is_clash], note if n else "")
+
+
+def _unzipped(mesh: _Mesh) -> _Mesh:
+    n_edges = int((topology.edges_of(mesh.faces).n_uses > 2).sum())
+    vertices, faces = topology.unzipped(mesh.vertices, mesh.faces)
+    while (is_bad := topology.overused(faces)).any():
+        vertices, faces = topology.unzipped(vertices, faces[~is_bad])
+    n_vertices, n_faces = len(np.unique(faces)) - len(np.unique(mesh.faces)), len(mesh.faces) - len(faces)
+    what = counted(n_edges, "non-manifold edge") if n_edges else "Pinched vertices"
+    dropped = f", {counted(n_faces, 'face')} dropped" if n_faces else ""
+    note = f"{what} cut apart ({counted(n_vertices, 'vertex', 'vertices')} doubled{dropped})."
+    return mesh.after(vertices, faces, note if n_edges or n_vertices > 0 else "")
+
+
+def _one_piece(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
+    """Keep the largest piece, or the notable one nearest to a point (3,)."""
+    label = topology.face_components(mesh.faces)
+    area = np.bincount(label, triangles.areas(mesh.vertices[mesh.faces]))
+    if len(area) <= 1:
+        return mesh
+    order = np.argsort(-area)
+    notable = [k for k in order if k == order[0] or area[k] > NOTABLE_OF_AREA * area.sum()]
+    kept = notable[0] if at_mm is None else min(notable, key=lambda k: _gap_mm(mesh, label == k, at_mm))
+    left = [f"{area[k]:.1f} mm2 about {_middle(mesh, label == k)}" for k in notable if k != kept]
+    note = f"{counted(len(area) - 1, 'loose piece')} dropped ({area[kept] / area.sum():.1%} of the area kept)"
+    note += f", the notable of {', '.join(left)}: give --at to keep another one." if left else "."
+    return mesh.after(mesh.vertices, mesh.faces[label == kept], note)
+
+
+def _gap_mm(mesh: _Mesh, member: Bools, at_mm: Floats) -> float:
+    """Distance of a point (3,) to a piece of the mesh."""
+    return float(Surface(mesh.vertices, mesh.faces[member]).closest(at_mm[None])[1][0])
+
+
+def _middle(mesh: _Mesh, member: Bools) -> str:
+    return place(mesh.vertices[np.unique(mesh.faces[member])].mean(axis=0))
+
+
+def _outward(mesh: _Mesh) -> _Mesh:
+    vertices, faces = triangles.cap(mesh.vertices, mesh.faces, triangles.boundary_loops(mesh.vertices, mesh.faces))
+    if triangles.volume(vertices[faces]) >= 0:
+        return mesh
+    return mesh.after(mesh.vertices, mesh.faces[:, ::-1], "The surface was inside out; all faces turned.")
+
+
+def _filled(mesh: _Mesh) -> _Mesh:
+    loops = triangles.boundary_loops(mesh.vertices, mesh.faces)
+    vertices, faces = triangles.cap(mesh.vertices, mesh.faces, loops)
+    diameter = 4 * triangles.volume(vertices[faces]) / float(triangles.areas(mesh.vertices[mesh.faces]).sum())
+    wall_normal = triangles.vertex_normals(mesh.vertices, mesh.faces)
+    is_hole = [_is_hole(mesh.vertices[loop], wall_normal[loop], diameter) for loop in loops]
+    holes = [loop for loop, hole in zip(loops, is_hole, strict=True) if hole]
+    sideways = [
+        mesh.vertices[loop]
+        for loop, hole in zip(loops, is_hole, strict=True)
+        if not hole and _is_in_wall(mesh.vertices[loop], wall_normal[loop])
+    ]
+    filled_vertices, filled_faces = mesh.vertices, mesh.faces
+    for loop in holes:
+        filled_vertices, filled_faces = _fill(filled_vertices, filled_faces, loop)
+    notes = [_hole_note([mesh.vertices[loop] for loop in holes])] if holes else []
+    notes += [_sideways_note(points) for points in sideways]
+    return mesh.after(filled_vertices, filled_faces, " ".join(notes))
+
+
+def _hole_note(holes_mm: list[Floats]) -> str:
+    widest_mm = max(triangles.perimeter(points) for points in holes_mm)
+    return f"{counted(len(holes_mm), 'hole')} in the wall filled (the widest {widest_mm:.2g} mm round)."
+
+
+def _sideways_note(points: Floats) -> str:
+    return (
+        f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at {place(triangles.polygon_centroid(points))} "
+        "looks sideways out of the wall: fill it in the surface if no artery leaves there."
+    )
+
+
+def _is_hole(points: Floats, wall_normal: Floats, diameter: float) -> bool:
+    """Tell a hole in the wall from an end: it is tiny, or a slit, or it is small and the wall lies in its plane."""
+    width = triangles.perimeter(points) / np.pi
+    smooth = _without_teeth(points)
+    size = float(np.linalg.norm(triangles.polygon_area_vector(smooth)))
+    if (
+        width < ALWAYS_HOLE_OF_DIAMETER * diameter
+        or 4 * np.pi * size < SLIT_ROUNDNESS * triangles.perimeter(smooth) ** 2
+    ):
+        return True
+    return width < WALL_HOLE_OF_DIAMETER * diameter and _is_in_wall(points, wall_normal)
+
+
+def _is_in_wall(points: Floats, wall_normal: Floats) -> bool:
+    """Tell whether the wall around a loop (n, 3) lies in its plane; at an end it stands on it."""
+    area = triangles.polygon_area_vector(_without_teeth(points))
+    return float(np.abs(wall_normal @ area).mean()) > 0.7 * float(np.linalg.norm(area))
+
+
+def _without_teeth(points: Floats) -> Floats:
+    return points if len(points) < 8 else _rounded(_rounded(points))
+
+
+def _rounded(points: Floats) -> Floats:
+    """Take the teeth off a closed polygon (n, 3)."""
+    return 0.25 * (np.roll(points, 1, axis=0) + 2 * points + np.roll(points, -1, axis=0))
+
+
+def _fill(vertices: Floats, faces: Ints, loop: Ints) -> tuple[Floats, Ints]:
+    """Close a loop with the vertices it has; with a fan about its centroid where it is very long or that cannot be."""
+    ring = loop[::-1]
+    patch = None if len(ring) > LONGEST_PATCHED else topology.least_area(vertices[ring], _joined(faces, ring))
+    if patch is None:
+        return triangles.cap(vertices, faces, [loop])
+    return vertices, np.concatenate([faces, ring[patch]]).astype(np.int32)
+
+
+def _joined(faces: Ints, ring: Ints) -> Bools:
+    """Tell for each pair (n, n) of ring vertices whether the mesh has an edge between them already."""
+    place = np.full(faces.max() + 1, -1)
+    place[ring] = np.arange(len(ring))
+    a, b = place[triangles.directed_edges(faces)].T
+    joined = np.zeros((len(ring), len(ring)), dtype=bool)
+    both = (a >= 0) & (b >= 0)
+    joined[a[both], b[both]] = joined[b[both], a[both]] = True
+    return joined

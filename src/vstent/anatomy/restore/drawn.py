@@ -1,0 +1,141 @@
+"""A neck drawn by hand: the wall is cut beside the curve, and what that parts from the inlet is the sac."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from vstent.anatomy.restore.bulges import FLANK, Bulge, bulge_at
+from vstent.anatomy.restore.tubes import tubes_of
+from vstent.errors import InputError
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Vessel
+from vstent.kernels import curves, triangles
+from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.units import place
+
+FAR_MM: Final = 1.5
+"""A neck that is drawn further than this from the wall is not of this vessel."""
+STEP_EDGES: Final = 0.25
+"""The curve is followed in steps of this many edges of the mesh."""
+RIBBON_EDGES: Final = 1.5
+"""The wall is cut by a ribbon along the curve that reaches so many edges into and out of the wall."""
+FEWEST_VERTICES: Final = 12
+"""A sac's wall has at least this many vertices."""
+
+
+class Drawn(NamedTuple):
+    """A vessel's wall cut along a drawn neck."""
+
+    vertices_mm: Floats
+    """(n, 3) vertices of the sac's wall."""
+    faces: Ints
+    """(m, 3) its faces."""
+    artery: Surface
+    """The wall without it."""
+    bulge: Bulge
+    """What of the sac's wall stands out of the tubes around all centerlines; its foot is where it begins to."""
+    neck_mm: Floats
+    """(k, 3) the neck, evenly spaced; what was drawn outside the lumen lies on the wall."""
+    cut_mm: Floats
+    """(k, 3) points of the wall nearest to these."""
+
+    def neck_of(self, rim_mm: Floats) -> Floats:
+        """Points (j, 3) of the neck beside points (j, 3) one after the other along the cut."""
+        ring = np.concatenate([self.cut_mm, self.cut_mm[:1]])
+        place = curves.arc_length(ring)
+        turn = np.unwrap(curves.project(ring, rim_mm)[0] / place[-1], period=1.0)
+        turn = np.maximum.accumulate(turn) if turn[-1] > turn[0] else np.minimum.accumulate(turn)
+        return curves.interpolate(
+            place / place[-1], np.concatenate([self.neck_mm, self.neck_mm[:1]]), np.mod(turn, 1.0)
+        )
+
+
+def cut_along(vessel: Vessel, neck_mm: Floats) -> Drawn:
+    """Cut the wall beside a closed curve (k, 3).
+
+    Raises
+    ------
+    InputError
+        When the curve is no curve, lies off the wall, parts nothing from it, or goes around the artery.
+    """
+    given = np.asarray(neck_mm, dtype=np.float64)
+    if given.ndim != 2 or given.shape[1] != 3 or len(given) < 3 or not np.isfinite(given).all():
+        raise InputError("the neck is no closed curve: give three points or more, each of three coordinates in mm")
+    lumen = vessel.lumen
+    edge_mm = _edge_mm(lumen)
+    ring = np.concatenate([given, given[:1]])
+    n = max(32, round(float(curves.arc_length(ring)[-1]) / (STEP_EDGES * edge_mm)))
+    even = curves.resample_evenly(ring, n + 1)[:-1]
+    cut = _on_wall(lumen, even)
+    level = _level_mm(vessel, cut, RIBBON_EDGES * edge_mm)
+    sac, artery = (triangles.clip(lumen.vertices_mm, lumen.faces, side * level)[:2] for side in (1.0, -1.0))
+    neck = np.where((vessel.closed.signed_distance(even) < 0)[:, None], even, cut)
+    return Drawn(*sac, Surface(*artery), _bulge(vessel, level < 0), neck, cut)
+
+
+def _edge_mm(lumen: Surface) -> float:
+    """Typical length of the mesh's edges."""
+    corners = lumen.corners_mm
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+
+
+def _on_wall(lumen: Surface, curve_mm: Floats) -> Floats:
+    """Points (n, 3) of the wall nearest to those of a curve (n, 3)."""
+    points, distance, _ = lumen.closest(curve_mm)
+    worst = int(distance.argmax())
+    if distance[worst] > FAR_MM:
+        raise InputError(
+            f"the neck lies {distance[worst]:.1f} mm off the wall at {place(curve_mm[worst])}: "
+            f"draw it no more than {FAR_MM:g} mm off"
+        )
+    return points
+
+
+def _bulge(vessel: Vessel, is_sac: Bools) -> Bulge:
+    """The part of a sac's wall, vertices (n,), that is no branch's as far as the centerlines tell."""
+    tubes = tubes_of(vessel.centerlines)
+    height, sphere = tubes.height_mm(vessel.lumen.vertices_mm)
+    height = np.where(is_sac, height, -np.inf)
+    dome = vessel.lumen.vertices_mm[height.argmax()]
+    found = bulge_at(vessel.lumen, height, height > FLANK * tubes.radius_mm[sphere], dome)
+    points = vessel.lumen.vertices_mm[is_sac]
+    return found or Bulge(points, points, dome, float(height.max()))
+
+
+def _ribbon(lumen: Surface, curve_mm: Floats, reach_mm: float) -> Surface:
+    """A band square to the wall along a closed curve (n, 3) on it."""
+    normals = lumen.normals[lumen.closest(curve_mm)[2]]
+    n_waves = triangles.perimeter(curve_mm) / (4.0 * reach_mm)
+    across = reach_mm * curves.lowpass(normals, n_waves)
+    n = len(curve_mm)
+    here, there = np.arange(n), (np.arange(n) + 1) % n
+    faces = [np.stack([here, there, n + there], axis=1), np.stack([here, n + there, n + here], axis=1)]
+    return Surface(np.concatenate([curve_mm - across, curve_mm + across]), np.concatenate(faces))
+
+
+def _level_mm(vessel: Vessel, curve_mm: Floats, reach_mm: float) -> Floats:
+    """Distance (n,) of the wall's vertices from the curve (k, 3), negative beyond it seen from the inlet."""
+    lumen = vessel.lumen
+    ribbon = _ribbon(lumen, curve_mm, reach_mm)
+    edges = triangles.directed_edges(lumen.faces)
+    ends = lumen.vertices_mm[edges]
+    distance = ribbon.closest(lumen.vertices_mm)[1]
+    near = np.flatnonzero(distance[edges].min(axis=1) < np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
+    is_crossed = np.zeros(len(edges), dtype=bool)
+    is_crossed[near] = ribbon.crosses(ends[near, 0], ends[near, 1])
+    label = triangles.joined(edges[~is_crossed], len(lumen.vertices_mm))
+    return np.where(_is_sac(vessel, label), -distance, distance)
+
+
+def _is_sac(vessel: Vessel, label: Ints) -> Bools:
+    """Tell the vertices (n,) of the largest part, by label (n,), that is cut off from the inlet."""
+    points = vessel.lumen.vertices_mm
+    at_end = [label[int(np.linalg.norm(points - end.center_mm, axis=1).argmin())] for end in vessel.openings]
+    count = np.bincount(label)
+    count[at_end[0]] = 0
+    sac = int(count.argmax())
+    if count[sac] < FEWEST_VERTICES:
+        raise InputError("the neck parts nothing from the artery: draw it as one closed curve around the sac's mouth")
+    if sac in at_end[1:] and at_end[0] not in at_end[1:]:
+        raise InputError("the neck goes around the artery itself: draw it around the sac's mouth alone")
+    return np.asarray(label == sac)

@@ -1,0 +1,198 @@
+"""The landing surface: the patient's own wall, closed across necks and ostia.
+
+In sections along the parent axis the wall is rho(s, theta). A smooth baseline under it is found by asymmetric least
+squares (Eilers and Boelens 2005): a wall that stands out of the baseline, as sac and branch do, loses its weight.
+Where the wall stands out, and a little around, it is replaced by the smoothest surface through the wall around
+(a thin plate on the (s, theta) grid); elsewhere it stays what it is.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from scipy.linalg import solveh_banded
+from scipy.ndimage import binary_dilation, binary_propagation, map_coordinates
+from scipy.sparse import csc_matrix, diags, eye, kron
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
+
+from vstent.anatomy.restore.axis import STEP_MM, Tube, section_directions, section_rays
+from vstent.devices.stent import tube_faces
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Centerline, Vessel
+from vstent.kernels import curves
+from vstent.kernels.arrays import Bools, Floats, Ints, freeze
+
+N_RAYS: Final = 72
+"""Vertices in a ring of the landing surface: every 5 degrees."""
+OUT: Final = 0.20
+"""A wall that stands out of the baseline by this fraction of the radius is sac or branch..."""
+FLARE: Final = 0.06
+"""... and so is the wall around it that stands out by this fraction: the flare of its mouth."""
+MARGIN_MM: Final = 0.3
+"""The closed part reaches this far beyond."""
+PRIOR: Final = 0.02
+"""Weight of the fitted tube beside the wall's 1: decides where there is no wall at all."""
+SAME_MM: Final = 1e-3
+"""A ray that goes on for less than this has met the same wall."""
+N_PASSES: Final = 12
+"""Passes of asymmetric least squares; weights settle within 10."""
+
+
+@dataclass(frozen=True, eq=False)
+class Landing:
+    """The landing surface on its grid of sections and angles."""
+
+    points_mm: Floats
+    """(n, 3) axis of the parent artery."""
+    rho_mm: Floats
+    """(n, rays) distance of the landing surface from the axis."""
+    is_restored: Bools
+    """(n, rays) closes a neck or an ostium."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "points_mm", np.float64, (-1, 3))
+        freeze(self, "rho_mm", np.float64, (len(self.points_mm), -1))
+        freeze(self, "is_restored", np.bool_, self.rho_mm.shape)
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The landing surface as an open tube, one ring of vertices per axis point."""
+        rings = self.points_mm[:, None] + self.rho_mm[..., None] * section_directions(self.points_mm, self.n_rays)
+        return Surface(rings.reshape(-1, 3), tube_faces(*self.rho_mm.shape))
+
+    @cached_property
+    def solid(self) -> Surface:
+        """The landing surface closed at both ends."""
+        return Vessel(self.surface).closed
+
+    @property
+    def n_rays(self) -> int:
+        """Vertices in a ring."""
+        return int(self.rho_mm.shape[1])
+
+    @cached_property
+    def section_radius_mm(self) -> Floats:
+        """(n,) radius of the circle of the section's area."""
+        return np.sqrt((self.rho_mm**2).mean(axis=1))
+
+    @cached_property
+    def axis(self) -> Centerline:
+        """The parent axis with the distance to the landing surface."""
+        return Centerline(self.points_mm, self.surface.closest(self.points_mm)[1])
+
+    @cached_property
+    def frames(self) -> Floats:
+        """(n, 3, 3) frames that the angles are counted in."""
+        return curves.parallel_frames(self.points_mm)
+
+    def grid_of(self, points_mm: Floats) -> Floats:
+        """Fractional grid position (k, 2), section and ray, of the points (k, 3) nearest sections."""
+        abscissa = curves.arc_length(self.points_mm)
+        s = curves.project(self.points_mm, points_mm)[0]
+        section = np.interp(s, abscissa, np.arange(len(abscissa)))
+        nearest = np.round(section).astype(int)
+        offset = points_mm - curves.interpolate(abscissa, self.points_mm, s)
+        local = np.einsum("kij,kj->ki", self.frames[nearest], offset)
+        ray = np.mod(np.arctan2(local[:, 2], local[:, 1]), 2 * np.pi) * self.n_rays / (2 * np.pi)
+        return np.stack([section, ray], axis=1)
+
+    def nearest_sections(self, points_mm: Floats) -> Ints:
+        """Number (k,) of the section nearest to each of (k, 3) points."""
+        return np.asarray(cKDTree(self.points_mm).query(points_mm)[1])
+
+    def at_grid(self, grid: Floats) -> Floats:
+        """Points (k, 3) of the landing surface at fractional grid positions (k, 2), bilinear."""
+        wrapped = np.concatenate([self.surface.vertices_mm.reshape(*self.rho_mm.shape, 3)] * 2, axis=1)
+        place = [np.clip(grid[:, 0], 0, len(self.points_mm) - 1), np.mod(grid[:, 1], self.n_rays)]
+        return np.stack([map_coordinates(wrapped[..., k], place, order=1) for k in range(3)], axis=1)
+
+
+def close_landing(lumen: Surface, tube: Tube, own: Surface | None = None) -> Landing:
+    """Close the necks and ostia of the lumen's wall along a tube; with `own`, all of it that is not this wall too."""
+    rho = section_rays(lumen, tube.points_mm, N_RAYS)
+    radius = np.repeat(tube.radius_mm[:, None], N_RAYS, axis=1)
+    # Plates are as stiff against an oval as against other waves across: they are laid on what remains of a round tube.
+    oval = tube.rho_mm(N_RAYS) - radius
+    has_wall = np.isfinite(rho) & (rho < 4.0 * radius)
+    if own is not None:
+        has_wall &= section_rays(own, tube.points_mm, N_RAYS) < rho + SAME_MM
+    wall = np.where(has_wall, rho - oval, radius)
+    scale = float(np.median(tube.radius_mm))
+    baseline = _baseline(wall, has_wall, radius, scale)
+    out = (wall - baseline) / radius
+    is_out = binary_propagation(_around(out > OUT), mask=_around(~has_wall | (out > FLARE)))
+    restored = _core(_dilated(is_out | _around(~has_wall), scale))
+    return Landing(tube.points_mm, oval + _closed(wall, restored, baseline, scale), restored)
+
+
+def _baseline(wall: Floats, has_wall: Bools, radius: Floats, scale_mm: float) -> Floats:
+    """Smooth surface under the wall, by asymmetric least squares on every second section and ray.
+
+    What the baseline can follow is longer than three radii: half the grid holds it, at an eighth of the cost.
+    """
+    fine, wall, has_wall, radius = wall, wall[::2, ::2], has_wall[::2, ::2], radius[::2, ::2]
+    stiffness = _thin_plate(wall.shape[0], wall.shape[1], scale_mm / (2 * STEP_MM))
+    baseline = radius
+    for _ in range(N_PASSES):
+        out = (wall - baseline) / radius
+        weight = np.where(has_wall, 1.0 / (1.0 + np.maximum(out / FLARE, 0.0) ** 4), 0.0)
+        system = csc_matrix(diags((weight + PRIOR).ravel()) + stiffness)
+        baseline = _solve(system, (weight * wall + PRIOR * radius).ravel(), 2 * wall.shape[1]).reshape(wall.shape)
+    grid = np.meshgrid(np.arange(fine.shape[0]) / 2, np.arange(fine.shape[1]) / 2, indexing="ij")
+    wrapped = np.concatenate([baseline, baseline[:, :1]], axis=1)
+    return np.asarray(map_coordinates(wrapped, grid, order=1, mode="nearest"))
+
+
+def _closed(wall: Floats, restored: Bools, baseline: Floats, scale_mm: float) -> Floats:
+    """The wall, and where it is to be restored the smoothest continuation that stays near the baseline."""
+    unknown = np.flatnonzero(restored)
+    if not len(unknown):
+        return wall
+    system = csc_matrix(PRIOR * eye(wall.size) + _thin_plate(wall.shape[0], wall.shape[1], scale_mm / STEP_MM))[unknown]
+    known = np.where(restored, 0.0, wall).ravel()
+    right = PRIOR * baseline.ravel()[unknown] - system @ known
+    return _with_values(wall, unknown, spsolve(csc_matrix(system[:, unknown]), right))
+
+
+def _with_values(wall: Floats, index: Ints, values: Floats) -> Floats:
+    closed = wall.ravel().copy()
+    closed[index] = values
+    return closed.reshape(wall.shape)
+
+
+def _solve(system: csc_matrix, right: Floats, bandwidth: int) -> Floats:
+    """Solve a symmetric positive definite banded system."""
+    upper = system.tocoo()
+    keep = upper.col >= upper.row
+    band = np.zeros((bandwidth + 1, len(right)))
+    band[bandwidth + upper.row[keep] - upper.col[keep], upper.col[keep]] = upper.data[keep]
+    return np.asarray(solveh_banded(band, right, check_finite=False))
+
+
+def _thin_plate(n: int, n_rays: int, radius_steps: float) -> csc_matrix:
+    """Stiffness of a thin plate on the grid, stiff against waves shorter than 3 radii along and a third of a turn."""
+    ring = eye(n_rays, format="csc")
+    turn = 2.0 * ring - csc_matrix(np.roll(np.eye(n_rays), 1, axis=0) + np.roll(np.eye(n_rays), -1, axis=0))
+    along = (3.0 * radius_steps / (2 * np.pi)) ** 2
+    round_ = (n_rays / (2 * np.pi * 3.0)) ** 2
+    plate = along**2 * kron(curves.roughness(n, 2), ring) + round_**2 * kron(eye(n), turn @ turn)
+    return csc_matrix(plate + 2.0 * along * round_ * kron(curves.roughness(n, 1), turn))
+
+
+def _around(grid: Bools) -> Bools:
+    """Three copies side by side: what touches across the seam of the ring hangs together."""
+    return np.concatenate([grid] * 3, axis=1)
+
+
+def _core(tripled: Bools) -> Bools:
+    n_rays = tripled.shape[1] // 3
+    return tripled[:, n_rays : 2 * n_rays]
+
+
+def _dilated(tripled: Bools, radius_mm: float) -> Bools:
+    along = max(1, round(MARGIN_MM / STEP_MM))
+    ray_mm = 2 * np.pi * radius_mm / N_RAYS
+    round_ = max(1, round(MARGIN_MM / ray_mm))
+    return np.asarray(binary_dilation(tripled, np.ones((2 * along + 1, 2 * round_ + 1), dtype=bool)))

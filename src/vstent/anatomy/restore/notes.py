@@ -1,0 +1,149 @@
+"""What is told of an anatomy: one sentence on everything that was found, assumed, or would be taken for a mistake."""
+
+from typing import Final
+
+import numpy as np
+
+from vstent.anatomy.restore.bulges import Bulge
+from vstent.anatomy.restore.path import PASSING, is_off_sacs, reach_of
+from vstent.anatomy.restore.sac import is_in_one
+from vstent.anatomy.trace import parent_radius_mm
+from vstent.geometry.vessel import Aneurysm, Centerline, Opening, Vessel
+from vstent.kernels import curves
+from vstent.units import counted, place
+
+FUSIFORM: Final = 1.5
+"""An artery that is wider by this factor than at both its ends is told..."""
+END_MM: Final = 2.0
+"""... which are as wide as they are over this length."""
+NEAR_SAC_MM: Final = 4.0
+"""An opening so near to a sac's wall is told."""
+STENOSED: Final = 0.7
+"""An artery narrower by this factor beside a neck than beyond that and across the neck is told..."""
+STENOSED_REACH: Final = 2.0
+"""... where that is within this many diameters of the neck."""
+
+
+def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
+    """Sentences on the sacs cut off from the bulges found, and on the parent artery, along the centerline `path`."""
+    line, sacs = vessel.centerlines[path], [bulge for bulge in bulges if is_in_one(bulge.points_mm, aneurysms)]
+    return (
+        *_found(vessel, path, aneurysms, len(bulges)),
+        *_before_another(vessel, path, bulges),
+        *_near_sacs(vessel, bulges),
+        *_from_sacs(vessel, path, aneurysms),
+        *_fusiform(line, sacs),
+        *(note for sac in aneurysms for note in _stenosed(line, sac)),
+    )
+
+
+def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
+    """A sentence on a bulge that is a sac only for whoever asks for it."""
+    if bulge is None:
+        return ()
+    return (
+        f"A bulge {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)} is too flat to be taken for a sac "
+        "unasked: give --at there.",
+    )
+
+
+def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges: int) -> tuple[str, ...]:
+    """Sentences on where the parent artery runs and how many sacs hang on it."""
+    end = vessel.far_ends[path]
+    notes = [f"The parent artery runs from the inlet to {end.role} (diameter {end.diameter_mm:.1f} mm)."]
+    if not aneurysms:
+        notes.append("No sac was found: the landing surface is the artery's own wall with its side branches closed.")
+    if n_bulges > len(aneurysms) > 0:
+        more = counted(n_bulges - len(aneurysms), "more bulge")
+        notes.append(f"{more}, flat, a sac's lobe, or on another branch: no sac of its own.")
+    return tuple(notes)
+
+
+def _before_another(vessel: Vessel, path: int, bulges: list[Bulge]) -> tuple[str, ...]:
+    """A sentence where the highest bulge hangs on the artery from another inlet, before the parent artery."""
+    if not bulges or reach_of(vessel.centerlines[path], bulges[0]) <= PASSING:
+        return ()
+    return tuple(
+        f"The bulge {bulges[0].height_mm:.1f} mm high at {place(bulges[0].dome_mm)} hangs on the "
+        f"artery from {end.role}, {end.described}: give that as the first --inlet."
+        for end, line in zip(vessel.far_ends, vessel.centerlines, strict=True)
+        if end.is_inlet and reach_of(line, bulges[0]) <= PASSING
+    )
+
+
+def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
+    """A sentence where the artery along a centerline widens all round, off its sacs."""
+    radius = np.where(is_off_sacs(line, bulges), line.inscribed_radius_mm, 0.0)
+    at_end = np.minimum(line.abscissa_mm, line.length_mm - line.abscissa_mm) < END_MM
+    is_first = line.abscissa_mm < 0.5 * line.length_mm
+    ends_mm = max(float(np.median(line.inscribed_radius_mm[at_end & side])) for side in (is_first, ~is_first))
+    widest = int(np.argmax(radius))
+    if radius[widest] < FUSIFORM * ends_mm:
+        return ()
+    return (
+        f"The artery is {2 * radius[widest]:.1f} mm wide at {place(line.points_mm[widest])} and {2 * ends_mm:.1f} mm "
+        "at its wider end: a fusiform aneurysm is no sac here, has no neck, and stays part of the landing surface.",
+    )
+
+
+def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
+    """Sentences where the artery along a centerline narrows beside a neck, and is wide again beyond and across it.
+
+    How wide the artery is under a neck is told by how wide it is beside it: little is, where it is stenosed there.
+    """
+    abscissa, radius = line.abscissa_mm, line.inscribed_radius_mm
+    at_neck = curves.project(line.points_mm, aneurysm.neck_mm)[0]
+    gap_mm = np.maximum(at_neck.min() - abscissa, abscissa - at_neck.max())
+    reach_mm = STENOSED_REACH * 2.0 * parent_radius_mm(abscissa, radius)[np.argmin(gap_mm)]
+    upstream, downstream = (
+        side & (gap_mm > 0) & (gap_mm < reach_mm) for side in (abscissa < at_neck.min(), abscissa > at_neck.max())
+    )
+    if not (upstream.any() and downstream.any()):
+        return ()
+    notes = []
+    for side, other in ((upstream, downstream), (downstream, upstream)):
+        throat = int(np.argmin(np.where(side, radius, np.inf)))
+        beyond_mm = float(radius[side & (gap_mm > gap_mm[throat])].max(initial=0.0))
+        around_mm = min(beyond_mm, float(radius[other].max()))
+        if radius[throat] < STENOSED * around_mm:
+            notes.append(
+                f"The artery is {2 * radius[throat]:.1f} mm wide at {place(line.points_mm[throat])}, "
+                f"{gap_mm[throat]:.1f} mm from a neck, and {2 * around_mm:.1f} mm on both sides of that: it is "
+                "stenosed. The landing surface may lie inside its wall between there and the neck: look at it, and "
+                "give --neck where the neck found is too large."
+            )
+    return tuple(notes)
+
+
+def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
+    """Sentences on the openings that lie on a sac or beside one: holes in it, or branches cut off at their mouth."""
+    notes = []
+    for opening in vessel.far_ends:
+        gap_mm = min((float(bulge.distances_mm(opening.center_mm[None])[0]) for bulge in bulges), default=np.inf)
+        if gap_mm < NEAR_SAC_MM:
+            notes.append(
+                f"{opening.role}, {opening.described}, lies {gap_mm:.1f} mm from a sac's wall: close it where it is a "
+                "hole; give --outlet where the parent artery leads elsewhere."
+            )
+    return tuple(notes)
+
+
+def _from_sacs(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
+    """Sentences on the branches that leave from a sac: their blood goes on passing through it behind a device."""
+    branches = [one for k, one in enumerate(zip(vessel.far_ends, vessel.centerlines, strict=True)) if k != path]
+    return tuple(_through_sac(opening) for opening, line in branches if any(_leaves(line, one) for one in aneurysms))
+
+
+def _through_sac(opening: Opening) -> str:
+    way, beside = ("opens into", ", and is none of the neck inflow") if opening.is_inlet else ("leaves from", "")
+    return (
+        f"{opening.role}, {opening.described}, {way} a sac: what it carries goes on through the sac behind any "
+        f"device{beside}."
+    )
+
+
+def _leaves(line: Centerline, aneurysm: Aneurysm) -> bool:
+    """Tell whether a centerline comes out of a sac by another way than its neck: farther from it than it is wide."""
+    inside = np.flatnonzero(aneurysm.sac.signed_distance(line.points_mm) < 0)
+    last = inside[-1:]
+    return bool((aneurysm.neck.closest(line.points_mm[last])[1] > line.inscribed_radius_mm[last]).any())

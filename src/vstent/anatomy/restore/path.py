@@ -1,0 +1,90 @@
+"""The centerline that the parent artery follows: past the sac to an outlet, at every fork the wider way on."""
+
+from functools import reduce
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.anatomy.restore.bulges import Bulge
+from vstent.anatomy.trace import parent_radius_mm
+from vstent.geometry.vessel import Centerline, Vessel
+from vstent.kernels import curves
+from vstent.kernels.arrays import Bools, Floats
+
+REACH_MM: Final = 10.0
+"""At a fork, the parent artery goes on where the vessel is wider over this length."""
+IN_SAC: Final = 1.2
+"""A sphere reaches into a sac whose wall is within this many of its radii."""
+BACK_RAD: Final = np.radians(100.0)
+"""A way that turns by more than this at a fork turns back: where two arteries join, it is the other one..."""
+BACK: Final = 0.8
+"""... which is no wider than the one that both feed (Murray 1926), or hardly: it counts as this much of its width."""
+SHARED: Final = 2.0
+"""Two lines are one up to this many radii before they part."""
+PASSING: Final = 2.0
+"""A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
+
+
+def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -> int:
+    """Number of the centerline that the parent artery follows: past the sac to an outlet, at every fork the wider way.
+
+    To another inlet it leads only where `outlet_mm` (3,) is there.
+    """
+    lines = vessel.centerlines
+    if outlet_mm is not None:
+        ends = np.array([opening.center_mm for opening in vessel.far_ends])
+        return int(np.argmin(np.linalg.norm(ends - np.asarray(outlet_mm), axis=1)))
+    leads_out = [not opening.is_inlet for opening in vessel.far_ends]
+    reach = np.array([reach_of(line, bulges[0]) if bulges else 0.0 for line in lines])
+    reach = np.where(leads_out, reach, np.inf)
+    passing = np.flatnonzero(reach <= max(PASSING, 1.25 * reach.min()))
+    off = [is_off_sacs(line, bulges[:1]) for line in lines]
+    return int(reduce(lambda i, k: i if _is_wider(lines[i], lines[k], off[i], off[k]) else k, passing))
+
+
+def is_off_sacs(line: Centerline, bulges: list[Bulge]) -> Bools:
+    """Tell the points (n,) of a centerline whose inscribed spheres reach into none of the sacs: they make them wide."""
+    off = np.ones(len(line.points_mm), dtype=bool)
+    for bulge in bulges:
+        off &= bulge.distances_mm(line.points_mm) > IN_SAC * line.inscribed_radius_mm
+    return off
+
+
+def reach_of(line: Centerline, bulge: Bulge) -> float:
+    """Return the least distance between a centerline and a bulge's foot, in parent radii; the wall itself is at 1."""
+    radius = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
+    return float((cKDTree(bulge.foot_mm).query(line.points_mm)[0] / radius).min())
+
+
+def _is_wider(one: Centerline, other: Centerline, one_is_off: Bools, other_is_off: Bools) -> bool:
+    """Tell whether the first of two centerlines is the wider over `REACH_MM` beyond their fork."""
+    return _width_beyond_fork(one, other, one_is_off) >= _width_beyond_fork(other, one, other_is_off)
+
+
+def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> float:
+    """Median radius of a centerline over `REACH_MM` beyond its fork from another, less where it turns back there.
+
+    0 where it parts in the sac alone.
+    """
+    distance = curves.project(other.points_mm, line.points_mm)[1]
+    apart = np.flatnonzero((distance > line.inscribed_radius_mm) & is_off)
+    if not len(apart):
+        return 0.0
+    fork_mm = line.abscissa_mm[apart[0]]
+    beyond = (line.abscissa_mm >= fork_mm) & (line.abscissa_mm <= fork_mm + REACH_MM)
+    # A way that is mostly in the sac is a branch of the sac: the sac's own width is none of its.
+    own = beyond & is_off if (beyond & is_off).sum() < 0.5 * beyond.sum() else beyond
+    share = BACK if _turns_back(line, float(fork_mm)) else 1.0
+    return share * float(np.median(line.inscribed_radius_mm[own]))
+
+
+def _turns_back(line: Centerline, fork_mm: float) -> bool:
+    """Tell whether a centerline that parts from another at an abscissa turns back: over `REACH_MM` on both sides of it.
+
+    Lines part where the one leaves the other's sphere, some way behind the fork.
+    """
+    shared_mm = fork_mm - SHARED * float(np.interp(fork_mm, line.abscissa_mm, line.inscribed_radius_mm))
+    places_mm = np.array([shared_mm - REACH_MM, shared_mm, fork_mm, fork_mm + REACH_MM])
+    before, _, beyond = np.diff(line.at(np.clip(places_mm, 0.0, line.length_mm)), axis=0)
+    return bool(before @ beyond < np.cos(BACK_RAD) * np.linalg.norm(before) * np.linalg.norm(beyond))

@@ -1,0 +1,122 @@
+"""Restore the parent artery: find the sac, and close its neck and the side branches' ostia.
+
+The paper (Zhong et al. 2016) shrinks the sac by hand ("aneurysm scaling"). Here it is found: the wall that stands out
+of the tubes around all centerlines is a sac where it stands out by more than the artery's own radius. The parent
+artery is then a tube around its own axis (`axis`), its wall the patient's own except across necks and ostia, where it
+is closed by the smoothest surface through the wall around them (`landing`). What of the lumen lies outside that tube
+and holds the sac's dome is the sac (`sac`).
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+from vstent.anatomy.restore.axis import Mouth, fit_axis
+from vstent.anatomy.restore.bulges import Bulge, find_bulges, flat_bulges
+from vstent.anatomy.restore.drawn import cut_along
+from vstent.anatomy.restore.landing import Landing, close_landing
+from vstent.anatomy.restore.notes import flat_told, told
+from vstent.anatomy.restore.path import parent_path
+from vstent.anatomy.restore.sac import cut_sac, drawn_sac, is_in_one
+from vstent.anatomy.restore.tubes import tubes_of
+from vstent.errors import InputError, VesselError
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Vessel
+from vstent.kernels.arrays import Floats
+from vstent.units import place
+
+ON_FOOT: Final = 1.5
+"""A foot, which rises to half a radius above the nearest artery, is an artery's own up to this many of its radii."""
+MOST_FLAT: Final = 3
+"""No more flat bulges than this are looked into: one on a branch takes as long as restoring the artery does."""
+
+
+def restore(
+    vessel: Vessel, *, at_mm: Floats | None = None, outlet_mm: Floats | None = None, neck_mm: Floats | None = None
+) -> Anatomy:
+    """Return the anatomy of a traced vessel: parent artery, landing surface, sacs.
+
+    Parameters
+    ----------
+    vessel : a vessel with centerlines.
+    at_mm : (3,) a point near the sac wanted; all sacs otherwise.
+    outlet_mm : (3,) a point near the opening that the parent artery leads to; the widest way on to an outlet otherwise.
+    neck_mm : (k, 3) a neck drawn by hand, a closed curve near the wall: what it parts from the inlet is a sac, and
+        the only one; necks are found otherwise.
+
+    Raises
+    ------
+    InputError
+        When nothing stands out of the artery near `at_mm`, or `neck_mm` does not part a sac from the artery.
+    VesselError
+        When the vessel has no centerlines, or its wall is no artery's along them.
+    """
+    if not vessel.centerlines:
+        raise VesselError("the vessel has no centerlines: trace it before restoring its parent artery")
+    drawn = None if neck_mm is None else cut_along(vessel, neck_mm)
+    bulges = [drawn.bulge] if drawn else find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
+    if at_mm is not None and not bulges:
+        raise InputError(f"no sac stands out of the artery near {place(at_mm)}: give a point in its dome")
+    path = parent_path(vessel, bulges, outlet_mm)
+    landing = _landing(vessel, path, bulges, drawn.artery if drawn else None)
+    side_lines = _all_but(path, vessel.centerlines)
+    sacs = [drawn_sac(vessel, landing, side_lines, drawn)] if drawn else _sacs(vessel, landing, side_lines, bulges)
+    aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
+    flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm, path, landing)
+    return Anatomy(
+        vessel,
+        landing.axis,
+        landing.section_radius_mm,
+        landing.surface,
+        landing.is_restored.ravel(),
+        aneurysms,
+        (*told(vessel, path, bulges, aneurysms), *flat_told(flat)),
+    )
+
+
+def _landing(vessel: Vessel, path: int, bulges: Sequence[Bulge], own: Surface | None = None) -> Landing:
+    """The landing surface along a centerline, with the necks of bulges closed; `own`: see `close_landing`."""
+    line = vessel.centerlines[path]
+    mouths = [Mouth(_foot_on(line, bulge), bulge.inward) for bulge in bulges]
+    return close_landing(vessel.lumen, fit_axis(vessel.lumen, line, mouths), own)
+
+
+def _flat_sac(vessel: Vessel, outlet_mm: Floats | None, path: int, landing: Landing) -> Bulge | None:
+    """The highest bulge too flat to be taken for a sac of which one is cut off where it is asked for: a blister.
+
+    It hardly bears on the fit of the artery, so that the landing surface along a path holds for all bulges on it.
+    """
+    flat = flat_bulges(vessel.lumen, tubes_of(vessel.centerlines))[:MOST_FLAT]
+    landings = {path: landing}
+    # Forks and bends bulge as high as a blister does: they turn out to be the artery once it is restored.
+    for bulge in flat:
+        way = parent_path(vessel, [bulge], outlet_mm)
+        if way not in landings:
+            landings[way] = _landing(vessel, way, ())
+        if cut_sac(vessel, landings[way], _all_but(way, vessel.centerlines), bulge):
+            return bulge
+    return None
+
+
+def _all_but(path: int, lines: Sequence[Centerline]) -> list[Centerline]:
+    return [line for k, line in enumerate(lines) if k != path]
+
+
+def _sacs(vessel: Vessel, landing: Landing, side_lines: list[Centerline], bulges: list[Bulge]) -> list[Aneurysm]:
+    """The sacs of those bulges that hang on the parent artery and are not flat."""
+    found: list[Aneurysm] = []
+    for bulge in bulges:
+        sac = cut_sac(vessel, landing, side_lines, bulge)
+        # Bulges apart above the tubes may be one sac above the landing surface, which lies lower.
+        found += [] if sac is None or is_in_one(sac.sac.vertices_mm, found) else [sac]
+    return found
+
+
+def _foot_on(line: Centerline, bulge: Bulge) -> Floats:
+    """Points (k, 3) of a bulge's foot that stand on the artery along a centerline; all where none does.
+
+    Where a branch leaves from the sac beside its neck, the foot goes around the branch's mouth too.
+    """
+    tubes = tubes_of([line])
+    height, sphere = tubes.height_mm(bulge.foot_mm)
+    on_artery = bulge.foot_mm[height < ON_FOOT * tubes.radius_mm[sphere]]
+    return on_artery if len(on_artery) else bulge.foot_mm

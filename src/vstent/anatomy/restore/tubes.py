@@ -1,0 +1,65 @@
+"""Tubes: the vessel as it would be around its centerlines alone, without any sac."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.anatomy.trace import SPEED_CAP, parent_radius_mm
+from vstent.geometry.vessel import Centerline
+from vstent.kernels.arrays import Floats, Ints, freeze
+
+N_CLASSES: Final = 16
+"""Classes of spheres of about the same radius."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tubes:
+    """A union of spheres along centerlines."""
+
+    centers_mm: Floats
+    """(n, 3) centerline points."""
+    radius_mm: Floats
+    """(n,) inscribed radius, no more than the parent artery's there."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "centers_mm", np.float64, (-1, 3))
+        freeze(self, "radius_mm", np.float64, (len(self.centers_mm),))
+
+    def height_mm(self, points_mm: Floats) -> tuple[Floats, Ints]:
+        """Return the distance (n,) of points (n, 3) to the tubes' wall, negative inside, and each one's sphere (n,)."""
+        if not len(self.centers_mm):
+            return np.full(len(points_mm), np.inf), np.zeros(len(points_mm), dtype=np.int32)
+        distance, nearest = cKDTree(self.centers_mm).query(points_mm)
+        sphere = np.array(nearest, dtype=np.int32)
+        own_mm = self.radius_mm[sphere]
+        height = np.asarray(distance - own_mm)
+        # Sorting spheres by radius into a few classes makes the nearest wall a nearest-centre query per class, and only
+        # a sphere wider than the one about the nearest centre can have a nearer wall.
+        for members in np.array_split(np.argsort(-self.radius_mm), min(N_CLASSES, len(self.radius_mm))):
+            widest = float(self.radius_mm[members[0]])
+            open_ = np.flatnonzero(own_mm < widest)
+            if not len(open_):
+                continue
+            limit = max(float(height[open_].max()) + widest, 0.0)
+            query = cKDTree(self.centers_mm[members]).query(points_mm[open_], distance_upper_bound=limit)
+            distance, nearest = np.asarray(query[0]), np.asarray(query[1])
+            found = nearest < len(members)
+            open_, chosen = open_[found], members[nearest[found]]
+            candidate = distance[found] - self.radius_mm[chosen]
+            closer = candidate < height[open_]
+            height[open_[closer]], sphere[open_[closer]] = candidate[closer], chosen[closer]
+        return height, sphere
+
+
+def tubes_of(centerlines: Sequence[Centerline]) -> Tubes:
+    """Tubes around centerlines with the radius of the parent artery."""
+    if not centerlines:
+        return Tubes(np.zeros((0, 3)), np.zeros(0))
+    radius = [
+        np.minimum(line.inscribed_radius_mm, SPEED_CAP * parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm))
+        for line in centerlines
+    ]
+    return Tubes(np.concatenate([line.points_mm for line in centerlines]), np.concatenate(radius))

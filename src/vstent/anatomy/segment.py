@@ -1,0 +1,425 @@
+"""Segment: a scan -> the wall of the contrast-filled lumen."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.special import ndtr
+
+from vstent.errors import VesselError
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Vessel
+from vstent.io.surfaces import GIANT_DIAMETER_MM, VESSEL_DIAMETER_MM
+from vstent.kernels import smoothing, topology, triangles
+from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.isosurface import isosurface
+from vstent.units import place
+
+FEWEST_VOXELS: Final = 300
+"""A lumen of fewer voxels is noise."""
+NOTABLE_PIECE: Final = 0.02
+"""Pieces with less than this fraction of the voxels of the largest about the point given are not taken for the vessel
+there."""
+BAND: Final = 0.05
+"""The threshold is told to be known to within this fraction of the step from tissue to lumen."""
+FARTHEST_MM: Final = 5.0
+"""How far from the point given the lumen may be."""
+AROUND_MM: Final = 15.0
+"""Where a point is given, the first threshold is that of the scan within this distance of it."""
+FILLS: Final = 0.2
+"""What fills more of the scan than this fraction, and is wider than vessels are, is a head or a field of view..."""
+AIR_MM: Final = 2.0
+"""... and what lies no further than this from the air or padding around it says nothing of vessels."""
+MOST_GROUNDS: Final = 3
+"""Padding, air and tissue: no more levels than these lie below a vessel's."""
+MOST_FACES: Final = 120_000
+"""Meshes of more triangles are decimated to this number."""
+SMOOTHING_STEPS: Final = 12
+PASS_BAND: Final = 0.1
+CURVATURE_ROUNDS: Final = 25
+"""The wall's curvature is averaged so many times with the neighbours': over some three voxels."""
+CREVICE_ROUNDS: Final = 4
+"""Where the curvature averaged so many times is hollow, there is a crevice between two parts of the vessel..."""
+CREVICE_RINGS: Final = 3
+"""... which reaches this many rings of vertices further."""
+PROFILE_VOXELS: Final = 4.0
+"""How far into the lumen and into the tissue the profiles across the wall reach."""
+PROFILES: Final = 8000
+
+
+def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | None = None) -> Vessel:
+    """Find the wall of the lumen where the scan crosses a threshold.
+
+    Parameters
+    ----------
+    image : a scan in which the blood is brighter than what surrounds it.
+    threshold : intensity of the wall; proposed where not given: half way between tissue and lumen, see `propose`.
+    at_mm : (3,) point in or near the vessel wanted; the largest vessel where not given.
+
+    Returns
+    -------
+    vessel : the lumen's wall in LPS mm, open where it meets the border of the scan; its openings are not named yet.
+        Notes say how the threshold was found and what it does to the diameter.
+
+    Raises
+    ------
+    VesselError
+        There is no lumen: nothing, or almost nothing, is brighter than the threshold, or nothing near the point, or
+        what is brighter is wider than any artery.
+
+    Smoothing is that of Taubin 1995; what volume it takes is measured, said and given back.
+    """
+    lumen, notes, profile = propose(image, at_mm=at_mm) if threshold is None else _at(image, float(threshold), at_mm)
+    _refuse_wide(lumen, profile)
+    surface, smooth_note = _smooth(_wall(lumen))
+    if threshold is None:
+        surface = _unblurred(surface, profile)
+    surface, decimation_notes = _decimated(surface)
+    size = " x ".join(f"{h:.3g}" for h in image.spacing_mm)
+    share = lumen.n_voxels / lumen.n_above
+    found = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all above the threshold."
+    # Not of the threshold itself: where a scan's intensities begin is arbitrary.
+    off = BAND * (profile.lumen - profile.tissue)
+    band_mm = 2 * off / profile.slope_per_mm
+    band = f"A threshold {off:.3g} lower or higher, {BAND:.0%} of the step from tissue to lumen, changes diameters by "
+    band += f"+-{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
+    all_notes = (*image.notes, *notes, band, found, smooth_note, *decimation_notes)
+    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm, blur_mm=profile.blur_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class Lumen:
+    """The voxels of one vessel, and the intensity of its wall."""
+
+    field: NDArray[np.float32]
+    """(i, j, k) intensities of the part of the scan about the vessel; other vessels are put below the threshold."""
+    affine_mm: Floats
+    """(4, 4) index in `field` -> LPS mm."""
+    threshold: float
+    """Intensity of the wall."""
+    n_voxels: int
+    """Voxels in the vessel."""
+    n_above: int
+    """Voxels of the whole scan above the threshold."""
+
+    @property
+    def voxel_mm(self) -> float:
+        """Edge of a cube as large as a voxel."""
+        return float(np.abs(np.linalg.det(self.affine_mm[:3, :3])) ** (1 / 3))
+
+
+def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[str, ...], "Profile"]:
+    """Propose a threshold; return the lumen, how it was found, and the profile across its wall.
+
+    Vessels are far less than a tenth of the voxels, so the histogram of the scan does not show them. A first threshold
+    is the mean intensity weighted with the squared gradient (Kittler, Illingworth and Foeglein 1985, Comput. Vis.
+    Graph. Image Process. 30:125). The vessel found with it is crossed by profiles along the normals of its wall, and
+    the threshold set half way between the medians of tissue and lumen: full width at half maximum (Hoogeveen, Bakker
+    and Viergever 1998, Magn. Reson. Med. 40:751). The wall of a cylinder of radius R, blurred with standard deviation
+    s, does not lie at one half but at Phi(-s / (2 R)) of the step (mean curvature flow, to first order); s is taken
+    from the slope of the profile. R is the whole vessel's; `_unblurred` sees to branches and sacs.
+    """
+    first, profile = _first(image, at_mm)
+    second = replace(first, threshold=profile.wall_level)
+    profile = _profile(second)
+    lumen = _lumen(image, profile.wall_level, at_mm)
+    note = (
+        f"Threshold {lumen.threshold:.4g} proposed: half way between tissue ({profile.tissue:.4g}) and lumen "
+        f"({profile.lumen:.4g}), corrected for the wall's curvature and a blur of {profile.blur_mm:.2g} mm."
+    )
+    return lumen, (note,), profile
+
+
+def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tuple[str, ...], "Profile"]:
+    lumen = _lumen(image, threshold, at_mm)
+    profile = _profile(lumen)
+    note = f"Threshold {threshold:.4g} as given; {profile.wall_level:.4g} would have been proposed."
+    return lumen, (note,), profile
+
+
+def _refuse_wide(lumen: Lumen, profile: "Profile") -> None:
+    if 2 * profile.radius_mm <= GIANT_DIAMETER_MM:
+        return
+    middle_mm = lumen.affine_mm[:3] @ [*(0.5 * (np.array(lumen.field.shape) - 1)), 1.0]
+    raise VesselError(
+        f"What is brighter than threshold {lumen.threshold:.4g} about {place(middle_mm)} is "
+        f"{2 * profile.radius_mm:.0f} mm wide, and no artery is wider than {GIANT_DIAMETER_MM:g} mm: it is a head, "
+        "bone or the field of view; give --threshold, or --at with a point in the artery, or crop the scan where the "
+        "two touch."
+    )
+
+
+# -- voxels ------------------------------------------------------------------------------------------------------------
+
+
+def _first(image: Image, at_mm: Floats | None) -> tuple[Lumen, "Profile"]:
+    """Pick the vessel at a first threshold, and sample the profile across its wall.
+
+    The strongest edges of a scan may be those between a head and the air, or a field of view and its padding. What is
+    brighter than such a threshold fills the scan: then the next threshold is looked for within that.
+    """
+    voxels = image.voxels[_around(image, at_mm)]
+    lumen = _lumen(image, _edge_level(voxels), at_mm)
+    profile = _profile(lumen)
+    for _ in range(MOST_GROUNDS):
+        is_wide = 2 * profile.radius_mm > VESSEL_DIAMETER_MM[1]
+        if not is_wide or lumen.n_voxels < FILLS * image.voxels.size:
+            break
+        is_within = _clear_of(voxels < lumen.threshold, image.spacing_mm)
+        lumen = _lumen(image, _edge_level(voxels, is_within), at_mm)
+        profile = _profile(lumen)
+    return lumen, profile
+
+
+def _around(image: Image, at_mm: Floats | None) -> tuple[slice, ...]:
+    """Box of the voxels within `AROUND_MM` of a point (3,); the whole scan without one, or far from it."""
+    whole = tuple(slice(0, n) for n in image.voxels.shape)
+    if at_mm is None:
+        return whole
+    low, high = _reach(image, at_mm, AROUND_MM)
+    return tuple(map(slice, low, high)) if (high - low > 2).all() else whole
+
+
+def _reach(image: Image, at_mm: Floats, reach_mm: float) -> tuple[Ints, Ints]:
+    """First (3,) and behind the last (3,) index of the voxels in a box about a point (3,), within the scan."""
+    reach = np.ceil(reach_mm / image.spacing_mm).astype(int) + 1
+    middle = np.round(image.to_index(np.asarray(at_mm, dtype=np.float64)[None])[0]).astype(int)
+    low = np.clip(middle - reach, 0, image.voxels.shape)
+    return low, np.clip(middle + reach + 1, low, image.voxels.shape)
+
+
+def _clear_of(is_ground: Bools, spacing_mm: Floats) -> Bools:
+    """Tell the voxels further than `AIR_MM` from the ground."""
+    return np.asarray(ndimage.distance_transform_edt(~is_ground, sampling=spacing_mm) > AIR_MM)
+
+
+def _edge_level(voxels: NDArray[Any], is_within: Bools | None = None) -> float:
+    """Mean intensity weighted with the squared gradient, on every other voxel; gradients of the noise do not count.
+
+    With `is_within`, as large as the scan, on those of its voxels alone.
+    """
+    if min(voxels.shape) < 3:
+        raise VesselError(f"A scan of {' x '.join(map(str, voxels.shape))} voxels is too thin to find a lumen in it.")
+    middle = (slice(1, -1, 2),) * 3
+    squared = np.zeros(voxels[middle].shape, dtype=np.float32)
+    for axis in range(3):
+        ahead, behind = list(middle), list(middle)
+        ahead[axis], behind[axis] = slice(2, None, 2), slice(0, -2, 2)
+        squared += (voxels[tuple(ahead)].astype(np.float32) - voxels[tuple(behind)].astype(np.float32)) ** 2
+    counts = np.ones(squared.shape, dtype=bool) if is_within is None else is_within[middle]
+    noise = float(np.median(squared[counts])) if counts.any() else 0.0
+    weight = np.where(counts & (squared > 8 * noise), squared, 0.0).astype(np.float64)
+    if not weight.sum() > 0:
+        raise VesselError(
+            "The scan has no edges, so there is no contrast-filled lumen in it; check that it is the right series."
+        )
+    return float((weight * voxels[middle]).sum() / weight.sum())
+
+
+class _Pieces(NamedTuple):
+    """The connected pieces of what is brighter than a threshold."""
+
+    label: NDArray[Any]
+    """(i, j, k) number of the piece that a voxel is of, 0 for none."""
+    size: NDArray[Any]
+    """(pieces + 1,) voxels in each; 0 in the first."""
+    threshold: float
+    """The threshold."""
+
+
+def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
+    """Pick the connected voxels above the threshold: the piece nearest to the point, or the largest."""
+    above = image.voxels >= threshold
+    if above.all():
+        raise VesselError(
+            f"No lumen: no voxel is below threshold {threshold:.4g} "
+            f"(the scan's range is {image.voxels.min()} to {image.voxels.max()}); give another --threshold."
+        )
+    label, n_components = ndimage.label(above)
+    size = np.bincount(label[above], minlength=n_components + 1)
+    if size.max(initial=0) < FEWEST_VOXELS:
+        raise VesselError(
+            f"No lumen: at threshold {threshold:.4g} the largest piece has {size.max(initial=0)} voxels "
+            f"(the scan's range is {image.voxels.min()} to {image.voxels.max()}); give another --threshold."
+        )
+    pieces = _Pieces(label, size, threshold)
+    chosen = int(size.argmax()) if at_mm is None else _nearest(image, pieces, np.asarray(at_mm, dtype=np.float64))
+    box = _with_margin(ndimage.find_objects(label, max_label=chosen)[chosen - 1], label.shape)
+    part = label[box]
+    field = image.voxels[box].astype(np.float32)
+    below = np.float32(threshold - 0.5 * max(float(field.max()) - threshold, 1e-6))
+    field[(part > 0) & (part != chosen)] = below
+    affine = np.array(image.affine_mm)
+    affine[:3, 3] = image.to_mm(np.array([[s.start for s in box]]))[0]
+    return Lumen(field, affine, threshold, int(size[chosen]), int(size.sum()))
+
+
+def _nearest(image: Image, pieces: _Pieces, at_mm: Floats) -> int:
+    """Number of the piece nearest to a point (3,), debris left out."""
+    low, high = _reach(image, at_mm, FARTHEST_MM)
+    part = pieces.label[tuple(map(slice, low, high))]
+    # Counted about the point alone: the bone of a head has a hundred times an artery's voxels.
+    n_near = np.bincount(part.ravel(), minlength=len(pieces.size))
+    n_near[pieces.size < FEWEST_VOXELS] = 0
+    index = np.argwhere(np.isin(part, np.flatnonzero(n_near > NOTABLE_PIECE * n_near.max())))
+    distance = (
+        np.linalg.norm(image.to_mm((low + index).astype(np.float64)) - at_mm, axis=1)
+        if len(index)
+        else np.array([np.inf])
+    )
+    if distance.min() > FARTHEST_MM:
+        place = ", ".join(f"{v:.1f}" for v in at_mm)
+        raise VesselError(
+            f"There is no lumen within {FARTHEST_MM:g} mm of ({place}) mm: nothing notable there is brighter than "
+            f"threshold {pieces.threshold:.4g}; check --at, which is in LPS mm, or give another --threshold."
+        )
+    return int(part[tuple(index[distance.argmin()])])
+
+
+def _with_margin(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """Widen a box by the reach of the profiles, within the scan."""
+    margin = int(PROFILE_VOXELS) + 2
+    return tuple(slice(max(0, s.start - margin), min(n, s.stop + margin)) for s, n in zip(box, shape, strict=True))
+
+
+# -- profiles across the wall ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """How the intensity falls from the lumen to the tissue."""
+
+    lumen: float
+    """Median intensity inside, where the vessel is thick."""
+    tissue: float
+    """Median intensity outside."""
+    slope_per_mm: float
+    """How steeply it falls at half height."""
+    radius_mm: float
+    """Hydraulic radius 2 V / A of the vessel."""
+    voxel_mm: float
+    """Edge of a cube as large as a voxel."""
+
+    @property
+    def blur_mm(self) -> float:
+        """Standard deviation of the Gaussian that makes such a slope of a step.
+
+        Reading between voxels by linear interpolation blurs once more, with a variance of voxel^2 / 6: that is not the
+        scan's and is taken off.
+        """
+        read_mm = (self.lumen - self.tissue) / (np.sqrt(2 * np.pi) * self.slope_per_mm)
+        return float(np.sqrt(max(read_mm**2 - self.voxel_mm**2 / 6, 0.0)))
+
+    @property
+    def wall_level(self) -> float:
+        """Intensity of the wall of a blurred cylinder."""
+        share = float(ndtr(-0.5 * min(self.blur_mm / self.radius_mm, 1.0)))
+        return self.tissue + share * (self.lumen - self.tissue)
+
+
+def _profile(lumen: Lumen) -> Profile:
+    """Sample the scan along the normals of a smoothed wall."""
+    surface = _taubin(_wall(lumen))
+    some = np.random.default_rng(0).permutation(len(surface.vertices_mm))[:PROFILES]
+    depth_mm = np.arange(-PROFILE_VOXELS, PROFILE_VOXELS + 0.01, 0.25) * lumen.voxel_mm
+    points = surface.vertices_mm[some, None] + depth_mm[:, None] * surface.vertex_normals[some, None]
+    inverse = np.linalg.inv(lumen.affine_mm)
+    index = points.reshape(-1, 3) @ inverse[:3, :3].T + inverse[:3, 3]
+    value = ndimage.map_coordinates(lumen.field, index.T, order=1, mode="nearest").reshape(len(some), -1)
+    value = value[_is_thick(value, depth_mm, lumen)]
+    course, outer = np.median(value, axis=0), depth_mm > 0.55 * PROFILE_VOXELS * lumen.voxel_mm
+    # The plateau is where the blur reaches least; in a thin vessel that is its axis, not the deepest sample.
+    plateau, tissue = float(course.max()), float(np.median(value[:, outer]))
+    slope = _slope(course, depth_mm, 0.5 * (plateau + tissue))
+    radius_mm = 2 * lumen.n_voxels * lumen.voxel_mm**3 / surface.area_mm2
+    return Profile(plateau, tissue, slope, radius_mm, lumen.voxel_mm)
+
+
+def _is_thick(value: NDArray[Any], depth_mm: Floats, lumen: Lumen) -> Bools:
+    """Tell the profiles (n,) that stay in the lumen all the way in; the thicker half of all where hardly any do."""
+    stays = value[:, depth_mm < 0].min(axis=1) >= lumen.threshold
+    if stays.mean() > 0.05:
+        return stays
+    within = (value[:, depth_mm < 0] >= lumen.threshold).sum(axis=1)
+    return within >= np.median(within)
+
+
+def _slope(profile: NDArray[Any], depth_mm: Floats, level: float) -> float:
+    """Steepest descent of a profile about a level, per mm."""
+    steps = -np.gradient(profile, depth_mm)
+    near = np.abs(profile - level) <= 0.35 * np.ptp(profile)
+    return max(float(steps[near].max(initial=0.0)), 1e-6 * float(np.ptp(profile)) + 1e-300)
+
+
+# -- mesh --------------------------------------------------------------------------------------------------------------
+
+
+def _wall(lumen: Lumen) -> Surface:
+    """Outermost iso-surface in LPS mm, outward; cavities in the lumen are pieces of their own and so left out."""
+    index, faces = isosurface(lumen.field, lumen.threshold)
+    label = topology.face_components(faces)
+    area = np.bincount(label, triangles.areas(index[faces]))
+    index, faces = triangles.compact(index, faces[label == area.argmax()])
+    if np.linalg.det(lumen.affine_mm[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    return Surface(index @ lumen.affine_mm[:3, :3].T + lumen.affine_mm[:3, 3], faces)
+
+
+def _taubin(surface: Surface) -> Surface:
+    vertices = smoothing.taubin(surface.vertices_mm, surface.faces, iterations=SMOOTHING_STEPS, pass_band=PASS_BAND)
+    return Surface(vertices, surface.faces)
+
+
+def _smooth(rough: Surface) -> tuple[Surface, str]:
+    """Smooth, and give back the volume that this takes."""
+    volume = _capped_volume_mm3(rough)
+    smooth = _taubin(rough)
+    lost = volume - _capped_volume_mm3(smooth)
+    vertices = smooth.vertices_mm + (lost / smooth.area_mm2) * smooth.vertex_normals
+    return Surface(
+        vertices, smooth.faces
+    ), f"Smoothing changed the volume by {-lost / volume:+.2%}, which was given back."
+
+
+def _unblurred(surface: Surface, profile: Profile) -> Surface:
+    """Move the wall to where it was before the blur: by s^2 times its mean curvature, less that of the whole vessel.
+
+    The threshold is right for the whole vessel's radius. A thin branch comes out too narrow with it and a sac too wide;
+    no shift is larger than half a voxel. A crevice turns faster than the blur resolves: it says nothing of how the wall
+    beside it is curved, and has no part in the average.
+    """
+    curvature = smoothing.mean_curvature(surface.vertices_mm, surface.faces, rounds=CREVICE_ROUNDS)
+    mean = smoothing.averaging(len(curvature), surface.faces)
+    is_wall = curvature > 0
+    for _ in range(CREVICE_RINGS):
+        is_wall &= mean @ is_wall.astype(np.float64) > 1.0 - 1e-9
+    total, weight = np.where(is_wall, curvature, 0.0), is_wall.astype(np.float64)
+    for _ in range(CURVATURE_ROUNDS):
+        total, weight = mean @ total, mean @ weight
+    typical = 0.5 / profile.radius_mm
+    curvature = np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), typical)
+    shift_mm = profile.blur_mm**2 * (curvature - typical)
+    shift_mm = np.clip(shift_mm, -0.5 * profile.voxel_mm, 0.5 * profile.voxel_mm)
+    return Surface(surface.vertices_mm + shift_mm[:, None] * surface.vertex_normals, surface.faces)
+
+
+def _decimated(fine: Surface) -> tuple[Surface, tuple[str, ...]]:
+    """Decimate a very fine mesh: collapse edges by the quadric error (Garland and Heckbert 1997, SIGGRAPH)."""
+    if len(fine.faces) <= MOST_FACES:
+        return fine, ()
+    import fast_simplification
+
+    vertices, faces = fast_simplification.simplify(
+        np.array(fine.vertices_mm), np.array(fine.faces), target_count=MOST_FACES
+    )
+    coarse = Surface(vertices, faces)
+    change = _capped_volume_mm3(coarse) / _capped_volume_mm3(fine) - 1
+    return coarse, (f"{len(fine.faces)} triangles decimated to {len(faces)} (volume {change:+.2%}).",)
+
+
+def _capped_volume_mm3(surface: Surface) -> float:
+    vertices, faces = triangles.cap(surface.vertices_mm, surface.faces, surface.boundary_loops)
+    return triangles.volume(vertices[faces])

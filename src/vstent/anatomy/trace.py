@@ -1,0 +1,165 @@
+"""Trace a vessel: from a wall to openings, centerlines and maximum inscribed spheres.
+
+A centerline is the path from the inlet to another opening, along the Voronoi vertices inside the lumen, of the shortest
+travel time at the speed of the inscribed radius (Antiga et al. 2003, IEEE Trans. Med. Imaging 22:674; Piccinelli et
+al. 2009, IEEE Trans. Med. Imaging 28:1141). There the wide spheres of a sac attract the path; here the speed is capped
+at `SPEED_CAP` times the radius that the artery has on both sides, so that a sac is not worth a detour.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import chain
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.anatomy.contacts import find_contact, part
+from vstent.anatomy.openings import guessed, named, open_ends, with_inlets
+from vstent.anatomy.short_cuts import along_arms, around_sacs
+from vstent.errors import VesselError
+from vstent.geometry.spheres import centered
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Centerline, Opening, Vessel
+from vstent.kernels import curves, medial
+from vstent.kernels.arrays import Floats, Ints
+
+SPEED_CAP: Final = 1.1
+"""The travel speed is at most this many parent radii."""
+STEP_MM: Final = 0.1
+"""Spacing of centerline points."""
+PARENT_WINDOW_MM: Final = 16.0
+"""The parent radius is a low percentile of the inscribed radii within a window of this length: a neck is shorter."""
+PARENT_PERCENTILE: Final = 35.0
+SMOOTHED_DIAMETERS: Final = 0.75
+"""Waves of a centerline shorter than this many local diameters are smoothed away."""
+THIN: Final = 0.3
+"""An outlet narrower than this fraction of the inlet may be left closed where the lumen to it is interrupted."""
+MOST_CONTACTS: Final = 12
+"""No more contacts between arteries than this are parted."""
+
+
+def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
+    """Return the vessel with its ends opened and a centerline from the inlet to every other opening.
+
+    Parameters
+    ----------
+    vessel : a repaired lumen, open or closed by flat caps, ends found or not.
+    inlet_mm : (3,) a point near the opening to take as inlet, or (k, 3) one near each opening that brings blood, first
+        that where the parent artery begins; the widest opening otherwise, with a note where another is nearly as wide.
+
+    Raises
+    ------
+    InputError
+        When no opening is near a point of `inlet_mm`, two are near the same, or none is left to be an outlet.
+    VesselError
+        When fewer than two ends are found, or an opening cannot be reached from the inlet.
+    """
+    is_guess = not vessel.openings and inlet_mm is None
+    vessel, spheres = (vessel, vessel.lumen.medial) if vessel.openings else open_ends(vessel)
+    if inlet_mm is not None:
+        vessel = with_inlets(vessel, np.atleast_2d(np.asarray(inlet_mm, dtype=np.float64)))
+    vessel, graph, paths = _paths(vessel, spheres)
+    for _ in range(MOST_CONTACTS):
+        parted = _parted(vessel, graph, paths, holds_inlet=inlet_mm is not None)
+        if parted is None:
+            break
+        vessel, graph, paths = _paths(parted, parted.lumen.medial)
+    lines = tuple(_centerline(vessel.lumen, graph.points[path], graph.radius[path]) for path in paths)
+    vessel = guessed(vessel) if is_guess else vessel
+    return replace(vessel, centerlines=lines)
+
+
+def _paths(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.Medial, list[Ints]]:
+    """The vessel with the openings that can be reached, the medial graph, and the path to each of them."""
+    vessel, graph = _reachable(vessel, _graph(vessel, spheres))
+    paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
+    cap_mm = _radius_cap(graph, paths)
+    paths = along_arms(graph, _shortest(vessel, graph, cap_mm), cap_mm)
+    found = [around_sacs(graph, path, SPEED_CAP) for path in paths]
+    notes = dict.fromkeys([*vessel.notes, *chain(*(told for _, told in found))])
+    return replace(vessel, notes=tuple(notes)), graph, [path for path, _ in found]
+
+
+def _parted(vessel: Vessel, graph: medial.Medial, paths: list[Ints], *, holds_inlet: bool) -> Vessel | None:
+    """The vessel without the first contact that a path slips through; None where there is none to be parted."""
+    contacts = (find_contact(graph.points[path], graph.radius[path], graph) for path in paths)
+    parted = (part(vessel, contact, holds_inlet=holds_inlet) for contact in contacts if contact is not None)
+    return next((one for one in parted if one is not None), None)
+
+
+def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
+    """Radius (n,) that the artery has around each point of a path, whatever sac it passes.
+
+    A running low percentile of the inscribed radii (n,), evenly spaced, over `PARENT_WINDOW_MM`.
+    """
+    step = float(abscissa_mm[-1]) / max(len(abscissa_mm) - 1, 1)
+    return curves.running_percentile(radius_mm, PARENT_PERCENTILE, round(PARENT_WINDOW_MM / step))
+
+
+def _graph(vessel: Vessel, spheres: medial.Medial) -> medial.Medial:
+    """Join the openings to the medial graph; they are its last vertices, in their order."""
+    ends = np.array([opening.center_mm for opening in vessel.openings])
+    reach = np.array([0.25 * opening.diameter_mm for opening in vessel.openings])
+    return medial.with_terminals(spheres, ends, reach)
+
+
+def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Medial]:
+    """Leave thin outlets that the inlet does not reach closed; complain of wide ones, and of further inlets."""
+    first = len(graph.points) - len(vessel.openings)
+    cost, _ = medial.shortest_paths(medial.cost_graph(graph, np.full(len(graph.radius), np.inf)), first)
+    is_reached = np.isfinite(cost[first:])
+    lost = [opening for opening, reached in zip(vessel.openings, is_reached, strict=True) if not reached]
+    leads_out = any(outlet not in lost for outlet in vessel.outlets)
+    for opening in lost:
+        if opening.is_inlet or opening.diameter_mm > THIN * vessel.inlet.diameter_mm or not leads_out:
+            raise VesselError(_unreachable(vessel.inlet, opening))
+    kept = np.ones(len(graph.points), dtype=bool)
+    kept[first:] = is_reached
+    notes = tuple(f"An opening {opening.described} is cut off from the inlet: closed." for opening in lost)
+    openings = named(vessel.inlets, [opening for opening in vessel.openings if opening not in lost])
+    return replace(vessel, openings=openings, notes=(*vessel.notes, *notes)), medial.keep(graph, kept)
+
+
+def _radius_cap(graph: medial.Medial, paths: Sequence[Ints]) -> Floats:
+    """Cap (n,) on the travel speed: `SPEED_CAP` times the parent radius of the nearest path point."""
+    points, parents = [], []
+    for path in paths:
+        abscissa = curves.arc_length(graph.points[path])
+        even = np.linspace(0.0, abscissa[-1], max(2, round(abscissa[-1] / STEP_MM)))
+        points.append(curves.interpolate(abscissa, graph.points[path], even))
+        parents.append(parent_radius_mm(even, np.interp(even, abscissa, graph.radius[path])))
+    nearest = cKDTree(np.concatenate(points)).query(graph.points)[1]
+    return SPEED_CAP * np.concatenate(parents)[nearest]
+
+
+def _shortest(vessel: Vessel, graph: medial.Medial, radius_cap: Floats) -> list[Ints]:
+    """Path from the inlet to each far end, as vertices of the graph."""
+    inlet = len(graph.points) - len(vessel.openings)
+    _, before = medial.shortest_paths(medial.cost_graph(graph, radius_cap), inlet)
+    return [medial.path_to(before, end) for end in range(inlet + 1, len(graph.points))]
+
+
+def _unreachable(inlet: Opening, opening: Opening) -> str:
+    return (
+        f"{opening.role}, {opening.described}, is not connected to the inlet (diameter "
+        f"{inlet.diameter_mm:.1f} mm): the lumen is interrupted between them; lower the threshold, or cut that part "
+        "away"
+    )
+
+
+def _centerline(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Centerline:
+    points = curves.resample(path_mm, STEP_MM)
+    abscissa, along = curves.arc_length(path_mm), np.linspace(0.0, 1.0, len(points))
+    radius = np.maximum(np.interp(along * abscissa[-1], abscissa, radius_mm), STEP_MM)
+    # Voronoi vertices jitter on a scale finer than a diameter: longer waves pass. Third differences leave a bend as it
+    # is where second ones would pull it inwards.
+    waves = 2.0 * radius * SMOOTHED_DIAMETERS / (2 * np.pi * STEP_MM)
+    points = centered(wall, curves.smooth(points, _held_ends(len(points)), waves**6, order=3), radius)
+    return Centerline(points, wall.inscribed_radius(points))
+
+
+def _held_ends(n: int) -> Floats:
+    weight = np.ones(n)
+    weight[[0, -1]] = 1e6
+    return weight

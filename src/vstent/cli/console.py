@@ -1,0 +1,259 @@
+"""What a terminal shows: a line per stage with its time, and the table of a comparison."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from statistics import median
+from typing import Any, Final
+
+from rich.console import Console as RichConsole
+from rich.status import Status
+from rich.table import Table
+
+from vstent.devices.design import Design
+from vstent.flow.convergence import Refinement
+from vstent.flow.positions import POSITIONS, Scatter
+from vstent.geometry.vessel import Opening
+from vstent.plan.rank import Ranking
+
+ROWS: Final = (
+    ("Neck inflow", "neck_inflow_mL_s"),
+    ("Mean sac velocity", "mean_sac_velocity_m_s"),
+    ("Sac wall shear stress, mean", "mean_sac_wss_Pa"),
+    ("Turnover time", "turnover_time_s"),
+)
+"""Rows of the comparison: title, key of the index."""
+DEVICE_ROWS: Final = (
+    ("Size (label)", "size"),
+    ("Deployed length", "deployed_length_mm"),
+    ("Apposed", "apposed_fraction"),
+    ("Metal coverage over the neck", "neck_metal_coverage_fraction"),
+)
+"""Rows on the devices: title, key of the measure."""
+
+
+QUIET_S: Final = 30.0
+"""Where there is no terminal, a stage at work says a line this often."""
+
+
+class Console:
+    """Shows the progress of a study on standard error and its table on standard output."""
+
+    def __init__(self) -> None:
+        self._err = RichConsole(stderr=True, highlight=False)
+        self._out = RichConsole(highlight=False)
+        self._status: Status | None = None
+        self._began: dict[str, float] = {}
+        self._told = time.monotonic()
+
+    @contextmanager
+    def live(self) -> Iterator[None]:
+        """Show a spinner with the stage at work, where there is a terminal."""
+        with self._err.status("starting") as status:
+            self._status = status
+            yield
+            self._status = None
+
+    def progress(self, stage: str, fraction: float, detail: str) -> None:
+        """Take a study's word: a stage begins (0), goes on, or is done (1)."""
+        now = time.monotonic()
+        began = self._began.setdefault(stage, now)
+        if fraction >= 1.0:
+            self._err.print(f"[bold]{stage:18}[/] {now - began:6.1f} s  [dim]{detail}[/]", soft_wrap=True)
+            del self._began[stage]
+        elif self._err.is_terminal and self._status is not None:
+            self._status.update(f"{stage} {fraction:4.0%} {detail}")
+        elif now - self._told > QUIET_S and fraction > 0:
+            self._told = now
+            self._err.print(f"{stage:18} {fraction:4.0%} {detail}", soft_wrap=True)
+
+    def say(self, text: str) -> None:
+        """Print a line on standard error."""
+        self._err.print(text, soft_wrap=True, markup=False)
+
+    def print(self, item: Any) -> None:
+        """Print a line or a table on standard output."""
+        self._out.print(item)
+
+
+def comparison_table(metrics: Mapping[str, Any]) -> Table:
+    """Table of bare artery and devices: each value with its unit, and its change against bare."""
+    stents = metrics["stents"]
+    table = Table("", "bare", *stents)
+    for title, key in DEVICE_ROWS:
+        if any(key in stent["deployment"] for stent in stents.values()):
+            table.add_row(title, "", *(_cell(key, stent["deployment"].get(key)) for stent in stents.values()))
+    if "bare" not in metrics:
+        return table
+    table.add_section()
+    for title, key in ROWS:
+        bare = metrics["bare"].get(key)
+        if bare is None:
+            continue
+        table.add_row(title, _cell(key, bare), *(_change(key, bare, stent["flow"][key]) for stent in stents.values()))
+    return table
+
+
+COHORT_COLUMNS: Final = (
+    ("length, mm", "deployment.deployed_length_mm", "{:.1f}"),
+    ("apposed", "deployment.apposed_fraction", "{:.0%}"),
+    ("metal at neck", "deployment.neck_metal_coverage_fraction", "{:.0%}"),
+    ("neck inflow, after / before", "ratios.neck_inflow_mL_s_ratio", "{:.2f}"),
+    ("s a case", "case_s", "{:.1f}"),
+    ("CPU s a case", "case_cpu_s", "{:.1f}"),
+    ("MB", "peak_memory_MB", "{:.0f}"),
+)
+"""Columns of a cohort: title, key, form."""
+RANKING_COLUMNS: Final = (
+    ("mm long", "deployed_length_mm", "{:.1f}"),
+    ("apposed", "apposed_fraction", "{:.0%}"),
+    ("mm beyond neck", "landing_length_mm", "{:.1f}"),
+    ("metal at neck", "neck_metal_coverage_fraction", "{:.0%}"),
+)
+"""Columns of the ranking: title, key of the measure, its form."""
+
+
+def ranking_table(ranking: Ranking, shown: int) -> Table:
+    """Table of the best candidates, and how many there are beyond."""
+    table = Table("", "device and size", "shift", "score", *(title for title, _, _ in RANKING_COLUMNS))
+    for number, candidate in enumerate(ranking.candidates[:shown], start=1):
+        values = [(candidate.measures.get(key), form) for _, key, form in RANKING_COLUMNS]
+        cells = ["" if value is None else form.format(value) for value, form in values]
+        score = f"{candidate.score:.2f}" if candidate.is_suitable else "out"
+        table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells)
+    table.columns[1].no_wrap = True
+    table.caption = f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable"
+    return table
+
+
+def ranking_reasons(ranking: Ranking, shown: int) -> str:
+    """Lines that say why the best candidates stand where they do."""
+    best = enumerate(ranking.candidates[:shown], start=1)
+    return "\n".join(f"{number}. {candidate.label}: {candidate.reason}" for number, candidate in best)
+
+
+def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Table of a cohort: a line a device, with medians of what came through."""
+    columns = [column for column in COHORT_COLUMNS if any(row.get(column[1]) is not None for row in rows)]
+    table = Table("device", "done", "failed", "lost", *(title for title, _, _ in columns))
+    for device in dict.fromkeys(row["device"] for row in rows):
+        own = [row for row in rows if row["device"] == device]
+        counts = [str(sum(row["outcome"] == outcome for row in own)) for outcome in ("done", "failed", "lost")]
+        found = [[row[key] for row in own if row.get(key) is not None] for _, key, _ in columns]
+        cells = [
+            form.format(median(values)) if values else "" for values, (*_, form) in zip(found, columns, strict=True)
+        ]
+        table.add_row(device, *counts, *cells)
+    table.caption = "medians"
+    return table
+
+
+def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
+    """Table of intervals: each result of each device, and the causes of its spread."""
+    from vstent.reporting.uncertainty import intervals
+
+    table = Table("device", "result", "mean", "95 % between", "and", "because of", title="what is not sure, varied")
+    for name, stent in metrics["stents"].items():
+        for row in intervals(stent):
+            causes = ", ".join(f"{cause} {share:.0%}" for cause, share in row.shares if share >= 0.005)
+            table.add_row(name, row.name, row.mean, row.low, row.high, causes)
+    return table
+
+
+def opening_table(openings: Sequence[Opening]) -> Table:
+    """Table of the vessel's ends: role, diameter, area, where."""
+    from vstent.reporting.quantities import opening_rows
+
+    table = Table("opening", "diameter", "area", "center (LPS)")
+    for row in opening_rows(openings):
+        table.add_row(*map(_spaced, row))
+    return table
+
+
+def morphology_table(measures: Mapping[str, Any]) -> Table:
+    """Table of a vessel's measures: name, value with unit."""
+    from vstent.reporting.quantities import flatten
+
+    table = Table("morphology", "")
+    for quantity in flatten(measures):
+        table.add_row(quantity.name, quantity.text)
+    return table
+
+
+def flow_table(metrics: Mapping[str, Any]) -> Table:
+    """Table of every index of the flow: bare, and with each device with its change."""
+    from vstent.reporting.quantities import flatten
+
+    stents = metrics["stents"]
+    table = Table("flow", "bare", *stents)
+    for quantity in flatten(metrics["bare"]):
+        changes = (_change(quantity.key, quantity.value, stent["flow"][quantity.key]) for stent in stents.values())
+        table.add_row(quantity.name, _cell(quantity.key, quantity.value), *changes)
+    return table
+
+
+def convergence_table(found: Refinement) -> Table:
+    """Table of one refinement: every quantity at three sizes, its observed order, its value at size zero."""
+    from vstent.reporting.quantities import flatten
+
+    columns = (f"{size:.3g}" for size in found.sizes)
+    table = Table(found.name.replace("_", " "), *columns, "order", "limit", "±")
+    for key, one in found.quantities.items():
+        order = "not one way" if one.order is None else f"{one.order:.1f}"
+        values = [quantity.text for value in one.values for quantity in flatten({key: value})]
+        name = flatten({key: 0.0})[0].name
+        table.add_row(name, *values, order, _cell(key, one.extrapolated), f"{one.uncertainty_fraction:.1%}")
+    return table
+
+
+def positions_table(found: Mapping[str, Scatter]) -> Table:
+    """Table of the same flow in several positions on the grid: every quantity in each, mean and half the range."""
+    from vstent.reporting.quantities import flatten
+
+    table = Table("position on the grid", *POSITIONS, "mean", "±")
+    for key, one in found.items():
+        values = [flatten({key: value})[0].text for value in (*one.values, one.mean)]
+        table.add_row(flatten({key: 0.0})[0].name, *values, f"{one.uncertainty_fraction:.1%}")
+    return table
+
+
+def _cell(key: str, value: Any) -> str:
+    """A value with its unit; empty where there is none."""
+    from vstent.reporting.quantities import format_value
+
+    return "" if value is None else _spaced(format_value(key, value))
+
+
+def _spaced(text: str) -> str:
+    """Put plain spaces for narrow ones, which not every terminal has."""
+    return text.replace("\u202f", " ")
+
+
+def _change(key: str, bare: float, value: float) -> str:
+    from vstent.reporting.quantities import ERRORS
+
+    is_told = bare and key not in ERRORS
+    return f"{_cell(key, value)} ({value / bare - 1:+.0%})" if is_told else _cell(key, value)
+
+
+def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:
+    """Table of found against true: title, found, true, unit."""
+    table = Table("against the phantom's truth", "unit", "found", "true", "error")
+    for title, found, true, unit in rows:
+        error = f"{found / true - 1:+.1%}" if true else f"{found - true:+.3g}"
+        table.add_row(title, unit, f"{found:.4g}", f"{true:.4g}", error)
+    return table
+
+
+def device_table(devices: Mapping[str, Design]) -> Table:
+    """Table of the catalogue: names, construction, sizes, and how sure the numbers are."""
+    table = Table(
+        "name", "device", "construction", "sizes (diameter x length, mm)", "numbers cited / derived / estimated"
+    )
+    for name, design in devices.items():
+        sure = [sum(fact.confidence == level for fact in design.facts) for level in ("cited", "derived", "estimated")]
+        diameters = sorted({size.diameter_mm for size in design.sizes})
+        lengths = sorted({size.length_mm for size in design.sizes})
+        sizes = f"{diameters[0]:g} to {diameters[-1]:g} x {lengths[0]:g} to {lengths[-1]:g} ({len(design.sizes)} sizes)"
+        table.add_row(name, design.name, design.kind.replace("_", "-"), sizes, " / ".join(map(str, sure)))
+    return table

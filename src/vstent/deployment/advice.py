@@ -1,0 +1,135 @@
+"""Advice: where a device lies, what to do when it does not fit, and what no device there covers."""
+
+from functools import lru_cache
+from math import inf
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from vstent.deployment.method import Course
+from vstent.deployment.sizing import (
+    APPOSED_GAP_MM,
+    LOOSE_FRACTION,
+    OVERSIZED_FRACTION,
+    neck_points_mm,
+    neck_span_mm,
+    oversizing_fraction,
+    reach_mm,
+    wanted_margin_mm,
+)
+from vstent.devices.design import LaserCut
+from vstent.devices.stent import Stent
+from vstent.geometry.vessel import Anatomy
+from vstent.kernels.arrays import Bools, Floats
+
+SHORT_MM: Final = 0.1
+"""A device reaches far enough beyond the neck when no more than this is missing: its length was only foreseen."""
+
+OFF_MM: Final = 0.5
+"""A neck that reaches further than this off the parent artery opens into another branch besides."""
+
+
+class Gaps(NamedTuple):
+    """How a device lies on the wall."""
+
+    gap_mm: Floats
+    """(rows, columns) clearance between its outer face and the wall."""
+    is_at_patient: Bools
+    """(rows, columns) whether that wall is the patient's own."""
+
+
+def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
+    """One sentence on where the device lies and what to do when it does not fit; one on a neck on a fork, if it is."""
+    return f"{_lies(anatomy, stent, course, gaps)}{_of_fork(anatomy)}"
+
+
+def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
+    gap_mm, is_at_patient = gaps
+    lies = (
+        f"{stent.design.name} {stent.size.label} lies from {stent.proximal_abscissa_mm:.1f} to "
+        f"{stent.distal_abscissa_mm:.1f} mm of the parent artery, {stent.deployed_length_mm:.1f} mm long"
+        f"{_width(anatomy, stent)}{_reach(anatomy, stent)}"
+    )
+    if course.outcome == "iteration_limit":
+        done = course.terminated_fraction[-1]
+        return f"{lies}, but only {done:.0%} of its contour reached the wall: raise the iteration limit or tau."
+    if not is_at_patient.any():
+        return f"{lies}, and none of it against the patient's own wall."
+    is_loose = is_at_patient & (gap_mm > APPOSED_GAP_MM)
+    loose = is_loose.sum() / is_at_patient.sum()
+    if loose <= LOOSE_FRACTION:
+        return f"{lies}, and {1 - loose:.0%} of it lies against the wall."
+    off = f"{loose:.0%} of it stands off the wall, by up to {gap_mm[is_at_patient].max():.2f} mm"
+    return f"{lies}, and {off}: {_remedy(anatomy, stent, gap_mm, is_loose)}"
+
+
+@lru_cache(maxsize=8)
+def _of_fork(anatomy: Anatomy) -> str:
+    """A sentence that begins with a space where the neck opens into more than the parent artery; else nothing."""
+    off_mm = anatomy.landing_surface.closest(neck_points_mm(anatomy))[1].max(initial=0.0)
+    if off_mm < OFF_MM:
+        return ""
+    return (
+        f" The neck lies on a fork: it reaches up to {off_mm:.1f} mm off this artery, where blood enters beside any "
+        "device in it."
+    )
+
+
+def _width(anatomy: Anatomy, stent: Stent) -> str:
+    """A clause that begins with a comma where a device is labelled for far wider arteries; else nothing."""
+    over = oversizing_fraction(anatomy, stent)
+    if over <= OVERSIZED_FRACTION:
+        return ""
+    has_narrower = any(size.diameter_mm < stent.size.diameter_mm for size in stent.design.sizes)
+    narrower = "narrower size" if has_narrower else "device for narrower arteries"
+    return f", labelled {1 + over:.1f} times as wide as the artery there (choose a {narrower})"
+
+
+def _reach(anatomy: Anatomy, stent: Stent) -> str:
+    """A clause that begins with a comma where a device misses the neck or hardly reaches beyond it; else nothing."""
+    if not anatomy.aneurysms:
+        return ""
+    proximal_mm, distal_mm = neck_span_mm(anatomy)
+    before_mm, after_mm = proximal_mm - stent.proximal_abscissa_mm, stent.distal_abscissa_mm - distal_mm
+    end, beyond_mm, move = (
+        ("proximal", before_mm, "proximally") if before_mm < after_mm else ("distal", after_mm, "distally")
+    )
+    wanted_mm = wanted_margin_mm(anatomy)
+    if beyond_mm >= wanted_mm - SHORT_MM:
+        return ""
+    what = f"only {beyond_mm:.1f} mm beyond" if beyond_mm >= 0 else f"{-beyond_mm:.1f} mm short of"
+    return f", {what} the neck's {end} end{_remedy_of_reach(anatomy, stent, np.array([before_mm, after_mm]), move)}"
+
+
+def _remedy_of_reach(anatomy: Anatomy, stent: Stent, beyond_mm: Floats, move: str) -> str:
+    """What to do, in brackets, about a device that reaches (2,) `beyond_mm` the neck; nothing where nothing helps."""
+    half_mm, center_mm = 0.5 * stent.deployed_length_mm, float(np.mean(neck_span_mm(anatomy)))
+    fits = half_mm < center_mm < anatomy.axis.length_mm - half_mm
+    if fits and beyond_mm.mean() >= wanted_margin_mm(anatomy):
+        return f" (land it more {move})"
+    size = stent.size
+    longer = (
+        other
+        for other in sorted(stent.design.sizes, key=lambda other: other.length_mm)
+        if other.diameter_mm == size.diameter_mm and other.length_mm > size.length_mm
+    )
+    next_one = next(longer, None)
+    helps = next_one is not None and reach_mm(stent.design, anatomy, next_one) > beyond_mm.min() + SHORT_MM
+    return " (choose a longer size)" if helps else ""
+
+
+def _remedy(anatomy: Anatomy, stent: Stent, gap_mm: Floats, is_loose: Bools) -> str:
+    """Why nodes stand off the wall by `gap_mm` (rows, columns), and what to do."""
+    free_mm = stent.size.free_diameter_mm
+    could_open = stent.row_diameter_mm + 2 * gap_mm.mean(axis=1) < free_mm
+    if isinstance(stent.design, LaserCut) and is_loose[could_open].sum() > 0.5 * is_loose.sum():
+        return "its struts do not stretch, and the way outside the bend is longer; choose a device of braided wires."
+    its = f"its free diameter is {free_mm:.2f} mm"
+    wider = [size for size in stent.design.sizes if size.diameter_mm > stent.size.diameter_mm]
+    if not wider:
+        return f"{its}; choose a device that is made wider."
+    # The shortest first: where a wider size fits at all, it is most likely one of those.
+    wider.sort(key=lambda size: (size.length_mm, size.diameter_mm))
+    if all(reach_mm(stent.design, anatomy, size) == -inf for size in wider):
+        return f"{its}, and wider sizes are too long for this artery; choose another device."
+    return f"{its}; choose a wider size."

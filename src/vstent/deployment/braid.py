@@ -1,0 +1,259 @@
+"""Constant wire, the default method: rows marched along the parent axis by wires that cannot stretch."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import final
+
+import numpy as np
+
+from vstent.deployment import pieces
+from vstent.deployment.active_contour import State
+from vstent.deployment.contour import evenly_spaced, perimeters, planes
+from vstent.deployment.method import AbstractMethod, Opened, Placement, check_inside
+from vstent.devices.design import Design, LaserCut, Size, grid, row_spacing_mm
+from vstent.devices.stent import Landing, row_diameters_mm
+from vstent.geometry.vessel import Anatomy
+from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.units import MM_PER_UM
+
+ROUNDS = 8
+"""Rows are marched anew at most so often."""
+SETTLED_MM = 0.1
+"""Rows have settled when none moves further than this from one round to the next."""
+LAST_STEPS = 5
+"""Steps at most for the last nodes, once 99 % have terminated."""
+TABLE_ROWS = 501
+"""Samples of the row spacing along the artery."""
+FREELY = 0.999
+"""A row this near to the free perimeter stopped there, not at the wall."""
+BEYOND_MM = 500.0
+"""Rows are counted so far beyond the artery, to say by how much a device misses it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """The contour's diameter along the parent axis, and how the axis bends."""
+
+    abscissa_mm: Floats
+    """(k,) arc lengths."""
+    diameter_mm: Floats
+    """(k,) diameters of the circles of the same perimeter."""
+    bend: tuple[Floats, Floats] = (np.zeros(1), np.zeros(1))
+    """(m,) arc lengths and (m,) the axis's curvature there, per mm."""
+
+    def at(self, abscissa_mm: Floats) -> Floats:
+        """Return the diameter at arc lengths; beyond the ends it stays what it is there."""
+        return np.interp(abscissa_mm, self.abscissa_mm, self.diameter_mm)
+
+    def spacing_mm(self, design: Design, size: Size, abscissa_mm: Floats) -> Floats:
+        """Return the distance between lattice rows of a device at arc lengths."""
+        return row_spacing_mm(design, size, self.at(abscissa_mm), np.interp(abscissa_mm, *self.bend))
+
+    def corrected(self, abscissa_mm: Floats, diameter_mm: Floats) -> "Profile":
+        """Return the profile through (r,) measured diameters; beyond them it keeps its shape, shifted."""
+        error_mm = np.interp(self.abscissa_mm, abscissa_mm, diameter_mm - self.at(abscissa_mm))
+        outside = (self.abscissa_mm < abscissa_mm[0]) | (self.abscissa_mm > abscissa_mm[-1])
+        together = np.concatenate([self.abscissa_mm[outside], abscissa_mm])
+        values = np.concatenate([(self.diameter_mm + error_mm)[outside], diameter_mm])
+        order = np.argsort(together)
+        return replace(self, abscissa_mm=together[order], diameter_mm=values[order])
+
+
+def expected_profile(design: Design, size: Size, anatomy: Anatomy) -> Profile:
+    """Diameter that the contour will have, against the landing surface or free, and the bends its rows heed.
+
+    Rows of a laser-cut device are put as in a straight artery: in a tight bend its cells leave the wall, and its rows
+    do not come as near together as those of a braid. From there `vstent.deployment.cells` moves them.
+    """
+    offset_mm = design.wall_offset_um * MM_PER_UM
+    diameter_mm = np.minimum(2 * (anatomy.section_radius_mm - offset_mm), size.free_diameter_mm)
+    if isinstance(design, LaserCut):
+        return Profile(anatomy.axis.abscissa_mm, diameter_mm)
+    return Profile(anatomy.axis.abscissa_mm, diameter_mm, bend(anatomy))
+
+
+def bend(anatomy: Anatomy) -> tuple[Floats, Floats]:
+    """Return arc lengths (m,) and how the parent axis bends there (m,), per mm."""
+    across = planes(anatomy.axis)
+    return across.abscissa_mm, across.curvature_per_mm
+
+
+def landed_row(design: Design, size: Size, landing: Landing) -> int:
+    """Return the row of nodes that lies where the device is landed."""
+    rows = grid(design, size).rows
+    return {"proximal": 0, "center": (rows - 1) // 2, "distal": rows - 1}[landing.anchor]
+
+
+def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Floats:
+    """Arc lengths (rows,) of the rows: from each to the next it is h(D), so rows are counted by the integral of ds/h.
+
+    The landing point is the middle row, the first (proximal) or the last (distal). Rows may leave the artery, where
+    the diameter is that of its end.
+    """
+    shape = grid(design, size)
+    start = landed_row(design, size, landing)
+    first, last = profile.abscissa_mm[[0, -1]]
+    table_mm = np.concatenate([[first - BEYOND_MM], np.linspace(first, last, TABLE_ROWS), [last + BEYOND_MM]])
+    per_mm = shape.row_split / profile.spacing_mm(design, size, table_mm)
+    count = np.concatenate([[0.0], np.cumsum(0.5 * (per_mm[1:] + per_mm[:-1]) * np.diff(table_mm))])
+    wanted = np.interp(landing.abscissa_mm, table_mm, count) + np.arange(shape.rows) - start
+    return np.interp(wanted, count, table_mm)
+
+
+@final
+@dataclass(frozen=True)
+class FreeDiameter:
+    """Stops a row when its perimeter reaches the device's free one: a wider artery stays untouched."""
+
+    diameter_mm: float
+    """The free diameter."""
+
+    def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
+        """Let every row go from `before_mm` towards `after_mm` only as far as its perimeter may grow."""
+        allowed = np.pi * self.diameter_mm
+        old, new = perimeters(before_mm), perimeters(after_mm)
+        is_over = new >= allowed
+        share = np.where(is_over, (allowed - old) / np.where(is_over, np.maximum(new - old, 1e-12), 1.0), 1.0)
+        share = np.clip(share, 0.0, 1.0)[:, None, None]
+        nodes_mm = before_mm + share * (after_mm - before_mm)
+        return nodes_mm, np.broadcast_to(is_over[:, None], nodes_mm.shape[:2])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ConstantWire(AbstractMethod):
+    """The device's own mechanics round the paper's contour: wires keep their length, rows their free diameter.
+
+    Rows are as far apart as the wires put them (`march`), so length and ends are predictions; a row stops growing at
+    the free diameter; where the artery bends, crossings slide along the wall until the single pieces of wire are as
+    long as they were made, as far as that goes (`pieces`).
+    """
+
+    def init(self, placement: Placement) -> Opened:
+        """Put rows where they would lie if the device filled the artery."""
+        profile = expected_profile(placement.design, placement.size, placement.anatomy)
+        rows_mm = march(placement.design, placement.size, placement.landing, profile)
+        return Opened(placement.start(self.contour, rows_mm, placement.size.free_diameter_mm), rows_mm)
+
+    def step(self, placement: Placement, opened: Opened) -> Opened:
+        """Let the contour grow, no row wider than the free device; once it lies, march the rows anew."""
+        opened = self._grown(placement, opened)
+        return self._marched(placement, opened) if self.terminate(opened) else opened
+
+    def result(self, placement: Placement, opened: Opened) -> Opened:
+        """Let crossings slide until pieces of wire have their length; put nodes to the wall, or off it as cells ask."""
+        for _ in range(LAST_STEPS):
+            if opened.contour.is_terminated.all():
+                break
+            opened = self._grown(placement, opened)
+        design, size, rows = placement.design, placement.size, np.arange(len(opened.abscissa_mm))
+        held = landed_row(design, size, placement.landing)
+        laid = partial(self._between, placement, opened)
+        slid = pieces.slide(design, size, opened.contour.nodes_mm, held, laid)
+        rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
+        check_inside(design, size, rows_mm, placement.anatomy.axis.length_mm)
+        where_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row)
+        centers_mm = placement.across.middle(where_mm.ravel()).reshape(slid.nodes_mm.shape)
+        state = opened.contour.about(centers_mm, _nearest(slid.row, len(rows)))
+        everywhere = np.ones_like(state.is_terminated)
+        if isinstance(design, LaserCut):  # its cells' springs hold it to its free width
+            on_wall_mm = laid(slid.nodes_mm.reshape(-1, 3), slid.row.ravel(), slid.column.ravel())
+            state = replace(state, nodes_mm=on_wall_mm.reshape(slid.nodes_mm.shape) + slid.lift_mm)
+            return Opened(self.contour.classify(state, everywhere, placement.wall), rows_mm)
+        state, laid_mm = self._laid(placement, replace(state, nodes_mm=slid.nodes_mm), everywhere)
+        return Opened(replace(state, nodes_mm=self._no_wider(state.nodes_mm, laid_mm, size.free_diameter_mm)), rows_mm)
+
+    def _between(self, placement: Placement, opened: Opened, points_mm: Floats, row: Floats, column: Floats) -> Floats:
+        """Where (n, 3) points between the nodes, at fractional rows and columns (n,), lie: against the wall as they do.
+
+        What is between rows that stopped at the free diameter stays, unless it is outside.
+        """
+        contour = opened.contour
+        rows, columns = (
+            _nearest(row, contour.nodes_mm.shape[0]),
+            np.rint(column).astype(int) % contour.nodes_mm.shape[1],
+        )
+        where_mm = pieces.extrapolated(np.arange(len(opened.abscissa_mm)), opened.abscissa_mm, row)
+        state = contour.near(points_mm, placement.across.middle(where_mm), rows, columns)
+        is_narrow = perimeters(contour.nodes_mm)[rows] < FREELY * np.pi * placement.size.free_diameter_mm
+        state = replace(state, is_terminated=state.is_terminated & is_narrow[:, None])
+        return self._laid(placement, state, np.ones_like(state.is_terminated))[1].reshape(-1, 3)
+
+    @staticmethod
+    def _no_wider(slid_mm: Floats, laid_mm: Floats, free_mm: float) -> Floats:
+        """Lay rows on the wall only as far as they stay no wider, seen along the device, than it is when free."""
+        old, new = row_diameters_mm(slid_mm), row_diameters_mm(laid_mm)
+        share = np.where(new > free_mm, (free_mm - old) / np.maximum(new - old, 1e-12), 1.0)
+        nodes_mm = slid_mm + np.clip(share, 0.0, 1.0)[:, None, None] * (laid_mm - slid_mm)
+        middle_mm = nodes_mm.mean(axis=1, keepdims=True)
+        shrunk = np.minimum(free_mm / row_diameters_mm(nodes_mm), 1.0)[:, None, None]
+        return middle_mm + shrunk * (nodes_mm - middle_mm)
+
+    def _grown(self, placement: Placement, opened: Opened) -> Opened:
+        """One step of the contour; a row that reaches the free diameter stops there."""
+        before, after = opened.contour, self.contour.step(opened.contour, placement.wall)
+        free = FreeDiameter(placement.size.free_diameter_mm)
+        nodes_mm, is_stopped = free(before.nodes_mm, after.nodes_mm)
+        after = replace(after, nodes_mm=nodes_mm, is_terminated=after.is_terminated | is_stopped)
+        return replace(opened, contour=after)
+
+    def _marched(self, placement: Placement, opened: Opened) -> Opened:
+        """March the rows by their measured diameters until they stay where they are.
+
+        Raises
+        ------
+        LandingError
+            When a row leaves the artery.
+        """
+        design, size, axis = placement.design, placement.size, placement.anatomy.axis
+        profile = expected_profile(design, size, placement.anatomy)
+        for done in range(ROUNDS):
+            profile = profile.corrected(opened.abscissa_mm, perimeters(opened.contour.nodes_mm) / np.pi)
+            rows_mm = march(design, size, placement.landing, profile)
+            check_inside(design, size, rows_mm, axis.length_mm)
+            if done and np.abs(rows_mm - opened.abscissa_mm).max() < SETTLED_MM:
+                break
+            opened = self._moved(placement, opened, rows_mm)
+        return opened
+
+    def _moved(self, placement: Placement, opened: Opened, rows_mm: Floats) -> Opened:
+        """Move the rows along the axis, keeping the contour's shape, and space nodes evenly.
+
+        Rows beyond where the contour was are put to the wall; those between stay near it until the result is.
+        """
+        across, state, before_mm = placement.across, opened.contour, opened.abscissa_mm
+        in_plane_mm = evenly_spaced(across.coordinates(before_mm, state.nodes_mm))
+        nodes_mm = across.place(rows_mm, _interpolated(before_mm, in_plane_mm, rows_mm))
+        near = np.rint(np.interp(rows_mm, before_mm, np.arange(len(before_mm)))).astype(int)
+        centers_mm = np.broadcast_to(across.middle(rows_mm)[:, None], nodes_mm.shape)
+        state = state.about(centers_mm, np.broadcast_to(near[:, None], nodes_mm.shape[:2]))
+        is_beyond = (rows_mm < before_mm[0]) | (rows_mm > before_mm[-1])
+        is_asked = np.broadcast_to(is_beyond[:, None], nodes_mm.shape[:2])
+        state, laid_mm = self._laid(placement, replace(state, nodes_mm=nodes_mm), is_asked)
+        free = FreeDiameter(placement.size.free_diameter_mm)
+        return Opened(replace(state, nodes_mm=free(state.nodes_mm, laid_mm)[0]), rows_mm)
+
+    def _laid(self, placement: Placement, state: State, is_asked: Bools) -> tuple[State, Floats]:
+        """Put nodes asked about (rows, columns) out of the wall's way; return also where all lie against it.
+
+        A node that had terminated goes back to the wall by eq. (6, 7); one that still moves does so only where it
+        would be outside or nearer than dd.
+        """
+        held = state.is_terminated & is_asked
+        state = self.contour.classify(state, is_asked, placement.wall)
+        points_mm = state.nodes_mm.reshape(-1, 3)
+        is_off = held.ravel() & (state.contact.distance_mm > self.contour.dd_mm)
+        back_mm = self.contour.relocated_mm(points_mm, np.zeros_like(is_off), state.contact)
+        return state, np.where(is_off[:, None], back_mm, points_mm).reshape(state.nodes_mm.shape)
+
+
+def _nearest(row: Floats, rows: int) -> Ints:
+    """Return the row of nodes that each fractional one is nearest to."""
+    return np.clip(np.rint(row), 0, rows - 1).astype(int)
+
+
+def _interpolated(old_mm: Floats, values: Floats, new_mm: Floats) -> Floats:
+    """Values (n, m, d) known at arc lengths (n,), linear between them and constant beyond, at (k,)."""
+    i = np.clip(np.searchsorted(old_mm, new_mm, side="right") - 1, 0, len(old_mm) - 2)
+    share = np.clip((new_mm - old_mm[i]) / (old_mm[i + 1] - old_mm[i]), 0.0, 1.0)[:, None, None]
+    return (1 - share) * values[i] + share * values[i + 1]

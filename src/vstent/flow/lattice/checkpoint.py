@@ -1,0 +1,73 @@
+"""A lattice-Boltzmann run as arrays, and going on from them as if it had never stopped."""
+
+from collections import deque
+from collections.abc import Collection, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from vstent.flow.case import FlowCase
+from vstent.flow.engines import Saved
+from vstent.flow.lattice.close_up import CloseUp
+from vstent.flow.lattice.scales import Scales
+from vstent.flow.lattice.state import Snapshot, State, build, take_pace
+
+
+def pack(state: State) -> Saved:
+    """All of a run that its case and grid do not say."""
+    if state.device is not None:
+        state.device.fetch(state)
+    return {
+        "check_s": np.array(state.check_s),
+        "pace": state.pace,
+        "kept": np.array(state.snapshots.maxlen or 0),
+        "steps": np.array(state.steps),
+        "since_check": np.array(state.since_check),
+        "loop_seconds": np.array(state.loop_seconds),
+        "populations": state.populations[: 19 * state.addressing.stride],
+        "source": state.links.source,
+        "openings": state.links.openings,
+        "refill": state.refill.refill,
+        "history": np.array(state.history),
+        **_columns("last", state.snapshots, len(state.domain.cells)),
+        **_columns("means", state.blocks, len(state.domain.cells)),
+    }
+
+
+def _columns(name: str, snapshots: Collection[Snapshot], cells: int) -> Saved:
+    """Snapshots as arrays of this name."""
+    count = len(snapshots)
+    return {
+        f"{name} step_s": np.array([one.scales.step_s for one in snapshots]),
+        f"{name} velocity": np.array([one.velocity for one in snapshots], np.float32).reshape(count, cells, 3),
+        f"{name} density": np.array([one.density for one in snapshots], np.float32).reshape(count, cells),
+        f"{name} outflow": np.array([one.outflow for one in snapshots]),
+        f"{name} checks": np.array([one.checks for one in snapshots]),
+        f"{name} speed": np.array([one.speed for one in snapshots if one.checks > 1], np.float32).reshape(-1, cells),
+    }
+
+
+def _snapshots(name: str, saved: Saved, scales: Scales) -> Iterator[Snapshot]:
+    """The snapshots saved by this name."""
+    columns = (saved[f"{name} {what}"] for what in ("step_s", "velocity", "density", "outflow", "checks"))
+    speeds = iter(saved[f"{name} speed"])
+    for step_s, velocity, density, outflow, checks in zip(*columns, strict=True):
+        speed = next(speeds) if checks > 1 else None
+        yield Snapshot(replace(scales, step_s=float(step_s)), velocity, density, outflow, int(checks), speed)
+
+
+def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp | None) -> State:
+    """Build the run of a case anew and put it where it was."""
+    check_s, kept = float(saved["check_s"]), int(saved["kept"])
+    state = build(case, cell_size_mm, check_s, saved["pace"], close_up=close_up, start=None, kept=kept)
+    state.history = list(saved["history"])
+    take_pace(state)
+    state.populations[: 19 * state.addressing.stride] = saved["populations"]
+    state.links.source[:] = saved["source"]
+    state.links.openings[:] = saved["openings"]
+    state.refill.refill[:] = saved["refill"]
+    state.snapshots = deque(_snapshots("last", saved, state.scales), maxlen=kept)
+    state.blocks = tuple(_snapshots("means", saved, state.scales))
+    state.steps, state.since_check = int(saved["steps"]), int(saved["since_check"])
+    state.loop_seconds = float(saved["loop_seconds"])
+    return state

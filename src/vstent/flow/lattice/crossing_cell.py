@@ -1,0 +1,237 @@
+"""Flow through a periodic cell of resolved wires: what the screen's law is calibrated on.
+
+The cell repeats in all three directions. Its wires are straight cylinders, solid grid cells with the exact place of
+their wall on every link; a body force drives the blood through them, as a pressure gradient would. What the wires take
+of it is known without looking at their surface: in steady flow it is the gradient times the cell's volume.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.kernels import lanes
+from vstent.flow.lattice.setup import linear_weights, quadratic_weights
+from vstent.kernels.arrays import Bools, Floats, Ints
+
+RELAXATION_STEPS = 1.0
+"""Relaxation time of the stress."""
+ODD_RATE = 1 / (0.5 + 3 / 16 / (RELAXATION_STEPS - 0.5))
+"""So that walls half-way between cells lie exactly there (Ginzburg and d'Humieres 2003, Phys. Rev. E 68, 066614)."""
+VISCOSITY = (RELAXATION_STEPS - 0.5) / 3
+"""Kinematic viscosity in squared cells per step."""
+DEFER_PAIRS, DEFER_PART = 4, 0.3
+"""Step pairs between updates of the quadratic reflection, and the part of the way that each goes."""
+CHECK_PAIRS = 50
+"""Step pairs between looks at whether the flow has settled."""
+SETTLED = 3e-4
+"""Change of the mean velocity between looks at which it has."""
+MAX_CHECKS = 600
+"""Most looks."""
+
+
+@dataclass(frozen=True)
+class Wires:
+    """Straight cylinders in a periodic box, lengths in cells."""
+
+    shape: tuple[int, int, int]
+    """Cells of the box."""
+    points: tuple[tuple[float, float, float], ...]
+    """(w, 3) a point of every axis."""
+    directions: tuple[tuple[float, float, float], ...]
+    """(w, 3) unit vector along every axis; a wire leaves the box where its neighbour's image comes in."""
+    radius: float
+    """Radius."""
+
+
+@dataclass(frozen=True, eq=False)
+class CellFlow:
+    """Steady flow through a cell, in lattice units."""
+
+    velocity: Floats
+    """(i, j, k, 3), zero inside the wires."""
+    force: Floats
+    """(3,) what the wires take of a pressure gradient as large as the body force: it presses on them as well."""
+    is_blood: Bools
+    """(i, j, k)."""
+
+    @property
+    def superficial_velocity(self) -> Floats:
+        """(3,) mean over blood and wires."""
+        return self.velocity.mean(axis=(0, 1, 2))
+
+
+def crossing_wires(across: int, along: int, height: int, diameter: float, apart: float = 1.0) -> Wires:
+    """Two families of wires on the diagonals of a box of along x across x height cells.
+
+    Their angle to the first axis is atan(across / along), their spacing along * across / hypot(along, across). Their
+    axes lie so many diameters `apart`: one family on the other, or, with 0, both in one plane. Woven wires do either.
+    """
+    length = float(np.hypot(along, across))
+    up, down = (along / length, across / length, 0.0), (along / length, -across / length, 0.0)
+    middle, shift = 0.5 * height, 0.5 * apart * diameter
+    points = ((0.0, 0.0, middle - shift), (0.0, 0.0, middle + shift))
+    return Wires((along, across, height), points, (up, down), 0.5 * diameter)
+
+
+def row_of_wires(spacing: int, height: int, diameter: float) -> Wires:
+    """One family along the first axis, `spacing` apart along the second, rows `height` apart along the third."""
+    return Wires((4, spacing, height), ((0.0, 0.5 * spacing, 0.5 * height),), ((1.0, 0.0, 0.0),), 0.5 * diameter)
+
+
+def flow_through(wires: Wires, force: Floats) -> CellFlow:
+    """Steady flow under a body force (3,) per cell volume, mass of a cell and step; with inertia.
+
+    Raises
+    ------
+    ValueError
+        When it does not settle.
+    """
+    is_blood = _blood(wires)
+    grid = _Grid(wires, is_blood)
+    force = np.asarray(force, dtype=np.float64)
+    before = np.zeros((wires.shape[2], 3))
+    for _ in range(MAX_CHECKS):
+        grid.advance(force)
+        velocity = grid.velocity(force)
+        mean = velocity.mean(axis=(0, 1))
+        if np.abs(mean - before).max() < SETTLED * np.abs(mean).max():
+            return CellFlow(velocity, force * is_blood.size, is_blood)
+        before = mean
+    raise ValueError(f"the flow through the cell {wires.shape} has not settled: use a smaller force")
+
+
+def sheet_speed(flow: CellFlow, force: Floats) -> float:
+    """Speed along the first axis in a thin sheet that takes as much of blood passing at an angle as the wires do.
+
+    Between sheets a height h apart, which blood crosses at speed w, a body force F makes it faster: steady advection
+    and diffusion, w u' = F + nu u'', have u = u_0 + (F / w) (z - h (e^(w z / nu) - 1) / (e^(w h / nu) - 1)). The mean
+    of it gives u_0, negative where the wires hold up more than a sheet could.
+    """
+    height = flow.velocity.shape[2]
+    mean, _, through = flow.superficial_velocity
+    crossing = through * height / VISCOSITY
+    return float(mean - force[0] * height / through * (0.5 - 1 / crossing + 1 / np.expm1(crossing)))
+
+
+def _blood(wires: Wires) -> Bools:
+    """Cells (i, j, k) outside the wires, without the gaps of a single cell between two of them.
+
+    Blood in such a gap, thrown from wall to wall, would keep what the force gives it.
+    """
+    blood = _signed_distance(wires, np.argwhere(np.ones(wires.shape, bool))).reshape(wires.shape) > 0
+    while True:
+        gap = np.zeros_like(blood)
+        for axis in range(3):
+            gap |= blood & ~np.roll(blood, 1, axis) & ~np.roll(blood, -1, axis)
+        if not gap.any():
+            return blood
+        blood &= ~gap
+
+
+def _images(wires: Wires) -> tuple[Floats, Floats]:
+    """Points and directions of every wire that can touch the box: those of the boxes around."""
+    shifts = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * wires.shape
+    points = (np.array(wires.points)[:, None] + shifts).reshape(-1, 3)
+    return points, np.repeat(np.array(wires.directions), len(shifts), axis=0)
+
+
+def _signed_distance(wires: Wires, at: Ints) -> Floats:
+    """Distance (n,) of points (n, 3) from the nearest wire's wall, negative inside."""
+    nearest = np.full(len(at), np.inf)
+    for point, direction in zip(*_images(wires), strict=True):
+        offset = at - point
+        away = offset - (offset @ direction)[:, None] * direction
+        nearest = np.minimum(nearest, np.linalg.norm(away, axis=1))
+    return nearest - wires.radius
+
+
+def _fractions(wires: Wires, cells: Ints, steps: Ints) -> Floats:
+    """Where each link (n,) from a cell (n, 3) along a step (n, 3) meets a wire first, as a fraction of it."""
+    first = np.ones(len(cells))
+    for point, direction in zip(*_images(wires), strict=True):
+        offset = cells - point
+        offset = offset - (offset @ direction)[:, None] * direction
+        step = steps - (steps @ direction)[:, None] * direction
+        a, b = (step**2).sum(axis=1), (offset * step).sum(axis=1)
+        inside = b**2 - a * ((offset**2).sum(axis=1) - wires.radius**2)
+        root = (-b - np.sqrt(np.maximum(inside, 0.0))) / np.maximum(a, 1e-12)
+        first = np.where((inside > 0) & (root > 0), np.minimum(first, root), first)
+    return np.maximum(first, 1e-3)
+
+
+class _Grid:
+    """The populations of a periodic box and their addresses (see `vstent.flow.lattice.kernels.d3q19`)."""
+
+    def __init__(self, wires: Wires, is_blood: Bools) -> None:
+        self._shape, self._is_blood = wires.shape, is_blood
+        self._stride = int(np.prod(wires.shape))
+        self._f = np.zeros(19 * self._stride + lanes.COUNT, np.float32)
+        cells = np.argwhere(is_blood)
+        self._place = self._number(cells)
+        self._address(cells)
+        self._link(wires, cells)
+
+    def _number(self, cells: Ints) -> Ints:
+        i, j, k = np.moveaxis(cells % np.array(self._shape), -1, 0)
+        return ((i * self._shape[1] + j) * self._shape[2] + k).astype(np.int32)
+
+    def _address(self, cells: Ints) -> None:
+        """Cut the rows where they come back in, so that every row's neighbours are contiguous."""
+        last = self._shape[2] - 1
+        follows = (np.diff(cells, axis=0) == (0, 0, 1)).all(axis=1)
+        follows &= (cells[1:, 2] != 1) & (cells[1:, 2] != last)
+        first = np.flatnonzero(np.r_[True, ~follows])
+        self._length = np.diff(np.r_[first, len(cells)]).astype(np.int32)
+        if self._length.max() > lattice.SEGMENT:
+            raise ValueError(f"a cell may be {lattice.SEGMENT} high at most")
+        start = cells[first]
+        behind = [self._number(start - c) for c in lattice.VELOCITIES]
+        self._populations = lattice.addresses(self._place[first], behind, self._stride)
+
+    def _link(self, wires: Wires, cells: Ints) -> None:
+        blood = self._is_blood.ravel()
+        ahead = np.stack([blood[self._number(cells + c)] for c in lattice.VELOCITIES], axis=1)
+        cell, q = np.nonzero(~ahead)
+        here, c = cells[cell], lattice.VELOCITIES[q]
+        fraction = _fractions(wires, here, c)
+        has_one = blood[self._number(here - c)]
+        has_two = has_one & blood[self._number(here - 2 * c)]
+        weight = linear_weights(fraction, has_one)
+        correction = quadratic_weights(fraction)
+        correction[:, :3] -= weight
+        correction[~has_two] = 0.0
+        at, after, before = (self._number(here + n * c) for n in (0, 1, -1))
+        further = np.where(has_two, self._number(here - 2 * c), at)
+        out, back = q * self._stride, lattice.OPPOSITE[q] * self._stride
+        rows = [back + at, back + before, out + at, out + after, back + further, out + before]
+        self._links = np.stack(rows, axis=1).astype(np.int32)
+        self._path, self._weight = lattice.paths(self._links, weight)
+        self._correction = correction.astype(np.float32)
+        self._source = np.zeros(len(q), np.float32)
+
+    def advance(self, force: Floats) -> None:
+        """Make `CHECK_PAIRS` step pairs, the force given as a kick between them."""
+        segments = len(self._length)
+        limit = np.full(segments, np.inf, np.float32)
+        relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
+        cells = self._populations, self._length, relaxation, lattice.no_screen(segments)
+        back = self._path, self._weight, self._source, *lattice.NO_LINKS[3:]
+        bands = lattice.undivided(segments, len(self._source))
+        lost = np.empty_like(self._source)  # made up for nowhere here
+        for pair in range(CHECK_PAIRS):
+            self._kick(2.0 * force)
+            lattice.update(self._f, cells, back, *bands)
+            if pair % DEFER_PAIRS == 0:
+                lattice.defer(self._f, self._links, self._correction, self._source, lost, np.float32(DEFER_PART))
+
+    def _kick(self, impulse: Floats) -> None:
+        kick = 3 * lattice.WEIGHTS * (lattice.VELOCITIES @ impulse)
+        populations = self._f[: 19 * self._stride].reshape(19, -1)
+        populations += (kick[:, None] * self._is_blood.ravel()).astype(np.float32)
+
+    def velocity(self, force: Floats) -> Floats:
+        """Velocity (i, j, k, 3) in the middle between two kicks."""
+        result = np.zeros((self._stride, 3))
+        result[self._place] = lattice.moments(self._f, self._stride, self._place)[:, 1:] + force
+        return result.reshape(*self._shape, 3)

@@ -1,0 +1,161 @@
+"""The embedded engine for steady flow: sparse lattice-Boltzmann, D3Q19, single precision, interpolated walls."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+
+from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.engines import AbstractEngine, Outcome, Saved
+from vstent.flow.lattice import close_up as close_ups
+from vstent.flow.lattice.checkpoint import pack, unpack
+from vstent.flow.lattice.close_up import CloseUp
+from vstent.flow.lattice.cost import estimate, refuse_too_large
+from vstent.flow.lattice.gpu import require_gpu
+from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.pace import longest_step_s, peak_speed_m_s
+from vstent.flow.lattice.reading import field_of, read, read_moving
+from vstent.flow.lattice.settling import CHECKS_APART, SURE, Mean, left_to_settle, mean_of, swings, with_check
+from vstent.flow.lattice.state import State, build, is_at_check, step
+from vstent.flow.lattice.trouble import trouble
+from vstent.units import M_PER_MM
+
+CHECK_DIAMETERS = 0.5
+"""Flow time between checks, in inlet diameters over mean inlet speed."""
+LEAST_CHECKS = 24
+"""The limit of time steps leaves room for at least this many checks: fewer cannot tell whether the flow has settled."""
+
+INFLOW_WEIGHT: Final = 3
+"""What the flow through an inlet has left to go, which is known, counts so many times as much as what is foretold."""
+SLOWER: Final = 0.5
+"""A run that diverged is tried again with a time step so much shorter."""
+
+
+class AbstractLattice(AbstractEngine[State]):
+    """Sparse D3Q19 in single precision with shifted populations, two relaxation times and interpolated walls.
+
+    It writes no file. A coarse run costs a sixteenth per second of flow, and so sound and vortices are led out cheaply.
+    """
+
+    coarsening: ClassVar[float | None] = 2.0
+    refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm", "lattice_speed")
+    closes_up: ClassVar[bool] = True
+    runs_on_gpu: ClassVar[bool] = True
+
+    def cost(self, case: FlowCase) -> str:
+        """Say how many cells and steps, how much memory and time."""
+        if case.settings.device_gpu:
+            require_gpu()
+        refuse_too_large(case)
+        return str(estimate(case))
+
+    def calmer(self, case: FlowCase) -> FlowCase:
+        """Return the case with a shorter time step: a narrow place inside may hold faster blood than the openings."""
+        return replace(case, settings=replace(case.settings, lattice_speed=SLOWER * case.settings.lattice_speed))
+
+    def close_up(self, case: FlowCase) -> CloseUp | None:
+        """Return what of the vessel is computed; None: all of it."""
+        return None if self.outer is None else close_ups.close_up(case, self.outer)
+
+    def save(self, state: State) -> Saved:
+        """Return the run as arrays."""
+        return pack(state)
+
+    def resume(self, case: FlowCase, saved: Saved) -> State:
+        """Build the run anew and put it where it was."""
+        return unpack(case, self.cell_size_mm, saved, self.close_up(case))
+
+    def step(self, state: State) -> State:
+        """Advance towards the next check."""
+        step(state)
+        return state
+
+    def trouble(self, state: State) -> str:
+        """Say why the run diverged."""
+        return trouble(state)
+
+
+@dataclass(frozen=True)
+class LatticeBoltzmann(AbstractLattice):
+    """The sparse D3Q19 engine at constant inflow."""
+
+    def init(self, case: FlowCase, start: FlowField | None) -> State:
+        """Choose the time step so that the fastest blood moves `lattice_speed` cells a step; in a close-up, more."""
+        close_up = self.close_up(case)
+        stretch = 1 if close_up is None else close_ups.STRETCH
+        step_s = stretch * longest_step_s(case, self.cell_size_mm, peak_speed_m_s(case, start, close_up))
+        steps = _steps_per_check(case, step_s)
+        pace, kept = np.array([steps]), 2 * CHECKS_APART + 1
+        return build(case, self.cell_size_mm, steps * step_s, pace, close_up=close_up, start=start, kept=kept)
+
+    def step(self, state: State) -> State:
+        """Advance towards the next check; there, add it to the means of the run."""
+        super().step(state)
+        if is_at_check(state):
+            state.blocks = with_check(state.blocks, state.snapshots[-1])
+        return state
+
+    def terminate(self, state: State) -> float | None:
+        """Fraction that the monitored quantities have left to go, or the standard error of their means, if less."""
+        if not is_at_check(state):
+            return None
+        if state.snapshots[-1].is_lost:
+            return float("nan")
+        return min(_left(state), _mean(state).left)
+
+    def max_checks(self, state: State) -> int:
+        """Checks within the limit of time steps."""
+        steps = state.case.settings.max_steps * (1 if self.outer is None else close_ups.SHARE_WITHIN)
+        return max(4, int(steps // state.steps_per_check))
+
+    def result(self, state: State, outcome: Outcome) -> FlowField:
+        """Return the last check of a flow that has settled, or the mean of what it swings about."""
+        left = _left(state)
+        if left < state.case.settings.tolerance:
+            return field_of(state, read(state, [state.snapshots[-1]]), outcome, left, "The flow has settled.")
+        mean = _mean(state)
+        uncertain, advice = _of_mean(state, mean, is_converged=outcome.is_converged)
+        return field_of(state, read_moving(state, state.blocks[-mean.blocks :]), outcome, uncertain, advice)
+
+
+def _steps_per_check(case: FlowCase, step_s: float) -> int:
+    steps = CHECK_DIAMETERS * case.vessel.inlet.diameter_mm * M_PER_MM / float(case.inlet_speeds_m_s[0]) / step_s
+    return 2 * max(1, round(0.5 * min(steps, case.settings.max_steps / LEAST_CHECKS)))
+
+
+def _left(state: State) -> float:
+    fields = [one.velocity[state.probe.cells] for one in state.snapshots]
+    return max(left_to_settle(np.array(state.history), fields), INFLOW_WEIGHT * _inflow_error(state))
+
+
+def _inflow_error(state: State) -> float:
+    """How far what enters anywhere is from what is to, over all that is to: while sound is under way, openings give."""
+    openings = state.links.openings
+    enters = openings[:, 0] == lattice.INFLOW
+    wanted = (state.links.wanted * openings[:, 7])[enters]
+    return float(np.abs(state.snapshots[-1].outflow[enters] + wanted).sum() / wanted.sum())
+
+
+def _mean(state: State) -> Mean:
+    return mean_of(state.blocks, np.array(state.history), state.probe.cells)
+
+
+def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, str]:
+    """How uncertain the means of a flow that has not settled are, as a fraction of them, and that in words."""
+    swing, moved = swings(np.array(state.history), mean.checks)
+    means = (
+        f"means over its last {1e3 * mean.checks * state.check_s:.0f} ms, in which what is monitored ranged over up to "
+        f"{100 * swing:.1f} % of its mean"
+    )
+    of_means, of_field = (100 * SURE * error for error in (mean.standard_error, mean.field_error))
+    known = (
+        f"they are known to within {of_means:.1f} %, the sac's velocity, place by place, to within {of_field:.0f} % "
+        f"({SURE} standard errors)"
+    )
+    if is_converged:
+        return of_means / 100, f"The flow goes on moving about its mean: these are {means}; {known}."
+    unsettled = f"The flow has not settled in {state.steps} time steps and may be unsteady by nature: these are {means}"
+    if np.isfinite(mean.left):
+        return of_means / 100, f"{unsettled}; {known}: allow more steps to know them better."
+    drift = "" if np.isnan(moved) else f"; from the means of as long before, they differ by up to {100 * moved:.1f} %"
+    return float(np.nanmax([swing, moved])), f"{unsettled}{drift}."

@@ -1,0 +1,116 @@
+"""What a lattice-Boltzmann run has come to, in SI units: its last checks or their mean, and the stress on the wall."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.flow import domain as domains
+from vstent.flow.case import FlowField, Phase, Swing
+from vstent.flow.engines import Outcome
+from vstent.flow.lattice import close_up as close_ups
+from vstent.flow.lattice.setup import CELL_REYNOLDS
+from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
+from vstent.flow.wall_stress import mean_shear_Pa, wall_stress
+from vstent.kernels.arrays import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A flow in SI units."""
+
+    velocity_m_s: Floats
+    """(n, 3)."""
+    pressure_Pa: Floats
+    """(n,)."""
+    wall_shear_stress_Pa: Floats
+    """(v, 3)."""
+    wall_pressure_Pa: Floats
+    """(v,)."""
+    inlets_mL_s: Floats
+    """(i,) in through every inlet; nan where a close-up does not reach it."""
+    outlets_mL_s: Floats
+    """(k,) out through every outlet; nan likewise, 0 where no cell of all reaches it."""
+    swing: Swing | None = None
+    """What it is the mean of, where a steady flow moves."""
+    neck_inflow_mL_s: float | None = None
+    """Its mean there."""
+
+
+def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
+    """Return the mean of some snapshots in SI units, with the stress on the wall."""
+    domain = state.domain
+    velocity_m_s = _mean(snapshots, (one.velocity_m_s for one in snapshots))
+    pressure_Pa = _mean(snapshots, (one.pressure_Pa for one in snapshots))
+    stress_Pa, wall_pressure_Pa = wall_stress(
+        domain, velocity_m_s, pressure_Pa, lumen=state.case.vessel.lumen, blood=state.case.blood
+    )
+    outflow_mL_s = np.full(len(state.case.vessel.openings), np.nan if state.close_up else 0.0)
+    is_opening = state.links.patch <= len(outflow_mL_s)
+    through = _mean(snapshots, (one.outflow_mL_s for one in snapshots))
+    outflow_mL_s[state.links.patch[is_opening] - 1] = through[is_opening]
+    backwards_mL_s, outlets_mL_s = state.case.vessel.of_inlets_and_outlets(outflow_mL_s)
+    return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, -backwards_mL_s, outlets_mL_s)
+
+
+def read_moving(state: State, snapshots: Sequence[Snapshot]) -> Reading:
+    """Return the mean of the last snapshots of a flow that moves, with what a mean does not tell."""
+    flow, case = read(state, snapshots), state.case
+    speed_m_s = _mean(snapshots, (one.speed_m_s for one in snapshots))
+    shear_Pa = mean_shear_Pa(state.domain, flow.velocity_m_s, speed_m_s, lumen=case.vessel.lumen, blood=case.blood)
+    checks = sum(one.checks for one in snapshots)
+    inflow_mL_s = float(np.array(state.history)[-checks:, NECK_INFLOW:].mean(axis=0).sum())
+    return replace(flow, swing=Swing(speed_m_s, shear_Pa), neck_inflow_mL_s=inflow_mL_s)
+
+
+def _mean(snapshots: Sequence[Snapshot], values: Iterable[Floats | NDArray[np.float32]]) -> Floats:
+    """Mean of a value of each snapshot, each counting as many times as it has checks."""
+    share = np.array([one.checks for one in snapshots]) / sum(one.checks for one in snapshots)
+    return np.asarray(sum(part * value for part, value in zip(share, values, strict=True)))
+
+
+def field_of(
+    state: State, flow: Reading, outcome: Outcome, left: float, advice: str, phases: tuple[Phase, ...] = ()
+) -> FlowField:
+    """Put a flow together with how it was reached, and what it has `left` to go."""
+    domain, vessel = state.domain, state.case.vessel
+    section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
+    inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
+    field = FlowField(
+        cells=domain.cells,
+        origin_mm=domain.origin_mm,
+        cell_size_mm=domain.cell_size_mm,
+        velocity_m_s=flow.velocity_m_s,
+        pressure_Pa=flow.pressure_Pa,
+        wall=vessel.lumen,
+        wall_shear_stress_Pa=flow.wall_shear_stress_Pa,
+        wall_pressure_Pa=flow.wall_pressure_Pa,
+        inlets_mL_s=flow.inlets_mL_s,
+        outlets_mL_s=flow.outlets_mL_s,
+        inlet_pressure_Pa=inlet_Pa,
+        outlet_pressure_Pa=outlet_Pa,
+        blood=state.case.blood,
+        is_converged=outcome.is_converged,
+        unsettled_fraction=left,
+        advice=advice + _of_the_grid(state, flow, phases),
+        residual=np.array(outcome.residual),
+        steps=state.steps,
+        seconds=outcome.seconds,
+        updates_per_s=len(domain.cells) * state.steps / state.loop_seconds,
+        phases=phases,
+        swing=flow.swing,
+        neck_inflow_mL_s=flow.neck_inflow_mL_s,
+    )
+    return field if state.close_up is None else close_ups.assembled(state.close_up, field)
+
+
+def _of_the_grid(state: State, flow: Reading, phases: tuple[Phase, ...]) -> str:
+    """Say where the cells are too wide for the vessel (in a close-up those around it are, if any) or for the flow."""
+    narrow = ""
+    if state.close_up is None:
+        narrow = domains.too_narrow(state.case, state.domain.cell_size_mm)
+        narrow += domains.unreached(state.case.vessel, state.domain)
+    is_vessel = np.repeat(state.limit, state.addressing.length) == CELL_REYNOLDS
+    speed_m_s = np.max([np.linalg.norm(moment.velocity_m_s, axis=1) for moment in phases or (flow,)], axis=0)
+    return narrow + domains.too_fast(state.domain, np.where(is_vessel, speed_m_s, 0.0), state.case.blood, CELL_REYNOLDS)

@@ -1,0 +1,59 @@
+"""Lattice units of the embedded engine, and the rate that its accuracy and stability were tuned to."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.flow.case import Blood
+from vstent.units import M3_PER_ML
+
+ODD_RATE = 0.7
+"""Relaxation rate of the odd part: lower is more isotropic, higher is more stable and leaks less. Where blood is fast
+it is as much higher as is stable (`vstent.flow.lattice.kernels.collision`)."""
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Lattice units of one grid and time step."""
+
+    cell_m: float
+    """Edge of a cell."""
+    step_s: float
+    """Time step."""
+    blood: Blood
+    """The fluid."""
+
+    @property
+    def speed_m_s(self) -> float:
+        """One cell per time step."""
+        return self.cell_m / self.step_s
+
+    @property
+    def pressure_Pa(self) -> float:
+        """Pressure of unit density deviation: rho c^2 / 3."""
+        return self.blood.density_kg_m3 * self.speed_m_s**2 / 3
+
+    @property
+    def flow_mL_s(self) -> float:
+        """One cell volume per time step."""
+        return self.cell_m**3 / self.step_s / M3_PER_ML
+
+    @property
+    def viscosity(self) -> float:
+        """Kinematic viscosity, in squared cells per time step."""
+        return self.blood.kinematic_viscosity_m2_s * self.step_s / self.cell_m**2
+
+    @property
+    def thinning(self) -> NDArray[np.float32]:
+        """(4,) the blood's law in lattice units (see `lattice.update`)."""
+        law = self.blood.thinning
+        if law is None:
+            return np.zeros(4, np.float32)
+        more = (law.rest_viscosity_Pa_s - self.blood.viscosity_Pa_s) / self.blood.viscosity_Pa_s
+        return np.array([3 * self.viscosity * more, law.time_s / self.step_s, law.a, (law.n - 1) / law.a], np.float32)
+
+    @property
+    def relaxation_steps(self) -> float:
+        """Relaxation time of the stress, in time steps."""
+        return 3 * self.viscosity + 0.5

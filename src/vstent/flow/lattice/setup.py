@@ -1,0 +1,342 @@
+"""What the lattice-Boltzmann engine needs before its first step: addresses, units, walls and openings."""
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from vstent.flow.case import FlowCase
+from vstent.flow.domain import Domain
+from vstent.flow.lattice.close_up import CloseUp
+from vstent.flow.lattice.ends import Ends
+from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.kernels import lanes
+from vstent.flow.lattice.scales import ODD_RATE, Scales
+from vstent.kernels import voxels
+from vstent.kernels.arrays import Bools, Floats, Ints
+
+CELL_REYNOLDS_AT_END = 25.0
+"""Largest speed x cell / viscosity in the openings' extensions, whose ends are where fast blood becomes unstable first
+(30 to 50 were seen to fail): faster blood is made thicker there."""
+CELL_REYNOLDS: Final = 75.0
+"""The same in the vessel. C0038's systole diverged with 100 in cells of 0.4 mm and with 150 in cells of 0.2 mm."""
+CUT_CELLS = 6
+"""Cells at the cuts of a close-up that count as such an extension."""
+CELL_REYNOLDS_IN_CUT: Final = 5.0
+"""The same in a cut's own cells: in the few between it and the wall what moves would grow (C0038 at systole: tenfold in
+60 steps)."""
+CELLS_IN_CUT: Final = 2
+"""How many cells deep those are."""
+PAGE, OFF_PAGE = 1024, 216
+"""Numbers in 4096 bytes, and by how many more than whole pages of them a cell's populations lie apart: a cache has the
+same few places for what is whole pages apart, and nineteen such runs at once would take a quarter longer."""
+CURVE: Final = np.array([1.0, -2.0, 0.0, 1.0, 0.0], np.float32)
+"""The second difference along a link, of a, b, c, e and g (see `lattice.defer`)."""
+REFILL_BLOCK = 2
+"""Edge, in cells, of the blocks within which the walls' losses are made up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Addressing:
+    """Where populations lie (see `vstent.flow.lattice.kernels.d3q19`)."""
+
+    stride: int
+    """Storage places, and some more (see `OFF_PAGE`)."""
+    place: Ints
+    """(n,) storage place of every cell."""
+    length: Ints
+    """(s,) cells of every segment."""
+    first_cell: Ints
+    """(s,) first cell of every segment."""
+    address: Ints
+    """(2, s, 19) where the populations of every segment begin, in an even step and in an odd one."""
+    link_address: Ints
+    """(l, 6) see `lattice.paths`."""
+    link_has_one: NDArray[np.bool_]
+    """(l,) the cell behind the link's cell is blood, and no septum lies between."""
+    link_has_two: NDArray[np.bool_]
+    """(l,) so it is with the two cells behind it."""
+    septa: Ints
+    """(2, t) see `lattice.update`, by layer of their cell."""
+    septum_cell: Ints
+    """(t,) that cell."""
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Coefficients of everything that is sent back, ends first, then the wall; sources change in place.
+
+    The ends are the openings, and in a close-up the cuts beyond which the blood goes on.
+    """
+
+    patch: Ints
+    """(k,) patch of every end (see `Domain.link_patch`)."""
+
+    address: Ints
+    """(l, 6) see `lattice.paths`."""
+    path: Ints
+    """(2, l, 3) see `lattice.update`, after an even step and after an odd one."""
+    weight: NDArray[np.float32]
+    """(l, 2) see `lattice.update`."""
+    correction: NDArray[np.float32]
+    """(l, 5) see `lattice.defer`."""
+    viscous: NDArray[np.float32]
+    """(l,) how much of `CURVE` viscosity takes off that."""
+    source: NDArray[np.float32]
+    """(l,)."""
+    openings: Floats
+    """(k, 10) see `lattice.drive`."""
+    start: Ints
+    """(k + 1,) first link of every opening, and of the wall."""
+    by_layer: Ints
+    """(o,) the ends' links, by layer of their cell."""
+    place: Ints
+    """(o,) storage place of every opening link."""
+    direction: Ints
+    """(o,) lattice velocity of every opening link."""
+    wanted: Floats
+    """(k,) speed wanted at every end at mean flow."""
+    course: Floats
+    """(m, k) what is wanted there besides, speed or density, at equal times of a cycle."""
+    shape: Floats
+    """(m, o, 2) see `lattice.drive`, at the same times."""
+
+    def stretched(self, stretch: float) -> "Links":
+        """The same for time steps that are so many times as long; what changes in place is shared."""
+        is_inflow = np.repeat(self.openings[:, 0] == lattice.INFLOW, np.diff(self.start))
+        return replace(
+            self,
+            correction=self.correction - np.outer(np.float32(stretch - 1) * self.viscous, CURVE),
+            wanted=stretch * self.wanted,
+            course=stretch * self.course,
+            shape=np.where(is_inflow, 1.0, stretch**2)[:, None] * self.shape,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Refill:
+    """What interpolated walls lose and get back (see `lattice.balance`); `refill` changes in place."""
+
+    place: Ints
+    """(w,) storage place of every wall cell."""
+    groups: tuple[Ints, Ints, Ints, Ints]
+    """See `lattice.balance`; a group is the wall cells of a block of `REFILL_BLOCK` cells."""
+    lost: NDArray[np.float32]
+    """(l,) see `lattice.defer`."""
+    refill: NDArray[np.float32]
+    """(w,) added in every step."""
+
+
+def in_extensions(case: FlowCase, domain: Domain) -> Bools:
+    """Whether every cell (n,) lies in the extension of an opening."""
+    result = np.zeros(len(domain.cells), dtype=bool)
+    for opening, section in zip(case.vessel.openings, domain.sections, strict=True):
+        offset = domain.centers_mm - opening.center_mm
+        ahead_mm = offset @ opening.normal
+        length_mm = float(((section - opening.center_mm) @ opening.normal).max())
+        beside_mm = np.linalg.norm(offset - ahead_mm[:, None] * opening.normal, axis=1)
+        result |= (ahead_mm > 0) & (ahead_mm < length_mm) & (beside_mm < opening.diameter_mm)
+    return result
+
+
+def thickest(case: FlowCase, domain: Domain) -> NDArray[np.float32]:
+    """Largest cell Reynolds number (n,) of every cell: faster blood is computed thicker."""
+    limit = np.where(in_extensions(case, domain), CELL_REYNOLDS_AT_END, CELL_REYNOLDS)
+    cut = np.zeros(domain.cells.max(axis=0) + 2, dtype=bool)
+    cut[tuple(domain.cells[domain.link_cell[domain.link_patch > len(case.vessel.openings)]].T)] = True
+    for cells, most in ((CUT_CELLS, CELL_REYNOLDS_AT_END), (CELLS_IN_CUT, CELL_REYNOLDS_IN_CUT)):
+        if cut.any():
+            near = ndimage.binary_dilation(cut, ndimage.generate_binary_structure(3, 3), cells)
+            limit[near[tuple(domain.cells.T)]] = most
+    return limit.astype(np.float32)
+
+
+def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
+    """Lay out the populations of a domain; no segment spans cells where `limit` (n,) differs (see `thickest`)."""
+    cells = domain.cells
+    inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
+    inside[tuple(cells.T)] = True
+    stored = voxels.dilate(inside, lattice.VELOCITIES[1:])
+    number = np.full(inside.shape, -1, dtype=np.int32)
+    # What a vector holds beyond its segment is written again as it was: of another layer, another thread may be there.
+    number[stored] = np.arange(stored.sum()) + lanes.COUNT * np.nonzero(stored)[0]
+    count = int(number.max()) + lanes.COUNT
+    stride = count + (OFF_PAGE - count) % PAGE
+    place = number[tuple(cells.T)]
+    is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(limit) != 0)
+    first: Ints = np.flatnonzero(np.r_[True, is_new])
+    length = np.diff(np.r_[first, len(cells)])
+    first, length = _cut(first, length)
+    start = cells[first]
+    behind = [number[tuple((start - c).T)] for c in lattice.VELOCITIES]
+    septa = _septa(domain, number, stride)
+    links = _link_addresses(domain, number, inside, stride, septa)
+    to_int = np.int32
+    return Addressing(
+        stride,
+        place,
+        length.astype(to_int),
+        first.astype(to_int),
+        lattice.addresses(place[first], behind, stride),
+        *links,
+        septa,
+        domain.septum_cell,
+    )
+
+
+def _cut(first: Ints, length: Ints) -> tuple[Ints, Ints]:
+    """Cut segments longer than the buffer."""
+    pieces = -(-length // lattice.SEGMENT)
+    owner = np.repeat(np.arange(len(first)), pieces)
+    rank = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    start = rank * lattice.SEGMENT
+    return first[owner] + start, np.minimum(length[owner] - start, lattice.SEGMENT)
+
+
+def _link_addresses(
+    domain: Domain, number: Ints, inside: NDArray[np.bool_], stride: int, septa: Ints
+) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Addresses (l, 6) of `lattice.paths`, and whether one and whether two blood cells lie behind the link's cell."""
+    q = domain.link_direction
+    p = lattice.OPPOSITE[q]
+    cell, c = domain.cells[domain.link_cell], lattice.VELOCITIES[q]
+    second = np.maximum(cell - 2 * c, 0)
+    here, ahead, behind = (number[tuple(x.T)] for x in (cell, cell + c, cell - c))
+    has_one = inside[tuple((cell - c).T)] & ~np.isin(q * stride + here, septa)
+    has_two = has_one & inside[tuple(second.T)] & ~np.isin(q * stride + behind, septa)
+    further = np.where(has_two, number[tuple(second.T)], here)
+    rows = [
+        p * stride + here,
+        p * stride + behind,
+        q * stride + here,
+        q * stride + ahead,
+        p * stride + further,
+        q * stride + behind,
+    ]
+    return np.stack(rows, axis=1).astype(np.int32), has_one, has_two
+
+
+def _septa(domain: Domain, number: Ints, stride: int) -> Ints:
+    """Addresses (2, t) of what cells send each other through septa."""
+    q = domain.septum_direction
+    cell = domain.cells[domain.septum_cell]
+    here, ahead = (number[tuple(x.T)] for x in (cell, cell + lattice.VELOCITIES[q]))
+    return np.stack([lattice.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
+
+
+def build_links(
+    case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales, close_up: CloseUp | None
+) -> Links:
+    """Interpolated reflection at the wall, imposed flow or pressure at the ends."""
+    order = _link_order(domain)
+    patch = domain.link_patch[order]
+    patches = np.unique(patch[patch > 0])
+    of_ends = patch[: int((patch > 0).sum())]
+    start: Ints = np.asarray(np.searchsorted(of_ends, np.r_[patches, patches[-1] + 1]), dtype=np.int32)
+    fraction = domain.link_fraction[order]
+    weight = linear_weights(fraction, addressing.link_has_one[order])
+    correction, viscous = parabolic_weights(fraction, scales.relaxation_steps)
+    correction[:, :3] -= weight
+    is_plain = ~addressing.link_has_two[order]
+    is_plain[: start[-1]] = True
+    correction[is_plain], viscous[is_plain], weight[: start[-1]] = 0.0, 0.0, (-1.0, 0.0, 0.0)
+    opening_links = order[: start[-1]]
+    ends = Ends(case, domain, scales, close_up)
+    openings, wanted, course, shape = ends.imposed(patches, np.split(opening_links, start[1:-1]))
+    weight[: start[-1]][np.repeat(openings[:, 0] == lattice.INFLOW, np.diff(start))] = (1.0, 0.0, 0.0)
+    return Links(
+        patches,
+        addressing.link_address[order],
+        *lattice.paths(addressing.link_address[order], weight),
+        correction.astype(np.float32),
+        viscous.astype(np.float32),
+        np.zeros(len(order), dtype=np.float32),
+        openings,
+        start,
+        np.argsort(domain.link_cell[opening_links], kind="stable").astype(np.int32),
+        addressing.place[domain.link_cell[opening_links]],
+        domain.link_direction[opening_links],
+        wanted,
+        course,
+        shape,
+    )
+
+
+def _link_order(domain: Domain) -> Ints:
+    """Ends first, in order, by cell within each; then the wall, by layer, and by direction within it.
+
+    So each address runs on, and what is done with a layer finds it in the processor's cache.
+    """
+    is_wall = domain.link_patch == 0
+    patch = np.where(is_wall, domain.link_patch.max() + 1, domain.link_patch)
+    layer = domain.cells[domain.link_cell, 0]
+    return np.lexsort((domain.link_cell, *(np.where(is_wall, key, 0) for key in (domain.link_direction, layer)), patch))
+
+
+def build_bands(domain: Domain, addressing: Addressing, links: Links) -> Ints:
+    """Bands (b + 1, 5) of `lattice.update`: the layers of cells across the first axis of the grid."""
+    of_ends, of_walls = np.split(domain.link_cell[_link_order(domain)], links.start[-1:])
+    cells = addressing.first_cell, np.unique(of_walls), of_walls, of_ends[links.by_layer], addressing.septum_cell
+    layer = domain.cells[:, 0]
+    edges = np.arange(layer.min(), layer.max() + 2)
+    bands = np.stack([np.searchsorted(layer[ordered], edges) for ordered in cells], axis=1)
+    bands[:, 2] += links.start[-1]
+    return bands.astype(np.int32)
+
+
+def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
+    """Linear interpolated reflection (Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids 13, 3452, eq. 5).
+
+    Half-way where it would need the cell behind and that is no blood.
+    """
+    zero = np.zeros_like(fraction)
+    near = np.stack([2 * fraction, 1 - 2 * fraction, zero], axis=1)
+    far = np.stack([0.5 / fraction, zero, 1 - 0.5 / fraction], axis=1)
+    weight = np.where(fraction[:, None] < 0.5, near, far)
+    weight[~has_one & (fraction < 0.5)] = (1.0, 0.0, 0.0)
+    return weight
+
+
+def quadratic_weights(fraction: Floats) -> Floats:
+    """Quadratic interpolated reflection (Lallemand and Luo 2003, J. Comput. Phys. 184, 406, eq. 10): (l, 5)."""
+    x, zero = fraction, np.zeros_like(fraction)
+    near = np.stack([x * (1 + 2 * x), 1 - 4 * x**2, zero, -x * (1 - 2 * x), zero], axis=1)
+    far = np.stack([1 / (x * (2 * x + 1)), zero, (2 * x - 1) / x, zero, (1 - 2 * x) / (1 + 2 * x)], axis=1)
+    return np.where(x[:, None] < 0.5, near, far)
+
+
+def parabolic_weights(fraction: Floats, relaxation_steps: float) -> tuple[Floats, Floats]:
+    """Reflection that is exact for a parabola along the link: (l, 5) weights of a, b, c, e and g (see `lattice.defer`).
+
+    And how much of `CURVE` they would have more (l,) without viscosity.
+
+    Quadratic interpolation alone lets blood slip by up to an eighth of a squared cell times the flow's curvature: its
+    populations carry, beside the velocity, second differences and what the odd rate has still to relax (Ginzburg and
+    d'Humieres 2003, Phys. Rev. E 68, 066614, sec. III). Both are put back by the second difference, a - 2 b + e; how
+    much of it comes with the viscosity is taken between a plane channel and a tube, for read off the populations it
+    would be wrong where a screen's force meets the wall.
+    """
+    x, even, odd = fraction, relaxation_steps - 0.5, 1 / ODD_RATE - 0.5
+    per = 1 / np.maximum(1, x * (2 * x + 1))
+    viscous = even * (odd + np.abs(x - 0.5)) * per
+    return quadratic_weights(fraction) + np.outer(x * (1 - x) * per - viscous, CURVE), viscous
+
+
+def build_refill(domain: Domain, addressing: Addressing) -> Refill:
+    """Group the wall cells into blocks."""
+    order = _link_order(domain)
+    cell = domain.link_cell[order][domain.link_patch[order] == 0]
+    wall_cell, of_link = np.unique(cell, return_inverse=True)
+    group = np.unique(domain.cells[wall_cell] // REFILL_BLOCK, axis=0, return_inverse=True)[1].ravel()
+    groups = *_grouped(group[of_link]), *_grouped(group)
+    lost, refill = (np.zeros(n, np.float32) for n in (len(of_link), len(wall_cell)))
+    return Refill(addressing.place[wall_cell], groups, lost, refill)
+
+
+def _grouped(group: Ints) -> tuple[Ints, Ints]:
+    """Where each of the g groups begins (g + 1,) in the order (n,) of things by their group (n,), and that order."""
+    order = np.argsort(group, kind="stable")
+    starts = np.searchsorted(group[order], np.arange(group.max(initial=-1) + 2))
+    return starts.astype(np.int32), order.astype(np.int32)

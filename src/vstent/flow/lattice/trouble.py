@@ -1,0 +1,58 @@
+"""Why a lattice-Boltzmann run diverged, from the last check at which all was well."""
+
+import numpy as np
+
+from vstent.flow.lattice.setup import CELL_REYNOLDS, CELL_REYNOLDS_AT_END
+from vstent.flow.lattice.state import Snapshot, State
+from vstent.kernels.arrays import Floats
+from vstent.units import place
+
+FAST = 0.4
+"""Speed from which the sound is too near."""
+
+
+def trouble(state: State) -> str:
+    """One sentence: what happened, the last good state, the likeliest cause and what to do about it."""
+    good = [one for one in state.snapshots if not one.is_lost]
+    when_ms = 1e3 * state.time_s
+    if not good:
+        return (
+            f"the flow diverged within the first {when_ms:.3g} ms, before any good check: the time step is too long"
+            " for its speed; halve the lattice speed or the cell size"
+        )
+    last = good[-1]
+    speed = np.linalg.norm(last.velocity, axis=1)
+    fastest = int(speed.argmax())
+    behind = next(k for k, one in enumerate(reversed(state.snapshots)) if one is last)
+    good_ms = when_ms - 1e3 * behind * state.check_s
+    return (
+        f"the flow diverged between {good_ms:.3g} and {when_ms:.3g} ms; at the last good check the fastest blood moved "
+        f"{speed[fastest] * last.scales.speed_m_s:.2g} m/s at {place(state.domain.centers_mm[fastest])}: "
+        + _cause(state, last, speed, fastest)
+    )
+
+
+def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
+    if speed[fastest] > FAST:
+        return (
+            f"the time step is too long, for that is {speed[fastest]:.2g} cells a step; halve the lattice speed "
+            f"({state.case.settings.lattice_speed:.3g})"
+        )
+    outlets = [(k, one) for k, one in enumerate(state.case.vessel.openings) if not one.is_inlet]
+    coming_back = [one.role for k, one in outlets if _backflow(state, last, k) > FAST * speed[fastest]]
+    if coming_back:
+        role = coming_back[0]
+        return f"blood comes back through {role}; cut the vessel further from there, or share the outflow (murray)"
+    otherwise = "" if state.close_up is None else ", or leave out --close-up (close_up)"
+    cell_reynolds = speed[fastest] / last.scales.viscosity
+    return (
+        f"the grid is too coarse for it (speed x cell / viscosity = {cell_reynolds:.0f}, while blood is computed "
+        f"thicker from {CELL_REYNOLDS:.0f} on, behind openings from {CELL_REYNOLDS_AT_END:.0f}); "
+        f"set a cell size of {0.7 * state.domain.cell_size_mm:.2g} mm{otherwise}"
+    )
+
+
+def _backflow(state: State, last: Snapshot, k: int) -> float:
+    """Fastest blood that enters through opening k, in cells a step."""
+    cell = state.domain.link_cell[state.domain.link_patch == k + 1]
+    return float(-(last.velocity[cell] @ state.case.vessel.openings[k].normal).min()) if len(cell) else 0.0

@@ -1,0 +1,281 @@
+"""The engine that hands the flow to OpenFOAM: meshes, computes from check to check, reads the fields back.
+
+The finite volumes of OpenFOAM are of any shape; what is returned lies on the same regular grid as the embedded engine's
+flow, so that every index, streamline and picture takes either.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Final
+
+import numpy as np
+
+from vstent.errors import FlowError
+from vstent.flow import domain as domains
+from vstent.flow.case import PHASES, FlowCase, FlowField, Phase, Swing
+from vstent.flow.engines import AbstractEngine, Outcome, Saved
+from vstent.flow.lattice.pace import waveform_of
+from vstent.flow.lattice.pulse import cycle_change, cycles_advice
+from vstent.flow.lattice.settling import quantities_left
+from vstent.flow.openfoam import folder as folders
+from vstent.flow.openfoam import program, results
+from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
+from vstent.flow.openfoam.case import foam_case, strut_solids
+from vstent.flow.openfoam.cost import tell_cost
+from vstent.flow.openfoam.setup import FoamSetup
+from vstent.kernels.arrays import Floats, Ints
+
+CHECK_ITERATIONS: Final = 50
+"""Iterations of a steady flow between checks."""
+CHECKS_AVERAGED: Final = 8
+"""Checks whose mean is the result where a steady flow does not settle."""
+CHECKS_HELD: Final = 3
+"""Checks at which the inflow is corrected for every inlet's meshed area."""
+
+
+@dataclass(eq=False)
+class State:
+    """A run under way in a folder; its files change."""
+
+    case: FlowCase
+    """What is computed."""
+    setup: FoamSetup
+    """How."""
+    found: program.Program
+    """OpenFOAM."""
+    application: str
+    """The solver's program."""
+    folder: Path
+    """The case folder."""
+    domain: domains.Domain
+    """The grid of the result."""
+    bridge: Bridge
+    """From OpenFOAM's cells to it."""
+    sac_cells: Ints
+    """Cells of the sac, or of the whole lumen where there is none."""
+    snapshots: deque[Snapshot]
+    """The flow at the last checks."""
+    is_settled: bool = False
+    """Whether the solver's own residuals are below their limits."""
+    history: list[Floats] = field(default_factory=list)
+    """Monitored quantities at every check."""
+    loop_seconds: float = 0.0
+    """Time in the solver."""
+
+    @property
+    def is_pulse(self) -> bool:
+        """Whether the inflow follows a waveform."""
+        return self.case.settings.waveform is not None
+
+
+@dataclass(frozen=True, eq=False)
+class OpenFoam(AbstractEngine[State]):
+    """OpenFOAM's laminar solvers on a mesh by snappyHexMesh: simpleFoam, or pimpleFoam along a waveform.
+
+    The cell size is that of the mesh in the vessel, before layers and refinement; a run of the same case that
+    stopped in the folder goes on from the last time written. A stent is meshed as its struts over necks and ostia.
+    """
+
+    layers: int = 2
+    """Layers of flat cells along the wall."""
+    grid_size_mm: float | None = None
+    """Edge of a cell of the result's grid; None: as OpenFOAM's."""
+
+    def cost(self, case: FlowCase) -> str:
+        """Say how many cells, how much memory and time; with a stent's struts where there is one."""
+        return tell_cost(case, self.cell_size_mm)
+
+    def init(self, case: FlowCase, start: FlowField | None) -> State:
+        """Find OpenFOAM, write the case, mesh it, and find the way from its cells to the grid."""
+        if self.folder is None:
+            raise FlowError("OpenFOAM needs a folder to work in: name one")
+        solids, found = strut_solids(case), program.find()
+        setup = FoamSetup(
+            self.cell_size_mm, found.flavour, self.layers, processes=case.settings.processes, struts=solids
+        )
+        domain = domains.build(case.vessel, self.grid_size_mm or self.cell_size_mm)
+        sac = domains.cells_of_sac(case, domain)
+        foam = foam_case(case, setup)
+        folders.prepare(self.folder, foam)
+        folders.mesh(found, self.folder, setup)
+        if start is not None and not results.times(self.folder):
+            folders.begin_from(self.folder, start)
+        across = bridge(case, domain, self.folder)
+        kept: deque[Snapshot] = deque(maxlen=PHASES if case.settings.waveform else CHECKS_AVERAGED)
+        state = State(case, setup, found, foam.application, self.folder, domain, across, sac, kept)
+        for time in _whole_cycles(case, results.times(self.folder)):
+            _note(state, time)
+        return state
+
+    def step(self, state: State) -> State:
+        """Run the solver to the next check and read what it wrote."""
+        began = perf_counter()
+        reached = results.times(state.folder)
+        end = _next_end(state, float(reached[-1]) if reached else 0.0)
+        folders.stop_at(state.folder, end, every=None if state.is_pulse else CHECK_ITERATIONS)
+        said = program.run(state.found, state.folder, [state.application], processes=state.setup.processes)
+        state.loop_seconds += perf_counter() - began
+        _note(state, results.times(state.folder)[-1])
+        state.is_settled = not _correct_inflow(state) and "solution converged" in said
+        return state
+
+    def terminate(self, state: State) -> float:
+        """Fraction that the monitored quantities have left to go, or the change from cycle to cycle."""
+        history = np.array(state.history)
+        if not np.isfinite(history[-1]).all():
+            return float("nan")
+        if state.is_pulse:
+            return cycle_change(history)
+        if state.is_settled:
+            return 0.0
+        return quantities_left(history)
+
+    def save(self, state: State) -> None:
+        """Return nothing: OpenFOAM's own times in the case folder are what a run goes on from."""
+
+    def resume(self, case: FlowCase, saved: Saved) -> State:
+        """Go on from the last time written."""
+        return self.init(case, None)
+
+    def trouble(self, state: State) -> str:
+        """Say where the run diverged."""
+        good = state.snapshots[-2].time if len(state.snapshots) > 1 else "none"
+        return (
+            f"OpenFOAM's flow diverged at time {state.snapshots[-1].time} (last good state: {good}) in {state.folder}: "
+            "change the cell size a little or take fewer layers"
+        )
+
+    def max_checks(self, state: State) -> int:
+        """Checks within the limit of iterations, or phases of all cycles."""
+        if state.is_pulse:
+            left = PHASES * state.case.settings.max_cycles - _phases_done(state)
+            return left if left > 0 else PHASES
+        return state.setup.iterations // CHECK_ITERATIONS
+
+    def result(self, state: State, outcome: Outcome) -> FlowField:
+        """Return the last check, or the mean: of the last checks where the flow has not settled, of a pulse's cycle."""
+        is_last = outcome.is_converged and not state.is_pulse
+        return _field_of(state, [state.snapshots[-1]] if is_last else list(state.snapshots), outcome)
+
+
+def _next_end(state: State, reached: float) -> float:
+    if not state.is_pulse:
+        return reached + CHECK_ITERATIONS
+    phase_s = waveform_of(state.case).period_s / PHASES
+    return (round(reached / phase_s) + 1) * phase_s
+
+
+def _whole_cycles(case: FlowCase, written: list[str]) -> list[str]:
+    """Times from the beginning of the first cycle of which all are still there; none of a steady flow."""
+    if case.settings.waveform is None:
+        return []
+    phase_s = case.settings.waveform.period_s / PHASES
+    is_first = [round(float(time) / phase_s) % PHASES == 1 for time in written]
+    return written[is_first.index(True) :] if any(is_first) else []
+
+
+def _phases_done(state: State) -> int:
+    """Phases since the pulse began, in this run and those that it goes on from."""
+    if not state.snapshots:
+        return 0
+    return round(float(state.snapshots[-1].time) * PHASES / waveform_of(state.case).period_s)
+
+
+def _note(state: State, time: str) -> None:
+    """Read what was written at a time, and what is monitored of it."""
+    state.snapshots.append(read(state.case, state.bridge, state.folder, time))
+    state.history.append(_monitored(state, state.snapshots[-1]))
+
+
+def _monitored(state: State, now: Snapshot) -> Floats:
+    """Mean speed of the sac, pressure at the inlet, mean speed of the vessel, neck inflow: as the embedded engine."""
+    speed = np.linalg.norm(now.velocity_m_s, axis=1)
+    inlet = state.domain.link_cell[state.domain.link_patch == 1]
+    values = [speed[state.sac_cells].mean(), now.pressure_Pa[inlet].mean(), speed.mean()]
+    return np.array([*values, now.neck_inflow_mL_s] if state.case.ostium is not None else values, dtype=float)
+
+
+def _correct_inflow(state: State) -> bool:
+    """Correct the inlets' mean speeds for their meshed areas, less than the sections'; tell whether that was due."""
+    case, now = state.case, state.snapshots[-1]
+    share = float(case.settings.inflow_factor(np.array([float(now.time)]))[0])
+    if len(state.history) > CHECKS_HELD or abs(share) < 0.2:
+        return False
+    factors = -share * case.inlets_mL_s / case.vessel.of_inlets_and_outlets(now.outflow_mL_s)[0]
+    scaled = [
+        folders.scale_inflow(state.folder, inlet.role, factor)
+        for inlet, factor in zip(case.vessel.inlets, factors, strict=True)
+        if abs(factor - 1) > 1e-5
+    ]
+    return any(scaled)
+
+
+def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField:
+    def mean(name: str) -> Floats:
+        return np.asarray(np.mean([getattr(one, name) for one in kept], axis=0))
+
+    vessel, domain = state.case.vessel, state.domain
+    pressure_Pa, outflow_mL_s = mean("pressure_Pa"), mean("outflow_mL_s")
+    inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(domains.section_pressure_Pa(vessel, domain, pressure_Pa))
+    backwards_mL_s, outlets_mL_s = vessel.of_inlets_and_outlets(outflow_mL_s)
+    steps = len(state.history) * (1 if state.is_pulse else CHECK_ITERATIONS)
+    return FlowField(
+        cells=domain.cells,
+        origin_mm=domain.origin_mm,
+        cell_size_mm=domain.cell_size_mm,
+        velocity_m_s=mean("velocity_m_s"),
+        pressure_Pa=pressure_Pa,
+        wall=vessel.lumen,
+        wall_shear_stress_Pa=mean("wall_shear_stress_Pa"),
+        wall_pressure_Pa=mean("wall_pressure_Pa"),
+        inlets_mL_s=-backwards_mL_s,
+        outlets_mL_s=outlets_mL_s,
+        inlet_pressure_Pa=inlet_Pa,
+        outlet_pressure_Pa=outlet_Pa,
+        blood=state.case.blood,
+        is_converged=outcome.is_converged,
+        unsettled_fraction=outcome.residual[-1],
+        advice=_advice(state, outcome),
+        residual=np.array(outcome.residual),
+        steps=steps,
+        seconds=outcome.seconds,
+        updates_per_s=state.bridge.n_cells * steps / max(state.loop_seconds, 1e-9),
+        phases=_phases(state.case, kept) if state.is_pulse else (),
+        swing=None if state.is_pulse or len(kept) == 1 else swing_of(kept),
+        neck_inflow_mL_s=float(mean("neck_inflow_mL_s")),
+    )
+
+
+def swing_of(kept: list[Snapshot]) -> Swing:
+    """What the mean of a steady solver's last checks does not tell."""
+    speed_m_s = np.mean([np.linalg.norm(one.velocity_m_s, axis=1) for one in kept], axis=0)
+    shear_Pa = np.mean([np.linalg.norm(one.wall_shear_stress_Pa, axis=1) for one in kept], axis=0)
+    return Swing(speed_m_s, shear_Pa)
+
+
+def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
+    """The last cycle; its times are those of the waveform."""
+    phase_s = waveform_of(case).period_s / PHASES
+
+    def phase(k: int, one: Snapshot) -> Phase:
+        backwards_mL_s, outlets_mL_s = case.vessel.of_inlets_and_outlets(one.outflow_mL_s)
+        moment = one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa
+        return Phase((k + 1) * phase_s, -backwards_mL_s, outlets_mL_s, *moment, one.neck_inflow_mL_s)
+
+    return tuple(phase(k, one) for k, one in enumerate(cycle))
+
+
+def _advice(state: State, outcome: Outcome) -> str:
+    mesh = f"OpenFOAM on {state.bridge.n_cells} cells ({state.folder})."
+    if state.is_pulse:
+        changes = np.array([change for change in outcome.residual if np.isfinite(change)])
+        cycles = _phases_done(state) // PHASES
+        return f"{cycles_advice(changes, cycles, is_converged=outcome.is_converged)} {mesh}"
+    if outcome.is_converged:
+        return f"The flow has settled. {mesh}"
+    return (
+        f"The steady solver has not settled in {state.setup.iterations} iterations: the flow may be unsteady by "
+        f"nature; follow it in time with a waveform. {mesh}"
+    )

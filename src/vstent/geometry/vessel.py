@@ -1,0 +1,198 @@
+"""The artery's nouns: Opening, Centerline, Vessel, Aneurysm, Anatomy."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from vstent.geometry.surface import Surface
+from vstent.kernels import curves
+from vstent.kernels.arrays import Bools, Floats, freeze
+from vstent.units import place
+
+
+@dataclass(frozen=True, eq=False)
+class Opening:
+    """A flat end of the vessel, through which blood enters or leaves."""
+
+    center_mm: Floats
+    """(3,) centroid of the section."""
+    normal: Floats
+    """(3,) unit normal, out of the lumen."""
+    area_mm2: float
+    """Area of the section."""
+    role: str
+    """``inlet``, where the parent artery begins; ``inlet_2``, ``inlet_3``, ... in the order given; ``outlet_1``,
+    ``outlet_2``, ... from the widest outlet to the narrowest."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "center_mm", np.float64, (3,))
+        freeze(self, "normal", np.float64, (3,))
+
+    @property
+    def diameter_mm(self) -> float:
+        """Diameter of the circle of the same area."""
+        return float(2 * np.sqrt(self.area_mm2 / np.pi))
+
+    @property
+    def described(self) -> str:
+        """Width and place in words: ``3.5 mm wide at (1.0, -2.5, 30.2) mm``."""
+        return f"{self.diameter_mm:.1f} mm wide at {place(self.center_mm)}"
+
+    @property
+    def is_inlet(self) -> bool:
+        """Whether blood enters through it."""
+        return self.role.startswith("inlet")
+
+
+def roles(n_inlets: int, n_outlets: int) -> list[str]:
+    """Roles of so many openings in a vessel's order."""
+    inlets = ["inlet", *(f"inlet_{k}" for k in range(2, n_inlets + 1))]
+    return [*inlets, *(f"outlet_{k}" for k in range(1, n_outlets + 1))]
+
+
+def murray_shares(openings: Sequence[Opening]) -> Floats:
+    """Return the parts (k,) of a flow that openings take: as diameter cubed (Murray 1926, PNAS 12, 207)."""
+    cubes = np.array([opening.diameter_mm**3 for opening in openings])
+    return np.asarray(cubes / cubes.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Centerline:
+    """A curve along the lumen with the maximum inscribed sphere at every point."""
+
+    points_mm: Floats
+    """(n, 3) points, from the inlet towards another opening."""
+    inscribed_radius_mm: Floats
+    """(n,) radius of the maximum inscribed sphere."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "points_mm", np.float64, (-1, 3))
+        freeze(self, "inscribed_radius_mm", np.float64, (len(self.points_mm),))
+
+    @cached_property
+    def abscissa_mm(self) -> Floats:
+        """(n,) arc length from the first point."""
+        return curves.arc_length(self.points_mm)
+
+    @property
+    def length_mm(self) -> float:
+        """Length of the whole curve."""
+        return float(self.abscissa_mm[-1])
+
+    @cached_property
+    def frames(self) -> Floats:
+        """(n, 3, 3) rows: tangent and two normals, parallel-transported (no twist)."""
+        return curves.parallel_frames(self.points_mm)
+
+    def at(self, abscissa_mm: Floats) -> Floats:
+        """Return the points (k, 3) at arc lengths (k,), linear between points."""
+        return curves.interpolate(self.abscissa_mm, self.points_mm, abscissa_mm)
+
+    def nearest_abscissa_mm(self, points_mm: Floats) -> Floats:
+        """Return the arc length (k,) of the foot of each of (k, 3) points on the curve."""
+        return curves.project(self.points_mm, points_mm)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Vessel:
+    """A lumen with named openings and, once traced, its centerlines."""
+
+    lumen: Surface
+    """The wall, open at every opening."""
+    openings: tuple[Opening, ...] = ()
+    """The inlet, further inlets as they were given, the outlets from the widest to the narrowest; empty before
+    tracing."""
+    centerlines: tuple[Centerline, ...] = ()
+    """One from the inlet to each of `far_ends`, in their order; empty before tracing."""
+    notes: tuple[str, ...] = ()
+    """What was found, guessed or repaired on the way, one sentence each."""
+    threshold_band_mm: float = 0.0
+    """By how much a diameter grows where the scan's threshold is lower by 5 % of the step from tissue to lumen, and
+    shrinks where it is higher by as much; 0 for a vessel that is no scan's."""
+    blur_mm: float | None = None
+    """Standard deviation of the point spread through which the scan shows the wall; None where it is not known."""
+
+    @property
+    def closed(self) -> Surface:
+        """The lumen with every open loop capped: what is inside it is blood."""
+        return self.lumen.closed
+
+    @property
+    def inlet(self) -> Opening:
+        """The opening where the parent artery begins, and the centerlines."""
+        return self.openings[0]
+
+    @property
+    def far_ends(self) -> tuple[Opening, ...]:
+        """The openings that the centerlines lead to: all but the inlet."""
+        return self.openings[1:]
+
+    @property
+    def inlets(self) -> tuple[Opening, ...]:
+        """The openings through which blood enters: the inlet, and those given besides."""
+        return tuple(opening for opening in self.openings if opening.is_inlet)
+
+    @property
+    def outlets(self) -> tuple[Opening, ...]:
+        """The openings through which blood leaves."""
+        return tuple(opening for opening in self.openings if not opening.is_inlet)
+
+    def of_inlets_and_outlets(self, values: Floats) -> tuple[Floats, Floats]:
+        """Part values (k,) of all openings into those of the inlets (i,) and those of the outlets."""
+        n_inlets = len(self.inlets)
+        return values[:n_inlets], values[n_inlets:]
+
+
+@dataclass(frozen=True, eq=False)
+class Aneurysm:
+    """A sac and the neck through which it hangs on the parent artery."""
+
+    sac: Surface
+    """The lumen outside the landing surface, closed across the neck."""
+    neck: Surface
+    """The part of the landing surface that closes the sac; its normals point into the sac."""
+    neck_mm: Floats
+    """(k, 3) closed curve where lumen and landing surface part (the last point joins the first)."""
+    proximal_abscissa_mm: float
+    """Where the neck begins on the parent axis."""
+    distal_abscissa_mm: float
+    """Where the neck ends on the parent axis."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "neck_mm", np.float64, (-1, 3))
+
+    @property
+    def center_abscissa_mm(self) -> float:
+        """Middle of the neck on the parent axis."""
+        return 0.5 * (self.proximal_abscissa_mm + self.distal_abscissa_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """A traced vessel with its parent artery restored."""
+
+    vessel: Vessel
+    """The patient's lumen, with sac and branches: what blood flows through."""
+    axis: Centerline
+    """The parent artery's own axis, inlet to outlet; radius = distance to the landing surface."""
+    section_radius_mm: Floats
+    """(n,) radius of the circle with the area of the landing surface's section at every axis point."""
+    landing_surface: Surface
+    """The parent artery with sac and side branches closed: an open tube, what a stent expands against."""
+    is_restored: Bools
+    """(v,) per landing-surface vertex: closes a neck or an ostium, is not the patient's own wall."""
+    aneurysms: tuple[Aneurysm, ...]
+    """The sacs found, the largest first; empty for a healthy artery."""
+    notes: tuple[str, ...] = ()
+    """What was found or assumed, one sentence each."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "section_radius_mm", np.float64, (len(self.axis.points_mm),))
+        freeze(self, "is_restored", np.bool_, (len(self.landing_surface.vertices_mm),))
+
+    @cached_property
+    def is_restored_face(self) -> Bools:
+        """(f,) per landing-surface triangle: every corner of it is restored."""
+        return np.asarray(self.is_restored[self.landing_surface.faces].all(axis=1))

@@ -1,0 +1,195 @@
+"""Rank: every size of the chosen devices deployed, measured and graded; the best first, each with its reason."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from vstent.deployment.deploy import deploy, propose_landing
+from vstent.deployment.measure import Measures, measure
+from vstent.deployment.sizing import landing_diameters_mm
+from vstent.devices.design import Design, Size
+from vstent.devices.stent import Landing
+from vstent.errors import InputError, LandingError
+from vstent.geometry.vessel import Anatomy
+from vstent.kernels import curves
+from vstent.kernels.arrays import Floats
+from vstent.plan.criteria import Criteria, Criterion, default_criteria
+from vstent.plan.workers import spread
+
+TELLING: Final = 0.005
+"""A criterion is named in a reason where it costs more of the score than this."""
+TOLD: Final = 2
+"""So many criteria a reason names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One size of one device at one place, graded."""
+
+    design: Design
+    """The device."""
+    size: Size
+    """The size."""
+    shift_mm: float
+    """How far from the proposed place it was landed, distally."""
+    measures: Measures
+    """What `vstent.measure` and `landing_measures` say; empty where it could not be deployed."""
+    grades: dict[str, float]
+    """0 to 1 by the criteria's keys."""
+    score: float
+    """Weighted mean of the grades; 0 where it could not be deployed."""
+    is_suitable: bool
+    """No grade is 0."""
+    reason: str
+    """One sentence: what holds it back most, or why it could not be deployed."""
+
+    @property
+    def label(self) -> str:
+        """Device and size."""
+        return f"{self.design.name} {self.size.label}"
+
+    @property
+    def order(self) -> tuple[bool, float, str, float, float, float]:
+        """Sorts the best first; ties by name, size and shift, so that an order never depends on chance."""
+        return (
+            not self.is_suitable,
+            -self.score,
+            self.design.key,
+            self.size.diameter_mm,
+            self.size.length_mm,
+            abs(self.shift_mm),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """All candidates, the best first."""
+
+    candidates: tuple[Candidate, ...]
+    """The suitable ones by their score, then the rest."""
+    criteria: Criteria = field(default_factory=default_criteria)
+    """What they were graded by."""
+
+    @property
+    def suitable(self) -> tuple[Candidate, ...]:
+        """Those that no criterion rules out."""
+        return tuple(candidate for candidate in self.candidates if candidate.is_suitable)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One flat row a candidate: rank, device, size, shift, score, reason, grades, measures."""
+        return [_row(number, candidate) for number, candidate in enumerate(self.candidates, start=1)]
+
+
+def _row(number: int, candidate: Candidate) -> dict[str, Any]:
+    return {
+        "rank": number,
+        "device": candidate.design.key,
+        "label_diameter_mm": candidate.size.diameter_mm,
+        "label_length_mm": candidate.size.length_mm,
+        "shift_mm": candidate.shift_mm,
+        "is_suitable": candidate.is_suitable,
+        "score": candidate.score,
+        "reason": candidate.reason,
+        **{f"grade_{key}": grade for key, grade in candidate.grades.items()},
+        **{key: value for key, value in candidate.measures.items() if key not in ("device", "size")},
+    }
+
+
+def rank(
+    anatomy: Anatomy,
+    designs: Sequence[Design],
+    *,
+    criteria: Criteria | None = None,
+    shifts_mm: Sequence[float] = (0.0,),
+    jobs: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> Ranking:
+    """Deploy every size of every device at every shift, measure and grade it.
+
+    Parameters
+    ----------
+    anatomy : the artery, restored.
+    designs : the devices; every size of each is tried, none is left out beforehand.
+    criteria : what they are graded by; None: `default_criteria`.
+    shifts_mm : where each is landed, against the proposed place (centered on the neck), distally.
+    jobs : processes at work at once.
+    progress : told how many of how many are done.
+
+    Raises
+    ------
+    InputError
+        When there is nothing to try.
+    """
+    criteria = criteria or default_criteria()
+    tasks = [(design, size, float(shift)) for design in designs for size in design.sizes for shift in shifts_mm]
+    if not tasks:
+        raise InputError("There is nothing to rank: give at least one device and one landing shift.")
+    graded = []
+    for candidate in spread(_graded, (anatomy, criteria), tasks, jobs=jobs):
+        graded.append(candidate)
+        if progress is not None:
+            progress(len(graded), len(tasks))
+    return Ranking(tuple(sorted(graded, key=lambda candidate: candidate.order)), criteria)
+
+
+def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) -> Candidate:
+    """Deploy, measure and grade one size at one shift."""
+    (anatomy, criteria), (design, size, shift_mm) = common, task
+    try:
+        # Unmoved it is for `deploy` to say where the proposed place is: near an end of the artery only it knows.
+        landing = Landing(propose_landing(design, anatomy, size).abscissa_mm + shift_mm) if shift_mm else None
+        deployment = deploy(design, anatomy, size=size, landing=landing)
+    except LandingError as error:
+        return Candidate(design, size, shift_mm, {}, {}, 0.0, False, str(error))
+    measures = measure(anatomy, deployment)
+    measures |= landing_measures(anatomy, measures)
+    asked = [item for item in criteria.of(design) if item.key in measures]
+    grades = {item.key: item.grade(float(measures[item.key])) for item in asked}
+    weight = sum(item.weight for item in asked)
+    score = sum(item.weight * grades[item.key] for item in asked) / weight if weight else 0.0
+    is_suitable = all(grades.values())
+    reason = _reason(asked, grades, measures)
+    return Candidate(design, size, shift_mm, measures, grades, score, is_suitable, reason)
+
+
+def landing_measures(anatomy: Anatomy, measures: Measures) -> Measures:
+    """What the criteria ask besides `vstent.measure`: both sides of a device taken together, and where its ends lie."""
+    wider_mm = max(landing_diameters_mm(anatomy))
+    ends_mm = np.array([float(measures[f"{end}_end_abscissa_mm"]) for end in ("proximal", "distal")])
+    found: Measures = {"landing_oversizing_fraction": float(measures["label_diameter_mm"]) / wider_mm - 1}
+    found["end_bend_ratio"] = float(np.interp(ends_mm, anatomy.axis.abscissa_mm, bend_ratios(anatomy)).max())
+    sides = [float(measures[key]) for key in ("neck_to_proximal_end_mm", "neck_to_distal_end_mm") if key in measures]
+    if sides:
+        found |= {"landing_length_mm": min(sides), "longest_landing_mm": max(sides)}
+    branches = [
+        float(measures[key]) for key in ("proximal_end_to_branch_mm", "distal_end_to_branch_mm") if key in measures
+    ]
+    return found | ({"end_to_branch_mm": min(branches)} if branches else {})
+
+
+def bend_ratios(anatomy: Anatomy) -> Floats:
+    """Artery's diameter over the radius of its bend (n,) along the parent axis."""
+    axis = anatomy.axis
+    diameter_mm = 2 * float(np.median(anatomy.section_radius_mm))
+    even_mm = curves.resample_evenly(axis.points_mm, len(axis.points_mm))
+    curvature, _ = curves.curvature_and_torsion(even_mm, diameter_mm)
+    along_mm = np.linspace(0.0, axis.length_mm, len(even_mm))
+    return diameter_mm * np.interp(axis.abscissa_mm, along_mm, curvature)
+
+
+def _reason(asked: Sequence[Criterion], grades: dict[str, float], measures: Measures) -> str:
+    """One sentence: what rules it out, or what costs it most."""
+    if not asked:
+        return "No criterion asks for anything that was measured of it."
+    weight = sum(item.weight for item in asked)
+    said = {item.key: item.phrase.format(measures[item.key]) for item in asked}
+    out = [said[item.key] for item in asked if grades[item.key] == 0]
+    if out:
+        return f"Ruled out: {'; '.join(out)}."
+    lost = {item.key: item.weight * (1 - grades[item.key]) / weight for item in asked}
+    costly = sorted((key for key in lost if lost[key] > TELLING), key=lambda key: -lost[key])[:TOLD]
+    if costly:
+        return f"Costs it most: {'; '.join(f'{said[key]} (-{lost[key]:.2f})' for key in costly)}."
+    return "Meets every criterion almost in full."

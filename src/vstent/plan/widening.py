@@ -1,0 +1,67 @@
+"""Widening: the same anatomy had the scan's threshold been lower or higher."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline
+from vstent.kernels.arrays import Floats
+
+
+def widened(anatomy: Anatomy, diameter_mm: float) -> Anatomy:
+    """Return an anatomy whose walls lie further out: every diameter grows by `diameter_mm` (below zero: shrinks).
+
+    The wall moves along its own normals, the landing surface along its; sac and neck move with what they lie on, so
+    that they keep meeting. Where the neck begins and ends on the axis is left as it is.
+    """
+    half_mm, vessel = 0.5 * diameter_mm, anatomy.vessel
+    lumen, landing = (_moved_out(surface, half_mm) for surface in (vessel.lumen, anatomy.landing_surface))
+    wall = _Shift.of((vessel.lumen, lumen), (anatomy.landing_surface, landing))
+    tube = _Shift.of((anatomy.landing_surface, landing))
+    openings = tuple(
+        replace(opening, area_mm2=opening.area_mm2 * (1 + diameter_mm / opening.diameter_mm) ** 2)
+        for opening in vessel.openings
+    )
+    lines = tuple(_line(line, half_mm) for line in vessel.centerlines)
+    return replace(
+        anatomy,
+        vessel=replace(vessel, lumen=lumen, openings=openings, centerlines=lines),
+        axis=_line(anatomy.axis, half_mm),
+        section_radius_mm=anatomy.section_radius_mm + half_mm,
+        landing_surface=landing,
+        aneurysms=tuple(_sac(aneurysm, wall, tube) for aneurysm in anatomy.aneurysms),
+    )
+
+
+class _Shift:
+    """How far the wall has moved at its nearest vertex."""
+
+    def __init__(self, before_mm: Floats, shift_mm: Floats) -> None:
+        self.tree, self.shift_mm = cKDTree(before_mm), shift_mm
+
+    @staticmethod
+    def of(*moved: tuple[Surface, Surface]) -> "_Shift":
+        before = np.concatenate([old.vertices_mm for old, _ in moved])
+        return _Shift(before, np.concatenate([new.vertices_mm - old.vertices_mm for old, new in moved]))
+
+    def __call__(self, points_mm: Floats) -> Floats:
+        return points_mm + self.shift_mm[self.tree.query(points_mm)[1]]
+
+
+def _moved_out(surface: Surface, by_mm: float) -> Surface:
+    return Surface(surface.vertices_mm + by_mm * surface.vertex_normals, surface.faces)
+
+
+def _line(line: Centerline, half_mm: float) -> Centerline:
+    return Centerline(line.points_mm, line.inscribed_radius_mm + half_mm)
+
+
+def _sac(aneurysm: Aneurysm, wall: _Shift, tube: _Shift) -> Aneurysm:
+    return replace(
+        aneurysm,
+        sac=Surface(wall(aneurysm.sac.vertices_mm), aneurysm.sac.faces),
+        neck=Surface(tube(aneurysm.neck.vertices_mm), aneurysm.neck.faces),
+        neck_mm=tube(aneurysm.neck_mm),
+    )

@@ -1,0 +1,1 @@
+"""Reports: a finished case or cohort in, HTML and PDF out. Open ``page.py`` first."""

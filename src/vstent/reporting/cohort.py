@@ -1,0 +1,171 @@
+"""The report of a cohort: how many came through, how their numbers are distributed, and who stands apart."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from vstent.reporting.page import asset
+from vstent.reporting.quantities import Quantity, format_value
+
+Row = Mapping[str, Any]
+
+HEADLINES: Final = (
+    "vessel.sac_volume_mm3",
+    "vessel.neck_max_diameter_mm",
+    "vessel.parent_proximal_diameter_mm",
+    "deployment.deployed_length_mm",
+    "deployment.oversizing_fraction",
+    "deployment.apposed_fraction",
+    "deployment.max_wall_gap_mm",
+    "deployment.neck_metal_coverage_fraction",
+    "deployment.neck_pore_density_per_mm2",
+    "deployment.p95_wire_stretch_fraction",
+    "ratios.neck_inflow_mL_s_ratio",
+    "ratios.mean_sac_velocity_m_s_ratio",
+    "ratios.mean_sac_wss_Pa_ratio",
+    "ratios.turnover_time_s_ratio",
+    "case_s",
+    "peak_memory_MB",
+)
+"""Columns that are drawn, and in which outliers are sought."""
+OUTLYING: Final = 3.5
+"""A value stands apart from this modified z-score on (Iglewicz and Hoaglin 1993, How to Detect and Handle Outliers)."""
+NORMAL: Final = 0.6745
+"""Median absolute deviation of a normal distribution of standard deviation 1."""
+WIDTH, HEIGHT, EDGE = 640, 34, 8
+"""Of a strip, and what is left free at its ends."""
+
+
+class Distribution(NamedTuple):
+    """One number of one device over all cases."""
+
+    device: str
+    """The device."""
+    n_cases: int
+    """Cases that have it."""
+    quantiles: tuple[str, ...]
+    """Least, lower quartile, median, upper quartile, greatest, with the unit."""
+    strip: str
+    """A point per case, as SVG."""
+
+
+class Outlier(NamedTuple):
+    """One value that stands apart."""
+
+    case: str
+    device: str
+    name: str
+    value: str
+    median: str
+    score: float
+    """Modified z-score."""
+
+
+def cohort_report(name: str, rows: Sequence[Row]) -> str:
+    """Return the report of a cohort as the text of one HTML file, which asks nothing of a network.
+
+    Parameters
+    ----------
+    name : the cohort's.
+    rows : one a case and device: ``case``, ``device``, ``outcome``, ``stage``, ``sentence``, numbers.
+    """
+    from jinja2 import Environment, PackageLoader
+
+    done = [row for row in rows if row["outcome"] == "done"]
+    devices = list(dict.fromkeys(row["device"] for row in rows))
+    environment = Environment(loader=PackageLoader("vstent.reporting", "assets"), autoescape=True)
+    return environment.get_template("cohort.html.j2").render(
+        name=name,
+        style=Markup(asset("report.css")),
+        counts=[(device, *_counts(rows, device)) for device in devices],
+        n_cases=len({row["case"] for row in rows}),
+        distributions=[
+            (_name(key), [distribution(done, device, key) for device in devices if _values(done, device, key)])
+            for key in HEADLINES
+            if any(_is_number(row.get(key)) for row in done)
+        ],
+        outliers=[outlier for device in devices for key in HEADLINES for outlier in outliers(done, device, key)],
+        failures=[row for row in rows if row["outcome"] != "done"],
+        limit=OUTLYING,
+    )
+
+
+def _counts(rows: Sequence[Row], device: str) -> tuple[int, int, int]:
+    outcomes = [row["outcome"] for row in rows if row["device"] == device]
+    return outcomes.count("done"), outcomes.count("failed"), outcomes.count("lost")
+
+
+def modified_z_scores(values: Sequence[float]) -> list[float]:
+    """Distance of every value from the median, in median absolute deviations, scaled like a standard deviation."""
+    if not len(values):
+        return []
+    array = np.asarray(values, dtype=np.float64)
+    away = array - np.median(array)
+    deviation = float(np.median(np.abs(away)))
+    return (NORMAL * away / deviation).tolist() if deviation > 0 else [0.0] * len(array)
+
+
+def outliers(rows: Sequence[Row], device: str, key: str) -> list[Outlier]:
+    """Values of one column of one device that stand apart, the farthest first."""
+    found = _values(rows, device, key)
+    scores = modified_z_scores([value for _, value in found])
+    median = format_value(_leaf(key), float(np.median([value for _, value in found]))) if found else ""
+    apart = [
+        Outlier(case, device, _name(key), format_value(_leaf(key), value), median, score)
+        for (case, value), score in zip(found, scores, strict=True)
+        if abs(score) > OUTLYING
+    ]
+    return sorted(apart, key=lambda outlier: -abs(outlier.score))
+
+
+def distribution(rows: Sequence[Row], device: str, key: str) -> Distribution:
+    """How one column of one device is distributed."""
+    found = _values(rows, device, key)
+    values = [value for _, value in found]
+    quantiles = np.quantile(values, (0.0, 0.25, 0.5, 0.75, 1.0))
+    every = [float(row[key]) for row in rows if _is_number(row.get(key))]
+    return Distribution(
+        device,
+        len(values),
+        tuple(format_value(_leaf(key), float(value)) for value in quantiles),
+        Markup(_strip(found, key, (min(every), max(every)))),
+    )
+
+
+def _strip(found: Sequence[tuple[str, float]], key: str, span: tuple[float, float]) -> str:
+    """Every case a point on a line from the least to the greatest value of all devices; a box over the quartiles."""
+    low, high = span
+    per_unit = (WIDTH - 2 * EDGE) / (high - low) if high > low else 0.0
+    at = [EDGE + (value - low) * per_unit for _, value in found]
+    left, middle, right = np.quantile(at, (0.25, 0.5, 0.75))
+    scores = modified_z_scores([value for _, value in found])
+    points = [
+        f'<circle cx="{x:.1f}" cy="{HEIGHT / 2 + 6 * math.sin(7.0 * i):.1f}" r="3"'
+        f"{' class=apart' if abs(score) > OUTLYING else ''}>"
+        f"<title>{Markup.escape(case)}: {format_value(_leaf(key), value)}</title></circle>"
+        for i, (x, (case, value), score) in enumerate(zip(at, found, scores, strict=True))
+    ]
+    box = (
+        f'<rect x="{left:.1f}" y="4" width="{max(1.0, right - left):.1f}" height="{HEIGHT - 8}"/>'
+        f'<line x1="{middle:.1f}" x2="{middle:.1f}" y1="4" y2="{HEIGHT - 4}"/>'
+    )
+    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{box}{"".join(points)}</svg>'
+
+
+def _values(rows: Sequence[Row], device: str, key: str) -> list[tuple[str, float]]:
+    return [(str(row["case"]), float(row[key])) for row in rows if row["device"] == device and _is_number(row.get(key))]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _leaf(key: str) -> str:
+    return key.rsplit(".", 1)[-1]
+
+
+def _name(key: str) -> str:
+    return Quantity((_leaf(key),), 0.0).name

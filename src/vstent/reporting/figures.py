@@ -1,0 +1,238 @@
+"""Pictures of a scene without a graphics library: a depth buffer for the paint, matplotlib for the lettering."""
+
+import io
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vstent.devices.design import BARE
+from vstent.kernels import raster
+from vstent.kernels.arrays import Floats
+from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+BACKGROUND = (0.965, 0.973, 0.978)
+_INK = "#16262e"
+_QUIET = "#54666f"
+_LIGHT = np.array([-0.35, 0.50, 0.79])
+_SUPERSAMPLING = 2
+ABOVE = "What is above the scale is drawn in its last colour."
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A finished picture with its words."""
+
+    id: str
+    """What it shows: anatomy, contour, coverage, wires, streamlines, shear."""
+    title: str
+    """One line above it."""
+    caption: str
+    """What to see, and what the colours mean."""
+    png: bytes
+    """The picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One panel of a picture: what is drawn, and from where."""
+
+    title: str
+    """Above the panel."""
+    layers: tuple[MeshLayer | LineLayer, ...]
+    """What is drawn."""
+    view: View
+    """From where."""
+
+
+def pictures(scene: Scene) -> list[Picture]:
+    """Return the pictures of a scene: anatomy always, contour and wires per device, flow where it was computed."""
+    found = [_anatomy(scene)]
+    if len(scene.panes) > 1:
+        found += [_contour(scene), _coverage(scene), _wires(scene)]
+    drawn = {layer.id for layer in scene.layers}
+    if "streamlines" in drawn:
+        found.append(_streamlines(scene))
+    if "shear" in drawn:
+        found.append(_shear(scene))
+    return found
+
+
+def overview(scene: Scene) -> bytes:
+    """Return one wide PNG for a front page: wires across the neck, and the flow before and after where there is one."""
+    layers = ("lumen", "wires", "neck", "streamlines")
+    shots = [Shot(title, scene.pick(layers, pane), scene.view("profile")) for pane, title in scene.panes]
+    scales = {scale.id for scale in scene.scales}
+    return sheet(scene, shots, "speed" if "speed" in scales else "")
+
+
+def draw(layers: tuple[MeshLayer | LineLayer, ...], scene: Scene, view: View, size_px: tuple[int, int]) -> Floats:
+    """Paint layers seen from `view` into an image (h, w, 3), 0 to 1, of `size_px` (width, height).
+
+    Opaque triangles and lines hide what is farther; translucent layers are blended over them, denser where they are
+    seen at a grazing angle, so that a tube shows its outline and what it holds.
+    """
+    width, height = (n * _SUPERSAMPLING for n in size_px)
+    pixel = span_mm(view, size_px) / width
+    image = np.broadcast_to(np.array(BACKGROUND), (height, width, 3)).copy()
+    depth = np.full((height, width), np.inf)
+    sums, clear = np.zeros((height, width, 4)), np.ones((height, width))
+    for layer in sorted(layers, key=_is_translucent):
+        points = layer.points_mm if isinstance(layer, LineLayer) else layer.surface.vertices_mm
+        screen = _to_screen(points, view, pixel, (width, height))
+        colours = _colours(layer, scene, screen[:, 2])
+        if isinstance(layer, LineLayer):
+            radius = np.maximum(layer.radius_mm / pixel, 0.55 * _SUPERSAMPLING)
+            raster.paint_wires(screen, layer.starts, radius, pixel, colours, depth, image)
+            continue
+        normals = layer.surface.vertex_normals @ view.axes.T
+        shaded = colours * _brightness(normals, 0.72 if layer.scale else 0.50)[:, None]
+        if _is_translucent(layer):
+            alphas = _alphas(layer.opacity, normals)
+            raster.veil_triangles(screen, shaded, alphas, layer.surface.faces, depth, sums, clear)
+        else:
+            raster.paint_triangles(screen, shaded, layer.surface.faces, depth, image)
+    return np.clip(raster.resolve(image, sums, clear, _SUPERSAMPLING), 0.0, 1.0)
+
+
+def _is_translucent(layer: MeshLayer | LineLayer) -> bool:
+    return isinstance(layer, MeshLayer) and layer.opacity < 1.0
+
+
+def span_mm(view: View, size_px: tuple[int, int]) -> float:
+    """Return what the width of a picture spans, so that the view's sphere fits with a little room."""
+    return 2.15 * view.radius_mm * max(1.0, size_px[0] / size_px[1])
+
+
+def _to_screen(points_mm: Floats, view: View, pixel: float, size: tuple[int, int]) -> Floats:
+    seen = (points_mm - view.center_mm) @ view.axes.T
+    return np.stack([0.5 * size[0] + seen[:, 0] / pixel, 0.5 * size[1] - seen[:, 1] / pixel, -seen[:, 2]], axis=1)
+
+
+def _colours(layer: MeshLayer | LineLayer, scene: Scene, depth_mm: Floats) -> Floats:
+    """Colours (n, 3) of a layer's vertices or points at depths (n,) behind the middle of the picture."""
+    if layer.scale:
+        return scene.scale(layer.scale).paint(layer.values)
+    colours = np.tile(np.array(layer.colour), (len(depth_mm), 1))
+    if layer.id != "wires":
+        return colours
+    pale = 0.65 * np.clip(0.15 + depth_mm / scene.fade_mm, 0.0, 1.0)[:, None]
+    return colours * (1 - pale) + np.array(BACKGROUND) * pale
+
+
+def _brightness(normals: Floats, ambient: float) -> Floats:
+    """Light (n,) on both sides of a surface with unit normals (n, 3) in the view's axes."""
+    facing = normals * np.where(normals[:, 2:] < 0, -1.0, 1.0)
+    return ambient + (1.0 - ambient) * np.maximum(facing @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0)
+
+
+def _alphas(opacity: float, normals: Floats) -> Floats:
+    return opacity + (1.0 - opacity) * 0.75 * (1.0 - np.abs(normals[:, 2])) ** 3
+
+
+def _anatomy(scene: Scene) -> Picture:
+    ids = ("lumen", "landing", "sac", "neck")
+    titles = {"profile": "In profile", "frontal": "Frontal", "lateral": "From the left"}
+    shots = [Shot(title, scene.pick(ids, BARE), scene.view(view)) for view, title in titles.items()]
+    caption = "The patient's lumen (glass), the restored parent artery (sand), the sac (red) and the neck (red line)."
+    return Picture("anatomy", "The artery and its sac", caption, sheet(scene, shots, ""))
+
+
+def _contour(scene: Scene) -> Picture:
+    ids = ("lumen", "contour", "neck")
+    shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
+    caption = "The deployed contour in the lumen, coloured by its gap to the wall of the parent artery."
+    return Picture("contour", "Where the devices lie", caption, sheet(scene, shots, "wall_gap"))
+
+
+def _coverage(scene: Scene) -> Picture:
+    ids = ("lumen", "coverage", "neck")
+    shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
+    caption = (
+        "Coverage map: the part of the contour that is under metal, measured on the wires and averaged over a few "
+        "pores; denser on the inside of a bend, wider on its outside."
+    )
+    return Picture("coverage", "How much metal covers the wall", caption, sheet(scene, shots, "coverage"))
+
+
+def _wires(scene: Scene) -> Picture:
+    looks = {"profile": ("in profile", ("lumen", "wires", "neck")), "neck": ("seen from the sac", ("wires", "neck"))}
+    shots = [
+        Shot(f"{title}: {looks[view.id][0]}", scene.pick(looks[view.id][1], pane), view)
+        for pane, title in scene.panes[1:]
+        for view in scene.views
+        if view.id in looks
+    ]
+    caption = (
+        "The wires and the neck (red line); wires on the far side are paler. "
+        "Seen from the sac, close up, the wall is taken away."
+    )
+    return Picture("wires", "Wires across the neck", caption, sheet(scene, shots, ""))
+
+
+def _streamlines(scene: Scene) -> Picture:
+    ids = ("lumen", "streamlines", "neck")
+    shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes]
+    caption = f"Streamlines through artery and sac, coloured by speed on one scale. {ABOVE}"
+    return Picture("streamlines", "Blood flow before and after", caption, sheet(scene, shots, "speed"))
+
+
+def _shear(scene: Scene) -> Picture:
+    shots = [Shot(title, scene.pick(("shear", "neck"), pane), scene.view("profile")) for pane, title in scene.panes]
+    caption = f"Wall shear stress on the lumen, on one scale. {ABOVE}"
+    return Picture("shear", "Wall shear stress before and after", caption, sheet(scene, shots, "shear"))
+
+
+def sheet(scene: Scene, shots: list[Shot], scale: str) -> bytes:
+    """Lay panels side by side, two to a row where there are four, with one colour bar and a length bar: a PNG."""
+    from matplotlib.figure import Figure
+
+    columns = 2 if len(shots) == 4 else min(len(shots), 3)
+    rows = -(-len(shots) // columns)
+    panel = (760, 560) if columns < 3 else (520, 480)
+    foot = 0.62 if scale else 0.10
+    inches = (columns * panel[0] / 150, rows * (panel[1] / 150 + 0.30) + foot)
+    figure = Figure(figsize=inches, facecolor="white")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    figure.subplots_adjust(0, foot / inches[1], 1, 1 - 0.30 / inches[1], 0.02, 0.30 * rows / inches[1] * 0.35)
+    for axes in grid.ravel():
+        axes.set_axis_off()
+    for axes, shot in zip(grid.ravel(), shots, strict=False):
+        axes.imshow(draw(shot.layers, scene, shot.view, panel), interpolation="antialiased")
+        axes.set_title(shot.title, fontsize=8.5, color=_INK, loc="left", pad=4)
+        _length_bar(axes, span_mm(shot.view, panel), panel)
+    if scale:
+        _colour_bar(figure, scene, scale, inches)
+    return _png(figure)
+
+
+def _length_bar(axes: "Axes", width_mm: float, size_px: tuple[int, int]) -> None:
+    width, height = size_px
+    length_mm = next((step for step in (20.0, 10.0, 5.0, 2.0, 1.0) if step < 0.3 * width_mm), 0.5)
+    start, y = 0.04 * width, 0.95 * height
+    axes.plot([start, start + length_mm / width_mm * width], [y, y], color=_INK, linewidth=1.6)
+    chip = {"facecolor": BACKGROUND, "edgecolor": "none", "alpha": 0.75, "pad": 1.0}
+    axes.text(start, y - 0.025 * height, f"{length_mm:g} mm", fontsize=7, color=_INK, va="bottom", bbox=chip)
+
+
+def _colour_bar(figure: "Figure", scene: Scene, name: str, inches: tuple[float, float]) -> None:
+    scale = scene.scale(name)
+    axes = figure.add_axes((0.30, 0.34 / inches[1], 0.40, 0.12 / inches[1]))
+    axes.imshow(scale.colours[None], aspect="auto", extent=(scale.low, scale.high, 0.0, 1.0))
+    axes.set_yticks([])
+    axes.tick_params(labelsize=7, colors=_QUIET, length=2, pad=2)
+    axes.set_title(f"{scale.title} [{scale.unit}]", fontsize=7.5, color=_INK, pad=3)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def _png(figure: "Figure") -> bytes:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    stream = io.BytesIO()
+    FigureCanvasAgg(figure).print_figure(stream, dpi=150, format="png", metadata={"Software": None})
+    return stream.getvalue()

@@ -1,0 +1,168 @@
+"""Pictures of the way to a device in place, as Zhong et al. 2016 show it.
+
+The sac shrunk, the spheres along the axis, the first contour, its expansion, the wires in the parent artery and in the
+patient's own.
+"""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from vstent.devices.design import BARE
+from vstent.devices.stent import Deployment, tube_faces
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy
+from vstent.kernels.arrays import Floats, Ints
+from vstent.reporting.figures import Picture, Shot, sheet
+from vstent.reporting.scene import LineLayer, MeshLayer, Scene, curves_layer, round_up
+from vstent.reporting.thinning import some_frames, thin_frames
+from vstent.units import counted
+
+if TYPE_CHECKING:
+    from vstent.study.types import CaseResult
+
+SPHERE_STEP: Final = 0.9
+"""Distance between spheres that are drawn, in their radii."""
+FRAMES: Final = 4
+"""Moments of an expansion."""
+RINGS: Final = 28
+"""Rows of the first contour that are drawn as lines."""
+_SPHERE: Final = (0.36, 0.55, 0.72)
+_STEEL: Final = (0.58, 0.63, 0.68)
+_INK: Final = (0.10, 0.17, 0.20)
+
+
+def method_pictures(case: "CaseResult", scene: Scene) -> list[Picture]:
+    """Return the pictures of a case's way from the patient's artery to the device in place, in that order."""
+    found = [_restoration(scene), _spheres(case.anatomy, scene)]
+    if case.deployments:
+        found.append(_first_contours(case, scene))
+        found += [_expansion(name, deployment, case.anatomy, scene) for name, deployment in case.deployments.items()]
+        found.append(_fitted(scene))
+    return found
+
+
+def _restoration(scene: Scene) -> Picture:
+    profile = scene.view("profile")
+    lumen, landing = scene.pick(("lumen",), BARE), scene.pick(("landing",), BARE)
+    cut = scene.pick(("lumen", "sac", "neck"), BARE)
+    shots = [
+        Shot("As it was found", _opaque(lumen), profile),
+        Shot("The sac and its neck", cut, profile),
+        Shot("The sac shrunk: the parent artery", landing, profile),
+    ]
+    caption = (
+        "The wall as it was found; the sac (red), cut off along its neck (red line); and what is left when the sac is "
+        "shrunk and the side branches are closed: the parent artery, against which a device opens."
+    )
+    return Picture("restoration", "From the patient's artery to the parent artery", caption, sheet(scene, shots, ""))
+
+
+def _spheres(anatomy: Anatomy, scene: Scene) -> Picture:
+    spheres = _bead_layer(anatomy)
+    shots = [
+        Shot("In profile", (*scene.pick(("lumen", "axis"), BARE), spheres), scene.view("profile")),
+        Shot("Frontal", (*scene.pick(("lumen", "axis"), BARE), spheres), scene.view("frontal")),
+    ]
+    caption = (
+        "The axis of the parent artery (blue line) and spheres on it as wide as the artery lets them be (maximum "
+        "inscribed spheres): they set the diameter with which the contour begins."
+    )
+    return Picture("spheres", "Centerline and maximum inscribed spheres", caption, sheet(scene, shots, ""))
+
+
+def _bead_layer(anatomy: Anatomy) -> MeshLayer:
+    axis = anatomy.axis
+    at_mm = [0.0]
+    while at_mm[-1] < axis.length_mm:
+        radius_mm = float(np.interp(at_mm[-1], axis.abscissa_mm, axis.inscribed_radius_mm))
+        at_mm.append(at_mm[-1] + SPHERE_STEP * radius_mm)
+    stations = np.array(at_mm[:-1])
+    centers, radii = axis.at(stations), np.interp(stations, axis.abscissa_mm, axis.inscribed_radius_mm)
+    points, faces = _unit_sphere()
+    n = len(points)
+    vertices = (centers[:, None] + radii[:, None, None] * points).reshape(-1, 3)
+    beads = Surface(vertices, np.concatenate([faces + k * n for k in range(len(centers))]))
+    return MeshLayer("spheres", "", _SPHERE, "", np.zeros(0), beads, 0.30)
+
+
+def _unit_sphere(rows: int = 17, columns: int = 32) -> tuple[Floats, Ints]:
+    polar, turn = np.meshgrid(
+        np.linspace(0.01, np.pi - 0.01, rows), np.linspace(0, 2 * np.pi, columns, endpoint=False), indexing="ij"
+    )
+    points = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=-1)
+    return points.reshape(-1, 3), tube_faces(rows, columns)[:, ::-1]
+
+
+def _first_contours(case: "CaseResult", scene: Scene) -> Picture:
+    shots = []
+    for name, title in scene.panes[1:]:
+        layers = (*scene.pick(("axis",), BARE), *_contour_layers(case.deployments[name].history_mm[0]))
+        shots.append(Shot(title, (*_glass(scene), *layers), scene.view("profile")))
+    caption = (
+        "The contour before the first iteration, in the parent artery (glass): rows of nodes on planes across the "
+        "axis, each as wide as the maximum inscribed sphere there. Every few rows are drawn as lines."
+    )
+    return Picture("first", "The first contour", caption, sheet(scene, shots, ""))
+
+
+def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
+    """A contour (rows, columns, 3) as a surface with some of its rows as lines."""
+    rows, columns = nodes_mm.shape[:2]
+    surface = Surface(nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
+    some = np.unique(np.linspace(0, rows - 1, min(rows, RINGS)).astype(int))
+    rings = [np.concatenate([nodes_mm[row], nodes_mm[row, :1]]) for row in some]
+    return MeshLayer("first", "", _STEEL, "", np.zeros(0), surface), curves_layer("rings", rings, 0.02, _INK)
+
+
+def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene) -> Picture:
+    frames_mm, gaps_mm = thin_frames(deployment, anatomy.landing_surface, FRAMES)
+    contour = next(layer for layer in scene.pick(("contour",), name) if isinstance(layer, MeshLayer))
+    reached = np.concatenate([[0.0], deployment.terminated_fraction])
+    shots = []
+    for number, nodes_mm, gap_mm in zip(some_frames(deployment, FRAMES), frames_mm, gaps_mm, strict=True):
+        surface = replace(contour.surface, vertices_mm=nodes_mm)
+        layer = replace(contour, surface=surface, values=gap_mm, frames_mm=None, frame_values=None)
+        words = (
+            f"after {counted(number, 'iteration')}, {100 * reached[number]:.0f} % of the nodes at rest"
+            if number
+            else "before the first"
+        )
+        shots.append(Shot(words[:1].upper() + words[1:], (*_glass(scene), layer), scene.view("profile")))
+    # The scale of the deployed device is too narrow for the way there.
+    gap = scene.scale("wall_gap")
+    wide = replace(gap, high=round_up(max(gap.high, float(np.percentile(gaps_mm[0], 98)))))
+    shown = replace(scene, scales=tuple(wide if scale is gap else scale for scale in scene.scales))
+    title = f"Expansion of {dict(scene.panes)[name]}"
+    caption = (
+        f"The active contour on its way to the wall of the parent artery (glass) in "
+        f"{counted(len(deployment.history_mm) - 1, 'iteration')}, coloured by the gap that is left."
+    )
+    return Picture(f"expansion-{name}", title, caption, sheet(shown, shots, "wall_gap"))
+
+
+def _fitted(scene: Scene) -> Picture:
+    profile = scene.view("profile")
+    shots = [
+        shot
+        for pane, title in scene.panes[1:]
+        for shot in (
+            Shot(f"{title}: in the parent artery", (*_glass(scene), *scene.pick(("wires",), pane)), profile),
+            Shot(f"{title}: in the patient's artery", scene.pick(("lumen", "wires", "neck"), pane), profile),
+        )
+    ]
+    caption = (
+        "The wires on the expanded contour, and put back into the patient's own artery with its sac (neck: red line)."
+    )
+    return Picture("fitted", "The devices fitted", caption, sheet(scene, shots, ""))
+
+
+def _glass(scene: Scene) -> tuple[MeshLayer | LineLayer, ...]:
+    """The parent artery, seen through."""
+    layers = (layer for layer in scene.pick(("landing",), BARE) if isinstance(layer, MeshLayer))
+    return tuple(replace(layer, opacity=0.18) for layer in layers)
+
+
+def _opaque(layers: tuple[MeshLayer | LineLayer, ...]) -> tuple[MeshLayer | LineLayer, ...]:
+    return tuple(replace(layer, opacity=1.0) if isinstance(layer, MeshLayer) else layer for layer in layers)

@@ -1,0 +1,300 @@
+"""The page itself: what goes where."""
+
+import base64
+import hashlib
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from markupsafe import Markup
+
+from vstent.devices.design import BARE
+from vstent.devices.stent import Deployment
+from vstent.flow.case import LATTICE, OPENFOAM
+from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
+from vstent.reporting.figures import Picture, pictures
+from vstent.reporting.method import method_pictures
+from vstent.reporting.packing import pack
+from vstent.reporting.quantities import (
+    Change,
+    Quantity,
+    base_of,
+    compare,
+    flatten,
+    format_change,
+    opening_rows,
+    unit_of,
+)
+from vstent.reporting.scene import Scene, device_title, scene_of
+from vstent.reporting.uncertainty import Varied, uncertainty_of
+
+if TYPE_CHECKING:
+    from vstent.study.types import CaseResult
+
+WEBP_QUALITY: Final = 90
+OF_CONTOUR: Final = (
+    "The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way: "
+    "how an artery and a device push each other is not computed."
+)
+OF_USE: Final = "Research use only. Nothing here has been cleared for diagnosis or treatment."
+AT_OUTLETS: Final = {
+    "zero_pressure": "the pressure at the outlets was set, not measured in a patient",
+    "murray": "the flow was split among the outlets by the cube of their radius, not measured in a patient",
+}
+"""Setting of the outlets -> what it leaves out."""
+AT_INLETS: Final = "What each of the inlets brings was set, not measured in a patient."
+OF_DEVICE: Final = {
+    LATTICE: "In the flow a device is a thin resistance computed from its wires.",
+    OPENFOAM: "In the flow a device is its struts over the neck and over branches, meshed.",
+}
+"""Engine -> what it makes of a device."""
+
+
+def report(case: "CaseResult") -> str:
+    """Return the report of a case as the text of one HTML file.
+
+    The file asks nothing of a network (its content security policy forbids it), carries no field of a patient's record,
+    and stays below 10 MB: surfaces are thinned and quantised.
+    """
+    return as_html(contents_of(case))
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """All that a report holds, however it is laid out."""
+
+    name: str
+    """Of the case."""
+    metrics: dict[str, Any]
+    """Every number."""
+    scene: Scene
+    """What there is to look at."""
+    pictures: tuple[Picture, ...]
+    """In the order of the report."""
+    changes: list[Change]
+    """Numbers before and after."""
+    stents: list[dict[str, Any]]
+    """Every device: title, words, advice, quantities, facts."""
+    openings: list[tuple[str, str, str, str]]
+    """Role, diameter, area and center of every end of the vessel."""
+    is_pulse: bool
+    """Whether the flow is one."""
+    notes: tuple[str, ...]
+    """What was found, guessed or repaired."""
+    limits: tuple[str, ...]
+    """What is left out."""
+    provenance: list[tuple[str, list[tuple[str, str]]]]
+    """Groups of lines: how this was made."""
+
+    @property
+    def devices(self) -> tuple[tuple[str, str], ...]:
+        """Name and title of every device."""
+        return self.scene.panes[1:]
+
+    @property
+    def headlines(self) -> list[Change]:
+        """The rows for the first screen: the known headlines, or the first eight where none was measured."""
+        chosen = [row for key in HEADLINES for row in self.changes if row.before.key == key]
+        return chosen or self.changes[:8]
+
+    @property
+    def vessel(self) -> list[Quantity]:
+        """The anatomy's numbers."""
+        return flatten(self.metrics.get("vessel", {}), ("vessel",))
+
+    @property
+    def uncertainty(self) -> list[Varied]:
+        """Intervals by device; empty where nothing was varied."""
+        return uncertainty_of(self.metrics, dict(self.devices))
+
+    @property
+    def definitions(self) -> list[tuple[Definition, str]]:
+        """What every number means, and its unit, by name; ratios and outlets under what they are of."""
+        keys = {base_of(q.key)[0] for q in flatten(self.metrics)}
+        found = [(DEFINITIONS[key], unit_of(key)) for key in keys if key in DEFINITIONS]
+        return sorted(found, key=lambda pair: pair[0].name.casefold())
+
+
+def contents_of(case: "CaseResult") -> Contents:
+    """Return what the report of a case holds; its pictures are painted here."""
+    scene, metrics = scene_of(case), case.metrics
+    before, *after = pictures(scene)
+    return Contents(
+        name=case.name,
+        metrics=metrics,
+        scene=scene,
+        pictures=(before, *method_pictures(case, scene), *after),
+        changes=compare(metrics),
+        stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
+        openings=opening_rows(case.anatomy.vessel.openings),
+        is_pulse=any(field.phases for field in case.fields.values()),
+        notes=tuple(case.notes),
+        limits=limits_of(case),
+        provenance=_provenance(case.provenance),
+    )
+
+
+def limits_of(case: "CaseResult") -> tuple[str, ...]:
+    """Return what a result leaves out, a sentence each: of a flow, where there is one, by its own settings."""
+    flow = case.provenance.get("settings", {}).get("flow")
+    if flow is None:
+        return OF_CONTOUR, OF_USE
+    of_inlets = [AT_INLETS] if len(case.anatomy.vessel.inlets) > 1 else []
+    return OF_CONTOUR, *_limits_of_flow(flow), *of_inlets, OF_USE
+
+
+def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
+    thins = flow["blood"]["thinning"] is not None
+    blood = "Blood thins with the shear rate by a law fitted to others' blood" if thins else "Blood is Newtonian"
+    told = [f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
+    return [*told, OF_DEVICE[flow["engine"]]] if flow["engine"] in OF_DEVICE else told
+
+
+def as_html(told: Contents) -> str:
+    """Lay a report out as one HTML file."""
+    from jinja2 import Environment, PackageLoader
+
+    manifest, scene_bytes = pack(told.scene, _pane_notes(told.headlines))
+    scripts = {"viewer": _script("viewer.js"), "start": _script("start.js")}
+    environment = Environment(loader=PackageLoader("vstent.reporting", "assets"), autoescape=True)
+    return environment.get_template("report.html.j2").render(
+        name=told.name,
+        sections=_sections(told),
+        script_hashes=Markup(" ".join(_hash(script) for script in scripts.values())),
+        style=Markup(asset("report.css") + asset("viewer.css")),
+        **{name: Markup(script) for name, script in scripts.items()},
+        devices=told.devices,
+        change=format_change,
+        summary=told.headlines,
+        pictures=[_picture(picture) for picture in told.pictures],
+        vessel=told.vessel,
+        openings=told.openings,
+        stents=told.stents,
+        flow=told.changes,
+        of_pulse=OF_PULSE,
+        is_pulse=told.is_pulse,
+        flow_only=_flow_only(told.metrics, told.changes, dict(told.devices)),
+        uncertainty=told.uncertainty,
+        other=_other(told.metrics),
+        notes=told.notes,
+        limits=told.limits,
+        definitions=told.definitions,
+        provenance=told.provenance,
+        manifest=manifest,
+        scene_bytes=scene_bytes,
+    )
+
+
+def asset(name: str) -> str:
+    """Return the text of a file that pages are made of."""
+    return files("vstent.reporting").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def _script(name: str) -> str:
+    return asset(name).replace("</script", "<\\/script")
+
+
+def _hash(script: str) -> str:
+    """Return the script's source expression for a content security policy: only this very text may run."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
+
+
+def _sections(told: Contents) -> list[tuple[str, str]]:
+    titles = {"summary": "Summary", "scene": "3-D view", "pictures": "Pictures", "anatomy": "Anatomy"}
+    if told.stents:
+        titles["devices"] = "Devices"
+    if told.metrics.get("bare"):
+        titles["flow"] = "Blood flow"
+    if told.uncertainty:
+        titles["uncertainty"] = "Uncertainty"
+    titles |= {"notes": "Notes and limits", "definitions": "Definitions", "provenance": "How this was made"}
+    return list(titles.items())
+
+
+def _picture(picture: Picture) -> dict[str, str]:
+    words = {"id": picture.id, "title": picture.title, "caption": picture.caption}
+    return {**words, "base64": base64.b64encode(_webp(picture.png)).decode("ascii")}
+
+
+def _webp(png: bytes) -> bytes:
+    """Write a picture as WebP: a fifth of the bytes, and no difference to the eye."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.open(io.BytesIO(png)).convert("RGB").save(stream, "WEBP", quality=WEBP_QUALITY, method=4)
+    return stream.getvalue()
+
+
+def _pane_notes(headlines: list[Change]) -> dict[str, str]:
+    """One line per pane: the first headline, and by how much it changed."""
+    for row in headlines[:1]:
+        notes = {BARE: f"{row.before.name} {row.before.text}"}
+        for name, after in row.after.items():
+            notes[name] = f"{after.name} {after.text} ({format_change(row.before.value, after.value)})"
+        return notes
+    return {}
+
+
+def _stent(name: str, deployment: Deployment, metrics: dict[str, Any]) -> dict[str, Any]:
+    stent = deployment.stent
+    measured = metrics.get("stents", {}).get(name, {})
+    values = flatten(measured.get("deployment", {}), ("stents", name, "deployment"))
+    diameters = ", ".join(f"{d:g}" for d in np.unique(stent.wire_diameter_um))
+    wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
+    how = "terminated" if deployment.outcome == "terminated" else "stopped at its limit"
+    count = len(deployment.terminated_fraction)
+    steps = f"{count} iteration{'s' if count > 1 else ''}"
+    return {
+        "title": device_title(deployment),
+        "words": f"{wires}. The contour {how} after {steps}, in {deployment.seconds:.2f} s.",
+        "advice": deployment.advice,
+        "quantities": values,
+        "facts": [(Quantity((f.name,), None).name, f"{f.confidence}: {f.source}") for f in stent.design.facts],
+    }
+
+
+def _flow_only(metrics: dict[str, Any], rows: list[Change], titles: dict[str, str]) -> list[tuple[str, list[Quantity]]]:
+    """Flow results without a partner on the other side, and ratios, by pane."""
+    paired = {row.before.path for row in rows}
+    found = [("Before", [q for q in flatten(metrics.get("bare", {}), ("bare", "")) if q.path[2:] not in paired])]
+    for name, stent in metrics.get("stents", {}).items():
+        values = [q for q in flatten(stent.get("flow", {}), ("flow", name)) if q.path[2:] not in paired]
+        found.append((f"{titles.get(name, name)}: ratios", flatten(stent.get("ratios", {}), ("ratios", name))))
+        found.append((titles.get(name, name), values))
+    return [(title, values) for title, values in found if values]
+
+
+def _other(metrics: dict[str, Any]) -> list[Quantity]:
+    """Whatever the metrics hold besides the parts that have a place of their own."""
+    top = {key: value for key, value in metrics.items() if key not in ("vessel", "bare", "stents")}
+    stents = {
+        name: {key: value for key, value in stent.items() if key not in ("deployment", "flow", "ratios", "uncertainty")}
+        for name, stent in metrics.get("stents", {}).items()
+    }
+    return flatten(top) + list(flatten(stents))
+
+
+def _provenance(provenance: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    parts = {key: value for key, value in provenance.items() if isinstance(value, (dict, list, tuple))}
+    single = {key: value for key, value in provenance.items() if key not in parts}
+    groups = [(key.replace("_", " ").capitalize(), _lines(value)) for key, value in parts.items()]
+    return ([("Run", _lines(single))] if single else []) + [group for group in groups if group[1]]
+
+
+def _lines(values: Any) -> list[tuple[str, str]]:
+    return [(" · ".join(q.path).replace("_", " "), _plain(q.value)) for q in flatten(values)]
+
+
+def _plain(value: Any) -> str:
+    """Write a setting as text; of a path only its last part, since folders can carry a patient's name."""
+    if isinstance(value, PurePath) or (isinstance(value, str) and value.startswith("/")):
+        return PurePath(value).name
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_plain(one) for one in value)
+    return "–" if value is None else str(value)

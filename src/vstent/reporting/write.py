@@ -1,0 +1,21 @@
+"""The reports of a case and of a cohort: one HTML file each with every number, no network; of a case a PDF too."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vstent.io.files import atomic
+from vstent.io.writers import write_text
+from vstent.reporting.page import as_html, contents_of
+from vstent.reporting.pdf import as_pdf
+
+if TYPE_CHECKING:
+    from vstent.study.types import CaseResult
+
+
+def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False) -> None:
+    """Write ``report.html`` into the case folder `out`, and ``report.pdf`` beside it where it is to be printed."""
+    told = contents_of(case)
+    write_text(out / "report.html", as_html(told))
+    if is_printed:
+        with atomic(out / "report.pdf") as partial:
+            partial.write_bytes(as_pdf(told))

@@ -1,0 +1,184 @@
+"""Study: one patient, from a file to the flow before and after, with its files, its provenance and its resume.
+
+The stages follow each other as in design.md section 1. Geometry is computed first and nothing is written until every
+device is deployed, so that a wrong input leaves nothing behind. From then on each finished stage lies in the folder
+under a key that names everything it depends on; running the same study again reads it back instead of computing it.
+"""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from vstent.deployment.measure import morphology
+from vstent.devices.design import find_design
+from vstent.flow.convergence import Sensitivity
+from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.io import writers
+from vstent.study.crate import NAME as CRATE
+from vstent.study.folder import CACHE, claiming
+from vstent.study.ledger import ANATOMY, Ledger, hash_of
+from vstent.study.outputs import (
+    take_away_measures,
+    take_away_results,
+    take_away_study,
+    write_anatomy,
+    write_stent,
+    write_vessel,
+)
+from vstent.study.provenance import INPUT, METRICS, RUN, provenance
+from vstent.study.repeat import SECONDS, former_source, is_of_another
+from vstent.study.stages import (
+    check_inflow,
+    compute_flows,
+    deploy_all,
+    engine_folders,
+    find_anatomy,
+    find_vessel,
+    measure_all,
+    refine,
+    vary_all,
+)
+from vstent.study.types import CaseResult, Progress, Settings
+
+
+@claiming
+def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseResult:
+    """Run one study and write its folder; a study already begun there goes on where it stopped.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : what is given; the rest is proposed.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    FlowError
+        A flow could not be computed; everything before it is kept.
+    FolderError
+        Another process works in the folder, or it cannot be written to.
+    """
+    designs = {name: find_design(name) for name in settings.devices}
+    ledger = Ledger(out / CACHE, progress)
+    source = hash_of(path)
+    anatomy = find_anatomy(path, source, settings, ledger)
+    check_inflow(anatomy, settings.flow)
+    deployments = deploy_all(designs, anatomy, settings, ledger)
+    told = provenance(path, source, settings)
+    has_former = is_of_another(out, told)
+    _settle(path, out, source, ledger)
+    if has_former:
+        take_away_study(out, engine_folders(out, settings).values())
+    (out / CRATE).unlink(missing_ok=True)  # it describes files that are written anew
+    write_anatomy(out, anatomy)
+    for name, deployment in deployments.items():
+        with ledger.stage(f"struts {name}") as tell:
+            tell(write_stent(out / "stents" / name, deployment))
+    fields = compute_flows(out, anatomy, deployments, settings, ledger, source)
+    varied = vary_all(anatomy, deployments, settings, ledger, source)
+    with ledger.stage("measure"):
+        metrics = measure_all(anatomy, deployments, fields)
+        for name, spread in varied.items():
+            metrics["stents"][name]["uncertainty"] = spread
+        writers.write_json(out / METRICS, metrics)
+    told[SECONDS] = ledger.seconds
+    writers.write_json(out / RUN, told, is_exact=True)
+    of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
+    notes = (*anatomy.vessel.notes, *anatomy.notes, *of_flows)
+    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, notes)
+
+
+@claiming
+def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> Vessel:
+    """Find the vessel, its openings and its centerlines, untrimmed; write them into the folder `out`.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the folder.
+    settings : what is given; the rest is proposed.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    """
+    ledger = Ledger(out / CACHE, progress)
+    source = hash_of(path)
+    vessel = find_vessel(path, source, settings, ledger)
+    _settle(path, out, source, ledger)
+    write_vessel(out, vessel)
+    return vessel
+
+
+@claiming
+def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Anatomy, dict[str, Any]]:
+    """Shrink the sac: find the parent artery and measure it; write it into the folder `out`.
+
+    A study begun in the same folder goes on from what is found here, and the other way round.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : what is given; the rest is proposed.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    """
+    ledger = Ledger(out / CACHE, progress)
+    source = hash_of(path)
+    anatomy = find_anatomy(path, source, settings, ledger)
+    measures = morphology(anatomy)
+    _settle(path, out, source, ledger)
+    write_anatomy(out, anatomy)
+    writers.write_json(out / "morphology.json", measures)
+    return anatomy, measures
+
+
+@claiming
+def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> Sensitivity:
+    """Compute the flow without a device on three grids, time steps and positions; write ``convergence.json``.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : what is given; the cell size, given or proposed, is the finest.
+    progress : told of every stage.
+
+    Raises
+    ------
+    InputError
+        Something given cannot be used; nothing has been written.
+    FlowError
+        A flow could not be computed.
+    """
+    ledger = Ledger(out / CACHE, progress)
+    source = hash_of(path)
+    anatomy = find_anatomy(path, source, settings, ledger)
+    check_inflow(anatomy, settings.flow)
+    _settle(path, out, source, ledger)
+    found = refine(out, anatomy, settings, ledger)
+    kept = {one.name: asdict(one) for one in found.refinements}
+    kept["grid_position"] = {key: asdict(one) for key, one in found.positions.items()}
+    writers.write_json(out / "convergence.json", kept)
+    return found
+
+
+def _settle(path: Path, out: Path, source: str, ledger: Ledger) -> None:
+    """Keep what is held: the folder is this input's from here on; results of another one, or its anatomy, go."""
+    former = former_source(out)
+    if former not in (source, None):
+        take_away_results(out)
+    elif former is not None and ledger.is_held(ANATOMY):
+        take_away_measures(out)
+    ledger.settle()
+    writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve()), "sha256": source})
