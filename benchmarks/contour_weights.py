@@ -14,13 +14,13 @@ from vstent.deployment.active_contour import ActiveContour
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
 from vstent.deployment.zhong2016 import Zhong2016
-from vstent.devices import design as device
+from vstent.devices import catalogue
 from vstent.devices.stent import Landing
 from vstent.errors import VstentError
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 from tubes import arc, tube
 
 STIFF = ("a1", "a2", "a3", "a4", "a5")
@@ -48,8 +48,8 @@ def lobed() -> Anatomy:
 def row(anatomy: Anatomy, weights: dict[str, float]) -> str:
     """Deploy with some weights; roughness is the worst ratio of neighbouring node distances round a row."""
     label = ", ".join(f"{name} {value:g}" for name, value in weights.items())
-    design = device.find_design("silk")
-    size = device.find_size(design, diameter_mm=4, length_mm=15)
+    design = catalogue.find_design("silk")
+    size = catalogue.find_size(design, diameter_mm=4, length_mm=15)
     try:
         done = deploy(design, anatomy, size=size, landing=Landing(15.0), method=Zhong2016(ActiveContour(**weights)))
     except VstentError as error:

@@ -23,13 +23,14 @@ from vstent.deployment.method import Placement, run
 from vstent.deployment.sketch import bed, sketch
 from vstent.deployment.struts import struts
 from vstent.deployment.wall import AbstractWall, Contact, landing_wall
+from vstent.devices import catalogue
 from vstent.devices import design as device
 from vstent.devices.stent import Landing, Stent
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.kernels.arrays import Bools, Floats
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 from brute import BruteWall
 from test_deploy_rods import compared
 from tubes import arc, line, tube
@@ -105,7 +106,7 @@ def end_gap_mm(done: Any) -> float:
 
 def row(name: str, anatomy: Anatomy, key: str, method: str, size: device.Size | None) -> str:
     """One line of the table."""
-    done, seconds = timed(lambda: deploy(device.find_design(key), anatomy, size=size, method=method), 1)
+    done, seconds = timed(lambda: deploy(catalogue.find_design(key), anatomy, size=size, method=method), 1)
     found = measure(anatomy, done)
     iterations = len(done.terminated_fraction)
     return (
@@ -125,7 +126,7 @@ def real(name: str) -> Anatomy:
 
 def both_methods(name: str, anatomy: Anatomy, size: device.Size | None) -> str:
     """The two methods side by side."""
-    design = device.find_design("silk")
+    design = catalogue.find_design("silk")
     paper, ours = (deploy(design, anatomy, size=size, method=method) for method in ("zhong2016", "constant_wire"))
     first, last = paper.stent.row_abscissa_mm[[2, -3]]
     shared = (ours.stent.row_abscissa_mm > first) & (ours.stent.row_abscissa_mm < last)
@@ -140,8 +141,8 @@ def both_methods(name: str, anatomy: Anatomy, size: device.Size | None) -> str:
 
 def speed(anatomy: Anatomy) -> list[str]:
     """Times of Silk 4.0 x 20 from anatomy to struts, and of single questions to the wall."""
-    design = device.find_design("silk")
-    size = device.find_size(design, diameter_mm=4, length_mm=20)
+    design = catalogue.find_design("silk")
+    size = catalogue.find_size(design, diameter_mm=4, length_mm=20)
     landing = propose_landing(design, anatomy, size)
     method = ConstantWire().beside(1e-3 * design.wall_offset_um)
 
@@ -193,12 +194,12 @@ def beside_rods() -> list[str]:
 
 
 def main(names: list[str]) -> None:
-    silk = device.find_size(device.find_design("silk"), diameter_mm=4, length_mm=20)
+    silk = catalogue.find_size(catalogue.find_design("silk"), diameter_mm=4, length_mm=20)
     anatomies = {name: real(name) for name in names if (DATA / CASES[name]).exists()}
     print(HEADER)
     for name, anatomy in (ARTERIES | anatomies).items():
         for key, (diameter_mm, length_mm) in SIZES.items():
-            size = device.find_size(device.find_design(key), diameter_mm=diameter_mm, length_mm=length_mm)
+            size = catalogue.find_size(catalogue.find_design(key), diameter_mm=diameter_mm, length_mm=length_mm)
             for method in METHODS:
                 print(row(name, anatomy, key, method, size if name in ARTERIES else None))
     print("\nboth methods, Silk: zhong2016 | constant_wire")

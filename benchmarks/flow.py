@@ -27,7 +27,7 @@ from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.engines import Progress
 from vstent.flow.indices import indices
 from vstent.flow.lattice.engine import LatticeBoltzmann
-from vstent.flow.lattice.state import advance
+from vstent.flow.lattice.stepping import advance
 from vstent.flow.simulation import flow_case, simulate, simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.vessel import Anatomy, Vessel

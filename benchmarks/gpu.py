@@ -17,7 +17,8 @@ from vstent.errors import FlowError
 from vstent.flow.case import FlowCase, FlowSettings
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.gpu import gpu_name, require_gpu
-from vstent.flow.lattice.state import State, advance
+from vstent.flow.lattice.state import State
+from vstent.flow.lattice.stepping import advance
 from vstent.geometry.vessel import Vessel
 
 STEPS, ROUNDS = 200, 5
@@ -72,9 +73,9 @@ def difference(case: FlowCase, cell_mm: float) -> float:
 
 
 def _moments(state: State) -> np.ndarray:
-    from vstent.flow.lattice.kernels import d3q19 as lattice
+    from vstent.flow.lattice.kernels import d3q19
 
-    return lattice.moments(state.populations, state.addressing.stride, state.addressing.place)
+    return d3q19.moments(state.populations, state.addressing.stride, state.addressing.place)
 
 
 def main(cells_mm: list[float]) -> int:

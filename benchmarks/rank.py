@@ -12,7 +12,7 @@ from vstent.anatomy.repair import repair
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.devices.design import find_design
+from vstent.devices.catalogue import find_design
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.plan.rank import rank

@@ -10,7 +10,7 @@ part of the device that OpenFOAM meshes (`vstent.deployment.struts.over_restored
 what lies on the artery's wall, is kept besides. The two engines differ in the bare vessel already: what a device
 leaves of each engine's own bare value stands beside. `alignment` is the correlation of the two velocity fields in the
 sac, 1 where they are alike but for their size. A row is kept for every device in every vessel; other rows stay as they
-are. With --cases, OpenFOAM's cases stay in that folder, by vessel and device, and one that is there already is gone on with.
+are. With --cases, OpenFOAM's cases stay in that folder, by vessel and device, and one that is there already resumes.
 """
 
 import argparse

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 
 from vstent import phantoms
+from vstent.anatomy.morphology import morphology
 from vstent.anatomy.repair import repair
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.segment import segment
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.deployment.measure import morphology
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 from vstent.io.surfaces import read_surface
 from vstent.phantoms import Scanner
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
 from sac_truth import (
     GLUED,
     anatomy_of,

@@ -42,7 +42,8 @@ def table(titles: list[str], rows: list[list[str]], widths: str = "auto") -> str
 
 def devices() -> str:
     """Return one section a device, every number with its source and confidence, and a count of these."""
-    from vstent.devices.design import Braid, catalogue
+    from vstent.devices.catalogue import catalogue
+    from vstent.devices.design import Braid
 
     designs = catalogue()
     sure = Counter(fact.confidence for design in designs.values() for fact in design.facts)

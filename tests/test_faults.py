@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
-
 from faults import DONE, FAULTS, Fault, artery, play
+
 from vstent.io.writers import write_stl
 from vstent.study.pipeline import run
 from vstent.study.types import Settings

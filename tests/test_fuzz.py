@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faults import image_file, scan, surface_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from faults import image_file, scan, surface_file
-from vstent.devices.design import Braid, LaserCut, deployed_length_mm, grid
+from vstent.devices.design import Braid, LaserCut
+from vstent.devices.formulas import deployed_length_mm, grid
 from vstent.devices.schema import parse
 from vstent.errors import VstentError
 from vstent.flow.waveform import Waveform, waveform_of

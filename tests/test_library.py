@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faults import artery
 
 import vstent
-from faults import artery
 from vstent import plugins
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.braid import ConstantWire
 from vstent.deployment.deploy import deploy
-from vstent.devices import design as device
+from vstent.devices import catalogue
 from vstent.devices.stent import Deployment, Landing
 from vstent.errors import DeviceError, PluginError
 from vstent.flow.case import FlowSettings
@@ -151,17 +151,17 @@ def distribution(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "tiny_plugin", raising=False)
-    device.catalogue.cache_clear()
+    catalogue.catalogue.cache_clear()
     yield tmp_path
     monkeypatch.undo()
-    device.catalogue.cache_clear()
+    catalogue.catalogue.cache_clear()
 
 
 @pytest.mark.usefixtures("distribution")
 def test_a_device_is_plugged_in() -> None:
     plugged = vstent.find_design("plugged")
     assert (plugged.maker, plugged.n_wires, plugged.facts[0].confidence) == ("a test", 48, "estimated")
-    assert set(device.catalogue()) > {"silk", "enterprise"}
+    assert set(catalogue.catalogue()) > {"silk", "enterprise"}
 
 
 def test_a_device_that_is_plugged_in_twice_is_refused(distribution: Path) -> None:

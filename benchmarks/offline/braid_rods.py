@@ -1,9 +1,9 @@
 """An independent model of a braid in an artery: elastic Cosserat rods, pushed apart by their own springiness alone.
 
 Run from the repository, offline, some minutes a case: ``pip install pyelastica``, then
-``python benchmarks/offline/braid_rods.py``. What comes out is kept in ``tests/data/braid_rods.json`` and compared with
-`vstent.deploy` by ``tests/test_deploy_rods.py``. Rods are those of PyElastica (Gazzola et al. 2018, R. Soc. Open Sci.
-5:171628; MIT licence); nothing of vstent's deployment is used.
+``python benchmarks/offline/braid_rods.py``. The result is kept in ``tests/helpers/data/braid_rods.json`` and compared
+with `vstent.deploy` by ``tests/deployment/test_braid_rods.py``. The rods are those of PyElastica (Gazzola et al. 2018,
+R. Soc. Open Sci. 5:171628; MIT licence); nothing of vstent's deployment is used.
 
 The model. Every wire is a rod that bends, twists, stretches and shears, made (heat-set) as a helix of the free
 diameter; it weighs what makes the relaxation quick, for only its rest is asked for. The wall is stiff, smooth and one
@@ -42,7 +42,7 @@ STEPS = 1000
 LOOKS, BENDING_LOOKS = 120, 25
 AT_REST_MM = 3e-4
 """The braid is at rest when no node moves further than this from one look to the next."""
-OUT = Path(__file__).parents[2] / "tests" / "data" / "braid_rods.json"
+OUT = Path(__file__).parents[2] / "tests" / "helpers" / "data" / "braid_rods.json"
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ follows the closed formula :math:`L(D)/L_0 = \\cos\\alpha(D)/\\cos\\alpha_0`.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from vstent.devices.design import catalogue, deployed_length_mm, find_size
+from vstent.devices.catalogue import catalogue, find_size
+from vstent.devices.formulas import deployed_length_mm
 
 widths_mm = np.linspace(2.6, 4.0, 40)
 figure, axes = plt.subplots(figsize=(6, 4))

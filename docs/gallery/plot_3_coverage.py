@@ -9,7 +9,8 @@ How much of the wall a device covers depends on the diameter that it opens to. T
 import matplotlib.pyplot as plt
 import numpy as np
 
-from vstent.devices.design import catalogue, coverage_fraction, find_size, pore_density_per_mm2
+from vstent.devices.catalogue import catalogue, find_size
+from vstent.devices.formulas import coverage_fraction, pore_density_per_mm2
 
 widths_mm = np.linspace(2.6, 4.0, 40)
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4))

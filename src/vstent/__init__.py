@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vstent.anatomy.morphology import morphology as morphology
     from vstent.anatomy.repair import repair as repair
     from vstent.anatomy.restore.restore import restore as restore
     from vstent.anatomy.segment import segment as segment
@@ -14,10 +15,9 @@ if TYPE_CHECKING:
     from vstent.anatomy.trim import trim as trim
     from vstent.deployment.deploy import deploy as deploy
     from vstent.deployment.measure import measure as measure
-    from vstent.deployment.measure import morphology as morphology
     from vstent.deployment.struts import struts as struts
-    from vstent.devices.design import catalogue as catalogue
-    from vstent.devices.design import find_design as find_design
+    from vstent.devices.catalogue import catalogue as catalogue
+    from vstent.devices.catalogue import find_design as find_design
     from vstent.flow.simulation import simulate as simulate
     from vstent.io.images import read_image as read_image
     from vstent.io.surfaces import read_surface as read_surface
@@ -33,9 +33,9 @@ _HOMES = {
     "trace": "vstent.anatomy.trace",
     "trim": "vstent.anatomy.trim",
     "restore": "vstent.anatomy.restore.restore",
-    "morphology": "vstent.deployment.measure",
-    "catalogue": "vstent.devices.design",
-    "find_design": "vstent.devices.design",
+    "morphology": "vstent.anatomy.morphology",
+    "catalogue": "vstent.devices.catalogue",
+    "find_design": "vstent.devices.catalogue",
     "deploy": "vstent.deployment.deploy",
     "struts": "vstent.deployment.struts",
     "measure": "vstent.deployment.measure",

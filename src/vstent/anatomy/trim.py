@@ -16,8 +16,9 @@ from vstent.anatomy.restore.bulges import Bulge, find_bulges
 from vstent.anatomy.restore.tubes import tubes_of
 from vstent.anatomy.trace import parent_radius_mm, trace
 from vstent.errors import InputError
+from vstent.geometry.murray import murray_shares
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Centerline, Vessel, murray_shares
+from vstent.geometry.vessel import Centerline, Vessel
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 from vstent.units import place

@@ -262,7 +262,7 @@ def end_upload(case: Case, partial: Path, name: str) -> None:
 
 def devices() -> list[dict[str, Any]]:
     """Return the catalogue, as the page lists it."""
-    from vstent.devices.design import catalogue
+    from vstent.devices.catalogue import catalogue
 
     return [
         {

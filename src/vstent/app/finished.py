@@ -64,7 +64,8 @@ def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
 
 def _paths(folder: Path, source: str, settings: "Settings") -> dict[str, Path]:
     """Where a study keeps its flows."""
-    from vstent.devices.design import BARE, find_design
+    from vstent.devices.catalogue import find_design
+    from vstent.devices.design import BARE
     from vstent.study.folder import CACHE
     from vstent.study.stages import flow_key
 

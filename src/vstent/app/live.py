@@ -9,6 +9,7 @@ from typing import Any, Final, Literal, TypeVar
 import numpy as np
 from scipy.spatial import cKDTree
 
+from vstent.anatomy.morphology import morphology
 from vstent.app import necks, sheets
 from vstent.app.cases import Case
 from vstent.app.choices import DeviceChoice, placing_of
@@ -16,10 +17,12 @@ from vstent.app.cuts import cut
 from vstent.app.finished import kept_flows
 from vstent.deployment.contour import planes
 from vstent.deployment.deploy import propose_landing
-from vstent.deployment.measure import measure, morphology
+from vstent.deployment.measure import measure
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import Bed, Sketch, bed, sketch
-from vstent.devices.design import BARE, coverage_fraction, find_design
+from vstent.devices.catalogue import find_design
+from vstent.devices.design import BARE
+from vstent.devices.formulas import coverage_fraction
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import ReadError
 from vstent.flow.case import FlowField

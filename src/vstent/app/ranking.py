@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from vstent.app.cases import Case
 from vstent.app.jobs import RANKING
-from vstent.devices.design import find_design
+from vstent.devices.catalogue import find_design
 from vstent.io.writers import write_json
 from vstent.plan.rank import rank
 from vstent.study.folder import CACHE

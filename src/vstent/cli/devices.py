@@ -19,7 +19,7 @@ def add(commands: options.Commands) -> None:
 
 def _devices(arguments: argparse.Namespace) -> int:
     from vstent.cli.console import Console, device_table
-    from vstent.devices.design import catalogue
+    from vstent.devices.catalogue import catalogue
 
     Console().print(device_table(catalogue()))
     return 0
@@ -27,7 +27,7 @@ def _devices(arguments: argparse.Namespace) -> int:
 
 def _add(arguments: argparse.Namespace) -> int:
     from vstent.cli.console import Console, device_table
-    from vstent.devices.design import add_devices
+    from vstent.devices.catalogue import add_devices
 
     Console().print(device_table(add_devices(arguments.file)))
     return 0

@@ -30,7 +30,7 @@ def add(commands: options.Commands) -> None:
 
 def _rank(arguments: argparse.Namespace) -> int:
     from vstent.cli.console import Console, ranking_reasons, ranking_table
-    from vstent.devices.design import find_design
+    from vstent.devices.catalogue import find_design
     from vstent.plan.criteria import default_criteria, read_criteria
     from vstent.plan.rank import rank
     from vstent.study.outputs import write_ranking

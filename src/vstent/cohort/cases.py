@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from vstent.devices.design import find_design
+from vstent.devices.catalogue import find_design
 from vstent.errors import InputError, ReadError
 from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
 from vstent.io.tables import finite

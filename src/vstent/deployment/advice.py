@@ -6,13 +6,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from vstent.anatomy.landing_zones import neck_points_mm, neck_span_mm
 from vstent.deployment.method import Course
 from vstent.deployment.sizing import (
     APPOSED_GAP_MM,
     LOOSE_FRACTION,
     OVERSIZED_FRACTION,
-    neck_points_mm,
-    neck_span_mm,
     oversizing_fraction,
     reach_mm,
     wanted_margin_mm,

@@ -10,7 +10,8 @@ from vstent.deployment import pieces
 from vstent.deployment.active_contour import State
 from vstent.deployment.contour import evenly_spaced, perimeters, planes
 from vstent.deployment.method import AbstractMethod, Opened, Placement, check_inside
-from vstent.devices.design import Design, LaserCut, Size, grid, row_spacing_mm
+from vstent.devices.design import Design, LaserCut, Size
+from vstent.devices.formulas import grid, row_spacing_mm
 from vstent.devices.stent import Landing, row_diameters_mm
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints

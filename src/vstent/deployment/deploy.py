@@ -11,7 +11,8 @@ from vstent.deployment.braid import ConstantWire
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, laid_inside, run
 from vstent.deployment.wall import landing_wall
 from vstent.deployment.zhong2016 import Zhong2016
-from vstent.devices.design import Design, Size, compacted
+from vstent.devices.design import Design, Size
+from vstent.devices.formulas import compacted
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import InputError
 from vstent.geometry.vessel import Anatomy
@@ -40,7 +41,7 @@ def deploy(
 
     Parameters
     ----------
-    design : the device; see `vstent.devices.design.catalogue`.
+    design : the device; see `vstent.devices.catalogue.catalogue`.
     anatomy : the artery, restored.
     size : the size; None proposes one.
     landing : where its center, proximal or distal end is to lie; None centers it on the neck of the largest aneurysm,

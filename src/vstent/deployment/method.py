@@ -11,7 +11,8 @@ import numpy as np
 from vstent.deployment.active_contour import ActiveContour, State
 from vstent.deployment.contour import Planes, circles, planes
 from vstent.deployment.wall import TREE, AbstractWall
-from vstent.devices.design import Design, Size, grid
+from vstent.devices.design import Design, Size
+from vstent.devices.formulas import grid
 from vstent.devices.stent import Landing
 from vstent.errors import InputError, LandingError
 from vstent.geometry.vessel import Anatomy

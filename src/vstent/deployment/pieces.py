@@ -15,7 +15,8 @@ import numpy as np
 
 from vstent.deployment import cells
 from vstent.deployment.contour import normals
-from vstent.devices.design import Design, Grid, LaserCut, Size, grid, piece_length_mm
+from vstent.devices.design import Design, LaserCut, Size, piece_length_mm
+from vstent.devices.formulas import Grid, grid
 from vstent.kernels import net
 from vstent.kernels.arrays import Floats, Ints
 

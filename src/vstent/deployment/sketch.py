@@ -17,7 +17,8 @@ from vstent.deployment.contour import Planes, circles, evenly_spaced, perimeters
 from vstent.deployment.method import check_inside, check_landing
 from vstent.deployment.wall import AbstractWall, Contact
 from vstent.deployment.wires import Wires, draw
-from vstent.devices.design import Design, Size, grid
+from vstent.devices.design import Design, Size
+from vstent.devices.formulas import grid
 from vstent.devices.stent import Landing, Stent
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves

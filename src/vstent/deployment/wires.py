@@ -9,7 +9,8 @@ from scipy.sparse import csr_matrix
 
 from vstent.deployment.contour import normals
 from vstent.deployment.wall import AbstractWall
-from vstent.devices.design import Braid, Design, Grid, LaserCut, Size, grid, piece_length_mm
+from vstent.devices.design import Braid, Design, LaserCut, Size, piece_length_mm
+from vstent.devices.formulas import Grid, grid
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import MM_PER_UM

@@ -6,7 +6,7 @@ from typing import final
 import numpy as np
 
 from vstent.deployment.method import AbstractMethod, Opened, Placement
-from vstent.devices.design import grid
+from vstent.devices.formulas import grid
 from vstent.devices.stent import Landing
 from vstent.kernels.arrays import Floats
 

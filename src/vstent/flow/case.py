@@ -7,8 +7,9 @@ from typing import Final, Literal
 import numpy as np
 
 from vstent.devices.stent import Stent
+from vstent.geometry.murray import murray_shares
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Vessel, murray_shares
+from vstent.geometry.vessel import Vessel
 from vstent.kernels import voxels
 from vstent.kernels.arrays import Floats, Ints, freeze
 

@@ -10,11 +10,11 @@ from scipy import ndimage
 from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.case import Blood, FlowCase
-from vstent.flow.lattice.kernels.d3q19 import VELOCITIES
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Opening, Vessel
 from vstent.kernels import triangles, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
+from vstent.kernels.directions import VELOCITIES
 from vstent.units import M_PER_MM, place
 
 INLET_EXTENSION = 0.5

@@ -23,7 +23,7 @@ BREADTH = 0.4
 """How broad a band every wire is spread over, in spacings."""
 BLUNTED = 0.8
 """How much of what an even band slows blood by one does that drags least where blood is slowest: so rows of wires 0.03
-to 0.09 mm thick, 4 to 16 cells apart, hold slow blood up within 2 % of their law (`tests/test_screen_sheet.py`)."""
+to 0.09 mm thick, 4 to 16 cells apart, hold slow blood up within 2 % of their law (`test_screen_sheet.py`)."""
 GRID_MM = 0.15
 """Grid cells by which it is judged whether wires are told apart: between the usual ones and those of a close-up."""
 
@@ -44,7 +44,7 @@ def round_diameter(width: float, thickness: float) -> float:
     It is twice the radius r of the circle that the plane outside the section is mapped on, all that slow blood knows of
     it from afar: width = 4 r (E(m) - (1 - m) K(m)), thickness = the same of 1 - m, K and E being the complete elliptic
     integrals. A square strut drags as a wire 1.18 times as wide: resolved rows of either hold blood up alike within 1 %
-    (`tests/test_crossing_cell.py`).
+    (`tests/flow/lattice/test_crossing_cell.py`).
     """
 
     def side(m: float) -> float:

@@ -5,7 +5,7 @@ import numpy as np
 from vstent.flow.case import Blood
 from vstent.flow.domain import Domain
 from vstent.geometry.surface import Surface
-from vstent.kernels import sampling as lattice_sampling
+from vstent.kernels import sampling
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
@@ -19,7 +19,7 @@ def wall_stress(
     """Wall shear stress (v, 3) in Pa and pressure (v,) in Pa at the vertices of the lumen.
 
     The stress is the traction along the wall, mu du/dn, from a least-squares fit that is exact for Poiseuille flow (see
-    `lattice_sampling.fit_wall`); it points the way the blood drags the wall.
+    `sampling.fit_wall`); it points the way the blood drags the wall.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def _shear(domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, lumen: Sur
 
 def _fit(domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, lumen: Surface) -> tuple[Floats, Floats]:
     """Gradient (v, 3) of the velocity away from the wall, 1/s, and pressure (v,) at the vertices of the lumen."""
-    fit = lattice_sampling.fit_wall(
+    fit = sampling.fit_wall(
         domain.index,
         domain.depth_mm / domain.cell_size_mm,
         velocity_m_s,

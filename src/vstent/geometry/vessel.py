@@ -1,6 +1,5 @@
 """The artery's nouns: Opening, Centerline, Vessel, Aneurysm, Anatomy."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -50,12 +49,6 @@ def roles(n_inlets: int, n_outlets: int) -> list[str]:
     """Roles of so many openings in a vessel's order."""
     inlets = ["inlet", *(f"inlet_{k}" for k in range(2, n_inlets + 1))]
     return [*inlets, *(f"outlet_{k}" for k in range(1, n_outlets + 1))]
-
-
-def murray_shares(openings: Sequence[Opening]) -> Floats:
-    """Return the parts (k,) of a flow that openings take: as diameter cubed (Murray 1926, PNAS 12, 207)."""
-    cubes = np.array([opening.diameter_mm**3 for opening in openings])
-    return np.asarray(cubes / cubes.sum())
 
 
 @dataclass(frozen=True, eq=False)

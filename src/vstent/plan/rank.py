@@ -6,9 +6,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from vstent.anatomy.landing_zones import landing_diameters_mm
+from vstent.anatomy.morphology import Measures
 from vstent.deployment.deploy import deploy, propose_landing
-from vstent.deployment.measure import Measures, measure
-from vstent.deployment.sizing import landing_diameters_mm
+from vstent.deployment.measure import measure
 from vstent.devices.design import Design, Size
 from vstent.devices.stent import Landing
 from vstent.errors import InputError, LandingError

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vstent.deployment.measure import coverage_fractions
+from vstent.deployment.coverage import coverage_fractions
 from vstent.devices.design import BARE
 from vstent.devices.stent import Deployment, Stent
 from vstent.flow.case import FlowField

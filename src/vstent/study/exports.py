@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from vstent.devices.design import find_design
+from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Stent
 from vstent.errors import FlowError, InputError, ReadError
 from vstent.flow.case import FlowCase, FlowSettings

@@ -9,8 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from vstent.deployment.measure import morphology
-from vstent.devices.design import find_design
+from vstent.anatomy.morphology import morphology
+from vstent.devices.catalogue import find_design
 from vstent.flow.convergence import Sensitivity
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers

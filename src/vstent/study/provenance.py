@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from vstent.devices.design import find_design
+from vstent.devices.catalogue import find_design
 from vstent.flow.lattice.gpu import gpu_name
 from vstent.study.ledger import key_of
 from vstent.study.types import Settings

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from vstent.anatomy.morphology import morphology
 from vstent.anatomy.openings import opening_at
 from vstent.anatomy.repair import repair
 from vstent.anatomy.restore.restore import restore
@@ -16,9 +17,10 @@ from vstent.anatomy.segment import segment
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.deploy import deploy, propose_size
-from vstent.deployment.measure import measure, morphology
+from vstent.deployment.measure import measure
 from vstent.deployment.struts import over_restored
-from vstent.devices.design import BARE, Design, Size, find_sizes
+from vstent.devices.catalogue import find_sizes
+from vstent.devices.design import BARE, Design, Size
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import InputError
 from vstent.flow.case import FlowCase, FlowField, FlowSettings

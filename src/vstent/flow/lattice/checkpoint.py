@@ -10,7 +10,8 @@ from vstent.flow.case import FlowCase
 from vstent.flow.engines import Saved
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.scales import Scales
-from vstent.flow.lattice.state import Snapshot, State, build, take_pace
+from vstent.flow.lattice.state import Snapshot, State
+from vstent.flow.lattice.stepping import build, take_pace
 
 
 def pack(state: State) -> Saved:

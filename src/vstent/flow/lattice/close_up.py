@@ -23,10 +23,10 @@ from vstent.flow import domain as domains
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField, Phase, Swing
 from vstent.flow.domain import BEYOND, Domain, Window
-from vstent.flow.lattice.kernels.d3q19 import VELOCITIES
 from vstent.geometry.surface import Surface
 from vstent.kernels import sampling as lattice_sampling
 from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.directions import VELOCITIES
 
 WIDTH = 2
 """Cells elsewhere over those of the close-up."""

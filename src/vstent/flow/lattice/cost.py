@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from time import perf_counter
 
 import numba
@@ -14,10 +13,10 @@ from vstent.flow.case import PHASES, FlowCase
 from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
 from vstent.flow.lattice import close_up
 from vstent.flow.lattice.gpu import free_gpu_bytes
-from vstent.flow.lattice.kernels import d3q19 as lattice
-from vstent.flow.lattice.kernels import lanes
+from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.warm import keep_flow
 from vstent.flow.lattice.pace import pace
+from vstent.flow.memory import free_memory_bytes
 
 BYTES_PER_CELL = 750
 """Peak memory per blood cell (measured on 0.3 to 0.8 million cells: 300 to build and step; 280 for the last checks and
@@ -39,7 +38,7 @@ WHOLE_OVER_BLOCK = 3.5
 guess, and memory (the demo in cells of 0.14 mm, with Silk: 123 million updates a second, the block 440; 3.4 for C0038
 in 0.2 mm, 4.8 for a small bifurcation)."""
 BLOCK_ROWS = 4095
-"""Rows of the block that the rate is measured on, an odd number (see `lattice_setup.OFF_PAGE`)."""
+"""Rows of the block that the rate is measured on, an odd number (see `setup.address`)."""
 BLOCK_BAND = 15
 """Rows of each of its bands."""
 MARGIN = 1.05
@@ -165,7 +164,7 @@ def _measured_rate(on_gpu: bool) -> float:
     stride = int(length.sum())
     address = (64 * np.arange(BLOCK_ROWS)[:, None] + stride * np.arange(19)).astype(np.int32)
     f = np.zeros(19 * stride + lanes.COUNT, np.float32)
-    nothing = lattice.no_screen(BLOCK_ROWS)
+    nothing = d3q19.no_screen(BLOCK_ROWS)
     limit = np.full(BLOCK_ROWS, np.inf, np.float32)
     relaxation = np.float32(0.6), np.zeros(4, np.float32), limit, np.float32(0.7)
     if on_gpu:
@@ -174,34 +173,10 @@ def _measured_rate(on_gpu: bool) -> float:
         return stride / seconds_of_update(f, address, length, relaxation, nothing)
     rows = np.arange(0, BLOCK_ROWS + 1, BLOCK_BAND, dtype=np.int32)
     bands = np.column_stack([rows, np.zeros((len(rows), 4), np.int32)])
-    shares = lattice.share(length, nothing[0], bands, numba.get_num_threads())
+    shares = d3q19.share(length, nothing[0], bands, numba.get_num_threads())
     times: list[float] = []
     for _ in range(4):
         began = perf_counter()
-        lattice.update(f, (address[None], length, relaxation, nothing), lattice.NO_LINKS, bands, shares)
+        d3q19.update(f, (address[None], length, relaxation, nothing), d3q19.NO_LINKS, bands, shares)
         times.append(perf_counter() - began)
     return stride / min(times)
-
-
-def free_memory_bytes() -> float:
-    """Memory that can be had: the machine's, or the container's where that is less; infinite where neither says."""
-    return min(_available_bytes(), _container_bytes())
-
-
-def _available_bytes() -> float:
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        return float("inf")
-
-
-def _container_bytes() -> float:
-    """What a Linux control group leaves; file pages that it can drop count as free."""
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit, used = (float((group / name).read_text()) for name in ("memory.max", "memory.current"))
-        of_files = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        return limit - used + float(of_files.get("inactive_file", 0))
-    except (OSError, ValueError):
-        return float("inf")

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vstent.flow.lattice.kernels import d3q19 as lattice
-from vstent.flow.lattice.kernels import lanes
-from vstent.flow.lattice.setup import linear_weights, quadratic_weights
+from vstent.flow.lattice.kernels import d3q19, lanes
+from vstent.flow.lattice.walls import linear_weights, quadratic_weights
+from vstent.kernels import directions
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 RELAXATION_STEPS = 1.0
@@ -183,17 +183,17 @@ class _Grid:
         follows &= (cells[1:, 2] != 1) & (cells[1:, 2] != last)
         first = np.flatnonzero(np.r_[True, ~follows])
         self._length = np.diff(np.r_[first, len(cells)]).astype(np.int32)
-        if self._length.max() > lattice.SEGMENT:
-            raise ValueError(f"a cell may be {lattice.SEGMENT} high at most")
+        if self._length.max() > d3q19.SEGMENT:
+            raise ValueError(f"a cell may be {d3q19.SEGMENT} high at most")
         start = cells[first]
-        behind = [self._number(start - c) for c in lattice.VELOCITIES]
-        self._populations = lattice.addresses(self._place[first], behind, self._stride)
+        behind = [self._number(start - c) for c in directions.VELOCITIES]
+        self._populations = d3q19.addresses(self._place[first], behind, self._stride)
 
     def _link(self, wires: Wires, cells: Ints) -> None:
         blood = self._is_blood.ravel()
-        ahead = np.stack([blood[self._number(cells + c)] for c in lattice.VELOCITIES], axis=1)
+        ahead = np.stack([blood[self._number(cells + c)] for c in directions.VELOCITIES], axis=1)
         cell, q = np.nonzero(~ahead)
-        here, c = cells[cell], lattice.VELOCITIES[q]
+        here, c = cells[cell], directions.VELOCITIES[q]
         fraction = _fractions(wires, here, c)
         has_one = blood[self._number(here - c)]
         has_two = has_one & blood[self._number(here - 2 * c)]
@@ -203,10 +203,10 @@ class _Grid:
         correction[~has_two] = 0.0
         at, after, before = (self._number(here + n * c) for n in (0, 1, -1))
         further = np.where(has_two, self._number(here - 2 * c), at)
-        out, back = q * self._stride, lattice.OPPOSITE[q] * self._stride
+        out, back = q * self._stride, d3q19.OPPOSITE[q] * self._stride
         rows = [back + at, back + before, out + at, out + after, back + further, out + before]
         self._links = np.stack(rows, axis=1).astype(np.int32)
-        self._path, self._weight = lattice.paths(self._links, weight)
+        self._path, self._weight = d3q19.paths(self._links, weight)
         self._correction = correction.astype(np.float32)
         self._source = np.zeros(len(q), np.float32)
 
@@ -215,23 +215,23 @@ class _Grid:
         segments = len(self._length)
         limit = np.full(segments, np.inf, np.float32)
         relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
-        cells = self._populations, self._length, relaxation, lattice.no_screen(segments)
-        back = self._path, self._weight, self._source, *lattice.NO_LINKS[3:]
-        bands = lattice.undivided(segments, len(self._source))
+        cells = self._populations, self._length, relaxation, d3q19.no_screen(segments)
+        back = self._path, self._weight, self._source, *d3q19.NO_LINKS[3:]
+        bands = d3q19.undivided(segments, len(self._source))
         lost = np.empty_like(self._source)  # made up for nowhere here
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
-            lattice.update(self._f, cells, back, *bands)
+            d3q19.update(self._f, cells, back, *bands)
             if pair % DEFER_PAIRS == 0:
-                lattice.defer(self._f, self._links, self._correction, self._source, lost, np.float32(DEFER_PART))
+                d3q19.defer(self._f, self._links, self._correction, self._source, lost, np.float32(DEFER_PART))
 
     def _kick(self, impulse: Floats) -> None:
-        kick = 3 * lattice.WEIGHTS * (lattice.VELOCITIES @ impulse)
+        kick = 3 * d3q19.WEIGHTS * (directions.VELOCITIES @ impulse)
         populations = self._f[: 19 * self._stride].reshape(19, -1)
         populations += (kick[:, None] * self._is_blood.ravel()).astype(np.float32)
 
     def velocity(self, force: Floats) -> Floats:
         """Velocity (i, j, k, 3) in the middle between two kicks."""
         result = np.zeros((self._stride, 3))
-        result[self._place] = lattice.moments(self._f, self._stride, self._place)[:, 1:] + force
+        result[self._place] = d3q19.moments(self._f, self._stride, self._place)[:, 1:] + force
         return result.reshape(*self._shape, 3)

@@ -9,9 +9,10 @@ from vstent.flow import sampling
 from vstent.flow.case import FlowCase
 from vstent.flow.domain import Domain
 from vstent.flow.lattice.close_up import CloseUp
-from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.scales import ODD_RATE, Scales
 from vstent.flow.profile import developed_profile
+from vstent.kernels import directions
 from vstent.kernels.arrays import Floats, Ints
 
 SOUND_MEMORY = 0.002
@@ -41,7 +42,7 @@ class Ends:
 
         Returns
         -------
-        Rows (k, 9) of `lattice.drive`, what is wanted (k,) at mean flow, what is besides (m, k) at the moments of the
+        Rows (k, 9) of `d3q19.drive`, what is wanted (k,) at mean flow, what is besides (m, k) at the moments of the
         flow outside, and shapes (m, l, 2) at these.
         """
         usual, shape = self._at(self.close_up, patches, links)
@@ -55,7 +56,7 @@ class Ends:
         return usual, wanted, course, np.stack([shape for _, shape in moments])
 
     def _at(self, now: CloseUp | None, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats]:
-        """Rows (k, 9) of `lattice.drive`, and what is sent back through all links, (l, 2), at a moment."""
+        """Rows (k, 9) of `d3q19.drive`, and what is sent back through all links, (l, 2), at a moment."""
         ends = [self._end(now, int(patch), of_end) for patch, of_end in zip(patches, links, strict=True)]
         return np.stack([row for row, _ in ends]), np.concatenate([shape for _, shape in ends])
 
@@ -68,7 +69,7 @@ class Ends:
     def _opening(self, k: int, links: Ints) -> tuple[Floats, Floats]:
         opening = self.case.vessel.openings[k]
         flow_mL_s = np.concatenate([self.case.inlets_mL_s, self.case.held_mL_s])[k]
-        kind = lattice.INFLOW if opening.is_inlet else lattice.PRESSURE if np.isnan(flow_mL_s) else lattice.OUTFLOW
+        kind = d3q19.INFLOW if opening.is_inlet else d3q19.PRESSURE if np.isnan(flow_mL_s) else d3q19.OUTFLOW
         speed = np.nan_to_num(flow_mL_s) / opening.area_mm2 / self.scales.speed_m_s
         area = opening.area_mm2 / self.domain.cell_size_mm**2
         row = np.array([kind, speed, 0.0, self._rate(kind), *opening.normal, area, 0.0])
@@ -83,7 +84,7 @@ class Ends:
 
     def _rate(self, kind: float) -> float:
         """Rate at which an end changes what it remembers."""
-        if kind == lattice.INFLOW:
+        if kind == d3q19.INFLOW:
             return SOUND_MEMORY if self.case.settings.waveform is None else 1.0
         # Critically damped: the blood that the pressure moves is a column about as long as the grid.
         return 0.25 / float(np.ptp(self.domain.cells, axis=0).max())
@@ -95,7 +96,7 @@ class Ends:
         mean = shown.inflow_mL_s[part] / self.scales.flow_mL_s / area
         profile = (self._velocity(shown, links, way) / mean for way in (0.0, 0.5, 1.0))
         speed = now.inflow_mL_s[part] / self.scales.flow_mL_s / area
-        row = np.array([lattice.INFLOW, speed, 0.0, self._rate(lattice.INFLOW), *normal, area, 0.0])
+        row = np.array([d3q19.INFLOW, speed, 0.0, self._rate(d3q19.INFLOW), *normal, area, 0.0])
         return row, _sent(self.domain.link_direction[links], normal, area, *profile)
 
     def _exit(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
@@ -107,10 +108,10 @@ class Ends:
         _, _, at_mm = self._along(links, 0.5)
         density = sampling.values_at(now.outer, at_mm)[1] / self.scales.pressure_Pa
         inward = np.maximum(0.0, -self._velocity(now, links, 0.5) @ normal)
-        density += 1.5 * inward**2  # what `lattice.outlet_source` takes off again
-        kind = lattice.PRESSURE if self._takes_the_rest(part) else lattice.OUTFLOW
+        density += 1.5 * inward**2  # what `d3q19.outlet_source` takes off again
+        kind = d3q19.PRESSURE if self._takes_the_rest(part) else d3q19.OUTFLOW
         speed = -now.inflow_mL_s[part] / self.scales.flow_mL_s / area
-        row = np.array([kind, speed if kind == lattice.OUTFLOW else 0.0, 0.0, self._rate(kind), *normal, area, 0.0])
+        row = np.array([kind, speed if kind == d3q19.OUTFLOW else 0.0, 0.0, self._rate(kind), *normal, area, 0.0])
         return row, np.stack([density, np.zeros(len(links))], axis=1)
 
     @property
@@ -129,7 +130,7 @@ class Ends:
     def _along(self, links: Ints, part: float = 0.0) -> tuple[Ints, Ints, Floats]:
         """Direction (l,) and lattice velocity (l, 3) of links, and the point (l, 3) on each that part of its way."""
         q = self.domain.link_direction[links]
-        c = lattice.VELOCITIES[q]
+        c = directions.VELOCITIES[q]
         cell = self.domain.cells[self.domain.link_cell[links]]
         return q, c, self.domain.origin_mm + (cell + part * c) * self.domain.cell_size_mm
 
@@ -141,7 +142,7 @@ class Ends:
     def _section(self, links: Ints) -> tuple[Floats, float]:
         """Outward normal (3,) of a cut and its area in cells: the sum of the cells' faces in it."""
         q, c, _ = self._along(links)
-        faces = c[q <= lattice.AXIAL].sum(axis=0)
+        faces = c[q <= d3q19.AXIAL].sum(axis=0)
         area = float(np.linalg.norm(faces))
         return faces / area, area
 
@@ -159,7 +160,7 @@ def _sent(direction: Ints, normal: Floats, area: float, inner: Floats, at: Float
     area : of the entry, in faces of cells.
     inner, at, outer : (l, 3) velocity where each link begins, half-way, and where it ends, over the mean speed.
     """
-    c, weight = lattice.VELOCITIES[direction], lattice.WEIGHTS[direction]
+    c, weight = directions.VELOCITIES[direction], d3q19.WEIGHTS[direction]
     sent = -6 * weight * (c * at).sum(axis=1)
     pushed = _pushed(direction, inner, outer)
     speed = -(at @ normal)
@@ -173,7 +174,7 @@ def _pushed(direction: Ints, inner: Floats, outer: Floats) -> Floats:
 
     Sent back through the links, it is taken out: it would push blood towards the axis.
     """
-    c, weight = lattice.VELOCITIES[direction], lattice.WEIGHTS[direction]
+    c, weight = directions.VELOCITIES[direction], d3q19.WEIGHTS[direction]
 
     def squared(u: Floats) -> Floats:
         return np.asarray(4.5 * (c * u).sum(axis=1) ** 2 - 1.5 * (u**2).sum(axis=1))

@@ -12,12 +12,14 @@ from vstent.flow.lattice.checkpoint import pack, unpack
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.cost import estimate, refuse_too_large
 from vstent.flow.lattice.gpu import require_gpu
-from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.pace import longest_step_s, peak_speed_m_s
 from vstent.flow.lattice.reading import field_of, read, read_moving
-from vstent.flow.lattice.settling import CHECKS_APART, SURE, Mean, left_to_settle, mean_of, swings, with_check
-from vstent.flow.lattice.state import State, build, is_at_check, step
+from vstent.flow.lattice.settling import CHECKS_APART, Mean, left_to_settle, mean_of, with_check
+from vstent.flow.lattice.state import State
+from vstent.flow.lattice.stepping import build, is_at_check, step
 from vstent.flow.lattice.trouble import trouble
+from vstent.flow.stopping import SURE, swings
 from vstent.units import M_PER_MM
 
 CHECK_DIAMETERS = 0.5
@@ -131,7 +133,7 @@ def _left(state: State) -> float:
 def _inflow_error(state: State) -> float:
     """How far what enters anywhere is from what is to, over all that is to: while sound is under way, openings give."""
     openings = state.links.openings
-    enters = openings[:, 0] == lattice.INFLOW
+    enters = openings[:, 0] == d3q19.INFLOW
     wanted = (state.links.wanted * openings[:, 7])[enters]
     return float(np.abs(state.snapshots[-1].outflow[enters] + wanted).sum() / wanted.sum())
 

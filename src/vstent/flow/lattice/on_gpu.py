@@ -10,7 +10,7 @@ import numpy as np
 from numba import cuda
 from numpy.typing import NDArray
 
-from vstent.flow.lattice.kernels import gpu as lattice_gpu
+from vstent.flow.lattice.kernels import gpu as kernels
 from vstent.flow.lattice.kernels.gpu import THREADS
 from vstent.flow.lattice.scales import ODD_RATE
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, State
@@ -39,26 +39,26 @@ class Device:
         reflect = put(links.weight), self._source, put(state.refill.place), self._refill
         address = put(links.address[: links.start[-1]])
         of_openings = start, address, put(links.place), put(links.direction), put(links.shape)
-        drive = partial(_launch, lattice_gpu.drive, len(links.openings) * THREADS)
+        drive = partial(_launch, kernels.drive, len(links.openings) * THREADS)
         self._drive = partial(drive, f, a.stride, self._openings, of_openings, self._source)
-        swap = partial(_launch, lattice_gpu.swap, a.septa.shape[1], f, put(a.septa))
+        swap = partial(_launch, kernels.swap, a.septa.shape[1], f, put(a.septa))
         self._steps = []
         for address_of, path in zip(a.address, links.path, strict=True):
             self._steps += [
-                partial(_launch, lattice_gpu.update, cells, f, put(address_of), *update),
-                partial(_launch, lattice_gpu.reflect, max(len(path), len(state.refill.refill)), f, put(path), *reflect),
+                partial(_launch, kernels.update, cells, f, put(address_of), *update),
+                partial(_launch, kernels.reflect, max(len(path), len(state.refill.refill)), f, put(path), *reflect),
                 swap,
             ]
         self._settle = _settling(state, f, self._source, self._refill)
         self._place, self._moments = put(a.place), put(np.zeros((len(a.place), 4), np.float32))
         self._outflow = put(np.zeros(len(links.openings)))
         self._read = (
-            partial(_launch, lattice_gpu.moments, len(a.place), f, a.stride, self._place, self._moments),
-            partial(_launch, lattice_gpu.outflow, len(links.openings) * THREADS, f, start, address, self._outflow),
+            partial(_launch, kernels.moments, len(a.place), f, a.stride, self._place, self._moments),
+            partial(_launch, kernels.outflow, len(links.openings) * THREADS, f, start, address, self._outflow),
         )
 
     def advance(self, wanted: Floats, moments: Floats, first_pair: int) -> None:
-        """Make pairs of steps with what `lattice_state.imposed` returns; the first is that pair since a check."""
+        """Make pairs of steps with what `stepping.imposed` returns; the first is that pair since a check."""
         imposed = put(wanted), put(moments)
         for pair in range(len(wanted)):
             self._drive(*imposed, pair)
@@ -96,7 +96,7 @@ def seconds_of_update(
     """Time of an update of every cell, the best of some, with what `lattice.update` takes."""
     time, law, limit, odd_rate = relaxation
     segments = (*_cells_of(length), time, put(law), put(limit), odd_rate)
-    launch = partial(_launch, lattice_gpu.update, int(length.sum()), put(f), put(address), *segments, *map(put, screen))
+    launch = partial(_launch, kernels.update, int(length.sum()), put(f), put(address), *segments, *map(put, screen))
     times = []
     for _ in range(UPDATES_TIMED):
         cuda.synchronize()
@@ -119,8 +119,8 @@ def _settling(state: State, f: Any, source: Any, refill: Any) -> tuple[partial[N
     of_wall = slice(int(links.start[-1]), None)
     address = links.address[of_wall]
     correction, lost, groups = put(links.correction[of_wall]), put(walls.lost), tuple(map(put, walls.groups))
-    defer = partial(_launch, lattice_gpu.defer, len(address), f, put(address), correction, source[of_wall], lost, PART)
-    balance = partial(_launch, lattice_gpu.balance, len(walls.groups[0]) - 1, lost, groups, refill, PART)
+    defer = partial(_launch, kernels.defer, len(address), f, put(address), correction, source[of_wall], lost, PART)
+    balance = partial(_launch, kernels.balance, len(walls.groups[0]) - 1, lost, groups, refill, PART)
     return defer, balance
 
 

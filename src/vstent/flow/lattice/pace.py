@@ -9,11 +9,11 @@ from typing import Final
 
 import numpy as np
 
-from vstent.errors import FlowError
 from vstent.flow.case import PHASES, FlowCase, FlowField, Waveform
+from vstent.flow.cycles import pulse_of
 from vstent.flow.domain import extended_volume_mm3
 from vstent.flow.lattice.close_up import CloseUp
-from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.kernels import d3q19
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
@@ -63,12 +63,12 @@ def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up:
     FlowError
         When the case has no pulse.
     """
-    pulse = _Pulse(waveform_of(case))
+    pulse = _Pulse(pulse_of(case))
     peak_m_s = pulse.peaks_m_s(case, start, close_up)
     step_s = np.array([longest_step_s(case, cell_size_mm, peak) for peak in peak_m_s])
     shortest_s = step_s.min()
     way_mm = extended_volume_mm3(case.vessel) / sum(inlet.area_mm2 for inlet in case.vessel.inlets)
-    by_sound_s = pulse.sound_s() * lattice.SOUND * cell_size_mm / way_mm
+    by_sound_s = pulse.sound_s() * d3q19.SOUND * cell_size_mm / way_mm
     step_s = np.clip(np.minimum(step_s, by_sound_s), shortest_s, LONGEST * shortest_s)
     return (2 * np.ceil(0.5 * pulse.phase_s / step_s)).astype(np.int32)
 
@@ -103,16 +103,3 @@ class _Pulse:
         """
         most_per_s2 = np.maximum(self._curvature_per_s2.max(axis=1), 1e-9)
         return np.asarray(np.sqrt(2 * STORED * self._factor.mean(axis=1) / most_per_s2))
-
-
-def waveform_of(case: FlowCase) -> Waveform:
-    """Return the pulse of a case.
-
-    Raises
-    ------
-    FlowError
-        When it has none.
-    """
-    if case.settings.waveform is None:
-        raise FlowError("pulsatile flow needs a waveform: set one, or compute the steady flow")
-    return case.settings.waveform

@@ -8,24 +8,24 @@ from numpy.typing import NDArray
 from vstent.flow.case import FlowCase, Screen
 from vstent.flow.domain import Domain
 from vstent.flow.drag import concentration
-from vstent.flow.lattice.kernels import d3q19 as lattice
+from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.scales import Scales
 from vstent.flow.lattice.setup import Addressing
-from vstent.kernels import sampling as lattice_sampling
+from vstent.kernels import sampling
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
 
 @dataclass(frozen=True, eq=False)
 class ScreenEntries:
-    """A screen by segment (see `lattice.update`)."""
+    """A screen by segment (see `d3q19.update`)."""
 
     start: Ints
     """(s + 1,)."""
     place: Ints
     """(e,) place within the segment."""
     entry: NDArray[np.float32]
-    """(e, `lattice.ENTRY`)."""
+    """(e, `d3q19.ENTRY`)."""
     cell: Ints
     """(e,) cell."""
 
@@ -56,7 +56,7 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
     """The case's screen in lattice units."""
     segments = len(addressing.length)
     if case.screen is None:
-        return ScreenEntries(*lattice.no_screen(segments), np.zeros(0, np.int32))
+        return ScreenEntries(*d3q19.no_screen(segments), np.zeros(0, np.int32))
     spread = on_grid(case.screen, domain.index, domain.origin_mm, domain.cell_size_mm)
     per_step = scales.step_s / case.blood.density_kg_m3
     entry = np.column_stack(
@@ -84,7 +84,7 @@ def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float)
     index : (i, j, k) cell number at every grid point, -1 outside.
     """
     at = (screen.points_mm - origin_mm) / cell_size_mm
-    cells, weights = lattice_sampling.stencils(index, at)
+    cells, weights = sampling.stencils(index, at)
     share = np.where(cells >= 0, weights, 0.0)
     is_used = share > 0
     cell, owner = cells[is_used], np.broadcast_to(np.arange(len(cells))[:, None], cells.shape)[is_used]

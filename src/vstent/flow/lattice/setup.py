@@ -11,10 +11,10 @@ from vstent.flow.case import FlowCase
 from vstent.flow.domain import Domain
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.ends import Ends
-from vstent.flow.lattice.kernels import d3q19 as lattice
-from vstent.flow.lattice.kernels import lanes
-from vstent.flow.lattice.scales import ODD_RATE, Scales
-from vstent.kernels import voxels
+from vstent.flow.lattice.kernels import d3q19, lanes
+from vstent.flow.lattice.scales import Scales
+from vstent.flow.lattice.walls import CURVE, linear_weights, parabolic_weights
+from vstent.kernels import directions, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 CELL_REYNOLDS_AT_END = 25.0
@@ -32,8 +32,6 @@ CELLS_IN_CUT: Final = 2
 PAGE, OFF_PAGE = 1024, 216
 """Numbers in 4096 bytes, and by how many more than whole pages of them a cell's populations lie apart: a cache has the
 same few places for what is whole pages apart, and nineteen such runs at once would take a quarter longer."""
-CURVE: Final = np.array([1.0, -2.0, 0.0, 1.0, 0.0], np.float32)
-"""The second difference along a link, of a, b, c, e and g (see `lattice.defer`)."""
 REFILL_BLOCK = 2
 """Edge, in cells, of the blocks within which the walls' losses are made up."""
 
@@ -53,13 +51,13 @@ class Addressing:
     address: Ints
     """(2, s, 19) where the populations of every segment begin, in an even step and in an odd one."""
     link_address: Ints
-    """(l, 6) see `lattice.paths`."""
+    """(l, 6) see `d3q19.paths`."""
     link_has_one: NDArray[np.bool_]
     """(l,) the cell behind the link's cell is blood, and no septum lies between."""
     link_has_two: NDArray[np.bool_]
     """(l,) so it is with the two cells behind it."""
     septa: Ints
-    """(2, t) see `lattice.update`, by layer of their cell."""
+    """(2, t) see `d3q19.update`, by layer of their cell."""
     septum_cell: Ints
     """(t,) that cell."""
 
@@ -75,19 +73,19 @@ class Links:
     """(k,) patch of every end (see `Domain.link_patch`)."""
 
     address: Ints
-    """(l, 6) see `lattice.paths`."""
+    """(l, 6) see `d3q19.paths`."""
     path: Ints
-    """(2, l, 3) see `lattice.update`, after an even step and after an odd one."""
+    """(2, l, 3) see `d3q19.update`, after an even step and after an odd one."""
     weight: NDArray[np.float32]
-    """(l, 2) see `lattice.update`."""
+    """(l, 2) see `d3q19.update`."""
     correction: NDArray[np.float32]
-    """(l, 5) see `lattice.defer`."""
+    """(l, 5) see `d3q19.defer`."""
     viscous: NDArray[np.float32]
     """(l,) how much of `CURVE` viscosity takes off that."""
     source: NDArray[np.float32]
     """(l,)."""
     openings: Floats
-    """(k, 10) see `lattice.drive`."""
+    """(k, 10) see `d3q19.drive`."""
     start: Ints
     """(k + 1,) first link of every opening, and of the wall."""
     by_layer: Ints
@@ -101,11 +99,11 @@ class Links:
     course: Floats
     """(m, k) what is wanted there besides, speed or density, at equal times of a cycle."""
     shape: Floats
-    """(m, o, 2) see `lattice.drive`, at the same times."""
+    """(m, o, 2) see `d3q19.drive`, at the same times."""
 
     def stretched(self, stretch: float) -> "Links":
         """The same for time steps that are so many times as long; what changes in place is shared."""
-        is_inflow = np.repeat(self.openings[:, 0] == lattice.INFLOW, np.diff(self.start))
+        is_inflow = np.repeat(self.openings[:, 0] == d3q19.INFLOW, np.diff(self.start))
         return replace(
             self,
             correction=self.correction - np.outer(np.float32(stretch - 1) * self.viscous, CURVE),
@@ -117,14 +115,14 @@ class Links:
 
 @dataclass(frozen=True, eq=False)
 class Refill:
-    """What interpolated walls lose and get back (see `lattice.balance`); `refill` changes in place."""
+    """What interpolated walls lose and get back (see `d3q19.balance`); `refill` changes in place."""
 
     place: Ints
     """(w,) storage place of every wall cell."""
     groups: tuple[Ints, Ints, Ints, Ints]
-    """See `lattice.balance`; a group is the wall cells of a block of `REFILL_BLOCK` cells."""
+    """See `d3q19.balance`; a group is the wall cells of a block of `REFILL_BLOCK` cells."""
     lost: NDArray[np.float32]
-    """(l,) see `lattice.defer`."""
+    """(l,) see `d3q19.defer`."""
     refill: NDArray[np.float32]
     """(w,) added in every step."""
 
@@ -158,7 +156,7 @@ def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
     cells = domain.cells
     inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
     inside[tuple(cells.T)] = True
-    stored = voxels.dilate(inside, lattice.VELOCITIES[1:])
+    stored = voxels.dilate(inside, directions.VELOCITIES[1:])
     number = np.full(inside.shape, -1, dtype=np.int32)
     # What a vector holds beyond its segment is written again as it was: of another layer, another thread may be there.
     number[stored] = np.arange(stored.sum()) + lanes.COUNT * np.nonzero(stored)[0]
@@ -170,7 +168,7 @@ def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
     length = np.diff(np.r_[first, len(cells)])
     first, length = _cut(first, length)
     start = cells[first]
-    behind = [number[tuple((start - c).T)] for c in lattice.VELOCITIES]
+    behind = [number[tuple((start - c).T)] for c in directions.VELOCITIES]
     septa = _septa(domain, number, stride)
     links = _link_addresses(domain, number, inside, stride, septa)
     to_int = np.int32
@@ -179,7 +177,7 @@ def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
         place,
         length.astype(to_int),
         first.astype(to_int),
-        lattice.addresses(place[first], behind, stride),
+        d3q19.addresses(place[first], behind, stride),
         *links,
         septa,
         domain.septum_cell,
@@ -188,20 +186,20 @@ def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
 
 def _cut(first: Ints, length: Ints) -> tuple[Ints, Ints]:
     """Cut segments longer than the buffer."""
-    pieces = -(-length // lattice.SEGMENT)
+    pieces = -(-length // d3q19.SEGMENT)
     owner = np.repeat(np.arange(len(first)), pieces)
     rank = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    start = rank * lattice.SEGMENT
-    return first[owner] + start, np.minimum(length[owner] - start, lattice.SEGMENT)
+    start = rank * d3q19.SEGMENT
+    return first[owner] + start, np.minimum(length[owner] - start, d3q19.SEGMENT)
 
 
 def _link_addresses(
     domain: Domain, number: Ints, inside: NDArray[np.bool_], stride: int, septa: Ints
 ) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Addresses (l, 6) of `lattice.paths`, and whether one and whether two blood cells lie behind the link's cell."""
+    """Addresses (l, 6) of `d3q19.paths`, and whether one and whether two blood cells lie behind the link's cell."""
     q = domain.link_direction
-    p = lattice.OPPOSITE[q]
-    cell, c = domain.cells[domain.link_cell], lattice.VELOCITIES[q]
+    p = d3q19.OPPOSITE[q]
+    cell, c = domain.cells[domain.link_cell], directions.VELOCITIES[q]
     second = np.maximum(cell - 2 * c, 0)
     here, ahead, behind = (number[tuple(x.T)] for x in (cell, cell + c, cell - c))
     has_one = inside[tuple((cell - c).T)] & ~np.isin(q * stride + here, septa)
@@ -222,8 +220,8 @@ def _septa(domain: Domain, number: Ints, stride: int) -> Ints:
     """Addresses (2, t) of what cells send each other through septa."""
     q = domain.septum_direction
     cell = domain.cells[domain.septum_cell]
-    here, ahead = (number[tuple(x.T)] for x in (cell, cell + lattice.VELOCITIES[q]))
-    return np.stack([lattice.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
+    here, ahead = (number[tuple(x.T)] for x in (cell, cell + directions.VELOCITIES[q]))
+    return np.stack([d3q19.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
 
 
 def build_links(
@@ -245,11 +243,11 @@ def build_links(
     opening_links = order[: start[-1]]
     ends = Ends(case, domain, scales, close_up)
     openings, wanted, course, shape = ends.imposed(patches, np.split(opening_links, start[1:-1]))
-    weight[: start[-1]][np.repeat(openings[:, 0] == lattice.INFLOW, np.diff(start))] = (1.0, 0.0, 0.0)
+    weight[: start[-1]][np.repeat(openings[:, 0] == d3q19.INFLOW, np.diff(start))] = (1.0, 0.0, 0.0)
     return Links(
         patches,
         addressing.link_address[order],
-        *lattice.paths(addressing.link_address[order], weight),
+        *d3q19.paths(addressing.link_address[order], weight),
         correction.astype(np.float32),
         viscous.astype(np.float32),
         np.zeros(len(order), dtype=np.float32),
@@ -276,7 +274,7 @@ def _link_order(domain: Domain) -> Ints:
 
 
 def build_bands(domain: Domain, addressing: Addressing, links: Links) -> Ints:
-    """Bands (b + 1, 5) of `lattice.update`: the layers of cells across the first axis of the grid."""
+    """Bands (b + 1, 5) of `d3q19.update`: the layers of cells across the first axis of the grid."""
     of_ends, of_walls = np.split(domain.link_cell[_link_order(domain)], links.start[-1:])
     cells = addressing.first_cell, np.unique(of_walls), of_walls, of_ends[links.by_layer], addressing.septum_cell
     layer = domain.cells[:, 0]
@@ -284,44 +282,6 @@ def build_bands(domain: Domain, addressing: Addressing, links: Links) -> Ints:
     bands = np.stack([np.searchsorted(layer[ordered], edges) for ordered in cells], axis=1)
     bands[:, 2] += links.start[-1]
     return bands.astype(np.int32)
-
-
-def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
-    """Linear interpolated reflection (Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids 13, 3452, eq. 5).
-
-    Half-way where it would need the cell behind and that is no blood.
-    """
-    zero = np.zeros_like(fraction)
-    near = np.stack([2 * fraction, 1 - 2 * fraction, zero], axis=1)
-    far = np.stack([0.5 / fraction, zero, 1 - 0.5 / fraction], axis=1)
-    weight = np.where(fraction[:, None] < 0.5, near, far)
-    weight[~has_one & (fraction < 0.5)] = (1.0, 0.0, 0.0)
-    return weight
-
-
-def quadratic_weights(fraction: Floats) -> Floats:
-    """Quadratic interpolated reflection (Lallemand and Luo 2003, J. Comput. Phys. 184, 406, eq. 10): (l, 5)."""
-    x, zero = fraction, np.zeros_like(fraction)
-    near = np.stack([x * (1 + 2 * x), 1 - 4 * x**2, zero, -x * (1 - 2 * x), zero], axis=1)
-    far = np.stack([1 / (x * (2 * x + 1)), zero, (2 * x - 1) / x, zero, (1 - 2 * x) / (1 + 2 * x)], axis=1)
-    return np.where(x[:, None] < 0.5, near, far)
-
-
-def parabolic_weights(fraction: Floats, relaxation_steps: float) -> tuple[Floats, Floats]:
-    """Reflection that is exact for a parabola along the link: (l, 5) weights of a, b, c, e and g (see `lattice.defer`).
-
-    And how much of `CURVE` they would have more (l,) without viscosity.
-
-    Quadratic interpolation alone lets blood slip by up to an eighth of a squared cell times the flow's curvature: its
-    populations carry, beside the velocity, second differences and what the odd rate has still to relax (Ginzburg and
-    d'Humieres 2003, Phys. Rev. E 68, 066614, sec. III). Both are put back by the second difference, a - 2 b + e; how
-    much of it comes with the viscosity is taken between a plane channel and a tube, for read off the populations it
-    would be wrong where a screen's force meets the wall.
-    """
-    x, even, odd = fraction, relaxation_steps - 0.5, 1 / ODD_RATE - 0.5
-    per = 1 / np.maximum(1, x * (2 * x + 1))
-    viscous = even * (odd + np.abs(x - 0.5)) * per
-    return quadratic_weights(fraction) + np.outer(x * (1 - x) * per - viscous, CURVE), viscous
 
 
 def build_refill(domain: Domain, addressing: Addressing) -> Refill:

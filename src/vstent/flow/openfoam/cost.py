@@ -7,7 +7,7 @@ import numpy as np
 from vstent.errors import FlowError
 from vstent.flow.case import LATTICE, FlowCase
 from vstent.flow.domain import extended_volume_mm3
-from vstent.flow.lattice.cost import free_memory_bytes
+from vstent.flow.memory import free_memory_bytes
 from vstent.flow.openfoam.case import strut_solids
 from vstent.flow.openfoam.setup import FoamSetup
 

@@ -15,16 +15,15 @@ import numpy as np
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow.case import PHASES, FlowCase, FlowField, Phase, Swing
+from vstent.flow.cycles import cycle_change, cycles_advice, pulse_of
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
-from vstent.flow.lattice.pace import waveform_of
-from vstent.flow.lattice.pulse import cycle_change, cycles_advice
-from vstent.flow.lattice.settling import quantities_left
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
 from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.setup import FoamSetup
+from vstent.flow.stopping import quantities_left
 from vstent.kernels.arrays import Floats, Ints
 
 CHECK_ITERATIONS: Final = 50
@@ -163,7 +162,7 @@ class OpenFoam(AbstractEngine[State]):
 def _next_end(state: State, reached: float) -> float:
     if not state.is_pulse:
         return reached + CHECK_ITERATIONS
-    phase_s = waveform_of(state.case).period_s / PHASES
+    phase_s = pulse_of(state.case).period_s / PHASES
     return (round(reached / phase_s) + 1) * phase_s
 
 
@@ -180,7 +179,7 @@ def _phases_done(state: State) -> int:
     """Phases since the pulse began, in this run and those that it goes on from."""
     if not state.snapshots:
         return 0
-    return round(float(state.snapshots[-1].time) * PHASES / waveform_of(state.case).period_s)
+    return round(float(state.snapshots[-1].time) * PHASES / pulse_of(state.case).period_s)
 
 
 def _note(state: State, time: str) -> None:
@@ -257,7 +256,7 @@ def swing_of(kept: list[Snapshot]) -> Swing:
 
 def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
     """The last cycle; its times are those of the waveform."""
-    phase_s = waveform_of(case).period_s / PHASES
+    phase_s = pulse_of(case).period_s / PHASES
 
     def phase(k: int, one: Snapshot) -> Phase:
         backwards_mL_s, outlets_mL_s = case.vessel.of_inlets_and_outlets(one.outflow_mL_s)

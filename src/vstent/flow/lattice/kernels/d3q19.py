@@ -34,18 +34,8 @@ from vstent.flow.lattice.kernels.collision import (
 )
 from vstent.flow.lattice.kernels.lanes import COUNT, gather, load, starts, store, upto
 from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.directions import VELOCITIES
 
-VELOCITIES: Final[Ints] = np.array(
-    [[0, 0, 0]]
-    + [[s * (axis == k) for k in range(3)] for axis in range(3) for s in (1, -1)]
-    + [
-        [s * a for a in pair]
-        for pair in ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1), (0, 1, -1))
-        for s in (1, -1)
-    ],
-    dtype=np.int32,
-)
-"""(19, 3) lattice velocities."""
 WEIGHTS: Final = np.where((squares := (VELOCITIES**2).sum(axis=1)) == 0, 1 / 3, np.where(squares == 1, 1 / 18, 1 / 36))
 """(19,) rest weights."""
 OPPOSITE: Final = np.array([0] + [q + 1 if q % 2 else q - 1 for q in range(1, 19)], dtype=np.int32)
@@ -66,7 +56,6 @@ LINK_WORK, SCREENED_WORK = 0.06, 2.0
 """Time that a link takes, and a vector of a segment with screened cells, over that of a vector without."""
 ENTRY: Final = 7
 """Numbers that say what a cell of a screen resists (see `resist`): the unit normal and four of the resistance."""
-
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _ROOT_THREE: Final = float(np.sqrt(3.0))
 _U = np.uint64

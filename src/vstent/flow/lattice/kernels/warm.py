@@ -9,8 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from vstent.flow.lattice.kernels import d3q19 as lattice
-from vstent.flow.lattice.kernels import lanes
+from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.kernels.first_use import kept
 
 
@@ -26,16 +25,16 @@ def flow() -> None:
     f, none = np.zeros(20 * stride, np.float32), np.zeros(0, np.int32)
     relaxation = np.float32(1.0), np.zeros(4, np.float32), np.full(1, np.inf, np.float32), np.float32(1.0)
     address = stride * np.arange(19, dtype=np.int32)[None, None]
-    lattice.update(
-        f, (address, np.ones(1, np.int32), relaxation, lattice.no_screen(1)), lattice.NO_LINKS, *lattice.undivided(1)
+    d3q19.update(
+        f, (address, np.ones(1, np.int32), relaxation, d3q19.no_screen(1)), d3q19.NO_LINKS, *d3q19.undivided(1)
     )
     links, source = np.zeros((0, 6), np.int32), np.zeros(0, np.float32)
     nowhere = np.zeros(1, np.int32)
     of_openings = nowhere, links, none, none, np.zeros((1, 0, 2))
-    lattice.drive(f, stride, np.zeros((0, 9)), of_openings, np.zeros(3), source)
-    lattice.defer(f, links, np.zeros((0, 5), np.float32), source, source, np.float32(1.0))
-    lattice.balance(source, (nowhere, none, nowhere, none), source, np.float32(1.0))
-    lattice.moments(f, stride, none)
-    times = lattice.relaxation_times(f, stride, none, relaxation[0], relaxation[1])
-    lattice.resisted(np.zeros((0, 3), np.float32), np.zeros((0, lattice.ENTRY), np.float32), times, np.float32(1.0))
-    lattice.rescale(f, stride, none, links, np.float32(1.0), np.float32(1.0))
+    d3q19.drive(f, stride, np.zeros((0, 9)), of_openings, np.zeros(3), source)
+    d3q19.defer(f, links, np.zeros((0, 5), np.float32), source, source, np.float32(1.0))
+    d3q19.balance(source, (nowhere, none, nowhere, none), source, np.float32(1.0))
+    d3q19.moments(f, stride, none)
+    times = d3q19.relaxation_times(f, stride, none, relaxation[0], relaxation[1])
+    d3q19.resisted(np.zeros((0, 3), np.float32), np.zeros((0, d3q19.ENTRY), np.float32), times, np.float32(1.0))
+    d3q19.rescale(f, stride, none, links, np.float32(1.0), np.float32(1.0))

@@ -1,0 +1,135 @@
+"""Morphology of the aneurysm: sac, neck and parent artery in numbers."""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.spatial.distance import pdist
+
+from vstent.anatomy.landing_zones import landing_diameters_mm, neck_span_mm
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Aneurysm
+from vstent.kernels import curves, triangles
+from vstent.kernels.arrays import Floats
+
+Measures = dict[str, float | str]
+"""Numbers by names that end in their unit; a few names hold words."""
+Morphology = dict[str, float | str | Measures]
+"""The same, with the measures of each further sac under a name of their own: ``sac_2``, ``sac_3``, ..."""
+PARTED: Final = 0.9
+"""A section by the neck plane of less than so much of the neck is a piece: the artery's wall rises through it."""
+FEWEST_AXIS_POINTS: Final = 9
+"""A shorter axis is too short to tell how it bends."""
+BENT: Final = 0.1
+"""An axis is bent, and has a torsion, where its curvature exceeds this over the artery's diameter."""
+
+
+def morphology(anatomy: Anatomy) -> Morphology:
+    """Measure the parent artery and its aneurysms: the largest first, others under ``sac_2``, ``sac_3`` and so on.
+
+    Height, aspect ratio and size ratio as defined by Dhar et al. 2008 (Neurosurgery 63:185): the height is measured
+    square to the neck plane; the size ratio takes the longest distance from the neck's center to the dome; the neck's
+    diameter in the aspect ratio is twice the mean distance from its center to its rim. Volume and area are those of
+    the sac, closed across the neck, which is curved like the artery's wall. Most of the literature cuts a sac by a
+    plane instead (Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355): the sac beyond the neck plane, which goes
+    through the neck's center square to its vector area, and its section by it stand beside; the section is left out
+    where the artery's wall rises through the plane and parts it. Curvature and torsion are those of the parent axis
+    (Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141), of a quartic through one diameter of it to both sides;
+    that much is left out at its ends.
+    """
+    found: Morphology = {**_parent(anatomy)}
+    if anatomy.vessel.threshold_band_mm > 0:
+        found["diameter_threshold_band_mm"] = anatomy.vessel.threshold_band_mm
+    found |= _course(anatomy)
+    for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
+        beside = _parent(replace(anatomy, aneurysms=(aneurysm,)))
+        measures = _sac(aneurysm, 0.5 * sum(beside.values()))
+        found |= measures if number == 1 else {f"sac_{number}": {**beside, **measures}}
+    return found
+
+
+def _parent(anatomy: Anatomy) -> dict[str, float]:
+    """Diameters of the parent artery beside the neck of the largest aneurysm."""
+    proximal_mm, distal_mm = landing_diameters_mm(anatomy)
+    return {"parent_proximal_diameter_mm": proximal_mm, "parent_distal_diameter_mm": distal_mm}
+
+
+def _course(anatomy: Anatomy) -> Measures:
+    """How the parent axis bends and twists; nothing for an axis of a few points."""
+    axis = anatomy.axis
+    diameter_mm = 2 * float(np.median(anatomy.section_radius_mm))
+    inner = (axis.abscissa_mm >= diameter_mm) & (axis.abscissa_mm <= axis.length_mm - diameter_mm)
+    if inner.sum() < FEWEST_AXIS_POINTS:
+        return {}
+    even_mm = curves.resample_evenly(axis.points_mm, len(axis.points_mm))
+    curvature, torsion = curves.curvature_and_torsion(even_mm, diameter_mm)
+    is_bent = inner & (curvature * diameter_mm > BENT)
+    found: Measures = {
+        "parent_mean_curvature_per_mm": float(curvature[inner].mean()),
+        "parent_max_curvature_per_mm": float(curvature[inner].max()),
+        "parent_mean_torsion_per_mm": float(np.abs(torsion[is_bent]).mean()) if is_bent.any() else 0.0,
+    }
+    if anatomy.aneurysms:
+        proximal_mm, distal_mm = neck_span_mm(anatomy)
+        at_neck = np.interp(np.linspace(proximal_mm, distal_mm, 51), axis.abscissa_mm, curvature)
+        found["neck_mean_curvature_per_mm"] = float(at_neck.mean())
+    return found
+
+
+def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
+    rim_mm, dome_mm = aneurysm.neck_mm, aneurysm.sac.vertices_mm
+    center_mm = triangles.polygon_centroid(rim_mm)
+    vector_mm2 = triangles.polygon_area_vector(rim_mm)
+    neck_area_mm2 = float(np.linalg.norm(vector_mm2))
+    normal = vector_mm2 / neck_area_mm2 * np.sign((dome_mm.mean(axis=0) - center_mm) @ vector_mm2)
+    height_mm = float(((dome_mm - center_mm) @ normal).max())
+    reach_mm = float(np.linalg.norm(dome_mm - center_mm, axis=1).max())
+    neck_mean_mm = float(2 * np.linalg.norm(rim_mm - center_mm, axis=1).mean())
+    width_mm = _widths_mm(rim_mm, normal)
+    plane_area_mm2, plane_volume_mm3 = _beyond(aneurysm.sac, center_mm, normal)
+    found: Measures = {
+        "sac_volume_mm3": abs(aneurysm.sac.volume_mm3),
+        "sac_area_mm2": aneurysm.sac.area_mm2 - aneurysm.neck.area_mm2,
+        "sac_height_mm": height_mm,
+        "sac_max_height_mm": reach_mm,
+        "sac_max_diameter_mm": _diameter_mm(dome_mm),
+        "sac_plane_volume_mm3": plane_volume_mm3,
+        "neck_area_mm2": neck_area_mm2,
+        "neck_surface_area_mm2": aneurysm.neck.area_mm2,
+        "neck_perimeter_mm": triangles.perimeter(rim_mm),
+        "neck_min_diameter_mm": float(width_mm.min()),
+        "neck_max_diameter_mm": float(width_mm.max()),
+        "aspect_ratio": height_mm / neck_mean_mm,
+        "size_ratio": reach_mm / parent_diameter_mm,
+    }
+    if plane_area_mm2 > PARTED * neck_area_mm2:
+        found["neck_plane_area_mm2"] = plane_area_mm2
+    return found
+
+
+def _beyond(sac: Surface, center_mm: Floats, normal: Floats) -> tuple[float, float]:
+    """Area of the largest piece of a sac's section by a plane, and the volume beyond that plane."""
+    below_mm = -(sac.vertices_mm - center_mm) @ normal
+    vertices, faces, _ = triangles.clip(sac.vertices_mm, sac.faces, below_mm)
+    loops = triangles.boundary_loops(vertices, faces)
+    capped, closed = triangles.cap(vertices, faces, loops)
+    areas = [float(np.linalg.norm(triangles.polygon_area_vector(vertices[loop]))) for loop in loops]
+    return max(areas, default=0.0), triangles.volume(capped[closed])
+
+
+def _diameter_mm(points_mm: Floats) -> float:
+    """Largest distance between points (n, 3), sought among those that are outermost in 600 directions."""
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(600)
+    z = np.linspace(-1, 1, 600)
+    directions = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+    outermost = np.unique((points_mm @ directions.T).argmax(axis=0))
+    return float(pdist(points_mm[outermost]).max())
+
+
+def _widths_mm(rim_mm: Floats, normal: Floats) -> Floats:
+    """Widths (180,) of a closed curve in every direction of the plane square to `normal`, one per degree."""
+    first = curves.any_perpendicular(normal)
+    second = np.cross(normal, first)
+    angle = np.pi * np.arange(180) / 180
+    along = rim_mm @ (np.outer(first, np.cos(angle)) + np.outer(second, np.sin(angle)))
+    return np.ptp(along, axis=0)

@@ -1,0 +1,95 @@
+"""Metal coverage and pores of a deployed device, on its drawn wires."""
+
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+
+from vstent.anatomy.morphology import Measures
+from vstent.devices.formulas import coverage_fraction, grid, pore_density_per_mm2
+from vstent.devices.stent import Stent
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy
+from vstent.kernels import curves, triangles
+from vstent.kernels.arrays import Bools, Floats
+from vstent.units import MM_PER_UM
+
+NECK_TOLERANCE_MM: Final = 0.02
+"""The neck's triangles lie on the landing surface to within this: they are other triangles than its own."""
+SAMPLES_PER_QUAD: Final = 8
+"""Points per direction at which coverage is tried in every quad of the contour."""
+
+
+def quad_areas_mm2(stent: Stent) -> Floats:
+    """Area (rows - 1, columns) of every quad of the contour."""
+    return stent.contour.areas_mm2.reshape(2, len(stent.nodes_mm) - 1, -1).sum(axis=0)
+
+
+def coverage_fractions(stent: Stent) -> Floats:
+    """Part (rows - 1, columns) of every quad of the contour under metal, seen square to the contour."""
+    from vstent.kernels.coverage import covered_fractions  # compiles on first use
+
+    here = stent.piece_starts
+    radius_mm = 0.5 * stent.wire_diameter_um[stent.point_wires[here]] * MM_PER_UM
+    points_mm = stent.wire_points_mm
+    return covered_fractions(stent.nodes_mm, points_mm[here], points_mm[here + 1], radius_mm, SAMPLES_PER_QUAD)
+
+
+def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats]:
+    """Area (p,) of every whole pore and its center (p, 3).
+
+    Pores sit where the lattice has no junction; each fills half of the four lattice cells around it.
+    """
+    shape = grid(stent.design, stent.size)
+    lattice_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
+    cells = quad_areas_mm2(stent).reshape(
+        shape.lattice_rows - 1, shape.row_split, shape.lattice_columns, shape.column_split
+    )
+    cell_mm2 = cells.sum(axis=(1, 3))
+    pairs = cell_mm2 + np.roll(cell_mm2, 1, axis=1)
+    area_mm2 = 0.5 * (pairs[:-1] + pairs[1:])
+    row, column = np.meshgrid(np.arange(1, shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
+    is_pore = (row + column) % 2 == 1
+    return area_mm2[is_pore], lattice_mm[1:-1][is_pore]
+
+
+def density(anatomy: Anatomy, stent: Stent) -> Measures:
+    """Measure metal coverage (fraction) and pore density (1/mm2), of the whole device and over the neck."""
+    quads_mm = 0.25 * (stent.nodes_mm[1:] + stent.nodes_mm[:-1])
+    quads_mm = (quads_mm + np.roll(quads_mm, -1, axis=1)).reshape(-1, 3)
+    hidden, area_mm2 = coverage_fractions(stent).ravel(), quad_areas_mm2(stent).ravel()
+    pore_mm2, pores_mm = pore_areas_mm2(stent)
+    diameter_mm = float(stent.row_diameter_mm.mean())
+    found: Measures = {
+        "metal_coverage_fraction": float(np.average(hidden, weights=area_mm2)),
+        "metal_coverage_formula_fraction": coverage_fraction(stent.design, stent.size, diameter_mm),
+        "pore_density_formula_per_mm2": pore_density_per_mm2(stent.design, stent.size, diameter_mm),
+    }
+    if len(pores_mm):
+        found["pore_density_per_mm2"] = float(len(pore_mm2) / pore_mm2.sum())
+    if anatomy.aneurysms:
+        on_neck = is_over_neck(anatomy, quads_mm)
+        if on_neck.any():
+            found["neck_metal_coverage_fraction"] = float(np.average(hidden[on_neck], weights=area_mm2[on_neck]))
+        on_neck = is_over_neck(anatomy, pores_mm)
+        if on_neck.any():
+            found["neck_pore_density_per_mm2"] = float(on_neck.sum() / pore_mm2[on_neck].sum())
+    return found
+
+
+@lru_cache(maxsize=8)
+def _neck_on_landing(anatomy: Anatomy) -> Surface:
+    """The largest aneurysm's neck moved to the landing surface, which it faces from afar where a sac sits on a fork."""
+    neck = anatomy.aneurysms[0].neck
+    vertices_mm, faces = triangles.compact(neck.vertices_mm, neck.faces)
+    return Surface(anatomy.landing_surface.closest(vertices_mm)[0], faces)
+
+
+def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
+    """Tell for (n, 3) points on the device whether the landing surface there closes or faces the largest neck."""
+    neck = _neck_on_landing(anatomy)
+    at_most_mm = anatomy.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM
+    low_mm, high_mm = neck.vertices_mm.min(axis=0), neck.vertices_mm.max(axis=0)
+    is_over = curves.lengths(points_mm - np.clip(points_mm, low_mm, high_mm)) <= at_most_mm
+    is_over[is_over] = neck.closest(points_mm[is_over])[1] <= at_most_mm[is_over]
+    return is_over

@@ -1,0 +1,267 @@
+"""Build a lattice-Boltzmann run and advance it from check to check."""
+
+from collections import deque
+from dataclasses import replace
+from time import perf_counter
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.flow import domain as domains
+from vstent.flow import sampling
+from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.lattice import close_up as close_ups
+from vstent.flow.lattice.close_up import CloseUp
+from vstent.flow.lattice.gpu import require_gpu, told
+from vstent.flow.lattice.kernels import d3q19, lanes
+from vstent.flow.lattice.kernels.warm import keep_flow
+from vstent.flow.lattice.scales import ODD_RATE, Scales
+from vstent.flow.lattice.screen import build_screen
+from vstent.flow.lattice.setup import (
+    address,
+    build_bands,
+    build_links,
+    build_refill,
+    thickest,
+)
+from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, OnDevice, Probe, Snapshot, State
+from vstent.kernels.arrays import Floats, Ints
+from vstent.units import M_PER_MM
+
+SLICE_UPDATES = 2e8
+"""Cell updates between looks at the clock: a few seconds of one core."""
+
+
+def build(
+    case: FlowCase,
+    cell_size_mm: float,
+    check_s: float,
+    pace: Ints,
+    *,
+    close_up: CloseUp | None,
+    start: FlowField | None,
+    kept: int,
+) -> State:
+    """Build grid, storage and coefficients, of a close-up or of the whole vessel, for the first steps.
+
+    Parameters
+    ----------
+    check_s, pace : time between checks, and (m,) the steps that it is made in, even, in turn.
+    start : a field on any grid to begin from; None: at rest.
+    kept : checks that are remembered.
+    """
+    if case.settings.device_gpu:
+        require_gpu()
+    keep_flow()
+    scales = Scales(cell_size_mm * M_PER_MM, check_s / int(pace[0]), case.blood)
+    if close_up is None:
+        domain = domains.build(case.vessel, cell_size_mm)
+    else:
+        domain = close_ups.build(case, cell_size_mm, close_up)
+    limit = thickest(case, domain)
+    addressing = address(domain, limit)
+    links = build_links(case, domain, addressing, scales, close_up)
+    screen = build_screen(case, domain, addressing, scales)
+    state = State(
+        case,
+        close_up,
+        domain,
+        addressing,
+        scales,
+        (links, screen),
+        links,
+        screen,
+        _probe(case, domain),
+        build_refill(domain, addressing),
+        build_bands(domain, addressing, links),
+        limit[addressing.first_cell],
+        np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
+        pace,
+        check_s,
+        deque(maxlen=kept),
+    )
+    if start is not None:
+        _begin_from(state, start)
+    return state
+
+
+def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
+    cells = domains.cells_of_sac(case, domain)
+    if case.ostium is None:
+        return Probe(cells, np.zeros((0, 3)), np.zeros((0, 3)))
+    points_mm, area_mm2 = sampling.surface_samples(case.ostium, domain.cell_size_mm)
+    return Probe(cells, (points_mm - domain.origin_mm) / domain.cell_size_mm, area_mm2)
+
+
+def _begin_from(state: State, start: FlowField) -> None:
+    """Begin from a flow; a pulse from the end of another's cycle, where there is one."""
+    pulses = state.case.settings.waveform is not None and start.phases
+    moment = start.at_phase(start.phases[-1]) if pulses else start
+    velocity, pressure = sampling.values_at(moment, state.domain.centers_mm)
+    d3q19.set_equilibrium(
+        state.populations,
+        state.addressing.stride,
+        state.addressing.place,
+        pressure / state.scales.pressure_Pa,
+        velocity / state.scales.speed_m_s,
+    )
+    links = state.links
+    for k in np.flatnonzero(links.openings[:, 0] == d3q19.INFLOW):
+        at_inlet = links.place[links.start[k] : links.start[k + 1]]
+        links.openings[k, 2] = d3q19.moments(state.populations, state.addressing.stride, at_inlet)[:, 0].mean()
+
+
+def step(state: State) -> None:
+    """Make the time steps of a few seconds, no further than to the next check; there, read the monitored quantities."""
+    began = perf_counter()
+    advance(state, min(_slice_steps(state), state.steps_per_check - state.since_check))
+    state.loop_seconds += perf_counter() - began
+    if state.since_check == state.steps_per_check:
+        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is told of, not warned of
+            state.snapshots.append(_snapshot(state))
+            state.history.append(_monitor(state, state.snapshots[-1]))
+            state.since_check = 0
+            _keep_pace(state)
+
+
+def is_at_check(state: State) -> bool:
+    """Whether the last steps ended at a check."""
+    return state.since_check == 0
+
+
+def _keep_pace(state: State) -> None:
+    """Go on, after a check, in time steps as long as they may be until the next; what moves, moves on as before."""
+    last, following = (int(state.pace[(len(state.history) + k) % len(state.pace)]) for k in (-1, 0))
+    if last == following:
+        return
+    if state.device is not None:
+        state.device.fetch(state)
+        state.device = None
+    before, stretch = state.scales.relaxation_steps, last / following
+    take_pace(state)
+    stress, a = stretch * state.scales.relaxation_steps / before, state.addressing
+    d3q19.rescale(state.populations, a.stride, a.place, state.links.address, np.float32(stretch), np.float32(stress))
+    state.links.openings[:, d3q19.OWN_DENSITIES] *= stretch**2
+    _settle(state, 1.0)
+
+
+def take_pace(state: State) -> None:
+    """Set the coefficients to the time steps until the next check; populations and openings stay as they are."""
+    stretch = int(state.pace[0]) / state.steps_per_check
+    state.scales = replace(state.scales, step_s=state.check_s / state.steps_per_check)
+    links, screen = state.built
+    state.links, state.screen = links.stretched(stretch), screen.stretched(stretch)
+
+
+def _slice_steps(state: State) -> int:
+    return 2 * max(1, round(SLICE_UPDATES / len(state.domain.cells) / 2))
+
+
+def advance(state: State, steps: int) -> None:
+    """Make an even number of time steps, in pairs."""
+    wanted, moments = imposed(state, state.since_check + 1 + np.arange(0, steps, 2))
+    first_pair = state.since_check // 2
+    if state.case.settings.device_gpu:
+        with told():
+            _device(state).advance(wanted, moments, first_pair)
+    else:
+        _advance_here(state, wanted, moments, first_pair)
+    state.steps += steps
+    state.since_check += steps
+
+
+def imposed(state: State, steps: Floats | Ints) -> tuple[Floats, Floats]:
+    """What is wanted (t, k) at every end at steps (t,) since the last check, and their moments (t, 3).
+
+    See `d3q19.drive`.
+    """
+    links = state.links
+    count = len(links.course)
+    checks = len(state.history) + steps / state.steps_per_check
+    now, part = np.divmod(checks - 1, 1)  # the first moment is the first check
+    moments = np.column_stack([now % count, (now + 1) % count, part])
+    before, after = (links.course[moments[:, k].astype(int)] for k in range(2))
+    factor = state.case.settings.inflow_factor(state.check_s * checks)
+    return factor[:, None] * links.wanted + before + part[:, None] * (after - before), moments
+
+
+def _device(state: State) -> OnDevice:
+    """Return the run on the GPU; the first time, put it there."""
+    from vstent.flow.lattice.on_gpu import Device
+
+    if state.device is None:
+        state.device = Device(state)
+    return state.device
+
+
+def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int) -> None:
+    """Make pairs of steps with what `imposed` returns; the first is that pair since a check."""
+    f, links, refill = state.populations, state.links, state.refill
+    a, screen = state.addressing, state.screen
+    shares = d3q19.share(a.length, screen.start, state.bands, numba.get_num_threads())
+    scales = state.scales
+    relaxation = np.float32(scales.relaxation_steps), scales.thinning, state.limit, np.float32(ODD_RATE)
+    cells = a.address, a.length, relaxation, (screen.start, screen.place, screen.entry)
+    back = links.path, links.weight, links.source, links.by_layer, refill.place, refill.refill, a.septa
+    of_openings = links.start, links.address, links.place, links.direction, links.shape
+    opening_source = links.source[: links.start[-1]]
+    for pair in range(len(wanted)):
+        links.openings[:, 1] = wanted[pair]
+        d3q19.drive(f, a.stride, links.openings, of_openings, moments[pair], opening_source)
+        d3q19.update(f, cells, back, state.bands, shares)
+        if (first_pair + pair) % DEFER_PAIRS == 0:
+            _settle(state, DEFER_PART)
+
+
+def _settle(state: State, part: float) -> None:
+    """Let what is deferred, the correction of the walls and the balance of what they lose, go so far of its way."""
+    links, refill, share = state.links, state.refill, np.float32(part)
+    wall = slice(links.start[-1], None)
+    of_walls = links.address[wall], links.correction[wall], links.source[wall]
+    d3q19.defer(state.populations, *of_walls, refill.lost, share)
+    d3q19.balance(refill.lost, refill.groups, refill.refill, share)
+
+
+def _snapshot(state: State) -> Snapshot:
+    moment, outflow = _read_here(state) if state.device is None else state.device.read()
+    velocity = np.ascontiguousarray(moment[:, 1:])
+    cells = state.screen.cell
+    if len(cells):
+        times = _relaxation_times(state, cells)
+        velocity[cells] = d3q19.resisted(velocity[cells], state.screen.entry, times, np.float32(ODD_RATE))
+    return Snapshot(state.scales, velocity, moment[:, 0], outflow)
+
+
+def _relaxation_times(state: State, cells: Ints) -> NDArray[np.float32]:
+    """Relaxation times (e,) of some cells, as they collide with."""
+    time, law = np.float32(state.scales.relaxation_steps), state.scales.thinning
+    if law[0] == 0:
+        return np.full(len(cells), time)
+    if state.device is not None:
+        state.device.fetch(state)
+    a = state.addressing
+    return np.asarray(d3q19.relaxation_times(state.populations, a.stride, a.place[cells], time, law))
+
+
+def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
+    """Density deviation and momentum (n, 4) of every cell, and the flow out (k,) through every opening."""
+    f, links = state.populations, state.links
+    moment = d3q19.moments(f, state.addressing.stride, state.addressing.place).astype(np.float32)
+    ends = range(len(links.start) - 1)
+    outflow = [d3q19.outflow(f, links.address[links.start[k] : links.start[k + 1]]) for k in ends]
+    return moment, np.array(outflow)
+
+
+def _monitor(state: State, now: Snapshot) -> Floats:
+    """Mean speed of the sac, pressure and mean speed of the vessel, neck inflow: what convergence is judged by."""
+    velocity_m_s = now.velocity_m_s
+    speed_m_s = np.linalg.norm(velocity_m_s, axis=1)
+    first_inflow = state.links.patch[np.argmax(state.links.openings[:, 0] == d3q19.INFLOW)]
+    inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
+    values = [speed_m_s[state.probe.cells].mean(), now.pressure_Pa[inlet].mean(), speed_m_s.mean()]
+    if len(state.probe.ostium_points):
+        at, area_mm2 = state.probe.ostium_points, state.probe.ostium_area_mm2
+        through_mL_s = sampling.read_through_mL_s(state.domain.index, velocity_m_s.astype(float), at, area_mm2)
+        values.append(sampling.inflow_mL_s(through_mL_s))
+    return np.array(values, dtype=float)

@@ -1,0 +1,631 @@
+"""The page's server: the same numbers by every way in, choices that keep their order, cases that outlive the server."""
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from importlib.resources import files
+from pathlib import Path
+
+import app_case
+import numpy as np
+import pytest
+import report_case
+
+import vstent
+from vstent import phantoms
+from vstent.app import cuts, intake, sheets
+from vstent.app.cases import STEPS, Store, load
+from vstent.app.desk import Desk
+from vstent.app.finished import kept_flows
+from vstent.cli import main
+from vstent.deployment.deploy import deploy
+from vstent.deployment.measure import measure
+from vstent.devices.catalogue import find_design
+from vstent.devices.stent import Landing
+from vstent.errors import ReadError
+from vstent.flow.case import Blood, CarreauYasuda, FlowSettings, Phase, Waveform
+from vstent.geometry.vessel import Anatomy
+from vstent.io.archive import load_noun
+from vstent.io.dicom_writer import write_dicom
+from vstent.io.images import read_image
+from vstent.io.writers import write_stl
+from vstent.plan.uncertainty import Ranges
+from vstent.study.folder import CACHE
+from vstent.study.ledger import Ledger
+from vstent.study.repeat import settings_of
+from vstent.study.stages import flow_key
+from vstent.study.types import Settings
+
+SILK = {"name": "silk"}
+
+
+@pytest.fixture(scope="module")
+def artery(tmp_path_factory):
+    path = tmp_path_factory.mktemp("input") / "phantom.stl"
+    write_stl(path, app_case.phantom_surface())
+    return path
+
+
+@pytest.fixture(scope="module")
+def study(artery, tmp_path_factory):
+    """The same at the command line."""
+    out = tmp_path_factory.mktemp("study") / "study"
+    command = ["run", str(artery), "--out", str(out), "--device", "silk", "--units", "mm", "--no-flow"]
+    assert main(command) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    return tmp_path_factory.mktemp("cases")
+
+
+@pytest.fixture(scope="module")
+def client(workspace):
+    with app_case.served(workspace) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def case(client, artery):
+    """A case brought in by HTTP, its vessel found; Silk alone is chosen, no flow is wanted."""
+    case = client.post("/api/cases", json={"name": "Phantom"}).json()
+    answer = client.put(f"/api/cases/{case['id']}/input", params={"name": "phantom.stl"}, content=artery.read_bytes())
+    assert answer.json() == {"taken": True}
+    choices = case["choices"] | {"devices": [SILK], "flow": {"is_wanted": False}, "units": "mm"}
+    client.put(f"/api/cases/{case['id']}/choices", json={"revision": case["revision"], "choices": choices})
+    client.post(f"/api/cases/{case['id']}/input/done")
+    view = app_case.wait(client, case["id"])
+    assert view["failed"] == {}
+    assert [view["steps"][step] for step in STEPS[:3]] == ["done"] * 3
+    return f"/api/cases/{case['id']}"
+
+
+def anatomy_of(client, case, workspace):
+    path = next((workspace / client.get(case).json()["id"] / CACHE).glob("anatomy-*.npz"))
+    return load_noun(path, Anatomy)
+
+
+def choose(client, case, **changes):
+    view = client.get(case).json()
+    body = {"revision": view["revision"], "choices": view["choices"] | changes}
+    return client.put(f"{case}/choices", json=body)
+
+
+def test_command_line_rest_and_python_find_the_same_numbers(client, case, artery, study, tmp_path):
+    client.post(f"{case}/jobs/flow")
+    view = app_case.wait(client, case.rpartition("/")[2])
+    assert set(view["steps"].values()) == {"done"}
+    by_rest = client.get(f"{case}/files/metrics.json").json()
+    by_cli = json.loads((study / "metrics.json").read_text())
+    settings = Settings(devices=("silk",), units="mm", flow=None)
+    vstent.run(artery, tmp_path / "python", settings, lambda *_: None)
+    by_python = json.loads((tmp_path / "python" / "metrics.json").read_text())
+    assert by_rest == by_cli == by_python
+    assert by_rest["stents"]["silk"]["deployment"]["deployed_length_mm"] > 10
+    report = client.get(f"{case}/files/report.html")
+    assert "Silk" in report.text
+    assert "sandbox" in report.headers["content-security-policy"]
+
+
+def test_voxels_without_a_header_wait_for_their_number_and_size(client):
+    voxels = np.full((24, 20, 16), 10, dtype=np.uint8)
+    voxels[6:18, 6:14, 4:12] = 200
+    bare = client.post("/api/cases", json={"name": "bare voxels"}).json()["id"]
+    client.put(f"/api/cases/{bare}/input", params={"name": "scan.raw"}, content=voxels.tobytes())
+    client.post(f"/api/cases/{bare}/input/done")
+    case = f"/api/cases/{bare}"
+    view = client.get(case).json()
+    assert view["wants_grid"]
+    assert (view["job"], view["failed"]) == (None, {})
+    for spacing_mm in ([0.5, 0.25, 2.0], [0.3, 0.3, 0.3]):
+        assert not choose(client, case, spacing_mm=spacing_mm, shape=[16, 20, 24]).json()["wants_grid"]
+        told = client.get(f"{case}/image").json()
+        assert (told["shape"], told["spacing_mm"]) == ([16, 20, 24], pytest.approx(spacing_mm))
+
+
+def test_a_case_takes_one_scan(client, case, artery):
+    answer = client.put(f"{case}/input", params={"name": "other.stl"}, content=artery.read_bytes())
+    assert answer.status_code == 422
+    assert "make another case for other.stl" in answer.json()["detail"]
+    two = f"/api/cases/{client.post('/api/cases', json={'name': 'two'}).json()['id']}"
+    for name in ("one.stl", "other.stl"):
+        assert client.put(f"{two}/input", params={"name": name}, content=artery.read_bytes()).status_code == 200
+    answer = client.post(f"{two}/input/done")
+    assert answer.status_code == 422
+    assert "one.stl and other.stl" in answer.json()["detail"]
+
+
+def test_a_header_and_the_voxels_that_it_names_are_one_scan(tmp_path):
+    (tmp_path / intake.FOLDER).mkdir()
+    (tmp_path / intake.FOLDER / "a.raw").write_bytes(bytes(8))
+    header = tmp_path / intake.FOLDER / "b.mhd"
+    header.write_text("ObjectType = Image\nNDims = 3\nDimSize = 2 2 2\nElementDataFile = a.raw\n")
+    assert intake.found(tmp_path) == f"{intake.FOLDER}/b.mhd"
+    (tmp_path / intake.FOLDER / "c.raw").write_bytes(bytes(8))
+    with pytest.raises(ReadError, match=r"b.mhd and c.raw"):
+        intake.found(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("way", "status", "words"),
+    [
+        ("/api/cases/unheard-of", 404, "no such case"),
+        ("/assets/unheard-of", 404, "no such file"),
+        ("{case}/section?abscissa_mm=nan", 422, "finite"),
+        ("{case}/image/surface?threshold=inf", 422, "finite"),
+    ],
+)
+def test_what_is_not_there_and_what_is_no_number_is_said_so(client, case, workspace, way, status, words):
+    answer = client.get(way.format(case=case))
+    assert answer.status_code == status
+    assert words in answer.text
+    assert str(workspace) not in answer.text
+
+
+def test_a_place_for_a_deployment_is_one_of_the_choices(client, case):
+    assert client.post(f"{case}/deployment", json={"device": SILK, "abscissa_mm": 12.0}).status_code == 422
+
+
+def test_a_case_without_a_scan_says_so(client):
+    empty = client.post("/api/cases", json={"name": "empty"}).json()["id"]
+    assert "no scan yet" in client.get(f"/api/cases/{empty}/image").json()["detail"]
+
+
+def test_a_second_tab_cannot_undo_what_the_first_has_done(client, case):
+    before = client.get(case).json()
+    assert choose(client, case, inlet_mm=[1.0, 2.0, 3.0]).status_code == 200
+    late = client.put(
+        f"{case}/choices", json={"revision": before["revision"], "choices": before["choices"] | {"threshold": 9.0}}
+    )
+    assert late.status_code == 409
+    now = client.get(case).json()
+    assert now["choices"]["inlet_mm"] == [1.0, 2.0, 3.0]
+    assert now["choices"]["threshold"] is None
+    # What depends on the inlet is out of date and not gone; the image does not depend on it.
+    assert now["steps"]["image"] == "done"
+    assert {now["steps"][step] for step in ("vessel", "sac")} == {"stale"}
+    assert client.get(f"{case}/anatomy").status_code == 200
+    undone = client.post(f"{case}/undo", json={"revision": now["revision"]}).json()
+    assert undone["choices"] == before["choices"]
+    assert undone["steps"] == before["steps"]
+    redone = client.post(f"{case}/redo", json={"revision": undone["revision"]}).json()
+    assert redone["choices"] == now["choices"]
+    client.post(f"{case}/undo", json={"revision": redone["revision"]})
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"devices": [{"name": "silk"}, {"name": "silk"}]},
+        {"inlet_mm": [1.0, 2.0]},
+        {"inlet_mm": [1.0, 2.0, 1e9]},
+        {"flow": {"cell_size_mm": 0.001}},
+        {"nonsense": 1},
+        {"threshold": "high"},
+        {"shape": [-1, 0, 3]},
+    ],
+)
+def test_choices_that_mean_nothing_are_refused(client, case, changes):
+    before = client.get(case).json()
+    assert choose(client, case, **changes).status_code == 422
+    assert client.get(case).json()["revision"] == before["revision"]
+
+
+def test_a_dragged_end_lies_where_the_hand_is_and_where_the_deployment_puts_it(client, case, workspace):
+    anatomy = anatomy_of(client, case, workspace)
+    design = find_design("silk")
+    for anchor, end in (("proximal", 0), ("distal", 1)):
+        start, _ = app_case.opened(client.post(f"{case}/sketch", json={"device": SILK}))
+        wanted = start["ends_mm"][end] + 1.3
+        answer = client.post(f"{case}/sketch", json={"device": SILK, "anchor": anchor, "abscissa_mm": wanted})
+        sketched, data = app_case.opened(answer)
+        assert sketched["ends_mm"][end] == pytest.approx(wanted, abs=1e-3)
+        stent = deploy(design, anatomy, landing=Landing(sketched["center_mm"])).stent
+        ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
+        np.testing.assert_allclose(sketched["ends_mm"], ends, atol=0.1)
+        # The end in hand stays there; how sure the artery's diameter is shows at the other one.
+        widths = [high - low for low, high in sketched["ends_band_mm"]]
+        assert widths[end] == pytest.approx(0, abs=1e-6)
+        low, high = sketched["ends_band_mm"][1 - end]
+        assert low < ends[1 - end] < high
+        (wires,) = sketched["layers"]
+        points = app_case.numbers(wires["points"], data)
+        apart = np.linalg.norm(points - stent.wire_points_mm, axis=1)
+        assert np.median(apart) < 0.06
+
+
+@pytest.mark.parametrize(
+    ("anchor", "abscissa_mm", "said"),
+    [("proximal", -5, "is not on the parent artery"), ("distal", 5, "leaves the artery")],
+)
+def test_a_device_dragged_out_of_the_artery_is_refused_with_a_sentence(client, case, anchor, abscissa_mm, said):
+    answer = client.post(f"{case}/sketch", json={"device": SILK, "anchor": anchor, "abscissa_mm": abscissa_mm})
+    assert answer.status_code == 422
+    assert said in answer.json()["detail"]
+
+
+def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
+    anatomy = anatomy_of(client, case, workspace)
+    device = SILK | {"center_mm": round(anatomy.axis.length_mm / 2, 3)}
+    assert choose(client, case, devices=[device]).status_code == 200
+    told, data = app_case.opened(client.post(f"{case}/deployment", json={"device": device, "colour": "coverage"}))
+    deployment = deploy(find_design("silk"), anatomy, landing=Landing(device["center_mm"]))
+    measures = measure(anatomy, deployment)
+    assert told["length_mm"] == pytest.approx(measures["deployed_length_mm"], rel=1e-9)
+    row = next(row for row in told["measures"]["rows"] if row["key"] == "deployed_length_mm")
+    assert float(row["cells"][0].split("\u202f")[0]) == pytest.approx(measures["deployed_length_mm"], rel=5e-3)
+    assert row["meaning"]
+    wires = next(layer for layer in told["layers"] if layer["id"] == "wires")
+    coverage = app_case.numbers(wires["values"], data)
+    assert coverage.mean() == pytest.approx(100 * measures["metal_coverage_fraction"], rel=0.05)
+    steps = client.get(case).json()["steps"]
+    assert (steps["device"], steps["deploy"]) == ("done", "done")
+    choose(client, case, devices=[SILK])
+
+
+def test_the_section_has_the_phantoms_radius(client, case):
+    start, _ = app_case.opened(client.post(f"{case}/sketch", json={"device": SILK}))
+    place = start["ends_mm"][0] + 1.0
+    section = client.get(f"{case}/section", params={"abscissa_mm": place, "device": "silk"}).json()
+    segments = np.array(section["landing"]).reshape(-1, 2, 2)
+    near = np.linalg.norm(segments, axis=2).max(axis=1) < section["artery_diameter_mm"]
+    length = np.linalg.norm(segments[near, 1] - segments[near, 0], axis=1).sum()
+    assert length / np.pi == pytest.approx(section["artery_diameter_mm"], rel=0.03)
+    assert section["device_diameter_mm"] < section["artery_diameter_mm"]
+
+
+def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
+    choose(client, case, devices=[{"name": "enterprise"}])
+    client.post(f"{case}/jobs/rank")
+    view = app_case.wait(client, case.rpartition("/")[2])
+    assert view["failed"] == {}
+    ranking = client.get(f"{case}/ranking").json()
+    assert ranking["is_current"]
+    assert [row["rank"] for row in ranking["rows"]] == list(range(1, 1 + len(find_design("enterprise").sizes)))
+    scores = [row["score"] for row in ranking["rows"] if row["is_suitable"]]
+    assert scores == sorted(scores, reverse=True)
+    assert all(row["reason"] for row in ranking["rows"])
+    choose(client, case, devices=[SILK])
+    assert not client.get(f"{case}/ranking").json()["is_current"]
+
+
+def test_a_job_computes_what_was_chosen_when_it_was_started(client, case):
+    before = client.get(case).json()
+    client.post(f"{case}/jobs/flow")
+    changed = choose(client, case, devices=[{"name": "enterprise"}]).json()  # before the job has loaded its modules
+    assert changed["job"]["stage"] == ""
+    while client.get(case).json()["job"]["stage"] == "":
+        time.sleep(0.02)
+    client.post(f"{case}/undo", json={"revision": changed["revision"]})
+    view = app_case.wait(client, case.rpartition("/")[2])
+    assert view["choices"] == before["choices"]
+    assert set(view["steps"].values()) == {"done"}
+    assert list(client.get(f"{case}/files/metrics.json").json()["stents"]) == ["silk"]
+
+
+def test_a_failure_is_told_while_what_caused_it_is_chosen(client, case):
+    choose(client, case, devices=[{"name": "unheard of"}])
+    client.post(f"{case}/jobs/flow")
+    failed = app_case.wait(client, case.rpartition("/")[2])
+    assert "unheard of" in failed["failed"]["flow"]
+    assert failed["steps"]["flow"] == "failed"
+    chosen = choose(client, case, devices=[SILK]).json()
+    assert chosen["failed"] == {}
+    assert "failed" not in chosen["steps"].values()
+    undone = client.post(f"{case}/undo", json={"revision": chosen["revision"]}).json()
+    assert undone["failed"] == failed["failed"]
+    choose(client, case, devices=[SILK])
+
+
+def test_a_flow_after_another_choice_of_the_vessel_finds_the_vessel_first(client, case):
+    before = client.get(case).json()
+    changed = choose(client, case, upstream_mm=12.0).json()
+    assert changed["steps"]["vessel"] == "stale"
+    client.post(f"{case}/jobs/flow")
+    while client.get(case).json()["anatomy"] == before["anatomy"]:
+        time.sleep(0.05)
+    view = client.delete(f"{case}/jobs").json()  # the former anatomy is not kept any more
+    assert [view["steps"][step] for step in STEPS[:3]] == ["done"] * 3
+    assert client.get(f"{case}/anatomy").status_code == 200
+    choose(client, case, upstream_mm=None)
+    client.post(f"{case}/jobs/anatomy")
+    app_case.wait(client, case.rpartition("/")[2])
+
+
+def test_a_job_is_stopped_within_a_second_and_said_so(client, case):
+    client.post(f"{case}/jobs/anatomy")
+    time.sleep(0.3)
+    began = time.monotonic()
+    view = client.delete(f"{case}/jobs").json()
+    assert time.monotonic() - began < 1.0
+    assert view["job"] is None
+    assert view["failed"]["image"].startswith("Stopped")
+
+
+def test_a_tab_is_told_of_every_change(client, case):
+    with client.stream("GET", f"{case}/events") as events:
+        lines = (line for line in events.iter_lines() if line.startswith("data: "))
+        first = json.loads(next(lines)[6:])
+        answer = choose(client, case, threshold=123.0).json()
+        assert answer["revision"] == first["revision"] + 1
+        second = json.loads(next(lines)[6:])
+    assert (second["revision"], second["choices"]["threshold"]) == (answer["revision"], 123.0)
+    client.post(f"{case}/undo", json={"revision": second["revision"]})
+
+
+def test_a_server_that_was_killed_at_work_goes_on_when_it_starts_again(artery, tmp_path):
+    with app_case.served(tmp_path, artery) as client:
+        case = client.get("/api/cases").json()["opened"]
+        until = time.monotonic() + 60
+        while client.get(f"/api/cases/{case}").json()["job"] is None:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+    state = json.loads((tmp_path / case / "app.json").read_text())
+    assert (state["job"], state["anatomy"]) == ("anatomy", "")
+    with app_case.served(tmp_path) as client:
+        assert client.get(f"/api/cases/{case}").json()["job"]["kind"] == "anatomy"
+        assert client.delete(f"/api/cases/{case}/jobs").json()["job"] is None
+
+
+def test_a_folder_of_vstent_run_opens_with_all_that_it_holds(study, tmp_path):
+    with app_case.served(tmp_path / "cases", study) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        view = client.get(case).json()
+        assert [device["name"] for device in view["choices"]["devices"]] == ["silk"]
+        assert view["choices"]["units"] == "mm"
+        assert not view["choices"]["flow"]["is_wanted"]
+        assert [step for step in STEPS if view["steps"][step] == "done"] == list(STEPS[:5])
+        told, _ = app_case.opened(client.post(f"{case}/deployment", json={"device": SILK}))
+        measured = json.loads((study / "metrics.json").read_text())["stents"]["silk"]["deployment"]
+        assert told["length_mm"] == pytest.approx(measured["deployed_length_mm"], rel=1e-6)
+
+
+def keep_flow(folder, source, settings, name):
+    """Keep a flow as a study of these settings does."""
+    key = flow_key(source, settings, name, None if name == "bare" else find_design(name))
+    Ledger(folder / CACHE, lambda *_: None).keep(f"flow {name}", key, report_case.field(1.0))
+
+
+@pytest.fixture
+def flown(study, tmp_path):
+    """A study's folder with flows, and what its run.json tells."""
+    folder = tmp_path / "flown"
+    shutil.copytree(study, folder, ignore=shutil.ignore_patterns("app.json"))
+    told = json.loads((folder / "run.json").read_text())
+    told["settings"]["flow"] = asdict(FlowSettings(inflow_mL_s=1.0))
+    (folder / "run.json").write_text(json.dumps(told))
+    for name in ("bare", "silk"):
+        keep_flow(folder, told["input"]["sha256"], settings_of(told["settings"]), name)
+    return folder, told
+
+
+def test_flows_of_other_settings_are_not_taken_for_those_of_the_results(flown, tmp_path):
+    folder, told = flown
+    with app_case.served(tmp_path / "cases", folder) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        view = client.get(case).json()
+        assert view["has_flow"]
+        assert set(view["steps"].values()) == {"done"}
+        # A study with another inflow was stopped after its first flow: the flow of the results is there no more.
+        settings = settings_of(told["settings"])
+        other = replace(settings, flow=replace(settings.flow, inflow_mL_s=3.0))
+        keep_flow(folder, told["input"]["sha256"], other, "bare")
+        view = client.get(case).json()
+        assert not view["has_flow"]
+        assert (view["steps"]["flow"], view["steps"]["report"]) == ("todo", "done")
+        assert "run the step Flow" in client.get(f"{case}/flow").json()["detail"]
+        (folder / "report.html").unlink()
+        assert client.get(case).json()["steps"]["report"] == "todo"
+    (folder / "app.json").unlink()
+    with app_case.served(tmp_path / "others", folder) as client:
+        (listed,) = client.get("/api/cases").json()["cases"]
+        assert listed["done"] == list(STEPS[:5])
+
+
+def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_path):
+    folder, told = flown
+    pulse = Waveform(0.8, (0.2,), (0.1,))
+    blood = Blood(1050.0, 0.0035, CarreauYasuda())
+    flow = FlowSettings(inflow_mL_s=1.0, blood=blood, waveform=pulse, close_up=True)
+    given = replace(settings_of(told["settings"]), flow=flow, uncertainty=Ranges(16, landing_mm=2.0), length_mm=20.0)
+    told["settings"] = asdict(given)
+    (folder / "run.json").write_text(json.dumps(told))
+    with app_case.served(tmp_path / "cases", folder) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        view = client.get(case).json()
+        assert {"flow blood viscosity_Pa_s 0.0035", "flow blood thinning", "flow close_up True"} < set(view["unseen"])
+        assert client.get("/api/waveform", params={"case_id": case.rpartition("/")[2]}).json()["time_s"][-1] == 0.8
+        choose(client, case, flow=view["choices"]["flow"] | {"inflow_mL_s": 2.0}, devices=[{"name": "enterprise"}])
+        asked = load("flown", folder).state.settings()
+    assert asdict(asked.flow) == asdict(replace(flow, inflow_mL_s=2.0))
+    assert asdict(asked.uncertainty) == asdict(given.uncertainty)
+    assert asked.placing("enterprise").length_mm is None  # that of Silk alone
+
+
+def test_a_setting_that_the_page_does_not_take_is_named(flown, tmp_path):
+    folder, told = flown
+    told["settings"]["flow"]["cell_size_mm"] = 0.03
+    (folder / "run.json").write_text(json.dumps(told))
+    with pytest.raises(ReadError, match=r"flow.cell_size_mm = 0.03.*vstent run"):
+        Desk(Store(tmp_path / "cases")).open(folder)
+
+
+def test_a_folder_whose_study_was_run_again_at_the_shell_shows_no_other_results_as_done(flown, tmp_path):
+    folder, told = flown
+    with app_case.served(tmp_path / "cases", folder) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        told["settings"]["flow"]["inflow_mL_s"] = 3.0
+        (folder / "run.json").write_text(json.dumps(told))
+        for name in ("bare", "silk"):
+            keep_flow(folder, told["input"]["sha256"], settings_of(told["settings"]), name)
+        view = client.get(case).json()
+    assert view["has_flow"]
+    assert (view["steps"]["flow"], view["steps"]["report"]) == ("todo", "todo")
+
+
+def test_flows_of_a_study_before_one_without_flow_are_not_its(flown):
+    folder, told = flown
+    assert [path.name.partition("-")[0] for path in kept_flows(folder).values()] == ["flow bare", "flow silk"]
+    told["settings"]["flow"] = None
+    (folder / "run.json").write_text(json.dumps(told))
+    assert kept_flows(folder) == {}
+
+
+def test_slices_hold_the_scans_voxels_and_the_live_surface_is_its_wall(tmp_path):
+    rng = np.random.default_rng(3)
+    voxels = rng.normal(100, 5, (40, 36, 30))
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in voxels.shape), indexing="ij"), axis=-1)
+    voxels[np.linalg.norm(grid - [20, 18, 15], axis=-1) < 9] = 1000
+    write_dicom(vstent_image(voxels), tmp_path / "scan")
+    with app_case.served(tmp_path / "cases", tmp_path / "scan") as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        while not client.get(case).json()["has_input"]:
+            time.sleep(0.02)
+        image = read_image(tmp_path / "scan")
+        told, data = app_case.opened(client.get(f"{case}/image/slice", params={"axis": 2, "index": 15}))
+        shown = app_case.numbers(told["values"], data).reshape(told["height"], told["width"])
+        np.testing.assert_allclose(shown, image.voxels[:, :, 15].T, atol=0.02)
+        assert client.get(f"{case}/image/slice", params={"axis": 2, "index": 30}).status_code == 422
+        told, data = app_case.opened(client.get(f"{case}/image/surface", params={"threshold": 550}))
+        points = app_case.numbers(told["layers"][0]["points"], data)
+        radius = np.linalg.norm(points - image.to_mm(np.array([[20, 18, 15]])), axis=1)
+        assert radius.mean() == pytest.approx(8.75 * 0.4, rel=0.03)
+
+
+def vstent_image(voxels):
+    from vstent.geometry.image import Image
+
+    return Image(voxels.astype(np.int16), np.diag([0.4, 0.4, 0.4, 1.0]), "XA")
+
+
+def test_a_cut_lies_in_one_plane_and_has_the_flows_speed_at_a_moment_or_in_the_mean():
+    anatomy, mean = report_case.anatomy(), report_case.field(1.0)
+    fast = Phase(
+        0.25,
+        2 * mean.inlets_mL_s,
+        2 * mean.outlets_mL_s,
+        2 * mean.velocity_m_s,
+        mean.pressure_Pa,
+        3 * mean.wall_shear_stress_Pa,
+    )
+    pulsing = replace(mean, phases=(fast,))
+    layers = [cuts.cut("bare", field, anatomy) for field in (mean, pulsing.at_phase(pulsing.phases[0]))]
+    points = layers[0].surface.vertices_mm
+    assert np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[2] < 1e-9
+    # In the bend's plane the speed is Poiseuille's: its largest, on the axis, is 0.5 m/s.
+    off = np.hypot(points[:, 0], points[:, 2]) - report_case.BEND_MM
+    on_axis = (np.abs(off) < 0.1) & (points[:, 2] > 3) & (np.abs(points[:, 1]) < 0.1)
+    assert on_axis.sum() > 10
+    np.testing.assert_allclose(layers[0].values[on_axis], 0.5, rtol=0.08)
+    np.testing.assert_allclose(layers[1].values, 2 * layers[0].values, rtol=1e-5)
+    np.testing.assert_allclose(pulsing.at_phase(pulsing.phases[0]).shear_Pa, 3 * mean.shear_Pa, rtol=1e-5)
+
+
+def test_the_interface_is_described_and_its_page_needs_no_network(client):
+    api = client.get("/api/openapi.json").json()
+    assert "/api/cases/{case_id}/choices" in api["paths"]
+    assert all(verb["summary"] for verbs in api["paths"].values() for verb in verbs.values())
+    for path in ("/api/docs", "/assets/docs.js", "/", "/assets/app.css"):
+        assert "https://" not in client.get(path).text
+
+
+def test_uncertainty_is_told_in_the_order_of_the_devices_with_its_causes():
+    def varied(low, high):
+        ends = {"mean": 0.5 * (low + high), "low": low, "high": high}
+        shares = {"landing_fraction": 0.2, "device_fraction": 0.7, "rest_fraction": 0.1}
+        ranges = {"threshold_mm": 0.0, "landing_mm": 1.0, "device_mm": 0.1, "inflow_fraction": 0.2}
+        return {
+            "samples_count": 16,
+            "failed_count": 1,
+            "ranges": ranges,
+            "intervals": {"deployed_length_mm": ends},
+            "shares": {"deployed_length_mm": shares},
+        }
+
+    metrics = {
+        "stents": {"enterprise": {"uncertainty": varied(12.0, 14.0)}, "silk": {"uncertainty": varied(15.0, 18.0)}}
+    }
+    silk, enterprise = sheets.uncertainty(metrics, {"silk": "Silk 4 x 15 mm", "enterprise": "Enterprise"})
+    assert (silk["title"], enterprise["title"]) == ("Silk 4 x 15 mm", "Enterprise")
+    (row,) = silk["rows"]
+    assert [row[key].replace("\u202f", " ") for key in ("mean", "low", "high")] == ["16.5 mm", "15.0 mm", "18.0 mm"]
+    assert [cause for cause, _ in row["shares"]] == ["device as made", "landing", "interplay"]
+    assert "16 deployments, of which 1 did not fit" in silk["words"]
+    assert sheets.uncertainty({"stents": {"silk": {}}}, {"silk": "Silk"}) == []
+
+
+def test_the_first_page_waits_for_nothing_that_only_results_need():
+    code = (
+        "import sys; from vstent.app import server; [server.asset(name) for name in server.ASSETS]; "
+        "print(sorted({'vstent.reporting.page', 'vstent.study', 'vstent.flow'} & set(sys.modules)))"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_the_page_was_built_from_the_sources_beside_it():
+    viewer = Path(__file__).resolve().parents[2] / "viewer"
+    sources = [source for folder in ("src", "app") for source in sorted((viewer / folder).iterdir())]
+    built = files("vstent.app").joinpath("assets", "app.js").read_text(encoding="utf-8")
+    digest = hashlib.sha256(
+        b"".join(path.read_bytes() for path in [*sources, viewer / "package-lock.json"])
+    ).hexdigest()
+    assert f"sources {digest} */" in built[:300], "run `npm ci && npm run build` in viewer/"
+    style = files("vstent.app").joinpath("assets", "app.css").read_text(encoding="utf-8")
+    assert style == (viewer / "app" / "app.css").read_text(encoding="utf-8")
+
+
+@pytest.mark.validation
+def test_with_flow_all_ways_in_agree_too(tmp_path):
+    path = tmp_path / "phantom.stl"
+    write_stl(path, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
+    with app_case.served(tmp_path / "cases", path) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        app_case.wait(client, case.rpartition("/")[2])
+        assert choose(client, case, devices=[SILK], flow={"cell_size_mm": 0.35}).status_code == 200
+        client.post(f"{case}/jobs/flow")
+        app_case.wait(client, case.rpartition("/")[2], 1200)
+        by_rest = client.get(f"{case}/files/metrics.json").json()
+    assert main(["run", str(path), "--out", str(tmp_path / "cli"), "--device", "silk", "--cell-size", "0.35"]) == 0
+    assert by_rest == json.loads((tmp_path / "cli" / "metrics.json").read_text())
+
+
+FIRST_REQUESTS = """
+import socket, sys, threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+import httpx, uvicorn
+from vstent.app.cases import Store
+from vstent.app.desk import Desk
+from vstent.app.server import create
+
+importing = set()
+def heard(event, values):
+    if event == "import" and values[0].startswith("vstent."):
+        importing.add(threading.get_ident())
+listener = socket.create_server(("127.0.0.1", 0))
+host = f"127.0.0.1:{listener.getsockname()[1]}"
+guard = create(Desk(Store(Path(sys.argv[1]))), token="t", hosts=(host,))
+server = uvicorn.Server(uvicorn.Config(guard, log_level="error"))
+sys.addaudithook(heard)
+thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+thread.start()
+def asked(path):
+    return httpx.get(f"http://{host}{path}", headers={"authorization": "Bearer t"}, timeout=60).status_code
+with ThreadPoolExecutor(9) as pool:
+    print(set(pool.map(asked, 3 * ["/api/waveform", "/api/catalogue", "/api/cases"])), len(importing))
+server.should_exit = True
+thread.join()
+"""
+
+
+def test_the_first_requests_wait_for_one_thread_that_loads(tmp_path):
+    """Threads that import a package and a module of it at once may get a half of it: a page then had answers of 500."""
+    given = [sys.executable, "-c", FIRST_REQUESTS, str(tmp_path)]
+    found = subprocess.run(given, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "{200} 1"

@@ -1,0 +1,370 @@
+"""A close-up computes the sac and its neck on fine cells, in a flow computed on wide ones."""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+from shapes import sphere
+from tubes import arc, line, tube
+from womersley import MEAN_MEAN_M_S, PULSE, RADIUS_M, womersley_m_s
+
+from vstent import phantoms
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.errors import FlowError, InputError
+from vstent.flow import domain
+from vstent.flow import simulation as flow
+from vstent.flow.case import OPENFOAM, FlowCase, FlowField, FlowSettings, Screen, Swing
+from vstent.flow.engines import AbstractEngine, run
+from vstent.flow.indices import indices
+from vstent.flow.lattice import close_up as close_ups
+from vstent.flow.lattice.cost import estimate
+from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.kernels import d3q19
+from vstent.flow.lattice.pace import peak_speed_m_s
+from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
+from vstent.flow.lattice.setup import thickest
+from vstent.flow.lattice.stepping import build, imposed, take_pace
+from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.waveform import OLDER_ADULT_ICA
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Vessel
+
+RADIUS_MM, INFLOW_ML_S = 2.0, 1.0
+MEAN_M_S = INFLOW_ML_S / (np.pi * RADIUS_MM**2)
+
+
+def ball(center_mm: tuple[float, float, float], radius_mm: float = 1.0) -> Surface:
+    """Stands for a sac: what a close-up is of."""
+    whole = sphere(radius_mm)
+    return Surface(whole.vertices_mm + np.array(center_mm), whole.faces)
+
+
+@cache
+def demo() -> Anatomy:
+    return restore(trim(trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.3)))))
+
+
+@cache
+def of_tube() -> FlowField:
+    vessel = tube(line(40.0), RADIUS_MM).vessel
+    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.2, close_up=True, tolerance=2e-3)
+    return simulate_case(FlowCase(vessel, sac=ball((0.0, 0.0, 24.0)), settings=settings))
+
+
+def at_rest(case: FlowCase, grid: domain.Domain) -> FlowField:
+    """A flow of one outlet of which nothing but what goes through it is known."""
+    still, lumen = np.zeros((len(grid.cells), 3)), case.vessel.lumen
+    stress = np.zeros((len(lumen.vertices_mm), 3))
+    values = still, still[:, 0], lumen, stress, stress[:, 0], case.inlets_mL_s, case.inlets_mL_s, np.zeros(1)
+    told = case.blood, True, 0.0, "", np.zeros(1), 1, 1.0, 1.0
+    return FlowField(grid.cells, grid.origin_mm, grid.cell_size_mm, *values, np.zeros(1), *told)
+
+
+@cache
+def outer_of_demo() -> tuple[FlowCase, FlowField]:
+    case = flow_case(demo(), None, FlowSettings(cell_size_mm=0.5))
+    return case, simulate_case(case)
+
+
+def test_a_close_up_of_poiseuille_flow_is_poiseuille_flow() -> None:
+    field = of_tube()
+    x, y, z = field.centers_mm.T
+    exact = 2 * MEAN_M_S * (1 - (x**2 + y**2) / RADIUS_MM**2)
+    within = (z > 15) & (z < 27)
+    error = (field.velocity_m_s - exact[:, None] * [0, 0, 1])[within] / (2 * MEAN_M_S)
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.002
+    fall_Pa_m = -np.polyfit(z[within] * 1e-3, field.pressure_Pa[within], 1)[0]
+    assert fall_Pa_m == pytest.approx(8 * 0.004 * MEAN_M_S / (RADIUS_MM * 1e-3) ** 2, rel=0.01)
+    height = field.wall.vertices_mm[:, 2]
+    middle = (height > 16) & (height < 26)
+    stress_Pa = field.wall_shear_stress_Pa[middle, 2].mean()
+    assert stress_Pa == pytest.approx(4 * 0.004 * MEAN_M_S / (RADIUS_MM * 1e-3), rel=0.02)
+
+
+def test_what_surrounds_a_close_up_is_given_half_of_the_steps_and_no_neck_to_watch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = []
+
+    def telling(engine: AbstractEngine[Any], case: FlowCase, **more: Any) -> FlowField:
+        seen.append((engine.cell_size_mm, case.settings.max_steps, case.ostium))
+        return run(engine, case, **more)
+
+    monkeypatch.setattr(flow, "run", telling)
+    sac = ball((0.0, 0.0, 24.0))
+    case = FlowCase(tube(line(40.0), RADIUS_MM).vessel, sac=sac, ostium=sac)
+    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.3, close_up=True, max_steps=960)
+    simulate_case(replace(case, settings=settings))
+    assert seen == [(0.6, 480, None), (0.3, 960, sac)]
+
+
+def test_the_flow_goes_on_across_the_cuts() -> None:
+    field = of_tube()
+    z = field.centers_mm[:, 2]
+    radius_mm = np.hypot(*field.centers_mm[:, :2].T)
+    on_axis = radius_mm < 0.3
+    exact = 2 * MEAN_M_S * (1 - (radius_mm / RADIUS_MM) ** 2)
+    fit = np.polyfit(z[on_axis & (z > 2) & (z < 38)], field.pressure_Pa[on_axis & (z > 2) & (z < 38)], 1)
+    for cut_mm, inwards in ((24 - 1 - 3 * 2 * RADIUS_MM, 1), (24 + 1 + 2 * RADIUS_MM, -1)):
+        near = on_axis & (np.abs(z - cut_mm) < 2)
+        assert np.abs(field.pressure_Pa[near] - np.polyval(fit, z[near])).max() < 0.02 * abs(fit[0]) * 40
+        fine = near & (inwards * (z - cut_mm) > 1.0)
+        assert np.abs(field.velocity_m_s[fine, 2] - exact[fine]).max() < 0.01 * 2 * MEAN_M_S
+
+
+def test_a_close_up_of_womersleys_flow_is_womersleys_flow() -> None:
+    vessel = tube(line(40.0), RADIUS_MM).vessel
+    inflow_mL_s = MEAN_MEAN_M_S * np.pi * RADIUS_M**2 * 1e6
+    settings = FlowSettings(
+        inflow_mL_s=inflow_mL_s, cell_size_mm=0.25, close_up=True, waveform=PULSE, lattice_speed=0.05
+    )
+    field = simulate_case(FlowCase(vessel, sac=ball((0.0, 0.0, 24.0)), settings=settings))
+    assert field.is_converged
+    x, y, z = field.centers_mm.T
+    within = (z > 15) & (z < 25)
+    peak_m_s = womersley_m_s(np.zeros(1), 0.0).max()
+    for phase in field.phases:
+        assert phase.inflow_mL_s == pytest.approx(inflow_mL_s * PULSE.factor(np.array([phase.time_s]))[0], rel=2e-3)
+        exact = womersley_m_s(1e-3 * np.hypot(x, y), phase.time_s)[:, None] * [0, 0, 1]
+        error = (phase.velocity_m_s - exact)[within] / peak_m_s
+        assert np.sqrt((error**2).sum(axis=1).mean()) < 0.004
+        assert np.abs(error).max() < 0.01
+
+
+def test_at_every_phase_cuts_let_through_what_the_flow_around_has_there() -> None:
+    case, _ = outer_of_demo()
+    pulse = replace(case, settings=replace(case.settings, waveform=OLDER_ADULT_ICA, max_cycles=1))
+    outer = simulate_case(pulse)
+    state = PulsatileLatticeBoltzmann(0.25, None, outer).init(pulse, outer)
+    chosen = close_ups.close_up(pulse, outer)
+    ends = state.links.openings
+    part = state.links.patch - len(case.vessel.openings) - 1
+    assert (part >= 0).all()
+    assert sorted(ends[:, 0]) == [d3q19.PRESSURE, d3q19.INFLOW, d3q19.OUTFLOW]
+    steps = state.steps_per_check * np.array([0.5, 1.0, 4.0, 4.5, 5.0, 20.0, 20.5])
+    wanted, moments = imposed(state, steps)
+    np.testing.assert_allclose(wanted[0], wanted[-1])  # it is periodic
+    flow_mL_s = wanted * np.where(ends[:, 0] == d3q19.INFLOW, 1, -1) * ends[:, 7] * state.scales.flow_mL_s
+    for row, phase in ((1, 0), (2, 3), (4, 4), (5, 19)):
+        expected = chosen.at_phase(outer.phases[phase]).inflow_mL_s[part]
+        is_flow = ends[:, 0] != d3q19.PRESSURE
+        np.testing.assert_allclose(flow_mL_s[row][is_flow], expected[is_flow], rtol=1e-9)
+        assert moments[row, int(moments[row, 2] > 0.5)] == phase
+    inlet = ends[:, 0] == d3q19.INFLOW
+    waveform = outer.inflow_mL_s * OLDER_ADULT_ICA.factor(steps * state.scales.step_s)
+    np.testing.assert_allclose(flow_mL_s[:, inlet][:, 0], waveform, rtol=5e-3)
+
+
+def test_what_is_built_for_some_steps_serves_longer_ones_as_if_built_for_them() -> None:
+    case, _ = outer_of_demo()
+    points_mm = demo().aneurysms[0].neck.vertices_mm
+    ones = np.ones(len(points_mm))
+    resistances = 300 * ones, 150 * ones, 0.5 * ones
+    screen = Screen(points_mm, ones[:, None] * [0.0, 0.6, 0.8], 0.1 * ones, *resistances, ones, ones)
+    settings = replace(case.settings, waveform=OLDER_ADULT_ICA, max_cycles=1, outlets="murray")
+    pulse = replace(case, screen=screen, settings=settings)
+    outer = simulate_case(pulse)
+    state = PulsatileLatticeBoltzmann(0.25, None, outer).init(pulse, outer)
+    checks = int(state.pace.argmin())
+    assert state.pace[checks] < 0.7 * state.pace[0]
+    state.history = [np.zeros(1)] * checks
+    take_pace(state)
+    fewest = state.pace[[checks]]
+    wanted = build(pulse, 0.25, state.check_s, fewest, close_up=state.close_up, start=None, kept=1)
+    assert state.scales == wanted.scales
+    assert len(state.screen.entry) > 20
+    np.testing.assert_allclose(state.screen.entry, wanted.screen.entry, rtol=1e-5)
+    np.testing.assert_allclose(state.links.correction, wanted.links.correction, atol=1e-6)
+    for name in ("wanted", "course", "shape"):
+        expected = getattr(wanted.links, name)
+        np.testing.assert_allclose(getattr(state.links, name), expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+def test_every_place_has_one_cell() -> None:
+    field = of_tube()
+    assert len(np.unique(field.cells, axis=0)) == len(field.cells)
+    assert (np.lexsort(field.cells.T[::-1]) == np.arange(len(field.cells))).all()
+    whole = domain.build(tube(line(40.0), RADIUS_MM).vessel, 0.2)
+    assert len(field.cells) == pytest.approx(len(whole.cells), rel=1e-2)
+
+
+def test_through_every_cut_passes_what_the_openings_beyond_it_take() -> None:
+    case, outer = outer_of_demo()
+    settings = replace(case.settings, cell_size_mm=0.25, close_up=True)
+    engine = LatticeBoltzmann(0.25, None, outer)
+    state = engine.init(replace(case, settings=settings), outer)
+    close_up = close_ups.close_up(case, outer)
+    assert close_up.inflow_mL_s.sum() == pytest.approx(0, abs=1e-3 * outer.inflow_mL_s)
+    assert (np.sort(close_up.inflow_mL_s) == np.sort([*outer.inlets_mL_s, *-outer.outlets_mL_s])).all()
+    while state.steps < 3000:
+        state = engine.step(state)
+    inflow_mL_s = -state.snapshots[-1].outflow * state.scales.flow_mL_s
+    order = state.links.patch - len(case.vessel.openings) - 1
+    assert inflow_mL_s == pytest.approx(close_up.inflow_mL_s[order], abs=0.003 * outer.inflow_mL_s)
+    assert inflow_mL_s.sum() == pytest.approx(0, abs=0.002 * outer.inflow_mL_s)
+
+
+def test_blood_may_be_thick_in_and_near_a_cut_and_behind_openings_only() -> None:
+    case, outer = outer_of_demo()
+    grid = close_ups.build(case, 0.25, close_ups.close_up(case, outer))
+    limit = thickest(case, grid)
+    in_cut = grid.cells[np.unique(grid.link_cell[grid.link_patch > len(case.vessel.openings)])]
+    away = cKDTree(in_cut).query(grid.cells, p=np.inf)[0]
+    assert set(limit[away <= 2]) == {5.0}
+    assert set(limit[(away > 2) & (away <= 6)]) == {25.0}
+    assert set(limit[away > 6]) == {75.0}
+    whole = domain.build(case.vessel, 0.25)
+    outside = np.zeros(len(whole.cells), dtype=bool)
+    for opening in case.vessel.openings:
+        offset_mm = whole.centers_mm - opening.center_mm
+        outside |= (offset_mm @ opening.normal > 0) & (np.linalg.norm(offset_mm, axis=1) < 3 * opening.diameter_mm)
+    assert set(thickest(case, whole)[~outside]) == {75.0}
+    assert set(thickest(case, whole)[outside]) == {25.0}
+
+
+def test_an_artery_that_only_passes_by_is_not_in_the_close_up() -> None:
+    path = arc(2.4, np.pi, straight_mm=14.0)
+    case = FlowCase(tube(path, 1.9).vessel, sac=ball((0.0, 0.0, -9.0)), settings=FlowSettings(cell_size_mm=0.38))
+    outer = simulate_case(replace(case, settings=replace(case.settings, max_steps=240)))
+    close_up = close_ups.close_up(case, outer)
+    passing = outer.centers_mm[:, 0] > 2.4
+    beside = passing & (np.linalg.norm(outer.centers_mm - [0, 0, -9.0], axis=1) < 4.0)
+    assert beside.sum() > 100
+    assert (close_up.part[passing] >= 0).all()
+    fine = close_ups.build(case, 0.19, close_up)
+    assert fine.centers_mm[:, 0].max() < 2.4
+    assert fine.centers_mm[:, 2].min() < -14.0  # upstream it reaches the inlet's extension
+    assert fine.centers_mm[:, 2].max() < -9.0 + 1.0 + 3.8 + 2 * 0.38
+
+
+@pytest.mark.parametrize("gap_mm", [0.3, 0.5])
+def test_a_close_up_does_not_reach_through_the_walls_of_arteries_that_touch(gap_mm: float) -> None:
+    """Gaps narrower than a wide cell, along limbs and extensions."""
+    middle_mm = 1.5 + 0.5 * gap_mm
+    vessel = tube(arc(middle_mm, np.pi, straight_mm=28.0), 1.5).vessel
+    grid = domain.build(vessel, 0.6)
+    assert len(grid.septum_cell) > 100
+    case = FlowCase(vessel, sac=ball((-1.5, 0.0, -14.0)), settings=FlowSettings(inflow_mL_s=2.0))
+    close_up = close_ups.close_up(case, at_rest(case, grid))
+    assert (close_up.part[grid.centers_mm[:, 0] > middle_mm] >= 0).all()
+    assert close_up.part_of_opening.tolist() == [0, 1]
+    assert close_up.inflow_mL_s == pytest.approx([2.0, -2.0])
+
+
+def test_what_a_swing_tells_is_the_close_ups_within_and_that_of_the_wide_cells_elsewhere() -> None:
+    vessel = tube(line(30.0), RADIUS_MM).vessel
+    case = FlowCase(vessel, sac=ball((0.0, 0.0, 15.0)), settings=FlowSettings(inflow_mL_s=INFLOW_ML_S))
+    outer = at_rest(case, domain.build(vessel, 0.5))
+    outer = replace(outer, velocity_m_s=outer.velocity_m_s + np.array([0.0, 0.0, 0.3]))
+    chosen = close_ups.close_up(case, outer)
+    inner = at_rest(case, close_ups.build(case, 0.25, chosen))
+    of_wall = np.arange(len(vessel.lumen.vertices_mm), dtype=float)
+    swing = Swing(np.linspace(1.0, 2.0, len(inner.cells)), of_wall)
+    found = close_ups.assembled(chosen, replace(inner, swing=swing, neck_inflow_mL_s=3.0))
+    assert found.swing is not None
+    assert found.neck_inflow_mL_s == 3.0
+    nearest_mm, of_inner = cKDTree(inner.centers_mm).query(found.centers_mm)
+    is_inner = nearest_mm < 1e-6
+    np.testing.assert_array_equal(found.speed_m_s[is_inner], swing.speed_m_s[of_inner[is_inner]])
+    deep = ~is_inner & (np.linalg.norm(found.centers_mm[:, :2], axis=1) < 1.0)
+    deep &= np.abs(found.centers_mm[:, 2] - 15.0) < 14.0
+    assert deep.sum() > 1000
+    np.testing.assert_allclose(found.speed_m_s[deep], 0.3, rtol=1e-6)
+    assert set(np.flatnonzero(found.shear_Pa != of_wall)) <= set(np.flatnonzero(found.shear_Pa == 0.0))
+    assert (found.shear_Pa == of_wall).sum() > 1000
+    assert (found.shear_Pa == 0.0).sum() > 1000
+    assert close_ups.assembled(chosen, inner).swing is None
+
+
+def test_a_recess_that_leads_nowhere_belongs_to_the_close_up() -> None:
+    chain = csr_matrix((np.ones(5), ([0, 1, 2, 3, 2], [1, 2, 3, 4, 5])), shape=(6, 6))
+    is_beyond = np.array([True, False, False, False, True, True])
+    assert close_ups._parts(chain, is_beyond, np.array([0, 4])).tolist() == [0, -1, -1, -1, 1, -1]
+
+
+def test_a_vessel_that_is_all_near_is_computed_as_a_whole() -> None:
+    long = Surface(sphere(1.0).vertices_mm * [1.0, 1.0, 7.0] + [0.0, 0.0, 6.0], sphere(1.0).faces)
+    settings = FlowSettings(cell_size_mm=0.4, max_steps=240)
+    case = FlowCase(tube(line(8.0), RADIUS_MM).vessel, sac=long, settings=settings)
+    near = close_ups.build(case, 0.2, close_ups.close_up(case, simulate_case(case)))
+    whole = domain.build(case.vessel, 0.2)
+    assert len(near.cells) == pytest.approx(len(whole.cells), rel=1e-2)
+    assert np.unique(near.link_patch).tolist() == [0, 1, 2]
+
+
+def test_the_cells_foretold_are_enough_and_not_far_too_many() -> None:
+    case, outer = outer_of_demo()
+    wanted = replace(case, settings=replace(case.settings, cell_size_mm=0.25, close_up=True))
+    made = len(close_ups.build(wanted, 0.25, close_ups.close_up(case, outer)).cells)
+    assert made < estimate(wanted).cells < 1.25 * made
+    whole = estimate(replace(wanted, settings=replace(wanted.settings, close_up=False)))
+    assert estimate(wanted).steps == whole.steps / 6
+    assert estimate(wanted).seconds < 0.4 * whole.seconds
+
+
+def test_no_close_up_without_a_sac_or_of_what_has_none() -> None:
+    bare = FlowCase(tube(line(8.0), 2.0).vessel, settings=FlowSettings(cell_size_mm=0.3, close_up=True))
+    with pytest.raises(FlowError, match="this vessel has none: leave out --close-up"):
+        simulate_case(bare)
+    with pytest.raises(InputError, match="the engine openfoam does not compute a close-up: leave out --close-up"):
+        simulate_case(replace(bare, settings=replace(bare.settings, engine=OPENFOAM)))
+
+
+def test_a_close_up_is_given_a_sixth_of_the_steps() -> None:
+    case, outer = outer_of_demo()
+    whole, near = (LatticeBoltzmann(0.25, None, around) for around in (None, outer))
+    state = near.init(case, outer)
+    assert near.max_checks(state) == int(case.settings.max_steps / 6 // state.steps_per_check) >= 12
+    assert whole.max_checks(state) == int(case.settings.max_steps // state.steps_per_check)
+
+
+def test_a_close_ups_time_step_goes_by_its_own_fastest_blood() -> None:
+    """Blood that is ten times as fast, but beyond its cuts, changes nothing; within it does. It is a third longer."""
+    case, outer = outer_of_demo()
+    part = close_ups.close_up(case, outer).part
+    for is_faster, times in ((part >= 0, 1.0), (part < 0, 10.0)):
+        velocity_m_s = np.where(is_faster[:, None], 10.0, 1.0) * outer.velocity_m_s
+        faster = replace(outer, velocity_m_s=velocity_m_s)
+        step_s = [LatticeBoltzmann(0.25, None, one).init(case, one).scales.step_s for one in (outer, faster)]
+        assert step_s[0] == pytest.approx(times * step_s[1])
+        assert step_s[0] * 1.1 * np.quantile(outer.speed_m_s[part < 0], 0.999) == pytest.approx(0.2 * 0.25e-3)
+
+
+def test_a_little_blood_may_be_twice_as_fast_as_time_steps_go_by() -> None:
+    """As in one narrow branch, which would cost all the vessel its time steps."""
+    case, outer = outer_of_demo()
+    usual_m_s = np.quantile(outer.speed_m_s, 0.999)
+    few = np.zeros(len(outer.cells), dtype=bool)
+    few[np.argsort(outer.speed_m_s)[-len(few) // 1500 :]] = True
+    assert few.mean() < 1e-3
+    for times, longer in ((1.9, 1.0), (4.0, 0.5)):
+        speed_m_s = np.where(few, times * usual_m_s, outer.speed_m_s)
+        velocity_m_s = outer.velocity_m_s * (speed_m_s / np.maximum(outer.speed_m_s, 1e-12))[:, None]
+        peak_m_s = peak_speed_m_s(case, replace(outer, velocity_m_s=velocity_m_s))
+        assert peak_m_s == pytest.approx(1.1 * usual_m_s / longer, rel=2e-3)
+
+
+def test_a_close_up_tells_of_branches_too_narrow_for_the_cells_around_it() -> None:
+    case, _ = outer_of_demo()
+    field = simulate_case(
+        replace(case, settings=replace(case.settings, close_up=True, cell_size_mm=0.2, max_steps=192))
+    )
+    assert "Of cells of 0.4 mm, outlet_2 (1.3 mm) has 3.2 across" in field.advice
+    assert "Of cells of 0.2 mm" not in field.advice
+
+
+@pytest.mark.validation
+def test_a_close_up_of_the_demo_is_what_fine_cells_all_over_give() -> None:
+    case = flow_case(demo(), None, FlowSettings(cell_size_mm=0.14))
+    whole, near = (
+        indices(simulate_case(replace(case, settings=replace(case.settings, close_up=close_up))), case.sac, case.ostium)
+        for close_up in (False, True)
+    )
+    for key, most in (("neck_inflow_mL_s", 0.03), ("mean_sac_velocity_m_s", 0.03), ("mean_sac_wss_Pa", 0.05)):
+        assert near[key] == pytest.approx(whole[key], rel=most), key

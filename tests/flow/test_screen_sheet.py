@@ -1,0 +1,156 @@
+"""A screen on the grid takes as much of blood as the thin sheet, or the row of wires, that it stands for."""
+
+import numpy as np
+import pytest
+
+from vstent.flow.case import Screen
+from vstent.flow.drag import concentration, drag_per_length
+from vstent.flow.lattice.kernels import d3q19, lanes
+from vstent.flow.lattice.scales import ODD_RATE
+from vstent.flow.lattice.screen import on_grid
+from vstent.flow.screen import bands
+from vstent.kernels import directions
+
+SHAPE = np.array([32, 4, 32])
+"""Cells of a box that repeats in all directions."""
+CELL_M, STEP_S = 1e-4, 1.1e-5
+"""Those of an artery's flow in cells of 0.1 mm, at its usual time step."""
+VISCOSITY_M2_S, DENSITY_KG_M3 = 0.004 / 1060, 1060.0
+VISCOSITY = VISCOSITY_M2_S * STEP_S / CELL_M**2
+SETTLED = 1e-5
+"""Change in 500 steps, of the largest speed, at which the flow has settled."""
+
+
+def samples(normal: np.ndarray, resistance_Pa_s_m: float, offset: float) -> Screen:
+    """A plane through the box, so many cells off its cells' centres."""
+    x, y = (a.ravel() for a in np.meshgrid(*((np.arange(8 * n) + 0.5) / 8 for n in SHAPE[:2]), indexing="ij"))
+    level = SHAPE[2] / 2 + offset
+    z = (level - x * normal[0] / normal[2]) % SHAPE[2]
+    points_mm = 1e3 * CELL_M * np.stack([x, y, z], axis=1)
+    area_mm2, alike = np.full(len(x), (1e3 * CELL_M / 8) ** 2 / normal[2]), np.full(len(x), resistance_Pa_s_m)
+    return Screen(points_mm, np.tile(normal, (len(x), 1)), area_mm2, alike, alike, 0 * alike, alike, alike)
+
+
+def entries(screen: Screen) -> tuple[np.ndarray, np.ndarray]:
+    """Cells (e,) of the box, and what they resist (e, ENTRY): what lies beyond a side comes in at the other."""
+    around = np.stack(np.meshgrid(*(np.arange(-1, n + 1) for n in SHAPE), indexing="ij"), axis=-1) % SHAPE
+    number = np.ravel_multi_index(tuple(np.moveaxis(around, -1, 0)), tuple(SHAPE)).ravel()
+    index = np.arange(len(number), dtype=np.int32).reshape(SHAPE + 2)
+    spread = on_grid(screen, index, np.full(3, -1e3 * CELL_M), 1e3 * CELL_M)
+    linear = np.stack([spread.along_Pa_s_m2, spread.across_Pa_s_m2], axis=1) * STEP_S / DENSITY_KG_M3
+    twice = spread.spread_Pa_s_m / DENSITY_KG_M3 * STEP_S / CELL_M
+    cell, of = np.unique(number[spread.cell], return_inverse=True)
+    mean = np.stack([np.bincount(of, linear[:, 1] * c) for c in (*spread.normal.T, twice)], axis=1)
+    total = np.stack([np.bincount(of, column) for column in linear.T], axis=1)
+    mean /= total[:, 1:]
+    return cell, np.column_stack([mean[:, :3], total, 0 * cell, mean[:, 3]]).astype(np.float32)
+
+
+def row(diameter_mm: float, spacing: int, offset: float) -> Screen:
+    """Wires along y across the box, so many cells apart, their axes so many off its cells' centres."""
+    cell_mm = 1e3 * CELL_M
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0, SHAPE[0], spacing) + offset, np.arange(0, SHAPE[1], 0.5)))
+    points_mm = cell_mm * np.stack([x, y, np.full(len(x), SHAPE[2] / 2 + offset)], axis=1)
+    along_mm, upwards = np.tile([0, 0.5 * cell_mm, 0], (len(x), 1)), np.tile([0.0, 0.0, 1.0], (len(x), 1))
+    band_mm, area_mm2 = bands(points_mm, along_mm, upwards, np.full(len(x), cell_mm * spacing))
+    # Beside wires so far apart lie none that cross them, but a screen gives either family half of its resistance.
+    drag = 2 * DENSITY_KG_M3 * VISCOSITY_M2_S * drag_per_length(diameter_mm, cell_mm * spacing) / (CELL_M * spacing)
+    one, across = np.ones(band_mm[..., 0].size), band_mm.shape[1]
+    lying = np.repeat(upwards, across, axis=0), np.repeat(area_mm2, across), drag * one, drag * one, 0 * one
+    points_mm = band_mm.reshape(-1, 3) % (cell_mm * SHAPE)
+    return Screen(points_mm, *lying, diameter_mm * one, cell_mm * spacing * one)
+
+
+class Box:
+    """The box's populations, and what drives them."""
+
+    def __init__(self, screen: Screen, force: np.ndarray, velocity: np.ndarray) -> None:
+        self.cells = np.argwhere(np.ones(SHAPE, bool))
+        last = SHAPE[2] - 1
+        cut = (self.cells[:, 2] == 0) | (self.cells[:, 2] == 1) | (self.cells[:, 2] == last)
+        first = np.flatnonzero(cut)
+        self.length = np.diff(np.r_[first, len(cut)]).astype(np.int32)
+        even = first[:, None] + len(cut) * np.arange(19)
+        behind = [self._number(self.cells[first] - c) for c in directions.VELOCITIES]
+        odd = np.stack([d3q19.OPPOSITE[q] * len(cut) + behind[q] for q in range(19)], axis=1)
+        self.address = np.stack([even, odd]).astype(np.int32)
+        cell, entry = entries(screen)
+        segment = np.searchsorted(first, cell, side="right") - 1
+        start = np.searchsorted(segment, np.arange(len(first) + 1)).astype(np.int32)
+        self.screen = start, (cell - first[segment]).astype(np.int32), entry
+        self.force = force
+        self.f = np.zeros(19 * len(cut) + lanes.COUNT, np.float32)
+        self.place = np.arange(len(cut), dtype=np.int32)
+        d3q19.set_equilibrium(self.f, len(cut), self.place, np.zeros(len(cut)), velocity)
+
+    def _number(self, cells: np.ndarray) -> np.ndarray:
+        return np.ravel_multi_index(tuple((cells % SHAPE).T), tuple(SHAPE))
+
+    def advance(self, pairs: int) -> None:
+        rows = len(self.length)
+        limit = np.full(rows, np.inf, np.float32)
+        relaxation = np.float32(3 * VISCOSITY + 0.5), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
+        cells = self.address, self.length, relaxation, self.screen
+        kick = (3 * d3q19.WEIGHTS * (directions.VELOCITIES @ (2 * self.force))).astype(np.float32)
+        for _ in range(pairs):
+            self.f[: 19 * len(self.cells)].reshape(19, -1)[:] += kick[:, None]
+            d3q19.update(self.f, cells, d3q19.NO_LINKS, *d3q19.undivided(rows))
+
+    def velocity(self) -> np.ndarray:
+        return d3q19.moments(self.f, len(self.cells), self.place)[:, 1:] + self.force
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.25, 0.5])
+@pytest.mark.parametrize(("resistance_Pa_s_m", "within"), [(60.0, 0.04), (380.0, 0.16)])
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.5**0.5, 0.0, 0.5**0.5)], ids=["along an axis", "at 45 degrees"])
+def test_blood_leaves_a_screen_as_it_would_leave_a_thin_sheet(
+    normal: tuple[float, float, float], resistance_Pa_s_m: float, within: float, offset: float
+) -> None:
+    """Steady advection and diffusion between sheets a height apart, driven along them (see `sheet_speed`)."""
+    n, along = np.array(normal), np.array([normal[2], 0.0, -normal[0]])
+    through, height = 0.05 * STEP_S / CELL_M, SHAPE[2] * normal[2]
+    resistance = resistance_Pa_s_m / DENSITY_KG_M3 * STEP_S / CELL_M
+    leaving = 2 * through
+    force = resistance / height * (through * n + leaving * along)
+    away = (np.argwhere(np.ones(SHAPE, bool)) @ (n / n[2]) - SHAPE[2] / 2 - offset) % SHAPE[2] * n[2]
+    gain = resistance * leaving / height / through
+    arriving = leaving + gain * (away - height * np.exp((away - height) * through / VISCOSITY))
+    box = Box(samples(n, resistance_Pa_s_m, offset), force, through * n + arriving[:, None] * along)
+    before, now = np.zeros(len(away)), arriving
+    for _ in range(200):
+        if np.abs(now - before).max() < SETTLED * np.abs(now).max():
+            break
+        box.advance(250)
+        before, now = now, box.velocity() @ along
+    else:
+        pytest.fail("the flow through the box has not settled")
+    behind = (away > 4) & (away < 0.4 * height)
+    slope, found = np.polyfit(away[behind], now[behind], 1)
+    assert slope == pytest.approx(gain, rel=0.03)
+    assert found == pytest.approx(leaving, rel=within)
+    np.testing.assert_allclose(box.velocity()[behind] @ n, through, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("diameter_mm", "spacing", "offset"),
+    [(0.09, 4, 0.0), (0.09, 8, 0.0), (0.09, 8, 0.25), (0.09, 8, 0.5), (0.03, 8, 0.25), (0.09, 16, 0.25)],
+)
+def test_wires_that_the_grid_tells_apart_hold_slow_blood_up_as_their_row_does(
+    diameter_mm: float, spacing: int, offset: float
+) -> None:
+    """The row's law (Tamada and Fujikawa) is of the mean velocity; a grid has blood slower at wires far apart."""
+    spacing_m = spacing * CELL_M
+    assert concentration(diameter_mm, 1e3 * spacing_m, 1e3 * CELL_M) > 1.1
+    expected = 1e-3 * STEP_S / CELL_M
+    force = VISCOSITY * drag_per_length(1e-3 * diameter_mm, spacing_m) / spacing * expected / SHAPE[2]
+    start = np.tile([0.0, 0.0, expected], (SHAPE.prod(), 1))
+    box = Box(row(diameter_mm, spacing, offset), np.array([0.0, 0.0, force]), start)
+    before, now = 0.0, expected
+    for _ in range(100):
+        if abs(now - before) < 1e-4 * expected:
+            break
+        box.advance(500)
+        before, now = now, box.velocity()[:, 2].mean()
+    else:
+        pytest.fail("the flow through the row has not settled")
+    assert now == pytest.approx(expected, rel=0.02)

@@ -1,0 +1,263 @@
+"""Uncertainty: intervals and shares against closed formulas, and against brute-force integrals."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from tubes import line, tube, with_neck
+
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.cli import main
+from vstent.deployment.deploy import deploy
+from vstent.devices import catalogue, formulas
+from vstent.devices.stent import Landing
+from vstent.errors import InputError
+from vstent.flow.case import FlowSettings
+from vstent.geometry.vessel import Vessel
+from vstent.io.writers import write_stl
+from vstent.phantoms import demo_phantom, phantom_surface
+from vstent.plan import uncertainty
+from vstent.plan.shares import first_order_shares
+from vstent.plan.uncertainty import CAUSES, Ranges, vary
+from vstent.plan.widening import widened
+from vstent.study.checkpoint import FlowCheckpoint
+
+SILK = catalogue.find_design("silk")
+SIZE = catalogue.find_size(SILK, diameter_mm=4, length_mm=15)
+RADIUS_MM, LENGTH_MM, DD_MM = 1.9, 32.0, 0.05
+
+
+@cache
+def artery():
+    return with_neck(tube(line(LENGTH_MM), RADIUS_MM), 14.0, 18.0)
+
+
+@cache
+def deployed():
+    return deploy(SILK, artery(), size=SIZE, landing=Landing(16.0))
+
+
+def length_mm(threshold_mm, wider_mm=0.0):
+    """The closed formula: what a Silk measures in a straight tube that is `threshold_mm` wider."""
+    diameter_mm = 2 * (RADIUS_MM - DD_MM) + threshold_mm
+    # as many rows of pieces longer in proportion: all lengths of the lattice scale with the free diameter
+    factor = 1 + wider_mm / SIZE.free_diameter_mm
+    return factor * formulas.deployed_length_mm(SILK, SIZE, diameter_mm / factor)
+
+
+def test_of_a_threshold_alone_the_interval_is_the_closed_formula_at_its_ends():
+    found = vary(artery(), deployed(), Ranges(16, threshold_mm=0.2, landing_mm=0.0, device_mm=0.0))
+    mean, low, high = found.interval("deployed_length_mm")
+    widths = 0.2 * found.points[:, 0]
+    wanted = np.array([length_mm(width) for width in widths])
+    assert found.values[:, 0] == pytest.approx(wanted, rel=1e-3)
+    assert mean == pytest.approx(wanted.mean(), rel=1e-3)
+    # 95 % of a uniform range of 0.2 mm to either side, less what 16 samples leave out
+    assert low == pytest.approx(length_mm(0.19), rel=0.02)
+    assert high == pytest.approx(length_mm(-0.19), rel=0.02)
+    assert found.shares("deployed_length_mm")["threshold"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_shares_of_two_causes_are_their_first_order_indices():
+    found = vary(artery(), deployed(), Ranges(32, threshold_mm=0.1, landing_mm=1.0, device_mm=0.1))
+    at, weight = np.polynomial.legendre.leggauss(12)
+    lengths = np.array([[length_mm(0.1 * t, 0.1 * w) for w in at] for t in at])
+    weights = np.outer(weight, weight) / 4
+    mean = (weights * lengths).sum()
+    variance = (weights * (lengths - mean) ** 2).sum()
+    of_threshold, of_device = lengths @ weight / 2, weight @ lengths / 2
+    wanted = {
+        "threshold": (weight / 2 @ (of_threshold - mean) ** 2) / variance,
+        "device": (weight / 2 @ (of_device - mean) ** 2) / variance,
+        "landing": 0.0,
+    }
+    shares = found.shares("deployed_length_mm")
+    assert {name: shares[name] for name in wanted} == pytest.approx(wanted, abs=0.02)
+    assert sum(shares.values()) == pytest.approx(1.0)
+    # how far the ends reach beyond the neck is moved by the landing, one to one
+    both = found.values[:, [found.names.index(f"neck_to_{end}_end_mm") for end in ("proximal", "distal")]]
+    shift = (both[:, 1] - both[:, 0]) / 2
+    assert np.ptp(shift - found.points[:, 1]) < 0.1
+    assert found.shares("neck_to_distal_end_mm")["landing"] > 0.5
+
+
+def test_a_fit_finds_the_shares_of_any_sum_of_quadratics_and_leaves_interplay_to_the_rest():
+    points = np.random.default_rng(1).uniform(-1, 1, (64, 3))
+    x, y, _ = points.T
+    shares = first_order_shares(points, 3 * x + 2 * y**2)
+    assert shares == pytest.approx(np.array([3, 4 * 4 / 45, 0]) / (3 + 16 / 45), abs=1e-6)
+    # twice as many causes and few points: the first degree alone
+    assert first_order_shares(points[:8], 3 * x[:8] + y[:8]) == pytest.approx([0.9, 0.1, 0.0], abs=1e-6)
+    many = np.random.default_rng(1).uniform(-1, 1, (1024, 3))
+    interplay = first_order_shares(many, many[:, 0] + 3 * many[:, 1] * many[:, 2])  # of 1/3 + 9/9, a quarter is x's
+    assert interplay == pytest.approx([0.25, 0.0, 0.0], abs=0.01)
+    assert first_order_shares(points, np.full(64, 7.0)).tolist() == [0, 0, 0]
+    assert first_order_shares(points[:4], x[:4]) is None
+
+
+def test_points_are_spread_evenly_in_every_cause_and_are_always_the_same():
+    found = vary(artery(), deployed(), Ranges(7, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0))
+    assert len(found.points) == 8
+    for column in found.points.T:
+        assert np.sort(column) == pytest.approx((2 * np.arange(8) + 1) / 8 - 1)
+    again = vary(artery(), deployed(), Ranges(8, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0))
+    assert (again.values == found.values).all()
+
+
+def test_a_device_that_leaves_the_artery_is_counted_and_left_out():
+    short = with_neck(tube(line(20.0), RADIUS_MM), 8.0, 12.0)
+    lies = deploy(SILK, short, size=SIZE, landing=Landing(10.0))
+    found = vary(short, lies, Ranges(8, threshold_mm=0.0, landing_mm=4.0, device_mm=0.0))
+    spare_mm = 10.0 - 0.5 * lies.stent.deployed_length_mm
+    assert found.n_failed == int((np.abs(4.0 * found.points[:, 1]) > spare_mm + 0.05).sum())
+    assert 0 < found.n_failed < 8
+    assert found.metrics()["failed_count"] == found.n_failed
+
+
+def test_metrics_are_finite_numbers_in_their_units():
+    found = vary(artery(), deployed(), Ranges(8, threshold_mm=0.1)).metrics()
+    assert found["ranges"] == {"threshold_mm": 0.1, "landing_mm": 1.0, "device_mm": 0.1, "inflow_fraction": 0.2}
+    for name, interval in found["intervals"].items():
+        assert interval["low"] <= interval["mean"] <= interval["high"]
+        assert sum(found["shares"][name].values()) == pytest.approx(1.0) or interval["low"] == interval["high"]
+    assert set(found["shares"]["deployed_length_mm"]) == {f"{name}_fraction" for name in (*CAUSES, "rest")}
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"samples": 1}, "at least 2"),
+        ({"flow_samples": -1}, "0 flows"),
+        ({"landing_mm": -1.0}, "landing_mm"),
+        ({"landing_mm": float("nan")}, "landing_mm"),
+        ({"threshold_mm": float("inf")}, "threshold_mm"),
+        ({"device_mm": -0.1}, "device_mm"),
+        ({"inflow_fraction": 1.0}, "less than 1"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(given, said):
+    with pytest.raises(InputError, match=said):
+        Ranges(**given)
+
+
+@pytest.mark.parametrize("device_mm", [0.43, 5.0])
+def test_a_device_made_so_much_wider_that_it_is_another_is_refused(device_mm):
+    with pytest.raises(InputError, match=r"no device 4\.20 mm wide when free .* give a range of less than 0\.42 mm"):
+        vary(artery(), deployed(), Ranges(2, device_mm=device_mm))
+
+
+def test_a_threshold_that_would_close_the_artery_is_refused():
+    with pytest.raises(InputError, match="close the artery"):
+        vary(artery(), deployed(), Ranges(16, threshold_mm=2.0))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--uncertainty", "1"], "at least 2"),
+        (["--uncertainty", "8", "--uncertain-flows", "-1"], "0 flows"),
+        (["--uncertainty", "8", "--vary", "landing=nan"], "landing_mm"),
+        (["--vary", "landing=2"], "--uncertainty N"),
+        (["--uncertain-flows", "2"], "--uncertainty N"),
+    ],
+)
+def test_the_command_refuses_them_before_anything_is_read(words, said, tmp_path, capsys):
+    assert main(["run", str(tmp_path / "none.stl"), "--out", str(tmp_path / "out"), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_widened_artery_is_wider_by_as_much_everywhere_and_its_sac_stays_closed():
+    vessel = trace(Vessel(phantom_surface(demo_phantom(), edge_mm=0.35)))
+    anatomy = restore(vessel)
+    other = widened(anatomy, 0.2)
+    away_mm = anatomy.landing_surface.closest(other.landing_surface.vertices_mm)[1]
+    assert away_mm == pytest.approx(0.1, abs=0.02)
+    assert other.section_radius_mm == pytest.approx(anatomy.section_radius_mm + 0.1)
+    sac, wider = anatomy.aneurysms[0], other.aneurysms[0]
+    assert not wider.sac.boundary_loops
+    # the sac grows by its wall's area times the shift, and loses what its neck moves in
+    wall_mm2 = sac.sac.area_mm2 - sac.neck.area_mm2
+    grown_mm3 = abs(wider.sac.volume_mm3) - abs(sac.sac.volume_mm3)
+    assert grown_mm3 == pytest.approx(0.1 * (wall_mm2 - sac.neck.area_mm2), rel=0.1)
+    on_tube = other.landing_surface.closest(wider.neck.vertices_mm)[1]
+    assert on_tube.max() < 0.03
+    opening, wide = anatomy.vessel.inlet, other.vessel.inlet
+    assert wide.diameter_mm == pytest.approx(opening.diameter_mm + 0.2)
+    back = widened(other, -0.2)
+    assert np.abs(back.vessel.lumen.vertices_mm - anatomy.vessel.lumen.vertices_mm).max() < 0.05
+
+
+def test_inflow_and_flow_are_varied_where_the_flow_is_asked(monkeypatch):
+    """A flow whose answer is known: what enters the sac is the inflow squared, and a device takes half."""
+
+    def answer(case, start=None):
+        return case
+
+    def known(case, *shapes):
+        inflow = case.settings.inflow_mL_s
+        return {"neck_inflow_mL_s": inflow if case.screen is None else 0.1 * inflow**2}
+
+    monkeypatch.setattr(uncertainty, "simulate_case", answer)
+    monkeypatch.setattr(uncertainty, "indices", known)
+    monkeypatch.setattr(uncertainty, "ostium", lambda *_: None)
+    monkeypatch.setattr("vstent.flow.simulation.ostium", lambda *_: None)
+    ranges = Ranges(8, flow_samples=8, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
+    found = vary(artery(), deployed(), ranges, flow=FlowSettings(inflow_mL_s=4.0))
+    ratio = found.values[:, found.names.index("neck_inflow_mL_s_ratio")]
+    assert ratio == pytest.approx(0.1 * 4.0 * (1 + 0.2 * found.points[:, 3]))
+    shares = found.shares("neck_inflow_mL_s_ratio")
+    assert shares["inflow"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_sample_whose_flow_is_done_is_not_computed_again(monkeypatch, tmp_path):
+    asked = []
+
+    def ratios(anatomy, stent, flow):
+        asked.append(flow.inflow_mL_s)
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return {"neck_inflow_mL_s_ratio": flow.inflow_mL_s**2}
+
+    monkeypatch.setattr(uncertainty, "_flow_ratios", ratios)
+    monkeypatch.setattr("vstent.flow.simulation.ostium", lambda *_: None)
+    ranges = Ranges(4, flow_samples=4, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
+    begun, flow = FlowCheckpoint(tmp_path, "vary silk", "key"), FlowSettings(inflow_mL_s=4.0)
+    with pytest.raises(KeyboardInterrupt):
+        vary(artery(), deployed(), ranges, flow=flow, checkpoint=begun)
+    resumed = vary(artery(), deployed(), ranges, flow=flow, checkpoint=begun)
+    assert len(asked) == 3 + 2
+    assert asked[3] == asked[2]  # the one that was interrupted is the first to be done
+    once = vary(artery(), deployed(), ranges, flow=flow)
+    assert resumed.names == once.names
+    assert (resumed.values == once.values).all()
+
+
+def test_a_study_tells_its_uncertainty_in_metrics_report_and_table_and_goes_on_from_it(tmp_path, capsys):
+    write_stl(tmp_path / "a.stl", phantom_surface(demo_phantom(), edge_mm=0.4))
+    out = tmp_path / "out"
+    command = ["run", str(tmp_path / "a.stl"), "--out", str(out), "--units", "mm", "--device", "enterprise"]
+    command += ["--no-flow", "--uncertainty", "8", "--vary", "threshold=0.2", "--vary", "landing=2"]
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "because of" in said
+    stent = json.loads((out / "metrics.json").read_text())["stents"]["enterprise"]
+    assert stent["uncertainty"]["ranges"]["landing_mm"] == 2.0
+    interval = stent["uncertainty"]["intervals"]["deployed_length_mm"]
+    assert interval["low"] < stent["deployment"]["deployed_length_mm"] < interval["high"]
+    page = (out / "report.html").read_text()
+    section = page[page.index('<section id="uncertainty">') : page.index('<section id="notes">')]
+    assert "all diameters ±0.200\u202fmm" in section
+    assert f"{interval['low']:.1f}\u202fmm and {interval['high']:.1f}\u202fmm" in section
+    before = (out / "metrics.json").read_bytes()
+    assert main(command) == 0
+    assert "vary enterprise" in capsys.readouterr().err
+    assert (out / "metrics.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("text", ["landing", "landing=x", "weather=1"])
+def test_causes_are_checked(text, capsys):
+    with pytest.raises(SystemExit):
+        main(["run", "a.stl", "--out", "out", "--vary", text])
+    assert "--vary" in capsys.readouterr().err

@@ -1,0 +1,127 @@
+"""The report on paper: what stands on the page stands there too, on A4, and nobody's name."""
+
+import re
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+import report_case
+
+from vstent.reporting.definitions import OF_PULSE
+from vstent.reporting.method import _bead_layer, _expansion, _unit_sphere
+from vstent.reporting.pdf import WIDTH, _Paper, _wrapped, as_pdf
+from vstent.reporting.scene import scene_of
+from vstent.reporting.thinning import some_frames, thin_frames
+from vstent.reporting.write import write_report
+
+
+@pytest.fixture(scope="module")
+def told():
+    return report_case.contents()
+
+
+@pytest.fixture(scope="module")
+def printed(told):
+    """The PDF, and all text that was put on its pages."""
+    put, words = _Paper._put, []
+
+    def noted(paper, x, y, text, size, **more):
+        words.append(text)
+        put(paper, x, y, text, size, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_Paper, "_put", noted)
+        return as_pdf(told), " ".join(words)
+
+
+def test_pages_are_a4_and_the_same_report_is_the_same_file(told, printed):
+    pdf, _ = printed
+    boxes = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", pdf)
+    assert len(boxes) > 5
+    for width, height in boxes:
+        assert float(width) / 72 * 25.4 == pytest.approx(210, abs=0.2)
+        assert float(height) / 72 * 25.4 == pytest.approx(297, abs=0.2)
+    without = replace(told, pictures=())
+    assert as_pdf(without) == as_pdf(without)
+    assert b"CreationDate" not in pdf
+    assert len(re.findall(rb"/Subtype /Image", pdf)) >= len(told.pictures)
+    assert len(pdf) < 10_000_000
+
+
+def test_every_number_and_its_definition_stand_in_the_pdf(told, printed):
+    text = " ".join(printed[1].split())
+    assert "Research use only" in text
+    assert "outlet 1 4.00 mm 12.6 mm² 8.9, 0.0, 1.3 mm" in text.replace("\u202f", " ")
+    assert "Braid angle " in text
+    assert "braid angle rad" not in text
+    assert OF_PULSE in text.partition("Definitions")[2]
+    for quantity in (*told.vessel, *(q for stent in told.stents for q in stent["quantities"])):
+        assert quantity.name in text, quantity
+        assert " ".join(quantity.text.split()) in text, quantity
+    for row in told.changes:
+        for value in (row.before, *row.after.values()):
+            assert " ".join(value.text.split()) in text, value
+    for definition, _ in told.definitions:
+        assert definition.name in text
+    assert all(picture.title in text for picture in told.pictures)
+
+
+def test_the_pdf_is_written_where_it_is_asked_for(told, tmp_path, monkeypatch):
+    monkeypatch.setattr(import_module("vstent.reporting.write"), "contents_of", lambda _: replace(told, pictures=()))
+    write_report(report_case.case(), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    write_report(report_case.case(), tmp_path, is_printed=True)
+    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_lines_keep_inside_the_page():
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextToPath
+
+    words = (
+        "MMMMM WWWW The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way. "
+    )
+    metrics, font = TextToPath(), FontProperties(family="DejaVu Sans", size=8.5)
+    for line in _wrapped(words * 5, WIDTH, 8.5):
+        assert metrics.get_text_width_height_descent(line, font, ismath=False)[0] < 72 * WIDTH
+
+
+def test_pictures_tell_the_way_from_the_artery_to_the_flow(told):
+    names = [picture.id for picture in told.pictures]
+    assert names == [
+        *("anatomy", "restoration", "spheres", "first", "expansion-silk", "expansion-enterprise", "fitted"),
+        *("contour", "coverage", "wires", "streamlines", "shear"),
+    ]
+
+
+def test_spheres_on_the_axis_are_as_wide_as_the_artery_and_follow_it_from_end_to_end():
+    anatomy = report_case.anatomy()
+    n = len(_unit_sphere()[0])
+    beads = _bead_layer(anatomy).surface.vertices_mm.reshape(-1, n, 3)
+    centers = beads.mean(axis=1)
+    assert np.linalg.norm(beads - centers[:, None], axis=2) == pytest.approx(report_case.RADIUS_MM, rel=1e-3)
+    along = anatomy.axis.nearest_abscissa_mm(centers)
+    assert along[0] == pytest.approx(0, abs=0.05)
+    assert anatomy.axis.length_mm - along[-1] < report_case.RADIUS_MM
+    assert np.diff(along) == pytest.approx(0.9 * report_case.RADIUS_MM, rel=0.01)
+
+
+def test_expansion_begins_at_the_first_contour_and_ends_at_the_deployed_one():
+    case = report_case.case()
+    deployment = case.deployments["silk"]
+    frames, gaps = thin_frames(deployment, case.anatomy.landing_surface, 4)
+    chosen = some_frames(deployment, 4)
+    assert chosen.tolist() == [0, 2, 4, 7]
+    np.testing.assert_array_equal(frames, deployment.history_mm[chosen].reshape(4, -1, 3))
+    assert (np.diff(gaps.mean(axis=1)) < 0).all()
+
+
+def test_a_contour_that_lies_on_the_wall_from_the_first_is_shown_too():
+    case = report_case.case()
+    deployment = case.deployments["silk"]
+    still = np.repeat(deployment.history_mm[-1:], 3, axis=0)
+    energy, gap = deployment.energy_mm2[:3], np.zeros_like(deployment.wall_gap_mm)
+    case.deployments = {"silk": replace(deployment, history_mm=still, energy_mm2=energy, wall_gap_mm=gap)}
+    scene = scene_of(case)
+    assert _expansion("silk", case.deployments["silk"], case.anatomy, scene).png.startswith(b"\x89PNG")

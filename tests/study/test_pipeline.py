@@ -1,0 +1,348 @@
+"""What a study writes, and that one stopped in the middle of a flow goes on from there."""
+
+import json
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tubes import line, tube, with_neck
+
+from vstent import phantoms
+from vstent.cli import main
+from vstent.deployment.deploy import deploy, propose_size
+from vstent.devices.catalogue import find_design, find_size
+from vstent.devices.design import Size
+from vstent.errors import DeviceError, InputError, LandingError
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
+from vstent.io.dicom_writer import write_dicom
+from vstent.io.surfaces import read_surface
+from vstent.io.writers import write_json, write_stl
+from vstent.study import stages
+from vstent.study.crate import write_crate
+from vstent.study.ledger import hash_of
+from vstent.study.outputs import write_anatomy
+from vstent.study.pipeline import restore_vessel, run
+from vstent.study.stages import deploy_one, engine_folders, size_of
+from vstent.study.types import Placing, Settings
+
+
+def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path) -> None:
+    artery = with_neck(tube(line(40.0), 2.0), 10.0, 14.0)
+    (first,) = artery.aneurysms
+    (second,) = with_neck(tube(line(40.0), 2.0), 24.0, 29.0).aneurysms
+    (tmp_path / "sac_mine.vtp").write_text("a user's own")
+    write_anatomy(tmp_path, replace(artery, aneurysms=(first, second)))
+    for number, aneurysm in (("", first), ("_2", second)):
+        sac, _ = read_surface(tmp_path / f"sac{number}.vtp", units="mm")
+        assert sac.area_mm2 == pytest.approx(aneurysm.sac.area_mm2, rel=1e-5)
+        assert (tmp_path / f"neck{number}.vtp").stat().st_size > 500
+    write_anatomy(tmp_path, artery)
+    assert {file.name for file in tmp_path.glob("[sn][ae]c*.vtp")} == {"sac.vtp", "neck.vtp", "sac_mine.vtp"}
+
+
+def test_a_source_is_all_files_that_its_scan_is_read_from(tmp_path: Path) -> None:
+    header, voxels = tmp_path / "scan.mhd", tmp_path / "scan.raw"
+    header.write_text("ElementDataFile = scan.raw\n")
+    voxels.write_bytes(b"one vessel")
+    first = hash_of(header)
+    assert first == sha256(header.read_bytes() + b"one vessel").hexdigest()
+    voxels.write_bytes(b"a later one")
+    assert hash_of(header) != first
+    write_dicom(Image(np.arange(5 * 6 * 7, dtype=np.int16).reshape(5, 6, 7), np.eye(4)), tmp_path / "series")
+    given, *others = sorted((tmp_path / "series").iterdir())
+    whole = hash_of(given)
+    (tmp_path / "series" / "notes.txt").write_text("not of the series")
+    assert hash_of(given) == hash_of(others[-1]) == whole
+    write_dicom(Image(np.zeros((5, 6, 7), dtype=np.int16), np.eye(4)), tmp_path / "other")
+    others[2].write_bytes((tmp_path / "other" / others[2].name).read_bytes())
+    assert hash_of(given) != whole
+    assert hash_of(voxels) == sha256(b"a later one").hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("name", "diameter_mm", "length_mm"), [("pipeline", 3.25, 30.0), ("pipeline", 3.0, 35.0), ("silk", 4.0, 15.0)]
+)
+def test_of_a_diameter_alone_the_length_is_as_long_as_that_diameter_needs(
+    name: str, diameter_mm: float, length_mm: float
+) -> None:
+    artery, design = with_neck(tube(line(60), 1.75), 24.0, 36.0), find_design(name)
+    size = size_of(design, artery, Placing(diameter_mm))
+    assert (size.diameter_mm, size.length_mm) == (diameter_mm, length_mm)
+    margins = {}
+    for length in sorted(size.length_mm for size in design.sizes if size.diameter_mm == diameter_mm):
+        stent = deploy(design, artery, size=find_size(design, diameter_mm=diameter_mm, length_mm=length)).stent
+        margins[length] = min(24 - stent.proximal_abscissa_mm, stent.distal_abscissa_mm - 36)
+        if length == length_mm:
+            break
+    assert margins.pop(length_mm) >= 3.9
+    assert all(margin_mm < 4 for margin_mm in margins.values())
+
+
+def test_of_a_length_alone_the_diameter_is_the_artery_s() -> None:
+    artery, silk = with_neck(tube(line(60), 1.75), 28.0, 32.0), find_design("silk")
+    assert size_of(silk, artery, Placing(length_mm=25.0)) == find_size(silk, diameter_mm=3.5, length_mm=25.0)
+    assert size_of(silk, artery, Placing()) == propose_size(silk, artery)
+
+
+def test_a_size_given_whole_is_taken_though_none_could_be_proposed() -> None:
+    artery, silk = with_neck(tube(line(20), 1.45), 8.0, 12.0), find_design("silk")
+    wide = Size(4.0, 8.0, 4.2)
+    own = replace(silk, sizes=(Size(3.0, 25.0, 3.2), Size(3.5, 25.0, 3.7), wide))
+    assert deploy_one(own, artery, Placing(4.0, 8.0)).stent.size == wide
+    with pytest.raises(LandingError, match="No size of"):
+        size_of(own, artery, Placing())
+    with pytest.raises(DeviceError, match=r"not made in 4\.1 mm"):
+        size_of(own, artery, Placing(4.1))
+
+
+@pytest.fixture(scope="module")
+def arteries(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two patients."""
+    folder = tmp_path_factory.mktemp("arteries")
+    for name, length_mm in (("first", 24.0), ("second", 26.0)):
+        artery = phantoms.with_sac(phantoms.tube(length_mm=length_mm), abscissa_mm=12.0, width_mm=5.0, neck_mm=3.5)
+        write_stl(folder / f"{name}.stl", phantoms.phantom_surface(artery, edge_mm=0.6))
+    return folder / "first.stl", folder / "second.stl"
+
+
+RESULTS_OF_ONE = (
+    *("report.pdf", "ranking.csv", "flow/bare/field.vtu", "flow/silk/wall.vtp"),
+    *("flow/bare/openfoam/vstent.key", "flow/bare/openfoam/system/controlDict"),
+)
+OF_THE_USER = ("notes.txt", "stents/silk/mine.vtp", "stents/my.stl", "flow/mine/case/field.vtu")
+
+
+def shown(folder: Path) -> set[str]:
+    """All files that are not hidden, by their way from the folder."""
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    return {name for name in files if not name.startswith(".")}
+
+
+@pytest.mark.parametrize("knows", ["input.json", "run.json"])
+def test_a_folder_used_for_another_patient_holds_nothing_of_the_former(
+    arteries: tuple[Path, Path], tmp_path: Path, knows: str
+) -> None:
+    first, second = arteries
+    out = tmp_path / "out"
+    settings = Settings(devices=("silk",), units="mm", flow=None)
+    run(first, out, settings, lambda *_: None)
+    for name in (*RESULTS_OF_ONE, *OF_THE_USER):
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("of the first")
+    (out / ".vstent" / "flow silk-1234.npz").write_text("kept")
+    if knows == "run.json":  # as version 0.1.0 left it
+        write_json(out / ".vstent" / "input.json", {"path": str(first)})
+    before = {name: (out / name).read_bytes() for name in shown(out)}
+    with pytest.raises(InputError):
+        run(second, out, replace(settings, length_mm=1e3), lambda *_: None)
+    assert {name: (out / name).read_bytes() for name in shown(out)} == before
+
+    again = replace(settings, devices=("enterprise",))
+    run(second, out, again, lambda *_: None)
+    run(second, tmp_path / "anew", again, lambda *_: None)
+    assert shown(out) == shown(tmp_path / "anew") | set(OF_THE_USER)
+    assert (out / "vessel.vtp").read_bytes() == (tmp_path / "anew" / "vessel.vtp").read_bytes()
+    assert (out / ".vstent" / "flow silk-1234.npz").read_text() == "kept"
+
+
+def test_the_same_patient_keeps_what_was_found_and_another_one_only_restored_does_not(
+    arteries: tuple[Path, Path], tmp_path: Path
+) -> None:
+    first, second = arteries
+    moved = tmp_path / "moved.stl"
+    moved.write_bytes(first.read_bytes())
+    settings = Settings(devices=("silk",), units="mm", flow=None)
+    run(first, tmp_path / "out", settings, lambda *_: None)
+    (tmp_path / "out" / "report.pdf").write_text("of the first")
+    before = shown(tmp_path / "out")
+    restore_vessel(moved, tmp_path / "out", settings, lambda *_: None)
+    run(first, tmp_path / "out", settings, lambda *_: None)
+    assert shown(tmp_path / "out") == before | {"morphology.json"}
+    restore_vessel(second, tmp_path / "out", settings, lambda *_: None)
+    restore_vessel(second, tmp_path / "anew", settings, lambda *_: None)
+    assert shown(tmp_path / "out") == shown(tmp_path / "anew")
+
+
+def test_a_folder_used_with_other_settings_holds_nothing_of_the_former(
+    arteries: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out, anew = tmp_path / "out", tmp_path / "anew"
+    former = Settings(
+        devices=("silk", "enterprise"), units="mm", flow=FlowSettings(cell_size_mm=0.5, engine="openfoam")
+    )
+    written_by_openfoam = [*engine_folders(out, former).values(), out / "flow" / "convergence" / "openfoam" / "grid"]
+    run(arteries[0], out, replace(former, flow=None), lambda *_: None)
+    restore_vessel(arteries[0], out, former, lambda *_: None)
+    for name in (*RESULTS_OF_ONE, *OF_THE_USER, "report.html", "ro-crate-metadata.json"):
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("of the former")
+    for folder in written_by_openfoam:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "vstent.key").write_text("a key")
+    cached = {path.name for path in (out / ".vstent").glob("*.npz")}
+    with pytest.raises(InputError):
+        run(arteries[0], out, replace(former, flow=None, length_mm=1e3), lambda *_: None)
+    assert (out / "report.pdf").exists()
+
+    settings = replace(former, devices=("enterprise",), flow=None)
+    run(arteries[0], out, settings, lambda *_: None)
+    run(arteries[0], anew, settings, lambda *_: None)
+    convergence = "flow/convergence/openfoam/grid/vstent.key"
+    assert shown(out) == shown(anew) | {*OF_THE_USER, "ranking.csv", "morphology.json", convergence}
+    assert (out / "metrics.json").read_bytes() == (anew / "metrics.json").read_bytes()
+    assert {path.name for path in (out / ".vstent").glob("*.npz")} == cached
+    run(arteries[0], out, replace(settings, upstream_mm=6.0), lambda *_: None)
+    assert shown(out) == shown(anew) | {*OF_THE_USER, "ranking.csv"}
+
+
+def test_stopped_with_other_settings_a_folder_holds_nothing_of_the_former_beside_the_new_flow(
+    arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, computed = tmp_path / "out", []
+    real = stages.simulate_case
+    stops = {"of": None}
+
+    def counted(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
+        if case.screen is not None and stops["of"] == case.settings.inflow_mL_s:
+            raise KeyboardInterrupt
+        computed.append((case.screen is not None, case.settings.inflow_mL_s))
+        return start if start is not None else real(case, start=start, **given)
+
+    monkeypatch.setattr(stages, "simulate_case", counted)
+    slow = Settings(devices=("silk",), units="mm", flow=FlowSettings(cell_size_mm=0.5, inflow_mL_s=1.0, max_steps=20))
+    fast = replace(slow, flow=replace(slow.flow, inflow_mL_s=3.0))
+    run(arteries[0], out, slow, lambda *_: None)
+    (out / "report.html").write_text("of the slow flow")
+    whole = shown(out)
+    first = json.loads((out / "run.json").read_text())["seconds"]
+    run(arteries[0], out, slow, lambda *_: None)  # the same again: everything stays
+    assert shown(out) == whole
+    again = json.loads((out / "run.json").read_text())["seconds"]
+    anew = {stage for stage in first if stage.partition(" ")[0] in ("deploy", "struts", "measure")}
+    assert {"segment", "trace", "trim", "restore", "plan flow", "flow bare", "flow silk"} == set(first) - anew
+    assert set(again) == set(first)
+    assert {stage for stage in first if again[stage] != first[stage]} == anew
+
+    stops["of"] = 3.0
+    with pytest.raises(KeyboardInterrupt):
+        run(arteries[0], out, fast, lambda *_: None)
+    of_flow = {"flow/bare/field.vtu", "flow/bare/wall.vtp"}
+    assert {name for name in shown(out) if name.startswith("flow/")} == of_flow
+    assert not {"metrics.json", "run.json", "report.html"} & shown(out)
+    stops["of"] = None
+    run(arteries[0], out, fast, lambda *_: None)
+    assert shown(out) == whole - {"report.html"}
+    assert computed == [(False, 1.0), (True, 1.0), (False, 3.0), (True, 3.0)]
+    assert json.loads((out / "run.json").read_text())["settings"]["flow"]["inflow_mL_s"] == 3.0
+
+
+def test_what_is_kept_damaged_is_found_anew_and_replaced(arteries: tuple[Path, Path], tmp_path: Path) -> None:
+    told: list[str] = []
+
+    def stages_told() -> set[str]:
+        told.clear()
+        restore_vessel(arteries[0], tmp_path, Settings(units="mm"), lambda stage, *_: told.append(stage))
+        return set(told)
+
+    assert stages_told() == {"segment", "trace", "trim", "restore"}
+    (kept,) = (tmp_path / ".vstent").glob("anatomy-*.npz")
+    kept.write_bytes(kept.read_bytes()[:100])
+    assert stages_told() == {"anatomy", "vessel", "trim", "restore"}
+    assert stages_told() == {"anatomy"}
+
+
+def test_a_crate_does_not_outlive_what_it_describes(arteries: tuple[Path, Path], tmp_path: Path) -> None:
+    settings = Settings(devices=("silk",), units="mm", flow=None)
+    case = run(arteries[0], tmp_path, settings, lambda *_: None)
+    write_crate(tmp_path, case.provenance, "2026-01-01")
+    run(arteries[0], tmp_path, settings, lambda *_: None)
+    assert "ro-crate-metadata.json" not in shown(tmp_path)
+
+
+def test_trimmed_otherwise_the_vessel_is_the_one_that_was_traced_and_the_result_the_same(tmp_path: Path) -> None:
+    artery, told = tmp_path / "artery.stl", []
+    tube = phantoms.tube(length_mm=24.0)
+    write_stl(artery, phantoms.phantom_surface(phantoms.with_sac(tube, abscissa_mm=12.0), edge_mm=0.6))
+    shorter = Settings(units="mm", upstream_mm=7.0)
+    restore_vessel(artery, tmp_path / "again", Settings(units="mm"), lambda *_: None)
+    again, _ = restore_vessel(artery, tmp_path / "again", shorter, lambda stage, *_: told.append(stage))
+    anew, _ = restore_vessel(artery, tmp_path / "anew", shorter, lambda *_: None)
+    assert list(dict.fromkeys(told)) == ["vessel", "trim", "restore"]
+    for name in ("vessel.vtp", "landing_surface.vtp", "sac.vtp", "morphology.json"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "anew" / name).read_bytes()
+    np.testing.assert_array_equal(again.landing_surface.vertices_mm, anew.landing_surface.vertices_mm)
+
+
+@pytest.mark.parametrize("given", ["at_mm", "inlet_mm"])
+def test_of_two_vessels_in_one_surface_the_one_at_the_point_given_is_taken(tmp_path: Path, given: str) -> None:
+    wide, thin = (phantoms.phantom_surface(phantoms.tube(radius_mm=r), edge_mm=0.6) for r in (2.0, 1.5))
+    vertices = np.concatenate([wide.vertices_mm, np.add(thin.vertices_mm, [30.0, 0, 0])])
+    faces = np.concatenate([wide.faces, thin.faces + len(wide.vertices_mm)])
+    write_stl(tmp_path / "both.stl", Surface(vertices, faces))
+    settings = Settings(units="mm")
+    assert stages._vessel(tmp_path / "both.stl", settings).lumen.vertices_mm[:, 0].max() < 3.0
+    settings = replace(settings, **{given: (30.0, 0.0, 0.0)})
+    assert stages._vessel(tmp_path / "both.stl", settings).lumen.vertices_mm[:, 0].min() > 27.0
+
+
+def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    artery, out = tmp_path / "artery.stl", tmp_path / "out"
+    write_stl(artery, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
+    command = ["run", str(artery), "--out", str(out), "--device", "silk", "--cell-size", "0.25"]
+    real, computed = stages.simulate_case, []
+
+    def stopped_with_a_stent(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
+        if case.screen is not None and not computed.count("silk"):
+            computed.append("silk")
+            raise KeyboardInterrupt
+        computed.append("silk" if case.screen else "bare")
+        return start if start is not None else real(case, start=start, **given)
+
+    monkeypatch.setattr(stages, "simulate_case", stopped_with_a_stent)
+    assert main(command) == 130
+    assert "give the same command again" in capsys.readouterr().err
+    assert (out / "flow" / "bare" / "field.vtu").stat().st_size > 100_000
+    assert not (out / "metrics.json").exists()
+    assert main(command) == 0
+    assert computed == ["bare", "silk", "silk"]
+    metrics = json.loads((out / "metrics.json").read_text())
+    # The second run was handed the bare flow: nothing changed, and every ratio is 1.
+    ratios = metrics["stents"]["silk"]["ratios"]
+    assert ratios["neck_inflow_mL_s_ratio"] == pytest.approx(1.0)
+    assert metrics["bare"]["neck_inflow_mL_s"] == pytest.approx(metrics["bare"]["neck_outflow_mL_s"], rel=0.1)
+    report = (out / "report.html").read_text()
+    assert all(f"Flow, {name}: The flow has " in report for name in ("bare", "silk"))
+    left = metrics["bare"]["unsettled_fraction"]
+    assert (left < 0.01) == ("Flow, bare: The flow has settled" in report)
+    assert metrics["stents"]["silk"]["flow"]["unsettled_fraction"] == left > 0
+    assert not any("unsettled" in key for key in ratios)
+    provenance = json.loads((out / "run.json").read_text())
+    assert len(provenance["input"]["sha256"]) == 64
+    assert {"numpy", "vstent", "python"} <= set(provenance["versions"])
+
+
+def test_a_device_whose_wires_change_does_not_get_the_flow_of_the_former(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    artery, out = tmp_path / "artery.stl", tmp_path / "out"
+    write_stl(artery, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
+    real, computed = stages.simulate_case, []
+    design = find_design("silk")
+
+    def computed_once(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
+        computed.append(case.stent.design.wires if case.stent else ())
+        return start if start is not None else real(case, start=start, **given)
+
+    monkeypatch.setattr(stages, "simulate_case", computed_once)
+    settings = Settings(devices=("silk",), flow=FlowSettings(cell_size_mm=0.35))
+    run(artery, out, settings, lambda *_: None)
+    monkeypatch.setattr("vstent.study.pipeline.find_design", lambda _: replace(design, wires=((48, 40.0),)))
+    run(artery, out, settings, lambda *_: None)
+    run(artery, out, settings, lambda *_: None)
+    assert computed == [(), design.wires, ((48, 40.0),)]
