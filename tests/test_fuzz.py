@@ -21,7 +21,7 @@ from vstent.errors import VstentError
 from vstent.flow.waveform import Waveform, waveform_of
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
-from vstent.io.archive import load_noun, save_noun
+from vstent.io.archive import load_data, save_data
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
@@ -174,12 +174,12 @@ def test_pulses(spoil: Callable[[bytes], bytes], tmp_path: Path) -> None:
 @given(spoil=spoilings())
 def test_kept_stages(spoil: Callable[[bytes], bytes], tmp_path: Path) -> None:
     noun = Surface(np.eye(4, 3), [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
-    save_noun(tmp_path / "sound.npz", noun)
+    save_data(tmp_path / "sound.npz", noun)
     file = tmp_path / "kept.npz"
     file.write_bytes(spoil((tmp_path / "sound.npz").read_bytes()))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of zipfile, about names that occur twice
-        check(file, lambda path: load_noun(path, Surface))
+        check(file, lambda path: load_data(path, Surface))
 
 
 CATALOGUE = (

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import vstent
-from vstent import cli
-from vstent.flow import simulation as flow
+from vstent import cli, flow
+from vstent.flow import simulation
 from vstent.study import demo
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
@@ -22,7 +22,7 @@ def blocks(language: str) -> list[str]:
 def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     demo.write_scan(tmp_path / "3dra")
     coarse = flow.FlowSettings(cell_size_mm=0.4, max_steps=1200)
-    monkeypatch.setattr(flow, "simulate", partial(flow.simulate, settings=coarse))
+    monkeypatch.setattr(simulation, "simulate", partial(flow.simulate, settings=coarse))
     monkeypatch.chdir(tmp_path)
     (example,) = blocks("python")
     names = {}
@@ -34,7 +34,7 @@ def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert after["mean_sac_velocity_m_s"] < before["mean_sac_velocity_m_s"]
 
 
-def test_a_verb_stays_a_verb_when_its_module_is_loaded() -> None:
+def test_a_public_function_stays_one_when_its_module_is_loaded() -> None:
     for name in vstent.__all__:
         verb = getattr(vstent, name)
         assert callable(verb)

@@ -1,28 +1,28 @@
-"""Everything that vstent raises.
+"""Exceptions of vstent.
 
-The tree::
+Their tree::
 
     VstentError
-    ├── InputError              what was given cannot be used (exit code 2 at the command line)
+    ├── InputError              an input or option cannot be used (exit code 2 at the command line)
     │   ├── ReadError           a file is missing, damaged, or not what its name says
-    │   ├── UnitError           a size that no intracranial vessel has, or a spacing that is not known
-    │   ├── VesselError         a surface without a lumen to work in: no openings, no volume, no path
+    │   ├── UnitError           a size of no intracranial vessel, or an unknown spacing
+    │   ├── VesselError         a surface without a usable lumen: no openings, no volume, no path
     │   ├── DeviceError         a device, size or wire that does not exist
     │   ├── LandingError        a landing zone that does not fit the artery
     │   └── PluginError         a plug-in that does not exist or cannot be loaded
-    ├── FlowError               a flow computation that cannot start or has diverged
-    └── FolderError             a case folder that another process works in, or that cannot be written to
+    ├── FlowError               a flow computation that cannot start or that diverged
+    └── FolderError             a case folder that another process uses, or that cannot be written
 
-Each message says what, where (mm), why, and one thing to do.
+Each message says what is wrong, where (mm), and what to do.
 """
 
 
 class VstentError(Exception):
-    """Base of every error that vstent raises on purpose."""
+    """Base class of all errors that vstent raises."""
 
 
 class InputError(VstentError):
-    """What was given cannot be used."""
+    """An input or option cannot be used."""
 
 
 class ReadError(InputError):
@@ -30,11 +30,11 @@ class ReadError(InputError):
 
 
 class UnitError(InputError):
-    """A size that no intracranial vessel has, or a spacing that is not known."""
+    """A size of no intracranial vessel, or an unknown spacing."""
 
 
 class VesselError(InputError):
-    """A surface without a lumen to work in."""
+    """A surface without a usable lumen."""
 
 
 class DeviceError(InputError):
@@ -47,7 +47,7 @@ class LandingError(InputError):
     def __init__(self, sentence: str, move_mm: float = 0.0) -> None:
         super().__init__(sentence)
         self.move_mm = move_mm
-        """How far along the artery (above zero: distally) to move the device; 0 where that is no help."""
+        """Distance in mm along the artery (positive: distal) to move the device by; 0 where that does not help."""
 
 
 class PluginError(InputError):
@@ -55,8 +55,8 @@ class PluginError(InputError):
 
 
 class FlowError(VstentError):
-    """A flow computation that cannot start or has diverged."""
+    """A flow computation that cannot start or that diverged."""
 
 
 class FolderError(VstentError):
-    """A case folder that another process works in, or that cannot be written to."""
+    """A case folder that another process uses, or that cannot be written."""

@@ -1,11 +1,11 @@
-"""Plug-ins: what other distributions add to vstent by entry points, in three groups.
+"""Plug-ins: entry points of other packages, in three groups.
 
-``vstent.devices``: a function that returns a catalogue, TOML text in which every number has its source.
+``vstent.devices``: a function that returns a device catalogue as TOML text in which every number has its source.
 
-``vstent.engines``: a class of `vstent.flow.engines.AbstractEngine`, made with the cell size in mm and a folder of its
-own, in which it may write.
+``vstent.engines``: a class derived from `vstent.flow.engines.AbstractEngine`, created with the grid spacing in mm and a
+folder that it may write to.
 
-``vstent.walls``: a class of `vstent.deployment.wall.AbstractWall`, made with the surface.
+``vstent.walls``: a class derived from `vstent.deployment.wall.AbstractWall`, created with the surface.
 """
 
 from importlib.metadata import EntryPoint, entry_points
@@ -14,15 +14,16 @@ from typing import Any, Literal
 from vstent.errors import PluginError
 
 Group = Literal["vstent.devices", "vstent.engines", "vstent.walls"]
+"""Entry point groups."""
 
 
 def plugins(group: Group) -> dict[str, EntryPoint]:
-    """Return what is installed for a group, by name.
+    """Return the installed entry points of a group by name.
 
     Raises
     ------
     PluginError
-        When two distributions use one name.
+        Two packages use one name.
     """
     found: dict[str, EntryPoint] = {}
     for entry in entry_points(group=group):
@@ -36,17 +37,19 @@ def plugins(group: Group) -> dict[str, EntryPoint]:
 
 
 def load(group: Group, name: str, *, built_in: str) -> Any:
-    """Return what a plug-in leads to; `built_in` names what there is without any, for the sentence.
+    """Load a plug-in by its name; `built_in` lists the built-in choices for the error message.
 
     Raises
     ------
     PluginError
-        When there is none of that name, or it cannot be loaded.
+        No plug-in has that name, or it cannot be loaded.
     """
     found = plugins(group)
     if name not in found:
         raise PluginError(f"There is no {name!r} in {group}: choose one of {', '.join([built_in, *found])}.")
     try:
         return found[name].load()
-    except Exception as error:  # another's code may raise anything
-        raise PluginError(f"The plug-in {name} of {group} cannot be loaded ({error}): reinstall it.") from error
+    except Exception as error:  # foreign code may raise anything
+        raise PluginError(
+            f"The plug-in {name} of {group} cannot be loaded ({error}). Reinstall its package."
+        ) from error

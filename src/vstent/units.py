@@ -4,18 +4,20 @@ from collections.abc import Iterable
 from typing import Final
 
 M_PER_MM: Final = 1e-3
+"""Meters in a millimeter."""
 MM_PER_UM: Final = 1e-3
+"""Millimeters in a micrometer."""
 M3_PER_ML: Final = 1e-6
-
+"""Cubic meters in a milliliter."""
 MM_PER: Final = {"m": 1e3, "cm": 10.0, "mm": 1.0}
-"""Length units a surface file may be in -> mm."""
+"""Millimeters in each length unit that a surface file may have."""
 
 
 def counted(n: int, one: str, many: str = "") -> str:
-    """A count with its noun: ``1 hole``, ``2 holes``; `many` where the plural is not `one` and an s."""
+    """Return a count with its unit word: ``1 hole``, ``2 holes``; `many` is the plural where it is not `one` + s."""
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
 def place(point_mm: Iterable[float]) -> str:
-    """Where a point (3,) is: ``(1.0, -2.5, 30.2) mm``."""
+    """Return a point (3,) in words: ``(1.0, -2.5, 30.2) mm``."""
     return f"({', '.join(f'{x:.1f}' for x in point_mm)}) mm"

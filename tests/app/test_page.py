@@ -29,7 +29,7 @@ from vstent.devices.stent import Landing
 from vstent.errors import ReadError
 from vstent.flow.case import Blood, CarreauYasuda, FlowSettings, Phase, Waveform
 from vstent.geometry.vessel import Anatomy
-from vstent.io.archive import load_noun
+from vstent.io.archive import load_data
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
 from vstent.io.writers import write_stl
@@ -87,7 +87,7 @@ def case(client, artery):
 
 def anatomy_of(client, case, workspace):
     path = next((workspace / client.get(case).json()["id"] / CACHE).glob("anatomy-*.npz"))
-    return load_noun(path, Anatomy)
+    return load_data(path, Anatomy)
 
 
 def choose(client, case, **changes):

@@ -144,7 +144,7 @@ def test_the_mirrored_artery_gives_the_mirrored_contour(method):
 @pytest.mark.parametrize("method", ["constant_wire", "zhong2016"])
 def test_twice_the_rows_and_columns_give_the_same_device(method, monkeypatch):
     coarse = deployed(method, wavy)
-    monkeypatch.setattr(device, "NODE_SPACING_LIMIT_MM", 0.135)
+    monkeypatch.setattr(formulas, "NODE_SPACING_LIMIT_MM", 0.135)
     fine = deploy(SILK, wavy(), size=SIZE, landing=Landing(18.0), method=method)
     assert fine.stent.nodes_mm.shape[1] == 2 * coarse.stent.nodes_mm.shape[1]
     assert fine.stent.deployed_length_mm == pytest.approx(coarse.stent.deployed_length_mm, rel=0.006)

@@ -315,6 +315,13 @@ def bomb(members: int) -> bytes:
     return gzip.compress(bytes(1 << 24), 9, mtime=0) * members
 
 
+def another(files: list[Path]) -> None:
+    """Add a slice with other pixels at the position of the third."""
+    dataset = pydicom.dcmread(files[2])
+    dataset.PixelData = (dataset.pixel_array + 1).tobytes()
+    dataset.save_as(files[2].with_name("x.dcm"))
+
+
 def deflated_bomb(files: list[Path]) -> None:
     """Make one slice unpack to more than half a gigabyte."""
     meta = pydicom.dcmread(files[3]).file_meta
@@ -414,7 +421,7 @@ def own_catalogue(out: Path) -> Iterator[None]:
 MESH, SCAN, SLICES, RAW = "surface files", "scans with a header", "DICOM series", "raw volumes"
 SHAPE, OPTION, DEVICE, MACHINE = "surfaces that are read", "options", "devices of one's own", "machine and folders"
 
-_TORN = "holds no triangles, or not all"
+_TORN = "holds no surface, or fewer triangles"
 _ANNOUNCED = "breaks off"
 _DAMAGED = "is damaged"
 _SOURCED = 'source = "none", confidence = "estimated"'
@@ -531,7 +538,7 @@ FAULTS: tuple[Fault, ...] = (
             ),
         ),
         INPUT,
-        "more than any scan",
+        "more than a scan",
     ),
     Fault(SCAN, "NIfTI whose voxels begin elsewhere", nifti(108, struct.pack("<f", -100)), INPUT, "begin at byte -100"),
     Fault(SCAN, "NIfTI with a count below zero", nifti(42, struct.pack("<3h", -20, 20, 44)), INPUT, _DAMAGED),
@@ -560,31 +567,32 @@ FAULTS: tuple[Fault, ...] = (
         "MHA, bytes in the other order",
         spoilt(".mha", (b"ByteOrderMSB = False", b"ByteOrderMSB = True")),
         INPUT,
-        "other order",
+        "wrong byte order",
     ),
     Fault(SCAN, "MHD without its data file", trace("a.mhd", lambda: detached(".mhd")), INPUT, _DAMAGED),
     Fault(SCAN, "colours", lambda folder: other_scan(folder, np.zeros((5, 6, 7, 3), np.uint8)), INPUT, "3 values per"),
     Fault(SCAN, "voxels that are no numbers", lambda folder: other_scan(folder, holed()), INPUT, "not numbers"),
     Fault(SCAN, "text", trace("a.nrrd", b"not a scan"), INPUT, _DAMAGED),
     Fault(SLICES, "empty folder", lambda folder: empty(folder), INPUT, "no DICOM images"),
-    Fault(SLICES, "a slice of no bytes", series(torn(-1, 0)), INPUT, "is no DICOM file"),
-    Fault(SLICES, "cut in the preamble", series(torn(5, 100)), INPUT, "is no DICOM file"),
+    Fault(SLICES, "a slice of no bytes", series(torn(-1, 0)), INPUT, "is not a DICOM file"),
+    Fault(SLICES, "cut in the preamble", series(torn(5, 100)), INPUT, "is not a DICOM file"),
     Fault(SLICES, "cut in the header", series(torn(5, 700)), INPUT, _DAMAGED),
     Fault(SLICES, "cut in the pixels", series(torn(5, -100)), INPUT, "damaged"),
     Fault(SLICES, "missing slice", series(lambda files: files[3].unlink()), INPUT, "1 slice is missing"),
-    Fault(SLICES, "slice twice", series(lambda f: shutil.copy(f[2], f[2].with_name("x.dcm"))), INPUT, "same place"),
+    Fault(SLICES, "slice twice", series(lambda f: shutil.copy(f[2], f[2].with_name("x.dcm"))), DONE, "dropped"),
+    Fault(SLICES, "two slices at one place", series(another), INPUT, "same position"),
     Fault(SLICES, "one slice only", series(lambda files: [f.unlink() for f in files[1:]]), INPUT, "is alone"),
-    Fault(SLICES, "no pixel size", series(edit(5, PixelSpacing=None)), INPUT, "how large its pixels"),
+    Fault(SLICES, "no pixel size", series(edit(5, PixelSpacing=None)), INPUT, "does not state its pixel spacing"),
     Fault(SLICES, "a slice of another size", series(edit(5, Rows=10)), INPUT, "another size"),
     Fault(SLICES, "uneven distances", series(edit(5, ImagePositionPatient=[0, 0, 2.6])), INPUT, "apart elsewhere"),
     Fault(SLICES, "slice out of line", series(edit(5, ImagePositionPatient=[1, 0, 2.5])), INPUT, "out of line"),
-    Fault(SLICES, "projections", series(edit(5, NumberOfFrames=3)), INPUT, "run of projections"),
+    Fault(SLICES, "projections", series(edit(5, NumberOfFrames=3)), INPUT, "series of projections"),
     Fault(
         SLICES,
         "slices of 65535 x 65535",
         series(lambda f: [edit(k, Rows=65535, Columns=65535)(f) for k in range(2)]),
         INPUT,
-        "more than any scan",
+        "more than a scan",
     ),
     Fault(SLICES, "a slice that unpacks to 0.5 GB", series(deflated_bomb), INPUT, "unpacks to more", is_heavy=True),
     Fault(SLICES, "tilted gantry", series(tilt), DONE, ""),

@@ -13,7 +13,7 @@ from vstent.errors import ReadError
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Opening, Vessel
-from vstent.io.archive import load_noun, save_noun
+from vstent.io.archive import load_data, save_data
 from vstent.phantoms import Phantom, Scanner, demo_phantom
 
 
@@ -61,13 +61,13 @@ def an_anatomy():
     ids=lambda noun: type(noun).__name__,
 )
 def test_nouns_come_back_to_the_last_bit(tmp_path, noun):
-    save_noun(tmp_path / "a.npz", noun)
-    assert same(load_noun(tmp_path / "a.npz", type(noun)), noun)
+    save_data(tmp_path / "a.npz", noun)
+    assert same(load_data(tmp_path / "a.npz", type(noun)), noun)
 
 
 def test_the_same_noun_is_written_in_the_same_bytes(tmp_path):
     for name in "ab":
-        save_noun(tmp_path / name, an_anatomy())
+        save_data(tmp_path / name, an_anatomy())
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -91,14 +91,14 @@ values = st.recursive(
 @given(value=values)
 def test_fields_of_every_kind_come_back(tmp_path_factory, value):
     path = tmp_path_factory.mktemp("archive") / "a.npz"
-    save_noun(path, Vessel(an_anatomy().vessel.lumen, (), (), value))  # a dataclass does not check what it holds
-    assert same(load_noun(path, Vessel).notes, value)
+    save_data(path, Vessel(an_anatomy().vessel.lumen, (), (), value))  # a dataclass does not check what it holds
+    assert same(load_data(path, Vessel).notes, value)
 
 
 def test_other_things_cannot_be_archived(tmp_path):
     for other in (object(), {1: 2}, {"a": np.array([object()])}, an_anatomy):
         with pytest.raises(TypeError, match="cannot be archived"):
-            save_noun(tmp_path / "a.npz", Vessel(an_anatomy().vessel.lumen, (), (), other))
+            save_data(tmp_path / "a.npz", Vessel(an_anatomy().vessel.lumen, (), (), other))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -117,30 +117,30 @@ def test_an_archive_builds_nothing_but_nouns_of_ours(tmp_path, module, name):
     with (tmp_path / "a.npz").open("wb") as file:
         np.savez(file, noun=np.frombuffer(text.encode(), np.uint8))
     with pytest.raises(ReadError, match="damaged or was written by another version"):
-        load_noun(tmp_path / "a.npz", Vessel)
+        load_data(tmp_path / "a.npz", Vessel)
 
 
 def test_pickles_are_refused(tmp_path):
     with (tmp_path / "a.npz").open("wb") as file:
         np.savez(file, noun=np.array([{"is": "noun"}], dtype=object))
     with pytest.raises(ReadError):
-        load_noun(tmp_path / "a.npz", Vessel)
+        load_data(tmp_path / "a.npz", Vessel)
 
 
 def test_wrong_type_missing_and_damaged_are_refused(tmp_path):
-    save_noun(tmp_path / "a.npz", an_anatomy())
+    save_data(tmp_path / "a.npz", an_anatomy())
     with pytest.raises(ReadError, match="holds a Anatomy where a Phantom is needed"):
-        load_noun(tmp_path / "a.npz", Phantom)
+        load_data(tmp_path / "a.npz", Phantom)
     with pytest.raises(ReadError, match="does not exist"):
-        load_noun(tmp_path / "b.npz", Anatomy)
+        load_data(tmp_path / "b.npz", Anatomy)
     data = (tmp_path / "a.npz").read_bytes()
     for n in range(0, len(data), max(1, len(data) // 60)):
         (tmp_path / "a.npz").write_bytes(data[:n])
         with pytest.raises(ReadError):
-            load_noun(tmp_path / "a.npz", Anatomy)
+            load_data(tmp_path / "a.npz", Anatomy)
 
 
 def test_the_devices_of_the_catalogue_come_back(tmp_path):
     for design in catalogue().values():
-        save_noun(tmp_path / "a.npz", design)
-        assert same(load_noun(tmp_path / "a.npz", type(design)), design)
+        save_data(tmp_path / "a.npz", design)
+        assert same(load_data(tmp_path / "a.npz", type(design)), design)

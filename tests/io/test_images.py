@@ -1,5 +1,6 @@
 import shutil
 
+import nibabel
 import numpy as np
 import pydicom
 import pytest
@@ -88,7 +89,7 @@ def test_other_files_and_smaller_series_are_passed_over(oblique, series):
     directory.save_as(series / "report.dcm")
     image = read_image(series)
     np.testing.assert_array_equal(image.voxels, oblique.voxels)
-    assert image.notes == ("2 DICOM series found; the one of 7 files taken.",)
+    assert image.notes == ("2 DICOM series found; the largest, of 7 files, is used.",)
 
 
 def test_one_file_stands_for_its_series(oblique, series):
@@ -115,7 +116,7 @@ def test_a_series_has_the_files_of_that_series_whichever_of_them_is_given(obliqu
     slices(series / "other")[0].rename(series / "z.dcm")
     assert files_of(files[0]) == files_of(files[3]) == files
     files[2].write_bytes(files[2].read_bytes()[:200])
-    assert files_of(files[0]) == [files[0]]
+    assert files_of(files[0]) == [*files[:2], *files[3:]]
 
 
 def test_missing_slice_is_refused_with_its_neighbours_named(series):
@@ -124,21 +125,86 @@ def test_missing_slice_is_refused_with_its_neighbours_named(series):
         read_image(series)
 
 
-def test_double_slice_is_refused_with_both_named(series):
+def test_an_exact_copy_of_a_slice_is_dropped_and_reported(oblique, series):
     shutil.copy(series / "IM0002.dcm", series / "copy.dcm")
-    with pytest.raises(ReadError, match=r"(copy\.dcm and IM0002\.dcm|IM0002\.dcm and copy\.dcm) lie at the same place"):
+    image = read_image(series)
+    np.testing.assert_array_equal(image.voxels, oblique.voxels)
+    assert image.notes == ("1 slice with the same position and the same pixels as another: dropped.",)
+
+
+def test_two_different_slices_at_one_position_are_refused_with_both_named(series):
+    shutil.copy(series / "IM0002.dcm", series / "copy.dcm")
+    other = pydicom.dcmread(series / "copy.dcm")
+    other.PixelData = (other.pixel_array + 1).tobytes()
+    other.save_as(series / "copy.dcm")
+    with pytest.raises(
+        ReadError, match=r"(copy\.dcm and IM0002\.dcm|IM0002\.dcm and copy\.dcm) differ but have the same"
+    ):
         read_image(series)
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        ("AcquisitionNumber", (1, 2)),
+        ("TemporalPositionIdentifier", (3, 7)),
+        ("AcquisitionTime", ("101500.0", "101530.5")),
+        ("TriggerTime", ("0", "35.5")),
+        ("EchoTime", ("3.4", "6.8")),
+    ],
+)
+def test_of_several_acquisitions_the_brightest_is_read_unless_one_is_chosen(oblique, series, key, values):
+    files = slices(series)
+    for number, file in enumerate(files):
+        edited(file, **{key: values[1]})
+        mask = pydicom.dcmread(file)
+        setattr(mask, key, values[0])
+        mask.SOPInstanceUID = f"1.2.3.{number}"
+        mask.PixelData = (mask.pixel_array // 4).astype(mask.pixel_array.dtype).tobytes()
+        mask.save_as(series / f"mask_{file.name}")
+    image = read_image(series)
+    np.testing.assert_array_equal(image.voxels, oblique.voxels)
+    assert "holds 2 acquisitions" in image.notes[0]
+    assert "Acquisition 2 is used" in image.notes[0]
+    np.testing.assert_array_equal(read_image(series, acquisition=1).voxels, oblique.voxels // 4)
+    with pytest.raises(ReadError, match=r"holds 2 acquisitions \(1: .*, 7 slices; 2: .*, 7 slices\), not 3"):
+        read_image(series, acquisition=3)
+
+
+def test_a_series_of_one_acquisition_has_no_second(series):
+    with pytest.raises(ReadError, match="acquisition 2 does not exist"):
+        read_image(series, acquisition=2)
+
+
+@pytest.mark.parametrize("is_signed", [0, 1])
+def test_monochrome1_is_inverted(oblique, series, is_signed):
+    stored = np.asarray(read_image(series).voxels)
+    plain = stored.view(np.int16 if is_signed else np.uint16).astype(int)
+    for file in slices(series):
+        edited(file, PhotometricInterpretation="MONOCHROME1", PixelRepresentation=is_signed)
+    image = read_image(series)
+    assert (image.voxels + plain == (-1 if is_signed else 65535)).all()
+    assert "MONOCHROME1" in image.notes[0]
+
+
+def test_of_files_side_by_side_the_multi_frame_file_given_is_read_alone(series, tmp_path):
+    lone = tmp_path / "enhanced.dcm"
+    shutil.copy(slices(series)[0], lone)
+    edited(lone, NumberOfFrames=3)
+    (tmp_path / "broken.dcm").write_bytes(slices(series)[1].read_bytes()[:200])
+    with pytest.raises(ReadError, match=r"enhanced\.dcm is a series of projections"):
+        read_image(lone)
 
 
 def test_slice_at_an_uneven_distance_is_refused(oblique, series):
     edited(series / "IM0005.dcm", ImagePositionPatient=list(np.round(oblique.to_mm([[0, 0, 4.1]])[0], 8)))
-    with pytest.raises(ReadError, match=r"Slice IM0005\.dcm lies 0\.407 mm after IM0004\.dcm"):
+    with pytest.raises(ReadError, match=r"Slice IM0005\.dcm is 0\.407 mm from IM0004\.dcm"):
         read_image(series)
 
 
 def test_slice_shifted_sideways_is_refused(oblique, series):
     edited(series / "IM0005.dcm", ImagePositionPatient=list(np.round(oblique.to_mm([[2, 0, 4]])[0], 8)))
-    with pytest.raises(ReadError, match=r"Slice IM0005\.dcm lies 0\.420 mm out of line"):
+    with pytest.raises(ReadError, match=r"Slice IM0005\.dcm is 0\.420 mm out of line"):
         read_image(series)
 
 
@@ -154,9 +220,9 @@ def test_a_sheared_series_keeps_its_shear(oblique, series):
     [
         ({"PixelSpacing": [0.2, 0.2]}, ReadError, "another pixel spacing"),
         ({"ImageOrientationPatient": [1, 0, 0, 0, 1, 0]}, ReadError, "another orientation"),
-        ({"PixelSpacing": None}, UnitError, "how large its pixels are"),
-        ({"ImagePositionPatient": None}, ReadError, "where it lies"),
-        ({"NumberOfFrames": 3}, ReadError, "run of projections"),
+        ({"PixelSpacing": None}, UnitError, "does not state its pixel spacing"),
+        ({"ImagePositionPatient": None}, ReadError, "does not state its position"),
+        ({"NumberOfFrames": 3}, ReadError, "series of projections"),
     ],
 )
 def test_a_slice_unlike_the_others_is_named(series, change, error, words):
@@ -310,6 +376,143 @@ def test_a_nifti_file_is_read_and_not_one_beside_it_that_differs_in_its_suffix(
     np.testing.assert_array_equal(read_image(tmp_path / f"scan{wanted}").voxels, oblique.voxels + 1000)
 
 
+def nifti_of(image, version=1, *, edges=None, **fields):
+    """Return a NIfTI image of nibabel in RAS with the voxels and, unless others are given, the frame of an image."""
+    kind = nibabel.Nifti1Image if version == 1 else nibabel.Nifti2Image
+    affine = np.diag([-1.0, -1.0, 1.0, 1.0]) @ image.affine_mm
+    if edges is not None:
+        affine[:3, :3] = np.diag([-1.0, -1.0, 1.0]) @ edges
+    made = kind(np.asarray(image.voxels), None)
+    made.header.set_sform(affine, code=fields.pop("code", 1))
+    made.header["qform_code"] = 0
+    made.header["pixdim"][1:4] = np.linalg.norm(affine[:3, :3], axis=0)
+    for key, value in fields.items():
+        made.header[key] = value
+    return made
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
+def test_both_versions_of_nifti_are_read(oblique, tmp_path, version, name):
+    nibabel.save(nifti_of(oblique, version), tmp_path / name)
+    image = read_image(tmp_path / name)
+    np.testing.assert_array_equal(image.voxels, oblique.voxels)
+    np.testing.assert_allclose(image.affine_mm, oblique.affine_mm, atol=2e-6 if version == 1 else 1e-12)
+    assert image.notes == ()
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int16, np.uint16, np.int32, np.float32])
+@pytest.mark.parametrize(("slope", "intercept"), [(0.5, -100.0), (2.0, 0.0), (0.0, 7.0), (1.0, 3.0)])
+def test_scaled_nifti_voxels_are_what_they_stand_for(oblique, tmp_path, kind, slope, intercept):
+    stored = (oblique.voxels % 200).astype(kind)
+    made = nifti_of(Image(stored, oblique.affine_mm))
+    nibabel.save(made, tmp_path / "a.nii")
+    data = bytearray((tmp_path / "a.nii").read_bytes())
+    data[112:120] = np.array([slope, intercept], "<f4").tobytes()
+    (tmp_path / "a.nii").write_bytes(bytes(data))
+    expected = stored * slope + intercept if slope else stored
+    np.testing.assert_allclose(read_image(tmp_path / "a.nii").voxels, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("unit", ["meter", "mm", "micron"])
+def test_nifti_units_become_mm(oblique, tmp_path, unit):
+    factor = {"meter": 1e-3, "mm": 1.0, "micron": 1e3}[unit]
+    affine = np.diag([factor] * 3 + [1.0]) @ oblique.affine_mm
+    made = nifti_of(Image(oblique.voxels, affine))
+    made.header.set_xyzt_units(unit)
+    nibabel.save(made, tmp_path / "a.nii")
+    np.testing.assert_allclose(read_image(tmp_path / "a.nii").affine_mm, oblique.affine_mm, atol=1e-5)
+
+
+def test_nifti_without_a_frame_has_its_voxel_axes(oblique, tmp_path):
+    nibabel.save(nifti_of(oblique, code=0), tmp_path / "a.nii")
+    expected = np.diag([*oblique.spacing_mm, 1.0])
+    np.testing.assert_allclose(read_image(tmp_path / "a.nii").affine_mm, expected, rtol=1e-6)
+
+
+def blob(shape=(30, 28, 26)):
+    """Return a smooth blob (i, j, k) off the center."""
+    i, j, k = np.meshgrid(*[np.arange(n) for n in shape], indexing="ij")
+    return (1000 * np.exp(-((i - 16) ** 2 + (j - 12) ** 2 + (k - 14) ** 2) / 30)).astype(np.float32)
+
+
+def blob_in_mm(image):
+    """Return integral and center of mass in mm of an image's values."""
+    weight = image.voxels.ravel().astype(float)
+    index = np.stack(np.unravel_index(np.arange(weight.size), image.voxels.shape), axis=1)
+    volume = abs(np.linalg.det(image.affine_mm[:3, :3]))
+    return weight.sum() * volume, np.average(image.to_mm(index), axis=0, weights=weight)
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nrrd"])
+@pytest.mark.parametrize("shear", [0.2, -0.15])
+@pytest.mark.parametrize("place", [(0, 1), (1, 2), (0, 2)])
+def test_a_large_shear_is_resampled_and_keeps_volume_and_place(tmp_path, suffix, shear, place):
+    edges = np.diag([0.4, 0.5, 0.6])
+    edges[place] = shear * edges[place[1], place[1]]
+    sheared = Image(blob(), np.block([[edges, np.array([[5.0], [-7], [9]])], [np.zeros((1, 3)), 1]]))
+    if suffix == ".nii":
+        nibabel.save(nifti_of(sheared), tmp_path / "a.nii")
+    else:
+        SimpleITK.WriteImage(itk_scan(sheared), str(tmp_path / "a.nrrd"))
+    image = read_image(tmp_path / f"a{suffix}")
+    axes = image.affine_mm[:3, :3] / image.spacing_mm
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-9)
+    whole, center = blob_in_mm(sheared)
+    found, moved = blob_in_mm(image)
+    assert found == pytest.approx(whole, rel=2e-3)
+    np.testing.assert_allclose(moved, center, atol=0.01)
+    assert "not perpendicular" in image.notes[-1]
+    assert "resampled" in image.notes[-1]
+
+
+def test_a_small_shear_takes_the_nearest_frame_and_says_how_far_it_moves(tmp_path):
+    edges = np.diag([0.5, 0.5, 0.5])
+    edges[0, 1] += 0.004 * 0.5
+    sheared = Image(blob(), np.block([[edges, np.zeros((3, 1))], [np.zeros((1, 3)), 1]]))
+    nibabel.save(nifti_of(sheared), tmp_path / "a.nii")
+    image = read_image(tmp_path / "a.nii")
+    np.testing.assert_array_equal(image.voxels, sheared.voxels)
+    axes = image.affine_mm[:3, :3] / image.spacing_mm
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-9)
+    corners = np.array(np.meshgrid(*[[0, n - 1] for n in image.voxels.shape])).reshape(3, -1).T
+    moved_mm = np.linalg.norm(image.to_mm(corners) - sheared.to_mm(corners), axis=1).max()
+    assert f"by at most {moved_mm:.2f} mm" in image.notes[-1]
+
+
+@pytest.mark.parametrize("field", [("dim", [3, 10, 0, 5, 1, 1, 1, 1]), ("datatype", 2048), ("vox_offset", 1e12)])
+def test_a_nifti_header_that_cannot_be_is_refused(oblique, tmp_path, field):
+    made = nifti_of(oblique)
+    head = made.header.copy()
+    head[field[0]] = field[1]
+    (tmp_path / "a.nii").write_bytes(head.binaryblock + bytes(4) + np.asarray(oblique.voxels).tobytes(order="F"))
+    with pytest.raises(ReadError, match=r"a\.nii"):
+        read_image(tmp_path / "a.nii")
+
+
+def test_vtk_images_are_read_with_their_frame(oblique, tmp_path):
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+    data = vtkImageData()
+    data.SetDimensions(oblique.voxels.shape)
+    data.SetSpacing(oblique.spacing_mm)
+    data.SetOrigin(oblique.affine_mm[:3, 3])
+    data.SetDirectionMatrix((oblique.affine_mm[:3, :3] / oblique.spacing_mm).ravel())
+    data.GetPointData().SetScalars(numpy_to_vtk(np.asarray(oblique.voxels).ravel(order="F"), deep=True))
+    writer = vtkXMLImageDataWriter()
+    writer.SetFileName(str(tmp_path / "a.vti"))
+    writer.SetInputData(data)
+    writer.Write()
+    image = read_image(tmp_path / "a.vti")
+    np.testing.assert_array_equal(image.voxels, oblique.voxels)
+    np.testing.assert_allclose(image.affine_mm, oblique.affine_mm, atol=1e-9)
+    (tmp_path / "b.vti").write_bytes((tmp_path / "a.vti").read_bytes()[:300])
+    with pytest.raises(ReadError, match=r"b\.vti is damaged"):
+        read_image(tmp_path / "b.vti")
+
+
 META = "ObjectType = Image\nNDims = 3\nElementSpacing = 1 1 1\nDimSize = 4 4 4\nElementType = MET_SHORT\n{}"
 NRRD = "NRRD0004\ntype: short\ndimension: 3\nsizes: 4 4 4\nendian: little\nencoding: raw\nspacings: 1 1 1\n{}"
 VOXELS_APART = {
@@ -370,7 +573,7 @@ def test_nifti_without_pixel_sizes_is_refused(oblique, tmp_path):
     data = bytearray(file.read_bytes())
     data[80:92] = bytes(12)
     file.write_bytes(bytes(data))
-    with pytest.raises(UnitError, match="how far its voxels are apart"):
+    with pytest.raises(UnitError, match="does not state a voxel spacing"):
         read_image(file)
 
 

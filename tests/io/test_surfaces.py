@@ -84,7 +84,7 @@ def test_quads_are_cut_along_the_shorter_diagonal_and_larger_polygons_into_fans(
         (-2, 6, 5),
     ]
     path.write_text("".join("v {} {} {}\n".format(*p) for p in points) + "f 1 2 3 4\nf 2 3 4 1\nf 5 6 7 8 9\n")
-    vertices, faces = read_apart(path)
+    vertices, faces, _ = read_apart(path)
     assert [{1, 3} <= set(f) for f in faces.tolist()] == [True, True, True, True, False, False, False]
     surface = Surface(vertices, faces)
     assert surface.areas_mm2.sum() == pytest.approx(400 + 400 + 100)
@@ -100,7 +100,7 @@ def test_an_stl_text_that_breaks_off_is_told_at_whatever_length(tmp_path):
     assert len(read_apart(path)[1]) == 60
     for lost in range(len("endsolid a\n"), len("endsolid a\n") + 50):
         path.write_text(whole[:-lost])
-        with pytest.raises(ReadError, match="holds no triangles, or not all"):
+        with pytest.raises(ReadError, match="holds no surface, or fewer triangles"):
             read_surface(path, units="mm")
 
 
@@ -110,7 +110,7 @@ def test_unit_is_guessed_and_said(tmp_path, unit):
     write_surface(tmp_path / "a.vtp", Surface(cylinder().vertices_mm * scale, cylinder().faces))
     read, notes = read_surface(tmp_path / "a.vtp")
     np.testing.assert_allclose(read.vertices_mm, cylinder().vertices_mm, atol=1e-12)
-    assert notes[0].startswith(f"Unit guessed: {unit} ")
+    assert notes[0].startswith(f"Length unit: {unit}, ")
     given_unit, no_notes = read_surface(tmp_path / "a.vtp", units=unit)
     np.testing.assert_array_equal(given_unit.vertices_mm, read.vertices_mm)
     assert no_notes == ()
@@ -122,20 +122,20 @@ def test_a_giant_aneurysm_is_read(tmp_path, units):
     write_surface(tmp_path / "a.vtp", Surface(cylinder().vertices_mm * scale, cylinder().faces))
     assert hydraulic_diameter(read_surface(tmp_path / "a.vtp", units=units)[0]) == pytest.approx(20.0)
     write_surface(tmp_path / "b.vtp", Surface(cylinder().vertices_mm * 1.5 * scale, cylinder().faces))
-    with pytest.raises(UnitError, match=r"0\.8 to 25 mm wide|of 30 mm, which no vessel"):
+    with pytest.raises(UnitError, match=r"have 0\.8 to 25 mm|of 30 mm, which no brain vessel"):
         read_surface(tmp_path / "b.vtp", units=units)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e3, 1e6])
 def test_what_fits_no_unit_is_refused(tmp_path, scale):
     write_surface(tmp_path / "a.vtp", Surface(cylinder().vertices_mm * scale, cylinder().faces))
-    with pytest.raises(UnitError, match="fits no unit"):
+    with pytest.raises(UnitError, match="has the size of a brain vessel in no unit"):
         read_surface(tmp_path / "a.vtp")
 
 
 def test_a_unit_that_makes_it_a_thousand_times_too_large_is_refused(tmp_path):
     write_surface(tmp_path / "a.vtp", cylinder())
-    with pytest.raises(UnitError, match=r"read in m would be 2.*mm long"):
+    with pytest.raises(UnitError, match=r"a\.vtp in m would be 2.*mm long"):
         read_surface(tmp_path / "a.vtp", units="m")
     with pytest.raises(UnitError, match="not known"):
         read_surface(tmp_path / "a.vtp", units="inch")
@@ -161,12 +161,12 @@ def test_text_and_emptiness_are_refused_in_one_sentence_and_silence(tmp_path, ca
 
 def test_empty_mesh_nan_and_flat_are_refused(tmp_path):
     write_surface(tmp_path / "empty.vtp", Surface(np.zeros((0, 3)), np.zeros((0, 3))))
-    with pytest.raises(ReadError, match="holds no triangles"):
+    with pytest.raises(ReadError, match="holds no surface"):
         read_surface(tmp_path / "empty.vtp")
     broken = np.array(cylinder().vertices_mm)
     broken[17, 1] = np.nan
     write_surface(tmp_path / "nan.vtp", Surface(broken, cylinder().faces))
-    with pytest.raises(ReadError, match=r"1 vertices that are not numbers \(first: vertex 17\)"):
+    with pytest.raises(ReadError, match=r"1 vertices that are not numbers \(first: 17\)"):
         read_surface(tmp_path / "nan.vtp")
     write_surface(
         tmp_path / "line.vtp",
@@ -196,7 +196,7 @@ def test_other_files_are_refused(tmp_path):
 def test_real_surfaces(shared_data, name, unit, faces):
     surface, notes = read_surface(shared_data / name)
     assert len(surface.faces) == faces
-    assert notes[0].startswith(f"Unit guessed: {unit} ")
+    assert notes[0].startswith(f"Length unit: {unit}, ")
 
 
 @pytest.fixture(scope="module")
@@ -244,3 +244,138 @@ def test_a_reader_has_so_much_of_the_processor_and_may_wait_for_it(busy: str, li
     begin = "import time\nfrom vstent.io import vtk_child\nvtk_child.SECONDS = 1.0\nvtk_child._limit(0)\n"
     ended = subprocess.run([sys.executable, "-c", begin + busy], check=False, timeout=60)
     assert (ended.returncode == 0) == lives
+
+
+# -- frames, grids and blocks, two walls -------------------------------------------------------------------------------
+
+
+def ras(surface):
+    return Surface(surface.vertices_mm * [-1, -1, 1], surface.faces)
+
+
+def stated(tmp_path, kind, frame):
+    """Write a cylinder in a frame with the words that 3D Slicer uses, and return the file."""
+    words = f"3D Slicer output. SPACE={frame}"
+    surface = ras(cylinder()) if frame == "RAS" else cylinder()
+    path = tmp_path / f"a{kind}"
+    if kind == ".stl":
+        write_stl(path, surface)
+        path.write_bytes(words.encode().ljust(80) + path.read_bytes()[80:])
+    elif kind == ".obj":
+        rows = [f"v {x} {y} {z}" for x, y, z in surface.vertices_mm.tolist()]
+        path.write_text(
+            "\n".join([f"# {words}", *rows, *(f"f {a} {b} {c}" for a, b, c in (surface.faces + 1).tolist())])
+        )
+    elif kind == ".ply":
+        head = (
+            f"ply\nformat ascii 1.0\ncomment {words}\nelement vertex {len(surface.vertices_mm)}\n"
+            "property float x\nproperty float y\nproperty float z\n"
+            f"element face {len(surface.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+        rows = [f"{x} {y} {z}" for x, y, z in surface.vertices_mm.tolist()]
+        path.write_text(head + "\n".join([*rows, *(f"3 {a} {b} {c}" for a, b, c in surface.faces.tolist())]) + "\n")
+    else:
+        from vtkmodules.vtkCommonCore import vtkStringArray
+        from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+        from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+        data = polydata_of(surface.vertices_mm, surface.faces)
+        writer = vtkXMLPolyDataWriter() if kind == ".vtp" else vtkPolyDataWriter()
+        if kind == ".vtp":
+            array = vtkStringArray()
+            array.SetName("SPACE")
+            array.InsertNextValue(frame)
+            data.GetFieldData().AddArray(array)
+        else:
+            writer.SetHeader(words)
+        writer.SetFileName(str(path))
+        writer.SetInputData(data)
+        writer.Write()
+    return path
+
+
+@pytest.mark.parametrize("kind", [".stl", ".obj", ".ply", ".vtp", ".vtk"])
+@pytest.mark.parametrize("frame", ["RAS", "LPS"])
+def test_the_frame_that_a_file_states_is_obeyed(tmp_path, kind, frame):
+    surface, notes = read_surface(stated(tmp_path, kind, frame))
+    center_mm = surface.corners_mm.mean(axis=(0, 1))
+    np.testing.assert_allclose(center_mm, cylinder().corners_mm.mean(axis=(0, 1)), atol=1e-4)
+    assert ("The file states RAS" in notes[0]) == (frame == "RAS")
+    turned, _ = read_surface(tmp_path / f"a{kind}", frame="lps" if frame == "RAS" else "ras")
+    np.testing.assert_allclose(turned.corners_mm.mean(axis=(0, 1)), center_mm * [-1, -1, 1], atol=1e-4)
+
+
+def test_our_own_files_state_lps(tmp_path):
+    write_stl(tmp_path / "a.stl", cylinder())
+    write_surface(tmp_path / "a.vtp", cylinder())
+    assert b"SPACE=LPS" in (tmp_path / "a.stl").read_bytes()[:80]
+    assert read_apart(tmp_path / "a.vtp")[2] == "LPS"
+
+
+@pytest.mark.parametrize("kind", [".vtu", ".vtm"])
+def test_grids_and_blocks_of_surfaces_are_read(tmp_path, kind):
+    from vtkmodules.vtkCommonDataModel import vtkMultiBlockDataSet
+    from vtkmodules.vtkFiltersCore import vtkAppendFilter
+    from vtkmodules.vtkIOXML import vtkXMLMultiBlockDataWriter, vtkXMLUnstructuredGridWriter
+
+    surface = cylinder()
+    half = len(surface.faces) // 2
+    parts = [polydata_of(surface.vertices_mm, part) for part in (surface.faces[:half], surface.faces[half:])]
+    if kind == ".vtu":
+        grid = vtkAppendFilter()
+        for part in parts:
+            grid.AddInputData(part)
+        grid.Update()
+        writer, data = vtkXMLUnstructuredGridWriter(), grid.GetOutput()
+    else:
+        writer, data = vtkXMLMultiBlockDataWriter(), vtkMultiBlockDataSet()
+        inner = vtkMultiBlockDataSet()
+        inner.SetBlock(0, parts[1])
+        data.SetBlock(0, parts[0])
+        data.SetBlock(1, None)
+        data.SetBlock(2, inner)
+    writer.SetFileName(str(tmp_path / f"a{kind}"))
+    writer.SetInputData(data)
+    writer.Write()
+    found, _ = read_surface(tmp_path / f"a{kind}")
+    assert found.area_mm2 == pytest.approx(surface.area_mm2, rel=1e-6)
+    assert len(found.faces) == len(surface.faces)
+
+
+def tube_between(radius_mm, *, length_mm=30.0, around=40, along=60, is_inward=False):
+    """Return an open tube along z, as vertices and faces."""
+    angle, z = np.meshgrid(2 * np.pi * np.arange(around) / around, np.linspace(0, length_mm, along))
+    points = np.stack([radius_mm * np.cos(angle), radius_mm * np.sin(angle), z], axis=-1).reshape(-1, 3)
+    faces = tube_faces(along, around)
+    return points, faces[:, ::-1] if is_inward else faces
+
+
+@pytest.mark.parametrize("is_inward", [False, True])
+@pytest.mark.parametrize("has_rims", [False, True])
+@pytest.mark.parametrize("thickness_mm", [0.1, 0.3, 0.8])
+def test_of_a_hollow_model_the_inner_wall_is_read(tmp_path, is_inward, has_rims, thickness_mm):
+    inner, inner_faces = tube_between(2.0, is_inward=is_inward)
+    outer, outer_faces = tube_between(2.0 + thickness_mm)
+    faces = [inner_faces, outer_faces + len(inner)]
+    if has_rims:
+        for ring in (0, len(inner) - 40):
+            a = ring + np.arange(40)
+            b, c, d = ring + (np.arange(40) + 1) % 40, a + len(inner), ring + (np.arange(40) + 1) % 40 + len(inner)
+            faces += [np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)]
+    write_stl(tmp_path / "a.stl", Surface(np.concatenate([inner, outer]), np.concatenate(faces)))
+    surface, notes = read_surface(tmp_path / "a.stl")
+    assert np.linalg.norm(surface.corners_mm[..., :2], axis=2).max() == pytest.approx(2.0, abs=1e-4)
+    assert len(surface.faces) == len(inner_faces)
+    assert any("inner and an outer wall" in note for note in notes)
+
+
+def test_two_arteries_side_by_side_or_one_with_caps_are_no_hollow_model(tmp_path):
+    points, faces = tube_between(2.0)
+    beside = Surface(
+        np.concatenate([points, points + np.array([4.3, 0, 0])]), np.concatenate([faces, faces + len(points)])
+    )
+    for surface in (beside, cylinder()):
+        write_stl(tmp_path / "a.stl", surface)
+        found, notes = read_surface(tmp_path / "a.stl")
+        assert len(found.faces) == len(surface.faces)
+        assert not any("wall" in note for note in notes)

@@ -28,7 +28,7 @@ from vstent.errors import ReadError
 from vstent.flow.case import FlowField
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Opening
-from vstent.io.archive import load_noun
+from vstent.io.archive import load_data
 from vstent.kernels import clipping
 from vstent.kernels.arrays import Floats
 from vstent.reporting.packing import message
@@ -103,7 +103,7 @@ class Live:
         path = self.case.folder / CACHE / f"anatomy-{key}.npz"
         if not key:
             raise ReadError("The vessel has not been found yet: run the first three steps.")
-        return self.remembered(("anatomy", key), lambda: load_noun(path, Anatomy))
+        return self.remembered(("anatomy", key), lambda: load_data(path, Anatomy))
 
     def choice(self, name: str) -> DeviceChoice:
         """Return what was chosen of a device.
@@ -146,7 +146,7 @@ class Live:
 
     def _field(self, path: Path, moment: int | None) -> FlowField:
         """A flow: its mean, or a moment of its last cycle."""
-        field = self.remembered(("flow", path, path.stat().st_mtime_ns), lambda: load_noun(path, FlowField))
+        field = self.remembered(("flow", path, path.stat().st_mtime_ns), lambda: load_data(path, FlowField))
         return field if moment is None or not field.phases else field.at_phase(field.phases[moment % len(field.phases)])
 
     def _flow_layers(self, name: str, path: Path, moment: int | None) -> list[MeshLayer | LineLayer]:

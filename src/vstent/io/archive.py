@@ -1,7 +1,7 @@
-"""Nouns <-> one compressed file each, so that a study can go on where it stopped.
+"""Save and load vstent's data classes, one compressed file each, so that a study can resume.
 
-An archive is a NumPy .npz: the arrays, and under the name ``noun`` a JSON text that says how they hang together. There
-is no pickle in it: reading one runs nothing but the constructors of vstent's own dataclasses.
+An archive is a NumPy .npz file: the arrays, and under the name ``noun`` a JSON text that describes their structure. It
+holds no pickle: loading runs only the constructors of vstent's own data classes.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vstent.errors import ReadError
 from vstent.io.files import atomic, existing
 
-Noun = TypeVar("Noun")
+Saved = TypeVar("Saved")
 
 _ROOT: Final = "vstent."
 _KIND: Final = "is"
@@ -49,55 +49,57 @@ DAMAGE: Final = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""All that reading a damaged archive raises."""
+"""Exceptions that reading a damaged archive raises."""
 MOST_BYTES: Final = 1 << 33
-"""No noun is larger, unpacked."""
+"""Largest unpacked size of an archive."""
 
 
-def save_noun(path: Path, noun: Any) -> None:
-    """Write a frozen dataclass of vstent, with all that it holds.
+def save_data(path: Path, value: Any) -> None:
+    """Write a frozen data class of vstent with everything it contains.
 
-    Fields may be arrays, numbers, strings, booleans, None, tuples, lists, dictionaries with strings for keys, and
-    dataclasses of vstent, nested as deep as wanted.
+    Fields may be arrays, numbers, strings, booleans, None, tuples, lists, dictionaries with string keys, and data
+    classes of vstent, nested to any depth.
 
     Raises
     ------
     TypeError
-        Something in it is of another type; nothing is written.
+        A field is of another type; nothing is written.
     """
     arrays: dict[str, NDArray[Any]] = {}
-    text = json.dumps(_packed(noun, arrays))
+    text = json.dumps(_packed(value, arrays))
     arrays["noun"] = np.frombuffer(text.encode(), dtype=np.uint8)
     with atomic(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
-def load_noun(path: Path, noun_type: type[Noun]) -> Noun:
-    """Read a dataclass of the type wanted.
+def load_data(path: Path, kind: type[Saved]) -> Saved:
+    """Read a data class of the given type.
 
     Raises
     ------
     ReadError
-        The file is missing, damaged, of another version, or holds something else.
+        The file is missing, damaged, of another version, or holds another type.
     """
     path = existing(path)
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             _refuse_bomb(archive)
-            noun = _unpacked(json.loads(archive["noun"].tobytes()), archive)
+            value = _unpacked(json.loads(archive["noun"].tobytes()), archive)
     except DAMAGE:
         raise ReadError(
-            f"{path} is damaged or was written by another version; delete it to compute it again."
+            f"{path} is damaged or was written by another version. Delete it to compute it again."
         ) from None
-    if not isinstance(noun, noun_type):
-        raise ReadError(f"{path} holds a {type(noun).__name__} where a {noun_type.__name__} is needed; delete it.")
-    return noun
+    if not isinstance(value, kind):
+        raise ReadError(
+            f"{path} holds a {type(value).__name__} where a {kind.__name__} is needed. Delete it to compute it again."
+        )
+    return value
 
 
 def _refuse_bomb(archive: Any) -> None:
-    """Raise ValueError where the archive would unpack to more than any noun holds."""
+    """Raise ValueError where the archive would unpack to more than `MOST_BYTES`."""
     if sum(entry.file_size for entry in archive.zip.infolist()) > MOST_BYTES:
-        raise ValueError("the archive unpacks to more than any noun holds")
+        raise ValueError("the archive unpacks to too many bytes")
 
 
 def _packed(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
@@ -131,14 +133,14 @@ def _unpacked(value: Any, archive: Any) -> Any:
     if kind == "dict":
         return {key: _unpacked(item, archive) for key, item in value["items"].items()}
     fields = {name: _unpacked(item, archive) for name, item in value["fields"].items()}
-    return _noun_class(value["module"], value["class"])(**fields)
+    return _class_of(value["module"], value["class"])(**fields)
 
 
-def _noun_class(module: str, name: str) -> type:
+def _class_of(module: str, name: str) -> type:
     if not module.startswith(_ROOT):
-        raise ValueError(f"{module}.{name} is no noun of vstent")
+        raise ValueError(f"{module}.{name} is not a data class of vstent")
     home = _FORMER_HOMES.get(module, module)
     found = getattr(importlib.import_module(home), name)
     if not (isinstance(found, type) and dataclasses.is_dataclass(found) and found.__module__ == home):
-        raise ValueError(f"{module}.{name} is no noun of vstent")
+        raise ValueError(f"{module}.{name} is not a data class of vstent")
     return found

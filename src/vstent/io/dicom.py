@@ -1,4 +1,4 @@
-"""DICOM series <-> Image."""
+"""DICOM series -> Image."""
 
 import logging
 import struct
@@ -6,7 +6,7 @@ import warnings
 import zlib
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,74 +18,90 @@ from vstent.errors import ReadError, UnitError
 from vstent.geometry.image import Image
 from vstent.io.files import silenced
 from vstent.kernels.arrays import Floats
+from vstent.units import counted
 
 MOST_VOXELS: Final = 1 << 31
-"""A series of more voxels is none of a head, or its headers lie."""
+"""Largest number of voxels of a series; a scan of the head has fewer."""
 MOST_UNPACKED: Final = 1 << 29
-"""Bytes that a packed (deflated) file may hold."""
+"""Largest unpacked size of a deflated file, in bytes."""
 SPACING_TOLERANCE: Final = 0.02
-"""Slices may lie this fraction of their distance off the regular grid."""
+"""Largest deviation of a slice from the regular grid, as a fraction of the slice distance."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Slice:
-    """One plane of voxels: a file, or a frame of one."""
+    """One plane of voxels: a file, or one frame of a multi-frame file."""
 
     dataset: Any
     path: Path
     frame: int | None
     position_mm: Floats
     orientation: Floats
-    """(2, 3) directions in which columns and rows are counted."""
+    """(2, 3) unit directions of growing column and of growing row number."""
     pixel_mm: Floats
-    """(2,) distance between columns and between rows."""
+    """(2,) distance between columns and between rows, in mm."""
     slope: float
     intercept: float
     padding: tuple[int, int] | None
-    """Least and largest stored value of what is outside the field of view, where that is stated."""
+    """Smallest and largest stored value that mark pixels outside the field of view; None where not stated."""
 
     @property
     def name(self) -> str:
-        """File, and frame if there are several."""
+        """Name of the file, with the frame number of a multi-frame file."""
         return self.path.name if self.frame is None else f"{self.path.name} frame {self.frame + 1}"
 
     @property
     def size(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Number of rows and of columns."""
         return int(self.dataset.Rows), int(self.dataset.Columns)
 
 
 def is_dicom(path: Path) -> bool:
-    """Tell whether a file begins like DICOM: four letters after a preamble of 128 bytes."""
+    """Return whether a file begins like DICOM: the letters DICM after a preamble of 128 bytes."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
         return file.read(132)[128:] == b"DICM"
 
 
-def read_dicom(path: Path) -> Image:
+def read_dicom(path: Path, *, acquisition: int | None = None) -> Image:
     """Read the largest series of a folder, or the series that one file belongs to.
 
-    The order of the slices and the distance between them come from their positions, never from names or numbers.
+    Slices are ordered by their positions, never by names or numbers. Exact copies of a slice are dropped. Where a
+    series holds several acquisitions of the same slices, as mask and fill runs, one of them is read: the one given,
+    else the one with the brightest vessels. MONOCHROME1 images are inverted.
+
+    Parameters
+    ----------
+    path : a folder, or one file of a series; a multi-frame file is read alone.
+    acquisition : which acquisition of a series that holds several, counted from 1.
 
     Raises
     ------
     ReadError
-        No DICOM volume is there, or a slice is missing, double, or out of line.
+        There is no DICOM volume, or a slice is missing, duplicated with other pixels, or misplaced.
     UnitError
-        The size of the pixels is not stated.
+        The pixel spacing is not stated.
     """
     with quiet():
-        series, note = _choose(path)
-        slices = [plane for file, dataset in series for plane in _planes(file, dataset)]
-        slices, affine = _arrange(slices)
+        series, notes = _choose(path)
+        planes, of_groups = _one_acquisition(
+            [p for file, dataset in series for p in _planes(file, dataset)], acquisition
+        )
+        planes, of_copies = _without_copies(planes)
+        slices, affine = _arrange(planes)
         voxels = np.stack([_pixels(plane) for plane in slices], axis=-1)  # (row, column, slice)
         modality = str(getattr(slices[0].dataset, "Modality", ""))
-    return Image(voxels.transpose(1, 0, 2), affine, modality, note)
+        of_colors = (INVERTED,) if _is_inverted(slices[0]) else ()
+    return Image(voxels.transpose(1, 0, 2), affine, modality, (*notes, *of_groups, *of_copies, *of_colors))
+
+
+INVERTED: Final = "The images are MONOCHROME1 (bright means low): intensities were inverted."
+"""Note on inverted images."""
 
 
 def series_of(path: Path) -> list[Path]:
-    """Return the files of the series that a file belongs to, by name; that file alone where one cannot be read."""
+    """Return the files of the series that a file belongs to, sorted; the file alone where it cannot be read."""
     try:
         with quiet():
             return sorted(file for file, _ in _choose(path)[0])
@@ -95,7 +111,7 @@ def series_of(path: Path) -> list[Path]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep pydicom's remarks on small faults to itself: what matters is raised."""
+    """Suppress pydicom's warnings about small faults; errors are still raised."""
     logger = logging.getLogger("pydicom")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -108,7 +124,7 @@ def quiet() -> Iterator[None]:
 
 
 def damage() -> tuple[type[Exception], ...]:
-    """Give all that pydicom raises for files and pixels that it cannot decode."""
+    """Return every exception that pydicom raises for files and pixels that it cannot decode."""
     from pydicom.errors import BytesLengthException, InvalidDicomError
 
     plain = (ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError)
@@ -116,31 +132,49 @@ def damage() -> tuple[type[Exception], ...]:
 
 
 def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
-    """Files of one series: the one with most voxels, or that of the file given."""
-    folder = path if path.is_dir() else path.parent
+    """Return the files of one series (the one with most voxels, or that of the file given) and notes."""
     found: dict[str, list[tuple[Path, Any]]] = {}
-    for file in _candidates(folder) if path.is_dir() else [path, *_siblings(path)]:
-        dataset = _header(file)
+    for file, dataset in _headers(path):
         if dataset is not None:
             found.setdefault(str(getattr(dataset, "SeriesInstanceUID", "")), []).append((file, dataset))
     wanted = [key for key, files in found.items() if path.is_dir() or any(file == path for file, _ in files)]
     if not wanted:
-        raise ReadError(f"{path} holds no DICOM images; check the path, or export the series again.")
+        raise ReadError(f"{path} holds no DICOM images. Check the path, or export the series again.")
     uid = max(wanted, key=lambda key: sum(_n_voxels(dataset) for _, dataset in found[key]))
     if (n_voxels := sum(_n_voxels(dataset) for _, dataset in found[uid])) > MOST_VOXELS:
         raise ReadError(
-            f"{path} announces {n_voxels / 1e9:.3g} billion voxels, more than any scan of a head; export it again."
+            f"{path} states {n_voxels / 1e9:.3g} billion voxels, more than a scan of the head. Export it again."
         )
-    note = f"{len(found)} DICOM series found; the one of {len(found[uid])} files taken." if len(found) > 1 else ""
-    return found[uid], (note,) if note else ()
+    note = f"{len(found)} DICOM series found; the largest, of {len(found[uid])} files, is used."
+    return found[uid], (note,) if len(found) > 1 and path.is_dir() else ()
+
+
+def _headers(path: Path) -> Iterator[tuple[Path, Any]]:
+    """Yield files with their headers: all below a folder, or the file given and its neighbors.
+
+    A multi-frame file is a volume of its own. A neighbor that cannot be read may belong to another series; where it
+    belongs to this one, its slice is reported as missing later.
+    """
+    if path.is_dir():
+        yield from ((file, _header(file)) for file in _candidates(path))
+        return
+    own = _header(path)
+    yield path, own
+    if own is not None and int(getattr(own, "NumberOfFrames", 1) or 1) > 1:
+        return
+    for file in _siblings(path):
+        with suppress(ReadError):
+            yield file, _header(file)
 
 
 def _candidates(folder: Path) -> list[Path]:
-    """All DICOM files below a folder; one that only bears the name is damaged, and its slice would be missing."""
+    """Return all DICOM files below a folder; raise ReadError for a damaged one, whose slice would be missing."""
     files = sorted(p for p in folder.rglob("*") if not p.name.startswith("."))
     for file in files:
         if file.suffix.lower() == ".dcm" and not file.is_dir() and not is_dicom(file):
-            raise ReadError(f"{file.name} is no DICOM file, or its beginning is damaged; copy it again, or remove it.")
+            raise ReadError(
+                f"{file.name} is not a DICOM file, or its beginning is damaged. Copy it again, or remove it."
+            )
     return [file for file in files if is_dicom(file)]
 
 
@@ -149,7 +183,7 @@ def _siblings(path: Path) -> list[Path]:
 
 
 def _header(file: Path) -> Any:
-    """Everything before the pixels of an image file; None for DICOM files that are no images."""
+    """Return the header of an image file; None for DICOM files that are not images."""
     import pydicom
 
     try:
@@ -162,12 +196,12 @@ def _header(file: Path) -> Any:
         return dataset
     except damage():
         raise ReadError(
-            f"{file.name} is damaged; copy it again, or remove it if it is not part of the series."
+            f"{file.name} is damaged. Copy it again, or remove it if it is not part of the series."
         ) from None
 
 
 def _refuse_bomb(file: Path) -> None:
-    """Refuse a deflated file that unpacks to more than a series holds: pydicom would unpack it whole."""
+    """Raise ReadError for a deflated file that unpacks to more than a series holds: pydicom would unpack all of it."""
     from pydicom.filereader import read_file_meta_info
     from pydicom.uid import DeflatedExplicitVRLittleEndian
 
@@ -180,7 +214,7 @@ def _refuse_bomb(file: Path) -> None:
         while length <= MOST_UNPACKED and (packed := unpacker.unconsumed_tail or stream.read(1 << 16)):
             length += len(unpacker.decompress(packed, 1 << 22))
     if length > MOST_UNPACKED:
-        raise ReadError(f"{file.name} unpacks to more than {MOST_UNPACKED / 1e9:.1f} GB; export the series again.")
+        raise ReadError(f"{file.name} unpacks to more than {MOST_UNPACKED / 1e9:.1f} GB. Export the series again.")
 
 
 def _n_voxels(dataset: Any) -> int:
@@ -188,17 +222,19 @@ def _n_voxels(dataset: Any) -> int:
 
 
 def _planes(file: Path, dataset: Any) -> list[_Slice]:
-    """Slices of one file: itself, or its frames."""
+    """Return the slices of one file: itself, or its frames."""
     try:
         return _frames(file, dataset)
     except damage():
-        raise ReadError(f"{file.name} is damaged: its position, orientation or pixel size cannot be read.") from None
+        raise ReadError(
+            f"{file.name} is damaged: its position, orientation or pixel spacing cannot be read. Export it again."
+        ) from None
 
 
 def _frames(file: Path, dataset: Any) -> list[_Slice]:
     if "PerFrameFunctionalGroupsSequence" not in dataset:
         if int(getattr(dataset, "NumberOfFrames", 1) or 1) > 1:
-            raise ReadError(f"{file.name} is a run of projections, not a volume; export the 3-D reconstruction.")
+            raise ReadError(f"{file.name} is a series of projections, not a volume. Export the 3-D reconstruction.")
         return [_plane(file, dataset, None, [dataset])]
     shared = list(getattr(dataset, "SharedFunctionalGroupsSequence", []))
     frames = dataset.PerFrameFunctionalGroupsSequence
@@ -212,7 +248,7 @@ _GROUP: Final = {
     "RescaleSlope": "PixelValueTransformationSequence",
     "RescaleIntercept": "PixelValueTransformationSequence",
 }
-"""Where enhanced multi-frame files keep what single-frame files hold at the top."""
+"""Sequences in which enhanced multi-frame files keep attributes that single-frame files have at the top level."""
 
 
 def _value(places: list[Any], keyword: str) -> Any:
@@ -230,10 +266,10 @@ def _plane(file: Path, dataset: Any, frame: int | None, places: list[Any]) -> _S
     pixel = _value(places, "PixelSpacing")
     if position is None or orientation is None:
         raise ReadError(
-            f"Slice {name} does not say where it lies in the patient; export the 3-D reconstruction as DICOM."
+            f"Slice {name} does not state its position in the patient. Export the 3-D reconstruction as DICOM."
         )
     if pixel is None:
-        raise UnitError(f"Slice {name} does not say how large its pixels are; export it again with PixelSpacing.")
+        raise UnitError(f"Slice {name} does not state its pixel spacing. Export it again with PixelSpacing.")
     return _Slice(
         dataset,
         file,
@@ -255,14 +291,117 @@ def _padding(dataset: Any) -> tuple[int, int] | None:
     return min(ends), max(ends)
 
 
+# -- acquisitions and copies ----------------------------------------------------------------------------------------
+
+
+ACQUISITION_KEYS: Final = {
+    "AcquisitionNumber": "acquisition number",
+    "TemporalPositionIdentifier": "temporal position",
+    "AcquisitionTime": "acquisition time",
+    "TriggerTime": "trigger time",
+    "EchoTime": "echo time",
+    "ContentTime": "content time",
+    "ImageType": "image type",
+}
+"""Attributes that may tell acquisitions of one series apart, in the order in which they are tried, with their names."""
+SAME_PLACE_MM: Final = 1e-3
+"""Slices that are nearer to each other than this have the same position."""
+BRIGHT_QUANTILE: Final = 0.999
+"""Quantile of a slice's values that stands for the brightness of its vessels."""
+SLICES_LOOKED_AT: Final = 5
+"""Number of slices of an acquisition whose brightness is compared."""
+
+
+def _places(planes: list[_Slice]) -> list[tuple[int, ...]]:
+    """Return the position of every slice as whole multiples of `SAME_PLACE_MM`."""
+    return [tuple(np.round(plane.position_mm / SAME_PLACE_MM).astype(int).tolist()) for plane in planes]
+
+
+def _one_acquisition(planes: list[_Slice], wanted: int | None) -> tuple[list[_Slice], tuple[str, ...]]:
+    """Return the slices of one acquisition and a note, where a series holds several of the same slices."""
+    key, groups = _acquisitions(planes)
+    if len(groups) < 2:
+        if wanted not in (None, 1):
+            raise ReadError(f"The series holds one acquisition: acquisition {wanted} does not exist. Give 1 or none.")
+        return planes, ()
+    names = [
+        f"{number}: {ACQUISITION_KEYS[key]} {name}, {len(one)} slices" for number, (name, one) in enumerate(groups, 1)
+    ]
+    listed = "; ".join(names)
+    if wanted is not None and not 1 <= wanted <= len(groups):
+        raise ReadError(
+            f"The series holds {len(groups)} acquisitions ({listed}), not {wanted}. Give one of these numbers."
+        )
+    chosen = int(np.argmax([_brightness(one) for _, one in groups])) if wanted is None else wanted - 1
+    why = "chosen because its vessels are the brightest; choose another by its number (--acquisition)"
+    note = f"The series holds {len(groups)} acquisitions ({listed}). Acquisition {chosen + 1} is used"
+    return groups[chosen][1], (f"{note}, as requested." if wanted is not None else f"{note}, {why}.",)
+
+
+def _acquisitions(planes: list[_Slice]) -> tuple[str, list[tuple[str, list[_Slice]]]]:
+    """Return the attribute that tells acquisitions apart and the slices by its values; no groups where there is one.
+
+    It is the first attribute whose values divide slices of the same position: every group has each position
+    once.
+    """
+    if len(set(_places(planes))) == len(planes):
+        return "", []
+    for key in ACQUISITION_KEYS:
+        groups: dict[str, list[_Slice]] = {}
+        for plane in planes:
+            groups.setdefault(_text(getattr(plane.dataset, key, None)), []).append(plane)
+        shared = set.intersection(*(set(_places(one)) for one in groups.values()))
+        if len(groups) > 1 and shared and all(len(set(_places(one))) == len(one) for one in groups.values()):
+            return key, sorted(groups.items(), key=lambda item: _sortable(item[0]))
+    return "", []
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "none"
+    return str(value) if isinstance(value, str) or not hasattr(value, "__iter__") else "/".join(map(str, value))
+
+
+def _sortable(name: str) -> tuple[float, str]:
+    try:
+        return float(name), name
+    except ValueError:
+        return float("inf"), name
+
+
+def _brightness(planes: list[_Slice]) -> float:
+    """Return the brightness of the vessels in slices about the middle of an acquisition."""
+    normal = np.cross(*planes[0].orientation)
+    order = np.argsort([plane.position_mm @ normal for plane in planes])
+    middle = np.unique(np.linspace(0.25, 0.75, SLICES_LOOKED_AT) * (len(planes) - 1)).round().astype(int)
+    return float(np.mean([np.quantile(_pixels(planes[order[i]]), BRIGHT_QUANTILE) for i in middle]))
+
+
+def _without_copies(planes: list[_Slice]) -> tuple[list[_Slice], tuple[str, ...]]:
+    """Return slices without exact copies (same position, same pixels), and a note where there were any."""
+    kept: dict[tuple[int, ...], _Slice] = {}
+    others: list[_Slice] = []
+    dropped = 0
+    for place, plane in zip(_places(planes), planes, strict=True):
+        first = kept.setdefault(place, plane)
+        if first is plane:
+            continue
+        if np.array_equal(_pixels(first), _pixels(plane)):
+            dropped += 1
+        else:
+            others.append(plane)
+    note = f"{counted(dropped, 'slice')} with the same position and the same pixels as another: dropped."
+    return [*kept.values(), *others], (note,) if dropped else ()
+
+
 # -- geometry ----------------------------------------------------------------------------------------------------------
 
 
 def _arrange(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
-    """Sort slices along their normal, and give the affine from (column, row, slice) to LPS mm."""
+    """Return slices sorted along their normal, and the affine from (column, row, slice) to LPS mm."""
     if len(slices) < 2:
         raise ReadError(
-            f"Slice {slices[0].name} is alone: one slice is no volume; give the folder of the whole series."
+            f"Slice {slices[0].name} is alone, and one slice is not a volume. Give the folder of the whole series."
         )
     _refuse_odd(slices)
     across, down = slices[0].orientation
@@ -285,7 +424,7 @@ def _arrange(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
 
 
 def _refuse_odd(slices: list[_Slice]) -> None:
-    """All slices must have the size, pixels and orientation of the majority."""
+    """Raise ReadError where a slice differs in size, pixel spacing or orientation from the majority."""
     for what, values in (
         ("size", [plane.size for plane in slices]),
         ("pixel spacing", [tuple(np.round(plane.pixel_mm, 5)) for plane in slices]),
@@ -295,15 +434,15 @@ def _refuse_odd(slices: list[_Slice]) -> None:
         odd = [plane.name for plane, value in zip(slices, values, strict=True) if value != usual]
         if odd:
             raise ReadError(
-                f"Slice {odd[0]} has another {what} than the rest of its series ({len(odd)} such); remove it."
+                f"Slice {odd[0]} has another {what} than the rest of its series ({len(odd)} such). Remove it."
             )
     across, down = slices[0].orientation
     if not all(np.isfinite([*p.position_mm, *p.orientation.ravel(), *p.pixel_mm]).all() for p in slices):
         raise ReadError(
-            "A slice has a position, orientation or pixel size that is not a number; export the series again."
+            "A slice has a position, orientation or pixel spacing that is not a number. Export the series again."
         )
     if abs(across @ across - 1) > 1e-3 or abs(down @ down - 1) > 1e-3 or abs(across @ down) > 1e-3:
-        raise ReadError(f"Slice {slices[0].name} has rows and columns that are not perpendicular; export it again.")
+        raise ReadError(f"Slice {slices[0].name} has rows and columns that are not perpendicular. Export it again.")
 
 
 def _refuse_gaps(slices: list[_Slice], height: Floats) -> None:
@@ -313,18 +452,18 @@ def _refuse_gaps(slices: list[_Slice], height: Floats) -> None:
         before, after = slices[i].name, slices[i + 1].name
         if step < 0.01 * usual or usual <= 0:
             raise ReadError(
-                f"Slices {before} and {after} lie at the same place ({height[i]:.3f} mm); keep one of them."
+                f"Slices {before} and {after} differ but have the same position ({height[i]:.3f} mm). Keep one of them."
             )
         if step > 1.5 * usual:
             missing = round(step / usual) - 1
             raise ReadError(
                 f"{missing} slice{'s are' if missing > 1 else ' is'} missing between {before} and {after} "
-                f"({height[i]:.3f} to {height[i + 1]:.3f} mm, elsewhere {usual:.3f} mm apart); export the series again."
+                f"({height[i]:.3f} to {height[i + 1]:.3f} mm, elsewhere {usual:.3f} mm apart). Export the series again."
             )
         if abs(step - usual) > SPACING_TOLERANCE * usual:
             raise ReadError(
-                f"Slice {after} lies {step:.3f} mm after {before}, but slices are {usual:.3f} mm apart elsewhere; "
-                "export the series with equal distances."
+                f"Slice {after} is {step:.3f} mm from {before}, but slices are {usual:.3f} mm apart elsewhere. "
+                "Export the series with equal distances."
             )
 
 
@@ -333,7 +472,7 @@ def _refuse_offsets(slices: list[_Slice], offset_mm: Floats, step_mm: float) -> 
     worst = int(distance.argmax())
     if distance[worst] > max(SPACING_TOLERANCE * step_mm, 1e-3):
         raise ReadError(
-            f"Slice {slices[worst].name} lies {distance[worst]:.3f} mm out of line with the others; export again."
+            f"Slice {slices[worst].name} is {distance[worst]:.3f} mm out of line with the others. Export again."
         )
 
 
@@ -341,14 +480,16 @@ def _refuse_offsets(slices: list[_Slice], offset_mm: Floats, step_mm: float) -> 
 
 
 def _pixels(plane: _Slice) -> NDArray[Any]:
-    """Rescaled values (rows, columns) of one slice."""
+    """Return the rescaled values (rows, columns) of one slice, bright for high."""
     pixels = _decoded(plane)
     if pixels.shape != plane.size:
         raise ReadError(
-            f"Slice {plane.name} holds {pixels.shape} values where {plane.size} were announced; export it again."
+            f"Slice {plane.name} holds {pixels.shape} values where its header states {plane.size}. Export it again."
         )
     if plane.padding:
-        pixels = _without_padding(pixels, plane.padding)
+        pixels = _without_padding(pixels, plane.padding, is_inverted=_is_inverted(plane))
+    if _is_inverted(plane):
+        pixels = _inverted(pixels, plane.dataset)
     if plane.slope == 1.0 and plane.intercept == 0.0:
         return pixels
     if plane.slope.is_integer() and plane.intercept.is_integer() and pixels.dtype.kind in "iu":
@@ -356,14 +497,29 @@ def _pixels(plane: _Slice) -> NDArray[Any]:
     return (pixels * plane.slope + plane.intercept).astype(np.float32)
 
 
-def _without_padding(stored: NDArray[Any], padding: tuple[int, int]) -> NDArray[Any]:
-    """Stored values (rows, columns), with the least of the others, or 0, where there is padding and no tissue.
+def _without_padding(stored: NDArray[Any], padding: tuple[int, int], *, is_inverted: bool) -> NDArray[Any]:
+    """Return stored values (rows, columns) with the darkest of the others, or 0, outside the field of view.
 
-    What stands for "outside the field of view" may be above all contrast (DICOM PS3.3, C.7.5.1.1.2).
+    The value that marks the outside may be brighter than any contrast (DICOM PS3.3, C.7.5.1.1.2).
     """
     is_padding = (stored >= padding[0]) & (stored <= padding[1])
     rest = stored[~is_padding]
-    return np.where(is_padding, rest.min() if rest.size else stored.dtype.type(0), stored)
+    if not rest.size:
+        return np.where(is_padding, stored.dtype.type(0), stored)
+    return np.where(is_padding, rest.max() if is_inverted else rest.min(), stored)
+
+
+def _is_inverted(plane: _Slice) -> bool:
+    return str(getattr(plane.dataset, "PhotometricInterpretation", "")).strip() == "MONOCHROME1"
+
+
+def _inverted(stored: NDArray[Any], dataset: Any) -> NDArray[Any]:
+    """Return the stored values of a MONOCHROME1 image (low is bright) turned upside down within their bits."""
+    if stored.dtype.kind == "f":
+        return -stored
+    is_signed, bits = int(getattr(dataset, "PixelRepresentation", 0)), int(dataset.BitsStored)
+    top = -1 if is_signed else (1 << bits) - 1
+    return (top - stored.astype(np.int64)).astype(np.int32 if bits > 15 else stored.dtype)
 
 
 def _decoded(plane: _Slice) -> NDArray[Any]:
@@ -377,7 +533,7 @@ def _decoded(plane: _Slice) -> NDArray[Any]:
 
 
 def _load_pixels(plane: _Slice) -> None:
-    """Read the pixel data into the header read before."""
+    """Add the pixel data to the header of a slice."""
     import pydicom
 
     full = pydicom.dcmread(plane.path)
@@ -388,7 +544,7 @@ def _load_pixels(plane: _Slice) -> None:
 
 
 def _decoded_by_gdcm(plane: _Slice) -> NDArray[Any]:
-    """Decode what pydicom alone cannot (JPEG, JPEG-LS, JPEG 2000): stored values, before rescaling."""
+    """Return stored values of images that pydicom cannot decode alone (JPEG, JPEG-LS, JPEG 2000)."""
     import SimpleITK
 
     try:
@@ -396,9 +552,9 @@ def _decoded_by_gdcm(plane: _Slice) -> NDArray[Any]:
             scan = SimpleITK.ReadImage(str(plane.path))
     except RuntimeError:
         raise ReadError(
-            f"The pixels of slice {plane.name} are damaged or in a format that is not known; "
-            "copy it again, or export the series uncompressed."
+            f"The pixels of slice {plane.name} are damaged or in a format that is not supported. "
+            "Copy it again, or export the series uncompressed."
         ) from None
     array = SimpleITK.GetArrayFromImage(scan)
-    stored = (array - plane.intercept) / plane.slope  # GDCM has rescaled
+    stored = (array - plane.intercept) / plane.slope  # GDCM returns rescaled values
     return stored if plane.frame is not None else stored[0]

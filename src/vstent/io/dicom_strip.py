@@ -1,4 +1,4 @@
-"""DICOM files without the patient: what is needed to read the voxels is kept by name, everything else is dropped."""
+"""Remove patient data from DICOM files: the elements needed to read the voxels are kept, all others dropped."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -13,21 +13,22 @@ KEPT: Final = frozenset(
     ImagePositionPatient ImageOrientationPatient BitsAllocated BitsStored HighBit PixelRepresentation SamplesPerPixel
     PhotometricInterpretation PlanarConfiguration RescaleSlope RescaleIntercept SharedFunctionalGroupsSequence
     PerFrameFunctionalGroupsSequence PlanePositionSequence PlaneOrientationSequence PixelMeasuresSequence
-    PixelValueTransformationSequence PixelData FloatPixelData DoubleFloatPixelData
+    PixelValueTransformationSequence PixelPaddingValue PixelPaddingRangeLimit AcquisitionNumber
+    TemporalPositionIdentifier TriggerTime EchoTime PixelData FloatPixelData DoubleFloatPixelData
     """.split()
 )
-"""Elements that a volume is read from; none names anybody."""
+"""Elements needed to read a volume; none identifies the patient."""
 RENAMED: Final = ("SeriesInstanceUID", "SOPInstanceUID")
-"""Identifiers that tell files of one series apart from another's: kept as digests."""
+"""Identifiers of series and image: kept as digests."""
 
 
 def strip_dicom(path: Path, out: Path) -> None:
-    """Write a DICOM file again with nothing in it but what its voxels need.
+    """Write a copy of a DICOM file with only the elements that its voxels need.
 
     Raises
     ------
     ReadError
-        It is damaged.
+        The file is damaged.
     """
     import pydicom
 
@@ -42,7 +43,7 @@ def strip_dicom(path: Path, out: Path) -> None:
             with atomic(out) as partial:
                 kept.save_as(partial, enforce_file_format=True)
     except damage():
-        raise ReadError(f"{out.name} is damaged, or no DICOM image; copy it again from where it came.") from None
+        raise ReadError(f"{out.name} is damaged, or not a DICOM image. Copy it again from its source.") from None
 
 
 def _kept(given: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Image -> DICOM series: how `vstent demo` gets an input that looks like a hospital's."""
+"""Write an `Image` as a DICOM series: the input of ``vstent demo``."""
 
 import hashlib
 import shutil
@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from vstent.geometry.image import Image
 
 CT_IMAGE_STORAGE: Final = "1.2.840.10008.5.1.4.1.1.2"
-"""Reconstructed rotational angiograms are commonly exported in this class; every viewer opens it as a volume."""
+"""Storage class in which reconstructed rotational angiograms are commonly exported (DICOM UID)."""
 MOMENT: Final = ("20000101", "120000")
+"""Date and time of every synthetic series."""
 
 
 def write_dicom(image: Image, folder: Path, *, description: str = "3DRA of a phantom, research only") -> None:
     """Write a scan as an anonymous series of single-frame files, one for each k.
 
-    The same image gives the same bytes. The folder is complete or not there at all; one of that name is replaced.
+    The same image gives the same bytes. The folder is complete or does not exist; an older one is replaced.
 
     Raises
     ------

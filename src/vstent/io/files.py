@@ -1,4 +1,4 @@
-"""Paths: what a file is by its name, and writing without ever leaving half a file behind."""
+"""Paths: file kinds by name, and writing that never leaves a half-written file."""
 
 import os
 import secrets
@@ -10,22 +10,24 @@ from typing import Final
 
 from vstent.errors import ReadError
 
-SURFACE_SUFFIXES: Final = (".stl", ".vtp", ".vtk", ".obj", ".ply")
+SURFACE_SUFFIXES: Final = (".stl", ".vtp", ".vtk", ".vtu", ".vtm", ".obj", ".ply")
+"""Names of surface files."""
+NIFTI_SUFFIXES: Final = (".nii", ".nii.gz")
 RAW_SUFFIXES: Final = (".raw", ".raw.gz")
-"""Voxels without a header: nothing says how many or how large they are."""
-IMAGE_SUFFIXES: Final = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", *RAW_SUFFIXES, ".dcm")
+"""Voxels without a header: their number and spacing must be given."""
+IMAGE_SUFFIXES: Final = (*NIFTI_SUFFIXES, ".nrrd", ".nhdr", ".mha", ".mhd", ".vti", *RAW_SUFFIXES, ".dcm")
 PARTIAL: Final = ".partial-"
-"""How the name of a file begins while it is being written; the process follows."""
+"""Begin of the name of a file that is being written; the process number follows."""
 _ONE_AT_A_TIME: Final = threading.RLock()
 
 
 def is_surface_file(path: Path) -> bool:
-    """Tell whether the name is that of a surface file."""
+    """Return whether the name is that of a surface file."""
     return suffix(path) in SURFACE_SUFFIXES
 
 
 def suffix(path: Path) -> str:
-    """Return the file's suffix in lower case, ``.gz`` together with what stands before it."""
+    """Return the file's suffix in lower case; ``.gz`` includes the suffix before it."""
     suffixes = [s.lower() for s in Path(path).suffixes]
     return "".join(suffixes[-2:]) if suffixes[-1:] == [".gz"] else "".join(suffixes[-1:])
 
@@ -46,7 +48,7 @@ def existing(path: Path) -> Path:
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Give a path in the same folder to write to; it becomes `path` when the block ends well, and vanishes if not."""
+    """Yield a temporary path in the same folder; it is renamed to `path` on success and removed on failure."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     name = path.parent / f"{PARTIAL}{os.getpid()}-{secrets.token_hex(8)}{path.suffix}"
@@ -60,7 +62,7 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> None:
-    """Take away what processes that were killed have left half-written in a folder and the two floors below it."""
+    """Remove files that killed processes left half-written in a folder and two levels below it."""
     for depth in ("", "*/", "*/*/"):
         for partial in folder.glob(f"{depth}{PARTIAL}*"):
             if partial.is_file() and not _is_running(partial.name[len(PARTIAL) :].partition("-")[0]):
@@ -81,9 +83,9 @@ def _is_running(process: str) -> bool:
 
 @contextmanager
 def silenced() -> Iterator[None]:
-    """Keep what C and C++ libraries write to standard error off the user's terminal; our own errors say it better.
+    """Discard what C and C++ libraries write to standard error; vstent reports its own errors.
 
-    Standard error belongs to the process: threads take turns.
+    Standard error belongs to the process, so one thread at a time may discard it.
     """
     with _ONE_AT_A_TIME:
         saved = os.dup(2)

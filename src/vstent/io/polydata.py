@@ -1,4 +1,4 @@
-"""Meshes to VTK's objects and back, as bare arrays."""
+"""Convert arrays to VTK data sets and back."""
 
 from typing import Any
 
@@ -49,8 +49,8 @@ def ragged_cells(connectivity: Ints, starts: Ints) -> Any:
 def triangles_of(data: Any) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Return the polygons of vtkPolyData as vertices (n, 3) and triangles (m, 3).
 
-    Lines, vertices and polygons with points that are not there are left out. VTK's own filters trust what a reader
-    gives them and crash on damaged files, so the arrays are looked at first.
+    Lines, vertices and polygons with invalid point numbers are left out. VTK's own filters do not check a reader's
+    output and crash on damaged files, so the arrays are checked here.
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -62,7 +62,7 @@ def triangles_of(data: Any) -> tuple[NDArray[Any], NDArray[np.int64]]:
 
 
 def _cells(cells: Any) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Points of all cells, the first of each, and their number; nothing where the arrays contradict each other."""
+    """Return point numbers of all cells, the start of each and its length; nothing where they are inconsistent."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     connectivity = vtk_to_numpy(cells.GetConnectivityArray()).astype(np.int64)
@@ -74,7 +74,7 @@ def _cells(cells: Any) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np
 
 
 def _polygons(cells: Any, vertices_mm: NDArray[Any]) -> NDArray[np.int64]:
-    """Triangles (m, 3): quadrilaterals are cut along the shorter diagonal, larger polygons into fans."""
+    """Return triangles (m, 3): quadrilaterals are cut along the shorter diagonal, larger polygons into fans."""
     connectivity, starts, count = _cells(cells)
     quads = connectivity[starts[count == 4][:, None] + np.arange(4)]
     quads = quads[((quads >= 0) & (quads < len(vertices_mm))).all(axis=1)]
@@ -92,7 +92,7 @@ def _polygons(cells: Any, vertices_mm: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def _strips(cells: Any) -> NDArray[np.int64]:
-    """Triangles (m, 3) of triangle strips: every second one is turned."""
+    """Return the triangles (m, 3) of triangle strips: every second one is turned."""
     connectivity, starts, count = _cells(cells)
     inner = np.maximum(count - 2, 0)
     step = np.arange(inner.sum()) - np.repeat(np.cumsum(inner) - inner, inner)

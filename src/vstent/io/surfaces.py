@@ -1,6 +1,7 @@
-"""Surface files -> Surface in mm."""
+"""Read surface files (STL, VTP, VTU, VTM, VTK, OBJ, PLY) as a `Surface` in LPS mm."""
 
 import os
+import re
 from pathlib import Path
 from typing import Final, Literal, get_args
 
@@ -8,82 +9,131 @@ import numpy as np
 
 from vstent.errors import ReadError, UnitError
 from vstent.geometry.surface import Surface
+from vstent.io.double_wall import inner_wall
 from vstent.io.files import SURFACE_SUFFIXES, existing, suffix
 from vstent.io.vtk_child import read_apart
 from vstent.kernels import topology, triangles
 from vstent.units import MM_PER
 
 Unit = Literal["m", "cm", "mm"]
+"""Length unit of a surface file."""
+Frame = Literal["lps", "ras"]
+"""Patient frame of coordinates: x to the left and y to the back (LPS, DICOM), or x to the right and y to the front."""
 
 VESSEL_DIAMETER_MM: Final = (0.8, 14.0)
-"""Hydraulic diameters 4 V / A of intracranial vessel trees, sacs included, by which a unit is guessed."""
+"""Smallest and largest hydraulic diameter 4 V / A of intracranial vessel trees with sacs; decides the unit."""
 GIANT_DIAMETER_MM: Final = 25.0
-"""That of an artery 4 mm wide with a giant sac of 36 mm: 4 V / A of a sphere is two thirds of its diameter."""
+"""Hydraulic diameter of an artery of 4 mm with a giant sac of 36 mm: that of a sphere is 2/3 of its diameter."""
 TYPICAL_DIAMETER_MM: Final = 3.5
+"""Typical hydraulic diameter; of two possible units the one that comes nearer is chosen."""
 VESSEL_SIZE_MM: Final = (5.0, 400.0)
-"""Diagonals of their bounding boxes."""
+"""Smallest and largest diagonal of the bounding box of such a tree."""
 
 
-def read_surface(path: Path, *, units: Unit | None = None) -> tuple[Surface, tuple[str, ...]]:
-    """Read the wall of a vessel from an STL, VTP, VTK, OBJ or PLY file.
+def read_surface(
+    path: Path, *, units: Unit | None = None, frame: Frame | None = None
+) -> tuple[Surface, tuple[str, ...]]:
+    """Read the wall of a vessel from an STL, VTP, VTU, VTM, VTK, OBJ or PLY file.
+
+    Of a hollow model (inner and outer wall) the inner wall is returned.
 
     Parameters
     ----------
-    path : the file; polygons of more than three corners are triangulated.
-    units : the unit of its coordinates; guessed from the vessel's size, and said in a note, where not given.
+    path : the file; polygons of more than three corners are triangulated, of a grid the outer faces are taken.
+    units : unit of its coordinates; by default derived from the vessel's size, and reported in a note.
+    frame : frame of its coordinates; by default the one that the file states (``SPACE=RAS`` in a header, comment or
+        field data), else LPS.
 
     Returns
     -------
-    surface : the mesh in mm exactly as it is in the file, faults included (see `vstent.repair`).
-    notes : what was assumed.
+    surface : the mesh in LPS mm as it is in the file, faults included (see `vstent.repair`).
+    notes : one sentence for every assumption.
 
     Raises
     ------
     ReadError
         The file is missing, damaged, empty, or not what its name says.
     UnitError
-        In the given unit, or in any, no intracranial vessel has this size.
+        The size is that of no intracranial vessel in the given unit, or in any.
     """
     path = existing(path)
-    surface = _checked(_read(path), path)
+    surface, stated = _read(path)
+    surface = _checked(surface, path)
     if units is not None and units not in get_args(Unit):
         raise UnitError(f"Unit {units} is not known: give m, cm or mm.")
+    surface, notes = _in_lps(surface, frame, stated)
+    inner = inner_wall(surface)
+    if inner is not None:
+        surface, notes = inner, (*notes, "The file holds an inner and an outer wall: the inner one is used.")
     size, diameter = _diagonal(surface), hydraulic_diameter(surface)
     unit = _guessed(size, diameter, path) if units is None else _accepted(units, size, diameter, path)
-    note = (
-        ""
-        if units is not None
-        else (
-            f"Unit guessed: {unit} (hydraulic diameter 4 V / A = {diameter * MM_PER[unit]:.2f} mm, "
-            f"extent {size * MM_PER[unit]:.0f} mm); --units overrules."
+    if units is None:
+        notes = (
+            *notes,
+            f"Length unit: {unit}, derived from the size (hydraulic diameter {diameter * MM_PER[unit]:.2f} mm, "
+            f"extent {size * MM_PER[unit]:.0f} mm). If it is wrong, give the unit (--units).",
         )
-    )
-    return Surface(surface.vertices_mm * MM_PER[unit], surface.faces), (note,) if note else ()
+    return Surface(surface.vertices_mm * MM_PER[unit], surface.faces), notes
 
 
-def _read(path: Path) -> Surface:
+RAS_TO_LPS: Final = np.array([-1.0, -1.0, 1.0])
+"""Factors that turn RAS coordinates into LPS ones, and back."""
+
+
+def _in_lps(surface: Surface, given: Frame | None, stated: str) -> tuple[Surface, tuple[str, ...]]:
+    """Return a surface in LPS and a note where the file states RAS; the frame given overrules the one stated."""
+    if given not in (None, *get_args(Frame)):
+        raise UnitError(f"Frame {given} is not known: give lps or ras.")
+    if (given or stated.lower()) != "ras":
+        return surface, ()
+    turned = Surface(surface.vertices_mm * RAS_TO_LPS, surface.faces)
+    return turned, () if given else ("The file states RAS coordinates (SPACE=RAS): they were converted to LPS.",)
+
+
+def _read(path: Path) -> tuple[Surface, str]:
+    """Return the surface in the unit and frame of the file, and the frame that the file states or nothing."""
     kind = suffix(path)
     if kind not in SURFACE_SUFFIXES:
-        raise ReadError(f"{path.name} is not a surface file: give one of {', '.join(SURFACE_SUFFIXES)}.")
+        raise ReadError(
+            f"{path.name} is not a surface file that vstent reads. Give one of {', '.join(SURFACE_SUFFIXES)}."
+        )
     if path.is_dir() or path.stat().st_size == 0:
         raise ReadError(f"{path.name} is {'a folder' if path.is_dir() else 'empty'}, not a surface file.")
     _refuse_mislabelled(path, kind)
     mesh = None if kind == ".stl" and _is_torn_text(path) else read_apart(path)
     if mesh is None or len(mesh[1]) == 0:
         raise ReadError(
-            f"{path.name} holds no triangles, or not all that it announces: it is empty, damaged or not a {kind} file; "
-            "copy it again or export it anew."
+            f"{path.name} holds no surface, or fewer triangles than it states: it is empty, damaged or not a {kind} "
+            "file. Copy or export it again."
         )
-    return Surface(*mesh)
+    vertices, faces, stated = mesh
+    return Surface(vertices, faces), stated or _stated_frame(path, kind)
+
+
+SPACE: Final = re.compile(rb"SPACE\s*[=:]\s*(RAS|LPS)", re.IGNORECASE)
+"""How 3D Slicer states the frame in a header or comment."""
+_HEAD_ENDS: Final = {".stl": b"facet", ".ply": b"end_header", ".obj": b"\nv ", ".vtk": b"DATASET"}
+"""Where the part of a file that may state its frame ends."""
+
+
+def _stated_frame(path: Path, kind: str) -> str:
+    """Return the frame that a header or comment states: ``RAS``, ``LPS`` or nothing."""
+    with path.open("rb") as file:
+        head = file.read(4096)
+    if kind == ".stl" and not _is_ascii_stl(head):
+        head = head[:80]
+    found = SPACE.search(head.partition(_HEAD_ENDS[kind])[0]) if kind in _HEAD_ENDS else None
+    return found[1].decode().upper() if found else ""
 
 
 TAIL_BYTES: Final = 4096
-"""So near its end an STL file in text has its last line."""
-_BEGINS: Final = {".vtp": (b"<",), ".vtk": (b"# vtk",), ".ply": (b"ply",)}
+"""Bytes at the end of an STL text file that hold its last line."""
+_BEGINS: Final = {**dict.fromkeys((".vtp", ".vtu", ".vtm"), (b"<",)), ".vtk": (b"# vtk",), ".ply": (b"ply",)}
+"""First bytes of a file by its suffix."""
 
 
 def _refuse_mislabelled(path: Path, kind: str) -> None:
-    """Look at the first bytes: readers that meet another format can take long or worse before they give up."""
+    """Raise ReadError where the first bytes are those of another format: VTK's readers may hang or crash on those."""
     with path.open("rb") as file:
         head = file.read(512)
     wrong = kind in _BEGINS and not head.lstrip(b"\xef\xbb\xbf \r\n\t").lower().startswith(_BEGINS[kind])
@@ -91,13 +141,11 @@ def _refuse_mislabelled(path: Path, kind: str) -> None:
         wrong = not (_is_ascii_stl(head) or _is_binary_stl(path, head))
     if kind == ".stl" and wrong and not head.lstrip().lower().startswith(b"solid") and len(head) >= 84:
         raise ReadError(
-            f"{path.name} breaks off, or is not a .stl file: its header announces {_n_stl(head)} triangles and there "
-            f"is room for {(path.stat().st_size - 84) // 50}; copy it again."
+            f"{path.name} breaks off, or is not a .stl file: its header states {_n_stl(head)} triangles and there is "
+            f"room for {(path.stat().st_size - 84) // 50}. Copy or export it again."
         )
     if wrong:
-        raise ReadError(
-            f"{path.name} is not a {kind} file, whatever its name says: it begins with {head[:16]!r}; export it again."
-        )
+        raise ReadError(f"{path.name} is not a {kind} file: it begins with {head[:16]!r}. Export it again.")
 
 
 def _is_ascii_stl(head: bytes) -> bool:
@@ -109,7 +157,7 @@ def _is_binary_stl(path: Path, head: bytes) -> bool:
 
 
 def _is_torn_text(path: Path) -> bool:
-    """Whether an STL file in text lacks its end: VTK reads one torn file in fifty as if it were binary."""
+    """Return whether an STL text file lacks its end: VTK reads some truncated text files as if they were binary."""
     with path.open("rb") as file:
         head = file.read(512)
         file.seek(-min(TAIL_BYTES, path.stat().st_size), os.SEEK_END)
@@ -118,22 +166,22 @@ def _is_torn_text(path: Path) -> bool:
 
 
 def _n_stl(head: bytes) -> int:
-    """Triangles that a binary STL file announces."""
+    """Return the number of triangles that the header of a binary STL file states."""
     return int.from_bytes(head[80:84], "little")
 
 
 def _checked(surface: Surface, path: Path) -> Surface:
     if len(surface.faces) < 4:
         raise ReadError(
-            f"{path.name} holds {len(surface.faces)} triangles, which is no vessel; give the wall of the vessel."
+            f"{path.name} holds {len(surface.faces)} triangles, too few for a vessel. Give the wall of the vessel."
         )
     bad = ~np.isfinite(surface.vertices_mm).all(axis=1)
     if bad.any():
         raise ReadError(
-            f"{path.name} has {bad.sum()} vertices that are not numbers (first: vertex {bad.argmax()}); repair it."
+            f"{path.name} has {bad.sum()} vertices that are not numbers (first: {bad.argmax()}). Export it again."
         )
     if not surface.areas_mm2.sum() > 0 or not np.isfinite(_diagonal(surface)):
-        raise ReadError(f"{path.name} has no area: all of its triangles are lines or points; export it again.")
+        raise ReadError(f"{path.name} has no area: all its triangles are lines or points. Export it again.")
     return surface
 
 
@@ -143,7 +191,7 @@ def _diagonal(surface: Surface) -> float:
 
 
 def hydraulic_diameter(surface: Surface) -> float:
-    """Return 4 V / A of the capped surface in its own unit: the diameter, if it were one long tube."""
+    """Return the hydraulic diameter 4 V / A of the capped surface in its own unit."""
     kept, same = topology.first_equals(surface.vertices_mm)
     welded = same[surface.faces].astype(np.int32)
     faces, _ = topology.oriented(welded[topology.sound_faces(welded)])
@@ -164,8 +212,8 @@ def _guessed(size: float, diameter: float, path: Path) -> str:
     fitting = usual or giant
     if not fitting:
         raise UnitError(
-            f"{path.name} fits no unit: its extent is {size:.4g} and its mean diameter {diameter:.4g}, but vessels "
-            f"of the brain are {VESSEL_DIAMETER_MM[0]:g} to {GIANT_DIAMETER_MM:g} mm wide; scale it to mm."
+            f"{path.name} has the size of a brain vessel in no unit: its extent is {size:.4g}, its hydraulic diameter "
+            f"{diameter:.4g}, and vessels have {VESSEL_DIAMETER_MM[0]:g} to {GIANT_DIAMETER_MM:g} mm. Scale it to mm."
         )
     return min(fitting, key=lambda unit: abs(np.log(diameter * MM_PER[unit] / TYPICAL_DIAMETER_MM)))
 
@@ -173,7 +221,7 @@ def _guessed(size: float, diameter: float, path: Path) -> str:
 def _accepted(unit: str, size: float, diameter: float, path: Path) -> str:
     if not _fits(size * MM_PER[unit], diameter * MM_PER[unit], GIANT_DIAMETER_MM):
         raise UnitError(
-            f"{path.name} read in {unit} would be {size * MM_PER[unit]:.4g} mm long with a mean diameter of "
-            f"{diameter * MM_PER[unit]:.4g} mm, which no vessel of the brain has; give another --units."
+            f"{path.name} in {unit} would be {size * MM_PER[unit]:.4g} mm long with a hydraulic diameter of "
+            f"{diameter * MM_PER[unit]:.4g} mm, which no brain vessel has. Give another unit (--units)."
         )
     return unit

@@ -1,4 +1,4 @@
-"""Tables in text files."""
+"""Read and write tables: CSV and Parquet."""
 
 import csv
 import io
@@ -16,12 +16,12 @@ from vstent.kernels.arrays import Floats
 
 
 def read_columns(path: Path, count: int) -> Floats:
-    """Read a CSV file of `count` columns of numbers (n, count); lines without a number before them are titles.
+    """Read a CSV file with `count` columns of numbers as an array (n, count); lines above the first number are titles.
 
     Raises
     ------
     ReadError
-        The file is missing, or a line has not `count` finite numbers.
+        The file is missing, or a line does not hold `count` finite numbers.
     """
     lines = existing(path).read_text(encoding="utf-8-sig", errors="replace").splitlines()
     rows: list[list[float]] = []
@@ -34,18 +34,18 @@ def read_columns(path: Path, count: int) -> Floats:
         if len(values) != count or None in values:
             raise ReadError(
                 f"line {number} of {path} is {line[:60]!r}: give {count} finite numbers, with decimal points, "
-                "parted by commas"
+                "separated by commas"
             )
         rows.append([float(value) for value in values if value is not None])
     if not rows:
-        raise ReadError(f"{path} holds no numbers: give {count} columns, parted by commas")
+        raise ReadError(f"{path} holds no numbers: give {count} columns, separated by commas")
     return np.array(rows)
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of named values as CSV: every name a column, in the order of first use; what a row lacks is empty.
+    """Write rows of named values as CSV: one column for each name in the order of first use; missing values are empty.
 
-    Floats have seven digits, truths are ``true`` and ``false``.
+    Floats have seven digits; booleans are ``true`` and ``false``.
     """
     names = columns_of(rows)
     text = io.StringIO()
@@ -61,7 +61,7 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Write rows of named values as Parquet; False, and nothing written, where pyarrow is not installed."""
+    """Write rows of named values as Parquet; return False and write nothing where pyarrow is not installed."""
     try:
         from pyarrow import parquet, table
     except ImportError:
@@ -78,12 +78,12 @@ def _plain(value: Any) -> Any:
 
 
 def finite(word: str) -> float:
-    """Read a finite number.
+    """Return a finite number read from text.
 
     Raises
     ------
     ValueError
-        When it is none.
+        The text is not a finite number.
     """
     value = float(word)
     if not math.isfinite(value):
@@ -92,7 +92,7 @@ def finite(word: str) -> float:
 
 
 def _number(word: str) -> float | None:
-    """Read a finite number; None where it is none."""
+    """Return a finite number read from text, or None."""
     try:
         return finite(word)
     except ValueError:

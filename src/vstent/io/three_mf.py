@@ -1,4 +1,4 @@
-"""3MF: a surface in millimetres for printers and CAD, a zip file of XML (3MF Core Specification 1.3)."""
+"""Write 3MF files: a surface in mm for printers and CAD, XML in a zip file (3MF Core Specification 1.3)."""
 
 from pathlib import Path
 from typing import Final
@@ -33,11 +33,11 @@ _MODEL: Final = """<?xml version="1.0" encoding="UTF-8"?>
 </model>
 """
 _LONG_AGO: Final = (1980, 1, 1, 0, 0, 0)
-"""Every part's date, so that the same surface gives the same file."""
+"""Date of every part: the same surface gives the same file."""
 
 
 def write_3mf(path: Path, surface: Surface) -> None:
-    """Write a closed surface in mm as 3MF; neighbours share vertices, so that nothing has to be sewn on reading."""
+    """Write a closed surface in mm as 3MF; neighboring triangles share vertices."""
     vertices = "\n".join(f'<vertex x="{x:.6f}" y="{y:.6f}" z="{z:.6f}"/>' for x, y, z in surface.vertices_mm.tolist())
     triangles = "\n".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in surface.faces.tolist())
     model = _MODEL.format(namespace=NAMESPACE, vertices=vertices, triangles=triangles)

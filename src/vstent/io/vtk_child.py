@@ -1,7 +1,7 @@
-"""VTK's readers, in a process of their own.
+"""VTK's readers, run in a child process.
 
-They are fast and know every dialect, but a damaged file can crash them, and us with them, or make them ask for all the
-memory there is. So a child reads the file and hands over bare arrays; when it dies, the file was damaged.
+VTK is fast and reads every dialect, but a damaged file can crash it or make it allocate all memory. The child reads the
+file and returns bare arrays. Where the child dies, the parent reports the file as damaged.
 """
 
 import errno
@@ -15,26 +15,63 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from vstent.errors import ReadError
+from vstent.geometry.image import Image
 from vstent.io.files import suffix
 from vstent.io.polydata import triangles_of
 from vstent.kernels.arrays import Floats, Ints
 
 SECONDS: Final = 8.0
-"""Of the processor: on a machine that has much else to do a sound file must not pass for a damaged one."""
+"""Processor time that a child may take, in s; a busy machine must not make a sound file look damaged."""
 SECONDS_PER_BYTE: Final = 1e-6
+"""Further processor time for each byte of the file, in s."""
 PATIENCE: Final = 1.0 if sys.platform == "win32" else 10.0
-"""Seconds of the clock for each of them; Windows counts no others."""
+"""Wall time allowed for each second of processor time; Windows limits wall time only."""
 MEMORY_BYTES: Final = 2_000_000_000
+"""Memory that a child may allocate, in bytes."""
 MEMORY_PER_BYTE: Final = 40
+"""Further memory for each byte of the file, in bytes."""
 DISK_FULL: Final = 28
-"""Exit code where the arrays could not be written."""
+"""Exit code of a child that could not write its arrays."""
 LEAST_USED: Final = 0.9
-"""Part of the points of an OBJ file that belong to triangles; they come first, so a file that breaks off has more."""
+"""Smallest fraction of the points of a complete OBJ file that belong to triangles; points come before triangles, so a
+truncated file has fewer."""
 
 
-def read_apart(path: Path) -> tuple[Floats, Ints] | None:
-    """Read vertices (n, 3) and triangles (m, 3) in a child process; None when that dies or takes too long."""
+def read_apart(path: Path) -> tuple[Floats, Ints, str] | None:
+    """Read a surface file in a child process.
+
+    Returns
+    -------
+    vertices : (n, 3) coordinates, triangles : (m, 3) vertex numbers, and the frame that the file's field data state
+    (``RAS``, ``LPS`` or nothing); None where the child died or took too long.
+    """
+    found = _from_child(path)
+    return None if found is None else (found["vertices"], found["faces"], str(found["space"]))
+
+
+def read_vti(path: Path) -> Image:
+    """Read a VTK image (``.vti``), its axes taken as LPS.
+
+    Raises
+    ------
+    ReadError
+        The file is damaged or holds no single values at its points.
+    """
+    found = _from_child(path)
+    if found is None:
+        raise ReadError(
+            f"{path.name} is damaged, or has no point data with one value per voxel. Copy or export it again."
+        )
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = found["edges"], found["origin"]
+    return Image(found["voxels"], affine)
+
+
+def _from_child(path: Path) -> dict[str, NDArray[Any]] | None:
+    """Return the arrays that a child read from a file; None where it died or took too long."""
     size = path.stat().st_size
     with tempfile.TemporaryDirectory(prefix="vstent-") as folder:
         result = Path(folder) / "surface.npz"
@@ -55,11 +92,11 @@ def read_apart(path: Path) -> tuple[Floats, Ints] | None:
         except subprocess.TimeoutExpired:
             return None
         with np.load(result) as arrays:
-            return arrays["vertices"], arrays["faces"]
+            return dict(arrays)
 
 
 def _environment() -> dict[str, str]:
-    """Ours, and the folder that this package was found in."""
+    """Return the environment of this process with the folder of this package on the path."""
     root = str(Path(__file__).resolve().parents[2])
     others = os.environ.get("PYTHONPATH", "")
     return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in (root, others) if p)}
@@ -70,7 +107,7 @@ def _seconds(size: int) -> float:
 
 
 def _limit(size: int) -> None:
-    """Bound this process's memory and processor time."""
+    """Limit the memory and the processor time of this process."""
     with suppress(ImportError):  # Windows has no such limits
         import resource
 
@@ -81,25 +118,24 @@ def _limit(size: int) -> None:
 
 
 def _reader(kind: str) -> Any:
-    if kind == ".vtp":
-        from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+    """Return VTK's reader for a file suffix."""
+    from vtkmodules import vtkIOGeometry, vtkIOLegacy, vtkIOPLY, vtkIOXML
 
-        return vtkXMLPolyDataReader()
-    if kind == ".vtk":
-        from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader
-
-        return vtkGenericDataObjectReader()
-    if kind == ".ply":
-        from vtkmodules.vtkIOPLY import vtkPLYReader
-
-        return vtkPLYReader()
-    from vtkmodules.vtkIOGeometry import vtkOBJReader, vtkSTLReader
-
-    return vtkSTLReader() if kind == ".stl" else vtkOBJReader()
+    readers = {
+        ".vtp": vtkIOXML.vtkXMLPolyDataReader,
+        ".vtu": vtkIOXML.vtkXMLUnstructuredGridReader,
+        ".vtm": vtkIOXML.vtkXMLMultiBlockDataReader,
+        ".vti": vtkIOXML.vtkXMLImageDataReader,
+        ".vtk": vtkIOLegacy.vtkGenericDataObjectReader,
+        ".ply": vtkIOPLY.vtkPLYReader,
+        ".stl": vtkIOGeometry.vtkSTLReader,
+        ".obj": vtkIOGeometry.vtkOBJReader,
+    }
+    return readers[kind]()
 
 
 def _faults() -> list[str]:
-    """Return a list that fills with whatever VTK complains of: after that it hands over what it has, zeros included."""
+    """Return a list that collects VTK's complaints: after an error VTK returns incomplete data, zeros included."""
     from vtkmodules.util.misc import calldata_type
     from vtkmodules.vtkCommonCore import VTK_STRING, vtkOutputWindow
 
@@ -107,7 +143,7 @@ def _faults() -> list[str]:
 
     @calldata_type(VTK_STRING)
     def note(_: Any, event: str, text: str) -> None:
-        if event == "ErrorEvent" or "Error reading" in text:  # binary data that end early are only warned of
+        if event == "ErrorEvent" or "Error reading" in text:  # truncated binary data raise a warning only
             faults.append(text)
 
     window: Any = vtkOutputWindow.GetInstance()
@@ -117,7 +153,7 @@ def _faults() -> list[str]:
 
 
 def _announced(path: Path) -> int:
-    """Return how many polygons the header of a PLY file announces; VTK is content with fewer."""
+    """Return how many polygons the header of a PLY file states; VTK accepts fewer."""
     if suffix(path) != ".ply":
         return 0
     with path.open("rb") as file:
@@ -127,9 +163,11 @@ def _announced(path: Path) -> int:
 
 
 def _polygons(data: Any) -> Any:
-    """Return polygons as they are, the outer faces of a volume mesh, and None for anything else."""
+    """Return polygons as they are, the outer faces of a grid, the joined surfaces of blocks; None for anything else."""
     if data is None or data.IsA("vtkPolyData"):
         return data
+    if data.IsA("vtkMultiBlockDataSet"):
+        return _joined([one for one in map(_polygons, _blocks(data)) if one is not None])
     if not data.IsA("vtkUnstructuredGrid"):
         return None
     from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
@@ -140,23 +178,85 @@ def _polygons(data: Any) -> Any:
     return outer.GetOutput()
 
 
+def _blocks(data: Any) -> list[Any]:
+    """Return the data sets of a multi-block data set, those of blocks in blocks included."""
+    children = [data.GetBlock(number) for number in range(data.GetNumberOfBlocks())]
+    return [one for child in children if child is not None for one in (_blocks(child) if _is_multi(child) else [child])]
+
+
+def _is_multi(data: Any) -> bool:
+    return bool(data.IsA("vtkMultiBlockDataSet"))
+
+
+def _joined(surfaces: list[Any]) -> Any:
+    """Return surfaces as one; None where there is none."""
+    from vtkmodules.vtkFiltersCore import vtkAppendPolyData
+
+    if not surfaces:
+        return None
+    appended = vtkAppendPolyData()
+    for surface in surfaces:
+        appended.AddInputData(surface)
+    appended.Update()
+    return appended.GetOutput()
+
+
+def _space(data: Any) -> str:
+    """Return the frame that the field data of a data set, or of one of its blocks, state under the name SPACE."""
+    for one in _blocks(data) if data is not None and _is_multi(data) else [data]:
+        array = None if one is None else one.GetFieldData().GetAbstractArray("SPACE")
+        if array is not None and array.GetNumberOfValues():
+            return str(array.GetVariantValue(0).ToString()).strip().upper()
+    return ""
+
+
+def _voxels(data: Any) -> dict[str, NDArray[Any]] | None:
+    """Return voxels (i, j, k), edges (3, 3) and origin (3,) of a VTK image; None without single values at points."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    scalars = data.GetPointData().GetScalars() or data.GetPointData().GetArray(0)
+    if scalars is None or scalars.GetNumberOfComponents() != 1:
+        return None
+    shape, extent = data.GetDimensions(), data.GetExtent()
+    matrix = data.GetDirectionMatrix()
+    direction = np.array([[matrix.GetElement(row, column) for column in range(3)] for row in range(3)])
+    edges = direction * np.array(data.GetSpacing())
+    origin = np.array(data.GetOrigin()) + edges @ np.array(extent[::2], dtype=np.float64)
+    return {"voxels": vtk_to_numpy(scalars).reshape(shape, order="F"), "edges": edges, "origin": origin}
+
+
+def _triangles(data: Any, path: Path) -> dict[str, NDArray[Any]] | None:
+    """Return vertices, triangles and stated frame; None where there are no polygons, or not all of them."""
+    polygons = _polygons(data)
+    if polygons is None:
+        return None
+    vertices, faces = triangles_of(polygons)
+    if len(faces) < _announced(path):
+        return None
+    if suffix(path) == ".obj" and len(np.unique(faces)) < LEAST_USED * len(vertices):
+        return None
+    return {
+        "vertices": vertices.astype(np.float64),
+        "faces": faces.astype(np.int32),
+        "space": np.array(_space(data)),
+    }
+
+
 def main(path: Path, result: Path) -> int:
-    """Read a file and save its vertices and faces; 1 when there is nothing to save."""
+    """Read a file and save its arrays; return 1 where there is nothing to save."""
     _limit(path.stat().st_size)
     reader = _reader(suffix(path))
     reader.SetFileName(str(path))
     faults = _faults()
     reader.Update()
-    data = _polygons(reader.GetOutput())
+    data = reader.GetOutputDataObject(0)
     if data is None or faults:
         return 1
-    vertices, faces = triangles_of(data)
-    if len(faces) < _announced(path):
-        return 1
-    if suffix(path) == ".obj" and len(np.unique(faces)) < LEAST_USED * len(vertices):
+    arrays = _voxels(data) if suffix(path) == ".vti" else _triangles(data, path)
+    if arrays is None:
         return 1
     try:
-        np.savez(result, vertices=vertices.astype(np.float64), faces=faces.astype(np.int32))
+        np.savez(result, **arrays)  # type: ignore[arg-type]
     except OSError:
         return DISK_FULL
     return 0

@@ -1,4 +1,4 @@
-"""Nouns and arrays -> files: VTP, VTU, STL, JSON, text. Every file is complete or not there at all."""
+"""Write VTP, VTU, STL, JSON and text files. A file is complete or does not exist."""
 
 import errno
 import json
@@ -19,8 +19,13 @@ from vstent.kernels.arrays import Floats, Ints
 
 Arrays = Mapping[str, NDArray[Any]]
 
+"""Arrays by name."""
 NOTHING: Final[Arrays] = {}
+"""No arrays."""
 SIGNIFICANT_DIGITS: Final = 7
+"""Digits of numbers in JSON and CSV files."""
+SPACE: Final = "LPS"
+"""Frame of every file written, stated as 3D Slicer does: ``SPACE=LPS``."""
 
 
 def write_surface(path: Path, surface: Surface, point_data: Arrays = NOTHING, cell_data: Arrays = NOTHING) -> None:
@@ -74,13 +79,13 @@ def write_centerlines(path: Path, centerlines: Sequence[Centerline]) -> None:
 def write_cells(
     path: Path, centers_mm: Floats, size_mm: float, cell_data: Arrays, point_data: Arrays = NOTHING
 ) -> None:
-    """Write the cubes of a regular grid that are in use as VTU: hexahedra that share their corners.
+    """Write the used cells of a regular grid as VTU: hexahedra that share their corners.
 
     Parameters
     ----------
     path : the file.
-    centers_mm : (c, 3) middles of the cubes, on one grid aligned with the axes.
-    size_mm : edge of the cubes.
+    centers_mm : (c, 3) centers of the cells, on one grid aligned with the axes.
+    size_mm : grid spacing.
     cell_data : arrays (c, ...).
     point_data : arrays (p, ...) on the corners in the order of `grid_corners`.
     """
@@ -96,11 +101,11 @@ def write_cells(
 
 
 _CORNERS: Final = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
-"""Corners of a cube in VTK's order for a hexahedron."""
+"""Corners of a unit cube in VTK's order of a hexahedron."""
 
 
 def grid_corners(centers_mm: Floats, size_mm: float) -> tuple[Floats, Ints]:
-    """Corners (p, 3) of cubes about centres (c, 3), each once, and the eight corners (c, 8) of every cube."""
+    """Return the corners (p, 3) of grid cells with centers (c, 3), each once, and the corners (c, 8) of every cell."""
     origin = np.min(centers_mm, axis=0, initial=np.inf) if len(centers_mm) else np.zeros(3)
     index = np.round((centers_mm - origin) / size_mm).astype(np.int64)
     n = index.max(axis=0, initial=0) + 2
@@ -125,8 +130,13 @@ def _attach(attributes: Any, arrays: Arrays, length: int) -> None:
 
 
 def _write_xml(path: Path, data: Any) -> None:
+    from vtkmodules.vtkCommonCore import vtkStringArray
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
+    frame = vtkStringArray()
+    frame.SetName("SPACE")
+    frame.InsertNextValue(SPACE)
+    data.GetFieldData().AddArray(frame)
     writer = (vtkXMLPolyDataWriter if data.IsA("vtkPolyData") else vtkXMLUnstructuredGridWriter)()
     writer.SetInputData(data)
     writer.SetDataModeToAppended()
@@ -145,21 +155,21 @@ _STL_FACE: Final = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), (
 
 
 def write_stl(path: Path, surface: Surface) -> None:
-    """Write a surface in mm as binary STL."""
+    """Write a surface in mm as binary STL; the header states the unit and the frame."""
     faces = np.zeros(len(surface.faces), dtype=_STL_FACE)
     faces["normal"], faces["corners"] = surface.normals, surface.corners_mm
-    header = b"vstent, mm".ljust(80) + len(faces).to_bytes(4, "little")
+    header = f"vstent, mm, SPACE={SPACE}".encode().ljust(80) + len(faces).to_bytes(4, "little")
     with atomic(path) as partial:
         partial.write_bytes(header + faces.tobytes())
 
 
 def write_json(path: Path, content: Any, *, is_exact: bool = False) -> None:
-    """Write numbers, strings, lists, mappings and arrays as JSON: sorted keys, floats of seven digits, or exact ones.
+    """Write numbers, strings, lists, mappings and arrays as JSON: sorted keys, floats of seven digits or exact.
 
     Raises
     ------
     ValueError
-        A number is not finite, or an object is none of these; nothing is written.
+        A number is not finite, or an object is of another type; nothing is written.
     """
     plain = _plain(content, "", is_exact)
     write_text(path, json.dumps(plain, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n")

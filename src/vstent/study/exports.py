@@ -20,7 +20,7 @@ from vstent.flow.openfoam.setup import Flavour, FoamSetup
 from vstent.flow.simulation import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.io import writers
-from vstent.io.archive import load_noun
+from vstent.io.archive import load_data
 from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, hash_of
 from vstent.study.provenance import RUN
@@ -120,7 +120,7 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
         words = ", ".join(f"--{name.removesuffix('_mm')} ({name})" for name in given)
         raise InputError(f"{path} is a case folder, and its vessel is taken as it lies there: leave out {words}")
     with ledger.stage("anatomy") as tell:
-        anatomy = load_noun(kept[-1], Anatomy)
+        anatomy = load_data(kept[-1], Anatomy)
         tell(f"taken from {path}")
     return anatomy
 

@@ -13,7 +13,7 @@ from typing import Any, Final, TypeVar
 
 from vstent.errors import ReadError
 from vstent.flow.engines import Progress as FlowProgress
-from vstent.io.archive import load_noun, save_noun
+from vstent.io.archive import load_data, save_data
 from vstent.io.images import files_of
 from vstent.io.writers import write_json
 from vstent.study.types import Progress, Settings
@@ -60,7 +60,7 @@ class Ledger:
             return None
         self.progress(name, 0.0, "")
         try:
-            noun = load_noun(path, noun_type)
+            noun = load_data(path, noun_type)
         except ReadError:
             return None
         self.seconds |= _seconds_of(path)
@@ -95,7 +95,7 @@ class Ledger:
         told = path.with_suffix(".json")
         stale = set(self.folder.glob(f"{name}-*")) - {path, told}
         write_json(told, seconds, is_exact=True)
-        save_noun(path, noun)
+        save_data(path, noun)
         for old in stale:
             old.unlink()
 

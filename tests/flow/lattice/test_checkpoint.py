@@ -94,7 +94,8 @@ KILLED = f"""
 import sys
 from pathlib import Path
 sys.path.insert(0, {str(Path(__file__).parents[2] / "helpers")!r})
-import test_flow_checkpoint as here
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+import test_checkpoint as here
 here.engines.SAVE_EVERY_S = 0.05
 case = here.FlowCase(here.vessel(), settings=here.LONG)
 here.simulate_case(case, checkpoint=here.FlowCheckpoint(Path(sys.argv[1]), "flow", "key"))

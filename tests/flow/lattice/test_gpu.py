@@ -41,7 +41,7 @@ from dataclasses import replace
 from pathlib import Path
 import numpy as np
 from vstent.flow.lattice.checkpoint import pack
-from vstent.flow.lattice.state import _read_here, advance, step
+from vstent.flow.lattice.stepping import _read_here, advance, step
 
 state = pickle.loads(Path(sys.argv[1]).read_bytes())
 assert "vstent.flow.lattice.kernels.gpu" not in sys.modules  # who did not ask for a GPU does not load what it takes

@@ -252,11 +252,11 @@ def collide(f, time):
 @pytest.mark.parametrize("viscosity", [1e-3, 2e-3, 4e-3, 8e-3])
 def test_no_wave_grows_on_fast_blood(viscosity):
     """Von Neumann's analysis of collision and streaming; with one rate for all blood they grow by up to 11 % a step."""
-    directions = np.array([(1, 0, 0), (1, 1, 0), (1, 1, 1), (2, 1, 0), (3, 2, 1)])
+    courses = np.array([(1, 0, 0), (1, 1, 0), (1, 1, 1), (2, 1, 0), (3, 2, 1)])
     along = np.array([d for d in np.ndindex(2, 2, 2) if any(d)])[:, None] * np.linspace(0.05, np.pi, 30)[:, None]
     waves = np.concatenate([along.reshape(-1, 3), np.random.default_rng(8).uniform(-np.pi, np.pi, (100, 3))])
     shift = np.exp(-1j * waves @ directions.VELOCITIES.T)
-    for direction in directions / np.linalg.norm(directions, axis=1)[:, None]:
+    for direction in courses / np.linalg.norm(courses, axis=1)[:, None]:
         for speed in (0.05, 0.1, 0.15, 0.2):
             step = shift[:, :, None] * linearised(speed * direction, viscosity)
             assert np.abs(np.linalg.eigvals(step)).max() < 1 + 1e-3

@@ -1,0 +1,77 @@
+"""Hollow models: surfaces that hold the inner and the outer wall of an artery."""
+
+from typing import Final
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from vstent.geometry.surface import Surface
+from vstent.kernels import topology, triangles
+from vstent.kernels.arrays import Bools, Floats, Ints
+
+SHARP_COSINE: Final = 0.5
+"""Cosine of the angle between the normals of neighboring faces below which an edge is sharp, as at the rims that join
+an inner and an outer wall."""
+LEAST_AREA: Final = 0.3
+"""Smallest ratio of the areas of an inner and an outer wall."""
+LEAST_COVERED: Final = 0.9
+"""Fraction of the inner wall's vertices that must have the outer wall at a similar distance."""
+MOST_UNEVEN: Final = 4.0
+"""Largest ratio of the thickest to the thinnest place of a wall, the thinnest and thickest 5 % left out."""
+THICKEST: Final = 0.35
+"""Largest thickness of a wall, as a fraction of the hydraulic diameter 4 V / A of the inner wall."""
+SAMPLES: Final = 2000
+"""Vertices at which the thickness is measured."""
+
+
+def inner_wall(surface: Surface) -> Surface | None:
+    """Return the inner wall of a hollow model, in its own unit; None where a surface is not one.
+
+    The faces are divided at sharp edges. A hollow model has two large parts, one inside the other at a nearly constant
+    distance; the inner one has the smaller area.
+    """
+    kept, same = topology.first_equals(surface.vertices_mm)
+    welded = same[surface.faces].astype(np.int32)
+    sound = topology.sound_faces(welded)
+    points_mm, faces = surface.vertices_mm[kept], welded[sound]
+    part = _smooth_parts(points_mm, faces)
+    area = np.bincount(part, triangles.areas(points_mm[faces]))
+    if len(area) < 2:
+        return None
+    outer, inner = np.argsort(area)[::-1][:2]
+    if area[inner] < LEAST_AREA * area[outer]:
+        return None
+    walls = [Surface(*triangles.compact(points_mm, faces[part == one])) for one in (inner, outer)]
+    return walls[0] if _is_around(*walls) else None
+
+
+def _smooth_parts(points_mm: Floats, faces: Ints) -> Ints:
+    """Return the part (m,) that every face belongs to, parts being divided by sharp and by open edges."""
+    corners = points_mm[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    order = np.lexsort(edges.T)
+    face = np.repeat(np.arange(len(faces)), 3)[order]
+    is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+    first, second = face[:-1][is_same], face[1:][is_same]
+    # A hollow model's two walls may be wound alike or not: only the line of the normals counts.
+    is_smooth: Bools = np.abs(np.einsum("ij,ij->i", normal[first], normal[second])) > SHARP_COSINE
+    links = coo_array((np.ones(is_smooth.sum()), (first[is_smooth], second[is_smooth])), shape=(len(faces),) * 2)
+    return np.asarray(connected_components(links, directed=False)[1])
+
+
+def _is_around(inner: Surface, outer: Surface) -> bool:
+    """Return whether the outer wall surrounds the inner one at a nearly constant distance."""
+    sample = inner.vertices_mm[:: max(1, len(inner.vertices_mm) // SAMPLES)]
+    thickness = outer.closest(sample)[1]
+    thin, thick = np.quantile(thickness, [0.05, 0.95])
+    vertices, closed = triangles.cap(
+        inner.vertices_mm, inner.faces, triangles.boundary_loops(inner.vertices_mm, inner.faces)
+    )
+    diameter = 4 * abs(triangles.volume(vertices[closed])) / max(inner.area_mm2, 1e-300)
+    is_even = 0 < thin and thick < MOST_UNEVEN * thin and thick < THICKEST * diameter
+    low, high = outer.vertices_mm.min(axis=0), outer.vertices_mm.max(axis=0)
+    is_within = ((sample > low - thick) & (sample < high + thick)).all(axis=1).mean()
+    return bool(is_even and is_within >= LEAST_COVERED)
