@@ -87,7 +87,7 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     band = f"A threshold {off:.3g} lower or higher, {BAND:.0%} of the step from tissue to lumen, changes diameters by "
     band += f"+-{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
     all_notes = (*image.notes, *notes, band, found, smooth_note, *decimation_notes)
-    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm, blur_mm=profile.blur_mm)
+    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm, blur_mm=profile.blur_mm, voxel_mm=lumen.voxel_mm)
 
 
 @dataclass(frozen=True, eq=False)

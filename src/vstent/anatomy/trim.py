@@ -227,7 +227,7 @@ def _trimmed(site: _Site) -> list[str]:
 def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
     """Sentences on the sacs that are not in what is left of the lumen."""
     return [
-        f"Another sac, {bulge.height_mm:.1f} mm high, lies beyond that at {place(bulge.dome_mm)}: give it with --at."
+        f"Another bulge, {bulge.height_mm:.1f} mm high, lies beyond that at {place(bulge.dome_mm)}: give it with --at."
         for bulge in bulges
         if lumen.closest(bulge.dome_mm[None])[1][0] > bulge.height_mm / 2
     ]

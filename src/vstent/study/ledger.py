@@ -132,7 +132,7 @@ def hash_of(path: Path) -> str:
 def anatomy_key(source: str, settings: Settings) -> str:
     """Key of the geometry of an input: devices and flow do not change it."""
     geometry = replace(settings, devices=(), diameter_mm=None, length_mm=None, center_mm=None, flow=None, placings={})
-    return key_of(source, replace(geometry, uncertainty=None))
+    return key_of(source, replace(geometry, uncertainty=None, without_flow=()))
 
 
 def vessel_key(source: str, settings: Settings) -> str:
@@ -143,5 +143,15 @@ def vessel_key(source: str, settings: Settings) -> str:
 
 def key_of(*parts: Any) -> str:
     """Short name of everything that a result depends on, this version of the code included."""
-    plain = [asdict(part) if is_dataclass(part) and not isinstance(part, type) else part for part in parts]
+    plain = [_plain(part) if is_dataclass(part) and not isinstance(part, type) else part for part in parts]
     return hashlib.sha256(json.dumps([version("vstent"), plain], sort_keys=True).encode()).hexdigest()[:16]
+
+
+_LATER: Final = {"without_flow": (), "acquisition": None, "frame": None}
+"""Fields that settings got after version 0.1 with their defaults: where they have these, keys are those of 0.1."""
+
+
+def _plain(part: Any) -> dict[str, Any]:
+    """Return the fields of a data class that a key depends on."""
+    fields = asdict(part)
+    return {key: value for key, value in fields.items() if key not in _LATER or value != _LATER[key]}

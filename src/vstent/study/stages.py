@@ -22,7 +22,7 @@ from vstent.deployment.struts import over_restored
 from vstent.devices.catalogue import find_sizes
 from vstent.devices.design import BARE, Design, Size
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.errors import InputError
+from vstent.errors import DeviceError, FlowError, InputError, LandingError
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.indices import compare, indices
@@ -102,14 +102,27 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
 
 def deploy_all(
     designs: Mapping[str, Design], anatomy: Anatomy, settings: Settings, ledger: Ledger
-) -> dict[str, Deployment]:
-    """Deploy every device, each in the given or the proposed size."""
-    deployments = {}
+) -> tuple[dict[str, Deployment], dict[str, str]]:
+    """Deploy every device, each in the given or the proposed size; return the deployments and the failures by name.
+
+    Raises
+    ------
+    InputError
+        No device can be deployed: the reason of the first.
+    """
+    deployments: dict[str, Deployment] = {}
+    failures: dict[str, str] = {}
     for name, design in designs.items():
-        with ledger.stage(f"deploy {name}") as tell:
-            deployments[name] = deploy_one(design, anatomy, settings.placing(name))
-            tell(deployments[name].advice)
-    return deployments
+        try:
+            with ledger.stage(f"deploy {name}") as tell:
+                deployments[name] = deploy_one(design, anatomy, settings.placing(name))
+                tell(deployments[name].advice)
+        except (DeviceError, LandingError) as error:
+            if len(failures) + 1 == len(designs):  # the last one too
+                raise
+            failures[name] = f"not deployed: {error}"
+            ledger.progress(f"deploy {name}", 1.0, failures[name])
+    return deployments, failures
 
 
 def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
@@ -162,32 +175,43 @@ def compute_flows(
     settings: Settings,
     ledger: Ledger,
     source: str,
-) -> dict[str, FlowField]:
-    """Compute the flow without and with each device; each is kept as soon as it is done."""
+) -> tuple[dict[str, FlowField], dict[str, str]]:
+    """Compute the flow without and with each device; each is kept as soon as it is done.
+
+    Returns the flows by name, and a sentence on every device whose flow could not be computed.
+    """
     if settings.flow is None:
-        return {}
+        return {}, {}
     fields: dict[str, FlowField] = {}
+    failures: dict[str, str] = {}
     folders = engine_folders(out, settings)
-    for name in (BARE, *deployments):
+    for name in (BARE, *(name for name in deployments if name not in settings.without_flow)):
         stent = None if name == BARE else deployments[name].stent
         stage, key = f"flow {name}", flow_key(source, settings, name, stent.design if stent else None)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
             if name == BARE:
                 _plan(anatomy, {name: one.stent for name, one in deployments.items()}, settings.flow, ledger)
-            with ledger.stage(stage) as tell:
-                field = simulate_case(
-                    flow_case(anatomy, stent, settings.flow),
-                    start=fields.get(BARE),
-                    folder=folders[name],
-                    progress=ledger.teller(stage),
-                    checkpoint=FlowCheckpoint(ledger.folder, stage, key),
-                )
-                tell(field.advice)
+            try:
+                with ledger.stage(stage) as tell:
+                    field = simulate_case(
+                        flow_case(anatomy, stent, settings.flow),
+                        start=fields.get(BARE),
+                        folder=folders[name],
+                        progress=ledger.teller(stage),
+                        checkpoint=FlowCheckpoint(ledger.folder, stage, key),
+                    )
+                    tell(field.advice)
+            except FlowError as error:
+                if name == BARE:
+                    raise
+                failures[name] = f"flow not computed: {error}"
+                ledger.progress(stage, 1.0, failures[name])
+                continue
             ledger.keep(stage, key, field)
         fields[name] = field
         write_field(out / "flow" / name, field)
-    return fields
+    return fields, failures
 
 
 def flow_key(source: str, settings: Settings, name: str, design: Design | None) -> str:

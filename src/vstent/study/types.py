@@ -57,6 +57,8 @@ class Settings:
     """Abscissa on the parent axis where the middle of the device is to lie."""
     flow: FlowSettings | None = field(default_factory=FlowSettings)
     """How to compute the flow; None: not at all."""
+    without_flow: tuple[str, ...] = ()
+    """Devices whose flow is not computed."""
     placings: dict[str, Placing] = field(default_factory=dict)
     """Sizes and places of single devices, by name, instead of those above that hold for all."""
 
@@ -91,5 +93,7 @@ class CaseResult:
     """``vessel``, ``bare``, ``stents.NAME.{deployment,flow,ratios}``; every number's key ends in its unit."""
     provenance: dict[str, Any]
     """Versions, inputs with hashes, settings, seconds per stage."""
+    failures: dict[str, str]
+    """Sentence on every device that was not deployed, or whose flow was not computed, by device name."""
     notes: tuple[str, ...]
     """What was found, guessed or repaired, and how far every flow is to be relied on."""

@@ -1,5 +1,6 @@
 """What is told of an anatomy: one sentence on everything that was found, assumed, or would be taken for a mistake."""
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -8,7 +9,7 @@ from vstent.anatomy.restore.bulges import Bulge
 from vstent.anatomy.restore.path import PASSING, is_off_sacs, reach_of
 from vstent.anatomy.restore.sac import is_in_one
 from vstent.anatomy.trace import parent_radius_mm
-from vstent.geometry.vessel import Aneurysm, Centerline, Opening, Vessel
+from vstent.geometry.vessel import Aneurysm, Candidate, Centerline, Opening, Vessel
 from vstent.kernels import curves
 from vstent.units import counted, place
 
@@ -35,6 +36,15 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
         *_fusiform(line, sacs),
         *(note for sac in aneurysms for note in _stenosed(line, sac)),
     )
+
+
+def candidates_told(aneurysms: Sequence[Aneurysm], candidates: Sequence[Candidate]) -> tuple[str, ...]:
+    """Return a sentence on bulges that were not taken for aneurysms, and how to choose one."""
+    others = [one.described for one in candidates if not one.is_aneurysm]
+    if not others:
+        return ()
+    begins = "Not taken for aneurysms" if aneurysms else "No convincing aneurysm was found; candidates"
+    return (f"{begins}: {'; '.join(others)}. Choose one by a point in it (--at).",)
 
 
 def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
