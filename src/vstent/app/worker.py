@@ -43,7 +43,7 @@ def find_anatomy(case: Case) -> None:
     """Find vessel, sac, neck and parent artery."""
     from vstent.study.pipeline import restore_vessel
 
-    restore_vessel(case.input, case.folder, case.state.settings(), progress)
+    restore_vessel(case.input, case.folder, case.state.settings(), progress, replaces=True)
     tell(anatomy=_anatomy_key(case))
 
 
@@ -57,7 +57,7 @@ def compute(case: Case) -> None:
 
     if _anatomy_key(case) != case.state.anatomy:
         find_anatomy(case)  # and told before the flow: a job that is stopped there has replaced the former one
-    result = run(case.input, case.folder, case.state.settings(), progress)
+    result = run(case.input, case.folder, case.state.settings(), progress, replaces=True)
     progress("report", 0.0, "")
     write_report(result, case.folder, is_printed=True)
     progress("report", 1.0, "")

@@ -72,7 +72,13 @@ def work(task: Task) -> None:
         rows = _rows(task)
         done = tuple(device for device, row in rows.items() if row["outcome"] == DONE)
         if task.keeps_files and done and len(rows) > 1:  # one study with all that can be done: nothing is computed anew
-            run(task.case.path, task.folder / "study", replace(task.case.settings, devices=done), _Watch())
+            run(
+                task.case.path,
+                task.folder / "study",
+                replace(task.case.settings, devices=done),
+                _Watch(),
+                replaces=True,
+            )
         if not task.keeps_files:
             shutil.rmtree(task.folder / "study", ignore_errors=True)
         spent = time.perf_counter() - began, time.process_time() - cpu, peak_memory_MB()
@@ -85,7 +91,7 @@ def _rows(task: Task) -> dict[str, Row]:
     """Do the artery once, then every device in it; what cannot be done is told in the row."""
     case, study = task.case, task.folder / "study"
     devices = case.settings.devices
-    failed = _failure(task, lambda watch: restore_vessel(case.path, study, case.settings, watch))
+    failed = _failure(task, lambda watch: restore_vessel(case.path, study, case.settings, watch, replaces=True))
     if failed:
         return dict.fromkeys(devices, failed)
     rows: dict[str, Row] = {}
@@ -93,7 +99,7 @@ def _rows(task: Task) -> dict[str, Row]:
         alone = replace(case.settings, devices=(device,))
 
         def with_device(watch: Progress, device: str = device, alone: Settings = alone) -> None:
-            found = run(case.path, study, alone, watch)
+            found = run(case.path, study, alone, watch, replaces=True)
             advice = found.deployments[device].advice
             rows[device] = {"outcome": DONE, "stage": "", "sentence": advice} | flat_metrics(found.metrics, device)
 

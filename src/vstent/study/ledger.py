@@ -138,7 +138,8 @@ def anatomy_key(source: str, settings: Settings) -> str:
 def vessel_key(source: str, settings: Settings) -> str:
     """Key of the vessel of an input: where it is cut and how its sac is taken off does not change it."""
     given = settings.units, settings.spacing_mm, settings.shape, settings.threshold, settings.at_mm, settings.inlet_mm
-    return key_of(source, "vessel", given)
+    later = [value for value in (settings.frame, settings.acquisition) if value is not None]
+    return key_of(source, "vessel", given, *later)
 
 
 def key_of(*parts: Any) -> str:

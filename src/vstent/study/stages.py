@@ -90,10 +90,10 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
 
 def _vessel(path: Path, settings: Settings) -> Vessel:
     if path.is_file() and is_surface_file(path):
-        surface, notes = read_surface(path, units=settings.units)
+        surface, notes = read_surface(path, units=settings.units, frame=settings.frame)
         vessel = Vessel(surface, notes=notes)
     else:
-        image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape)
+        image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape, acquisition=settings.acquisition)
         vessel = segment(image, threshold=settings.threshold, at_mm=_array(settings.at_mm))
     near_mm = _array(settings.inlet_mm if settings.at_mm is None else settings.at_mm)
     lumen, repairs = repair(vessel.lumen, at_mm=None if near_mm is None else np.atleast_2d(near_mm)[0])

@@ -31,6 +31,10 @@ class Settings:
     """Names in the catalogue."""
     units: Literal["m", "cm", "mm"] | None = None
     """Length unit of a surface file."""
+    frame: Literal["lps", "ras"] | None = None
+    """Frame of a surface file and of the points given; None: as the file states, and LPS points."""
+    acquisition: int | None = None
+    """Acquisition of a DICOM series that holds several, counted from 1."""
     spacing_mm: Point | None = None
     """Voxel edges of a raw volume."""
     shape: tuple[int, int, int] | None = None
