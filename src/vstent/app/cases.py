@@ -80,7 +80,7 @@ class State(BaseModel):
             return settings_of(self.former) if self.former else Settings()
         except ValueError:
             raise ReadError(
-                f"{self.name} was opened from a study of another version of vstent: open its scan anew."
+                f"{self.name} was opened from a study of another version of vstent. Open its scan again."
             ) from None
 
     def settings(self) -> "Settings":
@@ -164,7 +164,7 @@ class Case:
     def input(self) -> Path:
         """The scan or surface."""
         if not self._state.input:
-            raise ReadError(f"{self._state.name} has no scan yet: drop one on the page.")
+            raise ReadError(f"{self._state.name} has no scan yet. Drop one on the page.")
         return self.folder / self._state.input
 
     def change(self, revision: int, choices: Choices) -> State:
@@ -212,10 +212,7 @@ class Case:
 
     def _check(self, revision: int) -> None:
         if revision != self._state.revision:
-            raise Conflict(
-                f"This case was changed elsewhere (revision {self._state.revision}, not {revision}): "
-                "what you see has been brought up to date; make your change again."
-            )
+            raise Conflict("This case was changed in another window. The page now shows that change; make yours again.")
 
     def tell(self) -> None:
         """Wake all who look."""
@@ -245,9 +242,9 @@ def load(case_id: str, folder: Path) -> Case:
     try:
         state = State.model_validate_json((folder / STATE).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ReadError(f"{folder} is no case of the page: it has no {STATE}.") from None
+        raise ReadError(f"{folder} is not a case of the page: it has no {STATE}.") from None
     except (OSError, ValidationError, UnicodeDecodeError):
-        raise ReadError(f"{folder / STATE} is damaged: delete it and open the scan again.") from None
+        raise ReadError(f"{folder / STATE} is damaged. Delete it and open the scan again.") from None
     return Case(case_id, folder, state)
 
 
@@ -284,7 +281,7 @@ class Store:
         with self._lock:
             if case_id not in self._cases:
                 if identifier(case_id) != case_id or not (self.workspace / case_id / STATE).is_file():
-                    raise Absent("There is no such case: choose one of the list on the first page.")
+                    raise Absent("This case does not exist. Choose one of the list on the first page.")
                 self._cases[case_id] = load(case_id, self.workspace / case_id)
             return self._cases[case_id]
 

@@ -82,7 +82,7 @@ class Choices(Strict):
     @classmethod
     def _each_once(cls, devices: tuple[DeviceChoice, ...]) -> tuple[DeviceChoice, ...]:
         if len({device.name for device in devices}) < len(devices):
-            raise ValueError("a device can be chosen once")
+            raise ValueError("a device can be chosen only once")
         return devices
 
     def settings(self, former: "Settings") -> "Settings":

@@ -124,9 +124,9 @@ class Desk:
             There is no scan yet.
         """
         if not case.input.exists():
-            raise ReadError(f"The scan of {case.state.name} is not where it was: {case.input}. Put it back.")
+            raise ReadError(f"The scan of {case.state.name} has been moved from {case.input}. Put it back there.")
         if kind != "anatomy" and not case.state.choices.devices:
-            raise InputError("No device is chosen: choose one in the step Device.")
+            raise InputError("No device is chosen. Choose one in the step Device.")
         self.jobs.start(case, kind)
 
     def resume(self, case: Case) -> None:
@@ -166,7 +166,7 @@ class Desk:
         from vstent.io.images import read_image
 
         if _is_surface(case):
-            raise InputError("This case has no scan: it began with a surface.")
+            raise InputError("This case has no scan, because it began with a surface.")
         choices = case.state.choices
         grid = choices.spacing_mm, choices.shape
         with self._lock:
@@ -246,7 +246,7 @@ def begin_upload(case: Case, name: str) -> Path:
         The case has its scan, or the name is none of a scan or a surface.
     """
     if case.state.source:
-        raise InputError(f"{case.state.name} has its scan or surface already: make another case for {name}.")
+        raise InputError(f"{case.state.name} already has its scan or surface. Make another case for {name}.")
     intake.checked_name(name)
     folder = case.folder / intake.FOLDER
     folder.mkdir(parents=True, exist_ok=True)

@@ -42,7 +42,7 @@ STAGES: Final = {
 """First word of a study's stage -> step of the page."""
 SETTLING: Final = re.compile(r"([\d.]+)% left to settle, (?:.*?)(\d+) s left")
 """How a ledger tells of a flow (`vstent.study.ledger.Ledger.teller`)."""
-STOPPED: Final = "Stopped. What was finished is kept."
+STOPPED: Final = "Stopped. Finished results are kept."
 LAST_WORDS: Final = ".worker.log"
 """File of a case folder with what a job said when it broke off."""
 POINTS_KEPT: Final = 600
@@ -143,7 +143,8 @@ class Job:
             failure = STOPPED
         elif code and not failure:
             failure = (
-                f"The computation broke off (its last words: {LAST_WORDS}); what was finished is kept. Start it again."
+                f"The computation ended unexpectedly (its last words: {LAST_WORDS}). Finished results are "
+                "kept; start it again."
             )
         self._close(failure)
 

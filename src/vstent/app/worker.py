@@ -83,7 +83,7 @@ def main(kind: str, folder: Path) -> int:
         tell(error=str(error))
         return 1
     except OSError as error:
-        tell(error=f"{error.strerror or error}: what was finished is kept.")
+        tell(error=f"{error.strerror or error}. Finished results are kept.")
         return 1
     return 0
 

@@ -51,7 +51,7 @@ class Estimate:
         """The estimate in words."""
         hours = self.cpu_s / self.jobs / 3600
         time = f"{hours:.1f} h" if hours >= 1 else f"{max(1, round(60 * hours))} min"
-        return f"about {time} with {self.jobs} at once, up to {self.memory_MB:.0f} MB each"
+        return f"about {time} with {self.jobs} parallel processes, up to {self.memory_MB:.0f} MB each"
 
 
 def estimate(cases: Sequence[Case], jobs: int) -> Estimate:

@@ -118,7 +118,7 @@ def _failure(task: Task, do: Callable[[Progress], object]) -> Row:
         return {"outcome": FAILED, "stage": watch.stage, "sentence": str(error)}
     except Exception as error:  # noqa: BLE001 one case's fault must not end the cohort; it is told in its row
         write_text(task.folder / "traceback.txt", traceback.format_exc())
-        sentence = f"vstent did not foresee this, {type(error).__name__}: {error}. Report it with traceback.txt."
+        sentence = f"unexpected error, {type(error).__name__}: {error}. Please report it with traceback.txt."
         return {"outcome": FAILED, "stage": watch.stage, "sentence": sentence}
     return {}
 

@@ -68,8 +68,9 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
     tried = [size for size in design.sizes if size.diameter_mm <= tried_mm]
     shortest_mm = min(last - first for first, last in (_span(design, anatomy, size) for size in tried))
     raise LandingError(
-        f"No size of {design.name} up to {tried_mm:g} mm wide fits: the shortest would be {shortest_mm:.1f} mm long in "
-        f"a parent artery of {anatomy.axis.length_mm:.1f} mm. Choose another device or a longer piece of artery."
+        f"No size of {design.name} up to {tried_mm:g} mm in diameter fits: the shortest would be "
+        f"{shortest_mm:.1f} mm long in a parent artery of {anatomy.axis.length_mm:.1f} mm. Choose another "
+        "device, or give a longer piece of the artery."
     )
 
 

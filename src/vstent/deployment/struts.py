@@ -103,10 +103,12 @@ def _manifold(surface: Surface) -> Any:
     try:
         import manifold3d
     except ImportError as error:
-        raise DeviceError("Joining solids needs the library manifold3d: run pip install 'vstent[solids]'.") from error
+        raise DeviceError("Joining solids needs the package manifold3d. Run pip install 'vstent[solids]'.") from error
     body = manifold3d.Manifold(manifold3d.Mesh64(surface.vertices_mm.copy(), surface.faces.astype(np.uint64)))
     if body.status() != manifold3d.Error.NoError or body.is_empty():
-        raise DeviceError(f"A surface of {len(surface.faces)} triangles is not closed: it cannot be joined or cut.")
+        raise DeviceError(
+            f"A surface of {len(surface.faces)} triangles is not closed and cannot be joined or cut. Close it first."
+        )
     return body
 
 

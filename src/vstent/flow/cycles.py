@@ -31,16 +31,16 @@ def cycle_change(history: Floats) -> float:
 def cycles_advice(changes: Floats, cycles: int, *, is_converged: bool) -> str:
     """Say what the changes (c,) from cycle to cycle, as fractions, mean for the result."""
     if len(changes) == 0:
-        return "A single cycle was computed: allow two, to see whether it repeats."
-    said = f"Cycle {cycles} repeats the one before to within {100 * changes[-1]:.1f} %"
+        return "One cycle was computed. Allow two to see whether it repeats."
+    said = f"Cycle {cycles} differs from the one before by {100 * changes[-1]:.1f} %"
     if is_converged:
         return f"{said}: the flow is periodic."
     if len(changes) > 1 and changes[-1] > STALLED * changes[-2]:
         return (
-            f"{said}, no better than that one did ({100 * changes[-2]:.1f} %): vortices differ from cycle to cycle, "
-            "and more cycles will not make them alike."
+            f"{said}, no less than that one did ({100 * changes[-2]:.1f} %): vortices differ from cycle to "
+            "cycle, and more cycles will not change that."
         )
-    return f"{said}, which is more than was asked for: allow more cycles, or take it as it is."
+    return f"{said}, more than the tolerance. Allow more cycles, or accept this result."
 
 
 def pulse_of(case: FlowCase) -> Waveform:
@@ -52,5 +52,5 @@ def pulse_of(case: FlowCase) -> Waveform:
         When it has none.
     """
     if case.settings.waveform is None:
-        raise FlowError("pulsatile flow needs a waveform: set one, or compute the steady flow")
+        raise FlowError("pulsatile flow needs a waveform: give one, or compute the steady flow")
     return case.settings.waveform

@@ -115,8 +115,9 @@ def too_narrow(case: FlowCase, cell_size_mm: float) -> str:
         f"{outlet.role} ({outlet.diameter_mm:.2g} mm) has {outlet.diameter_mm / cell_size_mm:.1f}" for outlet in narrow
     )
     return (
-        f" Of cells of {cell_size_mm:.3g} mm, {named} across: with fewer than {BRANCH_CELLS:.0f} a branch resists too "
-        "much and takes too little blood; set a smaller cell size, or split the flow by Murray's law."
+        f" At a grid spacing of {cell_size_mm:.3g} mm, {named} across. With fewer than {BRANCH_CELLS:.0f} "
+        "cells a branch resists too much and carries too little blood: use a finer grid spacing, or split the "
+        "flow by Murray's law."
     )
 
 
@@ -126,7 +127,10 @@ def unreached(vessel: Vessel, grid: Domain) -> str:
     if not closed:
         return ""
     named = ", ".join(f"{outlet.role} ({outlet.diameter_mm:.2g} mm)" for outlet in closed)
-    return f" No cell of {grid.cell_size_mm:.3g} mm reaches {named}, where no blood leaves: set a smaller cell size."
+    return (
+        f" The grid of {grid.cell_size_mm:.3g} mm does not reach {named}, so no blood leaves there: use a "
+        "finer grid spacing."
+    )
 
 
 def _unlinked(vessel: Vessel, link_patch: Ints) -> list[Opening]:
@@ -147,8 +151,8 @@ def cells_of_sac(case: FlowCase, grid: Domain) -> Ints:
     cells = sampling.cells_inside(case.sac, grid.centers_mm, grid.cell_size_mm)
     if len(cells) == 0:
         raise CoarseGridError(
-            f"no cell of {grid.cell_size_mm:.3g} mm lies in the sac of {abs(case.sac.volume_mm3):.2g} mm3 near "
-            f"{place(case.sac.vertices_mm.mean(axis=0))}: set a smaller cell size"
+            f"no grid cell of {grid.cell_size_mm:.3g} mm is in the sac of {abs(case.sac.volume_mm3):.2g} mm3 "
+            f"near {place(case.sac.vertices_mm.mean(axis=0))}: use a finer grid spacing"
         )
     return cells
 
@@ -176,10 +180,10 @@ def too_fast(grid: Domain, speed_m_s: Floats, blood: Blood, most: float) -> str:
         return ""
     share = float((cell_reynolds > most).mean())
     return (
-        f" In {100 * share:.2g} % of the cells of {grid.cell_size_mm:.3g} mm blood is too fast for them, up to "
-        f"{speed_m_s[fastest]:.2g} m/s at {place(grid.centers_mm[fastest])}, and computed up to "
-        f"{cell_reynolds[fastest] / most:.2g} times as thick as it is: set a smaller cell size to see what that "
-        "changes."
+        f" Under-resolved: in {100 * share:.2g} % of the cells (spacing {grid.cell_size_mm:.3g} mm) the "
+        f"effective viscosity is raised, up to {cell_reynolds[fastest] / most:.2g} times nominal (speeds up to "
+        f"{speed_m_s[fastest]:.2g} m/s at {place(grid.centers_mm[fastest])}). Use a finer grid spacing to see "
+        "what this changes."
     )
 
 
@@ -222,8 +226,8 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
     if len(cells) < MIN_CELLS:
         raise CoarseGridError(
             f"only {len(cells)} cells of {cell_size_mm:.3g} mm connect to the inlet at "
-            f"{place(vessel.inlet.center_mm)}: the grid is too coarse for this vessel or the inlet is "
-            "blocked; set a smaller cell size"
+            f"{place(vessel.inlet.center_mm)}, because the grid is too coarse for this vessel or the inlet is "
+            "blocked: use a finer grid spacing"
         )
     index = np.full(inside.shape, -1, dtype=np.int32)
     index[inside] = np.arange(len(cells), dtype=np.int32)
@@ -241,8 +245,8 @@ def _refuse_unreached_inlet(vessel: Vessel, link_patch: Ints, cell_size_mm: floa
     for opening in _unlinked(vessel, link_patch):
         if opening.is_inlet:
             raise CoarseGridError(
-                f"no cell of {cell_size_mm:.3g} mm reaches {opening.role} ({opening.diameter_mm:.2g} mm wide at "
-                f"{place(opening.center_mm)}), where blood is to enter: set a smaller cell size"
+                f"the grid of {cell_size_mm:.3g} mm does not reach the inlet {opening.role} "
+                f"({opening.diameter_mm:.2g} mm wide at {place(opening.center_mm)}): use a finer grid spacing"
             )
 
 
@@ -273,8 +277,8 @@ def _connected(
     if len(found) == 0:
         at = place(vessel.inlet.center_mm)
         raise CoarseGridError(
-            f"no cell of {cell_size_mm:.3g} mm lies behind the inlet at {at}: check that the inlet is an open end, or "
-            "set a smaller cell size"
+            f"no cell of {cell_size_mm:.3g} mm is inside the inlet at {at}: check that the inlet is an open "
+            "end, or use a finer grid spacing"
         )
     return label == np.bincount(found).argmax()
 

@@ -99,7 +99,7 @@ class AbstractEngine(ABC, Generic[State]):
         FlowError
             When it does not fit in the free memory.
         """
-        return "What a flow costs with this engine is not known beforehand."
+        return "The run time with this engine is not known in advance."
 
     def calmer(self, case: FlowCase) -> FlowCase | None:
         """Return how to try once more what diverged; None: not at all."""

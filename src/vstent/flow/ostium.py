@@ -25,7 +25,7 @@ def ostium(aneurysm: Aneurysm, lumen: Surface) -> Surface:
     sac = aneurysm.sac
     is_open = lumen.closest(sac.corners_mm.mean(axis=1))[1] > ON_WALL_MM
     if not is_open.any():
-        raise FlowError("the sac is wall all round, so no blood enters it: restore the vessel again")
+        raise FlowError("the sac is closed all around, so no blood enters it: restore the vessel again")
     middle_mm = aneurysm.neck.vertices_mm[np.argmax(lumen.closest(aneurysm.neck.vertices_mm)[1])]
     vertices, faces = triangles.part_at(sac.vertices_mm, sac.faces[is_open], middle_mm)
     return Surface(vertices, faces[:, ::-1])

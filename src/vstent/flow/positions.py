@@ -12,7 +12,7 @@ from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
 
 POSITIONS: Final = {
-    "as it lies": Rotation.identity(),
+    "as given": Rotation.identity(),
     "45 deg about x": Rotation.from_euler("x", 45, degrees=True),
     "45 deg about y": Rotation.from_euler("y", 45, degrees=True),
 }

@@ -144,13 +144,12 @@ def engine_class(settings: FlowSettings) -> type[AbstractEngine[Any]]:
     engine = _engine_of(settings)
     if settings.close_up and not engine.closes_up:
         raise InputError(
-            f"the engine {settings.engine} does not compute a close-up: leave out --close-up (close_up), or take "
-            f"{LATTICE}"
+            f"the engine {settings.engine} cannot refine the grid in the sac: switch that off (--refine-sac), "
+            f"or use {LATTICE}"
         )
     if settings.device_gpu and not engine.runs_on_gpu:
         raise InputError(
-            f"the engine {settings.engine} does not compute on a GPU: leave out --device-gpu (device_gpu), or take "
-            f"{LATTICE}"
+            f"the engine {settings.engine} does not run on a GPU: switch that off (--gpu), or use {LATTICE}"
         )
     return engine
 

@@ -76,15 +76,17 @@ def waveform_of(time_s: Floats, flow: Floats) -> Waveform:
     """
     time_s, flow = np.asarray(time_s, dtype=np.float64), np.array(flow, dtype=np.float64)
     if len(time_s) < 5 or len(time_s) != len(flow):
-        raise InputError(f"a waveform of {len(time_s)} samples is no cycle: give 5 or more times, each with its flow")
+        raise InputError(
+            f"a waveform of {len(time_s)} samples is too short for a cycle: give at least 5 times with a flow each"
+        )
     if not (np.isfinite(time_s).all() and np.isfinite(flow).all() and (np.diff(time_s) > 0).all()):
-        raise InputError("the waveform's times do not increase, or a number is missing: mend the file")
+        raise InputError("the times of the waveform do not increase, or a number is missing: correct the file")
     flow[-1] = flow[0]
     period_s = float(time_s[-1] - time_s[0])
     times = time_s[0] + period_s * np.arange(RESAMPLED) / RESAMPLED
     spectrum = np.fft.rfft(CubicSpline(time_s, flow, bc_type="periodic")(times)) / RESAMPLED
     mean = float(spectrum[0].real)
     if mean <= 0:
-        raise InputError(f"the waveform's mean flow is {mean:.3g}: turn its sign, for blood must enter")
+        raise InputError(f"the mean flow of the waveform is {mean:.3g}, but blood must enter: change its sign")
     kept = 2 * spectrum[1 : 1 + HARMONICS] / mean
     return Waveform(period_s, tuple(map(float, kept.real)), tuple(map(float, -kept.imag)))

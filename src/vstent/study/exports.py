@@ -62,7 +62,7 @@ def export_openfoam(
     with ledger.stage("export") as tell:
         written = foam_case(case, setup)
         write(out, written)
-        tell(f"{len(written.files)} files, cells of {setup.cell_size_mm:.3g} mm, for {written.application}.")
+        tell(f"{len(written.files)} files for {written.application}, grid spacing {setup.cell_size_mm:.3g} mm.")
     return case, written
 
 
@@ -118,7 +118,7 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
     given = [name for name in GEOMETRY if getattr(settings, name) is not None]
     if given:
         words = ", ".join(f"--{name.removesuffix('_mm')} ({name})" for name in given)
-        raise InputError(f"{path} is a case folder, and its vessel is taken as it lies there: leave out {words}")
+        raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
     with ledger.stage("anatomy") as tell:
         anatomy = load_data(kept[-1], Anatomy)
         tell(f"taken from {path}")
@@ -145,7 +145,7 @@ def _told(path: Path, settings: Settings) -> Settings:
         return told_in(run)[1]
     except UNTOLD:
         raise ReadError(
-            f"{run} is not of this version, so where a device lies is not known: do the run again."
+            f"{run} is from another version, so the position of the device is unknown: run the case again"
         ) from None
 
 

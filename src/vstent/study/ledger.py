@@ -47,7 +47,7 @@ class Ledger:
 
         def tell(progress: FlowProgress) -> None:
             fraction = min(progress.fraction, 0.99)
-            settling = f"{progress.residual:.1%} left to settle, " if isfinite(progress.residual) else ""
+            settling = f"{progress.residual:.1%} from convergence, " if isfinite(progress.residual) else ""
             self.progress(name, fraction, f"{settling}{progress.seconds_left:.0f} s left")
 
         return tell

@@ -64,12 +64,12 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
         sha256 = str(told["input"]["sha256"])
         differences = _differences(told, settings)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise ReadError(f"{path} is no run.json of this version: give the scan and the options again.") from None
+        raise ReadError(f"{path} is not a run.json of this version: give the scan and the options again") from None
     source = moved_to or _input(path.parent)
     if not source.exists():
-        raise ReadError(f"{source}, the input of {path}, is not there: say where it is now with --input.")
+        raise ReadError(f"{source}, the input of {path}, does not exist: give its present place with --input")
     if hash_of(source) != sha256:
-        raise InputError(f"{source} is not the input of {path}: it has changed since. Give that file with --input.")
+        raise InputError(f"{source} is not the input of {path}, or has changed since: give that input with --input")
     return Record(path.parent, source, settings, differences)
 
 
@@ -78,7 +78,7 @@ def _input(folder: Path) -> Path:
         return Path(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"])
     except UNTOLD:
         raise ReadError(
-            f"{folder} does not say where its input lay (its folder {CACHE} is gone): say it with --input."
+            f"{folder} does not state the place of its input (its folder {CACHE} is missing): give it with --input"
         ) from None
 
 
@@ -123,7 +123,7 @@ def _adapter() -> "TypeAdapter[Settings]":
 def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]:
     now = {"versions": versions(), "machine": machine(settings), "devices": devices_of(settings.devices)}
     return tuple(
-        f"{name.replace('_', ' ')} ({part}): {told.get(part, {}).get(name, MISSING)} then, {value} now"
+        f"{name.replace('_', ' ')} ({part}): {told.get(part, {}).get(name, MISSING)} before, {value} now"
         for part, values in now.items()
         for name, value in values.items()
         if told.get(part, {}).get(name, MISSING) != value
@@ -141,21 +141,21 @@ def agreement(first: Path, second: Path) -> str:
     try:
         one, other = ((folder / METRICS).read_bytes() for folder in (first, second))
     except OSError as error:
-        raise ReadError(f"{error.filename} cannot be read: nothing to compare with.") from None
+        raise ReadError(f"{error.filename} cannot be read, so there is nothing to compare with") from None
     if one == other:
-        return "The metrics are the same to the last bit."
+        return "The metrics are identical to the last bit."
     then, now = dict(_numbers(json.loads(one))), dict(_numbers(json.loads(other)))
     if set(then) != set(now):
-        return f"The metrics differ: {len(set(then) ^ set(now))} of them are in one run only."
+        return f"The metrics differ: {len(set(then) ^ set(now))} of them exist in one run only."
     apart = {name: _relative(then[name], now[name]) for name in then}
     worst = max(apart, key=lambda name: apart[name])
     n_apart = sum(value > 0 for value in apart.values())
     if n_apart == 0:
-        return "The metrics are the same but for rounding."
+        return "The metrics agree except for rounding."
     verdict = "within" if apart[worst] <= TOLERANCE else "more than"
     return (
-        f"{n_apart} of {len(apart)} metrics differ, {worst} most: by {apart[worst]:.2g} of itself, "
-        f"{verdict} the {TOLERANCE:g} that another machine may make."
+        f"{n_apart} of {len(apart)} metrics differ, {worst} most (relative difference {apart[worst]:.2g}, "
+        f"{verdict} the {TOLERANCE:g} that another machine may cause)."
     )
 
 

@@ -65,7 +65,7 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
         tell(" ".join(traced.notes[len(whole.notes) :]))
     with ledger.stage("restore") as tell:
         anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
-        tell(" ".join([*anatomy.notes, *(f"Sac of {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
+        tell(" ".join([*anatomy.notes, *(f"Sac volume {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
     ledger.hold(ANATOMY, key, anatomy)
     return anatomy
 
@@ -155,9 +155,9 @@ def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
     for inlet, part_mL_s, speed_m_s in zip(case.vessel.inlets, case.inlets_mL_s, case.inlet_speeds_m_s, strict=True):
         if not SLOWEST_M_S <= speed_m_s <= FASTEST_M_S:
             raise InputError(
-                f"a mean inflow of {part_mL_s:g} mL/s through an inlet {inlet.diameter_mm:.1f} mm wide flows at "
-                f"{speed_m_s:.2g} m/s, and blood in arteries at {SLOWEST_M_S:g} to {FASTEST_M_S:g}: give mL/s (240 "
-                "mL/min are 4), or another inlet"
+                f"a mean inflow of {part_mL_s:g} mL/s through an inlet {inlet.diameter_mm:.1f} mm wide is "
+                f"{speed_m_s:.2g} m/s, but blood flows in arteries at {SLOWEST_M_S:g} to {FASTEST_M_S:g} m/s: "
+                "give mL/s (240 mL/min are 4 mL/s), or choose another inlet"
             )
 
 
@@ -264,7 +264,7 @@ def vary_all(
                 told = partial(_tell_count, ledger, stage)
                 begun = FlowCheckpoint(ledger.folder, stage, key)
                 varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
-                tell(f"{len(varied.points)} deployments, {varied.n_failed} of them did not fit.")
+                tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
             ledger.keep(stage, key, varied)
         found[name] = varied.metrics()
     return found

@@ -52,8 +52,8 @@ def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
     if bulge is None:
         return ()
     return (
-        f"A bulge {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)} is too flat to be taken for a sac "
-        "unasked: give --at there.",
+        f"A bulge {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)} is too flat to be used as a sac "
+        "unless it is chosen by that point (--at).",
     )
 
 
@@ -65,7 +65,7 @@ def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges:
         notes.append("No sac was found: the landing surface is the artery's own wall with its side branches closed.")
     if n_bulges > len(aneurysms) > 0:
         more = counted(n_bulges - len(aneurysms), "more bulge")
-        notes.append(f"{more}, flat, a sac's lobe, or on another branch: no sac of its own.")
+        notes.append(f"{more} not used: flat, a lobe of a sac, or on another branch.")
     return tuple(notes)
 
 
@@ -74,8 +74,8 @@ def _before_another(vessel: Vessel, path: int, bulges: list[Bulge]) -> tuple[str
     if not bulges or reach_of(vessel.centerlines[path], bulges[0]) <= PASSING:
         return ()
     return tuple(
-        f"The bulge {bulges[0].height_mm:.1f} mm high at {place(bulges[0].dome_mm)} hangs on the "
-        f"artery from {end.role}, {end.described}: give that as the first --inlet."
+        f"The bulge {bulges[0].height_mm:.1f} mm high at {place(bulges[0].dome_mm)} is on the artery from "
+        f"{end.role}, {end.described}: give that opening as the first inlet (--inlet)."
         for end, line in zip(vessel.far_ends, vessel.centerlines, strict=True)
         if end.is_inlet and reach_of(line, bulges[0]) <= PASSING
     )
@@ -91,8 +91,9 @@ def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
     if radius[widest] < FUSIFORM * ends_mm:
         return ()
     return (
-        f"The artery is {2 * radius[widest]:.1f} mm wide at {place(line.points_mm[widest])} and {2 * ends_mm:.1f} mm "
-        "at its wider end: a fusiform aneurysm is no sac here, has no neck, and stays part of the landing surface.",
+        f"The artery is {2 * radius[widest]:.1f} mm wide at {place(line.points_mm[widest])} and "
+        f"{2 * ends_mm:.1f} mm at its wider end. A fusiform aneurysm has no neck; it remains part of the "
+        "landing surface.",
     )
 
 
@@ -118,9 +119,9 @@ def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
         if radius[throat] < STENOSED * around_mm:
             notes.append(
                 f"The artery is {2 * radius[throat]:.1f} mm wide at {place(line.points_mm[throat])}, "
-                f"{gap_mm[throat]:.1f} mm from a neck, and {2 * around_mm:.1f} mm on both sides of that: it is "
-                "stenosed. The landing surface may lie inside its wall between there and the neck: look at it, and "
-                "give --neck where the neck found is too large."
+                f"{gap_mm[throat]:.1f} mm from a neck, and {2 * around_mm:.1f} mm on both sides of it: a "
+                "stenosis. The landing surface may lie inside the wall between there and the neck. Look at "
+                "it, and draw the neck by hand if it is too large (--neck)."
             )
     return tuple(notes)
 
@@ -132,8 +133,9 @@ def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
         gap_mm = min((float(bulge.distances_mm(opening.center_mm[None])[0]) for bulge in bulges), default=np.inf)
         if gap_mm < NEAR_SAC_MM:
             notes.append(
-                f"{opening.role}, {opening.described}, lies {gap_mm:.1f} mm from a sac's wall: close it where it is a "
-                "hole; give --outlet where the parent artery leads elsewhere."
+                f"{opening.role}, {opening.described}, is {gap_mm:.1f} mm from the wall of a sac. Close it in "
+                "the surface if it is a hole, or choose another outlet if the parent artery leads elsewhere "
+                "(--outlet)."
             )
     return tuple(notes)
 
@@ -145,11 +147,8 @@ def _from_sacs(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...]) -> tu
 
 
 def _through_sac(opening: Opening) -> str:
-    way, beside = ("opens into", ", and is none of the neck inflow") if opening.is_inlet else ("leaves from", "")
-    return (
-        f"{opening.role}, {opening.described}, {way} a sac: what it carries goes on through the sac behind any "
-        f"device{beside}."
-    )
+    way, beside = ("opens into", ", and is not part of the neck inflow") if opening.is_inlet else ("leaves from", "")
+    return f"{opening.role}, {opening.described}, {way} a sac: its blood flows through the sac with any device{beside}."
 
 
 def _leaves(line: Centerline, aneurysm: Aneurysm) -> bool:

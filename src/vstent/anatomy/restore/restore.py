@@ -58,7 +58,9 @@ def restore(
     drawn = None if neck_mm is None else cut_along(vessel, neck_mm)
     bulges = [drawn.bulge] if drawn else find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
     if at_mm is not None and not bulges:
-        raise InputError(f"no sac stands out of the artery near {place(at_mm)}: give a point in its dome")
+        raise InputError(
+            f"nothing bulges out of the artery near {place(at_mm)}: give a point in the dome of the sac, in LPS mm"
+        )
     path, landing, sacs = _closed(vessel, bulges, outlet_mm, drawn)
     candidates = [_classified(vessel, landing, sac) for sac in sacs]
     if drawn is None and at_mm is None:

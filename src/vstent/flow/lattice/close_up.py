@@ -120,7 +120,9 @@ def require_sac(case: FlowCase) -> Surface:
         When there is none.
     """
     if case.sac is None:
-        raise FlowError("a close-up is of a sac, and this vessel has none: leave out --close-up (close_up)")
+        raise FlowError(
+            "the grid cannot be refined in the sac, because this vessel has none: switch that off (--refine-sac)"
+        )
     return case.sac
 
 
@@ -284,7 +286,7 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
         is_converged=inner.is_converged and outer.is_converged,
         unsettled_fraction=max(inner.unsettled_fraction, outer.unsettled_fraction),
         advice=(
-            f"{inner.advice} Cells are {inner.cell_size_mm:.3g} mm wide in the sac and near it, "
+            f"{inner.advice} The grid spacing is {inner.cell_size_mm:.3g} mm in and near the sac and "
             f"{outer.cell_size_mm:.3g} mm elsewhere; there: {outer.advice}"
         ),
     )

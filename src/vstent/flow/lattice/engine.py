@@ -114,7 +114,7 @@ class LatticeBoltzmann(AbstractLattice):
         """Return the last check of a flow that has settled, or the mean of what it swings about."""
         left = _left(state)
         if left < state.case.settings.tolerance:
-            return field_of(state, read(state, [state.snapshots[-1]]), outcome, left, "The flow has settled.")
+            return field_of(state, read(state, [state.snapshots[-1]]), outcome, left, "The flow has converged.")
         mean = _mean(state)
         uncertain, advice = _of_mean(state, mean, is_converged=outcome.is_converged)
         return field_of(state, read_moving(state, state.blocks[-mean.blocks :]), outcome, uncertain, advice)
@@ -146,18 +146,22 @@ def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, st
     """How uncertain the means of a flow that has not settled are, as a fraction of them, and that in words."""
     swing, moved = swings(np.array(state.history), mean.checks)
     means = (
-        f"means over its last {1e3 * mean.checks * state.check_s:.0f} ms, in which what is monitored ranged over up to "
-        f"{100 * swing:.1f} % of its mean"
+        f"averages over the last {1e3 * mean.checks * state.check_s:.0f} ms, in which the monitored quantities "
+        f"varied by up to {100 * swing:.1f} % of their mean"
     )
     of_means, of_field = (100 * SURE * error for error in (mean.standard_error, mean.field_error))
     known = (
-        f"they are known to within {of_means:.1f} %, the sac's velocity, place by place, to within {of_field:.0f} % "
-        f"({SURE} standard errors)"
+        f"their statistical uncertainty ({SURE} standard errors) is {of_means:.1f} %, and {of_field:.0f} % for "
+        "the local velocity in the sac"
     )
     if is_converged:
-        return of_means / 100, f"The flow goes on moving about its mean: these are {means}; {known}."
-    unsettled = f"The flow has not settled in {state.steps} time steps and may be unsteady by nature: these are {means}"
+        return of_means / 100, f"The flow is unsteady. The results are {means}; {known}."
+    unsettled = f"The flow has not converged in {state.steps} time steps and may be unsteady. The results are {means}"
     if np.isfinite(mean.left):
-        return of_means / 100, f"{unsettled}; {known}: allow more steps to know them better."
-    drift = "" if np.isnan(moved) else f"; from the means of as long before, they differ by up to {100 * moved:.1f} %"
+        return of_means / 100, f"{unsettled}; {known}. Allow more steps to reduce it."
+    drift = (
+        ""
+        if np.isnan(moved)
+        else (f"; they differ by up to {100 * moved:.1f} % from the averages over an equal time before")
+    )
     return float(np.nanmax([swing, moved])), f"{unsettled}{drift}."

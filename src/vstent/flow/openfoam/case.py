@@ -55,13 +55,13 @@ def strut_solids(case: FlowCase) -> Surface | None:
         return None
     if case.stent is None:
         raise FlowError(
-            "OpenFOAM's porous zones resist alike in every cell, a screen does not: give the stent, whose struts are "
-            "meshed, or take the embedded engine"
+            "OpenFOAM's porous zones have the same resistance in every cell, which a screen has not: give the "
+            "stent, whose wires are meshed, or use the embedded engine"
         )
     if not len(case.stent.wire_points_mm):
         raise LandingError(
-            "no wire of the device lies over a neck or a branch's ostium, where OpenFOAM meshes its struts: land it "
-            "across one, or leave it away"
+            "no wire of the device is over a neck or a branch ostium, where OpenFOAM meshes wires: move it "
+            "across one, or compute without it"
         )
     return struts(case.stent)
 

@@ -43,14 +43,15 @@ def tell_cost(case: FlowCase, cell_size_mm: float) -> str:
     needed, free = _bytes(bare + at_struts), free_memory_bytes()
     if needed > free:
         raise FlowError(
-            f"OpenFOAM's mesh of {(bare + at_struts) / 1e6:.3g} million cells of {cell_size_mm:.3g} mm and less needs "
-            f"{needed / 1e9:.2g} GB, but {free / 1e9:.2g} GB of memory are free: {_what_fits(case, cell_size_mm, free)}"
+            f"OpenFOAM's mesh of {(bare + at_struts) / 1e6:.3g} million cells of {cell_size_mm:.3g} mm and "
+            f"less needs {needed / 1e9:.2g} GB, but {free / 1e9:.2g} GB of memory are free: "
+            f"{_what_fits(case, cell_size_mm, free)}"
         )
     seconds = bare * SECONDS_PER_CELL + at_struts * SECONDS_PER_STRUT_CELL
-    of_struts = f", {at_struts / 1e3:,.0f} thousand more at its struts" if at_struts else ""
+    of_struts = f", {at_struts / 1e3:,.0f} thousand more at the wires" if at_struts else ""
     return (
-        f"OpenFOAM: about {bare / 1e3:,.0f} thousand cells of {cell_size_mm:.3g} mm{of_struts}, {needed / 1e9:.2g} GB, "
-        f"{seconds / 60:.2g} min of one core for a steady flow."
+        f"OpenFOAM: about {bare / 1e3:,.0f} thousand cells of {cell_size_mm:.3g} mm{of_struts}, memory "
+        f"{needed / 1e9:.2g} GB, run time {seconds / 60:.2g} min of one core for a steady flow."
     )
 
 
@@ -69,8 +70,8 @@ def _what_fits(case: FlowCase, cell_size_mm: float, free_bytes: float) -> str:
     """What to do instead: take wider cells, or, where struts alone are too many, none."""
     for size_mm in cell_size_mm * WIDER ** np.arange(1, TRIED):
         if _bytes(sum(_cells(case, size_mm))) < free_bytes:
-            return f"set a cell size of {size_mm:.2g} mm"
-    return f"take the engine {LATTICE}, which needs no cells as small as the device's wires"
+            return f"use a grid spacing of {size_mm:.2g} mm"
+    return f"use the engine {LATTICE}, which needs no cells as small as the wires"
 
 
 def _bytes(cells: float) -> float:

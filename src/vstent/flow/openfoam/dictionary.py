@@ -61,7 +61,7 @@ def parse(text: str) -> dict[str, Any]:
     tokens = _TOKEN.findall(_COMMENT.sub(" ", text))
     entries, rest = _parsed(tokens, 0)
     if rest != len(tokens):
-        raise ReadError(f"an OpenFOAM dictionary closes a bracket too many, at token {rest}: write it anew")
+        raise ReadError(f"an OpenFOAM dictionary has one closing bracket too many, at token {rest}: write it again")
     return entries
 
 
@@ -93,4 +93,4 @@ def _end_of_value(tokens: list[str], place: int) -> int:
 
 def _expect(tokens: list[str], place: int, wanted: str, key: str) -> None:
     if place >= len(tokens) or tokens[place] != wanted:
-        raise ReadError(f"an OpenFOAM dictionary lacks the {wanted!r} that ends {key!r}: write it anew")
+        raise ReadError(f"an OpenFOAM dictionary lacks the {wanted!r} that ends {key!r}: write it again")

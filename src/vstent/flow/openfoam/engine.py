@@ -89,7 +89,7 @@ class OpenFoam(AbstractEngine[State]):
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Find OpenFOAM, write the case, mesh it, and find the way from its cells to the grid."""
         if self.folder is None:
-            raise FlowError("OpenFOAM needs a folder to work in: name one")
+            raise FlowError("OpenFOAM needs a folder to work in: give one")
         solids, found = strut_solids(case), program.find()
         setup = FoamSetup(
             self.cell_size_mm, found.flavour, self.layers, processes=case.settings.processes, struts=solids
@@ -142,8 +142,8 @@ class OpenFoam(AbstractEngine[State]):
         """Say where the run diverged."""
         good = state.snapshots[-2].time if len(state.snapshots) > 1 else "none"
         return (
-            f"OpenFOAM's flow diverged at time {state.snapshots[-1].time} (last good state: {good}) in {state.folder}: "
-            "change the cell size a little or take fewer layers"
+            f"OpenFOAM's flow diverged at time {state.snapshots[-1].time} (last good state: {good}) in "
+            f"{state.folder}: change the grid spacing a little, or use fewer wall layers"
         )
 
     def max_checks(self, state: State) -> int:
@@ -273,8 +273,8 @@ def _advice(state: State, outcome: Outcome) -> str:
         cycles = _phases_done(state) // PHASES
         return f"{cycles_advice(changes, cycles, is_converged=outcome.is_converged)} {mesh}"
     if outcome.is_converged:
-        return f"The flow has settled. {mesh}"
+        return f"The flow has converged. {mesh}"
     return (
-        f"The steady solver has not settled in {state.setup.iterations} iterations: the flow may be unsteady by "
-        f"nature; follow it in time with a waveform. {mesh}"
+        f"The steady solver has not converged in {state.setup.iterations} iterations, and the flow may be "
+        f"unsteady. Compute it in time with a waveform. {mesh}"
     )

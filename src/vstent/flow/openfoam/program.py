@@ -18,7 +18,7 @@ INSTALLED: Final = ("/usr/lib/openfoam/openfoam*", "/opt/openfoam*", "/opt/OpenF
 """Where the packages of openfoam.com and openfoam.org lie; each has an etc/bashrc."""
 MARKS: Final[dict[str, Flavour]] = {"foamRun": "org", FEATURES["com"]: "com"}
 """A program of each one's current releases: those of openfoam.org before 11 have neither, and read other settings."""
-INSTALL: Final = "install it (Debian, Ubuntu: sudo apt-get install openfoam), or take the embedded engine"
+INSTALL: Final = "install it (Debian, Ubuntu: sudo apt-get install openfoam), or use the embedded engine"
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def run(program: Program, folder: Path, words: list[str], *, processes: int = 1)
         stream.seek(before)
         said = stream.read().decode(errors="replace")
     if done.returncode != 0 or "FOAM FATAL" in said:
-        raise FlowError(f"{name} failed: {cause(said, done.returncode)} ({log} has the whole of it)")
+        raise FlowError(f"{name} failed: {cause(said, done.returncode)} (see {log})")
     return said
 
 
@@ -118,7 +118,7 @@ def cause(said: str, code: int) -> str:
     code : its exit status.
     """
     if code == -9 or "Killed" in said or "bad_alloc" in said:
-        return "it was ended for want of memory; take a larger cell size or fewer processes"
+        return "it was stopped for lack of memory: use a wider grid spacing or fewer processes"
     if fatal := re.search(
         r"FOAM FATAL(?: IO)? ERROR:?\s*(?:\(openfoam-[^)]*\)\s*)?(.*?)(?:\n\s*\n\s*From|\n\nfile:|\Z)", said, re.DOTALL
     ):
@@ -132,9 +132,9 @@ def _divergence(said: str) -> str:
     """Which of the usual three it was: the time step, a backflow at an outlet, or the mesh."""
     courant = [float(number) for number in re.findall(r"Courant Number mean: \S+ max: (\S+)", said)]
     if courant and courant[-1] > 20:
-        return f"the time step is too long (Courant number {courant[-1]:.0f}); shorten it or take a smaller cell size"
+        return f"the time step is too long (Courant number {courant[-1]:.0f}): shorten it or use a finer grid spacing"
     times = re.findall(r"^Time = (\S+?)s?$", said, re.MULTILINE)
     return (
-        f"at {times[-1] if times else 'the start'}: a cell of the mesh is too flat or blood rushes back through an "
-        "outlet; change the cell size a little, take fewer layers, or lengthen the outlets"
+        f"at {times[-1] if times else 'the start'}, because a cell of the mesh is too flat or blood flows back "
+        "through an outlet: change the grid spacing a little, use fewer wall layers, or extend the outlets"
     )

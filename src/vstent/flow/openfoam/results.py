@@ -64,7 +64,9 @@ def _parsed(path: Path) -> VolumeField:
         values = _values(inside[inside.index("internalField") :])
         return VolumeField(values, _entries(boundary, _ENTRY), _entries(boundary, _REFERENCE))
     except (OSError, ValueError) as error:
-        raise ReadError(f"OpenFOAM's field {path} is missing or damaged ({error}): delete its folder's run") from error
+        raise ReadError(
+            f"OpenFOAM's field {path} is missing or damaged ({error}): delete the folder of that run"
+        ) from error
 
 
 def _entries(boundary: str, entry: re.Pattern[str]) -> dict[str, Floats]:
