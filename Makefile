@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test validation check lint benchmark docs licences wheel-check viewer-check sentences clean
+.PHONY: demo test validation check lint benchmark docs licences wheel-check bounds-check viewer-check sentences clean
 
 demo: $(VENV)/.ready
 	$(BIN)/vstent demo --out demo
@@ -36,6 +36,10 @@ licences: $(VENV)/.ready-dev
 # Without PYTHONS in brief; with PYTHONS="python3.11 python3.12 python3.13", in an empty environment of each that is installed.
 wheel-check: $(VENV)/.ready
 	$(BIN)/python tools/wheel_check.py $(PYTHONS)
+
+# Installs the wheel with the lowest and with the newest dependencies, and runs the demo with a coarse flow in both.
+bounds-check: $(VENV)/.ready
+	$(BIN)/python tools/wheel_check.py --bounds
 
 # Rebuilds the JavaScript bundles where npm is installed and fails where they differ from those in the package.
 viewer-check: $(VENV)/.ready

@@ -294,7 +294,7 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
 ) -> None:
     artery, out = tmp_path / "artery.stl", tmp_path / "out"
     write_stl(artery, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
-    command = ["run", str(artery), "--out", str(out), "--device", "silk", "--cell-size", "0.25"]
+    command = ["run", str(artery), "--out", str(out), "--device", "silk", "--grid-spacing", "0.25"]
     real, computed = stages.simulate_case, []
 
     def stopped_with_a_stent(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
