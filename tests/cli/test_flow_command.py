@@ -96,8 +96,8 @@ def test_what_excludes_each_other_is_refused(words: list[str], capsys: pytest.Ca
     ("words", "said"),
     [
         (["--engine", "nonsense"], "There is no 'nonsense'"),
-        (["--engine", "openfoam", "--refine-sac"], "does not compute a close-up"),
-        (["--engine", "openfoam", "--gpu"], "does not compute on a GPU"),
+        (["--engine", "openfoam", "--close-up"], "does not support a finer grid"),
+        (["--engine", "openfoam", "--device-gpu"], "does not support a GPU"),
     ],
 )
 def test_an_engine_is_refused_before_anything_is_read(

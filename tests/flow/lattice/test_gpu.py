@@ -162,7 +162,7 @@ def test_the_command_line_says_so_before_it_reads_anything(
 
 
 def test_an_engine_that_knows_no_gpu_is_not_asked_to_use_one() -> None:
-    with pytest.raises(InputError, match="the engine openfoam does not compute on a GPU"):
+    with pytest.raises(InputError, match="the engine openfoam does not support a GPU"):
         engine_class(replace(ASKED, engine="openfoam"))
 
 
