@@ -364,6 +364,9 @@ def _spacing(text: str) -> tuple[float, float, float]:
 
 def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the options on the vessel under the names of the settings."""
+    in_lps = _from_ras if arguments.frame == "ras" else _as_given
+    inlets = tuple(map(in_lps, arguments.inlet)) if arguments.inlet else None
+    at, outlet, neck = arguments.at, getattr(arguments, "outlet", None), _neck(getattr(arguments, "neck", None))
     return {
         "units": arguments.units,
         "frame": arguments.frame,
@@ -371,13 +374,25 @@ def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
         "spacing_mm": arguments.spacing,
         "shape": arguments.shape,
         "threshold": arguments.threshold,
-        "at_mm": arguments.at,
-        "inlet_mm": tuple(arguments.inlet) if arguments.inlet else None,
-        "outlet_mm": getattr(arguments, "outlet", None),
+        "at_mm": at and in_lps(at),
+        "inlet_mm": inlets,
+        "outlet_mm": outlet and in_lps(outlet),
         "upstream_mm": getattr(arguments, "upstream", None),
         "downstream_mm": getattr(arguments, "downstream", None),
-        "neck_mm": _neck(getattr(arguments, "neck", None)),
+        "neck_mm": neck and tuple(map(in_lps, neck)),
     }
+
+
+Point: TypeAlias = tuple[float, float, float]
+
+
+def _as_given(point_mm: Point) -> Point:
+    return point_mm
+
+
+def _from_ras(point_mm: Point) -> Point:
+    """Return a RAS point in LPS."""
+    return -point_mm[0], -point_mm[1], point_mm[2]
 
 
 def _neck(path: Path | None) -> tuple[tuple[float, float, float], ...] | None:

@@ -1,6 +1,7 @@
 """Stages of a study: each timed and told of by the ledger."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from math import isfinite
@@ -22,7 +23,7 @@ from vstent.deployment.struts import over_restored
 from vstent.devices.catalogue import find_sizes
 from vstent.devices.design import BARE, Design, Size
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.errors import DeviceError, FlowError, InputError, LandingError
+from vstent.errors import DeviceError, FlowError, InputError, LandingError, VstentError
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.indices import compare, indices
@@ -44,16 +45,61 @@ SLOWEST_M_S: Final = 0.01
 FASTEST_M_S: Final = 2.0
 """Mean speeds at the inlet beyond which no artery of the brain's blood flows."""
 
+NEAR_MM: Final = 3.0
+"""Largest distance from the wall of a vessel at which another reading of a point is proposed."""
+
 
 def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) -> Anatomy:
-    """Read, segment, repair, trace, trim and restore; what was kept of this `source` (hash) is taken as it is.
+    """Read, segment, repair, trace, trim and restore; a result kept for this `source` (hash) is returned as it is.
 
-    What is found is held by the ledger: its `settle` keeps it.
+    The ledger holds the result until its `settle` keeps it.
+
+    Raises
+    ------
+    InputError
+        An input or option cannot be used. Where the point `at_mm` finds nothing, the message proposes the same point
+        in another frame or as a voxel index, if that finds a vessel.
     """
     key = anatomy_key(source, settings)
     kept = ledger.recall(ANATOMY, key, Anatomy)
     if kept is not None:
         return kept
+    try:
+        return _find_anatomy(path, source, settings, ledger, key)
+    except InputError as error:
+        if settings.at_mm is None or settings.neck_mm is not None:
+            raise
+        found = other_reading(path, settings)
+        if not found:
+            raise
+        raise type(error)(f"{error} {found}") from error
+
+
+def other_reading(path: Path, settings: Settings) -> str:
+    """Return a question that proposes another reading of the point `at_mm`, which finds a vessel; else nothing."""
+    for words, point_mm in _readings(path, settings):
+        with suppress(VstentError):
+            vessel = trace(_vessel(path, replace(settings, at_mm=point_mm)))
+            near_mm = vessel.lumen.closest(np.array([point_mm]))[1][0]
+            if near_mm < NEAR_MM:
+                return f"Did you mean {','.join(f'{x:.1f}' for x in point_mm)} ({words})?"
+    return ""
+
+
+def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
+    """Yield other readings of the point `at_mm`, in LPS mm, with their names."""
+    x, y, z = settings.at_mm or (0.0, 0.0, 0.0)
+    yield "the point given is RAS", (-x, -y, z)
+    if not (path.is_file() and is_surface_file(path)):
+        image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape, acquisition=settings.acquisition)
+        if all(0 <= i < n for i, n in zip((x, y, z), image.voxels.shape, strict=True)):
+            i, j, k = image.to_mm(np.array([[x, y, z]]))[0].tolist()
+            yield "the point given is a voxel index", (i, j, k)
+    yield "with the first sign changed", (-x, y, z)
+    yield "with the second sign changed", (x, -y, z)
+
+
+def _find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger, key: str) -> Anatomy:
     whole = find_vessel(path, source, settings, ledger)
     neck_mm = None if settings.neck_mm is None else np.array(settings.neck_mm, dtype=np.float64)
     at_mm = _array(settings.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
