@@ -1,4 +1,4 @@
-"""Server: the page's files and the REST interface, all of it described at /api/docs."""
+"""The server: the files of the page and the REST interface, which is described at /api/docs."""
 
 import asyncio
 import json
@@ -24,52 +24,52 @@ from vstent.errors import ReadError, VstentError
 
 MEDIA: Final = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css"}
 BINARY: Final = "application/octet-stream"
-"""A manifest and its arrays, as `vstent.reporting.packing` says."""
+"""Media type of binary answers: a manifest and its arrays (`vstent.reporting.packing`)."""
 SHARED: Final = ("viewer.js", "viewer.css")
-"""Files of the report that the page shares."""
+"""Files that the page shares with the report."""
 ASSETS: Final = ("index.html", "app.js", "app.css", "docs.html", "docs.js", *SHARED)
 BEAT_S: Final = 15.0
-"""A quiet stream of events says something this often."""
+"""Interval of keep-alive messages in a stream of events, in s."""
 
 Finite = Annotated[float, Query(allow_inf_nan=False)]
 Revision = Annotated[int, Field(ge=0)]
 
 
 class NewCase(Strict):
-    """A case to be made."""
+    """A case to create."""
 
     name: str = Field(max_length=120, min_length=1)
 
 
 class Change(Strict):
-    """Other choices, made on what a tab has seen last."""
+    """Changed choices, based on the revision that the client last read."""
 
     revision: Revision
     choices: Choices
 
 
 class Seen(Strict):
-    """What a tab has seen last."""
+    """The revision that the client last read."""
 
     revision: Revision
 
 
 class DeviceWanted(Strict):
-    """A device, to be drawn."""
+    """A device to draw."""
 
     device: DeviceChoice
     colour: Literal["wall_gap", "coverage", "diameter"] = "wall_gap"
 
 
 class SketchWanted(DeviceWanted):
-    """A device at a place, to be drawn."""
+    """A device at a position, to draw."""
 
     anchor: Literal["proximal", "center", "distal"] = "center"
     abscissa_mm: float | None = Field(default=None, ge=-1000, le=1000)
 
 
 class NeckWanted(Strict):
-    """A neck to be drawn, with one handle pulled to a point of the wall where they are given."""
+    """A neck to draw, optionally with one handle moved to a point on the wall."""
 
     curve_mm: tuple[Point, ...] = Field(min_length=3, max_length=1000)
     handle: int | None = Field(default=None, ge=0, lt=NECK_HANDLES)
@@ -77,7 +77,7 @@ class NeckWanted(Strict):
 
 
 def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
-    """Return the whole server: the interface behind its guard."""
+    """Return the server: the interface behind its guard."""
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -106,7 +106,7 @@ def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
 
 
 def new_token() -> str:
-    """Return a key that nobody can guess."""
+    """Return a random key."""
     return secrets.token_urlsafe(24)
 
 
@@ -117,7 +117,7 @@ def _said(_: Request, error: Exception) -> JSONResponse:
 def asset(name: str) -> Response:
     """Return one of the page's files."""
     folder = "reporting" if name in SHARED else "app"
-    # The package of the report itself is not loaded for it: that takes longer than the first page may.
+    # The reporting package is not imported for this, because that takes longer than the first page may.
     text = files("vstent").joinpath(folder, "assets", name).read_bytes()
     return Response(text, media_type=MEDIA[Path(name).suffix])
 
@@ -193,7 +193,7 @@ async def _stream(desk: Desk, case: Any) -> AsyncIterator[str]:
             yield f"data: {json.dumps(desk.view(case))}\n\n"
             try:
                 await asyncio.wait_for(event.wait(), BEAT_S)
-                await asyncio.sleep(0.05)  # words that follow each other quickly are told together
+                await asyncio.sleep(0.05)  # messages in quick succession are sent together
             except TimeoutError:
                 yield ": still here\n\n"
     finally:

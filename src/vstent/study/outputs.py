@@ -1,4 +1,4 @@
-"""The files of a case folder."""
+"""Write and remove the files of a case folder."""
 
 import shutil
 from collections.abc import Collection, Iterable
@@ -30,44 +30,44 @@ OF_STUDY: Final = (
     *(f"stents/*/{name}" for name in STENT),
     *(f"flow/*/{name}" for name in FIELD),
 )
-"""What a study writes of devices and flows, and tells of them."""
+"""Files of devices, flows and reports."""
 OF_ANATOMY: Final = ("morphology.json", "convergence.json")
-"""What is found of an anatomy alone."""
+"""Files that describe an anatomy alone."""
 RESULTS: Final = (
     *("vessel.vtp", "centerlines.vtp", "openings.json", "landing_surface.vtp", *SACS),
     *("ranking.csv", "ranking.json", *OF_ANATOMY, *OF_STUDY),
 )
-"""All that is written into a case folder beside the cache and the folders of OpenFOAM."""
+"""All files of a case folder except the cache and OpenFOAM's folders."""
 
 
 def take_away_results(out: Path) -> None:
-    """Take away the results in a case folder; what is kept in the cache, and files of the user's own, stay."""
+    """Remove the results in a case folder; the cache and the user's own files stay."""
     _take_away(out, RESULTS, list(out.glob(f"flow/**/{KEY}")))
 
 
 def take_away_study(out: Path, kept: Collection[Path]) -> None:
-    """Take away what a study with other settings wrote, but for OpenFOAM's folders in `kept`: it goes on from them."""
+    """Remove the results of a study with other settings, except OpenFOAM's folders in `kept`, which are resumed."""
     _take_away(out, OF_STUDY, [key for key in out.glob(f"flow/*/*/{KEY}") if key.parent not in kept])
 
 
 def take_away_measures(out: Path) -> None:
-    """Take away what was found of another anatomy alone."""
+    """Remove the results that describe another anatomy alone."""
     _take_away(out, OF_ANATOMY, list(out.glob(f"flow/convergence/**/{KEY}")))
 
 
 def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None:
-    """Take away files, OpenFOAM's folders by their `keys`, and folders that are empty then."""
+    """Remove files, OpenFOAM's folders by their `keys`, and folders that are then empty."""
     for file in [file for pattern in patterns for file in out.glob(pattern)]:
         file.unlink()
     for key in keys:
         shutil.rmtree(key.parent)
     for folder in [*out.glob("stents/*/"), *out.glob("flow/*/"), out / "stents", out / "flow"]:
-        with suppress(OSError):  # it is not there, or not empty
+        with suppress(OSError):  # it does not exist, or is not empty
             folder.rmdir()
 
 
 def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
-    """Write the wall, the centerlines (and other axes beside them) and the openings."""
+    """Write the wall, the centerlines (and further axes) and the openings."""
     out.mkdir(parents=True, exist_ok=True)
     writers.write_surface(out / "vessel.vtp", vessel.lumen)
     writers.write_centerlines(out / "centerlines.vtp", (*vessel.centerlines, *axes))
@@ -76,7 +76,7 @@ def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
 
 
 def write_anatomy(out: Path, anatomy: Anatomy) -> None:
-    """Write the vessel, the parent artery and the sacs; sacs found before and no more are taken away."""
+    """Write the vessel, the parent artery and the sacs; files of sacs that no longer exist are removed."""
     write_vessel(out, anatomy.vessel, anatomy.axis)
     restored = {"is_restored": anatomy.is_restored.astype(np.uint8)}
     writers.write_surface(out / "landing_surface.vtp", anatomy.landing_surface, restored)
@@ -93,7 +93,7 @@ def write_anatomy(out: Path, anatomy: Anatomy) -> None:
 
 
 def write_stent(folder: Path, deployment: Deployment) -> str:
-    """Write contour, wires and struts; say how many."""
+    """Write contour, wires and struts, and return a sentence with their numbers."""
     stent = deployment.stent
     folder.mkdir(parents=True, exist_ok=True)
     writers.write_surface(folder / "contour.vtp", stent.contour, {"wall_gap_mm": deployment.wall_gap_mm.ravel()})
@@ -107,7 +107,7 @@ def write_stent(folder: Path, deployment: Deployment) -> str:
 
 
 def write_field(folder: Path, field: FlowField) -> None:
-    """Write the flow in the cells and on the wall."""
+    """Write the flow on the grid and on the wall."""
     folder.mkdir(parents=True, exist_ok=True)
     of_cell = {"velocity_m_s": field.velocity_m_s, "pressure_Pa": field.pressure_Pa}
     if field.swing:

@@ -1,4 +1,4 @@
-"""Repeat: a run done again from what `run.json` says of it, and how far the two agree."""
+"""Repeat a run from its `run.json`, and compare the results."""
 
 import json
 from collections.abc import Mapping
@@ -20,28 +20,28 @@ if TYPE_CHECKING:
 
 MISSING: Final = "absent"
 SECONDS: Final = "seconds"
-"""Key of what every stage took."""
+"""Key of the seconds of every stage."""
 UNTOLD: Final = (OSError, ValueError, KeyError, TypeError)
-"""What comes of a file that is missing, damaged, or of another kind."""
+"""Exceptions that reading a missing, damaged or foreign file raises."""
 TOLERANCE: Final = 1e-3
-"""Relative, between machines: other processors round otherwise, and a count of pixels or an end of settling may turn on
-that. Measured on one processor with and without its wide and fused instructions: 2e-4, where the flow is steady."""
+"""Relative difference of metrics that another machine may cause, since processors round differently. Measured on one
+processor with and without wide and fused instructions: 2e-4 for a steady flow."""
 ROUNDING: Final = 1e-9
-"""In the unit of a metric: what differs by less is the rounding of a zero."""
+"""Absolute difference, in the unit of a metric, below which two values near zero are equal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A run as its `run.json` tells it."""
+    """A run as stated by its `run.json`."""
 
     folder: Path
     """The case folder."""
     input: Path
-    """Scan or surface: seen to be the same file."""
+    """Scan or surface, checked to be the same file."""
     settings: Settings
-    """All of them, to the last bit."""
+    """All settings, exactly."""
     differences: tuple[str, ...]
-    """What is not as it was then: versions, machine, devices; a sentence each."""
+    """What has changed since (versions, machine, devices), one sentence each."""
 
 
 def read_record(path: Path, moved_to: Path | None = None) -> Record:
@@ -50,14 +50,14 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
     Parameters
     ----------
     path : the file, in its case folder.
-    moved_to : where the input lies now; None: where it lay then.
+    moved_to : present path of the input; None: its former path.
 
     Raises
     ------
     ReadError
-        The file does not exist or is not of this version's kind, or the input is not where it was.
+        The file does not exist or is from another version, or the input is missing.
     InputError
-        The input is another one than then.
+        The input is another one.
     """
     try:
         told, settings = told_in(existing(path))
@@ -83,7 +83,7 @@ def _input(folder: Path) -> Path:
 
 
 def former_source(folder: Path) -> str | None:
-    """Return the hash of the input that a case folder's results are of; None where it does not say."""
+    """Return the hash of the input of a case folder's results; None where it is not stated."""
     with suppress(*UNTOLD):
         return str(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["sha256"])
     with suppress(*UNTOLD):
@@ -92,7 +92,7 @@ def former_source(folder: Path) -> str | None:
 
 
 def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
-    """Tell whether a case folder was begun by a run other than that with the provenance `told`, or one not ended."""
+    """Return whether a case folder was begun by a run with another provenance than `told`, or by an unfinished one."""
     with suppress(*UNTOLD):
         former = json.loads((folder / RUN).read_text(encoding="utf-8"))
         return {key: former[key] for key in former if key != SECONDS} != json.loads(json.dumps(told))
@@ -100,13 +100,13 @@ def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
 
 
 def told_in(run: Path) -> tuple[dict[str, Any], Settings]:
-    """What a `run.json` tells, and the settings among it; one of `UNTOLD` where this version cannot read it."""
+    """Return the content of a `run.json` and its settings; one of `UNTOLD` is raised where it cannot be read."""
     told = json.loads(run.read_text(encoding="utf-8"))
     return told, settings_of(told["settings"])
 
 
 def settings_of(told: Mapping[str, Any]) -> Settings:
-    """Rebuild the settings that a `run.json` tells; ValueError where this version does not know one."""
+    """Return the settings stated by a `run.json`; ValueError is raised where this version does not know one."""
     unknown = sorted(set(told) - {field.name for field in fields(Settings)})
     if unknown:
         raise ValueError(f"unknown settings: {unknown}")
@@ -131,12 +131,12 @@ def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]
 
 
 def agreement(first: Path, second: Path) -> str:
-    """Return a sentence on how far the metrics of two case folders agree.
+    """Return a sentence on how well the metrics of two case folders agree.
 
     Raises
     ------
     ReadError
-        One of them has none.
+        One of them has no metrics.
     """
     try:
         one, other = ((folder / METRICS).read_bytes() for folder in (first, second))
