@@ -39,6 +39,11 @@ WORDS = {
 """Expressions that do not come back, and what to say instead."""
 
 EXCEPTIONS = {
+    ("CHANGELOG.md", r"--(cell-size|close-up|device-gpu|uncertain-flows|crate)\b"): "the list of old names",
+    ("CHANGELOG.md", r"(?<!shear-)--thinning\b"): "the list of old names",
+    ("CHANGELOG.md", r"(?<!shear-)(?<!shear )\bthinning\b"): "the list of old names",
+    ("src/vstent/io/archive.py", r"\bnouns?\b"): "a key of the files",
+    ("src/vstent/reporting/page.py", r"(?<!shear-)(?<!shear )\bthinning\b"): "a key of run.json",
     (
         "src/vstent/cli/options.py",
         r"--(cell-size|close-up|device-gpu|uncertain-flows|crate)\b",
@@ -58,7 +63,7 @@ def spoken(path: Path) -> list[tuple[int, str]]:
     kinds = {tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
     return [
-        (token.start[0] + k, line)
+        (token.start[0] + k, re.sub(r"\{[^{}]*\}", "", line))
         for token in tokens
         if token.type in kinds
         for k, line in enumerate(token.string.splitlines())

@@ -23,7 +23,7 @@ SLIT_ROUNDNESS: Final = 0.4
 LONGEST_PATCHED: Final = 120
 """Holes of more vertices are closed by a fan: the better patch costs the cube of their number."""
 NOTABLE_OF_AREA: Final = 0.02
-"""Components dropped are told one by one from this fraction of the area on."""
+"""Removed pieces larger than this fraction of the area are reported one by one."""
 
 
 def repair(surface: Surface, *, at_mm: Floats | None = None) -> tuple[Surface, tuple[str, ...]]:

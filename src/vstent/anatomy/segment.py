@@ -24,7 +24,7 @@ NOTABLE_PIECE: Final = 0.02
 """Pieces with less than this fraction of the voxels of the largest about the point given are not taken for the vessel
 there."""
 BAND: Final = 0.05
-"""The threshold is told to be known to within this fraction of the step from tissue to lumen."""
+"""Assumed uncertainty of the threshold, as a fraction of the step from tissue to lumen."""
 FARTHEST_MM: Final = 5.0
 """How far from the point given the lumen may be."""
 AROUND_MM: Final = 15.0

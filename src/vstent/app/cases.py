@@ -46,7 +46,7 @@ class State(BaseModel):
     name: str
     revision: int = 0
     input: str = ""
-    """Path of the scan or surface: inside the case folder, or elsewhere on this machine if it was given to the command."""
+    """Path of the scan or surface: inside the case folder, or elsewhere if it was given to the command."""
     source: str = ""
     """SHA-256 of the input."""
     former: dict[str, Any] = Field(default_factory=dict)

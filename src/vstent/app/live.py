@@ -73,7 +73,7 @@ OPENING_COLOURS: Final = (
 
 
 class Live:
-    """The nouns of one case, loaded and computed when they are asked for, and remembered."""
+    """Data of one case, loaded and computed on demand, and cached."""
 
     def __init__(self, case: Case) -> None:
         self.case = case

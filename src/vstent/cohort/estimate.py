@@ -27,7 +27,7 @@ SCAN_TRIANGLES: Final = 60_000
 CPU_S_PER_DEVICE: Final = 1.0
 """Deployed, measured, its wires made solid."""
 FLOW_CELLS: Final = 200_000
-"""Of a vessel trimmed, with cells of 0.17 mm."""
+"""Measured on a trimmed vessel with a grid spacing of 0.17 mm."""
 CPU_S_PER_1000_CELLS: Final = 0.6
 """Steady, from rest: the demo's flows take about 130 s of CPU each."""
 MB_PER_1000_CELLS: Final = 1.0

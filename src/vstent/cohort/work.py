@@ -88,7 +88,7 @@ def work(task: Task) -> None:
 
 
 def _rows(task: Task) -> dict[str, Row]:
-    """Do the artery once, then every device in it; what cannot be done is told in the row."""
+    """Return the rows of a case: the artery is restored once, then every device deployed; failures are rows too."""
     case, study = task.case, task.folder / "study"
     devices = case.settings.devices
     failed = _failure(task, lambda watch: restore_vessel(case.path, study, case.settings, watch, replaces=True))
@@ -116,7 +116,7 @@ def _failure(task: Task, do: Callable[[Progress], object]) -> Row:
         do(watch)
     except VstentError as error:
         return {"outcome": FAILED, "stage": watch.stage, "sentence": str(error)}
-    except Exception as error:  # noqa: BLE001 one case's fault must not end the cohort; it is told in its row
+    except Exception as error:  # noqa: BLE001 one failed case must not end the cohort; its row states the error
         write_text(task.folder / "traceback.txt", traceback.format_exc())
         sentence = f"unexpected error, {type(error).__name__}: {error}. Please report it with traceback.txt."
         return {"outcome": FAILED, "stage": watch.stage, "sentence": sentence}

@@ -120,7 +120,7 @@ def _remedy_of_reach(anatomy: Anatomy, stent: Stent, beyond_mm: Floats, move: st
 
 
 def _remedy(anatomy: Anatomy, stent: Stent, gap_mm: Floats, is_loose: Bools) -> str:
-    """Why nodes stand off the wall by `gap_mm` (rows, columns), and what to do."""
+    """Return why nodes have gaps `gap_mm` (rows, columns) to the wall, and what to do."""
     free_mm = stent.size.free_diameter_mm
     could_open = stent.row_diameter_mm + 2 * gap_mm.mean(axis=1) < free_mm
     if isinstance(stent.design, LaserCut) and is_loose[could_open].sum() > 0.5 * is_loose.sum():

@@ -1,4 +1,4 @@
-"""The device's nouns once it is in an artery: Landing, Stent, Deployment."""
+"""A device in an artery: the data classes `Landing`, `Stent` and `Deployment`."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""The artery's nouns: Opening, Centerline, Vessel, Aneurysm, Anatomy."""
+"""The artery: the data classes `Opening`, `Centerline`, `Vessel`, `Aneurysm` and `Anatomy`."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -119,7 +119,7 @@ class Criteria:
     """What a ranking goes by."""
 
     items: tuple[Criterion, ...]
-    """In the order in which they are told."""
+    """Criteria in the order of the report."""
 
     def of(self, design: Design) -> tuple[Criterion, ...]:
         """Return those that concern a device."""

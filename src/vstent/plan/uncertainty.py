@@ -87,7 +87,7 @@ class Ranges:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What came of varying."""
+    """Result of an uncertainty study."""
 
     ranges: Floats
     """(4,) plus and minus of every cause, in the order of `CAUSES`: mm, mm, mm, fraction."""

@@ -18,7 +18,7 @@ from vstent.io.images import files_of
 from vstent.io.writers import write_json
 from vstent.study.types import Progress, Settings
 
-Noun = TypeVar("Noun")
+Kept = TypeVar("Kept")
 ANATOMY: Final = "anatomy"
 """Name under which an anatomy is stored."""
 
@@ -52,7 +52,7 @@ class Ledger:
 
         return tell
 
-    def recall(self, name: str, key: str, noun_type: type[Noun]) -> Noun | None:
+    def recall(self, name: str, key: str, kind: type[Kept]) -> Kept | None:
         """Return the result stored under a key, with the seconds it took; None where it is missing or damaged."""
         path = self.folder / f"{name}-{key}.npz"
         self._before[name] = set(self.seconds)
@@ -60,16 +60,16 @@ class Ledger:
             return None
         self.progress(name, 0.0, "")
         try:
-            noun = load_data(path, noun_type)
+            result = load_data(path, kind)
         except ReadError:
             return None
         self.seconds |= _seconds_of(path)
         self.progress(name, 1.0, "already done")
-        return noun
+        return result
 
-    def hold(self, name: str, key: str, noun: Any) -> None:
+    def hold(self, name: str, key: str, result: Any) -> None:
         """Hold a result until `settle` is called, because a later input may still be unusable."""
-        self._held.append((name, key, noun, self._seconds_since(name)))
+        self._held.append((name, key, result, self._seconds_since(name)))
 
     def is_held(self, name: str) -> bool:
         """Return whether a result of this name is held and not stored yet."""
@@ -81,21 +81,21 @@ class Ledger:
             self._write(*held)
         self._held.clear()
 
-    def keep(self, name: str, key: str, noun: Any) -> None:
+    def keep(self, name: str, key: str, result: Any) -> None:
         """Store a result under a key; an older one of the same name is dropped."""
-        self._write(name, key, noun, self._seconds_since(name))
+        self._write(name, key, result, self._seconds_since(name))
 
     def _seconds_since(self, name: str) -> dict[str, float]:
         """Return the seconds of every stage since a result was looked up."""
         return {stage: took for stage, took in self.seconds.items() if stage not in self._before.get(name, ())}
 
-    def _write(self, name: str, key: str, noun: Any, seconds: dict[str, float]) -> None:
+    def _write(self, name: str, key: str, result: Any, seconds: dict[str, float]) -> None:
         path = self.folder / f"{name}-{key}.npz"
         self.folder.mkdir(parents=True, exist_ok=True)
         told = path.with_suffix(".json")
         stale = set(self.folder.glob(f"{name}-*")) - {path, told}
         write_json(told, seconds, is_exact=True)
-        save_data(path, noun)
+        save_data(path, result)
         for old in stale:
             old.unlink()
 

@@ -82,7 +82,7 @@ def write_anatomy(out: Path, anatomy: Anatomy) -> None:
     writers.write_surface(out / "landing_surface.vtp", anatomy.landing_surface, restored)
     written = set()
     for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
-        sac, neck = (f"{noun}.vtp" if number == 1 else f"{noun}_{number}.vtp" for noun in ("sac", "neck"))
+        sac, neck = (f"{part}.vtp" if number == 1 else f"{part}_{number}.vtp" for part in ("sac", "neck"))
         writers.write_surface(out / sac, aneurysm.sac)
         closed = np.concatenate([aneurysm.neck_mm, aneurysm.neck_mm[:1]])
         writers.write_lines(out / neck, closed, np.array([0, len(closed)], dtype=np.int32))

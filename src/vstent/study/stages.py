@@ -261,7 +261,7 @@ def compute_flows(
 
 
 def flow_key(source: str, settings: Settings, name: str, design: Design | None) -> str:
-    """Key of one flow of an input: ``bare``, or behind a device of this design."""
+    """Return the key of one flow of an input: ``bare``, or with a device of this design."""
     placed = (design, settings.placing(name)) if design else ()
     return key_of(anatomy_key(source, settings), settings.flow, name, *placed)
 
@@ -295,7 +295,7 @@ def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings,
 def vary_all(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
 ) -> dict[str, dict[str, Any]]:
-    """Vary what is not sure about every deployment; return the metrics of each, none where it was not asked for."""
+    """Vary the uncertain inputs of every deployment; return the metrics of each, none where this is off."""
     if settings.uncertainty is None:
         return {}
     flow = settings.flow if settings.uncertainty.flow_samples else None

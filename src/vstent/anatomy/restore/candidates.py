@@ -26,7 +26,7 @@ FUNNEL_MM: Final = 3.0
 BLEB: Final = 0.4
 """A sac whose sphere of the same volume is smaller than this fraction of the artery's diameter is a bleb."""
 FEWEST_VOXELS: Final = 4.0
-"""A sac fewer voxels across than this cannot be told from noise and blur."""
+"""Fewest voxels across a sac that can be distinguished from noise and blur."""
 
 
 def classified(vessel: Vessel, aneurysm: Aneurysm, artery_diameter_mm: float) -> Candidate:

@@ -1,4 +1,4 @@
-"""What is told of an anatomy: one sentence on everything that was found, assumed, or would be taken for a mistake."""
+"""Notes on an anatomy: one sentence on every finding and assumption, and on everything that may look like an error."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -14,15 +14,15 @@ from vstent.kernels import curves
 from vstent.units import counted, place
 
 FUSIFORM: Final = 1.5
-"""An artery that is wider by this factor than at both its ends is told..."""
+"""An artery wider by this factor than at both its ends is reported as fusiform."""
 END_MM: Final = 2.0
-"""... which are as wide as they are over this length."""
+"""Length over which the width of an end is measured, in mm."""
 NEAR_SAC_MM: Final = 4.0
-"""An opening so near to a sac's wall is told."""
+"""Distance between an opening and the wall of a sac below which it is reported, in mm."""
 STENOSED: Final = 0.7
-"""An artery narrower by this factor beside a neck than beyond that and across the neck is told..."""
+"""Ratio of the width beside a neck to the widths beyond and across it, below which a stenosis is reported."""
 STENOSED_REACH: Final = 2.0
-"""... where that is within this many diameters of the neck."""
+"""Largest distance of a reported stenosis from the neck, in diameters."""
 
 
 def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
@@ -100,7 +100,7 @@ def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
 def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
     """Sentences where the artery along a centerline narrows beside a neck, and is wide again beyond and across it.
 
-    How wide the artery is under a neck is told by how wide it is beside it: little is, where it is stenosed there.
+    The width of the artery under a neck is estimated from its width beside it, which a stenosis makes too small.
     """
     abscissa, radius = line.abscissa_mm, line.inscribed_radius_mm
     at_neck = curves.project(line.points_mm, aneurysm.neck_mm)[0]
@@ -141,7 +141,7 @@ def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
 
 
 def _from_sacs(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
-    """Sentences on the branches that leave from a sac: their blood goes on passing through it behind a device."""
+    """Return sentences on branches that arise from a sac: their blood flows through it with any device."""
     branches = [one for k, one in enumerate(zip(vessel.far_ends, vessel.centerlines, strict=True)) if k != path]
     return tuple(_through_sac(opening) for opening, line in branches if any(_leaves(line, one) for one in aneurysms))
 

@@ -34,9 +34,9 @@ GPU_BYTES_PER_CELL = 320
 BYTES_AT_LEAST = 4.5e8
 """Memory of the program itself, its compiled kernels and one surface."""
 WHOLE_OVER_BLOCK = 3.5
-"""Time of a flow over that of its steps in a block of blood, which a cache holds: walls, openings, checks, the first
-guess, and memory (the demo in cells of 0.14 mm, with Silk: 123 million updates a second, the block 440; 3.4 for C0038
-in 0.2 mm, 4.8 for a small bifurcation)."""
+"""Ratio of the run time of a flow to that of its steps in a block of blood that fits the cache. The rest is walls,
+openings, checks, the first guess and memory. Measured: demo with Silk at 0.14 mm, 123 million updates per second
+against 440 in the block; 3.4 for C0038 at 0.2 mm, 4.8 for a small bifurcation."""
 BLOCK_ROWS = 4095
 """Rows of the block that the rate is measured on, an odd number (see `setup.address`)."""
 BLOCK_BAND = 15

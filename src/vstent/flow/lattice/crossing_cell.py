@@ -23,7 +23,7 @@ VISCOSITY = (RELAXATION_STEPS - 0.5) / 3
 DEFER_PAIRS, DEFER_PART = 4, 0.3
 """Step pairs between updates of the quadratic reflection, and the part of the way that each goes."""
 CHECK_PAIRS = 50
-"""Step pairs between looks at whether the flow has settled."""
+"""Step pairs between checks of convergence."""
 SETTLED = 3e-4
 """Change of the mean velocity between looks at which it has."""
 MAX_CHECKS = 600

@@ -25,7 +25,7 @@ from vstent.units import M_PER_MM
 CHECK_DIAMETERS = 0.5
 """Flow time between checks, in inlet diameters over mean inlet speed."""
 LEAST_CHECKS = 24
-"""The limit of time steps leaves room for at least this many checks: fewer cannot tell whether the flow has settled."""
+"""Fewest checks within the limit of time steps: fewer cannot show convergence."""
 
 INFLOW_WEIGHT: Final = 3
 """What the flow through an inlet has left to go, which is known, counts so many times as much as what is foretold."""
@@ -111,7 +111,7 @@ class LatticeBoltzmann(AbstractLattice):
         return max(4, int(steps // state.steps_per_check))
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
-        """Return the last check of a flow that has settled, or the mean of what it swings about."""
+        """Return the last check of a converged flow, or the time average of an unsteady one."""
         left = _left(state)
         if left < state.case.settings.tolerance:
             return field_of(state, read(state, [state.snapshots[-1]]), outcome, left, "The flow has converged.")
@@ -143,7 +143,7 @@ def _mean(state: State) -> Mean:
 
 
 def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, str]:
-    """How uncertain the means of a flow that has not settled are, as a fraction of them, and that in words."""
+    """Return the statistical uncertainty of the means of an unconverged flow, as a fraction and in words."""
     swing, moved = swings(np.array(state.history), mean.checks)
     means = (
         f"averages over the last {1e3 * mean.checks * state.check_s:.0f} ms, in which the monitored quantities "

@@ -14,7 +14,7 @@ ELSE: Final = "or compute on the processor (without --gpu)"
 
 
 def require_gpu() -> None:
-    """See that there is a GPU and what it takes to use it.
+    """Check that there is a usable GPU.
 
     Raises
     ------
