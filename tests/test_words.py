@@ -50,7 +50,6 @@ EXCEPTIONS = {
     ): "the table of old names",
     ("src/vstent/cli/options.py", r"(?<!shear-)--thinning\b"): "the table of old names",
     ("src/vstent/cli/options.py", r"(?<!shear-)(?<!shear )\bthinning\b"): "the table of old names",
-    ("src/vstent/reporting/thinning.py", r"(?<!shear-)(?<!shear )\bthinning\b"): "fewer triangles of a mesh",
 }
 """File and expression -> why it may stand there."""
 

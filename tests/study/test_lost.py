@@ -4,15 +4,21 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from vstent import phantoms
+from vstent.devices.catalogue import find_design
 from vstent.errors import FlowError, InputError, LandingError
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.geometry.surface import Surface
+from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
+from vstent.plan.rank import rank
 from vstent.plan.uncertainty import Ranges
 from vstent.study import stages
 from vstent.study.ledger import anatomy_key, key_of
+from vstent.study.outputs import write_ranking
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
 from vstent.study.types import Placing, Settings
 
@@ -177,3 +183,24 @@ def test_a_flow_that_diverges_is_a_row_with_its_reason(
 def test_keys_are_those_of_version_0_1_where_newer_settings_are_not_used() -> None:
     assert anatomy_key("source", replace(PLAIN, without_flow=("silk",))) == anatomy_key("source", PLAIN)
     assert key_of(Settings()) != key_of(Settings(without_flow=("silk",)))
+
+
+def test_a_ranking_of_another_device_keeps_the_rows_of_the_former_one(
+    arteries: tuple[Path, Path], tmp_path: Path
+) -> None:
+    anatomy, _ = restore_vessel(arteries[0], tmp_path / "out", PLAIN, quiet)
+    designs = [replace(find_design(name), sizes=find_design(name).sizes[:3]) for name in ("silk", "leo")]
+    for design in designs:
+        write_ranking(tmp_path / "out", rank(anatomy, [design]))
+    write_ranking(tmp_path, rank(anatomy, designs))
+    assert (tmp_path / "out" / "ranking.csv").read_text() == (tmp_path / "ranking.csv").read_text()
+
+
+def test_a_point_in_another_frame_is_recognized(arteries: tuple[Path, Path], tmp_path: Path) -> None:
+    surface, _ = read_surface(arteries[0], units="mm")
+    moved = tmp_path / "moved.stl"
+    write_stl(moved, Surface(surface.vertices_mm + np.array([40.0, 25.0, 0.0]), surface.faces))
+    anatomy, _ = restore_vessel(moved, tmp_path / "out", PLAIN, quiet)
+    x, y, z = anatomy.aneurysms[0].sac.vertices_mm.mean(axis=0).tolist()
+    with pytest.raises(InputError, match=rf"Did you mean {x:.1f},{y:.1f},{z:.1f} \(the point given is RAS\)\?"):
+        restore_vessel(moved, tmp_path / "other", replace(PLAIN, at_mm=(-x, -y, z)), quiet)

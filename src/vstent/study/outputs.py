@@ -1,5 +1,6 @@
 """Write and remove the files of a case folder."""
 
+import json
 import shutil
 from collections.abc import Collection, Iterable
 from contextlib import suppress
@@ -124,8 +125,33 @@ def write_field(folder: Path, field: FlowField) -> None:
 
 
 def write_ranking(out: Path, ranking: Ranking) -> None:
-    """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``."""
-    rows = ranking.rows()
-    write_rows(out / "ranking.csv", rows)
+    """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``.
+
+    Rows of other devices that a former ranking by the same criteria has are kept.
+    """
     criteria = [item.model_dump(exclude_none=True) for item in ranking.criteria.items]
+    rows = _ranked([*ranking.rows(), *_former_rows(out / "ranking.json", ranking, criteria)])
+    write_rows(out / "ranking.csv", rows)
     writers.write_json(out / "ranking.json", {"criteria": criteria, "candidates": rows, "research_use_only": True})
+
+
+def _ranked(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows of a ranking in order: suitable ones by their score, then the rest, numbered anew."""
+    size = ("device", "label_diameter_mm", "label_length_mm")
+
+    def place(row: dict[str, Any]) -> tuple[Any, ...]:
+        return not row["is_suitable"], -row["score"], *(row[key] for key in size), abs(row["shift_mm"])
+
+    return [row | {"rank": number} for number, row in enumerate(sorted(rows, key=place), start=1)]
+
+
+def _former_rows(path: Path, ranking: Ranking, criteria: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of a former ranking by the same criteria whose devices the new one does not have."""
+    try:
+        former = json.loads(path.read_text(encoding="utf-8"))
+        if former["criteria"] != json.loads(json.dumps(criteria)):
+            return []
+        devices = {candidate.design.key for candidate in ranking.candidates}
+        return [dict(row) for row in former["candidates"] if row["device"] not in devices]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []

@@ -31,11 +31,11 @@ from vstent.kernels.directions import VELOCITIES
 WIDTH = 2
 """Ratio of the grid spacing elsewhere to that in the refined region."""
 UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 3.0, 1.0
-"""Extent of the refined region from the sac towards the inlet and towards the outlets, in mean diameters 4 V / A of the
-vessel. The flow into the sac forms upstream: with one diameter the demo's neck inflow is 9 % too low, with two 2.4 %."""
+"""Extent of the refined region from the sac towards the inlet and the outlets, in mean diameters 4 V / A of the vessel.
+The flow into the sac forms upstream: with one diameter the demo's neck inflow is 9 % too low, with two 2.4 %."""
 STRETCH = 4 / 3
-"""Ratio of the time step of a steady flow in the refined region to that in a whole vessel, where it would be too long (a
-fork lost 0.3 % of its blood). The flow through the ends of the region is imposed. The means of C0038's sac and neck,
+"""Ratio of the time step of a steady flow in the refined region to that in a whole vessel, where it would be too long
+(a fork lost 0.3 % of its blood). The flow through the ends of the region is imposed. The means of C0038's sac and neck,
 bare and with Silk and Enterprise, change by at most 0.4 % with shorter steps, the demo's by 0.5 %. In a pulse the ratio
 is 1: with longer steps C0038 diverged at 0.2 mm."""
 SHARE_WITHIN = 1 / 6
