@@ -181,9 +181,9 @@ def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path,
     listed = tmp_path / "cohort.csv"
     listed.write_text(f"case,input,devices,at\nfirst,{scans / 'a.stl'},silk,\nlast,{scans / 'b.stl'},,\n")
     command = ["batch", str(listed), "--out", str(out), "--no-flow", "--units", "mm", "--device", "enterprise"]
-    assert main([*command, "--jobs", "2", "--files"]) == 0
+    assert main([*command, "--jobs", "2", "--keep-files"]) == 0
     said = capsys.readouterr()
-    assert "2 cases, 2 rows; 2 cases to do: about 1 min" in said.out
+    assert "2 cases, 2 table rows; 2 cases to run: run time about 1 min" in said.out
     with (out / "cohort.csv").open(newline="") as file:
         first, last = csv.DictReader(file)
     assert (first["case"], first["device"], first["outcome"]) == ("first", "silk", "done")
@@ -196,7 +196,7 @@ def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path,
     page = (out / "cohort.html").read_text()
     assert last["sentence"] in page.replace("&#39;", "'")
     assert main([*command, "--jobs", "2"]) == 0
-    assert "0 cases to do" in capsys.readouterr().out
+    assert "0 cases to run" in capsys.readouterr().out
 
 
 def test_parquet_holds_what_the_rows_hold(table, tmp_path):
@@ -207,21 +207,27 @@ def test_parquet_holds_what_the_rows_hold(table, tmp_path):
 
 
 BAD_LISTS = {
-    "an unknown column": ("input,sac\na.stl,1\n", "column 'sac'"),
+    "an unknown column": ("input,sac\na.stl,1\n", "unknown column 'sac'"),
     "no input": ("case\nfirst\n", "names no input"),
     "a point of two numbers": ("input,at\na.stl,1 2\n", "three numbers"),
-    "a threshold in words": ("input,threshold\na.stl,high\n", "threshold is 'high'"),
+    "a threshold in words": ("input,threshold\na.stl,high\n", "the value 'high' of threshold"),
     "a threshold that is no number": ("input,threshold\na.stl,500\na.stl,nan\n", "line 3 of"),
-    "an endless size": ("input,diameter\na.stl,inf\n", "diameter is 'inf', which cannot be used: a finite number"),
-    "a point that is nowhere": ("input,at\na.stl,1 nan 3\n", "at is '1 nan 3', which cannot be used: a finite"),
-    "a size below zero": ("input,length\na.stl,-4\n", "length is '-4', which cannot be used: it must be above zero"),
-    "half an inlet": ("input,inlet\na.stl,1 2 3; 4\n", "inlet is '1 2 3; 4', which cannot be used: three numbers"),
-    "voxels without an edge": ("input,spacing\na.raw,0.1 0 1\n", "spacing is '0.1 0 1', which cannot be used: it must"),
-    "no voxels": ("input,shape\na.raw,10 0 10\n", "shape is '10 0 10', which cannot be used: it must"),
-    "a unit of fields": ("input,units\na.stl,furlong\n", "units is 'furlong', which cannot be used: give one of m, cm"),
+    "an endless size": ("input,diameter\na.stl,inf\n", "the value 'inf' of diameter cannot be used: a finite number"),
+    "a point that is nowhere": ("input,at\na.stl,1 nan 3\n", "the value '1 nan 3' of at cannot be used: a finite"),
+    "a size below zero": ("input,length\na.stl,-4\n", "the value '-4' of length cannot be used: it must be above zero"),
+    "half an inlet": ("input,inlet\na.stl,1 2 3; 4\n", "the value '1 2 3; 4' of inlet cannot be used: three numbers"),
+    "voxels without an edge": (
+        "input,spacing\na.raw,0.1 0 1\n",
+        "the value '0.1 0 1' of spacing cannot be used: it must",
+    ),
+    "no voxels": ("input,shape\na.raw,10 0 10\n", "the value '10 0 10' of shape cannot be used: it must"),
+    "a unit of fields": (
+        "input,units\na.stl,furlong\n",
+        "the value 'furlong' of units cannot be used: give one of m, cm",
+    ),
     "a name with a slash": ("case,input\n../up,a.stl\n", "without slashes"),
-    "one name twice": ("case,input\nx,a.stl\nx,b.stl\n", "two cases called x"),
-    "no case at all": ("case,input\n", "holds no case"),
+    "one name twice": ("case,input\nx,a.stl\nx,b.stl\n", "two cases named x"),
+    "no case at all": ("case,input\n", "contains no case"),
     "a device that does not exist": ("input,devices\na.stl,slik\n", "silk"),
 }
 
@@ -301,7 +307,7 @@ def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_k
             for name in "bc":
                 row_path(tmp_path / "cases" / name, device).unlink()
         tasks = left_to_do(cases, tmp_path)
-        with pytest.raises(VstentError, match="scheduler is lost"):
+        with pytest.raises(VstentError, match="connection to the Dask scheduler is lost"):
             run_cohort(tasks, tmp_path, DaskCluster(scheduler.address, held), lambda *_: scheduler.process.kill())
     assert [task.case.name for task in left_to_do(cases, tmp_path)] == ["c"]
     run_cohort(left_to_do(cases, tmp_path), tmp_path, Processes(1), told)

@@ -314,7 +314,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inlets")
     write_stl(folder / "y.stl", wall(sac_at_mm=5.0))
     inlets = [f"--inlet={','.join(map(str, end_mm))}" for end_mm in at_ends(RIGHT, LEFT)]
-    words = ["--units", "mm", "--device", "silk", "--cell-size", "0.4", "--flow-rate", "3", *inlets]
+    words = ["--units", "mm", "--device", "silk", "--grid-spacing", "0.4", "--flow-rate", "3", *inlets]
     assert main(["run", str(folder / "y.stl"), "--out", str(folder / "first"), *words]) == 0
     return folder / "first"
 

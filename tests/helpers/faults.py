@@ -300,7 +300,7 @@ def named(folder: Path) -> list[str]:
 def on_gpu(folder: Path) -> list[str]:
     """Compute the artery's flow on a GPU."""
     write_stl(folder / "artery.stl", artery())
-    return ["flow", str(folder / "artery.stl"), "--out", "OUT", "--device-gpu"]
+    return ["flow", str(folder / "artery.stl"), "--out", "OUT", "--gpu"]
 
 
 def into_a_file(folder: Path) -> list[str]:
@@ -624,7 +624,7 @@ FAULTS: tuple[Fault, ...] = (
         little_memory,
     ),
     Fault(OPTION, "threshold that is no number", run("--threshold", "nan"), INPUT, "not finite"),
-    Fault(OPTION, "cells of no size", run("--cell-size", "0"), INPUT, "not above zero"),
+    Fault(OPTION, "cells of no size", run("--grid-spacing", "0"), INPUT, "not above zero"),
     Fault(OPTION, "inflow below zero", run("--flow-rate", "-3"), INPUT, "not above zero"),
     Fault(OPTION, "point of two numbers", run("--at", "1,2"), INPUT, "2 numbers, not 3"),
     Fault(OPTION, "an inlet given twice", run("--inlet", "0,0,0", "--inlet", "0,1,0"), INPUT, "the same opening"),
@@ -653,10 +653,10 @@ FAULTS: tuple[Fault, ...] = (
     Fault(DEVICE, "brackets 100 000 deep", toml("a = " + "[" * 100_000), INPUT, "mine.toml", own_catalogue),
     Fault(MACHINE, "blanks, umlauts, quotes in paths", named, DONE, ""),
     Fault(MACHINE, "link that leads to itself", linked, INPUT, "does not exist"),
-    Fault(MACHINE, "case folder below a file", into_a_file, FAILED, "give another --out"),
+    Fault(MACHINE, "case folder below a file", into_a_file, FAILED, "choose another folder (--out)"),
     Fault(MACHINE, "case folder that another run works in", run(), FAILED, "is in use by process", claimed),
     Fault(MACHINE, "GPU asked for where there is none", on_gpu, FAILED, "without --device-gpu", no_gpu),
-    Fault(MACHINE, "disk full", run(), FAILED, "make room", full_disk),
+    Fault(MACHINE, "disk full", run(), FAILED, "free some disk space", full_disk),
     Fault(MACHINE, "kept stages that unpack to 16 GB", bombed_cache, DONE, "", is_heavy=True),
 )
 

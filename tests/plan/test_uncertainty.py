@@ -157,10 +157,10 @@ def test_a_threshold_that_would_close_the_artery_is_refused():
     ("words", "said"),
     [
         (["--uncertainty", "1"], "at least 2"),
-        (["--uncertainty", "8", "--uncertain-flows", "-1"], "0 flows"),
+        (["--uncertainty", "8", "--uncertainty-flows", "-1"], "0 flows"),
         (["--uncertainty", "8", "--vary", "landing=nan"], "landing_mm"),
         (["--vary", "landing=2"], "--uncertainty N"),
-        (["--uncertain-flows", "2"], "--uncertainty N"),
+        (["--uncertainty-flows", "2"], "--uncertainty N"),
     ],
 )
 def test_the_command_refuses_them_before_anything_is_read(words, said, tmp_path, capsys):
@@ -241,7 +241,7 @@ def test_a_study_tells_its_uncertainty_in_metrics_report_and_table_and_goes_on_f
     command += ["--no-flow", "--uncertainty", "8", "--vary", "threshold=0.2", "--vary", "landing=2"]
     assert main(command) == 0
     said = capsys.readouterr().out
-    assert "because of" in said
+    assert "causes" in said
     stent = json.loads((out / "metrics.json").read_text())["stents"]["enterprise"]
     assert stent["uncertainty"]["ranges"]["landing_mm"] == 2.0
     interval = stent["uncertainty"]["intervals"]["deployed_length_mm"]

@@ -10,12 +10,14 @@ import pytest
 from tubes import line, tube, with_neck
 
 from vstent import phantoms
+from vstent.app.jobs import SETTLING
 from vstent.cli import main
 from vstent.deployment.deploy import deploy, propose_size
 from vstent.devices.catalogue import find_design, find_size
 from vstent.devices.design import Size
 from vstent.errors import DeviceError, InputError, LandingError
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.engines import Progress
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.io.dicom_writer import write_dicom
@@ -23,7 +25,7 @@ from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_json, write_stl
 from vstent.study import stages
 from vstent.study.crate import write_crate
-from vstent.study.ledger import hash_of
+from vstent.study.ledger import Ledger, hash_of
 from vstent.study.outputs import write_anatomy
 from vstent.study.pipeline import restore_vessel, run
 from vstent.study.stages import deploy_one, engine_folders, size_of
@@ -289,12 +291,21 @@ def test_of_two_vessels_in_one_surface_the_one_at_the_point_given_is_taken(tmp_p
     assert stages._vessel(tmp_path / "both.stl", settings).lumen.vertices_mm[:, 0].min() > 27.0
 
 
+def test_the_page_reads_the_remaining_change_that_a_ledger_reports(tmp_path: Path) -> None:
+    said: list[str] = []
+    report = Ledger(tmp_path, lambda *words: said.append(words[2])).teller("flow bare")
+    report(Progress(0.5, 0.0234, 45.4))
+    report(Progress(0.0, float("nan"), 90.0))
+    assert said == ["remaining change 2.3%, 45 s left", "90 s left"]
+    assert SETTLING.search(said[0]).groups() == ("2.3", "45")
+
+
 def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     artery, out = tmp_path / "artery.stl", tmp_path / "out"
     write_stl(artery, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
-    command = ["run", str(artery), "--out", str(out), "--device", "silk", "--cell-size", "0.25"]
+    command = ["run", str(artery), "--out", str(out), "--device", "silk", "--grid-spacing", "0.25"]
     real, computed = stages.simulate_case, []
 
     def stopped_with_a_stent(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
@@ -306,7 +317,7 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
 
     monkeypatch.setattr(stages, "simulate_case", stopped_with_a_stent)
     assert main(command) == 130
-    assert "give the same command again" in capsys.readouterr().err
+    assert "run the same command again to continue" in capsys.readouterr().err
     assert (out / "flow" / "bare" / "field.vtu").stat().st_size > 100_000
     assert not (out / "metrics.json").exists()
     assert main(command) == 0
@@ -317,9 +328,9 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     assert ratios["neck_inflow_mL_s_ratio"] == pytest.approx(1.0)
     assert metrics["bare"]["neck_inflow_mL_s"] == pytest.approx(metrics["bare"]["neck_outflow_mL_s"], rel=0.1)
     report = (out / "report.html").read_text()
-    assert all(f"Flow, {name}: The flow has " in report for name in ("bare", "silk"))
+    assert all(f"Flow {name}: The flow has " in report for name in ("without a device", "with silk"))
     left = metrics["bare"]["unsettled_fraction"]
-    assert (left < 0.01) == ("Flow, bare: The flow has settled" in report)
+    assert (left < 0.01) == ("Flow without a device: The flow has settled" in report)
     assert metrics["stents"]["silk"]["flow"]["unsettled_fraction"] == left > 0
     assert not any("unsettled" in key for key in ratios)
     provenance = json.loads((out / "run.json").read_text())

@@ -30,7 +30,7 @@ def case(tmp_path_factory):
     artery = phantoms.with_sac(phantoms.tube(length_mm=24), abscissa_mm=12, width_mm=5.0, neck_mm=3.5)
     write_stl(folder / "ä scan.stl", phantoms.phantom_surface(artery, edge_mm=0.45))
     options = ["--units", "mm", "--device", "silk", "--at=0.1234567891,3,12", "--center", "12.000000123"]
-    flow = ["--cell-size", "0.333333333333", "--flow-rate", "2.7182818284590"]
+    flow = ["--grid-spacing", "0.333333333333", "--flow-rate", "2.7182818284590"]
     varied = ["--uncertainty", "2", "--vary", "landing=0.1"]
     command = ["run", str(folder / "ä scan.stl"), "--out", str(folder / "first"), *options, *flow, *varied]
     assert main(command) == 0
@@ -38,10 +38,10 @@ def case(tmp_path_factory):
 
 
 def test_a_repeated_run_is_the_same_to_the_last_bit(case, capsys):
-    assert main(["run", str(case / "first" / "run.json"), "--out", str(case / "again"), "--crate"]) == 0
+    assert main(["run", str(case / "first" / "run.json"), "--out", str(case / "again"), "--ro-crate"]) == 0
     said = capsys.readouterr()
-    assert "the same to the last bit" in said.out
-    assert "Not as then" not in said.err
+    assert "identical to the last bit" in said.out
+    assert "Differs from the original run" not in said.err
     assert "already done" not in said.err
     first, again = case / "first", case / "again"
     for name in ("metrics.json", "vessel.vtp", "stents/silk/wires.vtp", "flow/silk/wall.vtp", "flow/bare/field.vtu"):
@@ -109,15 +109,15 @@ def test_other_versions_and_devices_are_told(case):
 def test_what_is_no_record_is_refused_in_a_sentence(text, tmp_path, capsys):
     (tmp_path / "run.json").write_text(text)
     assert main(["run", str(tmp_path / "run.json"), "--out", str(tmp_path / "out")]) == 2
-    assert "no run.json of this version" in capsys.readouterr().err
+    assert "not a run.json that this version can read" in capsys.readouterr().err
 
 
 def test_a_record_takes_no_other_settings_nor_its_own_folder(case, capsys):
     record = str(case / "first" / "run.json")
     assert main(["run", record, "--out", str(case / "x"), "--threshold", "3"]) == 2
-    assert "give no option" in capsys.readouterr().err
+    assert "already contains all settings: give only --out" in capsys.readouterr().err
     assert main(["run", record, "--out", str(case / "first")]) == 2
-    assert "another --out" in capsys.readouterr().err
+    assert "give another folder for the repetition (--out)" in capsys.readouterr().err
 
 
 def test_settings_come_back_from_json_to_the_last_bit(tmp_path):
@@ -133,10 +133,16 @@ def test_settings_come_back_from_json_to_the_last_bit(tmp_path):
 @pytest.mark.parametrize(
     ("length_mm", "told"),
     [
-        (11.0, "1 of 2 metrics differ, stents.silk.b_mm most: by 0.091 of itself, more than the 0.001 that another"),
-        (10.005, "1 of 2 metrics differ, stents.silk.b_mm most: by 0.0005 of itself, within the 0.001 that another"),
-        (10.0 + 1e-12, "The metrics are the same but for rounding."),
-        (10.0, "The metrics are the same to the last bit."),
+        (
+            11.0,
+            "1 of 2 metrics differ. The largest relative difference is 0.091, of stents.silk.b_mm: more than the 0.001",
+        ),
+        (
+            10.005,
+            "1 of 2 metrics differ. The largest relative difference is 0.0005, of stents.silk.b_mm: within the 0.001",
+        ),
+        (10.0 + 1e-12, "The metrics are identical except for rounding."),
+        (10.0, "The metrics are identical to the last bit."),
     ],
 )
 def test_disagreement_is_told_by_its_worst(length_mm, told, tmp_path):
@@ -166,5 +172,5 @@ def test_a_machine_without_wide_and_fused_instructions_agrees_within_what_is_sta
 
 
 def test_an_unfinished_folder_is_no_crate(tmp_path):
-    with pytest.raises(Exception, match="holds no finished case"):
+    with pytest.raises(Exception, match="contains no finished case"):
         write_crate(tmp_path, {}, "2026-01-01")

@@ -40,7 +40,7 @@ STAGES: Final = {
     "report": "report",
 }
 """First word of a study's stage -> step of the page."""
-SETTLING: Final = re.compile(r"([\d.]+)% left to settle, (?:.*?)(\d+) s left")
+SETTLING: Final = re.compile(r"remaining change ([\d.]+)%, (?:.*?)(\d+) s left")
 """How a ledger tells of a flow (`vstent.study.ledger.Ledger.teller`)."""
 STOPPED: Final = "Stopped. What was finished is kept."
 LAST_WORDS: Final = ".worker.log"

@@ -1,4 +1,4 @@
-"""`vstent app`: the page in the browser."""
+"""`vstent app`: plan a stent on a page in the browser."""
 
 import argparse
 import importlib.util
@@ -14,31 +14,53 @@ if TYPE_CHECKING:
 
 
 LAST_PORT: Final = 65535
-"""Ports have 16 bits."""
+"""Highest TCP port (16 bits)."""
 
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "app", "plan a stent on a page in the browser")
-    parser.add_argument("input", type=Path, nargs="?", help="scan, surface or case folder (else drop one on the page)")
-    parser.add_argument("--cases", type=Path, default=Path("vstent-cases"), metavar="DIR", help="folder of the cases")
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
-    parser.add_argument("--port", type=_port, default=0, help="port to listen at (default: a free one)")
-    parser.add_argument("--no-browser", action="store_true", help="only print the page's address")
+    parser = options.add_command(
+        commands, "app", "Plan a stent on a page in the browser.", "vstent app scan.nii.gz --cases vstent-cases"
+    )
+    options.group(parser, options.INPUT).add_argument(
+        "input",
+        type=Path,
+        nargs="?",
+        help="scan, surface or case folder to open (default: none; drop a file on the page instead)",
+    )
+    options.group(parser, options.OUTPUT).add_argument(
+        "--cases",
+        type=Path,
+        default=Path("vstent-cases"),
+        metavar="DIR",
+        help="folder in which the page keeps its cases (default: vstent-cases)",
+    )
+    page = options.group(parser, options.PAGE)
+    page.add_argument(
+        "--host", default="127.0.0.1", help="network address to listen on (default: 127.0.0.1, this machine only)"
+    )
+    page.add_argument("--port", type=_port, default=0, help="port to listen on (default: a free one)")
+    page.add_argument(
+        "--no-browser", action="store_true", help="print the address of the page without opening it (default: open it)"
+    )
     parser.set_defaults(command=_app)
 
 
 def _port(text: str) -> int:
+    """Convert text to a port number."""
     if not text.isdecimal() or int(text) > LAST_PORT:
-        raise argparse.ArgumentTypeError(f"{text!r} is no port: give 0 to {LAST_PORT}")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port number: give 0 to {LAST_PORT}")
     return int(text)
 
 
 def _app(arguments: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C."""
     from vstent.errors import InputError
 
     if importlib.util.find_spec("fastapi") is None or importlib.util.find_spec("uvicorn") is None:
-        raise InputError("The page needs two more packages: run `pip install 'vstent[app]'`, then try again.")
+        raise InputError(
+            "The page needs the packages fastapi and uvicorn: run `pip install 'vstent[app]'`, then try again."
+        )
     import uvicorn
 
     from vstent.app.server import create, new_token
@@ -51,7 +73,7 @@ def _app(arguments: argparse.Namespace) -> int:
     guard = create(desk, token=token, hosts=hosts)
     url = f"http://{arguments.host}:{port}/?token={token}"
     config = uvicorn.Config(guard, log_level="warning", timeout_graceful_shutdown=1, access_log=False)
-    print(f"vstent is at  {url}\nStop it with Ctrl-C. Research use only.", flush=True)
+    print(f"The page is at  {url}\nStop it with Ctrl-C. Research use only.", flush=True)
     if not arguments.no_browser:
         webbrowser.open(url)
     uvicorn.Server(config).run(sockets=[listener])
@@ -59,7 +81,7 @@ def _app(arguments: argparse.Namespace) -> int:
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """Listen from now on, so that the address printed answers; the server takes over what has come in."""
+    """Return a listening socket; the printed address accepts connections before the server has started."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     listener.bind((host, port))
@@ -68,7 +90,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def open_desk(given: Path | None, workspace: Path) -> "Desk":
-    """Return a desk with what was given at the shell on it, if anything was."""
+    """Return the state of the page for the cases in `workspace`, with the input `given` opened where there is one."""
     from vstent.app.cases import Store
     from vstent.app.desk import Desk
 

@@ -1,4 +1,4 @@
-"""`vstent batch`: a folder or a CSV file of cases, with every device, into one table."""
+"""`vstent batch`: run many cases with several devices and collect the results in one table."""
 
 import argparse
 from collections.abc import Sequence
@@ -14,21 +14,48 @@ if TYPE_CHECKING:
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "batch", "many cases x devices -> one table, with a report of the cohort")
-    parser.add_argument("cohort", type=Path, help="folder of scans or surfaces, or CSV file with a column `input`")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, or to go on with")
-    options.add_outlet(options.add_given(parser))
+    parser = options.add_command(
+        commands,
+        "batch",
+        "Run many cases with several devices; write one table and a cohort report.",
+        "vstent batch scans/ --out cohort --device silk --device enterprise --no-flow --jobs 2",
+    )
+    options.group(parser, options.INPUT).add_argument(
+        "cohort", type=Path, help="folder of scans or surfaces, or a CSV file with the paths in the column `input`"
+    )
+    written = options.group(parser, options.OUTPUT)
+    written.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder to write; finished cases in it are reused (required)",
+    )
+    written.add_argument(
+        "--keep-files",
+        action="store_true",
+        help="keep the case folder of every case, as `vstent run` writes it (default: keep the table only)",
+    )
+    options.add_given(parser)
+    options.add_outlet(parser)
     run.add_study(parser)
-    working = parser.add_argument_group("working")
-    options.add_jobs(working)
-    crew = working.add_mutually_exclusive_group()
-    crew.add_argument("--scheduler", metavar="ADDRESS", help="let the workers of this Dask scheduler do it")
-    crew.add_argument("--slurm", action="store_true", help="let --jobs jobs of a Slurm queue do it (dask-jobqueue)")
-    working.add_argument("--files", action="store_true", help="keep all that `vstent run` writes of every case")
+    options.add_jobs(parser)
+    crew = options.group(parser, options.PARALLEL).add_mutually_exclusive_group()
+    crew.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="run on the workers of this Dask scheduler, such as tcp://head:8786 (default: on this machine)",
+    )
+    crew.add_argument(
+        "--slurm",
+        action="store_true",
+        help="run as --jobs jobs of a Slurm queue; needs dask-jobqueue (default: on this machine)",
+    )
     parser.set_defaults(command=_batch)
 
 
 def _batch(arguments: argparse.Namespace) -> int:
+    """Run the cases that are not finished, then write and print the table of all."""
     from vstent.cli.console import Console, cohort_table
     from vstent.cohort.batch import collect, left_to_do, run_cohort, write_table
     from vstent.cohort.cases import device_rows, find_cases
@@ -37,9 +64,11 @@ def _batch(arguments: argparse.Namespace) -> int:
     console = Console()
     settings = run.given_study(arguments, **options.given_geometry(arguments))
     cases = find_cases(arguments.cohort, settings)
-    tasks = left_to_do(cases, arguments.out, keeps_files=arguments.files)
+    tasks = left_to_do(cases, arguments.out, keeps_files=arguments.keep_files)
     foreseen = estimate([task.case for task in tasks], arguments.jobs)
-    console.print(f"{len(cases)} cases, {device_rows(cases)} rows; {len(tasks)} cases to do: {foreseen.sentence}.")
+    console.print(
+        f"{len(cases)} cases, {device_rows(cases)} table rows; {len(tasks)} cases to run: {foreseen.sentence}."
+    )
     with console.live():
         run_cohort(tasks, arguments.out, _crew(arguments, foreseen), _teller(console))
     rows = collect(cases, arguments.out)
@@ -48,12 +77,13 @@ def _batch(arguments: argparse.Namespace) -> int:
     console.print(cohort_table(rows))
     console.print(f"Results in {', '.join(str(path) for path in [*written, arguments.out / 'cohort.html'])}.")
     if len(written) == 1:
-        console.say("No Parquet file: it needs pyarrow, pip install 'vstent[parquet]'.")
+        console.say("No Parquet file was written: it needs pyarrow (pip install 'vstent[parquet]').")
     console.print("Research use only.")
     return 0
 
 
 def _crew(arguments: argparse.Namespace, foreseen: "Estimate") -> "AbstractCrew":
+    """Return the workers: those of a Dask scheduler, of a Slurm queue, or processes of this machine."""
     from vstent.cohort.crews import DaskCluster, Processes, Slurm
 
     if arguments.scheduler:
@@ -64,6 +94,8 @@ def _crew(arguments: argparse.Namespace, foreseen: "Estimate") -> "AbstractCrew"
 
 
 def _teller(console: Any) -> Any:
+    """Return a function that prints one line for each finished case."""
+
     def tell(done: int, total: int, name: str, rows: Sequence[dict[str, Any]]) -> None:
         faults = [f" {row['device']}, {row['outcome']}: {row['sentence']}" for row in rows if row["outcome"] != "done"]
         console.say(f"{done}/{total} {name} {_seconds(rows)}{''.join(faults)}")
@@ -72,10 +104,12 @@ def _teller(console: Any) -> Any:
 
 
 def _seconds(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the run time of a case."""
     return ", ".join(sorted({f"{row['case_s']:.0f} s" for row in rows if "case_s" in row}))
 
 
 def _report(out: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write the report on the cohort."""
     from vstent.io.writers import write_text
     from vstent.reporting.cohort import cohort_report
 

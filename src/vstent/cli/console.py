@@ -1,4 +1,4 @@
-"""What a terminal shows: a line per stage with its time, and the table of a comparison."""
+"""Terminal output: one line for each stage with its run time, and the tables of results."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,22 +22,22 @@ ROWS: Final = (
     ("Sac wall shear stress, mean", "mean_sac_wss_Pa"),
     ("Turnover time", "turnover_time_s"),
 )
-"""Rows of the comparison: title, key of the index."""
+"""Rows of the flow comparison: title, metric key."""
 DEVICE_ROWS: Final = (
     ("Size (label)", "size"),
     ("Deployed length", "deployed_length_mm"),
     ("Apposed", "apposed_fraction"),
     ("Metal coverage over the neck", "neck_metal_coverage_fraction"),
 )
-"""Rows on the devices: title, key of the measure."""
+"""Rows that describe the devices: title, metric key."""
 
 
 QUIET_S: Final = 30.0
-"""Where there is no terminal, a stage at work says a line this often."""
+"""Time between two progress lines of a stage where the output is not a terminal, s."""
 
 
 class Console:
-    """Shows the progress of a study on standard error and its table on standard output."""
+    """Terminal of the command line: progress on standard error, tables on standard output."""
 
     def __init__(self) -> None:
         self._err = RichConsole(stderr=True, highlight=False)
@@ -48,14 +48,21 @@ class Console:
 
     @contextmanager
     def live(self) -> Iterator[None]:
-        """Show a spinner with the stage at work, where there is a terminal."""
+        """Show a spinner with the current stage, where the output is a terminal."""
         with self._err.status("starting") as status:
             self._status = status
             yield
             self._status = None
 
     def progress(self, stage: str, fraction: float, detail: str) -> None:
-        """Take a study's word: a stage begins (0), goes on, or is done (1)."""
+        """Show the progress of a stage.
+
+        Parameters
+        ----------
+        stage : name of the stage.
+        fraction : completed fraction: 0 at its start, 1 at its end.
+        detail : a sentence on the result or on the remaining run time.
+        """
         now = time.monotonic()
         began = self._began.setdefault(stage, now)
         if fraction >= 1.0:
@@ -77,9 +84,9 @@ class Console:
 
 
 def comparison_table(metrics: Mapping[str, Any]) -> Table:
-    """Table of bare artery and devices: each value with its unit, and its change against bare."""
+    """Return the table that compares the artery without a device and with each, with units and relative changes."""
     stents = metrics["stents"]
-    table = Table("", "bare", *stents)
+    table = Table("", "no device", *stents)
     for title, key in DEVICE_ROWS:
         if any(key in stent["deployment"] for stent in stents.values()):
             table.add_row(title, "", *(_cell(key, stent["deployment"].get(key)) for stent in stents.values()))
@@ -98,28 +105,28 @@ COHORT_COLUMNS: Final = (
     ("length, mm", "deployment.deployed_length_mm", "{:.1f}"),
     ("apposed", "deployment.apposed_fraction", "{:.0%}"),
     ("metal at neck", "deployment.neck_metal_coverage_fraction", "{:.0%}"),
-    ("neck inflow, after / before", "ratios.neck_inflow_mL_s_ratio", "{:.2f}"),
-    ("s a case", "case_s", "{:.1f}"),
-    ("CPU s a case", "case_cpu_s", "{:.1f}"),
-    ("MB", "peak_memory_MB", "{:.0f}"),
+    ("neck inflow, with / without", "ratios.neck_inflow_mL_s_ratio", "{:.2f}"),
+    ("run time, s", "case_s", "{:.1f}"),
+    ("CPU time, s", "case_cpu_s", "{:.1f}"),
+    ("memory, MB", "peak_memory_MB", "{:.0f}"),
 )
-"""Columns of a cohort: title, key, form."""
+"""Columns of the cohort table: title, metric key, format."""
 RANKING_COLUMNS: Final = (
-    ("mm long", "deployed_length_mm", "{:.1f}"),
+    ("length, mm", "deployed_length_mm", "{:.1f}"),
     ("apposed", "apposed_fraction", "{:.0%}"),
-    ("mm beyond neck", "landing_length_mm", "{:.1f}"),
+    ("landing zone, mm", "landing_length_mm", "{:.1f}"),
     ("metal at neck", "neck_metal_coverage_fraction", "{:.0%}"),
 )
-"""Columns of the ranking: title, key of the measure, its form."""
+"""Columns of the ranking: title, metric key, format."""
 
 
 def ranking_table(ranking: Ranking, shown: int) -> Table:
-    """Table of the best candidates, and how many there are beyond."""
-    table = Table("", "device and size", "shift", "score", *(title for title, _, _ in RANKING_COLUMNS))
+    """Return the table of the best `shown` candidates, with the number of all in its caption."""
+    table = Table("", "device and size", "shift, mm", "score", *(title for title, _, _ in RANKING_COLUMNS))
     for number, candidate in enumerate(ranking.candidates[:shown], start=1):
         values = [(candidate.measures.get(key), form) for _, key, form in RANKING_COLUMNS]
         cells = ["" if value is None else form.format(value) for value, form in values]
-        score = f"{candidate.score:.2f}" if candidate.is_suitable else "out"
+        score = f"{candidate.score:.2f}" if candidate.is_suitable else "unsuitable"
         table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells)
     table.columns[1].no_wrap = True
     table.caption = f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable"
@@ -127,13 +134,13 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
 
 
 def ranking_reasons(ranking: Ranking, shown: int) -> str:
-    """Lines that say why the best candidates stand where they do."""
+    """Return one line for each of the best `shown` candidates with the reason for its rank."""
     best = enumerate(ranking.candidates[:shown], start=1)
     return "\n".join(f"{number}. {candidate.label}: {candidate.reason}" for number, candidate in best)
 
 
 def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Table of a cohort: a line a device, with medians of what came through."""
+    """Return the table of a cohort: one row for each device, with medians over the finished cases."""
     columns = [column for column in COHORT_COLUMNS if any(row.get(column[1]) is not None for row in rows)]
     table = Table("device", "done", "failed", "lost", *(title for title, _, _ in columns))
     for device in dict.fromkeys(row["device"] for row in rows):
@@ -144,15 +151,15 @@ def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
             form.format(median(values)) if values else "" for values, (*_, form) in zip(found, columns, strict=True)
         ]
         table.add_row(device, *counts, *cells)
-    table.caption = "medians"
+    table.caption = "medians over the finished cases"
     return table
 
 
 def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
-    """Table of intervals: each result of each device, and the causes of its spread."""
+    """Return the table of an uncertainty study: mean, 95 % interval and main causes of every result."""
     from vstent.reporting.uncertainty import intervals
 
-    table = Table("device", "result", "mean", "95 % between", "and", "because of", title="what is not sure, varied")
+    table = Table("device", "result", "mean", "95 % from", "to", "causes", title="uncertainty")
     for name, stent in metrics["stents"].items():
         for row in intervals(stent):
             causes = ", ".join(f"{cause} {share:.0%}" for cause, share in row.shares if share >= 0.005)
@@ -161,7 +168,7 @@ def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
 
 
 def opening_table(openings: Sequence[Opening]) -> Table:
-    """Table of the vessel's ends: role, diameter, area, where."""
+    """Return the table of the vessel's openings: role, diameter, area, centre."""
     from vstent.reporting.quantities import opening_rows
 
     table = Table("opening", "diameter", "area", "center (LPS)")
@@ -171,7 +178,7 @@ def opening_table(openings: Sequence[Opening]) -> Table:
 
 
 def morphology_table(measures: Mapping[str, Any]) -> Table:
-    """Table of a vessel's measures: name, value with unit."""
+    """Return the table of the morphology: name, value with unit."""
     from vstent.reporting.quantities import flatten
 
     table = Table("morphology", "")
@@ -181,11 +188,11 @@ def morphology_table(measures: Mapping[str, Any]) -> Table:
 
 
 def flow_table(metrics: Mapping[str, Any]) -> Table:
-    """Table of every index of the flow: bare, and with each device with its change."""
+    """Return the table of every flow metric, without a device and with each, with relative changes."""
     from vstent.reporting.quantities import flatten
 
     stents = metrics["stents"]
-    table = Table("flow", "bare", *stents)
+    table = Table("flow", "no device", *stents)
     for quantity in flatten(metrics["bare"]):
         changes = (_change(quantity.key, quantity.value, stent["flow"][quantity.key]) for stent in stents.values())
         table.add_row(quantity.name, _cell(quantity.key, quantity.value), *changes)
@@ -193,13 +200,13 @@ def flow_table(metrics: Mapping[str, Any]) -> Table:
 
 
 def convergence_table(found: Refinement) -> Table:
-    """Table of one refinement: every quantity at three sizes, its observed order, its value at size zero."""
+    """Return the table of one refinement study: each quantity at three sizes, observed order, extrapolated value."""
     from vstent.reporting.quantities import flatten
 
     columns = (f"{size:.3g}" for size in found.sizes)
-    table = Table(found.name.replace("_", " "), *columns, "order", "limit", "±")
+    table = Table(found.name.replace("_", " "), *columns, "order", "extrapolated", "±")
     for key, one in found.quantities.items():
-        order = "not one way" if one.order is None else f"{one.order:.1f}"
+        order = "not monotonic" if one.order is None else f"{one.order:.1f}"
         values = [quantity.text for value in one.values for quantity in flatten({key: value})]
         name = flatten({key: 0.0})[0].name
         table.add_row(name, *values, order, _cell(key, one.extrapolated), f"{one.uncertainty_fraction:.1%}")
@@ -207,7 +214,7 @@ def convergence_table(found: Refinement) -> Table:
 
 
 def positions_table(found: Mapping[str, Scatter]) -> Table:
-    """Table of the same flow in several positions on the grid: every quantity in each, mean and half the range."""
+    """Return the table of the same flow in several positions on the grid, with mean and half the range."""
     from vstent.reporting.quantities import flatten
 
     table = Table("position on the grid", *POSITIONS, "mean", "±")
@@ -218,18 +225,19 @@ def positions_table(found: Mapping[str, Scatter]) -> Table:
 
 
 def _cell(key: str, value: Any) -> str:
-    """A value with its unit; empty where there is none."""
+    """Return a value with its unit; an empty string where there is none."""
     from vstent.reporting.quantities import format_value
 
     return "" if value is None else _spaced(format_value(key, value))
 
 
 def _spaced(text: str) -> str:
-    """Put plain spaces for narrow ones, which not every terminal has."""
+    """Return the text with plain spaces instead of narrow ones, which some terminals cannot show."""
     return text.replace("\u202f", " ")
 
 
 def _change(key: str, bare: float, value: float) -> str:
+    """Return a value with its unit and its change relative to the value without a device."""
     from vstent.reporting.quantities import ERRORS
 
     is_told = bare and key not in ERRORS
@@ -237,8 +245,13 @@ def _change(key: str, bare: float, value: float) -> str:
 
 
 def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:
-    """Table of found against true: title, found, true, unit."""
-    table = Table("against the phantom's truth", "unit", "found", "true", "error")
+    """Return the table that compares results with the true values of the phantom.
+
+    Parameters
+    ----------
+    rows : title, found value, true value, unit.
+    """
+    table = Table("compared with the phantom", "unit", "found", "true", "error")
     for title, found, true, unit in rows:
         error = f"{found / true - 1:+.1%}" if true else f"{found - true:+.3g}"
         table.add_row(title, unit, f"{found:.4g}", f"{true:.4g}", error)
@@ -246,7 +259,7 @@ def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:
 
 
 def device_table(devices: Mapping[str, Design]) -> Table:
-    """Table of the catalogue: names, construction, sizes, and how sure the numbers are."""
+    """Return the table of the catalogue: names, construction, sizes, and the number of entries of each confidence."""
     table = Table(
         "name", "device", "construction", "sizes (diameter x length, mm)", "numbers cited / derived / estimated"
     )

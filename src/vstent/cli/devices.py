@@ -1,4 +1,4 @@
-"""`vstent devices`: the catalogue, and devices of one's own."""
+"""`vstent devices`: list the device catalogue, and add devices to it."""
 
 import argparse
 from pathlib import Path
@@ -7,17 +7,25 @@ from vstent.cli import options
 
 
 def add(commands: options.Commands) -> None:
-    """Add the command and its own."""
-    parser = options.add_command(commands, "devices", "list the catalogue")
+    """Add the command and its sub-command."""
+    parser = options.add_command(
+        commands, "devices", "List the devices of the catalogue with their sizes.", "vstent devices"
+    )
     parser.set_defaults(command=_devices)
-    adding = options.add_command(parser.add_subparsers(metavar="COMMAND"), "add", "add devices of your own")
-    adding.add_argument(
-        "file", type=Path, help="TOML, written like vstent's catalogue.toml: every number with its source"
+    adding = options.add_command(
+        parser.add_subparsers(metavar="COMMAND"),
+        "add",
+        "Add your own devices to the catalogue.",
+        "vstent devices add my_devices.toml",
+    )
+    options.group(adding, options.INPUT).add_argument(
+        "file", type=Path, help="TOML file in the format of vstent's catalogue.toml: every number with its source"
     )
     adding.set_defaults(command=_add)
 
 
 def _devices(arguments: argparse.Namespace) -> int:
+    """Print the catalogue."""
     from vstent.cli.console import Console, device_table
     from vstent.devices.catalogue import catalogue
 
@@ -26,6 +34,7 @@ def _devices(arguments: argparse.Namespace) -> int:
 
 
 def _add(arguments: argparse.Namespace) -> int:
+    """Add the devices of a file and print them."""
     from vstent.cli.console import Console, device_table
     from vstent.devices.catalogue import add_devices
 

@@ -1,4 +1,4 @@
-"""`vstent flow`: the flow alone, in any vessel, sac or not, stent or not."""
+"""`vstent flow`: compute the blood flow in any vessel, with or without a sac or a device."""
 
 import argparse
 from pathlib import Path
@@ -16,21 +16,32 @@ if TYPE_CHECKING:
 def add(commands: options.Commands) -> None:
     """Add the command."""
     parser = options.add_command(
-        commands, "flow", "scan or surface -> blood flow, in any vessel, with or without devices"
+        commands,
+        "flow",
+        "Compute the blood flow in any vessel, with or without devices.",
+        "vstent flow artery.stl --units mm --out case --flow-rate 4.2 --grid-spacing 0.15",
     )
-    options.add_outlet(options.add_geometry(parser))
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument("--device", action="append", metavar="NAME", help="a device of the catalogue too; repeatable")
+    options.add_geometry(parser)
+    options.add_outlet(parser)
+    what = options.group(parser, options.FLOW).add_mutually_exclusive_group()
+    what.add_argument(
+        "--device",
+        action="append",
+        metavar="NAME",
+        help="also compute the flow with this device of the catalogue; repeatable (default: no device)",
+    )
     what.add_argument(
         "--convergence",
         action="store_true",
-        help="the bare flow on three grids, with three time steps and turned three ways on the grid, compared",
+        help="compare the flow without a device for three grid spacings, three time steps and three positions on the "
+        "grid (default: off)",
     )
     options.add_flow(parser)
     parser.set_defaults(command=_flow)
 
 
 def _flow(arguments: argparse.Namespace) -> int:
+    """Compute the flow, or its convergence, and print the tables."""
     from vstent.cli.console import Console
     from vstent.study.types import Settings
 
@@ -45,6 +56,7 @@ def _flow(arguments: argparse.Namespace) -> int:
 
 
 def _compute(path: Path, out: Path, settings: "Settings", console: "Console") -> "list[Table]":
+    """Compute the flow and return its table."""
     from vstent.cli.console import flow_table
     from vstent.study.pipeline import run
 
@@ -54,6 +66,7 @@ def _compute(path: Path, out: Path, settings: "Settings", console: "Console") ->
 
 
 def _converge(path: Path, out: Path, settings: "Settings", console: "Console") -> "list[Table]":
+    """Run the convergence study and return its tables."""
     from vstent.cli.console import convergence_table, positions_table
     from vstent.study.pipeline import refine_flow
 

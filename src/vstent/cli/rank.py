@@ -1,4 +1,4 @@
-"""`vstent rank`: every size of the chosen devices, the best first."""
+"""`vstent rank`: deploy every size of the chosen devices and rank the results."""
 
 import argparse
 from pathlib import Path
@@ -7,28 +7,37 @@ from typing import Final
 from vstent.cli import options
 
 SHOWN: Final = 15
-"""Rows of the table on the terminal; the files hold all."""
+"""Number of rows of the table on the terminal; the files contain all candidates."""
 
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "rank", "scan or surface -> every size deployed, measured, ranked")
-    options.add_outlet(options.add_geometry(parser))
+    parser = options.add_command(
+        commands,
+        "rank",
+        "Deploy every size of the chosen devices, measure each result and rank them.",
+        "vstent rank scan.nii.gz --out case --device silk --shift -2,0,2",
+    )
+    options.add_geometry(parser)
+    options.add_outlet(parser)
     options.add_devices(parser)
-    ranking = parser.add_argument_group("ranking")
-    ranking.add_argument("--criteria", type=Path, metavar="TOML", help="criteria instead of vstent's own")
+    ranking = options.group(parser, options.RANKING)
+    ranking.add_argument(
+        "--criteria", type=Path, metavar="TOML", help="file with your own ranking criteria (default: vstent's own)"
+    )
     ranking.add_argument(
         "--shift",
         type=options.numbers,
         default=[0.0],
         metavar="MM,MM,...",
-        help="landing places to try, against the proposed one, distally",
+        help="shifts to try, mm from the proposed position, positive towards distal (default: 0)",
     )
-    options.add_jobs(ranking)
+    options.add_jobs(parser)
     parser.set_defaults(command=_rank)
 
 
 def _rank(arguments: argparse.Namespace) -> int:
+    """Rank all sizes, write the ranking and print the best."""
     from vstent.cli.console import Console, ranking_reasons, ranking_table
     from vstent.devices.catalogue import find_design
     from vstent.plan.criteria import default_criteria, read_criteria
@@ -54,5 +63,5 @@ def _rank(arguments: argparse.Namespace) -> int:
     write_ranking(arguments.out, ranking)
     console.print(ranking_table(ranking, SHOWN))
     console.print(ranking_reasons(ranking, SHOWN))
-    console.print(f"All in {arguments.out / 'ranking.csv'} and ranking.json. Research use only.")
+    console.print(f"All candidates are in {arguments.out / 'ranking.csv'} and ranking.json. Research use only.")
     return 0

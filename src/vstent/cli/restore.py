@@ -1,4 +1,4 @@
-"""`vstent restore`: the sac shrunk, the parent artery found and measured."""
+"""`vstent restore`: find the sac and its neck, reconstruct the parent artery and measure them."""
 
 import argparse
 
@@ -7,14 +7,20 @@ from vstent.cli import options
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "restore", "scan or surface -> parent artery, sac, neck, measures")
-    given = options.add_geometry(parser)
-    options.add_outlet(given)
-    options.add_neck(given)
+    parser = options.add_command(
+        commands,
+        "restore",
+        "Find the sac and its neck, reconstruct the parent artery and measure them.",
+        "vstent restore artery.stl --units mm --out case",
+    )
+    options.add_geometry(parser)
+    options.add_outlet(parser)
+    options.add_neck(parser)
     parser.set_defaults(command=_restore)
 
 
 def _restore(arguments: argparse.Namespace) -> int:
+    """Reconstruct the artery and print its morphology."""
     from vstent.cli.console import Console, morphology_table
     from vstent.study.pipeline import restore_vessel
     from vstent.study.types import Settings

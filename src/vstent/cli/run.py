@@ -1,4 +1,4 @@
-"""`vstent run`: a patient's scan or surface, whole."""
+"""`vstent run`: run the whole workflow on one case, or repeat an earlier run."""
 
 import argparse
 from dataclasses import asdict
@@ -15,40 +15,67 @@ if TYPE_CHECKING:
 def add(commands: options.Commands) -> None:
     """Add the command."""
     parser = options.add_command(
-        commands, "run", "scan or surface -> stented artery, flow compared, report; run.json -> the same again"
+        commands,
+        "run",
+        "Deploy devices in one case, compare the blood flow, and write a report.",
+        "vstent run scan.nii.gz --out case --device silk",
     )
-    given = options.add_geometry(parser)
-    options.add_outlet(given)
-    options.add_neck(given)
-    given.add_argument("--diameter", type=options.positive, metavar="MM", help="label diameter of the devices")
-    given.add_argument("--length", type=options.positive, metavar="MM", help="label length of the devices")
+    options.add_geometry(parser, "; or the run.json of an earlier run, to repeat it")
+    options.group(parser, options.INPUT).add_argument(
+        "--input",
+        dest="moved_to",
+        type=Path,
+        metavar="PATH",
+        help="with a run.json: where its scan or surface is now (default: where it was)",
+    )
+    options.add_outlet(parser)
+    options.add_neck(parser)
+    given = options.group(parser, options.OVERRIDES)
     given.add_argument(
-        "--center", type=options.number, metavar="MM", help="where on the parent axis the device's middle lies"
+        "--diameter",
+        type=options.positive,
+        metavar="MM",
+        help="label diameter of the devices, mm (default: proposed from the artery)",
+    )
+    given.add_argument(
+        "--length",
+        type=options.positive,
+        metavar="MM",
+        help="label length of the devices, mm (default: proposed from the neck)",
+    )
+    given.add_argument(
+        "--center",
+        type=options.number,
+        metavar="MM",
+        help="position of the middle of the devices along the parent artery, mm from the inlet (default: proposed)",
     )
     add_study(parser)
     add_pdf(parser)
-    parser.add_argument("--crate", action="store_true", help="describe the folder as an RO-Crate besides")
-    parser.add_argument(
-        "--input", dest="moved_to", type=Path, metavar="PATH", help="where the input of a run.json lies now"
+    options.group(parser, options.OUTPUT).add_argument(
+        "--ro-crate", action="store_true", help="also describe the case folder as an RO-Crate (default: off)"
     )
     parser.set_defaults(command=_run)
 
 
 def add_study(parser: argparse.ArgumentParser) -> None:
-    """Add what every study may be told: the devices, and how to compute the flow, if at all."""
+    """Add the options of a study: devices, flow, uncertainty."""
     options.add_devices(parser)
-    flow = options.add_flow(parser)
-    flow.add_argument("--no-flow", action="store_true", help="stop after the deployment")
+    options.add_flow(parser)
+    options.group(parser, options.FLOW).add_argument(
+        "--no-flow", action="store_true", help="deploy the devices without computing the flow (default: compute it)"
+    )
     options.add_uncertainty(parser)
 
 
 def add_pdf(parser: argparse.ArgumentParser) -> None:
-    """Add whether the report is to be printed."""
-    parser.add_argument("--pdf", action="store_true", help="write the report as report.pdf besides")
+    """Add the option that writes the report as a PDF too."""
+    options.group(parser, options.OUTPUT).add_argument(
+        "--pdf", action="store_true", help="also write the report as report.pdf (default: report.html only)"
+    )
 
 
 def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
-    """Collect what a study is told; `given` are further settings."""
+    """Return the settings of a study; `given` are further fields of `Settings`."""
     from vstent.study.types import Settings
 
     flow = None if arguments.no_flow else options.given_flow(arguments)
@@ -57,7 +84,15 @@ def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
 
 
 def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool) -> "CaseResult":
-    """Run a study with its progress shown; write the report, as a PDF too where asked, and print the table."""
+    """Run a study, write its report and print the tables.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : settings of the study.
+    is_printed : whether to write the report as a PDF too.
+    """
     from vstent.cli.console import Console, comparison_table, uncertainty_table
     from vstent.study.pipeline import run
 
@@ -77,6 +112,7 @@ def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool) -> "
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    """Run a study, or repeat one from its run.json."""
     settings = given_study(
         arguments,
         **options.given_geometry(arguments),
@@ -91,7 +127,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _again(arguments: argparse.Namespace, given: "Settings") -> int:
-    """Repeat a run from its run.json; say what is not as it was, and how far the results agree."""
+    """Repeat a run from its run.json; report differences in the environment, and how well the results agree."""
     from vstent.cli.console import Console
     from vstent.errors import InputError
     from vstent.study.repeat import agreement, read_record
@@ -99,21 +135,24 @@ def _again(arguments: argparse.Namespace, given: "Settings") -> int:
 
     if asdict(given) != asdict(Settings()):
         raise InputError(
-            f"{arguments.input} says all settings: give no option but --out, --input, --pdf and --crate with it."
+            f"{arguments.input} already contains all settings: give only --out, --input, --pdf and --ro-crate with it."
         )
     record = read_record(arguments.input, arguments.moved_to)
     if arguments.out.resolve() == record.folder.resolve():
-        raise InputError(f"{arguments.out} is the folder of the run itself: give another --out to repeat it in.")
+        raise InputError(
+            f"{arguments.out} is the folder of the run itself: give another folder for the repetition (--out)."
+        )
     console = Console()
     for difference in record.differences:
-        console.say(f"Not as then: {difference}.")
+        console.say(f"Differs from the original run: {difference}.")
     _finish(arguments, study(record.input, arguments.out, record.settings, is_printed=arguments.pdf))
     console.print(agreement(record.folder, arguments.out))
     return 0
 
 
 def _finish(arguments: argparse.Namespace, case: "CaseResult") -> None:
+    """Write the RO-Crate where it is requested."""
     from vstent.study.crate import write_crate
 
-    if arguments.crate:
+    if arguments.ro_crate:
         write_crate(arguments.out, case.provenance, date.today().isoformat())

@@ -1,4 +1,4 @@
-"""`vstent trace`: the vessel and its centerlines alone."""
+"""`vstent trace`: extract the vessel wall, its openings and its centerlines."""
 
 import argparse
 
@@ -7,12 +7,18 @@ from vstent.cli import options
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "trace", "scan or surface -> wall, openings, centerlines")
+    parser = options.add_command(
+        commands,
+        "trace",
+        "Extract the vessel wall, its openings and its centerlines.",
+        "vstent trace scan.nii.gz --out case",
+    )
     options.add_geometry(parser)
     parser.set_defaults(command=_trace)
 
 
 def _trace(arguments: argparse.Namespace) -> int:
+    """Trace the vessel and print its openings."""
     from vstent.cli.console import Console, opening_table
     from vstent.study.pipeline import trace_vessel
     from vstent.study.types import Settings

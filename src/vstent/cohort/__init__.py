@@ -1,4 +1,4 @@
-"""Many patients: a folder or table of cases in, one table with a row for each device of each case out.
+"""Cohort: run many cases and collect one table with a row for each device of each case.
 
-Open ``batch.py`` first.
+``batch.py`` contains the functions to call.
 """

@@ -1,8 +1,8 @@
-"""Cohort: many patients, many devices: one row each in one table, whatever happens to whom.
+"""Run a cohort: many cases with several devices, one table row for each pair, even where a case fails.
 
-Every row is written into its case's folder as soon as it is known, under a key of all that it depends on (the input's
-hash, the settings, this version). Whoever dies, the next run does what is missing and nothing else; the table is made
-from the rows.
+Every row is written into the folder of its case as soon as it is known, under a key of everything that it depends on
+(hash of the input, settings, version). After an interruption the next run computes only the missing rows. The table is
+assembled from the rows.
 """
 
 from collections.abc import Sequence
@@ -16,18 +16,32 @@ from vstent.cohort.work import LOST, Row, Task, read_row, write_row
 from vstent.io.tables import write_parquet, write_rows
 
 CASES: Final = "cases"
-"""Folder that holds a folder for every case."""
+"""Name of the folder that contains the folders of the cases."""
 
 
 class Progress(Protocol):
-    """Told when a case has ended."""
+    """Function that is called when a case has ended."""
 
     def __call__(self, done: int, total: int, name: str, rows: Sequence[Row]) -> None:
-        """`done` of `total` cases have ended, the last is called `name` and has these rows."""
+        """Report the end of a case.
+
+        Parameters
+        ----------
+        done, total : number of cases that have ended, and of all.
+        name : name of the case that has just ended.
+        rows : its rows of the table.
+        """
 
 
 def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -> list[Task]:
-    """Return what is missing: the cases with the devices whose rows are not there, or were lost."""
+    """Return the missing tasks: cases with the devices whose rows do not exist, or whose process died.
+
+    Parameters
+    ----------
+    cases : all cases of the cohort.
+    out : folder of the cohort.
+    keeps_files : whether to keep the case folder of every case.
+    """
     tasks = []
     for case in cases:
         folder, keys = _folder(case, out), case.keys
@@ -40,14 +54,22 @@ def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -
 
 
 def run_cohort(tasks: Sequence[Task], out: Path, crew: AbstractCrew, progress: Progress) -> None:
-    """Let a crew do the tasks; a case whose process died gets rows that say so.
+    """Run the tasks; a case whose process died gets rows with the outcome ``lost``.
+
+    Parameters
+    ----------
+    tasks : the tasks, see `left_to_do`.
+    out : folder of the cohort.
+    crew : the processes or workers that run the tasks.
+    progress : called when a case has ended.
+
 
     Raises
     ------
     InputError
-        When the crew cannot begin.
+        The crew cannot start.
     VstentError
-        When the crew itself is lost; what was finished is kept.
+        The crew itself is lost; finished cases are kept.
     """
     for done, ended in enumerate(crew.do(tasks), start=1):
         task = tasks[ended.number]
@@ -58,17 +80,18 @@ def run_cohort(tasks: Sequence[Task], out: Path, crew: AbstractCrew, progress: P
 
 
 def collect(cases: Sequence[Case], out: Path) -> list[Row]:
-    """Return the rows that are there, in the order of cases and devices."""
+    """Return the existing rows, in the order of cases and devices."""
     rows = [read_row(_folder(case, out), device, key) for case in cases for device, key in case.keys.items()]
     return [row for row in rows if row is not None]
 
 
 def write_table(out: Path, rows: Sequence[Row]) -> list[Path]:
-    """Write ``cohort.csv`` and, where pyarrow is installed, ``cohort.parquet``; return what was written."""
+    """Write ``cohort.csv`` and, where pyarrow is installed, ``cohort.parquet``; return the paths written."""
     write_rows(out / "cohort.csv", rows)
     is_written = write_parquet(out / "cohort.parquet", rows)
     return [out / "cohort.csv", *([out / "cohort.parquet"] if is_written else [])]
 
 
 def _folder(case: Case, out: Path) -> Path:
+    """Return the folder of a case."""
     return out / CASES / case.name

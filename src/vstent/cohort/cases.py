@@ -1,4 +1,4 @@
-"""Cases: what a folder or a CSV file says is to be done."""
+"""Cases of a cohort, read from a folder or a CSV file."""
 
 import csv
 from collections.abc import Callable, Sequence
@@ -20,18 +20,18 @@ Number = TypeVar("Number", int, float)
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One patient of a cohort."""
+    """One case of a cohort."""
 
     name: str
-    """Its name in the table, and that of its folder."""
+    """Name in the table, also that of its folder."""
     path: Path
     """Scan or surface."""
     settings: Settings
-    """What is given; its devices are those to do."""
+    """Settings, including the devices to run."""
 
     @cached_property
     def keys(self) -> dict[str, str]:
-        """Key of every device's row: names everything that the row depends on."""
+        """Key of each device's row: a hash of everything that the row depends on."""
         source = hash_of(self.path)
         return {
             name: key_of(source, find_design(name), replace(self.settings, devices=(name,)))
@@ -44,64 +44,78 @@ def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:
 
     Parameters
     ----------
-    cohort : a folder, or a CSV file with titles. Its column ``input`` holds paths (relative ones from the file's
-        folder), ``case`` names (else the file's), ``devices`` names parted by blanks; the other columns are settings:
-        ``units``, ``threshold``, ``at``, ``inlet`` (a point, or several parted by semicolons), ``outlet``, ``spacing``,
-        ``shape``, ``diameter``, ``length``, ``center``. An empty cell takes what `settings` says.
-    settings : for every case.
+    cohort : a folder, or a CSV file with a header. Its column ``input`` contains paths, relative to the folder of the
+        file; ``case`` the names of the cases (default: the file name); ``devices`` names separated by blanks. The
+        other columns are settings: ``units``, ``threshold``, ``at``, ``inlet`` (a point, or several separated by
+        semicolons), ``outlet``, ``spacing``, ``shape``, ``diameter``, ``length``, ``center``. An empty cell takes the
+        value of `settings`.
+    settings : settings of every case.
 
     Raises
     ------
     ReadError
-        When there is no such folder or file, or no case in it.
+        The folder or file does not exist or contains no case.
     InputError
-        When a row of the file is wrong or two cases have one name.
+        A row of the file is wrong, or two cases have the same name.
     """
     refuse_missing(cohort)
     cases = _in_folder(cohort, settings) if cohort.is_dir() else _in_file(cohort, settings)
     if not cases:
-        raise ReadError(f"{cohort} holds no case: give a folder of scans or surfaces, or a CSV file of their paths")
+        raise ReadError(
+            f"{cohort} contains no case: give a folder of scans or surfaces, or a CSV file with their paths."
+        )
     names = [case.name for case in cases]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(f"{cohort} has two cases called {twice[0]}: name them in a CSV file's column `case`")
+        raise InputError(
+            f"{cohort} contains two cases named {twice[0]}: give names in the column `case` of a CSV file."
+        )
     for device in {device for case in cases for device in case.settings.devices}:
         find_design(device)
     return tuple(cases)
 
 
 def _in_folder(folder: Path, settings: Settings) -> list[Case]:
+    """Return the cases of a folder, hidden files excluded."""
     shown = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     return [Case(_name(path), path, settings) for path in shown if _is_case(path)]
 
 
 def _is_case(path: Path) -> bool:
+    """Return whether a path is a scan or surface by its name, or a folder that may contain a DICOM series."""
     if path.is_dir():
-        return any(file.is_file() for file in path.iterdir())  # a DICOM series has no names to go by
+        return any(file.is_file() for file in path.iterdir())  # the files of a DICOM series may have any name
     return suffix(path) in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES)
 
 
 def _name(path: Path) -> str:
+    """Return the name of a case without the suffix of its file."""
     return path.name if path.is_dir() else path.name[: len(path.name) - len(suffix(path))] or path.name
 
 
 def _in_file(path: Path, settings: Settings) -> list[Case]:
+    """Return the cases of a CSV file."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} cannot be read as a CSV file: {error}. Write it in UTF-8, with titles.") from error
+        raise InputError(
+            f"{path} cannot be read as a CSV file: {error}. Save it in UTF-8, with a header line."
+        ) from error
     return [_case(path, number, row, settings) for number, row in enumerate(rows, start=2)]
 
 
 def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Case:
+    """Return the case of one line of a CSV file."""
     given = {str(key).strip(): value.strip() for key, value in row.items() if isinstance(value, str) and value.strip()}
     where = f"line {line} of {file}"
     unknown = sorted(set(given) - {"case", "input", *COLUMNS})
     if unknown:
-        raise InputError(f"{where} has a column {unknown[0]!r}: the columns are case, input, {', '.join(COLUMNS)}")
+        raise InputError(
+            f"{where} has an unknown column {unknown[0]!r}: the columns are case, input, {', '.join(COLUMNS)}."
+        )
     if "input" not in given:
-        raise InputError(f"{where} names no input: fill its column `input`")
+        raise InputError(f"{where} names no input: fill in the column `input`.")
     path = file.parent / given["input"]
     changes: dict[str, Any] = {}
     for title in set(given) & set(COLUMNS):
@@ -109,38 +123,45 @@ def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Cas
         try:
             changes[name] = read(given[title])
         except ValueError as error:
-            raise InputError(f"{where}: {title} is {given[title]!r}, which cannot be used: {error}") from error
+            raise InputError(f"{where}: the value {given[title]!r} of {title} cannot be used: {error}.") from error
     name = given.get("case", _name(path))
     if Path(name).name != name:
-        raise InputError(f"{where} calls its case {name!r}: give a name without slashes")
+        raise InputError(f"{where} names its case {name!r}: give a name without slashes.")
     return Case(name, path, replace(settings, **changes))
 
 
 def _size(text: str) -> float:
+    """Convert text to a length greater than zero, mm."""
     return _above_zero(finite(text))
 
 
 def _count(text: str) -> int:
+    """Convert text to a count greater than zero."""
     return _above_zero(int(text))
 
 
 def _above_zero(value: Number) -> Number:
+    """Return a value greater than zero; raise ValueError for others."""
     if value <= 0:
         raise ValueError("it must be above zero")
     return value
 
 
 def _units(text: str) -> str:
+    """Return a known length unit; raise ValueError for others."""
     if text not in MM_PER:
         raise ValueError(f"give one of {', '.join(MM_PER)}")
     return text
 
 
 def _words(text: str) -> list[str]:
+    """Split a cell at blanks, commas and semicolons."""
     return text.replace(",", " ").replace(";", " ").split()
 
 
 def _three(kind: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+    """Return a converter of a cell with three values."""
+
     def read(text: str) -> tuple[Any, ...]:
         values = tuple(kind(word) for word in _words(text))
         if len(values) != 3:
@@ -151,6 +172,7 @@ def _three(kind: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
 
 
 def _points(text: str) -> tuple[tuple[float, ...], ...]:
+    """Convert a cell to points, mm."""
     values = [finite(word) for word in _words(text)]
     if len(values) % 3:
         raise ValueError("three numbers are needed for every point")
@@ -158,6 +180,7 @@ def _points(text: str) -> tuple[tuple[float, ...], ...]:
 
 
 def _devices(text: str) -> tuple[str, ...]:
+    """Convert a cell to device names, each once."""
     return tuple(dict.fromkeys(_words(text)))
 
 
@@ -174,9 +197,9 @@ COLUMNS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
     "length": ("length_mm", _size),
     "center": ("center_mm", finite),
 }
-"""Titles of a CSV file's columns: the setting each fills, and how it is read."""
+"""Columns of a CSV file: the field of `Settings` that each fills, and the converter of its cells."""
 
 
 def device_rows(cases: Sequence[Case]) -> int:
-    """Number of rows that the cohort's table will have."""
+    """Return the number of rows of the cohort's table."""
     return sum(len(case.settings.devices) for case in cases)

@@ -1,4 +1,4 @@
-"""Crews: who does the cases: processes of this machine, or the workers of a Dask cluster."""
+"""Crews: the workers that run the cases: processes of this machine, or the workers of a Dask cluster."""
 
 import multiprocessing
 import shutil
@@ -15,42 +15,42 @@ from vstent.cohort.work import Task, work
 from vstent.errors import InputError, VstentError
 
 ATTEMPTS: Final = 2
-"""A case whose process dies is tried so often."""
+"""Number of times that a case is tried whose process dies."""
 SPARE: Final = 2.0
-"""A job of a queue asks for so many times the memory foreseen: beyond it, it is killed."""
+"""Memory requested for a job of a queue, as a multiple of the estimate; the queue kills a job that exceeds it."""
 SCHEDULER_S: Final = 20.0
-"""A scheduler that does not answer for so long is lost."""
+"""Time after which a scheduler that does not answer is considered lost, s."""
 
 
 class Ended(NamedTuple):
-    """A task that has come to an end."""
+    """A task that has ended."""
 
     number: int
-    """Which."""
+    """Index of the task."""
     fault: str
-    """Why its process died; empty where it did its work."""
+    """Why its process died; empty where it finished."""
 
 
 class AbstractCrew(ABC):
-    """Does tasks. Rows are written by whoever does them, so that they outlive the one who gave the order."""
+    """Base class of crews. The workers write the rows, so that rows remain if the main process dies."""
 
     @abstractmethod
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Yield every task when it has ended, in any order."""
+        """Run the tasks and yield each when it has ended, in any order."""
 
 
 @final
 @dataclass(frozen=True)
 class Processes(AbstractCrew):
-    """Processes of this machine, a fresh one for every case: what dies takes nothing with it."""
+    """Processes of this machine, a new one for every case, so that a crash affects one case only."""
 
     jobs: int
     """How many at once."""
     work: Callable[[Task], None] = work
-    """What each does."""
+    """Function that runs one task."""
 
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Yield every task when its process has ended."""
+        """Run the tasks and yield each when its process has ended."""
         context = multiprocessing.get_context("spawn")
         waiting = [(number, 1) for number in reversed(range(len(tasks)))]
         running: list[tuple[BaseProcess, int, int]] = []
@@ -76,36 +76,39 @@ class Processes(AbstractCrew):
 
 
 def _uninterrupted(work: Callable[[Task], None], task: Task) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the first process's to answer, which ends this one
+    """Run one task in a process that ignores Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C and ends this one
     work(task)
 
 
 def _fault(exitcode: int | None) -> str:
+    """Return a sentence on how a process died; empty where it finished."""
     if not exitcode:
         return ""
     how = f"was killed by signal {-exitcode}" if exitcode < 0 else f"ended with code {exitcode}"
-    return f"Its process {how}, {ATTEMPTS} times: out of memory? Use fewer jobs, and run the same command again."
+    said = f"The process of this case {how} {ATTEMPTS} times, perhaps for lack of memory."
+    return f"{said} Run the same command with fewer jobs (--jobs)."
 
 
 @final
 @dataclass(frozen=True)
 class DaskCluster(AbstractCrew):
-    """Workers of a Dask cluster; they must see the same folders as this machine."""
+    """Workers of a Dask cluster; they need access to the same folders as this machine."""
 
     address: str
-    """Of the scheduler, such as tcp://head:8786."""
+    """Address of the scheduler, such as ``tcp://head:8786``."""
     work: Callable[[Task], None] = work
-    """What each worker does."""
+    """Function that runs one task."""
 
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Yield every task when its future has ended; a worker's death makes Dask give its task to another.
+        """Run the tasks and yield each when it has ended; Dask gives the task of a dead worker to another.
 
         Raises
         ------
         InputError
-            When Dask is missing or no scheduler answers.
+            Dask is not installed or no scheduler answers.
         VstentError
-            When the scheduler is lost: what was finished is kept.
+            The scheduler is lost; finished cases are kept.
         """
         with _client(self.address) as client:
             futures = {client.submit(self.work, task, pure=False): number for number, task in enumerate(tasks)}
@@ -124,26 +127,26 @@ class Slurm(AbstractCrew):
     jobs: int
     """How many at once."""
     memory_MB: float
-    """What one case is foreseen to need."""
+    """Estimated memory of one case."""
 
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Yield every task when it has ended.
+        """Run the tasks and yield each when it has ended.
 
         Raises
         ------
         InputError
-            When dask-jobqueue or Slurm is missing.
+            dask-jobqueue or Slurm is not installed.
         """
-        if shutil.which("sbatch") is None:  # dask-jobqueue would try to send jobs for ever
+        if shutil.which("sbatch") is None:  # dask-jobqueue would try to submit jobs for ever
             raise InputError(
-                "There is no Slurm here (no `sbatch` on the PATH): give the command where jobs are sent from."
+                "Slurm was not found (no `sbatch` on the PATH): run the command on a machine that can submit jobs."
             )
         with self.cluster() as cluster:
-            cluster.adapt(minimum_jobs=self.jobs, maximum_jobs=self.jobs)  # a job that the queue ends is asked for anew
+            cluster.adapt(minimum_jobs=self.jobs, maximum_jobs=self.jobs)  # ended jobs are submitted again
             yield from DaskCluster(cluster.scheduler_address).do(tasks)
 
     def cluster(self) -> Any:
-        """Start the scheduler; queue, account and time limit come from dask-jobqueue's own configuration file."""
+        """Start and return the cluster; the configuration file of dask-jobqueue sets queue, account and time limit."""
         try:
             from dask_jobqueue import SLURMCluster
         except ImportError:
@@ -152,10 +155,12 @@ class Slurm(AbstractCrew):
 
 
 def _missing(package: str) -> InputError:
-    return InputError(f"{package} is not installed: pip install 'vstent[cluster]', or leave the cluster out")
+    """Return the error for a package that is not installed."""
+    return InputError(f"{package} is not installed: run `pip install 'vstent[cluster]'`, or compute on this machine.")
 
 
 def _client(address: str) -> Any:
+    """Return a client of a Dask scheduler."""
     try:
         from distributed import Client
     except ImportError:
@@ -163,19 +168,23 @@ def _client(address: str) -> Any:
     try:
         return Client(address, timeout=SCHEDULER_S)
     except (OSError, ValueError) as error:
-        raise InputError(f"No Dask scheduler answers at {address}: start one with `dask scheduler`") from error
+        raise InputError(f"No Dask scheduler answers at {address}: start one with `dask scheduler`.") from error
 
 
 def _see_alive(client: Any) -> None:
+    """Raise VstentError where the scheduler is lost."""
     if client.status not in ("running", "connecting"):
         raise VstentError(
-            "the Dask scheduler is lost; finished cases are kept: start it again and give the same command"
+            "the connection to the Dask scheduler is lost. Finished cases are kept: start it and run the same command."
         )
 
 
 def _future_fault(future: Any) -> str:
+    """Return a sentence on why a task failed; empty where it finished."""
     if future.status == "finished":
         return ""
     if future.status == "error":
-        return f"Its worker failed: {future.exception()}. Look at the workers' logs, and run the same command again."
-    raise VstentError("the Dask scheduler is lost; finished cases are kept: start it again and give the same command")
+        return f"The worker of this case failed: {future.exception()}. See its log, then run the same command again."
+    raise VstentError(
+        "the connection to the Dask scheduler is lost. Finished cases are kept: start it and run the same command."
+    )

@@ -1,4 +1,4 @@
-"""Estimate: the time and memory that a cohort will take, told before it begins."""
+"""Estimate of the run time and memory of a cohort, before it starts."""
 
 import os
 from collections.abc import Sequence
@@ -9,53 +9,61 @@ from vstent.cohort.cases import Case
 from vstent.io.files import is_surface_file, suffix
 
 START_CPU_S: Final = 3.0
-"""A process starts and loads its compiled kernels."""
+"""CPU time to start a process and load the compiled kernels."""
 START_MB: Final = 220.0
-"""What a process holds before it has read anything."""
+"""Memory of a process before it has read an input."""
 STL_BYTES: Final = 50
-"""Of one triangle in a binary file; other surface files hold about as much a triangle."""
+"""Bytes of one triangle in a binary STL file; other formats need about as much."""
 CPU_S_PER_1000_TRIANGLES: Final = 0.25
-"""Repair, trace, restore: 38,000 triangles of AneuriskWeb's C0038 take 10 s, 25,000 of the demo's 2.5 s."""
+"""CPU time of repair, trace and restore. Measured: 10 s for the 38,000 triangles of AneuriskWeb C0038, 2.5 s for the
+25,000 of the demo."""
 MB_PER_1000_TRIANGLES: Final = 5.0
-"""Beside them: 400 MB in all for the demo."""
+"""Memory of these stages; measured: 400 MB in all for the demo."""
 CPU_S_PER_MILLION_VOXELS: Final = 0.5
-"""Reading and segmenting, before the surface is worked on."""
+"""CPU time of reading and segmenting a scan."""
 MB_PER_MILLION_VOXELS: Final = 40.0
-"""Several copies of a scan, as 32-bit numbers."""
+"""Memory of several copies of a scan as 32-bit numbers."""
 SCAN_TRIANGLES: Final = 60_000
-"""Of a vessel tree out of a scan."""
+"""Typical number of triangles of a vessel segmented from a scan."""
 CPU_S_PER_DEVICE: Final = 1.0
-"""Deployed, measured, its wires made solid."""
+"""CPU time to deploy and measure a device and to make its wires solid."""
 FLOW_CELLS: Final = 200_000
-"""Of a vessel trimmed, with cells of 0.17 mm."""
+"""Typical number of cells of a trimmed vessel at the grid spacing `COMMON_CELL_MM`."""
 CPU_S_PER_1000_CELLS: Final = 0.6
-"""Steady, from rest: the demo's flows take about 130 s of CPU each."""
+"""CPU time of a steady flow; measured: about 130 s for each flow of the demo."""
 MB_PER_1000_CELLS: Final = 1.0
-"""Of a flow at work."""
+"""Memory of a flow computation."""
 COMMON_CELL_MM: Final = 0.17
+"""Typical grid spacing."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is foreseen, roughly: within a factor of two on a machine of 2020's."""
+    """Estimated run time and memory, correct within a factor of two on a machine of 2020."""
 
     cpu_s: float
-    """Time of one core for all cases."""
+    """CPU time of all cases together."""
     memory_MB: float
-    """Largest memory of one case."""
+    """Memory of the largest case."""
     jobs: int
-    """Cases at once that the memory left on this machine bears."""
+    """Number of cases at once for which the free memory suffices."""
 
     @property
     def sentence(self) -> str:
-        """The estimate in words."""
+        """The estimate as a phrase."""
         hours = self.cpu_s / self.jobs / 3600
         time = f"{hours:.1f} h" if hours >= 1 else f"{max(1, round(60 * hours))} min"
-        return f"about {time} with {self.jobs} at once, up to {self.memory_MB:.0f} MB each"
+        return f"run time about {time} with {self.jobs} at once, memory up to {self.memory_MB:.0f} MB each"
 
 
 def estimate(cases: Sequence[Case], jobs: int) -> Estimate:
-    """Foresee time and memory of the cases left to do from the sizes of their files."""
+    """Estimate run time and memory of cases from the sizes of their files.
+
+    Parameters
+    ----------
+    cases : the cases to run.
+    jobs : requested number of cases at once.
+    """
     costs = [_cost(case) for case in cases]
     memory_MB = max((memory for _, memory in costs), default=START_MB)
     free_MB = _free_memory_MB()
@@ -64,7 +72,7 @@ def estimate(cases: Sequence[Case], jobs: int) -> Estimate:
 
 
 def _cost(case: Case) -> tuple[float, float]:
-    """CPU seconds and MB of one case."""
+    """Return the CPU time, s, and the memory, MB, of one case."""
     n_bytes = _bytes(case)
     is_surface = is_surface_file(case.path)
     voxels = 0.0 if is_surface else n_bytes * (4 if suffix(case.path).endswith(".gz") else 1) / 2
@@ -82,12 +90,13 @@ def _cost(case: Case) -> tuple[float, float]:
 
 
 def _bytes(case: Case) -> int:
+    """Return the size of the input of a case."""
     files = case.path.rglob("*") if case.path.is_dir() else [case.path]
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _free_memory_MB() -> float | None:
-    """Memory that new processes may take; None where the system does not say."""
+    """Return the free memory, MB; None where the system does not report it."""
     try:
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e6
     except (AttributeError, ValueError, OSError):

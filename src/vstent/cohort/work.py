@@ -1,4 +1,4 @@
-"""Work: one case done, whatever comes: a row a device, written as soon as it is known."""
+"""Run one case of a cohort and write a row for each device, also where something fails."""
 
 import json
 import shutil
@@ -17,36 +17,38 @@ from vstent.study.pipeline import restore_vessel, run
 from vstent.study.types import Progress, Settings
 
 Row = dict[str, Any]
-"""One case with one device: names to values."""
+"""Table row of one case with one device: column names and values."""
 
 COST: Final = ("case_s", "case_cpu_s", "peak_memory_MB")
-"""Columns that no two runs agree on: they tell of the computer, not of the case."""
+"""Columns that differ between runs, because they depend on the computer."""
 DONE: Final = "done"
+"""Outcome of a row: finished."""
 FAILED: Final = "failed"
-"""The input cannot be used, or a flow cannot be computed: doing it again changes nothing."""
+"""Outcome of a row: the input cannot be used or a flow cannot be computed; the next run does not repeat it."""
 LOST: Final = "lost"
-"""The process died: done again by the next run."""
+"""Outcome of a row: the process died; the next run repeats it."""
 MB: Final = 1e6
+"""Bytes in a megabyte."""
 _ALONE: Final = threading.Lock()
-"""Compiled kernels that run in parallel bear one caller in a process; a Dask worker may have several threads."""
+"""Lock: parallel kernels allow one caller in a process, and a Dask worker may have several threads."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is left to do of one case."""
+    """The missing rows of one case."""
 
     case: Case
-    """The case; its devices are those whose rows are missing."""
+    """The case, with the devices whose rows are missing."""
     folder: Path
-    """Where its rows are written."""
+    """Folder in which its rows are written."""
     keys: Mapping[str, str]
-    """Key of every missing row, by device."""
+    """Key of each missing row, by device."""
     keeps_files: bool = False
-    """Keep all that `vstent run` writes, in ``study`` beside the rows."""
+    """Whether to keep the case folder as `vstent run` writes it, in ``study`` next to the rows."""
 
 
 class _Watch:
-    """Knows which stage is at work."""
+    """Progress function that remembers the current stage."""
 
     stage = "read"
 
@@ -55,23 +57,23 @@ class _Watch:
 
 
 def row_path(folder: Path, device: str) -> Path:
-    """Where the row of a device lies in a case's folder."""
+    """Return the file of a device's row in the folder of a case."""
     return folder / f"{device}.json"
 
 
 def work(task: Task) -> None:
-    """Do one case: run its study with every missing device and write the rows.
+    """Run the study of one case with every missing device and write the rows.
 
-    A device that does not fit, or an input that cannot be used, is a row too, with the stage and the sentence.
+    A device that does not fit or an input that cannot be used gets a row with the stage and the error message.
     """
     import numba
 
     with _ALONE:
-        numba.set_num_threads(1)  # as many cases at once as there are cores
+        numba.set_num_threads(1)  # cases run in parallel, one on each core
         began, cpu = time.perf_counter(), time.process_time()
         rows = _rows(task)
         done = tuple(device for device, row in rows.items() if row["outcome"] == DONE)
-        if task.keeps_files and done and len(rows) > 1:  # one study with all that can be done: nothing is computed anew
+        if task.keeps_files and done and len(rows) > 1:  # one study of all devices that work, from stored stages
             run(task.case.path, task.folder / "study", replace(task.case.settings, devices=done), _Watch())
         if not task.keeps_files:
             shutil.rmtree(task.folder / "study", ignore_errors=True)
@@ -82,7 +84,7 @@ def work(task: Task) -> None:
 
 
 def _rows(task: Task) -> dict[str, Row]:
-    """Do the artery once, then every device in it; what cannot be done is told in the row."""
+    """Return a row for each device: the artery is restored once, then each device is run in it."""
     case, study = task.case, task.folder / "study"
     devices = case.settings.devices
     failed = _failure(task, lambda watch: restore_vessel(case.path, study, case.settings, watch))
@@ -104,26 +106,27 @@ def _rows(task: Task) -> dict[str, Row]:
 
 
 def _failure(task: Task, do: Callable[[Progress], object]) -> Row:
-    """Do something; return the row of its failure, empty where there was none."""
+    """Call `do`; return the row of its failure, empty where it succeeds."""
     watch = _Watch()
     try:
         do(watch)
     except VstentError as error:
         return {"outcome": FAILED, "stage": watch.stage, "sentence": str(error)}
-    except Exception as error:  # noqa: BLE001 one case's fault must not end the cohort; it is told in its row
+    except Exception as error:  # noqa: BLE001 an error in one case must not end the cohort; its row reports it
         write_text(task.folder / "traceback.txt", traceback.format_exc())
-        sentence = f"vstent did not foresee this, {type(error).__name__}: {error}. Report it with traceback.txt."
+        sentence = f"Unexpected error, {type(error).__name__}: {error}. Report it with the file traceback.txt."
         return {"outcome": FAILED, "stage": watch.stage, "sentence": sentence}
     return {}
 
 
 def flat_metrics(metrics: Mapping[str, Any], device: str) -> Row:
-    """Every number of a study's metrics that concerns a device, under names parted by dots."""
+    """Return the metrics of the vessel, the bare flow and one device, under keys joined by dots."""
     parts = {"vessel": metrics["vessel"], "bare": metrics.get("bare", {})} | dict(metrics["stents"][device])
     return _flat(parts, "")
 
 
 def _flat(values: Mapping[str, Any], before: str) -> Row:
+    """Return the values of nested mappings, under keys joined by dots."""
     row: Row = {}
     for name, value in values.items():
         row |= _flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {f"{before}{name}": value}
@@ -131,14 +134,14 @@ def _flat(values: Mapping[str, Any], before: str) -> Row:
 
 
 def write_row(task: Task, device: str, row: Row) -> None:
-    """Write the row of a device, with the key of all that it depends on."""
+    """Write the row of a device with its key."""
     named = {"case": task.case.name, "device": device} | row
     kept = {"key": task.keys[device], "row": named, "settings": asdict(task.case.settings)}
     write_json(row_path(task.folder, device), kept)
 
 
 def read_row(folder: Path, device: str, key: str) -> Row | None:
-    """Return the row of a device; None where it is missing, damaged, or of another input or version."""
+    """Return the row of a device; None where it is missing, damaged, or has another key."""
     try:
         kept = json.loads(row_path(folder, device).read_text(encoding="utf-8"))
         return dict(kept["row"]) if kept["key"] == key else None
@@ -147,7 +150,7 @@ def read_row(folder: Path, device: str, key: str) -> Row | None:
 
 
 def peak_memory_MB() -> float | None:
-    """Largest resident memory of this process so far; None where the system does not say."""
+    """Return the peak resident memory of this process; None where the system does not report it."""
     try:
         import resource
     except ImportError:  # Windows

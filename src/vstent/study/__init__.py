@@ -1,6 +1,6 @@
-"""One patient: an input file and `Settings` in, a case folder with every result out; a rerun resumes.
+"""Study of one case: from an input file and `Settings` to a case folder with all results; a second run resumes.
 
-Open ``pipeline.py`` first; ``stages.py`` holds the stages in their order.
+``pipeline.py`` contains the functions to call, ``stages.py`` the stages in their order.
 """
 
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel

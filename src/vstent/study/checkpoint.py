@@ -1,4 +1,4 @@
-"""Checkpoint: a flow under way, kept in the case's cache until it is done."""
+"""Checkpoints of unfinished flow computations, kept in the cache of the case folder."""
 
 from pathlib import Path
 
@@ -10,16 +10,16 @@ from vstent.io.files import atomic
 
 
 class FlowCheckpoint:
-    """One file for each run of a flow (the guesses and the answer), replaced whole.
+    """Saved states of one flow: one file for each run (coarse starting solutions and the final one).
 
-    The ledger drops them when it keeps the flow itself, for their names begin as its own.
+    Their names start with the name of the flow, so the ledger deletes them when it keeps the finished flow.
     """
 
     def __init__(self, folder: Path, flow: str, key: str) -> None:
         self._folder, self._flow, self._key = folder, flow, key
 
     def load(self, run: str) -> Saved | None:
-        """Return what was saved of a run last; None where nothing was, or it is damaged."""
+        """Return the last saved state of a run; None where there is none or the file is damaged."""
         try:
             with self._path(run).open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
@@ -27,9 +27,10 @@ class FlowCheckpoint:
             return None
 
     def save(self, run: str, saved: Saved) -> None:
-        """Keep the state of a run instead of the one before."""
+        """Save the state of a run and replace the previous one."""
         with atomic(self._path(run)) as partial, partial.open("wb") as file:
             np.savez(file, **saved)  # type: ignore[arg-type]
 
     def _path(self, run: str) -> Path:
+        """Return the file of a run."""
         return self._folder / f"{self._flow}-{self._key}-{run}.running.npz"

@@ -1,4 +1,4 @@
-"""Crate: a case folder as an RO-Crate: what each file is, and what made it.
+"""RO-Crate: machine-readable description of a case folder, its files and their origin.
 
 Version 1.1, https://w3id.org/ro/crate/1.1 (Soiland-Reyes et al. 2022, Data Science 5:97).
 """
@@ -12,8 +12,9 @@ from vstent.errors import ReadError
 from vstent.io.writers import write_json
 
 NAME: Final = "ro-crate-metadata.json"
+"""File name prescribed by RO-Crate."""
 LICENSE: Final = "https://spdx.org/licenses/BSD-3-Clause"
-"""Of the program."""
+"""Licence of vstent."""
 FORMATS: Final = {
     ".json": "application/json",
     ".csv": "text/csv",
@@ -25,41 +26,43 @@ FORMATS: Final = {
     ".png": "image/png",
     ".pdf": "application/pdf",
 }
+"""Media type of each file suffix."""
 ABOUT: Final = {
-    "metrics.json": "Every number, its unit in its key",
-    "run.json": "Versions, input with SHA-256, settings: enough to repeat the run",
-    "report.html": "The case in 3-D, before, after and change",
-    "report.pdf": "The same on paper, with the pictures",
-    "vessel.vtp": "The lumen",
-    "centerlines.vtp": "Centerlines, under VMTK's array names",
-    "landing_surface.vtp": "The parent artery, sac and branches closed: what the device expands against",
-    "sac.vtp": "The sac",
-    "neck.vtp": "The neck",
-    "openings.json": "Every opening, and what was repaired or guessed",
-    "contour.vtp": "Contour of the deployed device, with its distance from the wall",
-    "wires.vtp": "Axes of the wires",
-    "struts.stl": "Solids of the wires",
+    "metrics.json": "All metrics; the unit is part of each key",
+    "run.json": "Versions, SHA-256 of the input and settings, sufficient to repeat the run",
+    "report.html": "Interactive 3-D report: without and with the device, and the difference",
+    "report.pdf": "Report for printing",
+    "vessel.vtp": "Wall of the lumen",
+    "centerlines.vtp": "Centerlines, with the array names of VMTK",
+    "landing_surface.vtp": "Parent artery with the neck and branch ostia closed; the device expands against it",
+    "sac.vtp": "Sac",
+    "neck.vtp": "Neck curve",
+    "openings.json": "Openings, and notes on repairs and automatic choices",
+    "contour.vtp": "Contour of the deployed device, with its gap to the wall",
+    "wires.vtp": "Centerlines of the wires",
+    "struts.stl": "Solid wires",
     "field.vtu": "Velocity and pressure",
     "wall.vtp": "Wall shear stress",
 }
+"""Description of each file."""
 
 
 def write_crate(folder: Path, provenance: Mapping[str, Any], when: str) -> None:
-    """Describe every file of a finished case folder in ``ro-crate-metadata.json``; hidden ones are left out.
+    """Describe every file of a finished case folder in ``ro-crate-metadata.json``; hidden files are not listed.
 
     Parameters
     ----------
     folder : the case folder.
-    provenance : what its ``run.json`` says.
-    when : the day, ISO 8601.
+    provenance : contents of its ``run.json``.
+    when : date, ISO 8601.
 
     Raises
     ------
     ReadError
-        There is no finished case in the folder.
+        The folder contains no finished case.
     """
     if not (folder / "metrics.json").exists():
-        raise ReadError(f"{folder} holds no finished case: run it first.")
+        raise ReadError(f"{folder} contains no finished case: run it first.")
     paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and _is_shown(path.relative_to(folder))]
     files = [_file(folder, path) for path in paths]
     write_json(
@@ -72,10 +75,12 @@ def write_crate(folder: Path, provenance: Mapping[str, Any], when: str) -> None:
 
 
 def _is_shown(path: Path) -> bool:
+    """Return whether a file is listed, given its path inside the folder."""
     return path.name != NAME and not any(part.startswith(".") for part in path.parts)
 
 
 def _file(folder: Path, path: Path) -> dict[str, Any]:
+    """Return the entity of one file."""
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256")
     return {
@@ -89,6 +94,7 @@ def _file(folder: Path, path: Path) -> dict[str, Any]:
 
 
 def _crate(folder: Path, files: list[dict[str, Any]], when: str) -> list[dict[str, Any]]:
+    """Return the entities of the metadata file and of the folder."""
     return [
         {
             "@id": NAME,
@@ -100,9 +106,9 @@ def _crate(folder: Path, files: list[dict[str, Any]], when: str) -> list[dict[st
             "@id": "./",
             "@type": "Dataset",
             "name": f"Virtual stenting of {folder.resolve().name}",
-            "description": "A virtual stenting by vstent. Research use only: not for diagnosis or treatment.",
+            "description": "Virtual stenting with vstent. Research use only: not for diagnosis or treatment.",
             "datePublished": when,
-            "license": "Not for publication unless whoever holds the rights in the scan allows it",
+            "license": "Not for publication without the permission of the holder of the rights in the scan",
             "hasPart": [{"@id": file["@id"]} for file in files],
             "mentions": {"@id": "#run"},
         },
@@ -110,7 +116,7 @@ def _crate(folder: Path, files: list[dict[str, Any]], when: str) -> list[dict[st
 
 
 def _making(provenance: Mapping[str, Any], files: list[dict[str, Any]], when: str) -> list[dict[str, Any]]:
-    """Which program made the files, from what."""
+    """Return the entities of the program, its input and the run that wrote the files."""
     given = provenance["input"]
     return [
         {

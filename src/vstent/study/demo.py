@@ -1,4 +1,4 @@
-"""The demo: a synthetic 3DRA scan with a known truth, and how far the study's result is from it."""
+"""Demonstration case: a synthetic 3DRA scan with known geometry, and the comparison of results with it."""
 
 from pathlib import Path
 from typing import Final
@@ -10,15 +10,17 @@ from vstent.kernels import curves
 from vstent.phantoms import Phantom, demo_phantom, scan
 from vstent.study.types import CaseResult
 
-SEED: Final = 20161  # of the scan's noise: any other does as well
+SEED: Final = 20161
+"""Seed of the noise in the scan; the value is arbitrary."""
 END_DIAMETERS: Final = 1.0
-"""Radii are compared from this many diameters inside the ends on."""
+"""Distance from each end of the artery within which radii are not compared, in diameters."""
 
 Row = tuple[str, float, float, str]
+"""Title, value found, true value, unit."""
 
 
 def write_scan(folder: Path) -> Path:
-    """Write the demo's scan as a DICOM series, unless it is there, and return its folder."""
+    """Write the scan as a DICOM series into `folder`, unless the folder exists, and return the folder."""
     if not folder.is_dir():
         image = scan(demo_phantom(), np.random.default_rng(SEED))
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -27,23 +29,23 @@ def write_scan(folder: Path) -> Path:
 
 
 def truth(case: CaseResult) -> list[Row]:
-    """Compare a study of the demo's scan with the phantom: rows of title, found, true, unit."""
+    """Compare a study of the scan with the phantom; return rows of title, value found, true value, unit."""
     phantom = demo_phantom()
     found_mm, true_mm = _radii_mm(case, phantom)
     rows = [("Artery radius, mean along the axis", float(found_mm.mean()), float(true_mm.mean()), "mm")]
     worst = np.argmax(np.abs(found_mm / true_mm - 1))
-    rows.append(("Artery radius, where it is worst", float(found_mm[worst]), float(true_mm[worst]), "mm"))
+    rows.append(("Artery radius, at the largest error", float(found_mm[worst]), float(true_mm[worst]), "mm"))
     sacs = case.anatomy.aneurysms
     rows.append(("Sac volume", sacs[0].sac.volume_mm3 if sacs else 0.0, phantom.sac_volume_mm3, "mm3"))
     rows.append(("Neck area", sacs[0].neck.area_mm2 if sacs else 0.0, phantom.neck_area_mm2, "mm2"))
     for name in case.deployments:
         outside = case.metrics["stents"][name]["deployment"]["max_outside_mm"]
-        rows.append((f"Farthest node of {name} outside the landing surface", float(outside), 0.0, "mm"))
+        rows.append((f"Largest distance of {name} outside the landing surface", float(outside), 0.0, "mm"))
     return rows
 
 
 def _radii_mm(case: CaseResult, phantom: Phantom) -> tuple[np.ndarray, np.ndarray]:
-    """Radius of the landing surface and of the phantom's artery at the same places, ends left out."""
+    """Return the radii (n,) of the landing surface and of the phantom at the same positions, without the ends."""
     axis, parent = case.anatomy.axis, phantom.parent
     margin = 2 * END_DIAMETERS * float(axis.inscribed_radius_mm.mean())
     inner = (axis.abscissa_mm > margin) & (axis.abscissa_mm < axis.length_mm - margin)

@@ -1,4 +1,4 @@
-"""A case, or an input not yet studied, handed over to other solvers: an OpenFOAM case folder, or named patches."""
+"""Export of a case, or of a scan or surface, to other solvers: an OpenFOAM case folder, or named patches."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -32,7 +32,7 @@ GEOMETRY: Final = (
     *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
     *("neck_mm", "upstream_mm", "downstream_mm"),
 )
-"""Settings that say how the vessel is found."""
+"""Fields of `Settings` that determine the geometry of the vessel."""
 
 
 def export_openfoam(
@@ -44,14 +44,19 @@ def export_openfoam(
     ----------
     path : a case folder of `run`, or a scan or surface.
     out : the folder to write.
-    settings : what is given; the struts of its first device, if it names one, are meshed.
-    foam : fields of `FoamSetup`; where they name no flavour it is that of the OpenFOAM on this machine.
-    progress : told of every stage.
+    settings : settings of the case. Where it names devices, the struts of the first are meshed.
+    foam : fields of `FoamSetup`; without ``flavour``, that of the OpenFOAM installed on this machine.
+    progress : called at each stage.
+
+    Returns
+    -------
+    case : the flow problem.
+    written : the files that were written.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        The input or a setting cannot be used; nothing has been written.
     """
     ledger = Ledger(out / CACHE, progress)
     anatomy = _anatomy(path, settings, ledger)
@@ -62,27 +67,31 @@ def export_openfoam(
     with ledger.stage("export") as tell:
         written = foam_case(case, setup)
         write(out, written)
-        tell(f"{len(written.files)} files, cells of {setup.cell_size_mm:.3g} mm, for {written.application}.")
+        tell(f"{len(written.files)} files, grid spacing {setup.cell_size_mm:.3g} mm, solver {written.application}.")
     return case, written
 
 
 def export_patches(path: Path, out: Path, settings: Settings, progress: Progress) -> list[dict[str, Any]]:
-    """Write the boundary of the blood as watertight named patches; return name, id, area, centre and normal of each.
+    """Write the boundary of the blood volume as watertight, named patches.
 
-    ``patches.stl`` has one named solid per patch, ``patches.vtp`` the same faces with their ``patch_id``, both in mm;
-    ``patches.json`` says which is which, ``neck.stl`` is what blood crosses into the sac.
+    ``patches.stl`` contains one named solid for each patch, ``patches.vtp`` the same faces with their ``patch_id``,
+    ``neck.stl`` the surface through which blood enters the sac; all in mm. ``patches.json`` lists the patches.
 
     Parameters
     ----------
     path : a case folder of `run`, or a scan or surface.
     out : the folder to write.
-    settings : what is given of the vessel.
-    progress : told of every stage.
+    settings : settings that determine the vessel.
+    progress : called at each stage.
+
+    Returns
+    -------
+    patches : name, number, area (mm2), centre (mm) and normal of each patch.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        The input or a setting cannot be used; nothing has been written.
     """
     ledger = Ledger(out / CACHE, progress)
     case = flow_case(_anatomy(path, settings, ledger), None, FlowSettings())
@@ -103,6 +112,7 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: Progress
 
 
 def _middle(corners_mm: np.ndarray) -> dict[str, Any]:
+    """Return the centre (3,), mm, and the mean unit normal (3,) of triangles with corners (n, 3, 3)."""
     area_mm2 = 0.5 * np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     size_mm2 = np.linalg.norm(area_mm2, axis=1)
     total = area_mm2.sum(axis=0)
@@ -111,22 +121,25 @@ def _middle(corners_mm: np.ndarray) -> dict[str, Any]:
 
 
 def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
-    """The anatomy kept in a case folder, or that of an input."""
+    """Return the anatomy stored in a case folder, or computed from a scan or surface."""
     kept = sorted((path / CACHE).glob("anatomy-*.npz")) if path.is_dir() else []
     if not kept:
         return find_anatomy(path, hash_of(path), settings, ledger)
     given = [name for name in GEOMETRY if getattr(settings, name) is not None]
     if given:
         words = ", ".join(f"--{name.removesuffix('_mm')} ({name})" for name in given)
-        raise InputError(f"{path} is a case folder, and its vessel is taken as it lies there: leave out {words}")
+        raise InputError(
+            f"{path} is a case folder and already contains the vessel; options that would change it have no effect: "
+            f"leave out {words}."
+        )
     with ledger.stage("anatomy") as tell:
         anatomy = load_data(kept[-1], Anatomy)
-        tell(f"taken from {path}")
+        tell(f"read from {path}")
     return anatomy
 
 
 def _stent(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Stent | None:
-    """The first device, in the size and at the place that the case folder's own run gave it, or as proposed."""
+    """Return the first device, with the size and position of the run in the case folder, or as proposed."""
     if not settings.devices:
         return None
     name = settings.devices[0]
@@ -137,7 +150,7 @@ def _stent(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> 
 
 
 def _told(path: Path, settings: Settings) -> Settings:
-    """What the run of a case folder was told; the settings given where there has been none."""
+    """Return the settings of the run in a case folder; `settings` where there is no run."""
     run = path / RUN
     if not run.exists():
         return settings
@@ -145,11 +158,12 @@ def _told(path: Path, settings: Settings) -> Settings:
         return told_in(run)[1]
     except UNTOLD:
         raise ReadError(
-            f"{run} is not of this version, so where a device lies is not known: do the run again."
+            f"{run} cannot be read by this version, so the position of the device is not known: repeat the run."
         ) from None
 
 
 def _flavour_here() -> Flavour:
+    """Return the distribution of the installed OpenFOAM; ``com`` where there is none."""
     try:
         return program.find().flavour
     except FlowError:

@@ -1,4 +1,4 @@
-"""The case folder: one process at a time works in it, and it is never left half-made."""
+"""Case folder: a lock that admits one process at a time, and removal of incomplete files."""
 
 import os
 import platform
@@ -12,16 +12,16 @@ from vstent.errors import FolderError
 from vstent.io.files import sweep
 
 CACHE: Final = ".vstent"
-"""Folder inside the case folder that holds finished stages, and the lock."""
+"""Name of the folder inside the case folder that contains finished stages and the lock."""
 
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
 Study = Callable[Concatenate[Path, Path, Given], Found]
-"""Takes an input and a case folder, and more."""
+"""A function of an input path, a case folder and further arguments."""
 
 
 def claiming(study: Study[Given, Found]) -> Study[Given, Found]:
-    """Let a study have its case folder (the second argument) for itself while it runs."""
+    """Return the function with its case folder (second argument) locked while it runs."""
 
     @wraps(study)
     def alone(path: Path, out: Path, /, *args: Given.args, **given: Given.kwargs) -> Found:
@@ -33,14 +33,15 @@ def claiming(study: Study[Given, Found]) -> Study[Given, Found]:
 
 @contextmanager
 def claimed(out: Path) -> Iterator[None]:
-    """Keep other processes out of a case folder; folders that were made for it go again if they stay empty.
+    """Lock a case folder while the context is active.
 
-    What a process that was killed has left half-written there is taken away.
+    The folder is created where needed, and removed at the end if it is still empty. Incomplete files of a killed
+    process are deleted.
 
     Raises
     ------
     FolderError
-        Another process works there, or the folder cannot be written to.
+        Another process uses the folder, or it cannot be written to.
     """
     cache = out / CACHE
     made = [folder for folder in (cache, out, *out.parents) if not folder.exists()]
@@ -49,7 +50,7 @@ def claimed(out: Path) -> Iterator[None]:
         lock = _locked(cache / "lock")
     except OSError as error:
         _drop(made)
-        raise FolderError(f"{out} cannot be written to ({error.strerror}): give another --out.") from None
+        raise FolderError(f"{out} cannot be written to ({error.strerror}): choose another folder (--out).") from None
     try:
         sweep(out)
         yield
@@ -60,14 +61,14 @@ def claimed(out: Path) -> Iterator[None]:
 
 
 def _drop(folders: list[Path]) -> None:
-    """Remove folders, innermost first, as far as they are empty."""
+    """Delete folders, innermost first, up to the first that is not empty."""
     with suppress(OSError):
         for folder in folders:
             folder.rmdir()
 
 
 def _locked(path: Path) -> IO[str]:
-    """Lock a file until it is closed or the process dies, however it dies."""
+    """Return the locked and opened file; the lock ends when it is closed or the process ends."""
     while True:
         file = path.open("a+", encoding="utf-8")
         try:
@@ -76,7 +77,7 @@ def _locked(path: Path) -> IO[str]:
         except BaseException:
             file.close()
             raise
-        if is_there:  # and not taken away by a process that ended just now
+        if is_there:  # otherwise a process that has just ended deleted it
             file.truncate(0)
             file.write(f"process {os.getpid()} on {platform.node()}")
             file.flush()
@@ -85,9 +86,10 @@ def _locked(path: Path) -> IO[str]:
 
 
 def _lock(file: IO[str], path: Path) -> None:
+    """Lock a file; raise FolderError where another process holds the lock."""
     try:
         import fcntl
-    except ImportError:  # Windows: two processes are not kept apart there
+    except ImportError:  # Windows: no lock there
         return
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -95,5 +97,5 @@ def _lock(file: IO[str], path: Path) -> None:
         file.seek(0)
         who = file.read().strip() or "another process"
         raise FolderError(
-            f"{path.parent.parent} is in use by {who}: wait until that run ends, or give another --out."
+            f"{path.parent.parent} is in use by {who}: wait until that run ends, or choose another folder (--out)."
         ) from None

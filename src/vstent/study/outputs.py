@@ -1,4 +1,4 @@
-"""The files of a case folder."""
+"""Files of a case folder: writing them, and deleting those of earlier runs."""
 
 import shutil
 from collections.abc import Collection, Iterable
@@ -23,51 +23,54 @@ from vstent.study.crate import NAME as CRATE
 from vstent.study.provenance import METRICS, RUN
 
 STENT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
+"""Files of a deployed device."""
 FIELD: Final = ("field.vtu", "wall.vtp")
+"""Files of a flow field."""
 SACS: Final = ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp")
+"""Patterns of the files of sacs and necks."""
 OF_STUDY: Final = (
     *(METRICS, RUN, "report.html", "report.pdf", CRATE),
     *(f"stents/*/{name}" for name in STENT),
     *(f"flow/*/{name}" for name in FIELD),
 )
-"""What a study writes of devices and flows, and tells of them."""
+"""Patterns of the files that depend on devices and flow."""
 OF_ANATOMY: Final = ("morphology.json", "convergence.json")
-"""What is found of an anatomy alone."""
+"""Files that depend on the anatomy alone."""
 RESULTS: Final = (
     *("vessel.vtp", "centerlines.vtp", "openings.json", "landing_surface.vtp", *SACS),
     *("ranking.csv", "ranking.json", *OF_ANATOMY, *OF_STUDY),
 )
-"""All that is written into a case folder beside the cache and the folders of OpenFOAM."""
+"""Patterns of all files of a case folder, except the cache and the folders of OpenFOAM."""
 
 
 def take_away_results(out: Path) -> None:
-    """Take away the results in a case folder; what is kept in the cache, and files of the user's own, stay."""
+    """Delete the results in a case folder; the cache and the user's own files stay."""
     _take_away(out, RESULTS, list(out.glob(f"flow/**/{KEY}")))
 
 
 def take_away_study(out: Path, kept: Collection[Path]) -> None:
-    """Take away what a study with other settings wrote, but for OpenFOAM's folders in `kept`: it goes on from them."""
+    """Delete the results of a run with other settings; the folders of OpenFOAM in `kept` stay, for resuming."""
     _take_away(out, OF_STUDY, [key for key in out.glob(f"flow/*/*/{KEY}") if key.parent not in kept])
 
 
 def take_away_measures(out: Path) -> None:
-    """Take away what was found of another anatomy alone."""
+    """Delete the results that depend on the anatomy alone."""
     _take_away(out, OF_ANATOMY, list(out.glob(f"flow/convergence/**/{KEY}")))
 
 
 def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None:
-    """Take away files, OpenFOAM's folders by their `keys`, and folders that are empty then."""
+    """Delete files by pattern, the OpenFOAM folders that contain `keys`, and folders that are then empty."""
     for file in [file for pattern in patterns for file in out.glob(pattern)]:
         file.unlink()
     for key in keys:
         shutil.rmtree(key.parent)
     for folder in [*out.glob("stents/*/"), *out.glob("flow/*/"), out / "stents", out / "flow"]:
-        with suppress(OSError):  # it is not there, or not empty
+        with suppress(OSError):  # missing or not empty
             folder.rmdir()
 
 
 def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
-    """Write the wall, the centerlines (and other axes beside them) and the openings."""
+    """Write the wall, the centerlines with further `axes`, and the openings of a vessel."""
     out.mkdir(parents=True, exist_ok=True)
     writers.write_surface(out / "vessel.vtp", vessel.lumen)
     writers.write_centerlines(out / "centerlines.vtp", (*vessel.centerlines, *axes))
@@ -76,13 +79,13 @@ def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
 
 
 def write_anatomy(out: Path, anatomy: Anatomy) -> None:
-    """Write the vessel, the parent artery and the sacs; sacs found before and no more are taken away."""
+    """Write the vessel, the parent artery and the sacs; delete the files of sacs that are no longer found."""
     write_vessel(out, anatomy.vessel, anatomy.axis)
     restored = {"is_restored": anatomy.is_restored.astype(np.uint8)}
     writers.write_surface(out / "landing_surface.vtp", anatomy.landing_surface, restored)
     written = set()
     for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
-        sac, neck = (f"{noun}.vtp" if number == 1 else f"{noun}_{number}.vtp" for noun in ("sac", "neck"))
+        sac, neck = (f"{part}.vtp" if number == 1 else f"{part}_{number}.vtp" for part in ("sac", "neck"))
         writers.write_surface(out / sac, aneurysm.sac)
         closed = np.concatenate([aneurysm.neck_mm, aneurysm.neck_mm[:1]])
         writers.write_lines(out / neck, closed, np.array([0, len(closed)], dtype=np.int32))
@@ -93,7 +96,7 @@ def write_anatomy(out: Path, anatomy: Anatomy) -> None:
 
 
 def write_stent(folder: Path, deployment: Deployment) -> str:
-    """Write contour, wires and struts; say how many."""
+    """Write contour, wires and struts; return a sentence with the number of wires and triangles."""
     stent = deployment.stent
     folder.mkdir(parents=True, exist_ok=True)
     writers.write_surface(folder / "contour.vtp", stent.contour, {"wall_gap_mm": deployment.wall_gap_mm.ravel()})
@@ -107,7 +110,7 @@ def write_stent(folder: Path, deployment: Deployment) -> str:
 
 
 def write_field(folder: Path, field: FlowField) -> None:
-    """Write the flow in the cells and on the wall."""
+    """Write velocity and pressure in the cells, and wall shear stress and pressure on the wall."""
     folder.mkdir(parents=True, exist_ok=True)
     of_cell = {"velocity_m_s": field.velocity_m_s, "pressure_Pa": field.pressure_Pa}
     if field.swing:
@@ -124,7 +127,7 @@ def write_field(folder: Path, field: FlowField) -> None:
 
 
 def write_ranking(out: Path, ranking: Ranking) -> None:
-    """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``."""
+    """Write a ranking as ``ranking.csv``, and with its criteria as ``ranking.json``."""
     rows = ranking.rows()
     write_rows(out / "ranking.csv", rows)
     criteria = [item.model_dump(exclude_none=True) for item in ranking.criteria.items]

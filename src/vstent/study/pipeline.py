@@ -1,8 +1,8 @@
-"""Study: one patient, from a file to the flow before and after, with its files, its provenance and its resume.
+"""Study of one case: from a scan or surface to the flow without and with each device, in a case folder.
 
-The stages follow each other as in design.md section 1. Geometry is computed first and nothing is written until every
-device is deployed, so that a wrong input leaves nothing behind. From then on each finished stage lies in the folder
-under a key that names everything it depends on; running the same study again reads it back instead of computing it.
+Nothing is written until every device is deployed, so an unusable input leaves no files. From then on every finished
+stage is stored in the case folder under a key of everything that it depends on. Running the same study again reads
+stored stages instead of computing them.
 """
 
 from dataclasses import asdict
@@ -11,6 +11,7 @@ from typing import Any
 
 from vstent.anatomy.morphology import morphology
 from vstent.devices.catalogue import find_design
+from vstent.devices.design import BARE
 from vstent.flow.convergence import Sensitivity
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
@@ -43,23 +44,23 @@ from vstent.study.types import CaseResult, Progress, Settings
 
 @claiming
 def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseResult:
-    """Run one study and write its folder; a study already begun there goes on where it stopped.
+    """Run one study and write its case folder; an interrupted study in that folder is resumed.
 
     Parameters
     ----------
     path : a scan or a surface.
     out : the case folder.
-    settings : what is given; the rest is proposed.
-    progress : told of every stage.
+    settings : settings; fields that are None are chosen automatically.
+    progress : called at each stage.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        The input or a setting cannot be used; nothing has been written.
     FlowError
-        A flow could not be computed; everything before it is kept.
+        A flow could not be computed; the finished stages are kept.
     FolderError
-        Another process works in the folder, or it cannot be written to.
+        Another process uses the folder, or it cannot be written to.
     """
     designs = {name: find_design(name) for name in settings.devices}
     ledger = Ledger(out / CACHE, progress)
@@ -72,7 +73,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     _settle(path, out, source, ledger)
     if has_former:
         take_away_study(out, engine_folders(out, settings).values())
-    (out / CRATE).unlink(missing_ok=True)  # it describes files that are written anew
+    (out / CRATE).unlink(missing_ok=True)  # it describes files that are now rewritten
     write_anatomy(out, anatomy)
     for name, deployment in deployments.items():
         with ledger.stage(f"struts {name}") as tell:
@@ -86,26 +87,26 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
         writers.write_json(out / METRICS, metrics)
     told[SECONDS] = ledger.seconds
     writers.write_json(out / RUN, told, is_exact=True)
-    of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
+    of_flows = (f"Flow {_described(name)}: {field.advice}" for name, field in fields.items())
     notes = (*anatomy.vessel.notes, *anatomy.notes, *of_flows)
     return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, notes)
 
 
 @claiming
 def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> Vessel:
-    """Find the vessel, its openings and its centerlines, untrimmed; write them into the folder `out`.
+    """Extract the vessel, its openings and its centerlines, without trimming, and write them.
 
     Parameters
     ----------
     path : a scan or a surface.
-    out : the folder.
-    settings : what is given; the rest is proposed.
-    progress : told of every stage.
+    out : the folder to write.
+    settings : settings; fields that are None are chosen automatically.
+    progress : called at each stage.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        The input or a setting cannot be used; nothing has been written.
     """
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
@@ -117,21 +118,26 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) 
 
 @claiming
 def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Anatomy, dict[str, Any]]:
-    """Shrink the sac: find the parent artery and measure it; write it into the folder `out`.
+    """Find the sac and its neck, reconstruct the parent artery, measure both and write them.
 
-    A study begun in the same folder goes on from what is found here, and the other way round.
+    A study in the same case folder reuses these stages, and this function reuses those of a study.
 
     Parameters
     ----------
     path : a scan or a surface.
     out : the case folder.
-    settings : what is given; the rest is proposed.
-    progress : told of every stage.
+    settings : settings; fields that are None are chosen automatically.
+    progress : called at each stage.
+
+    Returns
+    -------
+    anatomy : vessel, parent artery and sacs.
+    measures : morphology, by metric key.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        The input or a setting cannot be used; nothing has been written.
     """
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
@@ -145,19 +151,21 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
 
 @claiming
 def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> Sensitivity:
-    """Compute the flow without a device on three grids, time steps and positions; write ``convergence.json``.
+    """Compute the flow without a device for three grid spacings, time steps and positions on the grid.
+
+    The results are written to ``convergence.json``.
 
     Parameters
     ----------
     path : a scan or a surface.
     out : the case folder.
-    settings : what is given; the cell size, given or proposed, is the finest.
-    progress : told of every stage.
+    settings : settings; fields that are None are chosen automatically. The grid spacing is the finest of the three.
+    progress : called at each stage.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        The input or a setting cannot be used; nothing has been written.
     FlowError
         A flow could not be computed.
     """
@@ -173,8 +181,13 @@ def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -
     return found
 
 
+def _described(flow: str) -> str:
+    """Return the name of a flow in words: without a device, or with which."""
+    return "without a device" if flow == BARE else f"with {flow}"
+
+
 def _settle(path: Path, out: Path, source: str, ledger: Ledger) -> None:
-    """Keep what is held: the folder is this input's from here on; results of another one, or its anatomy, go."""
+    """Store the results that wait and record the input; delete results of another input or of another anatomy."""
     former = former_source(out)
     if former not in (source, None):
         take_away_results(out)

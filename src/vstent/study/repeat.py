@@ -1,4 +1,4 @@
-"""Repeat: a run done again from what `run.json` says of it, and how far the two agree."""
+"""Repetition of a run from its `run.json`, and comparison of the two results."""
 
 import json
 from collections.abc import Mapping
@@ -19,29 +19,31 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
 MISSING: Final = "absent"
+"""Value shown where `run.json` does not contain an entry."""
 SECONDS: Final = "seconds"
-"""Key of what every stage took."""
+"""Key in `run.json` of the run time of every stage."""
 UNTOLD: Final = (OSError, ValueError, KeyError, TypeError)
-"""What comes of a file that is missing, damaged, or of another kind."""
+"""Exceptions raised by reading a file that is missing, damaged, or of another kind."""
 TOLERANCE: Final = 1e-3
-"""Relative, between machines: other processors round otherwise, and a count of pixels or an end of settling may turn on
-that. Measured on one processor with and without its wide and fused instructions: 2e-4, where the flow is steady."""
+"""Accepted relative difference between machines. Processors round differently, which can change a pixel count or the
+time step at which a flow has converged. Measured on one processor with and without vector and fused instructions: 2e-4
+for a steady flow."""
 ROUNDING: Final = 1e-9
-"""In the unit of a metric: what differs by less is the rounding of a zero."""
+"""Differences below this value, in the unit of the metric, are rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A run as its `run.json` tells it."""
+    """A run described by its `run.json`."""
 
     folder: Path
     """The case folder."""
     input: Path
-    """Scan or surface: seen to be the same file."""
+    """Scan or surface, whose hash has been checked."""
     settings: Settings
-    """All of them, to the last bit."""
+    """All settings, exact to the last bit."""
     differences: tuple[str, ...]
-    """What is not as it was then: versions, machine, devices; a sentence each."""
+    """Differences between then and now in versions, machine and devices, one phrase each."""
 
 
 def read_record(path: Path, moved_to: Path | None = None) -> Record:
@@ -50,40 +52,46 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
     Parameters
     ----------
     path : the file, in its case folder.
-    moved_to : where the input lies now; None: where it lay then.
+    moved_to : the present path of the input; None: the recorded path.
 
     Raises
     ------
     ReadError
-        The file does not exist or is not of this version's kind, or the input is not where it was.
+        The file does not exist or cannot be read by this version, or the input is not at its path.
     InputError
-        The input is another one than then.
+        The input has changed.
     """
     try:
         told, settings = told_in(existing(path))
         sha256 = str(told["input"]["sha256"])
         differences = _differences(told, settings)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise ReadError(f"{path} is no run.json of this version: give the scan and the options again.") from None
+        raise ReadError(
+            f"{path} is not a run.json that this version can read: give the scan or surface and the options instead."
+        ) from None
     source = moved_to or _input(path.parent)
     if not source.exists():
-        raise ReadError(f"{source}, the input of {path}, is not there: say where it is now with --input.")
+        raise ReadError(f"{source}, the input of {path}, does not exist: give its present path (--input).")
     if hash_of(source) != sha256:
-        raise InputError(f"{source} is not the input of {path}: it has changed since. Give that file with --input.")
+        raise InputError(
+            f"{source} is not the input of {path}, or it has changed since the run: give the original file (--input)."
+        )
     return Record(path.parent, source, settings, differences)
 
 
 def _input(folder: Path) -> Path:
+    """Return the recorded path of the input of a case folder."""
     try:
         return Path(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"])
     except UNTOLD:
         raise ReadError(
-            f"{folder} does not say where its input lay (its folder {CACHE} is gone): say it with --input."
+            f"{folder} does not contain the path of its input, because its folder {CACHE} is missing: give the path "
+            "(--input)."
         ) from None
 
 
 def former_source(folder: Path) -> str | None:
-    """Return the hash of the input that a case folder's results are of; None where it does not say."""
+    """Return the hash of the input of the results in a case folder; None where it is not recorded."""
     with suppress(*UNTOLD):
         return str(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["sha256"])
     with suppress(*UNTOLD):
@@ -92,7 +100,7 @@ def former_source(folder: Path) -> str | None:
 
 
 def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
-    """Tell whether a case folder was begun by a run other than that with the provenance `told`, or one not ended."""
+    """Return whether a case folder contains a run with a provenance other than `told`, or an unfinished run."""
     with suppress(*UNTOLD):
         former = json.loads((folder / RUN).read_text(encoding="utf-8"))
         return {key: former[key] for key in former if key != SECONDS} != json.loads(json.dumps(told))
@@ -100,13 +108,25 @@ def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
 
 
 def told_in(run: Path) -> tuple[dict[str, Any], Settings]:
-    """What a `run.json` tells, and the settings among it; one of `UNTOLD` where this version cannot read it."""
+    """Return the contents of a `run.json` and its settings.
+
+    Raises
+    ------
+    OSError, ValueError, KeyError, TypeError
+        This version cannot read the file.
+    """
     told = json.loads(run.read_text(encoding="utf-8"))
     return told, settings_of(told["settings"])
 
 
 def settings_of(told: Mapping[str, Any]) -> Settings:
-    """Rebuild the settings that a `run.json` tells; ValueError where this version does not know one."""
+    """Rebuild the settings from their entry in a `run.json`.
+
+    Raises
+    ------
+    ValueError
+        This version does not know a setting.
+    """
     unknown = sorted(set(told) - {field.name for field in fields(Settings)})
     if unknown:
         raise ValueError(f"unknown settings: {unknown}")
@@ -115,12 +135,14 @@ def settings_of(told: Mapping[str, Any]) -> Settings:
 
 @cache
 def _adapter() -> "TypeAdapter[Settings]":
+    """Return the validator of settings."""
     from pydantic import TypeAdapter  # its ValidationError is a ValueError
 
     return TypeAdapter(Settings)
 
 
 def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]:
+    """Return the differences in versions, machine and devices, one phrase each."""
     now = {"versions": versions(), "machine": machine(settings), "devices": devices_of(settings.devices)}
     return tuple(
         f"{name.replace('_', ' ')} ({part}): {told.get(part, {}).get(name, MISSING)} then, {value} now"
@@ -131,35 +153,36 @@ def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]
 
 
 def agreement(first: Path, second: Path) -> str:
-    """Return a sentence on how far the metrics of two case folders agree.
+    """Return a sentence on how well the metrics of two case folders agree.
 
     Raises
     ------
     ReadError
-        One of them has none.
+        A folder contains no metrics.
     """
     try:
         one, other = ((folder / METRICS).read_bytes() for folder in (first, second))
     except OSError as error:
-        raise ReadError(f"{error.filename} cannot be read: nothing to compare with.") from None
+        raise ReadError(f"{error.filename} cannot be read, so there is nothing to compare with.") from None
     if one == other:
-        return "The metrics are the same to the last bit."
+        return "The metrics are identical to the last bit."
     then, now = dict(_numbers(json.loads(one))), dict(_numbers(json.loads(other)))
     if set(then) != set(now):
-        return f"The metrics differ: {len(set(then) ^ set(now))} of them are in one run only."
+        return f"The metrics differ: {len(set(then) ^ set(now))} of them exist in one run only."
     apart = {name: _relative(then[name], now[name]) for name in then}
     worst = max(apart, key=lambda name: apart[name])
     n_apart = sum(value > 0 for value in apart.values())
     if n_apart == 0:
-        return "The metrics are the same but for rounding."
+        return "The metrics are identical except for rounding."
     verdict = "within" if apart[worst] <= TOLERANCE else "more than"
     return (
-        f"{n_apart} of {len(apart)} metrics differ, {worst} most: by {apart[worst]:.2g} of itself, "
-        f"{verdict} the {TOLERANCE:g} that another machine may make."
+        f"{n_apart} of {len(apart)} metrics differ. The largest relative difference is {apart[worst]:.2g}, of {worst}: "
+        f"{verdict} the {TOLERANCE:g} expected between machines."
     )
 
 
 def _relative(one: Any, other: Any) -> float:
+    """Return the relative difference of two values; 1 for different texts."""
     if one == other:
         return 0.0
     if isinstance(one, str) or isinstance(other, str):
@@ -169,6 +192,7 @@ def _relative(one: Any, other: Any) -> float:
 
 
 def _numbers(values: Mapping[str, Any], before: str = "") -> list[tuple[str, Any]]:
+    """Return the values of nested mappings, under keys joined by dots."""
     found = []
     for name, value in values.items():
         found += _numbers(value, f"{before}{name}.") if isinstance(value, Mapping) else [(f"{before}{name}", value)]

@@ -1,4 +1,4 @@
-"""Stages of a study: each timed and told of by the ledger."""
+"""Stages of a study; the ledger times each and reports it."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -41,14 +41,22 @@ from vstent.study.types import Placing, Point, Settings
 from vstent.units import counted
 
 SLOWEST_M_S: Final = 0.01
+"""Lowest accepted mean velocity at an inlet, m/s: below it, the flow rate is probably in another unit."""
 FASTEST_M_S: Final = 2.0
-"""Mean speeds at the inlet beyond which no artery of the brain's blood flows."""
+"""Highest accepted mean velocity at an inlet, m/s: above it, the flow rate is probably in another unit."""
 
 
 def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) -> Anatomy:
-    """Read, segment, repair, trace, trim and restore; what was kept of this `source` (hash) is taken as it is.
+    """Return the anatomy of an input: read, segment, repair, trace, trim and restore.
 
-    What is found is held by the ledger: its `settle` keeps it.
+    A stored anatomy is reused. A new one is stored when the ledger's `settle` is called.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    source : its hash.
+    settings : settings of the study.
+    ledger : record of the study.
     """
     key = anatomy_key(source, settings)
     kept = ledger.recall(ANATOMY, key, Anatomy)
@@ -59,19 +67,19 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
     at_mm = _array(settings.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
     outlet_mm = _array(settings.outlet_mm)
     if outlet_mm is not None:
-        opening_at(whole, outlet_mm)  # before ends are cut off: the outlet meant may be one of them
+        opening_at(whole, outlet_mm)  # before trimming, which may remove the chosen outlet
     with ledger.stage("trim") as tell:
         traced = trim(whole, at_mm=at_mm, upstream_mm=settings.upstream_mm, downstream_mm=settings.downstream_mm)
         tell(" ".join(traced.notes[len(whole.notes) :]))
     with ledger.stage("restore") as tell:
         anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
-        tell(" ".join([*anatomy.notes, *(f"Sac of {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
+        tell(" ".join([*anatomy.notes, *(f"Sac volume {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
     ledger.hold(ANATOMY, key, anatomy)
     return anatomy
 
 
 def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> Vessel:
-    """Read, segment, repair and trace; what was kept of this `source` (hash) is taken, what is found is held."""
+    """Return the traced vessel of an input: read, segment, repair and trace; see `find_anatomy`."""
     key = vessel_key(source, settings)
     kept = ledger.recall("vessel", key, Vessel)
     if kept is not None:
@@ -81,7 +89,7 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
         tell(" ".join(vessel.notes))
     with ledger.stage("trace") as tell:
         traced = trace(vessel, inlet_mm=_array(settings.inlet_mm))
-        widths = ", ".join(f"{inlet.role} {inlet.diameter_mm:.1f} mm wide" for inlet in traced.inlets)
+        widths = ", ".join(f"{inlet.role} diameter {inlet.diameter_mm:.1f} mm" for inlet in traced.inlets)
         found = f"{counted(len(traced.outlets), 'outlet')}; {widths}."
         tell(" ".join([found, *traced.notes[len(vessel.notes) :]]))
     ledger.hold("vessel", key, traced)
@@ -89,6 +97,7 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
 
 
 def _vessel(path: Path, settings: Settings) -> Vessel:
+    """Return the repaired lumen of a scan or surface."""
     if path.is_file() and is_surface_file(path):
         surface, notes = read_surface(path, units=settings.units)
         vessel = Vessel(surface, notes=notes)
@@ -103,7 +112,7 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
 def deploy_all(
     designs: Mapping[str, Design], anatomy: Anatomy, settings: Settings, ledger: Ledger
 ) -> dict[str, Deployment]:
-    """Deploy every device, each in the given or the proposed size."""
+    """Deploy every device; sizes and positions that are not given are proposed."""
     deployments = {}
     for name, design in designs.items():
         with ledger.stage(f"deploy {name}") as tell:
@@ -113,20 +122,20 @@ def deploy_all(
 
 
 def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
-    """Deploy a device in the size and at the place that are given, or proposed where they are not."""
+    """Deploy a device; a size or position that is not given is proposed."""
     landing = None if placing.center_mm is None else Landing(placing.center_mm)
     return deploy(design, anatomy, size=size_of(design, anatomy, placing), landing=landing)
 
 
 def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
-    """Return the size given; where of it a diameter or a length is not given, what is proposed of those that match.
+    """Return the given size; without a diameter or a length, propose one of the sizes that match the other.
 
     Raises
     ------
     DeviceError
-        When the device is not made in that size.
+        The device is not made in that size.
     LandingError
-        When none of those that match fits the artery.
+        No matching size fits the artery.
     """
     sizes = find_sizes(design, diameter_mm=placing.diameter_mm, length_mm=placing.length_mm)
     if placing.diameter_mm is not None and placing.length_mm is not None:
@@ -135,21 +144,27 @@ def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
 
 
 def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
-    """Refuse a mean inflow with which no blood flows: another unit was meant."""
+    """Check that the mean velocity at every inlet is physiological.
+
+    Raises
+    ------
+    InputError
+        It is outside `SLOWEST_M_S` to `FASTEST_M_S`: the flow rate is probably in another unit.
+    """
     if flow is None or flow.inflow_mL_s is None:
         return
     case = FlowCase(anatomy.vessel, settings=flow)
     for inlet, part_mL_s, speed_m_s in zip(case.vessel.inlets, case.inlets_mL_s, case.inlet_speeds_m_s, strict=True):
         if not SLOWEST_M_S <= speed_m_s <= FASTEST_M_S:
             raise InputError(
-                f"a mean inflow of {part_mL_s:g} mL/s through an inlet {inlet.diameter_mm:.1f} mm wide flows at "
-                f"{speed_m_s:.2g} m/s, and blood in arteries at {SLOWEST_M_S:g} to {FASTEST_M_S:g}: give mL/s (240 "
-                "mL/min are 4), or another inlet"
+                f"{part_mL_s:g} mL/s through an inlet of {inlet.diameter_mm:.1f} mm diameter give a mean velocity of "
+                f"{speed_m_s:.2g} m/s; {SLOWEST_M_S:g} to {FASTEST_M_S:g} m/s are accepted. Give the flow rate in mL/s "
+                "(240 mL/min are 4 mL/s), or choose another inlet."
             )
 
 
 def engine_folders(out: Path, settings: Settings) -> dict[str, Path]:
-    """Return where an engine keeps files of its own of every flow, by name; none where no flow is computed."""
+    """Return the folder in which the engine keeps its own files, by name of the flow; empty without flow."""
     if settings.flow is None:
         return {}
     return {name: out / "flow" / name / settings.flow.engine for name in (BARE, *settings.devices)}
@@ -163,7 +178,21 @@ def compute_flows(
     ledger: Ledger,
     source: str,
 ) -> dict[str, FlowField]:
-    """Compute the flow without and with each device; each is kept as soon as it is done."""
+    """Compute the flow without and with each device, and write and store each as soon as it is finished.
+
+    Parameters
+    ----------
+    out : the case folder.
+    anatomy : vessel, parent artery and sacs.
+    deployments : the deployed devices, by name.
+    settings : settings of the study.
+    ledger : record of the study.
+    source : hash of the input.
+
+    Returns
+    -------
+    fields : flow fields: ``bare``, then by device name; empty where no flow is requested.
+    """
     if settings.flow is None:
         return {}
     fields: dict[str, FlowField] = {}
@@ -191,13 +220,13 @@ def compute_flows(
 
 
 def flow_key(source: str, settings: Settings, name: str, design: Design | None) -> str:
-    """Key of one flow of an input: ``bare``, or behind a device of this design."""
+    """Return the key of one flow of an input: ``bare``, or with a device of this design."""
     placed = (design, settings.placing(name)) if design else ()
     return key_of(anatomy_key(source, settings), settings.flow, name, *placed)
 
 
 def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Sensitivity:
-    """Compute the flow without a device on three grids, with three time steps and in three positions on the grid."""
+    """Compute the flow without a device for three grid spacings, three time steps and three positions on the grid."""
     flow = settings.flow or FlowSettings()
     _plan(anatomy, {}, flow, ledger)
     with ledger.stage("convergence") as tell:
@@ -214,18 +243,18 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
 
 
 def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings, ledger: Ledger) -> None:
-    """Say what the flow will cost, and where a device's costs more; refuse one that does not fit in the memory."""
+    """Report the expected run time and memory of every flow; raise FlowError where the memory is insufficient."""
     with ledger.stage("plan flow") as tell:
         bare = flow_case(anatomy, None, settings)
         said = foretell_cost(bare)
         costs = {name: foretell_cost(replace(bare, stent=over_restored(one, anatomy))) for name, one in stents.items()}
-        tell(" ".join([said, *(f"Behind {name}, {cost}" for name, cost in costs.items() if cost != said)]))
+        tell(" ".join([said, *(f"With {name}: {cost}" for name, cost in costs.items() if cost != said)]))
 
 
 def vary_all(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
 ) -> dict[str, dict[str, Any]]:
-    """Vary what is not sure about every deployment; return the metrics of each, none where it was not asked for."""
+    """Run the uncertainty study of every deployment; return its metrics by device, empty where it is not requested."""
     if settings.uncertainty is None:
         return {}
     flow = settings.flow if settings.uncertainty.flow_samples else None
@@ -240,20 +269,21 @@ def vary_all(
                 told = partial(_tell_count, ledger, stage)
                 begun = FlowCheckpoint(ledger.folder, stage, key)
                 varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
-                tell(f"{len(varied.points)} deployments, {varied.n_failed} of them did not fit.")
+                tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit the artery.")
             ledger.keep(stage, key, varied)
         found[name] = varied.metrics()
     return found
 
 
 def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
+    """Report the number of finished runs of a stage."""
     ledger.progress(stage, 0.99 * done / total, f"{done} of {total}")
 
 
 def measure_all(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]
 ) -> dict[str, Any]:
-    """Measure the vessel, every deployment and every flow, and compare the latter with the bare one."""
+    """Return the metrics of the vessel, of every deployment and flow, and ratios to the flow without a device."""
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
     shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
     flow = {name: indices(field, *shapes) for name, field in fields.items()}
@@ -270,4 +300,5 @@ def measure_all(
 
 
 def _array(points_mm: Point | tuple[Point, ...] | None) -> Floats | None:
+    """Return points as an array, mm; None where there are none."""
     return None if points_mm is None else np.array(points_mm, dtype=np.float64)

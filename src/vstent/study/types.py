@@ -1,4 +1,4 @@
-"""What a study is told, and what it finds."""
+"""Data classes of a study: its settings and its result."""
 
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -9,87 +9,95 @@ from vstent.geometry.vessel import Anatomy
 from vstent.plan.uncertainty import Ranges
 
 Point = tuple[float, float, float]
+"""LPS coordinates, mm."""
 
 
 @dataclass(frozen=True)
 class Placing:
-    """Size and place of one device; None means that it is proposed."""
+    """Size and position of one device; None: proposed automatically."""
 
     diameter_mm: float | None = None
-    """Label diameter."""
+    """Label diameter of the device."""
     length_mm: float | None = None
-    """Label length."""
+    """Label length of the device."""
     center_mm: float | None = None
-    """Abscissa on the parent axis where the middle of the device is to lie."""
+    """Position of the middle of the device along the parent artery."""
 
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """Everything that a study may be told; None means that it is proposed."""
+    """Settings of a study; None: chosen automatically."""
 
     devices: tuple[str, ...] = ("silk", "enterprise")
-    """Names in the catalogue."""
+    """Names of devices in the catalogue."""
     units: Literal["m", "cm", "mm"] | None = None
     """Length unit of a surface file."""
     spacing_mm: Point | None = None
-    """Voxel edges of a raw volume."""
+    """Voxel size of a raw volume, or instead of that in the header of a scan."""
     shape: tuple[int, int, int] | None = None
-    """Voxel counts of a raw volume."""
+    """Number of voxels of a raw volume along each axis."""
     threshold: float | None = None
-    """Intensity of the lumen's wall in a scan."""
+    """Intensity of the vessel wall in a scan."""
     at_mm: Point | None = None
     """A point near the sac."""
     inlet_mm: Point | tuple[Point, ...] | None = None
-    """A point near the inlet; or one near each opening that brings blood, first that where the parent artery begins."""
+    """A point near the inlet, or one near each inlet, that of the parent artery first."""
     outlet_mm: Point | None = None
-    """A point near the outlet that the parent artery leads to."""
+    """A point near the outlet of the parent artery."""
     neck_mm: tuple[Point, ...] | None = None
-    """A neck drawn by hand: a closed curve near the wall around the sac's mouth."""
+    """A neck drawn by hand: points of a closed curve near the wall around the neck."""
     upstream_mm: float | None = None
-    """Length of artery to keep before the sac's middle."""
+    """Length of artery to keep upstream of the middle of the sac."""
     downstream_mm: float | None = None
-    """Length to keep of every way beyond the sac's middle."""
+    """Length of vessel to keep downstream of the middle of the sac, on every branch."""
     diameter_mm: float | None = None
     """Label diameter of the devices."""
     length_mm: float | None = None
     """Label length of the devices."""
     center_mm: float | None = None
-    """Abscissa on the parent axis where the middle of the device is to lie."""
+    """Position of the middle of the device along the parent artery."""
     flow: FlowSettings | None = field(default_factory=FlowSettings)
-    """How to compute the flow; None: not at all."""
+    """Settings of the flow computation; None: no flow is computed."""
     placings: dict[str, Placing] = field(default_factory=dict)
-    """Sizes and places of single devices, by name, instead of those above that hold for all."""
+    """Size and position of single devices, by name; they replace the values above, which apply to all devices."""
 
     uncertainty: Ranges | None = None
-    """What of the deployment is varied, and how far; None: nothing."""
+    """Ranges of the uncertainty study; None: no such study."""
 
     def placing(self, device: str) -> Placing:
-        """Return what is given of the size and the place of a device."""
+        """Return the given size and position of a device."""
         return self.placings.get(device) or Placing(self.diameter_mm, self.length_mm, self.center_mm)
 
 
 class Progress(Protocol):
-    """Told what a study does."""
+    """Function that a study calls to report its progress."""
 
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
-        """`stage` has come to `fraction` (1: done); `detail` says what was found, or how long is left."""
+        """Report the progress of a stage.
+
+        Parameters
+        ----------
+        stage : name of the stage.
+        fraction : completed fraction: 0 at its start, 1 at its end.
+        detail : a sentence on the result or on the remaining run time.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class CaseResult:
-    """All that a study found."""
+    """Result of a study."""
 
     name: str
-    """The case folder's name (a scan's own name may be the patient's)."""
+    """Name of the case folder (the name of the scan may be that of the patient)."""
     anatomy: Anatomy
-    """Vessel, parent artery, sacs."""
+    """Vessel, parent artery and sacs."""
     deployments: dict[str, Deployment]
-    """By device name."""
+    """Deployed devices, by name."""
     fields: dict[str, FlowField]
-    """``bare``, then by device name; empty where flow was not asked for."""
+    """Flow fields: ``bare``, then by device name; empty where no flow is requested."""
     metrics: dict[str, Any]
-    """``vessel``, ``bare``, ``stents.NAME.{deployment,flow,ratios}``; every number's key ends in its unit."""
+    """Metrics: ``vessel``, ``bare``, ``stents.NAME.{deployment,flow,ratios}``; every key ends in the unit."""
     provenance: dict[str, Any]
-    """Versions, inputs with hashes, settings, seconds per stage."""
+    """Versions, input with hash, settings, and run time of every stage in s."""
     notes: tuple[str, ...]
-    """What was found, guessed or repaired, and how far every flow is to be relied on."""
+    """Notes on repairs, automatic choices and the reliability of every flow."""

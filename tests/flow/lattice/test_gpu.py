@@ -157,7 +157,7 @@ def test_the_command_line_says_so_before_it_reads_anything(
 ) -> None:
     monkeypatch.setattr(gpus, "find_spec", lambda name: None)
     for command in ("run", "flow", "batch"):
-        assert main([command, str(tmp_path), "--out", str(tmp_path / "out"), "--device-gpu"]) == 1
+        assert main([command, str(tmp_path), "--out", str(tmp_path / "out"), "--gpu"]) == 1
         assert "numba-cuda is not installed" in " ".join(capsys.readouterr().err.split())
 
 
