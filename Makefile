@@ -1,9 +1,9 @@
-# Two commands do everything: `make demo` (sets up, runs the main job) and `make test` (sets up, runs the tests).
+# `make demo` sets up and runs the main job; `make test` sets up and runs the tests.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test validation check lint benchmark docs licences wheel-check clean
+.PHONY: demo test validation check lint benchmark docs licences wheel-check bounds-check viewer-check sentences clean
 
 demo: $(VENV)/.ready
 	$(BIN)/vstent demo --out demo
@@ -21,6 +21,7 @@ lint: $(VENV)/.ready-dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/codespell README.md CONTRIBUTING.md CHANGELOG.md docs src tests tools benchmarks viewer/app viewer/src
 
 benchmark: $(VENV)/.ready-dev
 	$(BIN)/python tools/record.py benchmark
@@ -32,14 +33,25 @@ docs: $(VENV)/.ready-docs
 licences: $(VENV)/.ready-dev
 	$(BIN)/python tools/licences.py
 
-# In brief; with PYTHONS="python3.11 python3.12 python3.13", in an empty environment of each that there is.
+# Without PYTHONS in brief; with PYTHONS="python3.11 python3.12 python3.13", in an empty environment of each that is installed.
 wheel-check: $(VENV)/.ready
 	$(BIN)/python tools/wheel_check.py $(PYTHONS)
+
+# Installs the wheel with the lowest and with the newest dependencies, and runs the demo with a coarse flow in both.
+bounds-check: $(VENV)/.ready
+	$(BIN)/python tools/wheel_check.py --bounds
+
+# Rebuilds the JavaScript bundles where npm is installed and fails where they differ from those in the package.
+viewer-check: $(VENV)/.ready
+	$(BIN)/python tools/viewer_check.py
+
+sentences: $(VENV)/.ready
+	$(BIN)/python tools/sentences.py
 
 clean:
 	rm -rf $(VENV) demo docs/_build docs/examples docs/generated
 
-# Kernels that a test process compiles itself are other machine code than those kept, so changed ones are compiled before.
+# Kernels are compiled before the tests: a test process that compiles them itself runs slightly different machine code.
 $(VENV)/.ready: pyproject.toml $(wildcard src/vstent/kernels/*.py src/vstent/flow/lattice/kernels/*.py)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "vstent needs Python 3.11 or newer: install it, then give PYTHON=/path/to/python3"; exit 1; }

@@ -1,11 +1,13 @@
-"""Pages that are made, not written: the devices, what every fault of the tests' list gets, what was recorded."""
+"""Generate pages of the reference: devices, options, metrics, errors, and recorded measurements."""
 
+import argparse
 import contextlib
 import io
 import os
 import re
 import tempfile
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ def setup(app: Any) -> dict[str, bool]:
 def write() -> None:
     """Write all pages."""
     GENERATED.mkdir(exist_ok=True)
-    pages = {"devices": devices(), "faults": faults()}
+    pages = {"devices": devices(), "faults": faults(), "options": options(), "metrics": metrics()}
     for name, text in (pages | {kind: recorded(kind) for kind in ("validation", "performance")}).items():
         (GENERATED / f"{name}.inc").write_text(text, encoding="utf-8")
 
@@ -63,6 +65,38 @@ def devices() -> str:
         rows = [[f"``{fact.name}``", fact.confidence, _escaped(fact.source)] for fact in design.facts]
         text.append(table(["number", "confidence", "source"], rows, "20 15 65"))
     return "".join(text)
+
+
+def options() -> str:
+    """Return one section a command with its help, as the program prints it."""
+    from vstent.cli import _parser
+
+    text = []
+    for name, command in _commands(_parser(), ""):
+        text.append(f"vstent {name}\n{'-' * (7 + len(name))}\n\n.. code-block:: text\n\n")
+        text += [f"   {line}".rstrip() + "\n" for line in command.format_help().splitlines()]
+        text.append("\n")
+    return "".join(text)
+
+
+def _commands(parser: Any, before: str) -> Iterator[tuple[str, Any]]:
+    """Yield every command below a parser with its name, commands of commands included."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, command in action.choices.items():
+                yield f"{before}{name}", command
+                yield from _commands(command, f"{before}{name} ")
+
+
+def metrics() -> str:
+    """Return a table of every metric: key, name, definition, source."""
+    from vstent.reporting.definitions import DEFINITIONS
+
+    rows = [
+        [f"``{key}``", _escaped(one.name), _escaped(one.meaning), _escaped(one.source) or "definition"]
+        for key, one in DEFINITIONS.items()
+    ]
+    return table(["key", "name", "definition", "source"], rows, "28 17 38 17")
 
 
 def _range(sizes: Any) -> str:

@@ -1,7 +1,8 @@
-"""Build the wheel, look into it, install it where nothing else is, and run the demo without flow there.
+"""Build the wheel, check its content, and run the demo from it with the lowest and the newest dependencies.
 
-Run from the repository: ``python tools/wheel_check.py [PYTHON ...]``, one empty environment for each interpreter that
-exists; without any, in brief: the wheel is unpacked beside the packages of this environment and run from there.
+Run from the repository: ``python tools/wheel_check.py [--bounds] [PYTHON ...]``. With interpreters, the wheel is
+installed in an empty environment of each. With ``--bounds`` it is installed twice, with the lowest versions that
+``pyproject.toml`` declares and with the newest. Without either, it runs beside the packages of this environment.
 """
 
 import os
@@ -9,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -41,10 +43,14 @@ def build(folder: Path) -> Path:
     return wheel
 
 
-def demo(command: list[str], folder: Path, environment: dict[str, str]) -> None:
-    """Run the demo without flow, far from the repository, and see its results."""
+COARSE_FLOW = ("--grid-spacing", "0.4", "--device", "silk")
+"""Options of a demo with a flow that takes less than a minute."""
+
+
+def demo(command: list[str], folder: Path, environment: dict[str, str], *options: str) -> None:
+    """Run the demo far from the repository and check that its results exist; without options, without flow."""
     out = folder / "demo"
-    given = ["demo", "--no-flow", "--out", str(out)]
+    given = ["demo", *(options or ("--no-flow",)), "--out", str(out)]
     done = subprocess.run([*command, *given], cwd=folder, env=environment, capture_output=True, text=True, check=False)
     missing = [name for name in RESULTS if not (out / name).is_file()]
     if done.returncode or missing:
@@ -74,10 +80,33 @@ def installed(wheel: Path, python: str, folder: Path) -> None:
     print(f"{version}: installed in an empty environment, and the demo without flow ran")
 
 
-def main(pythons: list[str]) -> None:
-    """Check the wheel with every interpreter that there is."""
+def lowest() -> list[str]:
+    """Return the requirements of ``pyproject.toml`` and of the extra app, each at its lower bound."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["app"]]
+    return [one.replace(">=", "==") for one in wanted]
+
+
+def at_bounds(wheel: Path, python: str, folder: Path) -> None:
+    """Run the demo with a coarse flow in two empty environments: with the lowest and with the newest dependencies."""
+    for name, pinned in (("lowest", lowest()), ("newest", [])):
+        place = folder / name
+        subprocess.run([python, "-m", "venv", place / "env"], check=True)
+        install = [place / "env" / "bin" / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        subprocess.run([*install, f"{wheel}[app]", *pinned], check=True)
+        environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        demo([str(place / "env" / "bin" / "vstent")], place, environment, *COARSE_FLOW)
+        print(f"{name} dependencies: installed in an empty environment, and the demo with a coarse flow ran")
+
+
+def main(words: list[str]) -> None:
+    """Check the wheel with every interpreter given that is installed."""
+    pythons = [word for word in words if word != "--bounds"]
     with tempfile.TemporaryDirectory(prefix="vstent-wheel-") as temporary:
         wheel = build(Path(temporary))
+        if "--bounds" in words:
+            at_bounds(wheel, (pythons or [sys.executable])[0], Path(temporary))
+            return
         if not pythons:
             in_brief(wheel, Path(temporary))
         for number, python in enumerate(pythons):

@@ -591,7 +591,7 @@ def test_with_flow_all_ways_in_agree_too(tmp_path):
         client.post(f"{case}/jobs/flow")
         app_case.wait(client, case.rpartition("/")[2], 1200)
         by_rest = client.get(f"{case}/files/metrics.json").json()
-    assert main(["run", str(path), "--out", str(tmp_path / "cli"), "--device", "silk", "--cell-size", "0.35"]) == 0
+    assert main(["run", str(path), "--out", str(tmp_path / "cli"), "--device", "silk", "--grid-spacing", "0.35"]) == 0
     assert by_rest == json.loads((tmp_path / "cli" / "metrics.json").read_text())
 
 

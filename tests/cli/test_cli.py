@@ -47,7 +47,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 BAD = {
     "a text file named .stl": ("text.stl", b"hello\n", [], "not a .stl"),
-    "an empty mesh": ("empty.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", [], "holds no surface"),
+    "an empty mesh": ("empty.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", [], "no triangles"),
     "a volume without spacing": ("scan.raw", bytes(4096), ["--shape", "16,16,16"], "spacing"),
     "a volume without shape": ("scan.raw", bytes(4096), ["--spacing", "0.4"], "shape"),
     "a volume of zeros": ("scan.raw", bytes(4096), ["--shape", "16,16,16", "--spacing", "0.4"], "lumen"),

@@ -62,7 +62,7 @@ def test_patches_of_a_studied_case_are_watertight(studied: Path, tmp_path: Path)
 
 def test_an_openfoam_case_of_a_studied_case_has_its_device_over_the_neck(studied: Path, tmp_path: Path) -> None:
     out = tmp_path / "foam"
-    options = ["--device", "enterprise", "--cell-size", "0.2", "--flow-rate", "2.5", "-j", "2", "--flavour", "com"]
+    options = ["--device", "enterprise", "--grid-spacing", "0.2", "--flow-rate", "2.5", "-j", "2", "--flavour", "com"]
     assert main(["export", "openfoam", str(studied), "--out", str(out), *options]) == 0
     assert (out / "Allrun").stat().st_mode & 0o111
     assert "mpirun -np 2 simpleFoam -parallel" in (out / "Allrun").read_text()
@@ -97,8 +97,8 @@ def test_a_studied_vessel_is_not_found_otherwise(
     [
         (["--layers", "-3"], "0 or more"),
         (["--engine", "nonsense"], "unrecognized"),
-        (["--close-up"], "unrecognized"),
-        (["--device-gpu"], "unrecognized"),
+        (["--refine-sac"], "unrecognized"),
+        (["--gpu"], "unrecognized"),
     ],
 )
 def test_options_that_openfoams_case_has_no_use_for_are_refused(

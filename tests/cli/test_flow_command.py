@@ -27,7 +27,7 @@ def test_flow_alone_in_a_tube_is_poiseuilles_and_is_not_computed_twice(
     write_stl(tmp_path / "tube.stl", phantoms.phantom_surface(phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM)))
     out = tmp_path / "out"
     command = ["flow", str(tmp_path / "tube.stl"), "--out", str(out), "--units", "mm", "--steady"]
-    command += ["--flow-rate", str(INFLOW_ML_S), "--cell-size", "0.25"]
+    command += ["--flow-rate", str(INFLOW_ML_S), "--grid-spacing", "0.25"]
     assert main(command) == 0
     said = capsys.readouterr()
     assert "Inlet flow" in said.out
@@ -61,7 +61,7 @@ def test_openfoam_gets_the_vessel_after_its_cost_is_told(
     told = " ".join(capsys.readouterr().err.split())
     assert 0 < told.index("OpenFOAM: about") < told.index("It is not here")
     assert asked == [(tmp_path / "out" / "flow" / "bare" / "openfoam", None)]
-    assert main([*command, "--units", "mm", "--convergence", "--cell-size", "0.25"]) == 1
+    assert main([*command, "--units", "mm", "--convergence", "--grid-spacing", "0.25"]) == 1
     assert "It is not here" in capsys.readouterr().err
     assert asked[1] == (tmp_path / "out" / "flow" / "convergence" / "openfoam" / "cell_size_mm-0.5", None)
 
@@ -71,8 +71,8 @@ def test_openfoam_gets_the_vessel_after_its_cost_is_told(
     [
         ([], Blood()),
         (["--viscosity", "0.0035", "--density", "1050"], Blood(1050.0, 0.0035)),
-        (["--thinning"], Blood(1060.0, 0.00345, CarreauYasuda())),
-        (["--thinning", "--viscosity", "0.004"], Blood(1060.0, 0.004, CarreauYasuda())),
+        (["--shear-thinning"], Blood(1060.0, 0.00345, CarreauYasuda())),
+        (["--shear-thinning", "--viscosity", "0.004"], Blood(1060.0, 0.004, CarreauYasuda())),
     ],
 )
 def test_the_blood_asked_for_is_the_blood_computed(words: list[str], expected: Blood) -> None:
@@ -96,8 +96,8 @@ def test_what_excludes_each_other_is_refused(words: list[str], capsys: pytest.Ca
     ("words", "said"),
     [
         (["--engine", "nonsense"], "There is no 'nonsense'"),
-        (["--engine", "openfoam", "--close-up"], "does not compute a close-up"),
-        (["--engine", "openfoam", "--device-gpu"], "does not compute on a GPU"),
+        (["--engine", "openfoam", "--close-up"], "does not support a finer grid"),
+        (["--engine", "openfoam", "--device-gpu"], "does not support a GPU"),
     ],
 )
 def test_an_engine_is_refused_before_anything_is_read(

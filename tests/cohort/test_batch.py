@@ -181,7 +181,7 @@ def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path,
     listed = tmp_path / "cohort.csv"
     listed.write_text(f"case,input,devices,at\nfirst,{scans / 'a.stl'},silk,\nlast,{scans / 'b.stl'},,\n")
     command = ["batch", str(listed), "--out", str(out), "--no-flow", "--units", "mm", "--device", "enterprise"]
-    assert main([*command, "--jobs", "2", "--files"]) == 0
+    assert main([*command, "--jobs", "2", "--keep-files"]) == 0
     said = capsys.readouterr()
     assert "2 cases, 2 rows; 2 cases to do: about 1 min" in said.out
     with (out / "cohort.csv").open(newline="") as file:

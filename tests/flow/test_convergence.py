@@ -46,7 +46,7 @@ def test_the_command_compares_three_grids_time_steps_and_positions(
     tube = phantoms.tube(length_mm=length_mm, radius_mm=radius_mm)
     write_stl(tmp_path / "tube.stl", phantoms.phantom_surface(tube))
     command = ["flow", str(tmp_path / "tube.stl"), "--out", str(tmp_path / "out"), "--units", "mm", "--convergence"]
-    assert main([*command, "--flow-rate", str(inflow_mL_s), "--cell-size", "0.25"]) == 0
+    assert main([*command, "--flow-rate", str(inflow_mL_s), "--grid-spacing", "0.25"]) == 0
     assert "limit" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "convergence.json").read_text())
     assert found["cell_size_mm"]["sizes"] == pytest.approx([0.5, 0.25 * RATIO, 0.25])

@@ -302,7 +302,7 @@ def test_a_grid_that_does_not_reach_an_inlet_is_refused() -> None:
     thin = phantoms.with_branch(phantoms.tube(), abscissa_mm=6.0, direction=np.array([1, 0, 1]), radius_mm=0.25)
     ends_mm = np.array([thin.ends[k][0] for k in (0, 2)])
     vessel = trace(Vessel(phantoms.phantom_surface(thin, edge_mm=0.15)), inlet_mm=ends_mm)
-    with pytest.raises(domain.CoarseGridError, match=r"reaches inlet_2 \(0.49 mm wide at .*: set a smaller cell size"):
+    with pytest.raises(domain.CoarseGridError, match=r"reaches inlet_2 \(0.49 mm wide at .*: use a finer grid spacing"):
         domain.build(vessel, 0.45)
 
 
@@ -314,7 +314,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inlets")
     write_stl(folder / "y.stl", wall(sac_at_mm=5.0))
     inlets = [f"--inlet={','.join(map(str, end_mm))}" for end_mm in at_ends(RIGHT, LEFT)]
-    words = ["--units", "mm", "--device", "silk", "--cell-size", "0.4", "--flow-rate", "3", *inlets]
+    words = ["--units", "mm", "--device", "silk", "--grid-spacing", "0.4", "--flow-rate", "3", *inlets]
     assert main(["run", str(folder / "y.stl"), "--out", str(folder / "first"), *words]) == 0
     return folder / "first"
 

@@ -300,7 +300,7 @@ def named(folder: Path) -> list[str]:
 def on_gpu(folder: Path) -> list[str]:
     """Compute the artery's flow on a GPU."""
     write_stl(folder / "artery.stl", artery())
-    return ["flow", str(folder / "artery.stl"), "--out", "OUT", "--device-gpu"]
+    return ["flow", str(folder / "artery.stl"), "--out", "OUT", "--gpu"]
 
 
 def into_a_file(folder: Path) -> list[str]:
@@ -636,7 +636,7 @@ FAULTS: tuple[Fault, ...] = (
         little_memory,
     ),
     Fault(OPTION, "threshold that is no number", run("--threshold", "nan"), INPUT, "not finite"),
-    Fault(OPTION, "cells of no size", run("--cell-size", "0"), INPUT, "not above zero"),
+    Fault(OPTION, "cells of no size", run("--grid-spacing", "0"), INPUT, "not above zero"),
     Fault(OPTION, "inflow below zero", run("--flow-rate", "-3"), INPUT, "not above zero"),
     Fault(OPTION, "point of two numbers", run("--at", "1,2"), INPUT, "2 numbers, not 3"),
     Fault(OPTION, "an inlet given twice", run("--inlet", "0,0,0", "--inlet", "0,1,0"), INPUT, "the same opening"),

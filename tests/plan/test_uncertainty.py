@@ -157,10 +157,10 @@ def test_a_threshold_that_would_close_the_artery_is_refused():
     ("words", "said"),
     [
         (["--uncertainty", "1"], "at least 2"),
-        (["--uncertainty", "8", "--uncertain-flows", "-1"], "0 flows"),
+        (["--uncertainty", "8", "--uncertainty-flows", "-1"], "0 flows"),
         (["--uncertainty", "8", "--vary", "landing=nan"], "landing_mm"),
         (["--vary", "landing=2"], "--uncertainty N"),
-        (["--uncertain-flows", "2"], "--uncertainty N"),
+        (["--uncertainty-flows", "2"], "--uncertainty N"),
     ],
 )
 def test_the_command_refuses_them_before_anything_is_read(words, said, tmp_path, capsys):

@@ -123,7 +123,7 @@ def shown(folder: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("knows", ["input.json", "run.json"])
-def test_a_folder_used_for_another_patient_holds_nothing_of_the_former(
+def test_a_folder_replaced_by_another_patient_s_holds_nothing_of_the_former(
     arteries: tuple[Path, Path], tmp_path: Path, knows: str
 ) -> None:
     first, second = arteries
@@ -138,18 +138,18 @@ def test_a_folder_used_for_another_patient_holds_nothing_of_the_former(
         write_json(out / ".vstent" / "input.json", {"path": str(first)})
     before = {name: (out / name).read_bytes() for name in shown(out)}
     with pytest.raises(InputError):
-        run(second, out, replace(settings, length_mm=1e3), lambda *_: None)
+        run(second, out, replace(settings, length_mm=1e3), lambda *_: None, replaces=True)
     assert {name: (out / name).read_bytes() for name in shown(out)} == before
 
     again = replace(settings, devices=("enterprise",))
-    run(second, out, again, lambda *_: None)
-    run(second, tmp_path / "anew", again, lambda *_: None)
+    run(second, out, again, lambda *_: None, replaces=True)
+    run(second, tmp_path / "anew", again, lambda *_: None, replaces=True)
     assert shown(out) == shown(tmp_path / "anew") | set(OF_THE_USER)
     assert (out / "vessel.vtp").read_bytes() == (tmp_path / "anew" / "vessel.vtp").read_bytes()
     assert (out / ".vstent" / "flow silk-1234.npz").read_text() == "kept"
 
 
-def test_the_same_patient_keeps_what_was_found_and_another_one_only_restored_does_not(
+def test_the_same_patient_keeps_what_was_found_and_another_one_that_replaces_it_does_not(
     arteries: tuple[Path, Path], tmp_path: Path
 ) -> None:
     first, second = arteries
@@ -162,12 +162,12 @@ def test_the_same_patient_keeps_what_was_found_and_another_one_only_restored_doe
     restore_vessel(moved, tmp_path / "out", settings, lambda *_: None)
     run(first, tmp_path / "out", settings, lambda *_: None)
     assert shown(tmp_path / "out") == before | {"morphology.json"}
-    restore_vessel(second, tmp_path / "out", settings, lambda *_: None)
+    restore_vessel(second, tmp_path / "out", settings, lambda *_: None, replaces=True)
     restore_vessel(second, tmp_path / "anew", settings, lambda *_: None)
     assert shown(tmp_path / "out") == shown(tmp_path / "anew")
 
 
-def test_a_folder_used_with_other_settings_holds_nothing_of_the_former(
+def test_a_folder_replaced_with_other_settings_holds_nothing_of_the_former(
     arteries: tuple[Path, Path], tmp_path: Path
 ) -> None:
     out, anew = tmp_path / "out", tmp_path / "anew"
@@ -175,7 +175,7 @@ def test_a_folder_used_with_other_settings_holds_nothing_of_the_former(
         devices=("silk", "enterprise"), units="mm", flow=FlowSettings(cell_size_mm=0.5, engine="openfoam")
     )
     written_by_openfoam = [*engine_folders(out, former).values(), out / "flow" / "convergence" / "openfoam" / "grid"]
-    run(arteries[0], out, replace(former, flow=None), lambda *_: None)
+    run(arteries[0], out, replace(former, flow=None), lambda *_: None, replaces=True)
     restore_vessel(arteries[0], out, former, lambda *_: None)
     for name in (*RESULTS_OF_ONE, *OF_THE_USER, "report.html", "ro-crate-metadata.json"):
         (out / name).parent.mkdir(parents=True, exist_ok=True)
@@ -185,21 +185,21 @@ def test_a_folder_used_with_other_settings_holds_nothing_of_the_former(
         (folder / "vstent.key").write_text("a key")
     cached = {path.name for path in (out / ".vstent").glob("*.npz")}
     with pytest.raises(InputError):
-        run(arteries[0], out, replace(former, flow=None, length_mm=1e3), lambda *_: None)
+        run(arteries[0], out, replace(former, flow=None, length_mm=1e3), lambda *_: None, replaces=True)
     assert (out / "report.pdf").exists()
 
     settings = replace(former, devices=("enterprise",), flow=None)
-    run(arteries[0], out, settings, lambda *_: None)
-    run(arteries[0], anew, settings, lambda *_: None)
+    run(arteries[0], out, settings, lambda *_: None, replaces=True)
+    run(arteries[0], anew, settings, lambda *_: None, replaces=True)
     convergence = "flow/convergence/openfoam/grid/vstent.key"
     assert shown(out) == shown(anew) | {*OF_THE_USER, "ranking.csv", "morphology.json", convergence}
     assert (out / "metrics.json").read_bytes() == (anew / "metrics.json").read_bytes()
     assert {path.name for path in (out / ".vstent").glob("*.npz")} == cached
-    run(arteries[0], out, replace(settings, upstream_mm=6.0), lambda *_: None)
+    run(arteries[0], out, replace(settings, upstream_mm=6.0), lambda *_: None, replaces=True)
     assert shown(out) == shown(anew) | {*OF_THE_USER, "ranking.csv"}
 
 
-def test_stopped_with_other_settings_a_folder_holds_nothing_of_the_former_beside_the_new_flow(
+def test_stopped_while_replacing_a_folder_holds_nothing_of_the_former_beside_the_new_flow(
     arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, computed = tmp_path / "out", []
@@ -215,11 +215,11 @@ def test_stopped_with_other_settings_a_folder_holds_nothing_of_the_former_beside
     monkeypatch.setattr(stages, "simulate_case", counted)
     slow = Settings(devices=("silk",), units="mm", flow=FlowSettings(cell_size_mm=0.5, inflow_mL_s=1.0, max_steps=20))
     fast = replace(slow, flow=replace(slow.flow, inflow_mL_s=3.0))
-    run(arteries[0], out, slow, lambda *_: None)
+    run(arteries[0], out, slow, lambda *_: None, replaces=True)
     (out / "report.html").write_text("of the slow flow")
     whole = shown(out)
     first = json.loads((out / "run.json").read_text())["seconds"]
-    run(arteries[0], out, slow, lambda *_: None)  # the same again: everything stays
+    run(arteries[0], out, slow, lambda *_: None, replaces=True)  # the same again: everything stays
     assert shown(out) == whole
     again = json.loads((out / "run.json").read_text())["seconds"]
     anew = {stage for stage in first if stage.partition(" ")[0] in ("deploy", "struts", "measure")}
@@ -229,12 +229,12 @@ def test_stopped_with_other_settings_a_folder_holds_nothing_of_the_former_beside
 
     stops["of"] = 3.0
     with pytest.raises(KeyboardInterrupt):
-        run(arteries[0], out, fast, lambda *_: None)
+        run(arteries[0], out, fast, lambda *_: None, replaces=True)
     of_flow = {"flow/bare/field.vtu", "flow/bare/wall.vtp"}
     assert {name for name in shown(out) if name.startswith("flow/")} == of_flow
     assert not {"metrics.json", "run.json", "report.html"} & shown(out)
     stops["of"] = None
-    run(arteries[0], out, fast, lambda *_: None)
+    run(arteries[0], out, fast, lambda *_: None, replaces=True)
     assert shown(out) == whole - {"report.html"}
     assert computed == [(False, 1.0), (True, 1.0), (False, 3.0), (True, 3.0)]
     assert json.loads((out / "run.json").read_text())["settings"]["flow"]["inflow_mL_s"] == 3.0
@@ -294,7 +294,7 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
 ) -> None:
     artery, out = tmp_path / "artery.stl", tmp_path / "out"
     write_stl(artery, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
-    command = ["run", str(artery), "--out", str(out), "--device", "silk", "--cell-size", "0.25"]
+    command = ["run", str(artery), "--out", str(out), "--device", "silk", "--grid-spacing", "0.25"]
     real, computed = stages.simulate_case, []
 
     def stopped_with_a_stent(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:

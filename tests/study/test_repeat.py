@@ -30,7 +30,7 @@ def case(tmp_path_factory):
     artery = phantoms.with_sac(phantoms.tube(length_mm=24), abscissa_mm=12, width_mm=5.0, neck_mm=3.5)
     write_stl(folder / "ä scan.stl", phantoms.phantom_surface(artery, edge_mm=0.45))
     options = ["--units", "mm", "--device", "silk", "--at=0.1234567891,3,12", "--center", "12.000000123"]
-    flow = ["--cell-size", "0.333333333333", "--flow-rate", "2.7182818284590"]
+    flow = ["--grid-spacing", "0.333333333333", "--flow-rate", "2.7182818284590"]
     varied = ["--uncertainty", "2", "--vary", "landing=0.1"]
     command = ["run", str(folder / "ä scan.stl"), "--out", str(folder / "first"), *options, *flow, *varied]
     assert main(command) == 0
@@ -38,7 +38,7 @@ def case(tmp_path_factory):
 
 
 def test_a_repeated_run_is_the_same_to_the_last_bit(case, capsys):
-    assert main(["run", str(case / "first" / "run.json"), "--out", str(case / "again"), "--crate"]) == 0
+    assert main(["run", str(case / "first" / "run.json"), "--out", str(case / "again"), "--ro-crate"]) == 0
     said = capsys.readouterr()
     assert "the same to the last bit" in said.out
     assert "Not as then" not in said.err

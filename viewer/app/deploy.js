@@ -46,11 +46,11 @@ export class Deploying {
     this.wanted = undefined;
     if (!this.isDragging) return;
     this.isDragging = false;
-    this.host.chosen(this.name, this.settled());
+    this.host.chosen(this.name, this.atRest());
   }
 
   /** Where the device is let go: the last sketch may still be under way, and its place is the one to keep. */
-  async settled() {
+  async atRest() {
     while (this.sketches.isBusy) await new Promise((resolve) => setTimeout(resolve, 15));
     return this.place.center_mm;
   }

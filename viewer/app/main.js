@@ -177,7 +177,7 @@ class Page {
 
   take(view) {
     const before = this.view;
-    // An event that was on its way while a choice was answered tells of before it.
+    // An event sent before the answer to a choice describes the state before it.
     if (before?.id === view.id && view.revision < before.revision) return;
     this.view = view;
     document.title = `${view.name} · vstent`;

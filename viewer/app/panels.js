@@ -2,7 +2,7 @@
 import { make } from "../src/dom.js";
 import { placeWords } from "./numbers.js";
 
-/** Where an opening lies, as it is told to a study. */
+/** Position of an opening, in the form of a study's settings. */
 export const placeOf = ({ center_mm }) => center_mm.map((x) => Number(x.toFixed(2)));
 
 /** What an opening is called: Inlet, Inlet 2, Outlet 1. */
@@ -27,7 +27,7 @@ function earlier(page) {
   return [make("p", { className: "note stale" }, ["The vessel shown is of an earlier choice. ", make("button", { type: "button", className: "link", onClick: () => page.go(stale) }, ["Find it again"])])];
 }
 
-/** What the study that the case was opened from was told besides. */
+/** Further settings of the study that the case was opened from. */
 function unseen(page) {
   const { unseen } = page.view;
   return unseen.length ? [make("p", { className: "note" }, [`As in the study that this case was opened from: ${unseen.join(", ")}.`])] : [];

@@ -88,7 +88,7 @@ export class Orbit {
     this.changed();
   }
 
-  /** Listen to pointer, wheel and keys on an element; `paneHeight()` tells how high a pane is in pixels. */
+  /** Listen to pointer, wheel and keys on an element; `paneHeight()` returns the height of a pane in pixels. */
   listen(element, paneHeight) {
     element.addEventListener("pointerdown", (event) => {
       if (event.target.closest("button, input, label, a")) return;

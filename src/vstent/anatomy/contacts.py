@@ -195,8 +195,8 @@ def _kept(vertices: Floats, faces: Ints, inlet_mm: Floats | None) -> Bools:
 
 
 def _note(contact: Contact, lost: float) -> str:
-    left = f"; what hung on it alone ({lost:.0%} of the wall) was left out" if lost > 0 else ""
+    left = f"; the part connected only through it ({lost:.0%} of the wall) was removed" if lost > 0 else ""
     return (
-        f"Two arteries touch at {place(contact.center_mm)} through a window "
-        f"{2 * contact.radius_mm:.2f} mm wide: parted there{left}."
+        f"Two touching arteries were separated at {place(contact.center_mm)} (window of "
+        f"{2 * contact.radius_mm:.2f} mm){left}."
     )

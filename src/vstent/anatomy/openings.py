@@ -58,23 +58,27 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
         When fewer than two ends can be found.
     """
     lumen, n_caps = _without_caps(vessel.lumen)
-    notes = [f"{counted(n_caps, 'flat cap')} taken off to open the vessel."] if n_caps else []
+    notes = [f"{counted(n_caps, 'flat cap')} removed to open the vessel."] if n_caps else []
     if not len(lumen.faces):
-        raise VesselError("the surface has flat sides only, and no round wall between them: it is not a vessel's")
+        raise VesselError(
+            "the surface has flat sides only and no round wall between them, so it is not a vessel: give the "
+            "wall of a vessel"
+        )
     closed = lumen
     lumen, n_arms = _with_open_arms(lumen, ARM_SLENDERNESS)
     if n_arms:
-        notes.append(f"{counted(n_arms, 'blind arm')} cut open square to the axis.")
+        notes.append(f"{counted(n_arms, 'blind arm')} cut open perpendicular to the axis.")
     if len(lumen.boundary_loops) < 2:
         lumen, n_stumps = _with_open_arms(lumen, STUMP_SLENDERNESS)
-        notes.append(f"{counted(n_stumps, 'short blind arm')} cut open, for blood had no other way in and out.")
+        notes.append(f"{counted(n_stumps, 'short blind arm')} cut open, because blood had no other way in or out.")
     spheres = closed.medial if lumen is closed else medial.within(closed.medial, lumen.closed.tree)
     loops = lumen.boundary_loops
     if len(loops) < 2:
         raise VesselError(
-            f"the surface about {place(lumen.vertices_mm.mean(axis=0))} has {counted(len(loops), 'opening')}, but "
-            "blood needs a way in and a way out: cut the vessel open at its ends, or give a longer piece of it; in a "
-            "scan it may be bone: give --at with a point in the artery, or crop the scan where the two touch"
+            f"the surface near {place(lumen.vertices_mm.mean(axis=0))} has {counted(len(loops), 'opening')}, "
+            "but a flow needs an inlet and an outlet: cut the vessel open at its ends, or give a longer "
+            "piece; in a scan it may be bone: choose a point in the artery (--at), or crop the scan where the "
+            "two touch"
         )
     found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
     widest = max(found, key=lambda opening: opening.area_mm2)
@@ -93,8 +97,8 @@ def opening_at(vessel: Vessel, point_mm: Floats) -> Opening:
     nearest = min(vessel.openings, key=lambda opening: _away_mm(opening, point_mm))
     if _is_far(nearest, point_mm) and vessel.lumen.closed.signed_distance(point_mm[None])[0] > 0:
         raise InputError(
-            f"no opening of the vessel is near {place(point_mm)}: the nearest, {nearest.described}, is "
-            f"{_away_mm(nearest, point_mm):.0f} mm away; give a point beside an opening, in LPS mm"
+            f"no opening of the vessel is near {place(point_mm)}; the nearest, {nearest.described}, is "
+            f"{_away_mm(nearest, point_mm):.0f} mm away: give a point near an opening, in LPS mm"
         )
     return nearest
 
@@ -111,11 +115,11 @@ def with_inlets(vessel: Vessel, inlets_mm: Floats) -> Vessel:
     _refuse_twice(inlets, inlets_mm)
     if len(inlets) == len(vessel.openings):
         raise InputError(
-            f"blood enters through all {len(inlets)} openings of the vessel and leaves through none: leave out the "
-            f"inlet {inlets[-1].described}, or another one"
+            f"all {len(inlets)} openings of the vessel are inlets and none is an outlet: remove the inlet "
+            f"{inlets[-1].described}, or another one"
         )
     notes = (
-        f"The inlet, {inlet.described}, is {_away_mm(inlet, inlet_mm):.0f} mm from the point given."
+        f"The inlet, {inlet.described}, is {_away_mm(inlet, inlet_mm):.0f} mm from the given point."
         for inlet, inlet_mm in zip(inlets, inlets_mm, strict=True)
         if _is_far(inlet, inlet_mm)
     )
@@ -129,8 +133,8 @@ def _refuse_twice(inlets: Sequence[Opening], inlets_mm: Floats) -> None:
         first = inlets.index(inlet)
         if first < k:
             raise InputError(
-                f"two inlets are the same opening, {inlet.described}, the nearest to both {place(inlets_mm[first])} "
-                f"and {place(inlets_mm[k])}: give one point beside each opening that brings blood"
+                f"two inlets are the same opening, {inlet.described}, which is the nearest to "
+                f"{place(inlets_mm[first])} and {place(inlets_mm[k])}: give one point near each inlet"
             )
 
 
@@ -143,8 +147,9 @@ def guessed(vessel: Vessel) -> Vessel:
     if widest.diameter_mm <= NEARLY * vessel.inlet.diameter_mm:
         return vessel
     note = (
-        f"The inlet, {vessel.inlet.described}, is a guess: the opening {widest.described} is nearly as wide; give "
-        "--inlet if blood comes from there, and again for each further opening that brings blood."
+        f"The inlet, {vessel.inlet.described}, was chosen because it is the widest opening, but "
+        f"{widest.described} is nearly as wide. Choose the inlet if this is wrong, and every further inlet "
+        "(--inlet)."
     )
     return replace(vessel, notes=(*vessel.notes, note))
 

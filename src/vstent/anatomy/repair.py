@@ -23,7 +23,7 @@ SLIT_ROUNDNESS: Final = 0.4
 LONGEST_PATCHED: Final = 120
 """Holes of more vertices are closed by a fan: the better patch costs the cube of their number."""
 NOTABLE_OF_AREA: Final = 0.02
-"""Components dropped are told one by one from this fraction of the area on."""
+"""Removed pieces larger than this fraction of the area are reported one by one."""
 
 
 def repair(surface: Surface, *, at_mm: Floats | None = None) -> tuple[Surface, tuple[str, ...]]:
@@ -49,7 +49,7 @@ def repair(surface: Surface, *, at_mm: Floats | None = None) -> tuple[Surface, t
         Nothing is left of the surface.
     """
     if not len(surface.faces):
-        raise VesselError("The surface has no triangles; check the file.")
+        raise VesselError("The surface has no triangles. Check the file.")
     mesh = _once(_Mesh(surface.vertices_mm, surface.faces, ()), at_mm)
     if mesh.notes:  # filling a hole that a pinched vertex runs through leaves needles: a second pass finds them
         mesh = _Mesh(*_once(_Mesh(mesh.vertices, mesh.faces, ()), at_mm).geometry, mesh.notes)
@@ -78,7 +78,7 @@ def _once(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
     for step in (_welded, _cleaned, _opened, _turned, _unzipped, one_piece, _outward, _filled):
         mesh = step(mesh)
         if len(mesh.faces) < 4:
-            raise VesselError("No surface is left after repair: its faces are all degenerate or loose; check the file.")
+            raise VesselError("No surface is left after repair: all its faces are degenerate or loose. Check the file.")
     return mesh
 
 
@@ -88,7 +88,7 @@ def _welded(mesh: _Mesh) -> _Mesh:
     welded, faces = topology.weld(vertices, faces, WELD_OF_EXTENT * extent)
     n = len(vertices) - len(welded)
     note = (
-        f"{counted(n, 'duplicate vertex', 'duplicate vertices')} welded (closer than {WELD_OF_EXTENT * extent:.1g} mm)."
+        f"{counted(n, 'duplicate vertex', 'duplicate vertices')} merged (closer than {WELD_OF_EXTENT * extent:.1g} mm)."
     )
     return mesh.after(welded, faces, note if n else "")
 
@@ -112,17 +112,17 @@ def _opened(mesh: _Mesh) -> _Mesh:
         faces = faces[~is_inner]
         total += int(is_inner.sum())
     return mesh.after(
-        mesh.vertices, faces, f"{counted(total, 'face')} of sheets inside the lumen dropped." if total else ""
+        mesh.vertices, faces, f"{counted(total, 'face')} of sheets inside the lumen removed." if total else ""
     )
 
 
 def _turned(mesh: _Mesh) -> _Mesh:
     faces, turned = topology.oriented(mesh.faces)
     n = int(turned.sum())
-    mesh = mesh.after(mesh.vertices, faces, f"{counted(n, 'face')} turned to agree with the others." if n else "")
+    mesh = mesh.after(mesh.vertices, faces, f"{counted(n, 'face')} reoriented." if n else "")
     is_clash = topology.clashing(faces)
     n = int(is_clash.sum())
-    note = f"{counted(n, 'face')} dropped that no orientation fits."
+    note = f"{counted(n, 'face')} without a consistent orientation removed."
     return mesh.after(mesh.vertices, faces[~is_clash], note if n else "")
 
 
@@ -134,7 +134,7 @@ def _unzipped(mesh: _Mesh) -> _Mesh:
     n_vertices, n_faces = len(np.unique(faces)) - len(np.unique(mesh.faces)), len(mesh.faces) - len(faces)
     what = counted(n_edges, "non-manifold edge") if n_edges else "Pinched vertices"
     dropped = f", {counted(n_faces, 'face')} dropped" if n_faces else ""
-    note = f"{what} cut apart ({counted(n_vertices, 'vertex', 'vertices')} doubled{dropped})."
+    note = f"{what} separated ({counted(n_vertices, 'vertex', 'vertices')} duplicated{dropped})."
     return mesh.after(vertices, faces, note if n_edges or n_vertices > 0 else "")
 
 
@@ -148,8 +148,8 @@ def _one_piece(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
     notable = [k for k in order if k == order[0] or area[k] > NOTABLE_OF_AREA * area.sum()]
     kept = notable[0] if at_mm is None else min(notable, key=lambda k: _gap_mm(mesh, label == k, at_mm))
     left = [f"{area[k]:.1f} mm2 about {_middle(mesh, label == k)}" for k in notable if k != kept]
-    note = f"{counted(len(area) - 1, 'loose piece')} dropped ({area[kept] / area.sum():.1%} of the area kept)"
-    note += f", the notable of {', '.join(left)}: give --at to keep another one." if left else "."
+    note = f"{counted(len(area) - 1, 'loose piece')} removed ({area[kept] / area.sum():.1%} of the area kept)"
+    note += f", the largest of them {', '.join(left)}; choose another piece by a point near it (--at)." if left else "."
     return mesh.after(mesh.vertices, mesh.faces[label == kept], note)
 
 
@@ -166,7 +166,7 @@ def _outward(mesh: _Mesh) -> _Mesh:
     vertices, faces = triangles.cap(mesh.vertices, mesh.faces, triangles.boundary_loops(mesh.vertices, mesh.faces))
     if triangles.volume(vertices[faces]) >= 0:
         return mesh
-    return mesh.after(mesh.vertices, mesh.faces[:, ::-1], "The surface was inside out; all faces turned.")
+    return mesh.after(mesh.vertices, mesh.faces[:, ::-1], "The surface was inside out; all faces were reversed.")
 
 
 def _filled(mesh: _Mesh) -> _Mesh:
@@ -191,13 +191,14 @@ def _filled(mesh: _Mesh) -> _Mesh:
 
 def _hole_note(holes_mm: list[Floats]) -> str:
     widest_mm = max(triangles.perimeter(points) for points in holes_mm)
-    return f"{counted(len(holes_mm), 'hole')} in the wall filled (the widest {widest_mm:.2g} mm round)."
+    return f"{counted(len(holes_mm), 'hole')} in the wall closed (the largest {widest_mm:.2g} mm around)."
 
 
 def _sideways_note(points: Floats) -> str:
     return (
-        f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at {place(triangles.polygon_centroid(points))} "
-        "looks sideways out of the wall: fill it in the surface if no artery leaves there."
+        f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at "
+        f"{place(triangles.polygon_centroid(points))} faces sideways out of the wall. If no artery leaves "
+        "there, close it in the surface."
     )
 
 

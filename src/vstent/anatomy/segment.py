@@ -24,7 +24,7 @@ NOTABLE_PIECE: Final = 0.02
 """Pieces with less than this fraction of the voxels of the largest about the point given are not taken for the vessel
 there."""
 BAND: Final = 0.05
-"""The threshold is told to be known to within this fraction of the step from tissue to lumen."""
+"""Assumed uncertainty of the threshold, as a fraction of the step from tissue to lumen."""
 FARTHEST_MM: Final = 5.0
 """How far from the point given the lumen may be."""
 AROUND_MM: Final = 15.0
@@ -80,14 +80,14 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     surface, decimation_notes = _decimated(surface)
     size = " x ".join(f"{h:.3g}" for h in image.spacing_mm)
     share = lumen.n_voxels / lumen.n_above
-    found = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all above the threshold."
+    found = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all voxels above the threshold."
     # Not of the threshold itself: where a scan's intensities begin is arbitrary.
     off = BAND * (profile.lumen - profile.tissue)
     band_mm = 2 * off / profile.slope_per_mm
-    band = f"A threshold {off:.3g} lower or higher, {BAND:.0%} of the step from tissue to lumen, changes diameters by "
+    band = f"A change of the threshold by {off:.3g} ({BAND:.0%} of the step from tissue to lumen) changes diameters by "
     band += f"+-{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
     all_notes = (*image.notes, *notes, band, found, smooth_note, *decimation_notes)
-    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm, blur_mm=profile.blur_mm)
+    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm, blur_mm=profile.blur_mm, voxel_mm=lumen.voxel_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,8 @@ def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[
     lumen = _lumen(image, profile.wall_level, at_mm)
     note = (
         f"Threshold {lumen.threshold:.4g} proposed: half way between tissue ({profile.tissue:.4g}) and lumen "
-        f"({profile.lumen:.4g}), corrected for the wall's curvature and a blur of {profile.blur_mm:.2g} mm."
+        f"({profile.lumen:.4g}), corrected for the curvature of the wall and a blur of {profile.blur_mm:.2g} "
+        "mm."
     )
     return lumen, (note,), profile
 
@@ -136,7 +137,7 @@ def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[
 def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tuple[str, ...], "Profile"]:
     lumen = _lumen(image, threshold, at_mm)
     profile = _profile(lumen)
-    note = f"Threshold {threshold:.4g} as given; {profile.wall_level:.4g} would have been proposed."
+    note = f"Threshold {threshold:.4g} as given; the proposed one is {profile.wall_level:.4g}."
     return lumen, (note,), profile
 
 
@@ -145,10 +146,10 @@ def _refuse_wide(lumen: Lumen, profile: "Profile") -> None:
         return
     middle_mm = lumen.affine_mm[:3] @ [*(0.5 * (np.array(lumen.field.shape) - 1)), 1.0]
     raise VesselError(
-        f"What is brighter than threshold {lumen.threshold:.4g} about {place(middle_mm)} is "
-        f"{2 * profile.radius_mm:.0f} mm wide, and no artery is wider than {GIANT_DIAMETER_MM:g} mm: it is a head, "
-        "bone or the field of view; give --threshold, or --at with a point in the artery, or crop the scan where the "
-        "two touch."
+        f"At threshold {lumen.threshold:.4g} the object near {place(middle_mm)} is {2 * profile.radius_mm:.0f} "
+        f"mm wide, and no artery is wider than {GIANT_DIAMETER_MM:g} mm: it is the head, bone or the field of "
+        "view. Set another threshold (--threshold), choose a point in the artery (--at), or crop the scan "
+        "where the two touch."
     )
 
 
@@ -202,7 +203,10 @@ def _edge_level(voxels: NDArray[Any], is_within: Bools | None = None) -> float:
     With `is_within`, as large as the scan, on those of its voxels alone.
     """
     if min(voxels.shape) < 3:
-        raise VesselError(f"A scan of {' x '.join(map(str, voxels.shape))} voxels is too thin to find a lumen in it.")
+        raise VesselError(
+            f"A scan of {' x '.join(map(str, voxels.shape))} voxels is too thin to contain a lumen. Give the "
+            "whole scan."
+        )
     middle = (slice(1, -1, 2),) * 3
     squared = np.zeros(voxels[middle].shape, dtype=np.float32)
     for axis in range(3):
@@ -214,7 +218,7 @@ def _edge_level(voxels: NDArray[Any], is_within: Bools | None = None) -> float:
     weight = np.where(counts & (squared > 8 * noise), squared, 0.0).astype(np.float64)
     if not weight.sum() > 0:
         raise VesselError(
-            "The scan has no edges, so there is no contrast-filled lumen in it; check that it is the right series."
+            "The scan has no edges and therefore no contrast-filled lumen. Check that it is the right series."
         )
     return float((weight * voxels[middle]).sum() / weight.sum())
 
@@ -235,15 +239,15 @@ def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
     above = image.voxels >= threshold
     if above.all():
         raise VesselError(
-            f"No lumen: no voxel is below threshold {threshold:.4g} "
-            f"(the scan's range is {image.voxels.min()} to {image.voxels.max()}); give another --threshold."
+            f"No voxel is below threshold {threshold:.4g} (intensities range from {image.voxels.min()} to "
+            f"{image.voxels.max()}). Set another threshold (--threshold)."
         )
     label, n_components = ndimage.label(above)
     size = np.bincount(label[above], minlength=n_components + 1)
     if size.max(initial=0) < FEWEST_VOXELS:
         raise VesselError(
-            f"No lumen: at threshold {threshold:.4g} the largest piece has {size.max(initial=0)} voxels "
-            f"(the scan's range is {image.voxels.min()} to {image.voxels.max()}); give another --threshold."
+            f"At threshold {threshold:.4g} the largest object has {size.max(initial=0)} voxels (intensities "
+            f"range from {image.voxels.min()} to {image.voxels.max()}). Set another threshold (--threshold)."
         )
     pieces = _Pieces(label, size, threshold)
     chosen = int(size.argmax()) if at_mm is None else _nearest(image, pieces, np.asarray(at_mm, dtype=np.float64))
@@ -273,8 +277,9 @@ def _nearest(image: Image, pieces: _Pieces, at_mm: Floats) -> int:
     if distance.min() > FARTHEST_MM:
         place = ", ".join(f"{v:.1f}" for v in at_mm)
         raise VesselError(
-            f"There is no lumen within {FARTHEST_MM:g} mm of ({place}) mm: nothing notable there is brighter than "
-            f"threshold {pieces.threshold:.4g}; check --at, which is in LPS mm, or give another --threshold."
+            f"There is no lumen within {FARTHEST_MM:g} mm of ({place}) mm: nothing notable there is brighter "
+            f"than threshold {pieces.threshold:.4g}. Check the point, which is in LPS mm (--at), or set "
+            "another threshold (--threshold)."
         )
     return int(part[tuple(index[distance.argmin()])])
 
@@ -381,7 +386,7 @@ def _smooth(rough: Surface) -> tuple[Surface, str]:
     vertices = smooth.vertices_mm + (lost / smooth.area_mm2) * smooth.vertex_normals
     return Surface(
         vertices, smooth.faces
-    ), f"Smoothing changed the volume by {-lost / volume:+.2%}, which was given back."
+    ), f"Smoothing changed the volume by {-lost / volume:+.2%}; the change was corrected."
 
 
 def _unblurred(surface: Surface, profile: Profile) -> Surface:
@@ -417,7 +422,7 @@ def _decimated(fine: Surface) -> tuple[Surface, tuple[str, ...]]:
     )
     coarse = Surface(vertices, faces)
     change = _capped_volume_mm3(coarse) / _capped_volume_mm3(fine) - 1
-    return coarse, (f"{len(fine.faces)} triangles decimated to {len(faces)} (volume {change:+.2%}).",)
+    return coarse, (f"{len(fine.faces)} triangles reduced to {len(faces)} (volume {change:+.2%}).",)
 
 
 def _capped_volume_mm3(surface: Surface) -> float:

@@ -160,6 +160,7 @@ def _sentence(graph: medial.Medial, through: Ints) -> str:
     widest = through[graph.radius[through].argmax()]
     place = ", ".join(f"{x:.0f}" for x in graph.points[widest])
     return (
-        f"The sac {2 * graph.radius[widest]:.0f} mm wide about {place} mm opens into the artery at two places, or "
-        "touches it: the artery is taken to go around, and the wider opening for the neck; part them in the surface."
+        f"The sac {2 * graph.radius[widest]:.0f} mm wide near {place} mm opens into the artery at two places, "
+        "or touches it. The artery is assumed to run around it, and the wider opening to be the neck. If this "
+        "is wrong, separate them in the surface."
     )

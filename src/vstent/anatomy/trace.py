@@ -116,7 +116,7 @@ def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Med
             raise VesselError(_unreachable(vessel.inlet, opening))
     kept = np.ones(len(graph.points), dtype=bool)
     kept[first:] = is_reached
-    notes = tuple(f"An opening {opening.described} is cut off from the inlet: closed." for opening in lost)
+    notes = tuple(f"An opening {opening.described} has no connection to the inlet and was closed." for opening in lost)
     openings = named(vessel.inlets, [opening for opening in vessel.openings if opening not in lost])
     return replace(vessel, openings=openings, notes=(*vessel.notes, *notes)), medial.keep(graph, kept)
 
@@ -142,9 +142,8 @@ def _shortest(vessel: Vessel, graph: medial.Medial, radius_cap: Floats) -> list[
 
 def _unreachable(inlet: Opening, opening: Opening) -> str:
     return (
-        f"{opening.role}, {opening.described}, is not connected to the inlet (diameter "
-        f"{inlet.diameter_mm:.1f} mm): the lumen is interrupted between them; lower the threshold, or cut that part "
-        "away"
+        f"{opening.role}, {opening.described}, is not connected to the inlet (diameter {inlet.diameter_mm:.1f} "
+        "mm), because the lumen is interrupted between them: lower the threshold, or remove that part"
     )
 
 

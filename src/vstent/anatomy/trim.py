@@ -187,8 +187,8 @@ def _inlets_of(vessel: Vessel, ends_mm: Floats, lumen: Surface) -> tuple[Floats,
     of_inlets = dict.fromkeys(loop[: len(vessel.inlets)].tolist())
     inlets = [k for k in of_inlets if k == loop[0] or brought[k] > 0]
     told = [
-        f"{opening.role}, {opening.described}, lies beyond that: "
-        f"{'its blood enters by another inlet' if k in inlets else 'through that cut more leaves than enters'}."
+        f"{opening.role}, {opening.described}, was cut off: "
+        f"{'its blood enters elsewhere' if k in inlets else 'that cut is an outlet now'}."
         for n, (opening, k) in enumerate(zip(vessel.inlets, loop, strict=False))
         if k in loop[:n] or k not in inlets
     ]
@@ -213,11 +213,11 @@ def _trimmed(site: _Site) -> list[str]:
     """Sentences on what is kept."""
     before, beyond = site.before, site.beyond
     return [
-        f"Trimmed to {before.kept_mm:.4g} mm of vessel before the sac's middle and {beyond.kept_mm:.4g} mm beyond it, "
-        "cut square.",
+        f"Trimmed to {before.kept_mm:.4g} mm of vessel proximal and {beyond.kept_mm:.4g} mm distal to the "
+        "middle of the sac.",
         *(
-            f"It is {way.kept_mm:.4g} mm {way.side} the sac's middle, not {way.usual_mm:g}: the neck reaches "
-            f"{way.neck_mm:.1f} mm from there."
+            f"{way.kept_mm:.4g} mm are kept {way.side} the middle of the sac instead of {way.usual_mm:g}, "
+            f"because the neck extends {way.neck_mm:.1f} mm from there."
             for way in (before, beyond)
             if way.has_grown
         ),
@@ -227,7 +227,8 @@ def _trimmed(site: _Site) -> list[str]:
 def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
     """Sentences on the sacs that are not in what is left of the lumen."""
     return [
-        f"Another sac, {bulge.height_mm:.1f} mm high, lies beyond that at {place(bulge.dome_mm)}: give it with --at."
+        f"Another bulge, {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)}, was cut off; choose it by "
+        "that point (--at)."
         for bulge in bulges
         if lumen.closest(bulge.dome_mm[None])[1][0] > bulge.height_mm / 2
     ]
@@ -260,9 +261,9 @@ def _site(vessel: Vessel, bulge: Bulge, upstream_mm: float | None, downstream_mm
 
 def _short(way: _Way, bulge: Bulge) -> str:
     return (
-        f"{way.asked_mm:g} mm of artery {way.side} the middle of the sac at {place(bulge.foot_mm.mean(axis=0))} would "
-        f"be cut through the sac or beside it: its neck reaches {way.neck_mm:.1f} mm from there; give {way.option} "
-        f"{way.least_mm:.1f} or more"
+        f"{way.asked_mm:g} mm of artery {way.side} the middle of the sac at "
+        f"{place(bulge.foot_mm.mean(axis=0))} would be a cut through the sac or next to it, because its neck "
+        f"extends {way.neck_mm:.1f} mm from there: give {way.option} {way.least_mm:.1f} or more"
     )
 
 

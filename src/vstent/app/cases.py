@@ -1,4 +1,4 @@
-"""Cases: what was chosen for a patient, which steps that leaves done or stale, and the file that remembers it."""
+"""Cases of the page: the user's choices, the state of every step, and the file that stores them."""
 
 import asyncio
 import hashlib
@@ -17,61 +17,61 @@ from vstent.app.choices import Choices
 from vstent.errors import InputError, ReadError
 from vstent.io.files import atomic
 
-if TYPE_CHECKING:  # loaded when a study is to be told something, as in `vstent.app.choices`
+if TYPE_CHECKING:  # imported when a study's settings are needed, as in `vstent.app.choices`
     from vstent.study.types import Settings
 
 STATE: Final = "app.json"
-"""File of a case folder that remembers the page's state."""
+"""File of a case folder that stores the page's state."""
 STEPS: Final = ("image", "vessel", "sac", "device", "deploy", "flow", "report")
-"""From left to right."""
+"""Steps of the page, from left to right."""
 UNDOS: Final = 100
-"""Changes that can be taken back."""
+"""Number of changes that can be undone."""
 
 Status = Literal["todo", "running", "done", "stale", "failed"]
 
 
 class Conflict(InputError):
-    """Somebody else has changed the case since it was looked at."""
+    """The case was changed elsewhere since this client last read it."""
 
 
 class Absent(ReadError):
-    """There is nothing of that name."""
+    """There is no case of that name."""
 
 
 class State(BaseModel):
-    """What a case folder remembers."""
+    """State of a case, as stored in its folder."""
 
     model_config = ConfigDict(frozen=True)
 
     name: str
     revision: int = 0
     input: str = ""
-    """The scan or surface: inside the case folder, or anywhere on this machine where it was given at the shell."""
+    """Path of the scan or surface: inside the case folder, or elsewhere if it was given to the command."""
     source: str = ""
     """SHA-256 of the input."""
     former: dict[str, Any] = Field(default_factory=dict)
-    """Settings of the study that the case was opened from, as its `run.json` tells them; empty where it began here."""
+    """Settings of the study that the case was opened from (its `run.json`); empty for a case begun on the page."""
     choices: Choices = Choices()
     undo: tuple[Choices, ...] = ()
     redo: tuple[Choices, ...] = ()
     done: dict[str, str] = Field(default_factory=dict)
-    """Step -> what it depended on when it was done."""
+    """Digest of everything that a finished step depended on, by step."""
     failed: dict[str, str] = Field(default_factory=dict)
-    """Step -> why."""
+    """Error message of every failed step, by step."""
     failed_with: dict[str, str] = Field(default_factory=dict)
-    """Step -> what the job depended on that failed there."""
+    """Digest of everything that a failed step depended on, by step."""
     anatomy: str = ""
     """Key of the anatomy in the ledger."""
     job: str = ""
-    """What is at work or, after the server was killed, was."""
+    """Kind of the running job, also after the server was killed."""
 
     def former_settings(self) -> "Settings":
-        """Return what stays where nothing can be chosen on the page.
+        """Return the settings that the page cannot change.
 
         Raises
         ------
         ReadError
-            They are of a study of another version.
+            They belong to a study of another version.
         """
         from vstent.study.repeat import settings_of
         from vstent.study.types import Settings
@@ -80,22 +80,22 @@ class State(BaseModel):
             return settings_of(self.former) if self.former else Settings()
         except ValueError:
             raise ReadError(
-                f"{self.name} was opened from a study of another version of vstent: open its scan anew."
+                f"{self.name} was opened from a study of another version of vstent. Open its scan again."
             ) from None
 
     def settings(self) -> "Settings":
-        """Return what a study is told."""
+        """Return the settings of the study."""
         return self.choices.settings(self.former_settings())
 
     def unseen(self) -> list[str]:
-        """Return the settings, with their values, that cannot be chosen on the page and are not as it has them."""
+        """Return the settings, with their values, that the page cannot change and that differ from its own."""
         from vstent.study.types import Settings
 
         return list(_differences(asdict(self.settings()), asdict(self.choices.settings(Settings()))))
 
 
 def _differences(given: dict[str, Any], usual: dict[str, Any], before: str = "") -> Iterator[str]:
-    """Names, with their values where those are short, of what is not as usual."""
+    """Yield names of settings that differ from the usual ones, with their values where those are short."""
     for name, value in given.items():
         if isinstance(value, dict) and isinstance(usual[name], dict):
             yield from _differences(value, usual[name], f"{before}{name} ")
@@ -104,7 +104,7 @@ def _differences(given: dict[str, Any], usual: dict[str, Any], before: str = "")
 
 
 def dependencies(state: State) -> dict[str, str]:
-    """Return for every step a digest of all that it depends on."""
+    """Return a digest of everything that each step depends on, by step."""
     chosen = state.choices.model_dump(mode="json")
     sizes = [[device.name, device.diameter_mm, device.length_mm] for device in state.choices.devices]
     centers = [device.center_mm for device in state.choices.devices]
@@ -125,13 +125,13 @@ def dependencies(state: State) -> dict[str, str]:
 
 
 def failures(state: State) -> dict[str, str]:
-    """Return the steps that failed with what is chosen now, and why."""
+    """Return the error messages of the steps that failed with the present choices, by step."""
     keys = set(dependencies(state).values())
     return {step: why for step, why in state.failed.items() if state.failed_with.get(step) in keys}
 
 
 def statuses(state: State, at_work: str, lost: Set[str]) -> dict[str, Status]:
-    """Return how every step stands; `at_work`: the step that a job is at, or empty; `lost`: whose results are gone."""
+    """Return the status of every step, given the step of the running job and the steps whose results are missing."""
     keys, failed = dependencies(state), failures(state)
 
     def status(step: str) -> Status:
@@ -147,7 +147,7 @@ def statuses(state: State, at_work: str, lost: Set[str]) -> dict[str, Status]:
 
 
 class Case:
-    """A case folder that several tabs look at and change, one change at a time."""
+    """A case folder that several browser tabs read and change, one change at a time."""
 
     def __init__(self, case_id: str, folder: Path, state: State) -> None:
         self.id, self.folder = case_id, folder
@@ -157,23 +157,23 @@ class Case:
 
     @property
     def state(self) -> State:
-        """What is chosen and done."""
+        """Choices and results of the steps."""
         return self._state
 
     @property
     def input(self) -> Path:
         """The scan or surface."""
         if not self._state.input:
-            raise ReadError(f"{self._state.name} has no scan yet: drop one on the page.")
+            raise ReadError(f"{self._state.name} has no scan yet. Drop one on the page.")
         return self.folder / self._state.input
 
     def change(self, revision: int, choices: Choices) -> State:
-        """Take other choices, unless the case was changed since `revision`.
+        """Replace the choices, unless the case was changed since `revision`.
 
         Raises
         ------
         Conflict
-            It was.
+            The case was changed since.
         """
         with self._lock:
             self._check(revision)
@@ -184,7 +184,7 @@ class Case:
             return self.update(choices=choices, undo=undo, redo=(), revision=before.revision + 1)
 
     def step_back(self, revision: int, *, forward: bool = False) -> State:
-        """Undo the last change, or do it again.
+        """Undo the last change, or redo it.
 
         Raises
         ------
@@ -202,7 +202,7 @@ class Case:
             return self.update(choices=taken[-1], undo=undo, redo=redo, revision=now.revision + 1)
 
     def update(self, **changes: Any) -> State:
-        """Change the state, write it down, and tell all who look."""
+        """Change the state, store it, and notify all clients."""
         with self._lock:
             self._state = self._state.model_copy(update=changes)
             with atomic(self.folder / STATE) as partial:
@@ -212,25 +212,22 @@ class Case:
 
     def _check(self, revision: int) -> None:
         if revision != self._state.revision:
-            raise Conflict(
-                f"This case was changed elsewhere (revision {self._state.revision}, not {revision}): "
-                "what you see has been brought up to date; make your change again."
-            )
+            raise Conflict("This case was changed in another window. The page now shows that change; make yours again.")
 
     def tell(self) -> None:
-        """Wake all who look."""
+        """Notify all clients."""
         for loop, event in tuple(self._listeners):
-            with suppress(RuntimeError):  # the loop of a client that is gone is closed
+            with suppress(RuntimeError):  # the event loop of a closed client is closed
                 loop.call_soon_threadsafe(event.set)
 
     def listen(self) -> asyncio.Event:
-        """Return what is set whenever something has changed; to be called in the client's loop."""
+        """Return an event that is set at every change; call it in the client's event loop."""
         event = asyncio.Event()
         self._listeners.add((asyncio.get_running_loop(), event))
         return event
 
     def leave(self, event: asyncio.Event) -> None:
-        """Tell a client no more."""
+        """Stop notifying a client."""
         self._listeners = {pair for pair in self._listeners if pair[1] is not event}
 
 
@@ -240,25 +237,25 @@ def load(case_id: str, folder: Path) -> Case:
     Raises
     ------
     ReadError
-        The folder remembers no state, or not one that can be read.
+        The folder holds no state, or one that cannot be read.
     """
     try:
         state = State.model_validate_json((folder / STATE).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ReadError(f"{folder} is no case of the page: it has no {STATE}.") from None
+        raise ReadError(f"{folder} is not a case of the page: it has no {STATE}.") from None
     except (OSError, ValidationError, UnicodeDecodeError):
-        raise ReadError(f"{folder / STATE} is damaged: delete it and open the scan again.") from None
+        raise ReadError(f"{folder / STATE} is damaged. Delete it and open the scan again.") from None
     return Case(case_id, folder, state)
 
 
 def identifier(name: str) -> str:
-    """Return a name for a folder and a URL: letters, digits, points, dashes and underlines."""
+    """Return a name for a folder and a URL: letters, digits, points, dashes and underscores."""
     plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-._")[:60]
     return plain or "case"
 
 
 class Store:
-    """All cases of a workspace, and the one given at the shell."""
+    """All cases of a workspace, and the one given to the command."""
 
     def __init__(self, workspace: Path) -> None:
         self.workspace = workspace
@@ -266,30 +263,30 @@ class Store:
         self._lock = threading.Lock()
 
     def ids(self) -> list[str]:
-        """Return the cases there are, the latest first."""
+        """Return the names of all cases, the latest first."""
         found = [path.parent for path in self.workspace.glob(f"*/{STATE}")]
         found.sort(key=lambda folder: -(folder / STATE).stat().st_mtime)
         return list(dict.fromkeys([*self._cases, *(folder.name for folder in found)]))
 
     def get(self, case_id: str) -> Case:
-        """Return a case.
+        """Return a case by its name.
 
         Raises
         ------
         Absent
-            There is none of that name.
+            There is no such case.
         ReadError
-            It is damaged.
+            The case is damaged.
         """
         with self._lock:
             if case_id not in self._cases:
                 if identifier(case_id) != case_id or not (self.workspace / case_id / STATE).is_file():
-                    raise Absent("There is no such case: choose one of the list on the first page.")
+                    raise Absent("This case does not exist. Choose one of the list on the first page.")
                 self._cases[case_id] = load(case_id, self.workspace / case_id)
             return self._cases[case_id]
 
     def create(self, name: str, folder: Path | None = None, **known: Any) -> Case:
-        """Make a case, in a folder of its own in the workspace unless one is given."""
+        """Create a case, by default in a new folder of the workspace."""
         with self._lock:
             case_id = free = identifier(name)
             count = 1
@@ -304,7 +301,7 @@ class Store:
         return case
 
     def of_input(self, path: Path) -> Case | None:
-        """Return the case that was begun with a file of this machine, if there is one."""
+        """Return the case that was begun with a file of this machine; None if there is none."""
         for case_id in self.ids():
             with suppress(ReadError):
                 case = self.get(case_id)
@@ -313,7 +310,7 @@ class Store:
         return None
 
     def adopt(self, folder: Path) -> Case:
-        """Take in a case folder that lies anywhere."""
+        """Add a case folder that is anywhere on this machine."""
         case = load(identifier(folder.resolve().name), folder.resolve())
         with self._lock:
             self._cases[case.id] = case

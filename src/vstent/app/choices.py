@@ -1,11 +1,13 @@
-"""What a user has chosen, as the page and the REST interface say it, and as a study understands it."""
+"""The user's choices: as the page and the REST interface state them, and as settings of a study."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-if TYPE_CHECKING:  # a study's modules are loaded when it is to be told something: the page must be there at once
+if (
+    TYPE_CHECKING
+):  # the modules of a study are imported only when its settings are needed, so that the page appears at once
     from vstent.flow.case import FlowSettings, Waveform
     from vstent.study.types import Placing, Settings
 
@@ -13,18 +15,18 @@ Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
 Length = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
 Count = Annotated[int, Field(gt=0, le=100_000)]
 NECK_HANDLES: Final = 12
-"""Points of a neck that can be pulled, evenly spaced."""
+"""Number of evenly spaced handles on a neck."""
 Point = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class Strict(BaseModel):
-    """A model that refuses names it does not know."""
+    """A model that rejects unknown fields."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class DeviceChoice(Strict):
-    """A device, its size and where its middle lies; what is not given is proposed."""
+    """A device with its size and the position of its middle; missing values are proposed."""
 
     name: str = Field(max_length=60)
     diameter_mm: Length | None = None
@@ -33,7 +35,7 @@ class DeviceChoice(Strict):
 
 
 class FlowChoice(Strict):
-    """How the blood flow is to be computed."""
+    """How the blood flow is computed."""
 
     is_wanted: bool = True
     cell_size_mm: Annotated[float, Field(ge=0.04, le=1.0)] | None = None
@@ -42,7 +44,7 @@ class FlowChoice(Strict):
     outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
 
     def settings(self, former: "FlowSettings") -> "FlowSettings | None":
-        """Return what a study is told of the flow; what cannot be chosen here stays as it was in `former`."""
+        """Return the flow settings of the study; settings that the page cannot change are taken from `former`."""
         if not self.is_wanted:
             return None
         return replace(
@@ -55,7 +57,7 @@ class FlowChoice(Strict):
 
 
 class Choices(Strict):
-    """Everything a user may choose; what is left out is proposed."""
+    """All choices of the user; missing values are proposed."""
 
     units: Literal["m", "cm", "mm"] | None = None
     spacing_mm: tuple[Length, Length, Length] | None = None
@@ -63,30 +65,30 @@ class Choices(Strict):
     threshold: Annotated[float, Field(allow_inf_nan=False)] | None = None
     at_mm: Point | None = None
     inlet_mm: Point | Annotated[tuple[Point, ...], Field(min_length=1, max_length=50)] | None = None
-    """Near the inlet; or near each opening that brings blood, first near that where the parent artery begins."""
+    """Point near the inlet, or near each inlet; the parent artery begins at the first."""
     outlet_mm: Point | None = None
     neck_mm: Annotated[tuple[Point, ...], Field(min_length=3, max_length=1000)] | None = None
-    """A neck drawn by hand: a closed curve near the wall."""
+    """Neck drawn by hand: a closed curve near the wall."""
     upstream_mm: Length | None = None
-    """Artery to keep before the sac's middle."""
+    """Length of artery to keep proximal to the sac."""
     downstream_mm: Length | None = None
-    """Of every way beyond the sac's middle, what is to be kept."""
+    """Length of vessel to keep distal to the sac."""
     devices: tuple[DeviceChoice, ...] = Field(
         default=(DeviceChoice(name="silk"), DeviceChoice(name="enterprise")), max_length=3
     )
     flow: FlowChoice = FlowChoice()
     uncertainty_samples: Annotated[int, Field(ge=8, le=256)] | None = None
-    """Deployments with what is not sure varied; None: none."""
+    """Number of deployments with uncertain inputs varied; None: none."""
 
     @field_validator("devices")
     @classmethod
     def _each_once(cls, devices: tuple[DeviceChoice, ...]) -> tuple[DeviceChoice, ...]:
         if len({device.name for device in devices}) < len(devices):
-            raise ValueError("a device can be chosen once")
+            raise ValueError("a device can be chosen only once")
         return devices
 
     def settings(self, former: "Settings") -> "Settings":
-        """Return what a study is told; what cannot be chosen here stays as it was in `former`."""
+        """Return the settings of the study; settings that the page cannot change are taken from `former`."""
         from vstent.flow.case import FlowSettings
         from vstent.plan.uncertainty import Ranges
         from vstent.study.types import Placing
@@ -94,7 +96,7 @@ class Choices(Strict):
         samples = self.uncertainty_samples
         return replace(
             former,
-            diameter_mm=None,  # every device is told its own below
+            diameter_mm=None,  # every device gets its own below
             length_mm=None,
             center_mm=None,
             devices=tuple(device.name for device in self.devices),
@@ -115,14 +117,14 @@ class Choices(Strict):
 
 
 def pulse_of(former: "FlowSettings") -> "Waveform":
-    """Return the pulse that can be chosen: the former one, or the published one where there was none."""
+    """Return the waveform that can be chosen: that of the former study, or the published one."""
     from vstent.flow.waveform import OLDER_ADULT_ICA
 
     return former.waveform or OLDER_ADULT_ICA
 
 
 def placing_of(device: DeviceChoice) -> "Placing":
-    """Return what a study is told of a device's size and place."""
+    """Return size and position of a device for the study."""
     from vstent.study.types import Placing
 
     return Placing(device.diameter_mm, device.length_mm, device.center_mm)

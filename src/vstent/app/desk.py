@@ -1,4 +1,4 @@
-"""Desk: the cases on the table, with what is at work on them; everything that the routes of the server ask for."""
+"""The open cases with their jobs: everything that the routes of the server call."""
 
 import json
 import tempfile
@@ -18,7 +18,7 @@ from vstent.io.files import existing
 
 
 class Desk:
-    """Cases, jobs, and what answers at once."""
+    """Cases, jobs, and immediate answers."""
 
     def __init__(self, store: Store, *, opened: str = "") -> None:
         self.store, self.opened = store, opened
@@ -33,12 +33,12 @@ class Desk:
     # -- cases ---------------------------------------------------------------------------------------------------------
 
     def open(self, path: Path) -> None:
-        """Put what was given at the shell on the table: a case of the page, one of `vstent run`, or a scan or surface.
+        """Open an input of the command: a case of the page, one of `vstent run`, or a scan or surface.
 
         Raises
         ------
         ReadError
-            There is nothing at that path.
+            The path does not exist.
         """
         existing(path)
         if (path / STATE).is_file():
@@ -52,19 +52,19 @@ class Desk:
                 self._to_begin = (case, path)
 
     def listed(self) -> list[dict[str, Any]]:
-        """Return every case with what it is called and how far it is."""
+        """Return every case with its title and progress."""
         found = []
         for case_id in self.store.ids():
             try:
                 case = self.store.get(case_id)
                 steps = statuses(case.state, "", lost_steps(case.folder, case.state))
             except ReadError:
-                continue  # somebody else's folder, or a damaged one
+                continue  # a folder of something else, or a damaged one
             found.append({"id": case_id, "name": case.state.name, "done": [s for s in STEPS if steps[s] == "done"]})
         return found
 
     def view(self, case: Case) -> dict[str, Any]:
-        """Return all that a tab must know of a case."""
+        """Return everything that a client needs to know of a case."""
         state, job = case.state, self.jobs.of(case)
         is_at_work = job is not None and job.is_alive
         at_work = job.step if job is not None and is_at_work else ""
@@ -92,7 +92,7 @@ class Desk:
         }
 
     def demo(self) -> Case:
-        """Make a case of the synthetic scan."""
+        """Create a case of the synthetic scan."""
         from vstent.study.demo import write_scan
 
         case = self.store.create("demo")
@@ -101,13 +101,13 @@ class Desk:
         return case
 
     def begin(self, case: Case) -> None:
-        """Everything is in: find the vessel, unless it must first be said how many and how large the voxels are."""
+        """Find the vessel of a complete upload, unless dimensions and voxel spacing must be given first."""
         self.point(case, intake.found(case.folder))
         if not _wants_grid(case):
             self.start(case, "anatomy")
 
     def point(self, case: Case, path: str) -> None:
-        """Say where the scan or surface lies."""
+        """Set the path of the scan or surface."""
         from vstent.study.ledger import hash_of
 
         source = hash_of(case.folder / path)
@@ -124,19 +124,19 @@ class Desk:
             There is no scan yet.
         """
         if not case.input.exists():
-            raise ReadError(f"The scan of {case.state.name} is not where it was: {case.input}. Put it back.")
+            raise ReadError(f"The scan of {case.state.name} has been moved from {case.input}. Put it back there.")
         if kind != "anatomy" and not case.state.choices.devices:
-            raise InputError("No device is chosen: choose one in the step Device.")
+            raise InputError("No device is chosen. Choose one in the step Device.")
         self.jobs.start(case, kind)
 
     def resume(self, case: Case) -> None:
-        """Go on with what was at work when the server was killed."""
+        """Resume the job that was running when the server was killed."""
         job = self.jobs.of(case)
         if case.state.job in KINDS and job is None and case.state.source:
             self.start(case, case.state.job)
 
     def note_deployed(self, case: Case, device: DeviceChoice) -> None:
-        """Remember that the devices as chosen were seen deployed."""
+        """Store that the chosen devices were shown deployed."""
         keys = dependencies(case.state)
         is_current = device in case.state.choices.devices and case.state.done.get("sac") == keys["sac"]
         chosen = {step: keys[step] for step in ("device", "deploy")}
@@ -146,7 +146,7 @@ class Desk:
     # -- what answers at once ------------------------------------------------------------------------------------------
 
     def live(self, case: Case) -> Any:
-        """Return what answers for a case."""
+        """Return the immediate answers of a case."""
         from vstent.app.live import Live
 
         with self._lock:
@@ -160,13 +160,13 @@ class Desk:
         Raises
         ------
         InputError
-            It is a surface, or nothing has come in yet.
+            The case has a surface, or no input yet.
         """
         from vstent.app.scans import Scan
         from vstent.io.images import read_image
 
         if _is_surface(case):
-            raise InputError("This case has no scan: it began with a surface.")
+            raise InputError("This case has no scan, because it began with a surface.")
         choices = case.state.choices
         grid = choices.spacing_mm, choices.shape
         with self._lock:
@@ -175,7 +175,7 @@ class Desk:
             return self._scans[case.id][1]
 
     def surface(self, case: Case, threshold: float) -> bytes:
-        """Return the surface that a threshold gives."""
+        """Return the surface at a threshold."""
         from vstent.app.live import LOCK
 
         scan = self.scan(case)
@@ -183,14 +183,14 @@ class Desk:
             return bytes(scan.surface(threshold))
 
     def neck(self, case: Case, curve_mm: Sequence[Point], handle: int | None, to_mm: Point | None) -> bytes:
-        """Return a neck, with one handle pulled where it is said whither."""
+        """Return a neck, with one handle moved if its new position is given."""
         import numpy as np
 
         whither = None if to_mm is None else np.array(to_mm, dtype=np.float64)
         return bytes(self.live(case).neck_message(np.array(curve_mm, dtype=np.float64), handle, whither))
 
     def numbers(self, case: Case) -> dict[str, Any]:
-        """Return every number found so far: anatomy, flow before and after, and how sure they are."""
+        """Return all results so far: anatomy, flow without and with devices, and uncertainty."""
         from vstent.app import sheets
 
         found: dict[str, Any] = {"anatomy": [], "flow": [], "uncertainty": []}
@@ -204,7 +204,7 @@ class Desk:
         return found
 
     def warm(self) -> None:
-        """Begin what was given at the shell; load what the first click will need, while the page is being looked at."""
+        """Start the case given to the command, and load what the first click will need."""
         self.load()
         if self._to_begin is not None:
             case, path = self._to_begin
@@ -213,9 +213,9 @@ class Desk:
         devices()
 
     def load(self) -> None:
-        """Load all that answers need, before the first: a second one waits.
+        """Import everything that answers need, before the first request; a second caller waits.
 
-        Two threads that import a package and a module of it at once may be given modules that are not whole.
+        Two threads that import a package and a module of it at the same time may get incomplete modules.
         """
         with self._loading:
             from vstent.app import live, scans, sheets  # noqa: F401
@@ -223,13 +223,13 @@ class Desk:
             from vstent.flow import waveform  # noqa: F401
 
     def close(self) -> None:
-        """Stop everything; cases remember what there was to do."""
+        """Stop all jobs; they are resumed later."""
         self.is_closing = True
         self.jobs.abandon()
 
 
 def code_of(error: Exception) -> int:
-    """Return the HTTP status that says what kind of error it is."""
+    """Return the HTTP status of an error."""
     if isinstance(error, Conflict):
         return 409
     if isinstance(error, Absent):
@@ -243,10 +243,10 @@ def begin_upload(case: Case, name: str) -> Path:
     Raises
     ------
     InputError
-        The case has its scan, or the name is none of a scan or a surface.
+        The case already has its input, or the name is that of neither a scan nor a surface.
     """
     if case.state.source:
-        raise InputError(f"{case.state.name} has its scan or surface already: make another case for {name}.")
+        raise InputError(f"{case.state.name} already has its scan or surface. Make another case for {name}.")
     intake.checked_name(name)
     folder = case.folder / intake.FOLDER
     folder.mkdir(parents=True, exist_ok=True)
@@ -256,12 +256,12 @@ def begin_upload(case: Case, name: str) -> Path:
 
 
 def end_upload(case: Case, partial: Path, name: str) -> None:
-    """Take an upload that is whole."""
+    """Accept a complete upload."""
     intake.take(partial, name, case.folder)
 
 
 def devices() -> list[dict[str, Any]]:
-    """Return the catalogue, as the page lists it."""
+    """Return the catalogue as the page lists it."""
     from vstent.devices.catalogue import catalogue
 
     return [
@@ -279,14 +279,14 @@ def devices() -> list[dict[str, Any]]:
 
 
 def landing(abscissa_mm: float | None, anchor: Literal["proximal", "center", "distal"]) -> Any:
-    """Return where a device is to lie, or None where nothing is said."""
+    """Return the landing of a device, or None where no position is given."""
     from vstent.devices.stent import Landing
 
     return None if abscissa_mm is None else Landing(abscissa_mm, anchor)
 
 
 def ranking(case: Case) -> dict[str, Any]:
-    """Return the sizes ranked, and whether they are of the case as it is."""
+    """Return the ranking, and whether it belongs to the present choices."""
     path = case.folder / RANKING
     if not path.is_file():
         return {"rows": [], "is_current": False}
@@ -297,7 +297,7 @@ def ranking(case: Case) -> dict[str, Any]:
 
 
 def pulse(case: Case | None) -> dict[str, Any]:
-    """Return the pulse that can be chosen, the published one unless a case has its own: times, flow over mean flow."""
+    """Return the waveform that can be chosen (times, flow over mean flow): the published one, or the case's own."""
     import numpy as np
 
     from vstent.flow.case import FlowSettings
@@ -309,7 +309,7 @@ def pulse(case: Case | None) -> dict[str, Any]:
 
 
 def _titles(metrics: dict[str, Any], case: Case) -> dict[str, str]:
-    """Names of the devices with their sizes, in the order in which they were chosen."""
+    """Return the titles of the devices with their sizes, in the order in which they were chosen."""
     order = [device.name for device in case.state.choices.devices]
     found = {name: stent["deployment"] for name, stent in metrics.get("stents", {}).items()}
     names = sorted(found, key=lambda name: order.index(name) if name in order else len(order))
@@ -323,7 +323,7 @@ def _is_surface(case: Case) -> bool:
 
 
 def _wants_grid(case: Case) -> bool:
-    """Whether nothing says yet how many and how large the voxels are."""
+    """Return whether the number and spacing of the voxels are unknown."""
     from vstent.io.files import RAW_SUFFIXES, suffix
 
     choices = case.state.choices

@@ -1,4 +1,4 @@
-"""Finished: what the study last finished in a case folder has left there, by what its `run.json` says of it."""
+"""Results of the last finished study in a case folder, found through its `run.json`."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING, Final
 from vstent.app.cases import State, dependencies
 from vstent.errors import InputError
 
-if TYPE_CHECKING:  # loaded when a folder is looked at, as in `vstent.app.choices`
+if TYPE_CHECKING:  # imported when a folder is read, as in `vstent.app.choices`
     from vstent.study.types import Settings
 
 RUN: Final = "run.json"
-"""What a study says of itself."""
+"""File in which a study states its settings."""
 REPORT: Final = "report.html"
 REMEMBERED: Final = 256
-"""So many versions of `run.json` are not read again."""
+"""Number of `run.json` files whose content is kept in memory."""
 
 
 def kept_flows(folder: Path) -> dict[str, Path]:
-    """Return where the flows of the study last finished are kept, ``bare`` first; none where one of them is not.
+    """Return the files of the flows of the last finished study, ``bare`` first; none where one of them is missing.
 
-    A study that began after it and was stopped may have put flows of other settings in their places.
+    A later study that was stopped may have replaced flows by those of other settings.
     """
     run = folder / RUN
     try:
@@ -31,7 +31,7 @@ def kept_flows(folder: Path) -> dict[str, Path]:
 
 
 def lost_steps(folder: Path, state: State) -> set[str]:
-    """Return the steps that may have been done and whose results are there no more, or those of another study."""
+    """Return the steps whose results are missing or belong to another study."""
     lost, flows, keys = set(), kept_flows(folder), dependencies(state)
     if state.choices.flow.is_wanted and not flows:
         lost.add("flow")
@@ -45,14 +45,14 @@ def lost_steps(folder: Path, state: State) -> set[str]:
 
 @lru_cache(maxsize=REMEMBERED)
 def _flows_wanted(folder: Path, given: str) -> dict[str, Path]:
-    """Where the flows of what a case's state (JSON) asks for are to be kept."""
+    """Return the files of the flows that a case's state (JSON) requests."""
     state = State.model_validate_json(given)
     return _paths(folder, state.source, state.settings())
 
 
 @lru_cache(maxsize=REMEMBERED)
 def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
-    """Where the flows are to be kept that a `run.json` tells of; nowhere where this version cannot read it."""
+    """Return the files of the flows that a `run.json` states; none where this version cannot read it."""
     from vstent.study.repeat import UNTOLD, told_in
 
     try:
@@ -63,7 +63,7 @@ def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
 
 
 def _paths(folder: Path, source: str, settings: "Settings") -> dict[str, Path]:
-    """Where a study keeps its flows."""
+    """Return the files in which a study keeps its flows."""
     from vstent.devices.catalogue import find_design
     from vstent.devices.design import BARE
     from vstent.study.folder import CACHE

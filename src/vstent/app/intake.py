@@ -28,7 +28,10 @@ MOST_FILES: Final = 5000
 """Files of a case, and entries of an archive."""
 LONGEST_NAME: Final = 120
 _BLOCK: Final = 1 << 20
-_TOO_MUCH: Final = f"The archive holds more than {UNPACKED_LIMIT >> 30} GB or {MOST_FILES} files: too much."
+_TOO_MUCH: Final = (
+    f"The archive holds more than {UNPACKED_LIMIT >> 30} GB or {MOST_FILES} files, which is too much. Drop a "
+    "smaller one."
+)
 
 
 def checked_name(name: str) -> str:
@@ -41,12 +44,12 @@ def checked_name(name: str) -> str:
     """
     is_plain = name and not any(mark in name for mark in ("/", "\\", "\0")) and not name.startswith(".")
     if not is_plain or len(name) > LONGEST_NAME or not name.isprintable():
-        raise ReadError("That is no plain file name: rename the file, and drop it again.")
+        raise ReadError("This file name cannot be used. Rename the file and drop it again.")
     kind = suffix(Path(name))
     has_kind = kind in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES, ".zip", ".ima", "")
     if not has_kind and kind.lstrip(".").isalpha():
         known = ", ".join((*SURFACE_SUFFIXES, *IMAGE_SUFFIXES, ".zip"))
-        raise ReadError(f"{name} is neither a scan nor a surface: drop a DICOM folder or one of {known}.")
+        raise ReadError(f"{name} is neither a scan nor a surface. Drop a DICOM folder or one of {known}.")
     return name
 
 
@@ -90,12 +93,10 @@ def found(case_folder: Path) -> str:
     if (folder / SERIES).is_dir():
         scans.append(folder / SERIES)
     if not scans:
-        raise ReadError("Nothing that has come in is a scan or a surface: drop a DICOM folder, a volume or a surface.")
+        raise ReadError("None of the files is a scan or a surface. Drop a DICOM folder, a volume or a surface.")
     if len(scans) > 1:
         names = " and ".join(path.name for path in scans[:2])
-        raise ReadError(
-            f"More than one scan or surface has come in ({names}): drop one of them, for a case of its own."
-        )
+        raise ReadError(f"There is more than one scan or surface ({names}). Drop one; make another case for the other.")
     return f"{FOLDER}/{scans[0].name}"
 
 
@@ -104,7 +105,7 @@ def _take_slice(path: Path, folder: Path) -> None:
     series.mkdir(exist_ok=True)
     count = sum(1 for _ in series.iterdir())
     if count >= MOST_FILES:
-        raise ReadError(f"More than {MOST_FILES} slices: drop one series.")
+        raise ReadError(f"More than {MOST_FILES} slices. Drop one series.")
     strip_dicom(path, series / f"slice-{count + 1:05}.dcm")
 
 
@@ -119,7 +120,7 @@ def _take_archive(path: Path, folder: Path) -> None:
             for number, entry in enumerate(entries):
                 left = _take_entry(archive, entry, folder / f".entry-{number}", folder, left)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError):
-        raise ReadError("The archive is damaged or locked: unpack it, and drop the folder.") from None
+        raise ReadError("The archive is damaged or locked. Unpack it and drop the folder.") from None
 
 
 def _take_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, partial: Path, folder: Path, left: int) -> int:
@@ -129,7 +130,10 @@ def _take_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, partial: Path,
             for block in iter(lambda: packed.read(_BLOCK), b""):
                 left -= len(block)
                 if left < 0:  # sizes in an archive can lie
-                    raise ReadError(f"The archive unpacks to more than {UNPACKED_LIMIT >> 30} GB: too much.")
+                    raise ReadError(
+                        f"The archive unpacks to more than {UNPACKED_LIMIT >> 30} GB, which is too much. Drop "
+                        "a smaller one."
+                    )
                 out.write(block)
         name = entry.filename.replace("\\", "/").rpartition("/")[2]
         if is_dicom(partial):
@@ -145,7 +149,9 @@ def _take_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, partial: Path,
 def _refuse_bomb(path: Path, name: str) -> None:
     """See that a compressed file unpacks to no more than the limit."""
     if suffix(Path(name)).endswith(".gz") and _unpacked_size(_blocks(path)) > UNPACKED_LIMIT:
-        raise ReadError(f"{name} unpacks to more than {UNPACKED_LIMIT >> 30} GB: too much.")
+        raise ReadError(
+            f"{name} unpacks to more than {UNPACKED_LIMIT >> 30} GB, which is too much. Drop a smaller one."
+        )
 
 
 def _blocks(path: Path) -> Iterable[bytes]:
@@ -153,7 +159,7 @@ def _blocks(path: Path) -> Iterable[bytes]:
         with gzip.open(path) as stream:
             yield from iter(lambda: stream.read(_BLOCK), b"")
     except (OSError, EOFError, zlib.error):
-        raise ReadError("The compressed file is damaged: copy it again from where it came.") from None
+        raise ReadError("The compressed file is damaged. Copy it again from its source.") from None
 
 
 def _unpacked_size(blocks: Iterable[bytes]) -> int:

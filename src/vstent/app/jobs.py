@@ -1,4 +1,4 @@
-"""Jobs: the long stages of a case, in a process of their own, so that the page stays quick and can stop them."""
+"""Jobs: the long stages of a case, run in a separate process so that the page stays responsive and can stop them."""
 
 import json
 import os
@@ -19,9 +19,9 @@ KINDS: Final = {
     "rank": ("device",),
     "flow": ("device", "deploy", "flow", "report"),
 }
-"""Kind of a job -> the steps that are done when it is."""
+"""Steps that each kind of job completes."""
 FIRST: Final = {"anatomy": "image", "rank": "device", "flow": "flow"}
-"""Kind of a job -> the step that it is said to be at before it has said a word."""
+"""Step that each kind of job shows before its first progress message."""
 STAGES: Final = {
     "scan": "image",
     "segment": "image",
@@ -39,19 +39,19 @@ STAGES: Final = {
     "vary": "report",
     "report": "report",
 }
-"""First word of a study's stage -> step of the page."""
+"""Step of the page for the first word of a study's stage."""
 SETTLING: Final = re.compile(r"([\d.]+)% left to settle, (?:.*?)(\d+) s left")
-"""How a ledger tells of a flow (`vstent.study.ledger.Ledger.teller`)."""
-STOPPED: Final = "Stopped. What was finished is kept."
+"""Form of the progress message of a flow (`vstent.study.ledger.Ledger.teller`)."""
+STOPPED: Final = "Stopped. Finished results are kept."
 LAST_WORDS: Final = ".worker.log"
-"""File of a case folder with what a job said when it broke off."""
+"""File of a case folder with the output of a job that ended unexpectedly."""
 POINTS_KEPT: Final = 600
 RANKING: Final = "ranking.json"
-"""File of a case folder that holds the sizes ranked."""
+"""File of a case folder with the ranking."""
 
 
 class Job:
-    """One process at work on a case."""
+    """A process that works on a case."""
 
     def __init__(self, case: Case, kind: str) -> None:
         self.case, self.kind = case, kind
@@ -67,32 +67,32 @@ class Job:
         with (case.folder / LAST_WORDS).open("w", encoding="utf-8") as last_words:
             self._process = subprocess.Popen(
                 command,
-                stdin=subprocess.PIPE,  # closes when the server is gone, however it went: then the job ends too
+                stdin=subprocess.PIPE,  # closes when the server ends for any reason, which ends the job too
                 stdout=subprocess.PIPE,
                 stderr=last_words,
                 text=True,
                 bufsize=1,
-                start_new_session=True,  # a job's own processes end with it
+                start_new_session=True,  # the job's own processes end with it
             )
         self._thread = threading.Thread(target=self._follow, daemon=True)
         self._thread.start()
 
     @property
     def step(self) -> str:
-        """The step that is at work; empty once all is done."""
+        """Present step; empty when all are done."""
         if self._process.poll() is not None and not self._thread.is_alive():
             return ""
         step = STAGES.get(self.stage.partition(" ")[0], FIRST[self.kind])
-        is_past = self._has_anatomy and step not in KINDS[self.kind]  # the anatomy is only read again
+        is_past = self._has_anatomy and step not in KINDS[self.kind]  # the anatomy is only loaded again
         return FIRST[self.kind] if is_past else step
 
     @property
     def is_alive(self) -> bool:
-        """Whether it is still at work."""
+        """Whether the process is running."""
         return self._thread.is_alive()
 
     def told(self) -> dict[str, Any]:
-        """Return how far it is."""
+        """Return the progress."""
         return {
             "kind": self.kind,
             "stage": self.stage,
@@ -104,13 +104,13 @@ class Job:
         }
 
     def stop(self) -> None:
-        """Stop at once; what was finished is kept."""
+        """Stop at once; finished results are kept."""
         self._is_stopped = True
         self._kill()
         self._thread.join(5.0)
 
     def abandon(self) -> None:
-        """Stop because the server ends; the case remembers that there was something to do."""
+        """Stop because the server ends; the case stores that the job is to be resumed."""
         self.case = _Deaf(self.case)  # type: ignore[assignment]
         self._kill()
 
@@ -125,7 +125,7 @@ class Job:
         assert self._process.stdout is not None
         assert self._process.stdin is not None
         failure = ""
-        with suppress(BrokenPipeError):  # it has ended already, which is told below
+        with suppress(BrokenPipeError):  # it has ended already, as reported below
             self._process.stdin.write(self._given.model_dump_json(exclude={"undo", "redo"}) + "\n")
         for line in self._process.stdout:
             told = json.loads(line)
@@ -143,12 +143,13 @@ class Job:
             failure = STOPPED
         elif code and not failure:
             failure = (
-                f"The computation broke off (its last words: {LAST_WORDS}); what was finished is kept. Start it again."
+                f"The computation ended unexpectedly (its last words: {LAST_WORDS}). Finished results are "
+                "kept; start it again."
             )
         self._close(failure)
 
     def _take_anatomy(self, key: str) -> None:
-        """The anatomy of the choices given is found, whatever job it was found for."""
+        """Store the anatomy of the present choices, whichever job found it."""
         self._has_anatomy = True
         steps, keys, state = KINDS["anatomy"], dependencies(self._given), self.case.state
         failed = {step: why for step, why in state.failed.items() if step not in steps}
@@ -167,7 +168,7 @@ class Job:
         self.case.tell()
 
     def _pass(self) -> None:
-        """Steps before the one at work are done."""
+        """Mark the steps before the present one as done."""
         steps, keys, done = KINDS[self.kind], dependencies(self._given), self.case.state.done
         passed = steps[: steps.index(self.step)] if self.step in steps else ()
         if any(done.get(step) != keys[step] for step in passed):
@@ -186,7 +187,7 @@ class Job:
 
 
 class _Deaf:
-    """Stands in for a case that must not be told any more."""
+    """Stands in for a case that must not receive further messages."""
 
     def __init__(self, case: Case) -> None:
         self.state: State = case.state
@@ -200,18 +201,18 @@ class _Deaf:
 
 
 class Jobs:
-    """At most one job per case."""
+    """The running jobs, at most one per case."""
 
     def __init__(self) -> None:
         self._jobs: dict[str, Job] = {}
         self._lock = threading.Lock()
 
     def of(self, case: Case) -> Job | None:
-        """Return what is at work on a case, or was last."""
+        """Return the running or last job of a case."""
         return self._jobs.get(case.id)
 
     def start(self, case: Case, kind: str) -> Job:
-        """Start a job; one that is at work is stopped first."""
+        """Start a job; a running one is stopped first."""
         with self._lock:
             current = self._jobs.get(case.id)
             if current is not None and current.is_alive:
@@ -222,13 +223,13 @@ class Jobs:
             return self._jobs[case.id]
 
     def stop(self, case: Case) -> None:
-        """Stop what is at work on a case."""
+        """Stop the job of a case."""
         job = self._jobs.get(case.id)
         if job is not None and job.is_alive:
             job.stop()
 
     def abandon(self) -> None:
-        """Stop everything because the server ends; cases go on when it starts again."""
+        """Stop all jobs because the server ends; they resume when it starts again."""
         for job in self._jobs.values():
             if job.is_alive:
                 job.abandon()

@@ -73,7 +73,7 @@ OPENING_COLOURS: Final = (
 
 
 class Live:
-    """The nouns of one case, loaded and computed when they are asked for, and remembered."""
+    """Data of one case, loaded and computed on demand, and cached."""
 
     def __init__(self, case: Case) -> None:
         self.case = case
@@ -102,7 +102,7 @@ class Live:
         key = self.case.state.anatomy
         path = self.case.folder / CACHE / f"anatomy-{key}.npz"
         if not key:
-            raise ReadError("The vessel has not been found yet: run the first three steps.")
+            raise ReadError("The vessel has not been found yet. Run the first three steps.")
         return self.remembered(("anatomy", key), lambda: load_data(path, Anatomy))
 
     def choice(self, name: str) -> DeviceChoice:
@@ -116,7 +116,7 @@ class Live:
         for device in self.case.state.choices.devices:
             if device.name == name:
                 return device
-        raise ReadError(f"{name} is not among the devices chosen.")
+        raise ReadError(f"{name} is not among the chosen devices.")
 
     def bed(self, choice: DeviceChoice) -> Bed:
         """Return the wall as a device finds it."""
@@ -222,7 +222,7 @@ class Live:
         with LOCK:
             paths = kept_flows(self.case.folder)
             if not paths:
-                raise ReadError("Not every flow of the results there are is kept: run the step Flow.")
+                raise ReadError("Some flows of these results are missing. Run the step Flow.")
             layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]
             bare = self._field(next(iter(paths.values())), None)
             most = _peak(bare)

@@ -46,4 +46,4 @@ def rank_sizes(case: Case, progress: Progress) -> None:
         "rows": rows,
     }
     write_json(case.folder / RANKING, content)
-    progress("rank", 1.0, f"{len(found.suitable)} of {len(rows)} sizes suit.")
+    progress("rank", 1.0, f"{len(found.suitable)} of {len(rows)} sizes are suitable.")

@@ -48,7 +48,7 @@ def reopened(store: Store, folder: Path) -> Case:
         where = json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"]
     except UNTOLD:
         raise ReadError(
-            f"{folder} was not written by this version of vstent: run the study again, or open its scan."
+            f"{folder} was written by another version of vstent. Run the study again, or open its scan."
         ) from None
     choices = _choices(settings, folder)
     anatomy = next((path.stem.rpartition("-")[2] for path in (folder / CACHE).glob("anatomy-*.npz")), "")
@@ -74,6 +74,6 @@ def _choices(settings: "Settings", folder: Path) -> Choices:
     except ValidationError as error:
         first = error.errors()[0]
         raise ReadError(
-            f"{folder} has {'.'.join(map(str, first['loc']))} = {first['input']}, which the page does not take "
-            f"({first['msg']}): go on with it by `vstent run`."
+            f"{folder} has {'.'.join(map(str, first['loc']))} = {first['input']}, which the page cannot change "
+            f"({first['msg']}). Continue it with `vstent run`."
         ) from None

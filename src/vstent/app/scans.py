@@ -59,7 +59,9 @@ class Scan:
             There is no such slice.
         """
         if not 0 <= index < self.image.voxels.shape[axis]:
-            raise InputError(f"The scan has no slice {index} there: it has {self.image.voxels.shape[axis]}.")
+            raise InputError(
+                f"The scan has no slice {index} in this direction; it has {self.image.voxels.shape[axis]}."
+            )
         plane = np.take(self.image.voxels, index, axis=axis).astype(np.float64)
         packer = Packer()
         values = packer.add_numbers(plane.T[..., None])

@@ -59,13 +59,13 @@ class Guard:
         refusal = self._refusal(scope, headers)
         limit = UPLOAD_LIMIT if _is_upload(scope) else BODY_LIMIT
         if refusal is None and _length(headers) > limit:
-            refusal = PlainTextResponse(f"More than {limit >> 20} MB: too large.", 413)
+            refusal = PlainTextResponse(f"More than {limit >> 20} MB, which is too much.", 413)
         sender = _with_headers(send)
         await (refusal or self.app)(scope, _counted(receive, limit), sender)
 
     def _refusal(self, scope: Scope, headers: dict[str, str]) -> Response | None:
         if headers.get("host", "") not in self.hosts:
-            return PlainTextResponse("This server answers to its own name only.", 403)
+            return PlainTextResponse("This server answers only to its own address.", 403)
         own = {f"http://{host}" for host in self.hosts}
         # A report is shown in a sandbox, whose origin is "null": it has nothing to ask for either.
         if headers.get("origin", next(iter(own))) not in own or headers.get("sec-fetch-site") == "cross-site":
@@ -76,7 +76,7 @@ class Guard:
             welcome.set_cookie(self.cookie, self.token, httponly=True, samesite="strict", path="/")
             return welcome
         if not self._is_right(_token(headers, self.cookie)):
-            return PlainTextResponse("Open the address that `vstent app` has printed: it carries the key.", 401)
+            return PlainTextResponse("Open the address that `vstent app` printed: it contains the key.", 401)
         return None
 
     def _is_right(self, given: str) -> bool:

@@ -1,4 +1,4 @@
-"""Server: the page's files and the REST interface, all of it described at /api/docs."""
+"""The server: the files of the page and the REST interface, which is described at /api/docs."""
 
 import asyncio
 import json
@@ -24,52 +24,52 @@ from vstent.errors import ReadError, VstentError
 
 MEDIA: Final = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css"}
 BINARY: Final = "application/octet-stream"
-"""A manifest and its arrays, as `vstent.reporting.packing` says."""
+"""Media type of binary answers: a manifest and its arrays (`vstent.reporting.packing`)."""
 SHARED: Final = ("viewer.js", "viewer.css")
-"""Files of the report that the page shares."""
+"""Files that the page shares with the report."""
 ASSETS: Final = ("index.html", "app.js", "app.css", "docs.html", "docs.js", *SHARED)
 BEAT_S: Final = 15.0
-"""A quiet stream of events says something this often."""
+"""Interval of keep-alive messages in a stream of events, in s."""
 
 Finite = Annotated[float, Query(allow_inf_nan=False)]
 Revision = Annotated[int, Field(ge=0)]
 
 
 class NewCase(Strict):
-    """A case to be made."""
+    """A case to create."""
 
     name: str = Field(max_length=120, min_length=1)
 
 
 class Change(Strict):
-    """Other choices, made on what a tab has seen last."""
+    """Changed choices, based on the revision that the client last read."""
 
     revision: Revision
     choices: Choices
 
 
 class Seen(Strict):
-    """What a tab has seen last."""
+    """The revision that the client last read."""
 
     revision: Revision
 
 
 class DeviceWanted(Strict):
-    """A device, to be drawn."""
+    """A device to draw."""
 
     device: DeviceChoice
     colour: Literal["wall_gap", "coverage", "diameter"] = "wall_gap"
 
 
 class SketchWanted(DeviceWanted):
-    """A device at a place, to be drawn."""
+    """A device at a position, to draw."""
 
     anchor: Literal["proximal", "center", "distal"] = "center"
     abscissa_mm: float | None = Field(default=None, ge=-1000, le=1000)
 
 
 class NeckWanted(Strict):
-    """A neck to be drawn, with one handle pulled to a point of the wall where they are given."""
+    """A neck to draw, optionally with one handle moved to a point on the wall."""
 
     curve_mm: tuple[Point, ...] = Field(min_length=3, max_length=1000)
     handle: int | None = Field(default=None, ge=0, lt=NECK_HANDLES)
@@ -77,7 +77,7 @@ class NeckWanted(Strict):
 
 
 def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
-    """Return the whole server: the interface behind its guard."""
+    """Return the server: the interface behind its guard."""
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -106,7 +106,7 @@ def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
 
 
 def new_token() -> str:
-    """Return a key that nobody can guess."""
+    """Return a random key."""
     return secrets.token_urlsafe(24)
 
 
@@ -117,7 +117,7 @@ def _said(_: Request, error: Exception) -> JSONResponse:
 def asset(name: str) -> Response:
     """Return one of the page's files."""
     folder = "reporting" if name in SHARED else "app"
-    # The package of the report itself is not loaded for it: that takes longer than the first page may.
+    # The reporting package is not imported for this, because that takes longer than the first page may.
     text = files("vstent").joinpath(folder, "assets", name).read_bytes()
     return Response(text, media_type=MEDIA[Path(name).suffix])
 
@@ -134,7 +134,7 @@ def _add_page(app: FastAPI) -> None:
     @app.get("/assets/{name}", include_in_schema=False)
     def one(name: str) -> Response:
         if name not in ASSETS:
-            raise Absent("There is no such file: the page is at /.")
+            raise Absent("This file does not exist. The page is at /.")
         return asset(name)
 
 
@@ -155,31 +155,31 @@ def _add_cases(api: APIRouter, desk: Desk) -> None:
     def demo() -> dict[str, Any]:
         return desk.view(desk.demo())
 
-    @api.get("/api/cases/{case_id}", summary="What is chosen and done; an interrupted job goes on")
+    @api.get("/api/cases/{case_id}", summary="Choices and results; an interrupted job resumes")
     def case(case_id: str) -> dict[str, Any]:
         found = desk.store.get(case_id)
         desk.resume(found)
         return desk.view(found)
 
-    @api.put("/api/cases/{case_id}/choices", summary="Choose; 409 where the case was changed elsewhere")
+    @api.put("/api/cases/{case_id}/choices", summary="Change choices; 409 where the case was changed elsewhere")
     def choose(case_id: str, change: Change) -> dict[str, Any]:
         found = desk.store.get(case_id)
         found.change(change.revision, change.choices)
         return desk.view(found)
 
-    @api.post("/api/cases/{case_id}/undo", summary="Take the last change back")
+    @api.post("/api/cases/{case_id}/undo", summary="Undo the last change")
     def undo(case_id: str, seen: Seen) -> dict[str, Any]:
         found = desk.store.get(case_id)
         found.step_back(seen.revision)
         return desk.view(found)
 
-    @api.post("/api/cases/{case_id}/redo", summary="Make the change taken back again")
+    @api.post("/api/cases/{case_id}/redo", summary="Redo the last undone change")
     def redo(case_id: str, seen: Seen) -> dict[str, Any]:
         found = desk.store.get(case_id)
         found.step_back(seen.revision, forward=True)
         return desk.view(found)
 
-    @api.get("/api/cases/{case_id}/events", summary="The same, again whenever it changes (server-sent events)")
+    @api.get("/api/cases/{case_id}/events", summary="The state, sent again whenever it changes (server-sent events)")
     async def events(case_id: str) -> StreamingResponse:
         found = await asyncio.to_thread(desk.store.get, case_id)
         return StreamingResponse(_stream(desk, found), media_type="text/event-stream")
@@ -193,7 +193,7 @@ async def _stream(desk: Desk, case: Any) -> AsyncIterator[str]:
             yield f"data: {json.dumps(desk.view(case))}\n\n"
             try:
                 await asyncio.wait_for(event.wait(), BEAT_S)
-                await asyncio.sleep(0.05)  # words that follow each other quickly are told together
+                await asyncio.sleep(0.05)  # messages in quick succession are sent together
             except TimeoutError:
                 yield ": still here\n\n"
     finally:
@@ -201,7 +201,7 @@ async def _stream(desk: Desk, case: Any) -> AsyncIterator[str]:
 
 
 def _add_input(api: APIRouter, desk: Desk) -> None:
-    @api.put("/api/cases/{case_id}/input", summary="Bring in a volume, a surface, a DICOM slice, or a ZIP of them")
+    @api.put("/api/cases/{case_id}/input", summary="Upload a volume, a surface, a DICOM slice, or a ZIP of them")
     async def bring(case_id: str, request: Request, name: Annotated[str, Query(max_length=300)]) -> dict[str, Any]:
         found = await asyncio.to_thread(desk.store.get, case_id)
         partial = await asyncio.to_thread(desks.begin_upload, found, name)
@@ -214,7 +214,7 @@ def _add_input(api: APIRouter, desk: Desk) -> None:
             partial.unlink(missing_ok=True)
         return {"taken": True}
 
-    @api.post("/api/cases/{case_id}/input/done", summary="All files are in: find the vessel")
+    @api.post("/api/cases/{case_id}/input/done", summary="All files are uploaded: find the vessel")
     def done(case_id: str) -> dict[str, Any]:
         found = desk.store.get(case_id)
         desk.begin(found)
@@ -228,7 +228,7 @@ def _add_input(api: APIRouter, desk: Desk) -> None:
     def one_slice(case_id: str, axis: Annotated[int, Query(ge=0, le=2)], index: int) -> Response:
         return Response(desk.scan(desk.store.get(case_id)).slice(axis, index), media_type=BINARY)
 
-    @api.get("/api/cases/{case_id}/image/surface", summary="The surface that a threshold gives (binary)")
+    @api.get("/api/cases/{case_id}/image/surface", summary="The surface at a threshold (binary)")
     def surface(case_id: str, threshold: Finite) -> Response:
         return Response(desk.surface(desk.store.get(case_id), threshold), media_type=BINARY)
 
@@ -240,25 +240,25 @@ def _add_jobs(api: APIRouter, desk: Desk) -> None:
         desk.start(found, kind)
         return desk.view(found)
 
-    @api.delete("/api/cases/{case_id}/jobs", summary="Stop it at once; what was finished is kept")
+    @api.delete("/api/cases/{case_id}/jobs", summary="Stop it at once; finished results are kept")
     def stop(case_id: str) -> dict[str, Any]:
         found = desk.store.get(case_id)
         desk.jobs.stop(found)
         return desk.view(found)
 
-    @api.get("/api/cases/{case_id}/ranking", summary="The sizes of the chosen devices, ranked")
+    @api.get("/api/cases/{case_id}/ranking", summary="The ranking of all sizes of the chosen devices")
     def ranking(case_id: str) -> dict[str, Any]:
         return desks.ranking(desk.store.get(case_id))
 
-    @api.get("/api/cases/{case_id}/numbers", summary="Every number found, with unit and definition")
+    @api.get("/api/cases/{case_id}/numbers", summary="Every result, with unit and definition")
     def numbers(case_id: str) -> dict[str, Any]:
         return desk.numbers(desk.store.get(case_id))
 
-    @api.get("/api/cases/{case_id}/files/{name}", summary="What a study has written")
+    @api.get("/api/cases/{case_id}/files/{name}", summary="The files of a study")
     def one_file(case_id: str, name: Literal["metrics.json", "run.json", "report.html", "report.pdf"]) -> Response:
         path = desk.store.get(case_id).folder / name
         if not path.is_file():
-            raise ReadError(f"{name} has not been written yet: run the step Flow.")
+            raise ReadError(f"{name} has not been written yet. Run the step Flow.")
         headers = {"content-security-policy": REPORT_POLICY} if name == "report.html" else {}
         return FileResponse(path, headers=headers)
 
@@ -268,24 +268,24 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
     def anatomy(case_id: str) -> Response:
         return Response(desk.live(desk.store.get(case_id)).anatomy_message(), media_type=BINARY)
 
-    @api.post("/api/cases/{case_id}/neck", summary="A neck with a handle pulled, and its area, at once (binary)")
+    @api.post("/api/cases/{case_id}/neck", summary="The neck with a handle moved, and its area (binary)")
     def neck(case_id: str, wanted: NeckWanted) -> Response:
         return Response(desk.neck(desk.store.get(case_id), *wanted.model_dump().values()), media_type=BINARY)
 
-    @api.post("/api/cases/{case_id}/sketch", summary="Where a device would lie, at once (binary)")
+    @api.post("/api/cases/{case_id}/sketch", summary="The expected position of a device (binary)")
     def sketch(case_id: str, wanted: SketchWanted) -> Response:
         live = desk.live(desk.store.get(case_id))
         landing = desks.landing(wanted.abscissa_mm, wanted.anchor)
         return Response(live.sketch_message(wanted.device, landing, wanted.colour), media_type=BINARY)
 
-    @api.post("/api/cases/{case_id}/deployment", summary="A device deployed, with its expansion and numbers (binary)")
+    @api.post("/api/cases/{case_id}/deployment", summary="A deployed device, with its expansion and numbers (binary)")
     def deployment(case_id: str, wanted: DeviceWanted) -> Response:
         found = desk.store.get(case_id)
         answer = desk.live(found).deployment_message(wanted.device, wanted.colour)
         desk.note_deployed(found, wanted.device)
         return Response(answer, media_type=BINARY)
 
-    @api.get("/api/cases/{case_id}/section", summary="What a plane across the parent axis cuts")
+    @api.get("/api/cases/{case_id}/section", summary="The section by a plane across the parent axis")
     def section(case_id: str, abscissa_mm: Finite, device: str | None = None) -> dict[str, Any]:
         return desk.live(desk.store.get(case_id)).section(device, abscissa_mm)
 
@@ -293,6 +293,6 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
     def flow(case_id: str, moment: Annotated[int | None, Query(ge=0)] = None) -> Response:
         return Response(desk.live(desk.store.get(case_id)).flow_message(moment), media_type=BINARY)
 
-    @api.get("/api/waveform", summary="The pulse that can be chosen, the published one or a case's own")
+    @api.get("/api/waveform", summary="The waveforms that can be chosen: the published one, or the case's own")
     def waveform(case_id: str | None = None) -> dict[str, Any]:
         return desks.pulse(None if case_id is None else desk.store.get(case_id))

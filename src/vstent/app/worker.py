@@ -1,8 +1,8 @@
-"""Worker: `python -m vstent.app.worker KIND FOLDER` does one job of a case and tells of it, a line of JSON each time.
+"""Worker process: `python -m vstent.app.worker KIND FOLDER` runs one job and reports it, one JSON line per message.
 
-The first line of its standard input is the case's state as it was when the job was started: what is chosen meanwhile is
-none of this job's. The input closes when the server that started it is gone, however it went; the worker then ends with
-all its processes, so that the case folder is free when the server starts again.
+The first line of its standard input is the case's state when the job was started; later choices do not affect the job.
+The input closes when the server ends for any reason. The worker then ends with all its processes, so that the case
+folder is free when the server starts again.
 """
 
 import json
@@ -21,7 +21,7 @@ from vstent.study.pipeline import run
 
 
 def end_with_the_server() -> None:
-    """Wait until the server is gone, and end."""
+    """Wait until the server has ended, and end."""
     sys.stdin.read()
     if hasattr(os, "killpg"):
         os.killpg(0, signal.SIGKILL)
@@ -29,13 +29,13 @@ def end_with_the_server() -> None:
 
 
 def tell(**told: Any) -> None:
-    """Say a line to the server."""
+    """Send one message to the server."""
     sys.stdout.write(json.dumps(told) + "\n")
     sys.stdout.flush()
 
 
 def progress(stage: str, fraction: float, detail: str) -> None:
-    """Tell of a study's stage."""
+    """Report the progress of a stage."""
     tell(stage=stage, fraction=fraction, detail=detail)
 
 
@@ -43,7 +43,7 @@ def find_anatomy(case: Case) -> None:
     """Find vessel, sac, neck and parent artery."""
     from vstent.study.pipeline import restore_vessel
 
-    restore_vessel(case.input, case.folder, case.state.settings(), progress)
+    restore_vessel(case.input, case.folder, case.state.settings(), progress, replaces=True)
     tell(anatomy=_anatomy_key(case))
 
 
@@ -52,12 +52,12 @@ def _anatomy_key(case: Case) -> str:
 
 
 def compute(case: Case) -> None:
-    """Deploy, compute the flow where it is wanted, and write the report: what `vstent run` does."""
+    """Deploy, compute the flow if requested, and write the report, as `vstent run` does."""
     from vstent.reporting.write import write_report
 
     if _anatomy_key(case) != case.state.anatomy:
-        find_anatomy(case)  # and told before the flow: a job that is stopped there has replaced the former one
-    result = run(case.input, case.folder, case.state.settings(), progress)
+        find_anatomy(case)  # reported before the flow: a job that is stopped there has replaced the former anatomy
+    result = run(case.input, case.folder, case.state.settings(), progress, replaces=True)
     progress("report", 0.0, "")
     write_report(result, case.folder, is_printed=True)
     progress("report", 1.0, "")
@@ -83,7 +83,7 @@ def main(kind: str, folder: Path) -> int:
         tell(error=str(error))
         return 1
     except OSError as error:
-        tell(error=f"{error.strerror or error}: what was finished is kept.")
+        tell(error=f"{error.strerror or error}. Finished results are kept.")
         return 1
     return 0
 

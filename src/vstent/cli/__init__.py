@@ -1,4 +1,7 @@
-"""Command line: one module a command. The only place that prints, and that knows of files' names on a shell."""
+"""The command line: arguments in, a study run, tables and messages out; one module for each command.
+
+Open ``run.py`` first; ``options.py`` holds the options that several commands share.
+"""
 
 import argparse
 import errno
@@ -9,30 +12,36 @@ from typing import Final
 
 from vstent.cli import app, batch, demo, devices, export, flow, rank, restore, run, trace
 from vstent.cli.interrupt import borne_interrupts
-from vstent.cli.options import EPILOG
+from vstent.cli.options import EPILOG, renamed
 from vstent.errors import InputError, VstentError
 
 COMMANDS: Final = (run, app, trace, restore, rank, batch, flow, export, demo, devices)
-"""In the order of the help."""
+"""Commands in the order of the help."""
 BAD_INPUT: Final = 2
+"""Exit code where an input or option cannot be used."""
 FAILED: Final = 1
+"""Exit code where a computation failed."""
 INTERRUPTED: Final = 130
+"""Exit code after Ctrl-C."""
 HELPER: Final = (sys.executable, "-m", "vstent.cli.warm")
-"""Compiles the kernels that are needed last, while this process compiles those that it needs now."""
+"""Command that compiles the kernels that are needed last, while this process compiles those that it needs first."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code (0 done, 1 failed, 2 bad input, 130 interrupted)."""
-    # Many small systems are solved, none large: threads of the linear algebra only wait for each other.
+    # The linear systems are small, so threads of the linear algebra would only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with borne_interrupts():
-        return _done(_parser().parse_args(argv))
+        words, notices = renamed(sys.argv[1:] if argv is None else argv)
+        for notice in notices:
+            print(f"vstent: note: {notice}", file=sys.stderr)
+        return _done(_parser().parse_args(words))
 
 
 def _done(arguments: argparse.Namespace) -> int:
-    """Do what was asked; return the exit code."""
+    """Run a command and return the exit code."""
     try:
-        if arguments.command.__module__ in (app.__name__, devices.__name__):  # they begin without kernels
+        if arguments.command.__module__ in (app.__name__, devices.__name__):  # they need no kernels to start
             return int(arguments.command(arguments))
         from vstent.kernels.first_use import telling
 
@@ -43,11 +52,11 @@ def _done(arguments: argparse.Namespace) -> int:
     except VstentError as error:
         return _fail(str(error), FAILED)
     except KeyboardInterrupt:
-        return _fail("stopped. What was finished is kept: give the same command again to go on.", INTERRUPTED)
+        return _fail("stopped. Finished results are kept: give the same command again to resume.", INTERRUPTED)
     except MemoryError:
         return _fail(
-            "there is not enough memory for this. What was finished is kept: give the same command on a machine with "
-            "more of it, or a part of the scan, or a larger --cell-size.",
+            "out of memory. Finished results are kept: use a machine with more memory, a part of the scan, or a wider "
+            "grid spacing (--grid-spacing).",
             FAILED,
         )
     except OSError as error:
@@ -56,14 +65,14 @@ def _done(arguments: argparse.Namespace) -> int:
 
 
 def _remedy(error: OSError) -> str:
-    """One thing to do about what the system refused."""
+    """Return what to do about an error of the operating system."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return "What was finished is kept, and nothing half-written: make room and give the same command again."
-    return "Nothing half-written was left: mend that and give the same command again."
+        return "Finished results are kept: free disk space and give the same command again."
+    return "No half-written file is left: correct that and give the same command again."
 
 
 def _first_use() -> None:
-    said = "first use of this version: its kernels are compiled, once, which takes about half a minute."
+    said = "first use of this version: compiling its kernels, which takes about half a minute once."
     print(f"vstent: {said}", file=sys.stderr, flush=True)
 
 
@@ -73,10 +82,10 @@ def _fail(sentence: str, code: int) -> int:
 
 
 class _Version(argparse.Action):
-    """Tells the version; to know it takes a while, so only when asked."""
+    """Prints the version, which takes a while to look up and is therefore looked up on request only."""
 
     def __call__(self, parser: argparse.ArgumentParser, *given: object) -> None:
-        """Print it and end."""
+        """Print the version and exit."""
         from importlib.metadata import version
 
         print(f"vstent {version('vstent')}")
@@ -85,9 +94,13 @@ class _Version(argparse.Action):
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="vstent", description="Virtual stenting of intracranial aneurysms.", epilog=EPILOG
+        prog="vstent",
+        description="Virtual stenting of intracranial aneurysms.",
+        epilog=f"Begin with: vstent demo --no-flow --out demo\n\n{EPILOG}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="tell the version, and end")
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for command in COMMANDS:
         command.add(commands)

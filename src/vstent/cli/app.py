@@ -1,4 +1,4 @@
-"""`vstent app`: the page in the browser."""
+"""`vstent app`: serve the page in the browser."""
 
 import argparse
 import importlib.util
@@ -14,23 +14,33 @@ if TYPE_CHECKING:
 
 
 LAST_PORT: Final = 65535
-"""Ports have 16 bits."""
+"""Largest port number."""
 
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "app", "plan a stent on a page in the browser")
-    parser.add_argument("input", type=Path, nargs="?", help="scan, surface or case folder (else drop one on the page)")
-    parser.add_argument("--cases", type=Path, default=Path("vstent-cases"), metavar="DIR", help="folder of the cases")
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine only)")
-    parser.add_argument("--port", type=_port, default=0, help="port to listen at (default: a free one)")
-    parser.add_argument("--no-browser", action="store_true", help="only print the page's address")
+    parser = options.add_command(commands, "app", "Plan a stent on a page in the browser.", "app scan/")
+    parser.add_argument(
+        "input", type=Path, nargs="?", help="scan, surface or case folder (default: drop one on the page)"
+    )
+    parser.add_argument(
+        "--cases",
+        type=Path,
+        default=Path("vstent-cases"),
+        metavar="DIR",
+        help="folder of the cases (default: vstent-cases)",
+    )
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address of the server (default: 127.0.0.1, this machine only)"
+    )
+    parser.add_argument("--port", type=_port, default=0, help="port of the server (default: a free one)")
+    parser.add_argument("--no-browser", action="store_true", help="print the address of the page without opening it")
     parser.set_defaults(command=_app)
 
 
 def _port(text: str) -> int:
     if not text.isdecimal() or int(text) > LAST_PORT:
-        raise argparse.ArgumentTypeError(f"{text!r} is no port: give 0 to {LAST_PORT}")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port: give 0 to {LAST_PORT}")
     return int(text)
 
 
@@ -59,7 +69,7 @@ def _app(arguments: argparse.Namespace) -> int:
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """Listen from now on, so that the address printed answers; the server takes over what has come in."""
+    """Return a socket that listens already, so that the printed address answers at once."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     listener.bind((host, port))
@@ -68,7 +78,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def open_desk(given: Path | None, workspace: Path) -> "Desk":
-    """Return a desk with what was given at the shell on it, if anything was."""
+    """Return a desk, with the input or case folder opened on it if one is given."""
     from vstent.app.cases import Store
     from vstent.app.desk import Desk
 

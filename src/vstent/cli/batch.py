@@ -1,4 +1,4 @@
-"""`vstent batch`: a folder or a CSV file of cases, with every device, into one table."""
+"""`vstent batch`: many cases with every device, in one table."""
 
 import argparse
 from collections.abc import Sequence
@@ -14,17 +14,26 @@ if TYPE_CHECKING:
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "batch", "many cases x devices -> one table, with a report of the cohort")
-    parser.add_argument("cohort", type=Path, help="folder of scans or surfaces, or CSV file with a column `input`")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, or to go on with")
+    parser = options.add_command(
+        commands,
+        "batch",
+        "Run many cases with every device, and write one table and a cohort report.",
+        "batch cohort/ --device silk --no-flow --out study --jobs 2",
+    )
+    parser.add_argument("cohort", type=Path, help="folder of scans or surfaces, or a CSV file with a column `input`")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="output folder; a folder that exists is continued"
+    )
     options.add_outlet(options.add_given(parser))
     run.add_study(parser)
-    working = parser.add_argument_group("working")
+    working = parser.add_argument_group("parallel work")
     options.add_jobs(working)
     crew = working.add_mutually_exclusive_group()
-    crew.add_argument("--scheduler", metavar="ADDRESS", help="let the workers of this Dask scheduler do it")
-    crew.add_argument("--slurm", action="store_true", help="let --jobs jobs of a Slurm queue do it (dask-jobqueue)")
-    working.add_argument("--files", action="store_true", help="keep all that `vstent run` writes of every case")
+    crew.add_argument("--scheduler", metavar="ADDRESS", help="use the workers of this Dask scheduler")
+    crew.add_argument("--slurm", action="store_true", help="use --jobs jobs of a Slurm queue (needs the extra cluster)")
+    working.add_argument(
+        "--keep-files", action="store_true", help="keep all files of every case (default: the table only)"
+    )
     parser.set_defaults(command=_batch)
 
 
@@ -37,7 +46,7 @@ def _batch(arguments: argparse.Namespace) -> int:
     console = Console()
     settings = run.given_study(arguments, **options.given_geometry(arguments))
     cases = find_cases(arguments.cohort, settings)
-    tasks = left_to_do(cases, arguments.out, keeps_files=arguments.files)
+    tasks = left_to_do(cases, arguments.out, keeps_files=arguments.keep_files)
     foreseen = estimate([task.case for task in tasks], arguments.jobs)
     console.print(f"{len(cases)} cases, {device_rows(cases)} rows; {len(tasks)} cases to do: {foreseen.sentence}.")
     with console.live():
@@ -48,7 +57,7 @@ def _batch(arguments: argparse.Namespace) -> int:
     console.print(cohort_table(rows))
     console.print(f"Results in {', '.join(str(path) for path in [*written, arguments.out / 'cohort.html'])}.")
     if len(written) == 1:
-        console.say("No Parquet file: it needs pyarrow, pip install 'vstent[parquet]'.")
+        console.say("No Parquet file was written: it needs pyarrow (pip install 'vstent[parquet]').")
     console.print("Research use only.")
     return 0
 

@@ -1,4 +1,4 @@
-"""What a terminal shows: a line per stage with its time, and the table of a comparison."""
+"""Terminal output: a line for every stage with its time, and the tables of results."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,22 +22,22 @@ ROWS: Final = (
     ("Sac wall shear stress, mean", "mean_sac_wss_Pa"),
     ("Turnover time", "turnover_time_s"),
 )
-"""Rows of the comparison: title, key of the index."""
+"""Rows of the comparison of flows: title and key of the index."""
 DEVICE_ROWS: Final = (
     ("Size (label)", "size"),
     ("Deployed length", "deployed_length_mm"),
     ("Apposed", "apposed_fraction"),
     ("Metal coverage over the neck", "neck_metal_coverage_fraction"),
 )
-"""Rows on the devices: title, key of the measure."""
+"""Rows of the comparison of deployments: title and key of the measure."""
 
 
 QUIET_S: Final = 30.0
-"""Where there is no terminal, a stage at work says a line this often."""
+"""Time between progress lines where the output is not a terminal, in s."""
 
 
 class Console:
-    """Shows the progress of a study on standard error and its table on standard output."""
+    """Shows the progress of a study on standard error and its tables on standard output."""
 
     def __init__(self) -> None:
         self._err = RichConsole(stderr=True, highlight=False)
@@ -48,14 +48,14 @@ class Console:
 
     @contextmanager
     def live(self) -> Iterator[None]:
-        """Show a spinner with the stage at work, where there is a terminal."""
+        """Show a spinner with the present stage on a terminal."""
         with self._err.status("starting") as status:
             self._status = status
             yield
             self._status = None
 
     def progress(self, stage: str, fraction: float, detail: str) -> None:
-        """Take a study's word: a stage begins (0), goes on, or is done (1)."""
+        """Show the progress of a stage, from 0 (begins) to 1 (done)."""
         now = time.monotonic()
         began = self._began.setdefault(stage, now)
         if fraction >= 1.0:
@@ -77,7 +77,7 @@ class Console:
 
 
 def comparison_table(metrics: Mapping[str, Any]) -> Table:
-    """Table of bare artery and devices: each value with its unit, and its change against bare."""
+    """Return the table of bare artery and devices: values with units and changes against bare."""
     stents = metrics["stents"]
     table = Table("", "bare", *stents)
     for title, key in DEVICE_ROWS:
@@ -90,8 +90,13 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
         bare = metrics["bare"].get(key)
         if bare is None:
             continue
-        table.add_row(title, _cell(key, bare), *(_change(key, bare, stent["flow"][key]) for stent in stents.values()))
+        table.add_row(title, _cell(key, bare), *(_change(key, bare, _of_flow(stent, key)) for stent in stents.values()))
     return table
+
+
+def _of_flow(stent: Mapping[str, Any], key: str) -> float | None:
+    """Return an index of the flow with a device; None where it was not computed."""
+    return stent.get("flow", {}).get(key)
 
 
 COHORT_COLUMNS: Final = (
@@ -103,18 +108,18 @@ COHORT_COLUMNS: Final = (
     ("CPU s a case", "case_cpu_s", "{:.1f}"),
     ("MB", "peak_memory_MB", "{:.0f}"),
 )
-"""Columns of a cohort: title, key, form."""
+"""Columns of the cohort table: title, key and number format."""
 RANKING_COLUMNS: Final = (
     ("mm long", "deployed_length_mm", "{:.1f}"),
     ("apposed", "apposed_fraction", "{:.0%}"),
     ("mm beyond neck", "landing_length_mm", "{:.1f}"),
     ("metal at neck", "neck_metal_coverage_fraction", "{:.0%}"),
 )
-"""Columns of the ranking: title, key of the measure, its form."""
+"""Columns of the ranking: title, key of the measure and number format."""
 
 
 def ranking_table(ranking: Ranking, shown: int) -> Table:
-    """Table of the best candidates, and how many there are beyond."""
+    """Return the table of the best candidates, with the number of all in its caption."""
     table = Table("", "device and size", "shift", "score", *(title for title, _, _ in RANKING_COLUMNS))
     for number, candidate in enumerate(ranking.candidates[:shown], start=1):
         values = [(candidate.measures.get(key), form) for _, key, form in RANKING_COLUMNS]
@@ -127,13 +132,13 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
 
 
 def ranking_reasons(ranking: Ranking, shown: int) -> str:
-    """Lines that say why the best candidates stand where they do."""
+    """Return a line with the reasons for the place of every candidate shown."""
     best = enumerate(ranking.candidates[:shown], start=1)
     return "\n".join(f"{number}. {candidate.label}: {candidate.reason}" for number, candidate in best)
 
 
 def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Table of a cohort: a line a device, with medians of what came through."""
+    """Return the table of a cohort: a row for each device with medians over the finished cases."""
     columns = [column for column in COHORT_COLUMNS if any(row.get(column[1]) is not None for row in rows)]
     table = Table("device", "done", "failed", "lost", *(title for title, _, _ in columns))
     for device in dict.fromkeys(row["device"] for row in rows):
@@ -149,10 +154,10 @@ def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
-    """Table of intervals: each result of each device, and the causes of its spread."""
+    """Return the table of uncertainty intervals of each result of each device, with the causes of the spread."""
     from vstent.reporting.uncertainty import intervals
 
-    table = Table("device", "result", "mean", "95 % between", "and", "because of", title="what is not sure, varied")
+    table = Table("device", "result", "mean", "95 % interval from", "to", "main causes", title="uncertainty")
     for name, stent in metrics["stents"].items():
         for row in intervals(stent):
             causes = ", ".join(f"{cause} {share:.0%}" for cause, share in row.shares if share >= 0.005)
@@ -161,7 +166,7 @@ def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
 
 
 def opening_table(openings: Sequence[Opening]) -> Table:
-    """Table of the vessel's ends: role, diameter, area, where."""
+    """Return the table of openings: role, diameter, area, center."""
     from vstent.reporting.quantities import opening_rows
 
     table = Table("opening", "diameter", "area", "center (LPS)")
@@ -171,7 +176,7 @@ def opening_table(openings: Sequence[Opening]) -> Table:
 
 
 def morphology_table(measures: Mapping[str, Any]) -> Table:
-    """Table of a vessel's measures: name, value with unit."""
+    """Return the table of morphology: name and value with unit."""
     from vstent.reporting.quantities import flatten
 
     table = Table("morphology", "")
@@ -181,25 +186,25 @@ def morphology_table(measures: Mapping[str, Any]) -> Table:
 
 
 def flow_table(metrics: Mapping[str, Any]) -> Table:
-    """Table of every index of the flow: bare, and with each device with its change."""
+    """Return the table of every flow index: bare, and with each device with its change."""
     from vstent.reporting.quantities import flatten
 
     stents = metrics["stents"]
     table = Table("flow", "bare", *stents)
     for quantity in flatten(metrics["bare"]):
-        changes = (_change(quantity.key, quantity.value, stent["flow"][quantity.key]) for stent in stents.values())
+        changes = (_change(quantity.key, quantity.value, _of_flow(stent, quantity.key)) for stent in stents.values())
         table.add_row(quantity.name, _cell(quantity.key, quantity.value), *changes)
     return table
 
 
 def convergence_table(found: Refinement) -> Table:
-    """Table of one refinement: every quantity at three sizes, its observed order, its value at size zero."""
+    """Return the table of one refinement: every quantity at three sizes, observed order and extrapolated value."""
     from vstent.reporting.quantities import flatten
 
     columns = (f"{size:.3g}" for size in found.sizes)
     table = Table(found.name.replace("_", " "), *columns, "order", "limit", "±")
     for key, one in found.quantities.items():
-        order = "not one way" if one.order is None else f"{one.order:.1f}"
+        order = "not monotone" if one.order is None else f"{one.order:.1f}"
         values = [quantity.text for value in one.values for quantity in flatten({key: value})]
         name = flatten({key: 0.0})[0].name
         table.add_row(name, *values, order, _cell(key, one.extrapolated), f"{one.uncertainty_fraction:.1%}")
@@ -207,10 +212,10 @@ def convergence_table(found: Refinement) -> Table:
 
 
 def positions_table(found: Mapping[str, Scatter]) -> Table:
-    """Table of the same flow in several positions on the grid: every quantity in each, mean and half the range."""
+    """Return the table of one flow in several orientations on the grid: every quantity, mean and half the range."""
     from vstent.reporting.quantities import flatten
 
-    table = Table("position on the grid", *POSITIONS, "mean", "±")
+    table = Table("orientation on the grid", *POSITIONS, "mean", "±")
     for key, one in found.items():
         values = [flatten({key: value})[0].text for value in (*one.values, one.mean)]
         table.add_row(flatten({key: 0.0})[0].name, *values, f"{one.uncertainty_fraction:.1%}")
@@ -218,26 +223,27 @@ def positions_table(found: Mapping[str, Scatter]) -> Table:
 
 
 def _cell(key: str, value: Any) -> str:
-    """A value with its unit; empty where there is none."""
+    """Return a value with its unit; empty where there is none."""
     from vstent.reporting.quantities import format_value
 
     return "" if value is None else _spaced(format_value(key, value))
 
 
 def _spaced(text: str) -> str:
-    """Put plain spaces for narrow ones, which not every terminal has."""
+    """Return text with plain spaces instead of narrow ones, which some terminals lack."""
     return text.replace("\u202f", " ")
 
 
-def _change(key: str, bare: float, value: float) -> str:
+def _change(key: str, bare: float, value: float | None) -> str:
+    """Return a value with its unit and its change against bare; empty where there is none."""
     from vstent.reporting.quantities import ERRORS
 
-    is_told = bare and key not in ERRORS
-    return f"{_cell(key, value)} ({value / bare - 1:+.0%})" if is_told else _cell(key, value)
+    has_change = value is not None and bare and key not in ERRORS
+    return f"{_cell(key, value)} ({value / bare - 1:+.0%})" if value is not None and has_change else _cell(key, value)
 
 
 def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:
-    """Table of found against true: title, found, true, unit."""
+    """Return the table of found and true values."""
     table = Table("against the phantom's truth", "unit", "found", "true", "error")
     for title, found, true, unit in rows:
         error = f"{found / true - 1:+.1%}" if true else f"{found - true:+.3g}"
@@ -246,7 +252,7 @@ def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:
 
 
 def device_table(devices: Mapping[str, Design]) -> Table:
-    """Table of the catalogue: names, construction, sizes, and how sure the numbers are."""
+    """Return the table of the catalogue: names, construction, sizes, and the grades of the numbers' sources."""
     table = Table(
         "name", "device", "construction", "sizes (diameter x length, mm)", "numbers cited / derived / estimated"
     )

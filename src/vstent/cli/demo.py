@@ -1,4 +1,4 @@
-"""`vstent demo`: the whole job on a synthetic scan, beside its known truth."""
+"""`vstent demo`: a whole study of a synthetic scan, compared with its known truth."""
 
 import argparse
 from pathlib import Path
@@ -8,8 +8,18 @@ from vstent.cli import options, run
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "demo", "the same on a synthetic scan, beside its known truth")
+    parser = options.add_command(
+        commands,
+        "demo",
+        "Run a study of a synthetic scan and compare it with the known truth.",
+        "demo --no-flow --out demo",
+    )
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="case folder (default: demo)")
+    parser.add_argument(
+        "--replace",
+        action="store_true",
+        help="replace results in the folder that belong to other settings (default: refuse)",
+    )
     run.add_study(parser)
     run.add_pdf(parser)
     parser.set_defaults(command=_demo)
@@ -20,6 +30,6 @@ def _demo(arguments: argparse.Namespace) -> int:
     from vstent.study.demo import truth, write_scan
 
     scan, settings = write_scan(arguments.out / "scan"), run.given_study(arguments)
-    case = run.study(scan, arguments.out, settings, is_printed=arguments.pdf)
+    case = run.study(scan, arguments.out, settings, is_printed=arguments.pdf, replaces=arguments.replace)
     Console().print(truth_table(truth(case)))
-    return 0
+    return 1 if case.failures else 0

@@ -1,4 +1,4 @@
-"""`vstent devices`: the catalogue, and devices of one's own."""
+"""`vstent devices`: list the catalogue, or add devices to it."""
 
 import argparse
 from pathlib import Path
@@ -8,11 +8,16 @@ from vstent.cli import options
 
 def add(commands: options.Commands) -> None:
     """Add the command and its own."""
-    parser = options.add_command(commands, "devices", "list the catalogue")
+    parser = options.add_command(commands, "devices", "List the devices of the catalogue, or add your own.", "devices")
     parser.set_defaults(command=_devices)
-    adding = options.add_command(parser.add_subparsers(metavar="COMMAND"), "add", "add devices of your own")
+    adding = options.add_command(
+        parser.add_subparsers(metavar="COMMAND"),
+        "add",
+        "Add devices of your own to the catalogue.",
+        "devices add mine.toml",
+    )
     adding.add_argument(
-        "file", type=Path, help="TOML, written like vstent's catalogue.toml: every number with its source"
+        "file", type=Path, help="TOML file in the form of vstent's catalogue.toml: every number with its source"
     )
     adding.set_defaults(command=_add)
 

@@ -1,4 +1,4 @@
-"""`vstent export`: a case for other solvers."""
+"""`vstent export`: write a case for other solvers."""
 
 import argparse
 from pathlib import Path
@@ -8,31 +8,49 @@ from vstent.cli import options
 
 def add(commands: options.Commands) -> None:
     """Add the command and its own."""
-    parser = options.add_command(commands, "export", "case folder, scan or surface -> files for other solvers")
+    parser = options.add_command(
+        commands, "export", "Write a case for other flow solvers.", "export openfoam case --out foam"
+    )
     kinds = parser.add_subparsers(required=True, metavar="WHAT")
-    foam = options.add_command(kinds, "openfoam", "an OpenFOAM case folder: mesh, boundary conditions, scripts")
+    foam = options.add_command(
+        kinds,
+        "openfoam",
+        "Write an OpenFOAM case folder: mesh settings, boundary conditions and scripts (lengths in m).",
+        "export openfoam case --device silk --out foam",
+    )
     _add_input(foam)
-    foam.add_argument("--device", metavar="NAME", help="mesh this device's struts over necks and branch ostia (none)")
+    foam.add_argument(
+        "--device", metavar="NAME", help="mesh this device's wires over necks and branch ostia (default: no device)"
+    )
     options.add_problem(foam)
     group = foam.add_argument_group("OpenFOAM")
     options.add_processes(group)
-    group.add_argument("--flavour", choices=("com", "org"), help="openfoam.com or .org (the one found, or com)")
-    group.add_argument("--layers", type=_layers, default=2, metavar="N", help="layers of flat cells along the wall (2)")
+    group.add_argument(
+        "--flavour", choices=("com", "org"), help="openfoam.com or openfoam.org (default: the one installed, else com)"
+    )
+    group.add_argument(
+        "--layers", type=_layers, default=2, metavar="N", help="prism layers along the wall (default: 2)"
+    )
     foam.set_defaults(command=_openfoam)
-    patches = options.add_command(kinds, "patches", "the blood's boundary as watertight named patches")
+    patches = options.add_command(
+        kinds,
+        "patches",
+        "Write the boundary of the lumen as watertight named patches (STL, VTP, JSON; lengths in mm).",
+        "export patches case --out patches",
+    )
     _add_input(patches)
     patches.set_defaults(command=_patches)
 
 
 def _add_input(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("input", type=Path, help="case folder of `vstent run`, or a scan or surface as that takes")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
+    parser.add_argument("input", type=Path, help="case folder of `vstent run`, scan or surface")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder")
     options.add_outlet(options.add_given(parser))
 
 
 def _layers(text: str) -> int:
     if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of layers: give 0 or more")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of layers: give 0 or more")
     return int(text)
 
 

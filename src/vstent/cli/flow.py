@@ -1,4 +1,4 @@
-"""`vstent flow`: the flow alone, in any vessel, sac or not, stent or not."""
+"""`vstent flow`: compute the flow in any vessel, with or without sac and stent."""
 
 import argparse
 from pathlib import Path
@@ -16,15 +16,20 @@ if TYPE_CHECKING:
 def add(commands: options.Commands) -> None:
     """Add the command."""
     parser = options.add_command(
-        commands, "flow", "scan or surface -> blood flow, in any vessel, with or without devices"
+        commands,
+        "flow",
+        "Compute the blood flow in any vessel, with or without devices.",
+        "flow artery.stl --grid-spacing 0.2 --out case",
     )
     options.add_outlet(options.add_geometry(parser))
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--device", action="append", metavar="NAME", help="a device of the catalogue too; repeatable")
+    what.add_argument(
+        "--device", action="append", metavar="NAME", help="device of the catalogue; repeat for several (default: none)"
+    )
     what.add_argument(
         "--convergence",
         action="store_true",
-        help="the bare flow on three grids, with three time steps and turned three ways on the grid, compared",
+        help="compare the flow without a device on three grids, with three time steps and in three orientations",
     )
     options.add_flow(parser)
     parser.set_defaults(command=_flow)
@@ -38,25 +43,25 @@ def _flow(arguments: argparse.Namespace) -> int:
     settings = Settings(devices=devices, flow=options.given_flow(arguments), **options.given_geometry(arguments))
     console = Console()
     compute = _converge if arguments.convergence else _compute
-    for table in compute(arguments.input, arguments.out, settings, console):
+    for table in compute(arguments.input, arguments.out, settings, console, arguments.replace):
         console.print(table)
     console.print(f"Results in {arguments.out}. Research use only.")
     return 0
 
 
-def _compute(path: Path, out: Path, settings: "Settings", console: "Console") -> "list[Table]":
+def _compute(path: Path, out: Path, settings: "Settings", console: "Console", replaces: bool) -> "list[Table]":
     from vstent.cli.console import flow_table
     from vstent.study.pipeline import run
 
     with console.live():
-        case = run(path, out, settings, console.progress)
+        case = run(path, out, settings, console.progress, replaces=replaces)
     return [flow_table(case.metrics)]
 
 
-def _converge(path: Path, out: Path, settings: "Settings", console: "Console") -> "list[Table]":
+def _converge(path: Path, out: Path, settings: "Settings", console: "Console", replaces: bool) -> "list[Table]":
     from vstent.cli.console import convergence_table, positions_table
     from vstent.study.pipeline import refine_flow
 
     with console.live():
-        found = refine_flow(path, out, settings, console.progress)
+        found = refine_flow(path, out, settings, console.progress, replaces=replaces)
     return [*map(convergence_table, found.refinements), positions_table(found.positions)]

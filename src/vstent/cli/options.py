@@ -1,10 +1,10 @@
-"""Options that several commands share, and what they say to a study."""
+"""Command-line options that several commands share, and the settings that they fill."""
 
 import argparse
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
@@ -15,26 +15,46 @@ if TYPE_CHECKING:
     from vstent.flow.case import Blood, FlowSettings, Waveform
     from vstent.plan.uncertainty import Ranges
 
-EPILOG: Final = (
-    "Research use only: not cleared for diagnosis or treatment. Lengths in mm, flow in SI; coordinates are LPS."
-)
+EPILOG: Final = "Lengths are in mm, coordinates are LPS. Research use only: not cleared for diagnosis or treatment."
+RENAMED: Final = {
+    "--cell-size": "--grid-spacing",
+    "--close-up": "--refine-sac",
+    "--thinning": "--shear-thinning",
+    "--device-gpu": "--gpu",
+    "--uncertain-flows": "--uncertainty-flows",
+    "--files": "--keep-files",
+    "--crate": "--ro-crate",
+}
+"""Option names of version 0.1 and their present names. The old ones are accepted until version 0.3."""
 PUBLISHED: Final = "published"
-"""The waveform where none is given."""
+"""Value of ``--pulsatile`` without a file: the published waveform."""
 LONGEST_CYCLE_S: Final = 3.0
+"""Longest cardiac cycle accepted, in s: 20 beats a minute."""
 SHORTEST_CYCLE_S: Final = 0.2
-"""Cycles of hearts: 20 to 300 beats a minute."""
+"""Shortest cardiac cycle accepted, in s: 300 beats a minute."""
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
-"""What a command adds itself to."""
+"""Parser to which every command adds itself."""
+
+
+def renamed(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a command line with the present names of options, and a notice for every old name in it."""
+    words, notices = [], []
+    for word in argv:
+        name, equals, value = word.partition("=")
+        words.append(RENAMED.get(name, name) + equals + value)
+        if name in RENAMED:
+            notices.append(f"{name} is now called {RENAMED[name]}; the old name is accepted until version 0.3.")
+    return words, notices
 
 
 def number(text: str) -> float:
-    """Read a number; argparse makes a sentence of the complaint."""
+    """Return a number read from text."""
     return _numbers(text, float, 1)[0]
 
 
 def positive(text: str) -> float:
-    """Read a number above zero."""
+    """Return a number above zero read from text."""
     value = number(text)
     if value <= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not above zero")
@@ -42,7 +62,7 @@ def positive(text: str) -> float:
 
 
 def within(low: float, high: float, remark: str) -> Callable[[str], float]:
-    """Return what reads a number between two; `remark` names the unit, and how another is turned into it."""
+    """Return a reader of numbers within a range; `remark` names the unit and a conversion into it."""
 
     def read(text: str) -> float:
         value = number(text)
@@ -53,112 +73,189 @@ def within(low: float, high: float, remark: str) -> Callable[[str], float]:
     return read
 
 
-def add_command(commands: Commands, name: str, text: str) -> argparse.ArgumentParser:
-    """Add a command with its line of help."""
-    parser = commands.add_parser(name, help=text, description=text, epilog=EPILOG)
-    # What begins with a digit behind the minus is a number or a point, no option; argparse knows -1 alone.
+def add_command(commands: Commands, name: str, text: str, example: str) -> argparse.ArgumentParser:
+    """Add a command with its summary and an example, the words after the command's name."""
+    parser = commands.add_parser(
+        name,
+        help=text[0].lower() + text[1:].rstrip("."),
+        description=text,
+        epilog=f"Example:\n  vstent {example}\n\n{EPILOG}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    # A minus and a digit begin a number or a point, not an option; argparse knows single numbers only.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     return parser
 
 
 def add_geometry(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
-    """Add the input, the folder, and what may be said of the vessel; return the group of the latter."""
+    """Add input, case folder and the options on the vessel; return the group of the latter."""
     parser.add_argument(
-        "input", type=Path, help="DICOM folder, NIfTI, NRRD, MHA, raw volume, STL, VTP, VTK, OBJ or PLY"
+        "input",
+        type=Path,
+        help="scan (DICOM folder, NIfTI, NRRD, MHA, VTI, raw) or surface (STL, VTP, VTU, VTK, OBJ, PLY)",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="case folder to write, or to go on with")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="case folder; a folder that exists is continued"
+    )
+    parser.add_argument(
+        "--replace",
+        action="store_true",
+        help="replace results in the case folder that belong to another input or other settings (default: refuse)",
+    )
     return add_given(parser)
 
 
 def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
-    """Add what may be said of the vessel; return the group."""
-    given = parser.add_argument_group("instead of what is guessed or proposed")
-    given.add_argument("--units", choices=("m", "cm", "mm"), help="length unit of a surface file")
-    given.add_argument("--spacing", type=_spacing, metavar="S|X,Y,Z", help="voxel edges of a raw volume, mm")
-    given.add_argument("--shape", type=_shape, metavar="I,J,K", help="voxel counts of a raw volume")
-    given.add_argument("--threshold", type=number, metavar="T", help="intensity of the lumen's wall in a scan")
-    given.add_argument("--at", type=_point, metavar="X,Y,Z", help="a point near the sac, mm")
+    """Add the options on the vessel; return their group."""
+    given = parser.add_argument_group("override automatic choices")
+    given.add_argument(
+        "--units", choices=("m", "cm", "mm"), help="length unit of a surface file (default: derived from its size)"
+    )
+    given.add_argument(
+        "--frame",
+        choices=("lps", "ras"),
+        help="frame of a surface file and of points (default: as stated in the file, else lps)",
+    )
+    given.add_argument(
+        "--acquisition",
+        type=_count,
+        metavar="N",
+        help="acquisition of a DICOM series with several (default: the brightest)",
+    )
+    given.add_argument("--spacing", type=_spacing, metavar="S|X,Y,Z", help="voxel spacing of a raw volume, mm")
+    given.add_argument(
+        "--shape", type=_shape, metavar="I,J,K", help="number of voxels of a raw volume, fastest axis first"
+    )
+    given.add_argument(
+        "--threshold",
+        type=number,
+        metavar="T",
+        help="intensity at the lumen wall of a scan (default: half way between tissue and lumen)",
+    )
+    given.add_argument(
+        "--at", type=_point, metavar="X,Y,Z", help="point in or near the aneurysm, mm (default: the largest sac)"
+    )
     given.add_argument(
         "--inlet",
         type=_point,
         action="append",
         metavar="X,Y,Z",
-        help="a point near the inlet, mm; again for each further opening that brings blood",
+        help="point near the inlet, mm (default: the widest opening); repeat for further inlets",
     )
     return given
 
 
 def add_outlet(given: "argparse._ArgumentGroup") -> None:
-    """Add the point that picks the parent artery's outlet, and how much of the vessel is kept."""
-    given.add_argument("--outlet", type=_point, metavar="X,Y,Z", help="a point near the parent artery's outlet, mm")
-    given.add_argument("--upstream", type=positive, metavar="MM", help="artery to keep before the sac's middle (35)")
-    given.add_argument("--downstream", type=positive, metavar="MM", help="vessel to keep beyond the sac's middle (25)")
+    """Add the outlet of the parent artery and the lengths of vessel to keep."""
+    given.add_argument("--outlet", type=_point, metavar="X,Y,Z", help="point near the outlet of the parent artery, mm")
+    given.add_argument(
+        "--upstream", type=positive, metavar="MM", help="length of artery kept proximal to the sac, mm (default: 35)"
+    )
+    given.add_argument(
+        "--downstream", type=positive, metavar="MM", help="length of vessel kept distal to the sac, mm (default: 25)"
+    )
 
 
 def add_neck(given: "argparse._ArgumentGroup") -> None:
-    """Add a neck that was drawn."""
+    """Add a neck drawn by hand."""
     given.add_argument(
-        "--neck", type=Path, metavar="CSV", help="the neck: columns x, y, z in mm of points along a closed curve"
+        "--neck",
+        type=Path,
+        metavar="CSV",
+        help="neck drawn by hand: columns x, y, z in mm of points along a closed curve",
     )
 
 
 def add_devices(parser: argparse.ArgumentParser) -> None:
     """Add the choice of devices."""
     parser.add_argument(
-        "--device", action="append", metavar="NAME", help="a device of the catalogue; repeatable (silk, enterprise)"
+        "--device",
+        action="append",
+        metavar="NAME",
+        help="device of the catalogue; repeat for several (default: silk and enterprise)",
     )
 
 
 def add_problem(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
-    """Add which flow it is, whatever computes it; return the group."""
+    """Add the options of the flow problem; return their group."""
     flow = parser.add_argument_group("flow")
     flow.add_argument(
-        "--flow-rate", type=positive, metavar="ML_S", help="mean inflow, all inlets' (0.27 m/s times their area)"
+        "--flow-rate",
+        type=positive,
+        metavar="ML_S",
+        help="mean inflow of all inlets, mL/s (default: 0.27 m/s times their area)",
     )
-    flow.add_argument("--cell-size", type=positive, metavar="MM", help="edge of a flow cell")
+    flow.add_argument(
+        "--grid-spacing",
+        type=positive,
+        metavar="MM",
+        help="spacing of the flow grid, mm (default: 29 cells per diameter)",
+    )
     pulse = flow.add_mutually_exclusive_group()
-    pulse.add_argument("--steady", action="store_true", help="at the mean inflow, not pulsing (the default)")
+    pulse.add_argument("--steady", action="store_true", help="constant mean inflow (the default)")
     pulse.add_argument(
         "--pulsatile",
         nargs="?",
         const=PUBLISHED,
         metavar="CSV",
-        help="follow a pulse: columns time in s and flow in any unit (the published one of the internal carotid)",
+        help="pulsatile inflow: a CSV file with columns time (s) and flow (any "
+        "unit); without a file the published waveform of "
+        "the internal carotid artery (Hoi et al. 2010)",
     )
     density, viscosity = within(900, 1200, "kg/m3: 1.06 g/mL are 1060"), within(0.001, 0.1, "Pa s: 4 mPa s are 0.004")
-    flow.add_argument("--density", type=density, default=1060.0, metavar="KG_M3", help="of blood (1060)")
-    flow.add_argument("--viscosity", type=viscosity, metavar="PA_S", help="of blood (0.004; at high shear 0.00345)")
     flow.add_argument(
-        "--thinning", action="store_true", help="blood thins with the shear rate, as Carreau and Yasuda's law has it"
+        "--density", type=density, default=1060.0, metavar="KG_M3", help="density of blood, kg/m3 (default: 1060)"
     )
-    flow.add_argument("--outlets", choices=("zero_pressure", "murray"), default="zero_pressure", help="outlet law")
+    flow.add_argument(
+        "--viscosity",
+        type=viscosity,
+        metavar="PA_S",
+        help="viscosity of blood, Pa s (default: 0.004; with --shear-thinning 0.00345 at high shear)",
+    )
+    flow.add_argument(
+        "--shear-thinning", action="store_true", help="shear-thinning blood (Carreau-Yasuda; default: Newtonian)"
+    )
+    flow.add_argument(
+        "--outlets",
+        choices=("zero_pressure", "murray"),
+        default="zero_pressure",
+        help="zero pressure at the outlets (default), or flow split by Murray's law (diameter cubed)",
+    )
     return flow
 
 
 def add_processes(group: "argparse._ArgumentGroup") -> None:
-    """Add how many processes OpenFOAM is given."""
-    group.add_argument("-j", "--processes", type=_jobs, default=1, metavar="N", help="processes for OpenFOAM (1)")
+    """Add the number of OpenFOAM processes."""
+    group.add_argument(
+        "-j", "--processes", type=_jobs, default=1, metavar="N", help="number of OpenFOAM processes (default: 1)"
+    )
 
 
 def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
-    """Add which flow it is and how it is computed; return the group."""
+    """Add the flow problem and how it is computed; return the group."""
     flow = add_problem(parser)
     flow.add_argument(
-        "--engine", default="lattice_boltzmann", metavar="NAME", help="openfoam, or a plug-in that computes the flow"
+        "--engine",
+        default="lattice_boltzmann",
+        metavar="NAME",
+        help="flow engine: lattice_boltzmann (default), openfoam, or a plug-in",
     )
     add_processes(flow)
     flow.add_argument(
-        "--close-up",
+        "--refine-sac",
         action="store_true",
-        help="cells of that size only in the sac and near it, twice as wide elsewhere",
+        help="use the grid spacing only in and near the sac, and twice it elsewhere",
     )
-    flow.add_argument("--device-gpu", action="store_true", help="compute the flow on an NVIDIA GPU (the extra gpu)")
+    flow.add_argument("--gpu", action="store_true", help="compute the flow on an NVIDIA GPU (needs the extra gpu)")
     return flow
 
 
 def add_jobs(group: "argparse._ArgumentGroup") -> None:
-    """Add how many processes work at once."""
-    group.add_argument("--jobs", type=_jobs, default=_cores(), metavar="N", help="processes at once (one a core)")
+    """Add the number of parallel processes."""
+    group.add_argument(
+        "--jobs", type=_jobs, default=_cores(), metavar="N", help="parallel processes (default: one per core)"
+    )
 
 
 def _cores() -> int:
@@ -167,25 +264,27 @@ def _cores() -> int:
 
 def _jobs(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of processes such as 2")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of processes: give a whole number such as 2")
     return int(text)
 
 
 def numbers(text: str) -> list[float]:
-    """Read numbers parted by commas."""
+    """Return numbers separated by commas."""
     return _numbers(text, float)
 
 
 def add_uncertainty(parser: argparse.ArgumentParser) -> None:
-    """Add what is varied to tell how sure the results are."""
+    """Add the options of the uncertainty study."""
     group = parser.add_argument_group("uncertainty")
-    group.add_argument("--uncertainty", type=int, metavar="N", help="deploy N times with what is not sure varied")
     group.add_argument(
-        "--uncertain-flows",
+        "--uncertainty", type=int, metavar="N", help="deploy N times with uncertain inputs varied (default: off)"
+    )
+    group.add_argument(
+        "--uncertainty-flows",
         type=int,
         default=0,
         metavar="M",
-        help="compute the flows of M of them too, before and after",
+        help="also compute the flows of M of these deployments (default: 0)",
     )
     group.add_argument(
         "--vary",
@@ -193,8 +292,9 @@ def add_uncertainty(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="CAUSE=RANGE",
-        help="how far to either side: threshold=MM (of all diameters; the scan's own band), landing=MM (1), "
-        "device=MM (0.1), inflow=FRACTION (0.2)",
+        help="range to either side: threshold=MM (change of diameters; "
+        "default: the scan's own), landing=MM (default: 1), "
+        "device=MM (default: 0.1), inflow=FRACTION (default: 0.2)",
     )
 
 
@@ -212,24 +312,22 @@ def _cause(text: str) -> tuple[str, float]:
     try:
         return RANGES[name], float(value)
     except (KeyError, ValueError):
-        raise argparse.ArgumentTypeError(f"{text!r} is none of {'=, '.join(RANGES)}= with a number") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not one of {'=, '.join(RANGES)}= with a number") from None
 
 
 def given_ranges(arguments: argparse.Namespace) -> "Ranges | None":
-    """Collect what is to be varied, and how far."""
+    """Return the ranges of the uncertainty study; None where it is off."""
     if arguments.uncertainty is None:
-        if arguments.vary or arguments.uncertain_flows:
-            raise InputError(
-                "--vary and --uncertain-flows say how --uncertainty is to be done: give --uncertainty N too"
-            )
+        if arguments.vary or arguments.uncertainty_flows:
+            raise InputError("--vary and --uncertainty-flows need --uncertainty N: give that too")
         return None
     from vstent.plan.uncertainty import Ranges
 
-    return Ranges(arguments.uncertainty, arguments.uncertain_flows, **dict(arguments.vary))
+    return Ranges(arguments.uncertainty, arguments.uncertainty_flows, **dict(arguments.vary))
 
 
 def _numbers(text: str, kind: type, count: int | None = None) -> list[float]:
-    """Read numbers parted by commas, `count` of them where that is said."""
+    """Return numbers separated by commas, `count` of them unless that is None."""
     try:
         numbers = [kind(part) for part in text.replace("x", ",").split(",")]
     except ValueError:
@@ -246,6 +344,12 @@ def _three(text: str, kind: type) -> tuple[float, float, float]:
     return first, second, third
 
 
+def _count(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
+    return int(text)
+
+
 def _point(text: str) -> tuple[float, float, float]:
     return _three(text, float)
 
@@ -259,19 +363,36 @@ def _spacing(text: str) -> tuple[float, float, float]:
 
 
 def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Collect what was said of the vessel, under the names of the settings."""
+    """Return the options on the vessel under the names of the settings."""
+    in_lps = _from_ras if arguments.frame == "ras" else _as_given
+    inlets = tuple(map(in_lps, arguments.inlet)) if arguments.inlet else None
+    at, outlet, neck = arguments.at, getattr(arguments, "outlet", None), _neck(getattr(arguments, "neck", None))
     return {
         "units": arguments.units,
+        "frame": arguments.frame,
+        "acquisition": arguments.acquisition,
         "spacing_mm": arguments.spacing,
         "shape": arguments.shape,
         "threshold": arguments.threshold,
-        "at_mm": arguments.at,
-        "inlet_mm": tuple(arguments.inlet) if arguments.inlet else None,
-        "outlet_mm": getattr(arguments, "outlet", None),
+        "at_mm": at and in_lps(at),
+        "inlet_mm": inlets,
+        "outlet_mm": outlet and in_lps(outlet),
         "upstream_mm": getattr(arguments, "upstream", None),
         "downstream_mm": getattr(arguments, "downstream", None),
-        "neck_mm": _neck(getattr(arguments, "neck", None)),
+        "neck_mm": neck and tuple(map(in_lps, neck)),
     }
+
+
+Point: TypeAlias = tuple[float, float, float]
+
+
+def _as_given(point_mm: Point) -> Point:
+    return point_mm
+
+
+def _from_ras(point_mm: Point) -> Point:
+    """Return a RAS point in LPS."""
+    return -point_mm[0], -point_mm[1], point_mm[2]
 
 
 def _neck(path: Path | None) -> tuple[tuple[float, float, float], ...] | None:
@@ -281,12 +402,12 @@ def _neck(path: Path | None) -> tuple[tuple[float, float, float], ...] | None:
 
 
 def given_devices(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """Names of the devices, each once; the paper's two where none is given."""
+    """Return the names of the devices, each once; by default the two of the paper."""
     return tuple(dict.fromkeys(arguments.device or ("silk", "enterprise")))
 
 
 def given_problem(arguments: argparse.Namespace) -> "FlowSettings":
-    """Collect which flow it is."""
+    """Return the settings of the flow problem."""
     from vstent.flow.case import FlowSettings
 
     return FlowSettings(
@@ -294,23 +415,23 @@ def given_problem(arguments: argparse.Namespace) -> "FlowSettings":
         blood=_blood(arguments),
         waveform=_waveform(arguments.pulsatile),
         outlets=arguments.outlets,
-        cell_size_mm=arguments.cell_size,
+        cell_size_mm=arguments.grid_spacing,
     )
 
 
 def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
-    """Collect which flow it is and how it is computed."""
+    """Return the settings of the flow problem and of its computation."""
     from vstent.flow.lattice.gpu import require_gpu
     from vstent.flow.simulation import engine_class
 
     settings = replace(
         given_problem(arguments),
-        close_up=arguments.close_up,
+        close_up=arguments.refine_sac,
         engine=arguments.engine,
         processes=arguments.processes,
-        device_gpu=arguments.device_gpu,
+        device_gpu=arguments.gpu,
     )
-    engine_class(settings)  # what cannot be is told before anything is computed
+    engine_class(settings)  # an unknown engine is reported before anything is computed
     if settings.device_gpu:
         require_gpu()
     return settings
@@ -319,7 +440,7 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
 def _blood(arguments: argparse.Namespace) -> "Blood":
     from vstent.flow.case import HIGH_SHEAR_VISCOSITY_PA_S, Blood, CarreauYasuda
 
-    if not arguments.thinning:
+    if not arguments.shear_thinning:
         return Blood(arguments.density, arguments.viscosity or Blood.viscosity_Pa_s)
     return Blood(arguments.density, arguments.viscosity or HIGH_SHEAR_VISCOSITY_PA_S, CarreauYasuda())
 
@@ -334,7 +455,7 @@ def _waveform(source: str | None) -> "Waveform | None":
     waveform = waveform_of(time_s, flow)
     if not SHORTEST_CYCLE_S <= waveform.period_s <= LONGEST_CYCLE_S:
         raise InputError(
-            f"the cycle in {source} takes {waveform.period_s:g} s, and a heart's {SHORTEST_CYCLE_S:g} to "
-            f"{LONGEST_CYCLE_S:g}: give one cycle, its times in seconds"
+            f"the cycle in {source} lasts {waveform.period_s:g} s, a cardiac cycle {SHORTEST_CYCLE_S:g} to "
+            f"{LONGEST_CYCLE_S:g} s: give one cycle with times in seconds"
         )
     return waveform

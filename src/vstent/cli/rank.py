@@ -1,4 +1,4 @@
-"""`vstent rank`: every size of the chosen devices, the best first."""
+"""`vstent rank`: deploy every size of the chosen devices and rank them."""
 
 import argparse
 from pathlib import Path
@@ -7,22 +7,27 @@ from typing import Final
 from vstent.cli import options
 
 SHOWN: Final = 15
-"""Rows of the table on the terminal; the files hold all."""
+"""Number of rows shown on the terminal; the files hold all."""
 
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "rank", "scan or surface -> every size deployed, measured, ranked")
+    parser = options.add_command(
+        commands,
+        "rank",
+        "Deploy every size of the chosen devices, measure them and rank them.",
+        "rank artery.stl --device silk --device pipeline --out case",
+    )
     options.add_outlet(options.add_geometry(parser))
     options.add_devices(parser)
     ranking = parser.add_argument_group("ranking")
-    ranking.add_argument("--criteria", type=Path, metavar="TOML", help="criteria instead of vstent's own")
+    ranking.add_argument("--criteria", type=Path, metavar="TOML", help="ranking criteria (default: vstent's own)")
     ranking.add_argument(
         "--shift",
         type=options.numbers,
         default=[0.0],
         metavar="MM,MM,...",
-        help="landing places to try, against the proposed one, distally",
+        help="shifts from the proposed landing to try, mm, positive distally (default: 0)",
     )
     options.add_jobs(ranking)
     parser.set_defaults(command=_rank)
@@ -42,7 +47,9 @@ def _rank(arguments: argparse.Namespace) -> int:
     console = Console()
     settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
     with console.live():
-        anatomy, _ = restore_vessel(arguments.input, arguments.out, settings, console.progress)
+        anatomy, _ = restore_vessel(
+            arguments.input, arguments.out, settings, console.progress, replaces=arguments.replace
+        )
         ranking = rank(
             anatomy,
             designs,

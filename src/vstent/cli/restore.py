@@ -1,4 +1,4 @@
-"""`vstent restore`: the sac shrunk, the parent artery found and measured."""
+"""`vstent restore`: find sac, neck and parent artery, and measure them."""
 
 import argparse
 
@@ -7,7 +7,9 @@ from vstent.cli import options
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "restore", "scan or surface -> parent artery, sac, neck, measures")
+    parser = options.add_command(
+        commands, "restore", "Remove the sac, restore the parent artery, and measure both.", "restore scan/ --out case"
+    )
     given = options.add_geometry(parser)
     options.add_outlet(given)
     options.add_neck(given)
@@ -22,7 +24,9 @@ def _restore(arguments: argparse.Namespace) -> int:
     console = Console()
     settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
     with console.live():
-        _, measures = restore_vessel(arguments.input, arguments.out, settings, console.progress)
+        _, measures = restore_vessel(
+            arguments.input, arguments.out, settings, console.progress, replaces=arguments.replace
+        )
     console.print(morphology_table(measures))
     console.print(f"Results in {arguments.out}. Research use only.")
     return 0

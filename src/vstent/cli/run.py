@@ -1,4 +1,4 @@
-"""`vstent run`: a patient's scan or surface, whole."""
+"""`vstent run`: from a scan or surface to the report."""
 
 import argparse
 from dataclasses import asdict
@@ -15,40 +15,50 @@ if TYPE_CHECKING:
 def add(commands: options.Commands) -> None:
     """Add the command."""
     parser = options.add_command(
-        commands, "run", "scan or surface -> stented artery, flow compared, report; run.json -> the same again"
+        commands,
+        "run",
+        "Deploy stents in a patient's artery, compute the flow before and after, and write a report.",
+        "run scan/ --device silk --device enterprise --out case",
     )
     given = options.add_geometry(parser)
     options.add_outlet(given)
     options.add_neck(given)
-    given.add_argument("--diameter", type=options.positive, metavar="MM", help="label diameter of the devices")
-    given.add_argument("--length", type=options.positive, metavar="MM", help="label length of the devices")
     given.add_argument(
-        "--center", type=options.number, metavar="MM", help="where on the parent axis the device's middle lies"
+        "--diameter", type=options.positive, metavar="MM", help="label diameter of the devices, mm (default: proposed)"
+    )
+    given.add_argument(
+        "--length", type=options.positive, metavar="MM", help="label length of the devices, mm (default: proposed)"
+    )
+    given.add_argument(
+        "--center",
+        type=options.number,
+        metavar="MM",
+        help="position of the device's middle along the parent artery, mm (default: proposed)",
     )
     add_study(parser)
     add_pdf(parser)
-    parser.add_argument("--crate", action="store_true", help="describe the folder as an RO-Crate besides")
+    parser.add_argument("--ro-crate", action="store_true", help="also describe the case folder as an RO-Crate")
     parser.add_argument(
-        "--input", dest="moved_to", type=Path, metavar="PATH", help="where the input of a run.json lies now"
+        "--input", dest="moved_to", type=Path, metavar="PATH", help="present place of the input of a run.json to repeat"
     )
     parser.set_defaults(command=_run)
 
 
 def add_study(parser: argparse.ArgumentParser) -> None:
-    """Add what every study may be told: the devices, and how to compute the flow, if at all."""
+    """Add the options of a study: devices, flow and uncertainty."""
     options.add_devices(parser)
     flow = options.add_flow(parser)
-    flow.add_argument("--no-flow", action="store_true", help="stop after the deployment")
+    flow.add_argument("--no-flow", action="store_true", help="deploy only, without computing the flow")
     options.add_uncertainty(parser)
 
 
 def add_pdf(parser: argparse.ArgumentParser) -> None:
-    """Add whether the report is to be printed."""
-    parser.add_argument("--pdf", action="store_true", help="write the report as report.pdf besides")
+    """Add the option to write the report as PDF."""
+    parser.add_argument("--pdf", action="store_true", help="also write the report as report.pdf")
 
 
 def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
-    """Collect what a study is told; `given` are further settings."""
+    """Return the settings of a study; `given` are further ones."""
     from vstent.study.types import Settings
 
     flow = None if arguments.no_flow else options.given_flow(arguments)
@@ -56,14 +66,14 @@ def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
     return Settings(devices=devices, flow=flow, uncertainty=ranges, **given)  # type: ignore[arg-type]
 
 
-def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool) -> "CaseResult":
-    """Run a study with its progress shown; write the report, as a PDF too where asked, and print the table."""
+def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool, replaces: bool) -> "CaseResult":
+    """Run a study, show its progress, write its reports and print its tables."""
     from vstent.cli.console import Console, comparison_table, uncertainty_table
     from vstent.study.pipeline import run
 
     console = Console()
     with console.live():
-        case = run(path, out, settings, console.progress)
+        case = run(path, out, settings, console.progress, replaces=replaces)
         console.progress("report", 0.0, "")
         from vstent.reporting.write import write_report
 
@@ -72,6 +82,8 @@ def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool) -> "
     console.print(comparison_table(case.metrics))
     if settings.uncertainty is not None:
         console.print(uncertainty_table(case.metrics))
+    for name, sentence in case.failures.items():
+        console.say(f"vstent: {name}: {sentence}")
     console.print(f"Results in {out}; open {out / 'report.html'}. Research use only.")
     return case
 
@@ -86,12 +98,12 @@ def _run(arguments: argparse.Namespace) -> int:
     )
     if arguments.input.suffix == ".json":
         return _again(arguments, settings)
-    _finish(arguments, study(arguments.input, arguments.out, settings, is_printed=arguments.pdf))
-    return 0
+    case = study(arguments.input, arguments.out, settings, is_printed=arguments.pdf, replaces=arguments.replace)
+    return _finish(arguments, case)
 
 
 def _again(arguments: argparse.Namespace, given: "Settings") -> int:
-    """Repeat a run from its run.json; say what is not as it was, and how far the results agree."""
+    """Repeat a run from its run.json; report what has changed since, and how well the results agree."""
     from vstent.cli.console import Console
     from vstent.errors import InputError
     from vstent.study.repeat import agreement, read_record
@@ -99,21 +111,24 @@ def _again(arguments: argparse.Namespace, given: "Settings") -> int:
 
     if asdict(given) != asdict(Settings()):
         raise InputError(
-            f"{arguments.input} says all settings: give no option but --out, --input, --pdf and --crate with it."
+            f"{arguments.input} states all settings: give only --out, --input, --pdf, --replace and --ro-crate with it."
         )
     record = read_record(arguments.input, arguments.moved_to)
     if arguments.out.resolve() == record.folder.resolve():
-        raise InputError(f"{arguments.out} is the folder of the run itself: give another --out to repeat it in.")
+        raise InputError(f"{arguments.out} is the folder of the run itself: give another --out for the repetition.")
     console = Console()
     for difference in record.differences:
-        console.say(f"Not as then: {difference}.")
-    _finish(arguments, study(record.input, arguments.out, record.settings, is_printed=arguments.pdf))
+        console.say(f"Changed since: {difference}.")
+    case = study(record.input, arguments.out, record.settings, is_printed=arguments.pdf, replaces=arguments.replace)
+    code = _finish(arguments, case)
     console.print(agreement(record.folder, arguments.out))
-    return 0
+    return code
 
 
-def _finish(arguments: argparse.Namespace, case: "CaseResult") -> None:
+def _finish(arguments: argparse.Namespace, case: "CaseResult") -> int:
+    """Write the RO-Crate where asked; return the exit code: 1 where a device or a flow failed."""
     from vstent.study.crate import write_crate
 
-    if arguments.crate:
+    if arguments.ro_crate:
         write_crate(arguments.out, case.provenance, date.today().isoformat())
+    return 1 if case.failures else 0

@@ -1,4 +1,4 @@
-"""`vstent trace`: the vessel and its centerlines alone."""
+"""`vstent trace`: find the vessel wall, its openings and centerlines."""
 
 import argparse
 
@@ -7,7 +7,9 @@ from vstent.cli import options
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(commands, "trace", "scan or surface -> wall, openings, centerlines")
+    parser = options.add_command(
+        commands, "trace", "Find the vessel wall, its openings and its centerlines.", "trace artery.stl --out case"
+    )
     options.add_geometry(parser)
     parser.set_defaults(command=_trace)
 
@@ -20,7 +22,7 @@ def _trace(arguments: argparse.Namespace) -> int:
     console = Console()
     settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
     with console.live():
-        vessel = trace_vessel(arguments.input, arguments.out, settings, console.progress)
+        vessel = trace_vessel(arguments.input, arguments.out, settings, console.progress, replaces=arguments.replace)
     console.print(opening_table(vessel.openings))
     console.print(f"Results in {arguments.out}. Research use only.")
     return 0

@@ -60,11 +60,13 @@ def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:
     refuse_missing(cohort)
     cases = _in_folder(cohort, settings) if cohort.is_dir() else _in_file(cohort, settings)
     if not cases:
-        raise ReadError(f"{cohort} holds no case: give a folder of scans or surfaces, or a CSV file of their paths")
+        raise ReadError(f"{cohort} holds no cases: give a folder of scans or surfaces, or a CSV file of their paths")
     names = [case.name for case in cases]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(f"{cohort} has two cases called {twice[0]}: name them in a CSV file's column `case`")
+        raise InputError(
+            f"{cohort} has two cases called {twice[0]}: give them names in the column `case` of a CSV file"
+        )
     for device in {device for case in cases for device in case.settings.devices}:
         find_design(device)
     return tuple(cases)
@@ -90,7 +92,9 @@ def _in_file(path: Path, settings: Settings) -> list[Case]:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} cannot be read as a CSV file: {error}. Write it in UTF-8, with titles.") from error
+        raise InputError(
+            f"{path} cannot be read as a CSV file: {error}. Save it as UTF-8 with column titles."
+        ) from error
     return [_case(path, number, row, settings) for number, row in enumerate(rows, start=2)]
 
 
@@ -99,9 +103,11 @@ def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Cas
     where = f"line {line} of {file}"
     unknown = sorted(set(given) - {"case", "input", *COLUMNS})
     if unknown:
-        raise InputError(f"{where} has a column {unknown[0]!r}: the columns are case, input, {', '.join(COLUMNS)}")
+        raise InputError(
+            f"{where} has an unknown column {unknown[0]!r}: the columns are case, input, {', '.join(COLUMNS)}"
+        )
     if "input" not in given:
-        raise InputError(f"{where} names no input: fill its column `input`")
+        raise InputError(f"{where} has no input: fill in its column `input`")
     path = file.parent / given["input"]
     changes: dict[str, Any] = {}
     for title in set(given) & set(COLUMNS):
@@ -112,7 +118,7 @@ def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Cas
             raise InputError(f"{where}: {title} is {given[title]!r}, which cannot be used: {error}") from error
     name = given.get("case", _name(path))
     if Path(name).name != name:
-        raise InputError(f"{where} calls its case {name!r}: give a name without slashes")
+        raise InputError(f"{where} names its case {name!r}: give a name without slashes")
     return Case(name, path, replace(settings, **changes))
 
 

@@ -84,7 +84,9 @@ def _fault(exitcode: int | None) -> str:
     if not exitcode:
         return ""
     how = f"was killed by signal {-exitcode}" if exitcode < 0 else f"ended with code {exitcode}"
-    return f"Its process {how}, {ATTEMPTS} times: out of memory? Use fewer jobs, and run the same command again."
+    return (
+        f"Its process {how} {ATTEMPTS} times; it may be out of memory. Use fewer jobs and run the same command again."
+    )
 
 
 @final
@@ -136,7 +138,7 @@ class Slurm(AbstractCrew):
         """
         if shutil.which("sbatch") is None:  # dask-jobqueue would try to send jobs for ever
             raise InputError(
-                "There is no Slurm here (no `sbatch` on the PATH): give the command where jobs are sent from."
+                "Slurm was not found (no `sbatch` on the PATH): run the command on a machine that submits jobs"
             )
         with self.cluster() as cluster:
             cluster.adapt(minimum_jobs=self.jobs, maximum_jobs=self.jobs)  # a job that the queue ends is asked for anew
@@ -152,7 +154,7 @@ class Slurm(AbstractCrew):
 
 
 def _missing(package: str) -> InputError:
-    return InputError(f"{package} is not installed: pip install 'vstent[cluster]', or leave the cluster out")
+    return InputError(f"{package} is not installed: run pip install 'vstent[cluster]', or work without the cluster")
 
 
 def _client(address: str) -> Any:
@@ -169,7 +171,7 @@ def _client(address: str) -> Any:
 def _see_alive(client: Any) -> None:
     if client.status not in ("running", "connecting"):
         raise VstentError(
-            "the Dask scheduler is lost; finished cases are kept: start it again and give the same command"
+            "the Dask scheduler was lost; finished cases are kept: start it again and give the same command"
         )
 
 
@@ -177,5 +179,5 @@ def _future_fault(future: Any) -> str:
     if future.status == "finished":
         return ""
     if future.status == "error":
-        return f"Its worker failed: {future.exception()}. Look at the workers' logs, and run the same command again."
-    raise VstentError("the Dask scheduler is lost; finished cases are kept: start it again and give the same command")
+        return f"Its worker failed: {future.exception()}. Check the workers' logs and run the same command again."
+    raise VstentError("the Dask scheduler was lost; finished cases are kept: start it again and give the same command")

@@ -27,7 +27,7 @@ SCAN_TRIANGLES: Final = 60_000
 CPU_S_PER_DEVICE: Final = 1.0
 """Deployed, measured, its wires made solid."""
 FLOW_CELLS: Final = 200_000
-"""Of a vessel trimmed, with cells of 0.17 mm."""
+"""Measured on a trimmed vessel with a grid spacing of 0.17 mm."""
 CPU_S_PER_1000_CELLS: Final = 0.6
 """Steady, from rest: the demo's flows take about 130 s of CPU each."""
 MB_PER_1000_CELLS: Final = 1.0
@@ -51,7 +51,7 @@ class Estimate:
         """The estimate in words."""
         hours = self.cpu_s / self.jobs / 3600
         time = f"{hours:.1f} h" if hours >= 1 else f"{max(1, round(60 * hours))} min"
-        return f"about {time} with {self.jobs} at once, up to {self.memory_MB:.0f} MB each"
+        return f"about {time} with {self.jobs} parallel processes, up to {self.memory_MB:.0f} MB each"
 
 
 def estimate(cases: Sequence[Case], jobs: int) -> Estimate:

@@ -72,7 +72,13 @@ def work(task: Task) -> None:
         rows = _rows(task)
         done = tuple(device for device, row in rows.items() if row["outcome"] == DONE)
         if task.keeps_files and done and len(rows) > 1:  # one study with all that can be done: nothing is computed anew
-            run(task.case.path, task.folder / "study", replace(task.case.settings, devices=done), _Watch())
+            run(
+                task.case.path,
+                task.folder / "study",
+                replace(task.case.settings, devices=done),
+                _Watch(),
+                replaces=True,
+            )
         if not task.keeps_files:
             shutil.rmtree(task.folder / "study", ignore_errors=True)
         spent = time.perf_counter() - began, time.process_time() - cpu, peak_memory_MB()
@@ -82,10 +88,10 @@ def work(task: Task) -> None:
 
 
 def _rows(task: Task) -> dict[str, Row]:
-    """Do the artery once, then every device in it; what cannot be done is told in the row."""
+    """Return the rows of a case: the artery is restored once, then every device deployed; failures are rows too."""
     case, study = task.case, task.folder / "study"
     devices = case.settings.devices
-    failed = _failure(task, lambda watch: restore_vessel(case.path, study, case.settings, watch))
+    failed = _failure(task, lambda watch: restore_vessel(case.path, study, case.settings, watch, replaces=True))
     if failed:
         return dict.fromkeys(devices, failed)
     rows: dict[str, Row] = {}
@@ -93,7 +99,7 @@ def _rows(task: Task) -> dict[str, Row]:
         alone = replace(case.settings, devices=(device,))
 
         def with_device(watch: Progress, device: str = device, alone: Settings = alone) -> None:
-            found = run(case.path, study, alone, watch)
+            found = run(case.path, study, alone, watch, replaces=True)
             advice = found.deployments[device].advice
             rows[device] = {"outcome": DONE, "stage": "", "sentence": advice} | flat_metrics(found.metrics, device)
 
@@ -110,9 +116,9 @@ def _failure(task: Task, do: Callable[[Progress], object]) -> Row:
         do(watch)
     except VstentError as error:
         return {"outcome": FAILED, "stage": watch.stage, "sentence": str(error)}
-    except Exception as error:  # noqa: BLE001 one case's fault must not end the cohort; it is told in its row
+    except Exception as error:  # noqa: BLE001 one failed case must not end the cohort; its row states the error
         write_text(task.folder / "traceback.txt", traceback.format_exc())
-        sentence = f"vstent did not foresee this, {type(error).__name__}: {error}. Report it with traceback.txt."
+        sentence = f"unexpected error, {type(error).__name__}: {error}. Please report it with traceback.txt."
         return {"outcome": FAILED, "stage": watch.stage, "sentence": sentence}
     return {}
 

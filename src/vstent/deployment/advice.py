@@ -45,20 +45,20 @@ def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
 def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
     gap_mm, is_at_patient = gaps
     lies = (
-        f"{stent.design.name} {stent.size.label} lies from {stent.proximal_abscissa_mm:.1f} to "
-        f"{stent.distal_abscissa_mm:.1f} mm of the parent artery, {stent.deployed_length_mm:.1f} mm long"
-        f"{_width(anatomy, stent)}{_reach(anatomy, stent)}"
+        f"{stent.design.name} {stent.size.label} spans "
+        f"{stent.proximal_abscissa_mm:.1f}-{stent.distal_abscissa_mm:.1f} mm along the parent artery (deployed "
+        f"length {stent.deployed_length_mm:.1f} mm){_width(anatomy, stent)}{_reach(anatomy, stent)}"
     )
     if course.outcome == "iteration_limit":
         done = course.terminated_fraction[-1]
-        return f"{lies}, but only {done:.0%} of its contour reached the wall: raise the iteration limit or tau."
+        return f"{lies}, but only {done:.0%} of its contour reached the wall. Raise the iteration limit or tau."
     if not is_at_patient.any():
-        return f"{lies}, and none of it against the patient's own wall."
+        return f"{lies}. All of it is over restored wall."
     is_loose = is_at_patient & (gap_mm > APPOSED_GAP_MM)
     loose = is_loose.sum() / is_at_patient.sum()
     if loose <= LOOSE_FRACTION:
-        return f"{lies}, and {1 - loose:.0%} of it lies against the wall."
-    off = f"{loose:.0%} of it stands off the wall, by up to {gap_mm[is_at_patient].max():.2f} mm"
+        return f"{lies}; {1 - loose:.0%} of it is apposed."
+    off = f"{loose:.0%} of it is not apposed, with gaps up to {gap_mm[is_at_patient].max():.2f} mm"
     return f"{lies}, and {off}: {_remedy(anatomy, stent, gap_mm, is_loose)}"
 
 
@@ -69,8 +69,8 @@ def _of_fork(anatomy: Anatomy) -> str:
     if off_mm < OFF_MM:
         return ""
     return (
-        f" The neck lies on a fork: it reaches up to {off_mm:.1f} mm off this artery, where blood enters beside any "
-        "device in it."
+        f" The neck is on a fork and extends up to {off_mm:.1f} mm beyond this artery; blood enters there "
+        "beside any device in it."
     )
 
 
@@ -81,7 +81,7 @@ def _width(anatomy: Anatomy, stent: Stent) -> str:
         return ""
     has_narrower = any(size.diameter_mm < stent.size.diameter_mm for size in stent.design.sizes)
     narrower = "narrower size" if has_narrower else "device for narrower arteries"
-    return f", labelled {1 + over:.1f} times as wide as the artery there (choose a {narrower})"
+    return f", label diameter {1 + over:.1f} times the diameter of the artery (choose a {narrower})"
 
 
 def _reach(anatomy: Anatomy, stent: Stent) -> str:
@@ -97,7 +97,9 @@ def _reach(anatomy: Anatomy, stent: Stent) -> str:
     if beyond_mm >= wanted_mm - SHORT_MM:
         return ""
     what = f"only {beyond_mm:.1f} mm beyond" if beyond_mm >= 0 else f"{-beyond_mm:.1f} mm short of"
-    return f", {what} the neck's {end} end{_remedy_of_reach(anatomy, stent, np.array([before_mm, after_mm]), move)}"
+    return (
+        f", {what} the {end} end of the neck{_remedy_of_reach(anatomy, stent, np.array([before_mm, after_mm]), move)}"
+    )
 
 
 def _remedy_of_reach(anatomy: Anatomy, stent: Stent, beyond_mm: Floats, move: str) -> str:
@@ -105,7 +107,7 @@ def _remedy_of_reach(anatomy: Anatomy, stent: Stent, beyond_mm: Floats, move: st
     half_mm, center_mm = 0.5 * stent.deployed_length_mm, float(np.mean(neck_span_mm(anatomy)))
     fits = half_mm < center_mm < anatomy.axis.length_mm - half_mm
     if fits and beyond_mm.mean() >= wanted_margin_mm(anatomy):
-        return f" (land it more {move})"
+        return f" (move it {move})"
     size = stent.size
     longer = (
         other
@@ -118,17 +120,20 @@ def _remedy_of_reach(anatomy: Anatomy, stent: Stent, beyond_mm: Floats, move: st
 
 
 def _remedy(anatomy: Anatomy, stent: Stent, gap_mm: Floats, is_loose: Bools) -> str:
-    """Why nodes stand off the wall by `gap_mm` (rows, columns), and what to do."""
+    """Return why nodes have gaps `gap_mm` (rows, columns) to the wall, and what to do."""
     free_mm = stent.size.free_diameter_mm
     could_open = stent.row_diameter_mm + 2 * gap_mm.mean(axis=1) < free_mm
     if isinstance(stent.design, LaserCut) and is_loose[could_open].sum() > 0.5 * is_loose.sum():
-        return "its struts do not stretch, and the way outside the bend is longer; choose a device of braided wires."
+        return (
+            "its struts keep their length, and the way around the outside of the bend is longer. Choose a "
+            "braided device."
+        )
     its = f"its free diameter is {free_mm:.2f} mm"
     wider = [size for size in stent.design.sizes if size.diameter_mm > stent.size.diameter_mm]
     if not wider:
-        return f"{its}; choose a device that is made wider."
+        return f"{its}. Choose a device of larger diameter."
     # The shortest first: where a wider size fits at all, it is most likely one of those.
     wider.sort(key=lambda size: (size.length_mm, size.diameter_mm))
     if all(reach_mm(stent.design, anatomy, size) == -inf for size in wider):
-        return f"{its}, and wider sizes are too long for this artery; choose another device."
-    return f"{its}; choose a wider size."
+        return f"{its}, and wider sizes are too long for this artery. Choose another device."
+    return f"{its}. Choose a wider size."

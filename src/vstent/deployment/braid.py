@@ -20,7 +20,7 @@ from vstent.units import MM_PER_UM
 ROUNDS = 8
 """Rows are marched anew at most so often."""
 SETTLED_MM = 0.1
-"""Rows have settled when none moves further than this from one round to the next."""
+"""Largest movement of a row between two rounds at which the rows have converged, in mm."""
 LAST_STEPS = 5
 """Steps at most for the last nodes, once 99 % have terminated."""
 TABLE_ROWS = 501

@@ -96,5 +96,5 @@ def _method(method: AbstractMethod | str) -> AbstractMethod:
     if isinstance(method, AbstractMethod):
         return method
     if method not in METHODS:
-        raise InputError(f"There is no way to deploy called {method!r}: choose one of {', '.join(METHODS)}.")
+        raise InputError(f"There is no deployment method called {method!r}. Choose one of {', '.join(METHODS)}.")
     return METHODS[method]()

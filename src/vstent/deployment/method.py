@@ -163,7 +163,8 @@ def run(method: AbstractMethod, placement: Placement, progress: Progress | None 
 def _check_finite(state: State, iteration: int) -> None:
     if not np.isfinite(state.nodes_mm).all():
         raise InputError(
-            f"The active contour ran away in iteration {iteration}: its weights are too large. Use a smaller tau."
+            f"The active contour diverged in iteration {iteration}, because its weights are too large. Use a "
+            "smaller tau."
         )
 
 
@@ -196,8 +197,8 @@ def check_landing(landing: Landing, artery_mm: float) -> None:
     """
     if not 0 <= landing.abscissa_mm <= artery_mm:
         raise LandingError(
-            f"A landing point at {landing.abscissa_mm:.1f} mm is not on the parent artery, which runs from 0 to "
-            f"{artery_mm:.1f} mm: give one between them."
+            f"A landing at {landing.abscissa_mm:.1f} mm is not on the parent artery, which spans "
+            f"0-{artery_mm:.1f} mm. Give a position between them."
         )
 
 
@@ -214,18 +215,18 @@ def check_inside(design: Design, size: Size, abscissa_mm: Floats, artery_mm: flo
         return
     length_mm = last - first
     lies = (
-        f"{design.name} {size.label} would lie from {first:.1f} to {last:.1f} mm of a parent artery that runs "
-        f"from 0 to {artery_mm:.1f} mm"
+        f"{design.name} {size.label} would span {first:.1f} to {last:.1f} mm of a parent artery of 0 to "
+        f"{artery_mm:.1f} mm"
     )
     if length_mm > artery_mm:
         raise LandingError(
-            f"{lies}: deployed it is {length_mm:.1f} mm long, longer than the artery. Choose a shorter size."
+            f"{lies}: its deployed length of {length_mm:.1f} mm exceeds the artery. Choose a shorter size."
         )
     end, by_mm = ("proximal", -first) if first < 0 else ("distal", last - artery_mm)
     move, sense = ("distally", 1) if first < 0 else ("proximally", -1)
     told_mm = np.ceil(by_mm / TOLD_MM) * TOLD_MM
     raise LandingError(
-        f"{lies}: it leaves the artery by {told_mm:.1f} mm at the {end} end. "
-        f"Land it at least {told_mm:.1f} mm more {move} or choose a shorter size.",
+        f"{lies}: it extends {told_mm:.1f} mm beyond the {end} end. Move it at least {told_mm:.1f} mm {move}, "
+        "or choose a shorter size.",
         sense * (by_mm + SPARE_MM),
     )

@@ -30,7 +30,7 @@ DIAMETER_SLACK_MM: Final = 0.05
 APPOSED_GAP_MM: Final = 0.1
 """A node is apposed when the device's outer face is nearer to the wall than this."""
 LOOSE_FRACTION: Final = 0.05
-"""Less of a device than this may stand off the wall without a word, and without a wider one being proposed."""
+"""Fraction of a device that may have gaps without a note and without a wider size being proposed."""
 OVERSIZED_FRACTION: Final = 0.8
 """A label may be this much wider than the artery without a word: Enterprise's, 4.5 mm, is from 2.5 mm on."""
 
@@ -58,7 +58,7 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
     labels = sorted({size.diameter_mm for size in design.sizes})
     zone = next((i for i, label in enumerate(labels) if label >= wider_mm - DIAMETER_SLACK_MM), len(labels) - 1)
     of_label = cache(partial(_of_label, design, anatomy))
-    # No size follows a bulge: where the next one would stand off too, the label of the landing zone stays.
+    # No size follows a bulge: where the next one would have gaps too, the size of the landing zone stays.
     held = (size for label in labels[zone : zone + 2] if (size := of_label(label)) and _lies(design, anatomy, size))
     fitting = (size for label in reversed(labels[: zone + 1]) if (size := of_label(label)))
     proposed = next(chain(held, fitting), None)
@@ -68,8 +68,9 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
     tried = [size for size in design.sizes if size.diameter_mm <= tried_mm]
     shortest_mm = min(last - first for first, last in (_span(design, anatomy, size) for size in tried))
     raise LandingError(
-        f"No size of {design.name} up to {tried_mm:g} mm wide fits: the shortest would be {shortest_mm:.1f} mm long in "
-        f"a parent artery of {anatomy.axis.length_mm:.1f} mm. Choose another device or a longer piece of artery."
+        f"No size of {design.name} up to {tried_mm:g} mm in diameter fits: the shortest would be "
+        f"{shortest_mm:.1f} mm long in a parent artery of {anatomy.axis.length_mm:.1f} mm. Choose another "
+        "device, or give a longer piece of the artery."
     )
 
 

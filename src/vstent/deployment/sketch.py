@@ -125,7 +125,7 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
 
 
 def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> Floats:
-    """Where (2,) rows as marched begin and end if the artery were wider by so much."""
+    """Return the proximal and distal end (2,), mm along the axis, for an artery wider by a given amount."""
     diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.free_diameter_mm)
     profile = replace(wall.profile, diameter_mm=diameter_mm)
     return march(wall.design, wall.size, landing, profile)[[0, -1]]

@@ -38,11 +38,11 @@ def struts(stent: Stent) -> Surface:
 
 
 def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
-    """Return the pieces of a stent's wires through which blood passes: over necks and ostia, and one spacing around.
+    """Return the pieces of a stent's wires over necks and ostia, with a margin of one wire spacing.
 
-    Those on the patient's own wall have no flow across them. Around a rim blood passes as well, along the wall where
-    wires stand off it and aslant through pores: with half a spacing, Enterprise's screen let 11 % more into the demo's
-    neck than the whole device, with one 1 %.
+    There is no flow across wires on the patient's own wall. Around a rim blood also passes along gaps and obliquely
+    through pores. Compared with the whole device, the neck inflow of the demo with Enterprise's screen is 11 % higher
+    with a margin of half a spacing, and 1 % higher with one spacing.
     """
     is_over = is_over_restored(stent, anatomy, stent.wire_points_mm)
     wire = stent.point_wires
@@ -103,10 +103,12 @@ def _manifold(surface: Surface) -> Any:
     try:
         import manifold3d
     except ImportError as error:
-        raise DeviceError("Joining solids needs the library manifold3d: run pip install 'vstent[solids]'.") from error
+        raise DeviceError("Joining solids needs the package manifold3d. Run pip install 'vstent[solids]'.") from error
     body = manifold3d.Manifold(manifold3d.Mesh64(surface.vertices_mm.copy(), surface.faces.astype(np.uint64)))
     if body.status() != manifold3d.Error.NoError or body.is_empty():
-        raise DeviceError(f"A surface of {len(surface.faces)} triangles is not closed: it cannot be joined or cut.")
+        raise DeviceError(
+            f"A surface of {len(surface.faces)} triangles is not closed and cannot be joined or cut. Close it first."
+        )
     return body
 
 

@@ -75,14 +75,14 @@ def _text(path: Path) -> str:
     except FileNotFoundError:
         raise DeviceError(f"{path} does not exist: check the path.") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise DeviceError(f"{path} cannot be read as text: give a TOML file of devices, or remove it.") from error
+        raise DeviceError(f"{path} cannot be read as text. Give a TOML file of devices, or remove it.") from error
 
 
 def _check_new(added: Mapping[str, Design], known: Mapping[str, Design], source: object) -> None:
     twice = sorted(set(called(added.values())) & set(called(known.values())))
     if twice:
         raise DeviceError(
-            f"{source} names a device that the catalogue has already, {twice[0]}: give it another key and name."
+            f"{source} names a device that the catalogue already has, {twice[0]}. Give it another key and name."
         )
 
 

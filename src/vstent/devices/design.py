@@ -85,8 +85,8 @@ class Braid:
         for count, diameter_um in self.wires:
             if count % 2:
                 raise DeviceError(
-                    f"{self.name} has {count} wires of {diameter_um:g} um: half of them wind either way, so use an "
-                    "even number of each."
+                    f"{self.name} has {count} wires of {diameter_um:g} um, but half of the wires of each kind "
+                    "run either way. Give an even number."
                 )
         _check_sizes(self)
 
@@ -157,12 +157,12 @@ Design = Braid | LaserCut
 
 def _check_columns(name: str, n_columns: int) -> None:
     if n_columns < 6 or n_columns % 2:
-        raise DeviceError(f"{name} has {n_columns} wires or struts round: use an even number of at least 6.")
+        raise DeviceError(f"{name} has {n_columns} wires or struts around. Give an even number of at least 6.")
 
 
 def _check_angle(name: str, angle_rad: float) -> None:
     if not STEEP_RAD[0] < angle_rad < STEEP_RAD[1]:
-        raise DeviceError(f"{name} has an angle of {angle_rad:.3f} rad to the axis: give 0.1 to 1.5 rad.")
+        raise DeviceError(f"{name} has an angle of {angle_rad:.3f} rad to the axis. Give 0.1 to 1.5 rad.")
 
 
 def _check_sizes(design: Design) -> None:
@@ -171,14 +171,14 @@ def _check_sizes(design: Design) -> None:
         taken = strips_fraction(design, size, size.free_diameter_mm)
         if taken >= 1:
             raise DeviceError(
-                f"{design.name} {size.label} has no room for its wires or struts: side by side they take {taken:.1f} "
-                "times its circumference. Give fewer or thinner ones."
+                f"{design.name} {size.label} has no room for its wires or struts: side by side they take "
+                f"{taken:.1f} times its circumference. Give fewer or thinner ones."
             )
         spacing_mm = piece_length_mm(design, size) * float(np.cos(angle_rad(design, size, size.diameter_mm)))
         if size.length_mm < 2 * spacing_mm:
             raise DeviceError(
-                f"{design.name} {size.label} is shorter than two rows of its cells, {spacing_mm:.1f} mm apart: give a "
-                "longer size, or more wires or struts."
+                f"{design.name} {size.label} is shorter than two rows of its cells, which are {spacing_mm:.1f} "
+                "mm apart. Give a longer size, or more wires or struts."
             )
 
 

@@ -75,14 +75,14 @@ def compacted(design: Design, size: Size, fraction: float) -> Size:
         return size
     changed = replace(size, compaction_fraction=fraction)
     if not (isinstance(design, Braid) and np.sin(STEEP_RAD[0]) < free_sine(design, changed) < np.sin(STEEP_RAD[1])):
-        would = "its wires would stand too steep" if fraction > 0 else "its wires would be pulled straight"
+        would = "its wires would be too steep" if fraction > 0 else "its wires would be pulled straight"
         why, then = (
-            (would, "a part nearer to 0")
+            (would, "a fraction nearer to 0")
             if isinstance(design, Braid)
             else ("its cells are joined", "0, or another device")
         )
         raise DeviceError(
-            f"{design.name} {size.label} cannot be compacted by {fraction:g} of its length: {why}. Give {then}."
+            f"{design.name} {size.label} cannot be compacted by {fraction:g} of its length, because {why}. Give {then}."
         )
     return changed
 

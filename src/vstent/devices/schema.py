@@ -150,12 +150,14 @@ def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:
         raise DeviceError(f"{name} is not valid TOML: {error}. Correct that line.") from error
     except RecursionError:
         raise DeviceError(
-            f"{name} is nested too deeply to be a catalogue: give it the form of catalogue.toml."
+            f"{name} is nested too deeply to be a catalogue. Give it the form of catalogue.toml."
         ) from None
     designs = {entry.key: entry.design() for entry in found}
     words = called(designs.values())
     if len(designs) < len(found) or len(set(words)) < len(words):
-        raise DeviceError(f"{name} uses one key or name for two devices: give each its own.")
+        raise DeviceError(f"{name} uses one key or name for two devices. Give each its own.")
     if BARE in words:
-        raise DeviceError(f"{name} calls a device {BARE!r}, as the flow without a device is called: call it otherwise.")
+        raise DeviceError(
+            f"{name} names a device {BARE!r}, which is reserved for the flow without a device. Give it another name."
+        )
     return designs

@@ -1,4 +1,4 @@
-"""The device's nouns once it is in an artery: Landing, Stent, Deployment."""
+"""A device in an artery: the data classes `Landing`, `Stent` and `Deployment`."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,7 +28,9 @@ class Landing:
 
     def __post_init__(self) -> None:
         if self.anchor not in ANCHORS:
-            raise LandingError(f"A device cannot be landed by its {self.anchor!r}: choose one of {', '.join(ANCHORS)}.")
+            raise LandingError(
+                f"A device cannot be positioned by its {self.anchor!r}. Choose one of {', '.join(ANCHORS)}."
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
-"""Blood flow with and without a stent: a `FlowCase` in, a `FlowField` and its hemodynamic indices out.
+"""Compute blood flow with and without a stent: from a `FlowCase` to a `FlowField` and its hemodynamic indices.
 
-Open ``simulation.py`` first; the two engines live in ``lattice`` and ``openfoam``.
+Start reading in ``simulation.py``. The two engines are in the packages ``lattice`` and ``openfoam``.
 """
 
 from vstent.flow.case import Blood, FlowCase, FlowField, FlowSettings, Screen

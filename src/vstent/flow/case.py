@@ -1,4 +1,4 @@
-"""The nouns of blood flow: Blood, FlowSettings, Screen, FlowCase, FlowField."""
+"""Data classes of a flow computation: Blood, FlowSettings, Screen, FlowCase, FlowField."""
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -14,51 +14,58 @@ from vstent.kernels import voxels
 from vstent.kernels.arrays import Floats, Ints, freeze
 
 LATTICE: Final = "lattice_boltzmann"
-"""Name of the engine that vstent brings along."""
+"""Name of the embedded lattice-Boltzmann engine."""
 OPENFOAM: Final = "openfoam"
-"""Name of the engine that hands the flow to OpenFOAM, a program of its own."""
+"""Name of the engine that runs OpenFOAM, a separate program."""
 
 
 HIGH_SHEAR_VISCOSITY_PA_S: Final = 0.00345
-"""Viscosity that goes with the numbers of `CarreauYasuda`."""
+"""Viscosity at high shear rate, Pa s, that belongs to the default values of `CarreauYasuda` (Cho and Kensey 1991)."""
 
 
 @dataclass(frozen=True)
 class CarreauYasuda:
-    """Blood that thins with the shear rate g: mu = m + (m0 - m) (1 + (t g)^a)^((n - 1) / a), m being at high shear.
+    """Shear-thinning viscosity after Carreau and Yasuda.
 
-    Bird, Armstrong and Hassager 1987, Dynamics of Polymeric Liquids 1, eq. 4.1-8; values of blood, with m = 0.00345
-    Pa s, as Cho and Kensey 1991 (Biorheology 28, 241) fit them.
+    mu = m + (m0 - m) (1 + (t g)^a)^((n - 1) / a), where g is the shear rate and m the viscosity at high shear rate.
+
+    References
+    ----------
+    Bird, Armstrong and Hassager 1987, Dynamics of Polymeric Liquids 1, eq. 4.1-8.
+    Cho and Kensey 1991, Biorheology 28, 241: the default values, for blood with m = 0.00345 Pa s.
     """
 
     rest_viscosity_Pa_s: float = 0.056
-    """m0, viscosity at rest."""
+    """m0, viscosity at zero shear rate."""
     time_s: float = 1.902
-    """t."""
+    """t, time constant."""
     a: float = 1.25
-    """a."""
+    """a, exponent of the transition from m0 to m."""
     n: float = 0.22
-    """n."""
+    """n, power-law index."""
 
 
 @dataclass(frozen=True)
 class Blood:
-    """A fluid (design.md section 5: the paper's values), Newtonian unless its thinning is given."""
+    """Blood as a fluid: Newtonian unless a shear-thinning law is given.
+
+    The defaults are those of Zhong et al. 2016, Sci. Rep. 6:21724.
+    """
 
     density_kg_m3: float = 1060.0
     """Mass density."""
     viscosity_Pa_s: float = 0.004
-    """Dynamic viscosity; that at high shear where blood thins."""
+    """Dynamic viscosity; with a shear-thinning law, its value at high shear rate."""
     thinning: CarreauYasuda | None = None
-    """How the viscosity falls with the shear rate; None: it does not."""
+    """Shear-thinning law; None: Newtonian."""
 
     @property
     def kinematic_viscosity_m2_s(self) -> float:
-        """Viscosity divided by density."""
+        """Kinematic viscosity: dynamic viscosity divided by density."""
         return self.viscosity_Pa_s / self.density_kg_m3
 
     def viscosity_at_Pa_s(self, rate_per_s: Floats) -> Floats:
-        """Dynamic viscosity (n,) at shear rates (n,)."""
+        """Return the dynamic viscosity (n,) at shear rates (n,)."""
         law = self.thinning
         if law is None:
             return np.full_like(rate_per_s, self.viscosity_Pa_s)
@@ -68,22 +75,25 @@ class Blood:
 
 @dataclass(frozen=True)
 class Waveform:
-    """A periodic flow, as multiples of its mean: 1 + sum of a_k cos(k w t) + b_k sin(k w t), w = 2 pi / period."""
+    """A periodic flow rate as a Fourier series, in multiples of its mean.
+
+    q(t) / mean = 1 + sum over k of a_k cos(k w t) + b_k sin(k w t), with w = 2 pi / period.
+    """
 
     period_s: float
     """Length of a cycle."""
     cosine: tuple[float, ...]
-    """a_k, from k = 1."""
+    """a_k for k = 1, 2, ..."""
     sine: tuple[float, ...]
-    """b_k, from k = 1."""
+    """b_k for k = 1, 2, ..."""
 
     def factor(self, time_s: Floats) -> Floats:
-        """Flow over mean flow at times (t,)."""
+        """Return the flow rate divided by its mean (t,) at times (t,)."""
         angle = 2 * np.pi / self.period_s * np.multiply.outer(time_s, np.arange(1, len(self.cosine) + 1))
         return 1 + np.cos(angle) @ np.array(self.cosine) + np.sin(angle) @ np.array(self.sine)
 
     def curvature_per_s2(self, time_s: Floats) -> Floats:
-        """Second time derivative (t,) of the flow over the mean flow."""
+        """Return the second time derivative (t,) of `factor` at times (t,)."""
         rate_per_s = 2 * np.pi / self.period_s * np.arange(1, len(self.cosine) + 1)
         harmonics = replace(self, cosine=tuple(rate_per_s**2 * self.cosine), sine=tuple(rate_per_s**2 * self.sine))
         return 1 - harmonics.factor(time_s)
@@ -91,73 +101,77 @@ class Waveform:
 
 @dataclass(frozen=True)
 class FlowSettings:
-    """How the flow is to be computed."""
+    """Settings of a flow computation."""
 
     inflow_mL_s: float | None = None
-    """Mean flow through all inlets; None: 0.27 m/s times the area of each."""
+    """Mean flow rate through all inlets together; None: 0.27 m/s times the area of each inlet."""
     blood: Blood = field(default_factory=Blood)
     """The fluid."""
     waveform: Waveform | None = None
-    """The pulse; None: steady flow at the mean."""
+    """Inflow waveform; None: steady inflow at the mean."""
     max_cycles: int = 4
-    """Most cycles of pulsatile flow."""
+    """Maximum number of cycles of a pulsatile flow."""
     cycle_tolerance: float = 0.02
-    """Pulsatile flow has converged when a cycle differs by less than this from the one before."""
+    """A pulsatile flow has converged when two consecutive cycles differ by less than this fraction (root mean
+    square)."""
     outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
-    """Zero pressure at every outlet, or the flow split as radius cubed (Murray 1926, PNAS 12, 207)."""
+    """Zero pressure at every outlet, or outflow in proportion to radius cubed (Murray 1926, PNAS 12, 207)."""
     cell_size_mm: float | None = None
-    """Edge of a grid cell; None: `cells_per_diameter` across the vessel, but no more than `cell_budget` cells."""
+    """Grid spacing; None: `cells_per_diameter` cells across the vessel, but at most `cell_budget` cells in all."""
     close_up: bool = False
-    """Whether cells are of that size only in the sac and near it (`lattice.close_up`), twice as wide elsewhere."""
+    """Whether to use this grid spacing only in and near the sac, and twice it elsewhere (see `lattice.close_up`)."""
     cells_per_diameter: float = 29.0
-    """Cells across the vessel's mean (hydraulic) diameter 4 V / A, where no cell size is given."""
+    """Number of cells across the mean (hydraulic) diameter 4 V / A of the vessel, where no grid spacing is given."""
     cell_budget: float = 480_000.0
-    """Most cells of the vessel, where no cell size is given."""
+    """Maximum number of cells in the vessel, where no grid spacing is given."""
     tolerance: float = 0.01
-    """Converged when every monitored quantity has less than this fraction of itself left to go, and the sac's velocity
-    less than twice that (root mean square); where they swing, when the standard error of every mean is less."""
+    """A flow has converged when every monitored quantity is expected to change by less than this fraction of itself,
+    and the velocity in the sac by less than twice this fraction (root mean square). An unsteady flow has converged
+    when the standard error of every time average is smaller than this fraction."""
     max_steps: int = 96_000
-    """Most time steps of a steady flow on the fine grid; a close-up makes a sixth of them, what surrounds it half."""
+    """Maximum number of time steps of a steady flow on the fine grid. With `close_up`, the refined part makes at
+    most a sixth of them and the surrounding flow at most half."""
     lattice_speed: float = 0.15
-    """Peak speed in cells per time step: sets the time step, a third longer in a steady close-up. Of steady flow the
-    grid's error, not the time step's, is what it changes, through the relaxation times."""
+    """Peak speed in cells per time step. It sets the time step, which is a third longer in a steady refined sac
+    (`close_up`). In steady flow it affects the result through the relaxation times, that is through the spatial
+    error, not through the error in time."""
     engine: str = LATTICE
-    """What computes the flow: ``lattice_boltzmann``, ``openfoam``, or the name of a plug-in (`vstent.plugins`)."""
+    """Flow engine: ``lattice_boltzmann``, ``openfoam``, or the name of a plug-in (`vstent.plugins`)."""
     processes: int = 1
-    """Processes on this machine, for OpenFOAM."""
+    """Number of processes on this machine (OpenFOAM only)."""
     device_gpu: bool = False
-    """Whether vstent's own engine computes on a GPU (the extra ``gpu``): results differ in the last bits."""
+    """Whether the embedded engine computes on a GPU (needs the extra ``gpu``); results differ in the last bits."""
 
     @property
     def settled_below(self) -> float:
-        """What the residual has to fall below."""
+        """Residual below which the flow has converged."""
         return self.tolerance if self.waveform is None else self.cycle_tolerance
 
     def inflow_factor(self, time_s: Floats) -> Floats:
-        """Inflow over mean inflow at times (t,)."""
+        """Return the inflow divided by its mean (t,) at times (t,)."""
         return np.ones(len(time_s)) if self.waveform is None else self.waveform.factor(time_s)
 
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """A stent as a thin resistance on the surface that its wires span."""
+    """A stent as a thin porous screen: a flow resistance on the surface that its wires span."""
 
     points_mm: Floats
     """(p, 3) sample points, dense on the surface."""
     normals: Floats
     """(p, 3) unit normals of the surface."""
     area_mm2: Floats
-    """(p,) area that each sample stands for."""
+    """(p,) surface area that each sample represents."""
     normal_resistance_Pa_s_m: Floats
     """(p,) pressure drop per normal velocity, Pa/(m/s)."""
     tangential_resistance_Pa_s_m: Floats
     """(p,) shear stress per tangential velocity, Pa/(m/s)."""
     inertial_loss: Floats
-    """(p,) K of the pressure drop K rho |u| u_n / 2, and of the shear stress K rho |u| u_t / 4."""
+    """(p,) coefficient K of the pressure drop K rho |u| u_n / 2 and of the shear stress K rho |u| u_t / 4."""
     wire_diameter_mm: Floats
-    """(p,) diameter of the wire that the sample is of."""
+    """(p,) diameter of the wire at the sample."""
     spacing_mm: Floats
-    """(p,) how far such wires lie apart; as far as they are thick in a sheet without gaps."""
+    """(p,) distance between neighbouring wires; equal to the wire diameter in a sheet without gaps."""
 
     def __post_init__(self) -> None:
         freeze(self, "points_mm", np.float64, (-1, 3))
@@ -168,20 +182,20 @@ class Screen:
 
 @dataclass(frozen=True, eq=False)
 class FlowCase:
-    """One flow to compute."""
+    """One flow problem: geometry, device and settings."""
 
     vessel: Vessel
-    """What blood flows through."""
+    """The vessel that the blood flows through."""
     sac: Surface | None = None
-    """The closed sac, for its indices and for judging convergence."""
+    """Closed surface of the sac, for its indices and for judging convergence."""
     ostium: Surface | None = None
-    """What blood crosses between artery and sac, its normals into the sac."""
+    """Surface through which blood passes between artery and sac, with normals into the sac."""
     screen: Screen | None = None
-    """The stent as a resistance, or None."""
+    """The stent as a porous screen, or None."""
     stent: Stent | None = None
     """The stent's wires over necks and ostia, for engines that resolve them, or None."""
     settings: FlowSettings = field(default_factory=FlowSettings)
-    """How to compute it."""
+    """Settings of the computation."""
 
     @property
     def blood(self) -> Blood:
@@ -190,7 +204,7 @@ class FlowCase:
 
     @property
     def inlets_mL_s(self) -> Floats:
-        """(i,) mean flow through each inlet: Murray's part of the one set, or 0.27 m/s times its area (design.md)."""
+        """Mean flow rate (i,) of each inlet: its Murray share of the given inflow, or 0.27 m/s times its area."""
         inlets = self.vessel.inlets
         if self.settings.inflow_mL_s is not None:
             return self.settings.inflow_mL_s * murray_shares(inlets)
@@ -198,17 +212,20 @@ class FlowCase:
 
     @property
     def inlet_speeds_m_s(self) -> Floats:
-        """(i,) mean speed in each inlet."""
+        """Mean speed (i,) in each inlet."""
         return self.inlets_mL_s / np.array([inlet.area_mm2 for inlet in self.vessel.inlets])
 
     @property
     def inflow_mL_s(self) -> float:
-        """Mean flow through all inlets."""
+        """Mean flow rate through all inlets together."""
         return float(self.inlets_mL_s.sum())
 
     @property
     def held_mL_s(self) -> Floats:
-        """(k,) mean flow that each outlet is held to by Murray's law; nan at zero pressure: the widest, or all."""
+        """Mean flow rate (k,) prescribed at each outlet by Murray's law; nan where the pressure is zero instead.
+
+        With Murray's law only the widest outlet has zero pressure, otherwise all outlets.
+        """
         outlets = self.vessel.outlets
         held = self.inflow_mL_s * murray_shares(outlets)
         held[: 1 if self.settings.outlets == "murray" else len(outlets)] = np.nan
@@ -216,31 +233,31 @@ class FlowCase:
 
 
 MEAN_INLET_SPEED_M_S = 0.27
-"""Mean speed in an internal carotid artery (design.md section 5)."""
+"""Default mean speed in an inlet, m/s, for an internal carotid artery."""
 
 
 PHASES = 20
-"""Moments at which a cycle is kept."""
+"""Number of equally spaced moments at which a cycle is stored."""
 
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """A moment of a pulsatile flow."""
+    """One moment of a pulsatile flow."""
 
     time_s: float
-    """Time since the waveform's beginning."""
+    """Time since the start of the waveform."""
     inlets_mL_s: Floats
-    """(i,) flow in through each inlet."""
+    """(i,) flow rate in through each inlet."""
     outlets_mL_s: Floats
-    """(k,) flow out through each outlet."""
+    """(k,) flow rate out through each outlet."""
     velocity_m_s: Floats
     """(n, 3) velocity at the cell centres."""
     pressure_Pa: Floats
     """(n,) pressure at the cell centres."""
     wall_shear_stress_Pa: Floats
-    """(v, 3) at the lumen's vertices."""
+    """(v, 3) wall shear stress at the lumen's vertices."""
     neck_inflow_mL_s: float | None = None
-    """Into the sac, as `FlowField` has it."""
+    """Neck inflow at this moment, or None (see `FlowField.neck_inflow_mL_s`)."""
 
     def __post_init__(self) -> None:
         freeze(self, "inlets_mL_s", np.float64, (-1,))
@@ -251,18 +268,18 @@ class Phase:
 
     @property
     def inflow_mL_s(self) -> float:
-        """Flow in through all inlets."""
+        """Flow rate in through all inlets together."""
         return float(self.inlets_mL_s.sum())
 
 
 @dataclass(frozen=True, eq=False)
 class Swing:
-    """What the mean of a steady flow that moves does not tell: what goes to and fro cancels in it."""
+    """Mean magnitudes of an unsteady flow at constant inflow; the mean vectors alone miss oscillations that cancel."""
 
     speed_m_s: Floats
-    """(n,) mean speed at the cell centres."""
+    """(n,) time-averaged speed at the cell centres."""
     shear_Pa: Floats
-    """(v,) mean magnitude of the wall shear stress at the lumen's vertices."""
+    """(v,) time-averaged magnitude of the wall shear stress at the lumen's vertices."""
 
     def __post_init__(self) -> None:
         freeze(self, "speed_m_s", np.float64, (-1,))
@@ -271,57 +288,59 @@ class Swing:
 
 @dataclass(frozen=True, eq=False)
 class FlowField:
-    """A computed flow and how it was reached: steady, or the mean of one that swings or pulses."""
+    """A computed flow and its convergence: a steady state, or the time average of an unsteady or pulsatile flow."""
 
     cells: Ints
     """(n, 3) integer grid coordinates of the blood cells, sorted."""
     origin_mm: Floats
     """(3,) centre of the cell (0, 0, 0)."""
     cell_size_mm: float
-    """Edge of a cell."""
+    """Grid spacing."""
     velocity_m_s: Floats
     """(n, 3) velocity at the cell centres."""
     pressure_Pa: Floats
-    """(n,) pressure above that of the outlets."""
+    """(n,) pressure at the cell centres, relative to the outlets."""
     wall: Surface
     """The lumen."""
     wall_shear_stress_Pa: Floats
-    """(v, 3) traction of the flow along the wall at the lumen's vertices."""
+    """(v, 3) tangential traction of the flow on the wall at the lumen's vertices."""
     wall_pressure_Pa: Floats
     """(v,) pressure at the lumen's vertices."""
     inlets_mL_s: Floats
-    """(i,) flow in through each inlet."""
+    """(i,) flow rate in through each inlet."""
     outlets_mL_s: Floats
-    """(k,) flow out through each outlet."""
+    """(k,) flow rate out through each outlet."""
     inlet_pressure_Pa: Floats
-    """(i,) mean pressure on each inlet's section."""
+    """(i,) mean pressure over each inlet's section."""
     outlet_pressure_Pa: Floats
-    """(k,) mean pressure on each outlet's section."""
+    """(k,) mean pressure over each outlet's section."""
     blood: Blood
     """The fluid."""
     is_converged: bool
-    """Whether every monitored quantity, or the mean that it swings about, has settled to within the tolerance."""
+    """Whether every monitored quantity, or its time average in an unsteady flow, is known to within the tolerance."""
     unsettled_fraction: float
-    """What any monitored quantity has left to go at most, as a fraction of it. Where it swings, three standard errors
-    of its mean; after too few checks to tell, what it ranges over, or how far its mean has moved, if that is more. Of a
-    pulse, what its last two cycles differ by (rms); inf where there is a single one."""
+    """Largest remaining error of convergence of any monitored quantity, as a fraction of it. Steady flow: the change
+    still expected. Unsteady flow: three standard errors of the time average; with too few checks for that, the range
+    of the quantity or the shift of its mean, whichever is larger. Pulsatile flow: the root-mean-square difference of
+    the last two cycles, inf after a single cycle."""
     advice: str
-    """One plain sentence: what to know or do about this result."""
+    """One sentence for the user: the state of convergence and what to do about it."""
     residual: Floats
-    """(r,) largest fraction that any monitored quantity has left to go, at every check."""
+    """(r,) largest expected remaining change of any monitored quantity at every check, as a fraction."""
     steps: int
-    """Time steps made, on the finest grid."""
+    """Number of time steps on the finest grid."""
     seconds: float
-    """Wall time."""
+    """Run time (wall clock)."""
     updates_per_s: float
-    """Cell updates per second, the finest grid's loop alone."""
+    """Cell updates per second in the main loop on the finest grid."""
     phases: tuple[Phase, ...] = ()
-    """The last cycle of a pulsatile flow, at equal times; empty for a steady one."""
+    """The last cycle of a pulsatile flow at equally spaced times; empty for a steady flow."""
     swing: Swing | None = None
-    """Of a steady flow that moves about its mean; None of any other."""
+    """Mean magnitudes of an unsteady flow at constant inflow; None for any other flow."""
     neck_inflow_mL_s: float | None = None
-    """Into the sac, where these cells do not tell it: the mean where the flow moves, and what a mesh with cells finer
-    than these about wires lets through (0 where there is no neck). None: as they tell."""
+    """Neck inflow where it cannot be computed from this field: the time average of an unsteady flow, or the value
+    from an OpenFOAM mesh that is finer around the wires than this grid (0 where there is no neck). None: it is
+    computed from the field."""
 
     def __post_init__(self) -> None:
         freeze(self, "cells", np.int32, (-1, 3))
@@ -339,27 +358,27 @@ class FlowField:
 
     @property
     def inflow_mL_s(self) -> float:
-        """Flow in through all inlets."""
+        """Flow rate in through all inlets together."""
         return float(self.inlets_mL_s.sum())
 
     @cached_property
     def centers_mm(self) -> Floats:
-        """(n, 3) cell centres."""
+        """Cell centres (n, 3)."""
         return self.origin_mm + self.cells * self.cell_size_mm
 
     @cached_property
     def speed_m_s(self) -> Floats:
-        """(n,) magnitude of the velocity; its mean where a steady flow moves."""
+        """Magnitude (n,) of the velocity; its time average in an unsteady flow at constant inflow."""
         return np.linalg.norm(self.velocity_m_s, axis=1) if self.swing is None else self.swing.speed_m_s
 
     @cached_property
     def index(self) -> Ints:
-        """(i, j, k) number of the cell at every grid point, -1 outside the blood."""
+        """Index of the cell at every grid point (i, j, k), -1 outside the blood."""
         return voxels.index_of(self.cells)
 
     @cached_property
     def shear_Pa(self) -> Floats:
-        """(v,) magnitude of the wall shear stress; its time average (TAWSS) where the flow pulses or moves."""
+        """Magnitude (v,) of the wall shear stress; its time average (TAWSS) in an unsteady or pulsatile flow."""
         if self.swing is not None:
             return self.swing.shear_Pa
         moments = self.phases or (self,)
@@ -367,16 +386,22 @@ class FlowField:
 
     @cached_property
     def oscillatory_shear_index(self) -> Floats:
-        """(v,) (1 - norm(mean stress) / mean norm) / 2 (He and Ku 1996, J. Biomech. Eng. 118, 74); 0 in steady flow."""
+        """Oscillatory shear index (v,), 0 in steady flow.
+
+        OSI = (1 - norm(mean stress) / mean norm) / 2 (He and Ku 1996, J. Biomech. Eng. 118, 74).
+        """
         return 0.5 * (1 - np.linalg.norm(self.wall_shear_stress_Pa, axis=1) / np.maximum(self.shear_Pa, 1e-12))
 
     @cached_property
     def relative_residence_time_per_Pa(self) -> Floats:
-        """(v,) 1 / ((1 - 2 OSI) TAWSS) (Himburg et al. 2004, Am. J. Physiol. Heart 286, H1916)."""
+        """Relative residence time (v,).
+
+        RRT = 1 / ((1 - 2 OSI) TAWSS) (Himburg et al. 2004, Am. J. Physiol. Heart 286, H1916).
+        """
         return 1 / np.maximum((1 - 2 * self.oscillatory_shear_index) * self.shear_Pa, 1e-12)
 
     def at_phase(self, phase: Phase) -> "FlowField":
-        """The flow at a moment of the cycle."""
+        """Return the flow at one moment of the cycle."""
         return replace(
             self,
             velocity_m_s=phase.velocity_m_s,

@@ -1,4 +1,4 @@
-"""How much a flow's numbers depend on the grid, on the time step and on how the vessel lies: three of each."""
+"""Sensitivity of the results to grid spacing, time step and position on the grid, from three computations of each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,54 +14,62 @@ from vstent.flow.positions import POSITIONS, Scatter, scatter, turned
 from vstent.flow.simulation import engine_class, simulate_case
 
 RATIO: Final = 2**0.5
-"""From one grid, or time step, to the next finer one."""
+"""Refinement ratio from one grid spacing, or time step, to the next."""
 TOLERANCE: Final = 0.002
-"""Flows settle to within this, so that the grid's part of a difference is not hidden."""
+"""Convergence tolerance of every run in the study: small enough not to hide the differences between grids."""
 SAFETY: Final = 1.25
-"""Factor on the difference to the extrapolated value (Roache 1994, J. Fluids Eng. 116, 405: three grids)."""
+"""Safety factor on the difference to the extrapolated value (Roache 1994, J. Fluids Eng. 116, 405, for three grids)."""
 ORDERS: Final = (0.5, 2.0)
-"""Observed orders outside are drawn to the nearer of these when extrapolating (as Celik et al. 2008 advise, J. Fluids
-Eng. 130, 078001): an order above the scheme's own is chance."""
+"""Lower and upper bound of the order used for extrapolation. An observed order outside is replaced by the nearer
+bound, because an order above that of the scheme is a coincidence (Celik et al. 2008, J. Fluids Eng. 130, 078001)."""
 
 
 @dataclass(frozen=True)
 class Convergence:
-    """One quantity on three grids, or with three time steps."""
+    """One quantity computed on three grids, or with three time steps."""
 
     values: tuple[float, float, float]
-    """From coarse to fine."""
+    """Values from the coarsest to the finest."""
     order: float | None
-    """Observed order; None where the three values do not go one way."""
+    """Observed order of convergence; None where the three values are not monotonic."""
     extrapolated: float | None
-    """Value at size zero (Richardson 1911, Phil. Trans. A 210, 307); None without an order."""
+    """Value extrapolated to size zero (Richardson 1911, Phil. Trans. A 210, 307); None without an order."""
     uncertainty_fraction: float
     """Estimated error of the finest value, as a fraction of it (grid convergence index; Roache 1994)."""
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """One size made smaller twice."""
+    """Results of refining one setting twice."""
 
     name: str
-    """``cell_size_mm``, or ``lattice_speed`` (proportional to the time step)."""
+    """Name of the setting: ``cell_size_mm``, or ``lattice_speed`` (proportional to the time step)."""
     sizes: tuple[float, float, float]
-    """From coarse to fine."""
+    """Values of the setting from the coarsest to the finest."""
     quantities: dict[str, Convergence]
-    """By the name of the index."""
+    """Convergence of each index, by its name."""
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What a flow's numbers depend on that is not physics."""
+    """Dependence of the results on numerical settings."""
 
     refinements: tuple[Refinement, ...]
-    """The cells first, then what else the engine can make smaller."""
+    """Refinement of the grid spacing first, then of the engine's other settings."""
     positions: dict[str, Scatter]
-    """The same flow with the vessel lying otherwise on the grid, by the name of the index."""
+    """Scatter of each index, by its name, when the vessel is rotated on the grid."""
 
 
 def observed(values: tuple[float, float, float], ratio: float = RATIO) -> Convergence:
-    """Order, extrapolated value and uncertainty from values on three grids, each `ratio` finer than the one before."""
+    """Return observed order, extrapolated value and uncertainty from three values.
+
+    Parameters
+    ----------
+    values : tuple of 3 float
+        Values from the coarsest to the finest grid.
+    ratio : float
+        Refinement ratio between consecutive grids.
+    """
     coarse, middle, fine = values
     before, last = middle - coarse, fine - middle
     scale = max(abs(fine), 1e-300)
@@ -79,18 +87,23 @@ def convergence(
     folder: Path | None = None,
     told: Callable[[float, str], None] = lambda fraction, sentence: None,
 ) -> Sensitivity:
-    """Compute a flow on three grids; on the middle one, with all other sizes made smaller twice and in other positions.
+    """Compute a flow with three grid spacings, three values of every other numerical setting, and in three positions.
+
+    All runs but those with another grid spacing use the middle one.
 
     Parameters
     ----------
-    case : its cell size is the finest.
-    folder : where the engine may keep files of its own, a folder in it for every flow.
-    told : told of every flow computed, with the fraction of all that is done.
+    case : FlowCase
+        The flow; its grid spacing is the finest.
+    folder : Path, optional
+        Folder for files of the engine, with a subfolder for every run.
+    told : callable
+        Called after every run with the completed fraction of the study and a sentence on the run.
 
     Raises
     ------
     FlowError
-        When a flow cannot be computed.
+        A flow cannot be computed.
     """
     cell_size, *others = engine_class(case.settings).refined_by
     runs = _Runs(case, folder, told, 3 + 2 * len(others) + len(POSITIONS) - 1, [])
@@ -106,17 +119,17 @@ def convergence(
 
 @dataclass(frozen=True, eq=False)
 class _Runs:
-    """All flows of one case."""
+    """All runs of one case, and a record of those that are done."""
 
     case: FlowCase
     folder: Path | None
     told: Callable[[float, str], None]
     count: int
-    """Flows that there will be."""
+    """Total number of runs planned."""
     done: list[FlowField]
 
     def refine(self, name: str, coarsest: float, settings: FlowSettings, known: FlowField | None) -> Refinement:
-        """Make one setting smaller twice; `known` is the flow with the coarsest, where there is one already."""
+        """Compute the flow with a setting at three sizes; `known` is the flow at the coarsest size, if available."""
         sizes = (coarsest, coarsest / RATIO, coarsest / RATIO**2)
         fields = [] if known is None else [known]
         for size in sizes[len(fields) :]:
@@ -126,7 +139,7 @@ class _Runs:
         return Refinement(name, sizes, _compared(self.case, fields))
 
     def turn(self, settings: FlowSettings, known: FlowField) -> dict[str, Scatter]:
-        """Lay the vessel on the grid in other ways; `known` is the flow as it lies."""
+        """Compute the flow with the vessel rotated on the grid; `known` is the flow in the original position."""
         case = replace(self.case, settings=settings)
         found = [indices(known, case.sac, case.ostium)]
         for name, turn in list(POSITIONS.items())[1:]:
@@ -135,21 +148,24 @@ class _Runs:
         return {key: scatter(tuple(float(one[key]) for one in found)) for key in QUANTITIES if key in found[0]}
 
     def _flow(self, case: FlowCase, name: str, start: FlowField | None) -> FlowField:
+        """Compute one flow, record it and report it."""
         own = None if self.folder is None else self.folder / name
-        # A stented flow takes its start for the bare one.
+        # With a screen, `start` would be taken for the flow without a device.
         field = simulate_case(case, start=start if case.screen is None else None, folder=own)
         self.done.append(field)
-        said = f"{name}: {len(field.cells)} cells, {field.steps} steps in {field.seconds:.0f} s."
+        said = f"{name}: {len(field.cells)} cells, {field.steps} time steps, run time {field.seconds:.0f} s."
         self.told(len(self.done) / self.count, said)
         return field
 
 
 def _changed(settings: FlowSettings, name: str, size: float) -> FlowSettings:
+    """Return the settings with one of them set to `size`."""
     values: dict[str, Any] = {name: size}
     return replace(settings, **values)
 
 
 def _compared(case: FlowCase, fields: list[FlowField]) -> dict[str, Convergence]:
+    """Return the convergence of every index from three fields, coarse to fine."""
     coarse, middle, fine = (indices(field, case.sac, case.ostium) for field in fields)
     keys = [key for key in QUANTITIES if key in fine]
     return {key: observed((float(coarse[key]), float(middle[key]), float(fine[key]))) for key in keys}

@@ -1,4 +1,4 @@
-"""Pulsatile flow: the waveform of a case, and whether its cycles repeat."""
+"""Cycle-to-cycle convergence of pulsatile flow."""
 
 from typing import Final
 
@@ -9,14 +9,22 @@ from vstent.flow.case import PHASES, FlowCase, Waveform
 from vstent.kernels.arrays import Floats
 
 STALLED: Final = 0.8
-"""Where a cycle's change is more than this part of the last one's, further cycles will not become alike."""
+"""If a cycle's change is more than this fraction of the previous one's, further cycles are not expected to converge."""
 
 
 def cycle_change(history: Floats) -> float:
-    """Largest root-mean-square change of any column of a history (phases, quantities) between its last two cycles.
+    """Return the largest relative change of any monitored quantity between the last two cycles.
 
-    Relative to the quantity's root mean square; inf where no cycle ends or no two are complete; nan where the history
-    is not finite.
+    Parameters
+    ----------
+    history : (phases, quantities) float
+        Monitored quantities at every stored phase.
+
+    Returns
+    -------
+    float
+        Root-mean-square change over the quantity's root mean square. inf between the ends of cycles or before two
+        cycles are complete; nan when the history is not finite.
     """
     if not np.isfinite(history[-1]).all():
         return float("nan")
@@ -29,28 +37,38 @@ def cycle_change(history: Floats) -> float:
 
 
 def cycles_advice(changes: Floats, cycles: int, *, is_converged: bool) -> str:
-    """Say what the changes (c,) from cycle to cycle, as fractions, mean for the result."""
+    """Describe the convergence of the cycles and what to do about it.
+
+    Parameters
+    ----------
+    changes : (c,) float
+        Changes between consecutive cycles, as fractions.
+    cycles : int
+        Number of the last cycle.
+    is_converged : bool
+        Whether the last change is below the tolerance.
+    """
     if len(changes) == 0:
-        return "A single cycle was computed: allow two, to see whether it repeats."
-    said = f"Cycle {cycles} repeats the one before to within {100 * changes[-1]:.1f} %"
+        return "Only a single cycle was computed: allow at least two to check that the flow is periodic."
+    said = f"Cycle {cycles} differs from the previous one by {100 * changes[-1]:.1f} %"
     if is_converged:
-        return f"{said}: the flow is periodic."
+        return f"{said}: the flow has converged to a periodic state."
     if len(changes) > 1 and changes[-1] > STALLED * changes[-2]:
         return (
-            f"{said}, no better than that one did ({100 * changes[-2]:.1f} %): vortices differ from cycle to cycle, "
-            "and more cycles will not make them alike."
+            f"{said}, hardly less than the change before ({100 * changes[-2]:.1f} %): the vortices differ from cycle "
+            "to cycle, and more cycles will not reduce the difference."
         )
-    return f"{said}, which is more than was asked for: allow more cycles, or take it as it is."
+    return f"{said}, more than the tolerance: allow more cycles, or accept this difference."
 
 
 def pulse_of(case: FlowCase) -> Waveform:
-    """Return the pulse of a case.
+    """Return the waveform of a case.
 
     Raises
     ------
     FlowError
-        When it has none.
+        The case has no waveform.
     """
     if case.settings.waveform is None:
-        raise FlowError("pulsatile flow needs a waveform: set one, or compute the steady flow")
+        raise FlowError("pulsatile flow needs an inflow waveform: set one, or compute steady flow")
     return case.settings.waveform

@@ -1,4 +1,4 @@
-"""The blood's domain: the lumen with straight extensions on a regular grid, and every link that leaves it."""
+"""The computational domain: the lumen with straight extensions on a regular grid, and its boundary links."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,53 +18,56 @@ from vstent.kernels.directions import VELOCITIES
 from vstent.units import M_PER_MM, place
 
 INLET_EXTENSION = 0.5
-"""Length of the straight tube before an inlet, in its diameters: the imposed profile is developed already."""
+"""Length of the straight extension of an inlet, in inlet diameters. Short, because the prescribed profile is already
+developed."""
 OUTLET_EXTENSION = 1.5
-"""Length of the straight tube behind an outlet, in outlet diameters: swirl and backflow decay in it."""
+"""Length of the straight extension of an outlet, in outlet diameters: swirl and backflow decay in it."""
 MIN_CELLS = 2_000
-"""Fewer cells than this are no vessel."""
+"""Minimum number of cells of a vessel."""
 BRANCH_CELLS = 6.0
-"""Cells across that a branch needs: tubes at an angle to the grid resist 2 to 70 % more than they should with six
-(Re 10 to 340), 10 to 310 % with four, 1.4 to 15 times as much with three."""
+"""Number of cells across that a branch needs. Tubes at an angle to the grid have 2 to 70 % too much resistance with
+six cells across (Re 10 to 340), 10 to 310 % with four, and 1.4 to 15 times the right one with three."""
 WALL = 0
-"""Patch number of the wall; opening k has k + 1."""
+"""Patch number of the wall; opening k has patch number k + 1."""
 BEYOND = -1
-"""Patch number of blood outside a window."""
+"""Patch number where the blood continues outside a window."""
 BACK_TO_BACK = -0.5
-"""Largest cosine between the normals of two walls that part two blood cells: a corner that a link clips parts nothing,
-and blood sent back there turns a jet that leaves its edge (13 links, 3 % of the peak in the FDA's nozzle)."""
+"""Largest cosine between the normals of two walls that separate two blood cells. A corner that a link only clips
+does not separate them: bounce-back there would deflect a jet that leaves the edge (13 links, 3 % of the peak
+velocity in the FDA nozzle)."""
 
 
 class CoarseGridError(FlowError):
-    """The grid is too coarse to hold what is to be computed."""
+    """The grid is too coarse for the vessel."""
 
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """Blood cells and the links that leave them."""
+    """Blood cells of a regular grid and the links that leave them."""
 
     cell_size_mm: float
-    """Edge of a cell."""
+    """Grid spacing."""
     origin_mm: Floats
     """(3,) centre of the cell (0, 0, 0)."""
     cells: Ints
-    """(n, 3) integer coordinates, sorted; a margin of one cell is free all round."""
+    """(n, 3) integer coordinates, sorted; the outermost layer of the grid contains no blood."""
     link_cell: Ints
-    """(l,) cell that each link leaves."""
+    """(l,) index of the cell that each link leaves."""
     link_direction: Ints
-    """(l,) lattice velocity along which it leaves."""
+    """(l,) index of the lattice velocity along the link."""
     link_fraction: Floats
-    """(l,) where it meets the surface, as a fraction of the link."""
+    """(l,) position where the link meets the surface, as a fraction of its length."""
     link_patch: Ints
-    """(l,) what it meets: 0 the wall, k + 1 opening k; in a part of a vessel, more where blood goes on beyond it."""
+    """(l,) patch that the link meets: 0 wall, k + 1 opening k; in a window other numbers where the blood continues
+    beyond it."""
     septum_cell: Ints
-    """(s,) blood cell on one side of a wall thinner than a cell, whose neighbour is blood too."""
+    """(s,) blood cell on one side of a wall thinner than a cell, with a blood cell on the other side."""
     septum_direction: Ints
-    """(s,) lattice velocity towards the other side; every pair stands here once."""
+    """(s,) index of the lattice velocity towards the other side; every pair is listed once."""
     surface: Surface
-    """The lumen with its extensions, closed."""
+    """Closed surface of the lumen with its extensions."""
     sections: tuple[Floats, ...]
-    """(k, 3) polygon of every opening at the end of its extension, mm."""
+    """For every opening the polygon (k, 3) at the end of its extension, in mm."""
 
     def __post_init__(self) -> None:
         freeze(self, "origin_mm", np.float64, (3,))
@@ -78,34 +81,35 @@ class Domain:
 
     @cached_property
     def centers_mm(self) -> Floats:
-        """(n, 3) cell centres."""
+        """Cell centres (n, 3)."""
         return self.origin_mm + self.cells * self.cell_size_mm
 
     @cached_property
     def index(self) -> Ints:
-        """(i, j, k) number of the cell at every grid point, -1 outside the blood."""
+        """Index of the cell at every grid point (i, j, k), -1 outside the blood."""
         return voxels.index_of(self.cells)
 
     @cached_property
     def depth_mm(self) -> Floats:
-        """(n,) distance of every cell from the surface."""
+        """Distance (n,) of every cell centre from the surface."""
         return self.surface.closest(self.centers_mm)[1]
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A part of the space to look for blood in."""
+    """A part of space to which the domain is restricted."""
 
     origin_mm: Floats
     """(3,) centre of the cell (0, 0, 0)."""
     mask: Bools
-    """(i, j, k) cells that belong to it; none at the border."""
+    """(i, j, k) cells that belong to the window; none on the border of the grid."""
 
 
 def too_narrow(case: FlowCase, cell_size_mm: float) -> str:
-    """Say which outlets take too little blood, being too narrow for cells of this size; nothing where none is.
+    """Return a warning about outlets too narrow for the grid spacing, or an empty string.
 
-    Where there is one outlet, or the split is given, what it takes does not hang on what it resists.
+    Such outlets carry too little flow. There is no warning for a single outlet or a prescribed split, where the flow
+    does not depend on the branch's resistance.
     """
     outlets = case.vessel.outlets
     narrow = [outlet for outlet in outlets if outlet.diameter_mm < BRANCH_CELLS * cell_size_mm]
@@ -115,46 +119,54 @@ def too_narrow(case: FlowCase, cell_size_mm: float) -> str:
         f"{outlet.role} ({outlet.diameter_mm:.2g} mm) has {outlet.diameter_mm / cell_size_mm:.1f}" for outlet in narrow
     )
     return (
-        f" Of cells of {cell_size_mm:.3g} mm, {named} across: with fewer than {BRANCH_CELLS:.0f} a branch resists too "
-        "much and takes too little blood; set a smaller cell size, or split the flow by Murray's law."
+        f" Under-resolved branches: at a grid spacing of {cell_size_mm:.3g} mm, {named} cells across. With fewer than "
+        f"{BRANCH_CELLS:.0f} a branch has too much resistance and carries too little flow: use a finer grid spacing, "
+        "or split the outflow by Murray's law."
     )
 
 
 def unreached(vessel: Vessel, grid: Domain) -> str:
-    """Say which outlets no cell of a whole vessel's grid reaches; nothing where there is none."""
+    """Return a warning about outlets that no cell of a whole vessel's grid reaches, or an empty string."""
     closed = [opening for opening in _unlinked(vessel, grid.link_patch) if not opening.is_inlet]
     if not closed:
         return ""
     named = ", ".join(f"{outlet.role} ({outlet.diameter_mm:.2g} mm)" for outlet in closed)
-    return f" No cell of {grid.cell_size_mm:.3g} mm reaches {named}, where no blood leaves: set a smaller cell size."
+    return (
+        f" At a grid spacing of {grid.cell_size_mm:.3g} mm no cell reaches {named}, so no blood leaves there: use a "
+        "finer grid spacing."
+    )
 
 
 def _unlinked(vessel: Vessel, link_patch: Ints) -> list[Opening]:
-    """Openings that no link of a whole vessel's grid meets."""
+    """Return the openings that no link of a whole vessel's grid meets."""
     return [opening for k, opening in enumerate(vessel.openings) if not (link_patch == k + 1).any()]
 
 
 def cells_of_sac(case: FlowCase, grid: Domain) -> Ints:
-    """Cells of a case's sac in a grid, all cells where it has none.
+    """Return the indices of the cells in a case's sac, or of all cells if it has none.
 
     Raises
     ------
     CoarseGridError
-        When no cell lies in the sac.
+        No cell centre is in the sac.
     """
     if case.sac is None:
         return np.arange(len(grid.cells), dtype=np.int32)
     cells = sampling.cells_inside(case.sac, grid.centers_mm, grid.cell_size_mm)
     if len(cells) == 0:
         raise CoarseGridError(
-            f"no cell of {grid.cell_size_mm:.3g} mm lies in the sac of {abs(case.sac.volume_mm3):.2g} mm3 near "
-            f"{place(case.sac.vertices_mm.mean(axis=0))}: set a smaller cell size"
+            f"at a grid spacing of {grid.cell_size_mm:.3g} mm no cell is inside the sac of "
+            f"{abs(case.sac.volume_mm3):.2g} mm3 near {place(case.sac.vertices_mm.mean(axis=0))}: use a finer grid "
+            "spacing"
         )
     return cells
 
 
 def section_pressure_Pa(vessel: Vessel, grid: Domain, pressure_Pa: Floats) -> Floats:
-    """Mean pressure (k,) of the cells on the plane of every opening itself, not of its extension's end; nan of none."""
+    """Return the mean pressure (k,) over the section of every opening, nan where no cell is near it.
+
+    The section is that of the opening, not the end of its extension.
+    """
 
     def mean_Pa(opening: Opening) -> float:
         offset = grid.centers_mm - opening.center_mm
@@ -166,9 +178,18 @@ def section_pressure_Pa(vessel: Vessel, grid: Domain, pressure_Pa: Floats) -> Fl
 
 
 def too_fast(grid: Domain, speed_m_s: Floats, blood: Blood, most: float) -> str:
-    """Say where blood, its speed (n,) in every cell, is computed thicker than it is; nothing where none is.
+    """Return a warning about cells in which the viscosity is raised for stability, or an empty string.
 
-    That is where speed x cell / viscosity is more than `most`.
+    Parameters
+    ----------
+    grid : Domain
+        The cells.
+    speed_m_s : (n,) float
+        Speed in every cell.
+    blood : Blood
+        The fluid.
+    most : float
+        Grid Reynolds number (speed x grid spacing / viscosity) above which the viscosity is raised.
     """
     cell_reynolds = speed_m_s * grid.cell_size_mm * M_PER_MM / blood.kinematic_viscosity_m2_s
     fastest = int(cell_reynolds.argmax())
@@ -176,17 +197,18 @@ def too_fast(grid: Domain, speed_m_s: Floats, blood: Blood, most: float) -> str:
         return ""
     share = float((cell_reynolds > most).mean())
     return (
-        f" In {100 * share:.2g} % of the cells of {grid.cell_size_mm:.3g} mm blood is too fast for them, up to "
-        f"{speed_m_s[fastest]:.2g} m/s at {place(grid.centers_mm[fastest])}, and computed up to "
-        f"{cell_reynolds[fastest] / most:.2g} times as thick as it is: set a smaller cell size to see what that "
-        "changes."
+        f" Under-resolved: in {100 * share:.2g} % of the cells the grid Reynolds number exceeds {most:.3g}, so the "
+        f"viscosity is raised there, up to {cell_reynolds[fastest] / most:.2g} times nominal. The fastest blood has "
+        f"{speed_m_s[fastest]:.2g} m/s at {place(grid.centers_mm[fastest])}; use a grid spacing finer than "
+        f"{grid.cell_size_mm:.3g} mm to check the effect."
     )
 
 
 def default_cell_size_mm(case: FlowCase) -> float:
-    """Edge of a cell: as set; else `cells_per_diameter` across the vessel, within the cell budget.
+    """Return the grid spacing of a case: as set, else from `cells_per_diameter` and `cell_budget`.
 
-    That is across its mean diameter 4 V / A, or across its inlet where that is less: a large sac widens the mean.
+    The cells are counted across the mean diameter 4 V / A of the vessel, or across its inlet where that is narrower,
+    because a large sac increases the mean.
     """
     settings = case.settings
     if settings.cell_size_mm is not None:
@@ -199,17 +221,17 @@ def default_cell_size_mm(case: FlowCase) -> float:
 
 
 def mean_diameter_mm(vessel: Vessel) -> float:
-    """Mean (hydraulic) diameter 4 V / A of a vessel, its sac included."""
+    """Return the mean (hydraulic) diameter 4 V / A of a vessel, including its sac."""
     return 4 * abs(vessel.closed.volume_mm3) / vessel.lumen.area_mm2
 
 
 def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> Domain:
-    """Put the blood of a vessel on a grid, all of it or what is connected in a window.
+    """Discretize the blood of a vessel on a regular grid, all of it or the largest connected part in a window.
 
     Raises
     ------
     CoarseGridError
-        When no blood connects to the inlet, or far too few cells do, or none to another inlet.
+        No cells are connected to the inlet, fewer than `MIN_CELLS` are, or none reaches another inlet.
     """
     surface, face_patch, sections = extend(vessel)
     origin_mm, shape = _box(surface, cell_size_mm) if window is None else (window.origin_mm, window.mask.shape)
@@ -221,9 +243,9 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
     cells = np.argwhere(inside).astype(np.int32)
     if len(cells) < MIN_CELLS:
         raise CoarseGridError(
-            f"only {len(cells)} cells of {cell_size_mm:.3g} mm connect to the inlet at "
-            f"{place(vessel.inlet.center_mm)}: the grid is too coarse for this vessel or the inlet is "
-            "blocked; set a smaller cell size"
+            f"at a grid spacing of {cell_size_mm:.3g} mm only {len(cells)} cells are connected to the inlet at "
+            f"{place(vessel.inlet.center_mm)}, so the grid is too coarse or the inlet is blocked: use a finer grid "
+            "spacing, or check the inlet"
         )
     index = np.full(inside.shape, -1, dtype=np.int32)
     index[inside] = np.arange(len(cells), dtype=np.int32)
@@ -237,25 +259,26 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
 
 
 def _refuse_unreached_inlet(vessel: Vessel, link_patch: Ints, cell_size_mm: float) -> None:
-    """Refuse a grid in which less blood would enter than is to: an outlet without cells is told, see `unreached`."""
+    """Raise an error if no cell reaches an inlet; an outlet without cells only causes a warning (see `unreached`)."""
     for opening in _unlinked(vessel, link_patch):
         if opening.is_inlet:
             raise CoarseGridError(
-                f"no cell of {cell_size_mm:.3g} mm reaches {opening.role} ({opening.diameter_mm:.2g} mm wide at "
-                f"{place(opening.center_mm)}), where blood is to enter: set a smaller cell size"
+                f"at a grid spacing of {cell_size_mm:.3g} mm no cell reaches {opening.role} "
+                f"({opening.diameter_mm:.2g} mm wide at {place(opening.center_mm)}), so no blood can enter there: use "
+                "a finer grid spacing"
             )
 
 
 def _box(surface: Surface, cell_size_mm: float) -> tuple[Floats, tuple[int, int, int]]:
-    """Centre (3,) of the first cell, and the number of cells along each axis, of a grid around a surface."""
-    # An odd offset keeps grid lines off the vertices and edges of analytic shapes.
+    """Return the centre (3,) of the first cell and the shape of a grid around a surface."""
+    # An irregular offset avoids grid lines exactly through vertices and edges of analytic shapes.
     origin_mm = surface.vertices_mm.min(axis=0) - cell_size_mm * (2.0 + np.array([0.1327, 0.2171, 0.1733]))
     shape = np.ceil((surface.vertices_mm.max(axis=0) - origin_mm) / cell_size_mm).astype(int) + 3
     return origin_mm, (int(shape[0]), int(shape[1]), int(shape[2]))
 
 
 def _largest(inside: Bools) -> Bools:
-    """Keep the largest connected part."""
+    """Return the mask of the largest connected part."""
     label, _ = ndimage.label(inside)
     return np.asarray(label == 1 + np.bincount(label.ravel())[1:].argmax())
 
@@ -263,6 +286,7 @@ def _largest(inside: Bools) -> Bools:
 def _connected(
     inside: np.ndarray, vessel: Vessel, section: Floats, origin_mm: Floats, cell_size_mm: float
 ) -> np.ndarray:
+    """Return the mask of the part connected to the inlet."""
     label, count = ndimage.label(inside)
     if count <= 1:
         return inside
@@ -273,20 +297,28 @@ def _connected(
     if len(found) == 0:
         at = place(vessel.inlet.center_mm)
         raise CoarseGridError(
-            f"no cell of {cell_size_mm:.3g} mm lies behind the inlet at {at}: check that the inlet is an open end, or "
-            "set a smaller cell size"
+            f"at a grid spacing of {cell_size_mm:.3g} mm there is no blood next to the inlet at {at}: check that the "
+            "inlet is an open end, or use a finer grid spacing"
         )
     return label == np.bincount(found).argmax()
 
 
 def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
-    """Add a straight tube of the section's own shape to every opening and close the ends.
+    """Add a straight extension with the section's own shape to every opening and close its end.
 
     Returns
     -------
-    surface : closed.
-    face_patch : (m,) 0 the wall, k + 1 the end of opening k.
-    sections : for every opening the polygon (j, 3) of its end.
+    surface : Surface
+        Closed surface.
+    face_patch : (m,) int
+        Patch of every face: 0 wall, k + 1 the end of opening k.
+    sections : tuple of (j, 3) float
+        For every opening the polygon of its end, in mm.
+
+    Raises
+    ------
+    FlowError
+        An opening does not match any open end of the lumen.
     """
     lumen, obstacles = vessel.lumen, [vessel.closed]
     vertices, faces = [lumen.vertices_mm], [lumen.faces]
@@ -313,23 +345,25 @@ def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
         count += 1
     missing = [vessel.openings[k].role for k in range(len(vessel.openings)) if k not in sections]
     if missing:
-        raise FlowError(f"no open end of the lumen belongs to {', '.join(missing)}: trace the vessel again")
+        raise FlowError(f"no open end of the lumen matches {', '.join(missing)}: trace the vessel again")
     surface = Surface(np.concatenate(vertices), np.concatenate(faces))
     return surface, np.concatenate(patch).astype(np.int32), tuple(sections[k] for k in range(len(vessel.openings)))
 
 
 def extended_volume_mm3(vessel: Vessel) -> float:
-    """Foretell the volume of a vessel with its extensions, none of which another wall cuts short."""
+    """Return the expected volume of a vessel with its extensions at full length."""
     ends = (opening.area_mm2 * _extension_mm(vessel, k) for k, opening in enumerate(vessel.openings))
     return abs(vessel.closed.volume_mm3) + sum(ends)
 
 
 def _extension_mm(vessel: Vessel, k: int) -> float:
+    """Return the full length of the extension of opening k."""
     opening = vessel.openings[k]
     return opening.diameter_mm * (INLET_EXTENSION if opening.is_inlet else OUTLET_EXTENSION)
 
 
 def _opening_of(vessel: Vessel, ring: Floats) -> int | None:
+    """Return the index of the opening that a boundary loop (j, 3) belongs to, or None."""
     center = triangles.polygon_centroid(ring)
     distance = [np.linalg.norm(opening.center_mm - center) / opening.diameter_mm for opening in vessel.openings]
     nearest = int(np.argmin(distance))
@@ -337,7 +371,7 @@ def _opening_of(vessel: Vessel, ring: Floats) -> int | None:
 
 
 def _extruded(vessel: Vessel, k: int, ring: Floats, obstacles: Sequence[Surface]) -> Floats:
-    """Ring moved out along the opening's normal onto the plane where the extension ends, half-way to an obstacle."""
+    """Return a ring (j, 3) moved out to the plane where the extension ends, at most half-way to an obstacle."""
     opening = vessel.openings[k]
     ahead = (ring - opening.center_mm) @ opening.normal
     outer = float(ahead.max())
@@ -351,13 +385,13 @@ def _extruded(vessel: Vessel, k: int, ring: Floats, obstacles: Sequence[Surface]
 
 
 def _tube(inner_mm: Floats, outer_mm: Floats) -> Surface:
-    """Tube between two rings (j, 3)."""
+    """Return the tube between two rings (j, 3)."""
     inner = np.arange(len(inner_mm), dtype=np.int32)
     return Surface(np.concatenate([inner_mm, outer_mm]), _strip(inner, inner + len(inner)))
 
 
 def _strip(inner: Ints, outer: Ints) -> Ints:
-    """Side faces between a loop that runs with the faces beside it and its copy further out."""
+    """Return the side faces between a boundary loop and its copy further out, oriented like the wall's faces."""
     a, b, c, d = inner, np.roll(inner, -1), np.roll(outer, -1), outer
     return np.concatenate([np.stack([b, a, d], axis=1), np.stack([b, d, c], axis=1)]).astype(np.int32)
 
@@ -371,7 +405,7 @@ def _links(
     origin_mm: Floats,
     cell_size_mm: float,
 ) -> tuple[Ints, Ints, Floats, Ints]:
-    """Links that leave the blood: their cell, direction, fraction to the surface and patch."""
+    """Return the links that leave the blood: their cell, direction, fraction to the surface and patch."""
     cell, direction = np.nonzero(neighbour < 0)
     starts = origin_mm + cells[cell] * cell_size_mm
     step_mm = VELOCITIES[direction] * cell_size_mm
@@ -386,17 +420,34 @@ def _links(
 
 
 def neighbours(index: Ints, cells: Ints) -> Ints:
-    """Number (n, 19) of every cell's neighbours, -1 where these are no blood, by the `index` (i, j, k) of the grid."""
+    """Return the cell indices (n, 19) of every cell's neighbours, -1 where they are not blood.
+
+    Parameters
+    ----------
+    index : (i, j, k) int
+        Index of the cell at every grid point, -1 outside the blood.
+    cells : (n, 3) int
+        Grid coordinates of the cells.
+    """
     return np.stack([index[tuple((cells + c).T)] for c in VELOCITIES], axis=1)
 
 
 def septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, cell_size_mm: float) -> tuple[Ints, Ints]:
-    """Links between two blood cells with a wall between them: their cell and direction, each pair once.
+    """Find the links between two blood cells that a wall separates.
 
     Parameters
     ----------
-    surface : the blood's; neighbour : (n, 19) see `neighbours`.
-    cells, origin_mm, cell_size_mm : as of a `Domain`.
+    surface : Surface
+        Closed boundary of the blood.
+    neighbour : (n, 19) int
+        Neighbour indices (see `neighbours`).
+    cells, origin_mm, cell_size_mm : array, array, float
+        As in a `Domain`.
+
+    Returns
+    -------
+    cell, direction : (s,) int
+        Cell and lattice direction of each link; every pair is listed once.
     """
     is_edge = np.asarray((neighbour < 0).any(axis=1))
     candidate = is_edge[:, None] & (neighbour >= 0) & is_edge[neighbour]

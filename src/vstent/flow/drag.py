@@ -1,4 +1,4 @@
-"""What wires take of the blood about them: the drag of rows, of crossing families, and of their bands on a grid."""
+"""Drag of stent wires: rows of cylinders, crossing families, and the correction for wires thinner than a grid cell."""
 
 import numpy as np
 from scipy.optimize import brentq
@@ -7,44 +7,61 @@ from scipy.special import ellipe, ellipk
 from vstent.kernels.arrays import Floats
 
 SHARE_FALL, SHARE_PER_SOLIDITY = 0.08, 5.9
-"""How much less normal over tangential resistance is than that of slender rods, and how it falls with wire diameter
-over spacing: what resolved crossing cells take of blood that passes at an angle, at d / s = 0.065 to 0.24 and 30 to 60
-degrees, the mean of wires one on the other and in one plane (`benchmarks/screen.py`, `screen.json`)."""
+"""Reduction of the ratio of normal to tangential resistance below that of slender rods: a constant, and its slope
+with wire diameter over spacing. Fitted to resolved crossing cells in oblique flow, at d / s = 0.065 to 0.24 and 30
+to 60 degrees, as the mean of stacked and coplanar wires (`benchmarks/screen.py`, `screen.json`)."""
 LEAST_SHARE = 0.02
-"""Least normal over tangential resistance."""
+"""Lower limit of the ratio of normal to tangential resistance."""
 INERTIAL_LOSS, SPARSEST = 0.35, 0.065
-"""K of the pressure drop K rho |u| u_n / 2 where blood passes at an angle at a wire Reynolds number of a half: the mean
-of resolved crossing cells with d / s below 0.15, the least of which is the other (`benchmarks/screen.py`,
-`screen.json`). Denser ones take half as much, beside a viscous resistance that makes either a few per cent."""
+"""Coefficient K of the pressure drop K rho |u| u_n / 2 in oblique flow at a wire Reynolds number of 0.5, and the
+smallest d / s it is fitted to. The mean of resolved crossing cells with d / s below 0.15 (`benchmarks/screen.py`,
+`screen.json`). Denser wires lose half as much, but their viscous resistance makes either value a few per cent of the
+total."""
 CROSSING_PER_SOLIDITY = 0.89
-"""How much crossing families resist more than their sum, per wire diameter over spacing: the mean of resolved crossing
-cells at d / s = 0.065 to 0.24 and 30 to 60 degrees, each 0.48 to 1.04 (`benchmarks/screen.py`, `screen.json`)."""
+"""Extra resistance of crossing families over the sum of two rows, per wire diameter over spacing. The mean of
+resolved crossing cells at d / s = 0.065 to 0.24 and 30 to 60 degrees, which range from 0.48 to 1.04
+(`benchmarks/screen.py`, `screen.json`)."""
 BREADTH = 0.4
-"""How broad a band every wire is spread over, in spacings."""
+"""Width of the band over which every wire is spread, in wire spacings."""
 BLUNTED = 0.8
-"""How much of what an even band slows blood by one does that drags least where blood is slowest: so rows of wires 0.03
-to 0.09 mm thick, 4 to 16 cells apart, hold slow blood up within 2 % of their law (`test_screen_sheet.py`)."""
+"""Ratio of the slowing by a band that drags least where the blood is slowest to the slowing by a uniform band. With
+this value, rows of wires 0.03 to 0.09 mm thick and 4 to 16 cells apart resist slow flow within 2 % of their drag law
+(`test_screen_sheet.py`)."""
 GRID_MM = 0.15
-"""Grid cells by which it is judged whether wires are told apart: between the usual ones and those of a close-up."""
+"""Grid spacing, mm, at which `parted` judges whether wires are distinguished: between the default and that of a
+refined sac."""
 
 
 def drag_per_length(diameter: Floats, spacing: Floats) -> Floats:
-    """Drag per length over viscosity times velocity of a row of cylinders, F' / (mu U); same unit for both lengths.
+    """Return the drag per length of a row of cylinders over viscosity times mean velocity, F' / (mu U).
 
-    F' = 8 pi mu U / (1 - 2 ln(2 t) + 2 t^2 / 3 - t^4 / 9), t = pi d / (2 s) (Tamada and Fujikawa 1957, Q. J. Mech.
-    Appl. Math. 10, 425; design.md section 5). 10.70 at d / s = 1 / 6.
+    F' = 8 pi mu U / (1 - 2 ln(2 t) + 2 t^2 / 3 - t^4 / 9), t = pi d / (2 s). It is 10.70 at d / s = 1 / 6.
+
+    Parameters
+    ----------
+    diameter, spacing : (n,) float
+        Wire diameter and distance between wires, in the same unit.
+
+    References
+    ----------
+    Tamada and Fujikawa 1957, Q. J. Mech. Appl. Math. 10, 425.
     """
     t = np.pi * np.minimum(diameter / spacing, 0.5) / 2
     return 8 * np.pi / (1 - 2 * np.log(2 * t) + 2 * t**2 / 3 - t**4 / 9)
 
 
 def round_diameter(width: float, thickness: float) -> float:
-    """Diameter of the round wire that drags as much as a strut of rectangular section; same unit for all lengths.
+    """Return the diameter of the round wire with the same drag as a strut of rectangular section.
 
-    It is twice the radius r of the circle that the plane outside the section is mapped on, all that slow blood knows of
-    it from afar: width = 4 r (E(m) - (1 - m) K(m)), thickness = the same of 1 - m, K and E being the complete elliptic
-    integrals. A square strut drags as a wire 1.18 times as wide: resolved rows of either hold blood up alike within 1 %
-    (`tests/flow/lattice/test_crossing_cell.py`).
+    It is twice the radius r of the circle onto which the plane outside the section is mapped conformally; slow flow far
+    from the strut depends only on r. With the complete elliptic integrals K and E, width = 4 r (E(m) - (1 - m) K(m)),
+    and thickness is the same expression with 1 - m. A square strut has the drag of a round wire 1.18 times as wide;
+    resolved rows of the two agree within 1 % (`tests/flow/lattice/test_crossing_cell.py`).
+
+    Parameters
+    ----------
+    width, thickness : float
+        Sides of the section, in the same unit as the result.
     """
 
     def side(m: float) -> float:
@@ -55,21 +72,36 @@ def round_diameter(width: float, thickness: float) -> float:
 
 
 def band_radius_mm(spacing_mm: Floats, cell_size_mm: float) -> Floats:
-    """Radius of the wire that slow blood takes a wire's band for, on a grid that spreads it besides.
+    """Return the radius of the wire that acts on slow flow like a wire's band, further spread by the grid.
 
-    The geometric mean of the distance between two points of the band: e^(-gamma / 2) (a + b) where they lie about its
-    axis with standard deviations a and b, gamma being Euler's constant.
+    It is the geometric mean of the distance between two points of the band: e^(-gamma / 2) (a + b) for points
+    distributed about the axis with standard deviations a and b, where gamma is Euler's constant.
+
+    Parameters
+    ----------
+    spacing_mm : (n,) float
+        Distance between wires.
+    cell_size_mm : float
+        Grid spacing.
     """
     of_cell_mm = cell_size_mm / np.sqrt(6)
     return np.exp(-np.euler_gamma / 2) * (np.hypot(BREADTH * spacing_mm / np.sqrt(12), of_cell_mm) + of_cell_mm)
 
 
 def concentration(diameter_mm: Floats, spacing_mm: Floats, cell_size_mm: float) -> Floats:
-    """How much more than by a row's law wires resist blood that a grid has slowed about them; 1 where bands melt.
+    """Return the factor on a row's drag law for wires that the grid resolves as separate bands; 1 where bands merge.
 
-    A row's drag F' is of the mean velocity. About wires far enough apart the grid slows blood itself, as about wires as
-    thick as their bands; what is left to finer ones is the difference, 1 / F' - 1 / F'_band. (So has Peaceman 1978,
-    Soc. Pet. Eng. J. 18, 183, wells on a grid, about which pressure is a logarithm as velocity is here.)
+    The drag F' of a row refers to the mean velocity. Around wires far enough apart, the grid itself slows the blood, as
+    around wires as thick as their bands. The remaining part, due to the thinner wires, is the difference 1 / F' - 1 /
+    F'_band. Peaceman 1978, Soc. Pet. Eng. J. 18, 183, treats wells on a grid the same way: around them the pressure is
+    logarithmic, as the velocity is here.
+
+    Parameters
+    ----------
+    diameter_mm, spacing_mm : (n,) float
+        Wire diameter and distance between wires.
+    cell_size_mm : float
+        Grid spacing.
     """
     drag, densest = drag_per_length(diameter_mm, spacing_mm), drag_per_length(spacing_mm, spacing_mm)
     band_mm = np.maximum(2 * band_radius_mm(spacing_mm, cell_size_mm), diameter_mm)
@@ -77,35 +109,39 @@ def concentration(diameter_mm: Floats, spacing_mm: Floats, cell_size_mm: float) 
 
 
 def parted(spacing_mm: Floats) -> Floats:
-    """How far a grid tells one wire from the next: 0 where their bands melt into a sheet, 1 from twice that spacing."""
+    """Return how far a grid separates neighbouring wires: 0 where their bands merge, 1 from twice that spacing on."""
     return np.clip(spacing_mm / (4 * band_radius_mm(spacing_mm, GRID_MM)) - 1, 0.0, 1.0)
 
 
 def crossing_factor(diameter: Floats, spacing: Floats) -> Floats:
-    """How much two crossing families resist, over the sum of two rows; 1 where wires are far apart."""
+    """Return the resistance of two crossing families over the sum of two rows; 1 where wires are far apart."""
     return 1 + CROSSING_PER_SOLIDITY * np.minimum(diameter / spacing, 0.5)
 
 
 def tangential_share(solidity: Floats, lengthwise: Floats, apart: Floats | float = 0.0) -> Floats:
-    """Tangential over normal resistance of crossing wires to blood that passes along the artery.
+    """Return the ratio of tangential to normal resistance of crossing wires, for flow along the artery.
 
-    A slender rod drags half as much along itself as across (design.md section 5). But each lies in the lee of others,
-    and the two layers have a height: the denser they are, the less of its way along the artery blood keeps.
+    A slender rod has half the drag along its axis as across it. Wires in the lee of others, and the height of the two
+    layers, raise the ratio: the denser the wires, the less tangential velocity remains.
 
     Parameters
     ----------
-    solidity : wire diameter over spacing.
-    lengthwise : mean squared cosine of the wires' angle to the artery.
-    apart : how far a grid tells wires apart, and holds that lee itself (see `parted`).
+    solidity : (n,) float
+        Wire diameter over spacing.
+    lengthwise : (n,) float
+        Mean squared cosine of the angle between wires and artery.
+    apart : (n,) float
+        How far the grid separates the wires and so reproduces the lee itself (see `parted`).
     """
     in_lee = (1 - apart) * (SHARE_FALL + SHARE_PER_SOLIDITY * solidity)
     return 1 / np.maximum(1 / (1 - 0.5 * lengthwise) - in_lee, LEAST_SHARE)
 
 
 def inertial_loss(solidity: Floats) -> Floats:
-    """Loss coefficient K of K rho |u| u_n / 2, by wire diameter over spacing; fewer wires than calibrated on take less.
+    """Return the loss coefficient K of K rho |u| u_n / 2 from wire diameter over spacing.
 
-    A wire drags by the whole velocity at it, which past a neck is several times the one through it. Along the screen
-    half as much is lost: wires that cross at right angles have half their length across the flow (see `resist`).
+    Below the range of calibration (`SPARSEST`) K falls in proportion to solidity. The drag of a wire depends on the
+    full velocity at it, which over a neck is several times the velocity through it. Tangentially the loss is half as
+    large: wires that cross at right angles have half their length across the flow (see `resist`).
     """
     return INERTIAL_LOSS * np.minimum(solidity / SPARSEST, 1.0)

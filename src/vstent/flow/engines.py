@@ -1,8 +1,8 @@
-"""Flow engines: one protocol, one driver (init / step / terminate / result).
+"""Flow engines: the abstract base class and the loop that drives every engine.
 
-An engine turns a FlowCase into a FlowField. It only knows how to begin, how to advance to the next check, what it has
-left to go, and how to say its result; the loop, its limit, the clock, the check for divergence and the progress are
-the driver's.
+An engine turns a `FlowCase` into a `FlowField`. It defines how to start, how to advance to the next check, how large
+the residual is, and how to return the result. The loop with its limit, the timing, the check for divergence and the
+progress reports are in `run`.
 """
 
 from abc import ABC, abstractmethod
@@ -20,125 +20,125 @@ from vstent.flow.case import FlowCase, FlowField
 
 State = TypeVar("State")
 Saved: TypeAlias = dict[str, NDArray[Any]]
-"""A run under way, as named arrays."""
+"""State of an unfinished run, as named arrays."""
 
 SAVE_EVERY_S = 20.0
-"""Time between saved states of a run: no more is lost when it is stopped."""
+"""Minimum time between saved states of a run, s: the most that an interruption loses, unless saving is slow."""
 SAVE_SHARE = 0.05
-"""Most of the time that saving may take: what is slow to save is saved more seldom."""
+"""Maximum share of the run time spent on saving: states that are slow to save are saved less often."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a computation has come."""
+    """Progress of a computation."""
 
     fraction: float
-    """Estimated part of the way done, 0 to 1."""
+    """Estimated completed fraction, 0 to 1."""
     residual: float
-    """Largest fraction that any monitored quantity has left to go."""
+    """Largest expected remaining change of any monitored quantity, as a fraction."""
     seconds_left: float
-    """Estimated time to the end."""
+    """Estimated remaining run time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What the driver knows at the end."""
+    """What the driver loop passes to the engine at the end of a run."""
 
     is_converged: bool
     """Whether the tolerance was reached before the limit."""
     residual: tuple[float, ...]
     """Residual at every check."""
     seconds: float
-    """Time from the beginning to the end."""
+    """Run time from start to end."""
     loop_seconds: float
-    """Time in the steps alone."""
+    """Run time of the loop alone."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bookmark:
-    """Where a run left off, and where it leaves word how far it has come."""
+    """Saved state from which a run resumes, and the function that saves it."""
 
     saved: Saved | None
-    """What the run saved last; None: it begins."""
+    """Last saved state of the run; None: the run starts from the beginning."""
     save: Callable[[Saved], None]
-    """Takes the state of the run from time to time."""
+    """Called with the state of the run from time to time."""
 
 
 class DivergenceError(FlowError):
-    """A run has grown without bounds."""
+    """A computation diverged."""
 
 
 @dataclass(frozen=True)
 class AbstractEngine(ABC, Generic[State]):
-    """A way to compute a flow; made with a cell size and a folder."""
+    """Base class of flow engines; an engine is created with a grid spacing and a folder."""
 
     cell_size_mm: float
-    """Edge of a cell."""
+    """Grid spacing."""
     folder: Path | None = None
-    """The engine's own folder for this one run, not there yet: what it writes lies there, and what lies there of the
-    same run it may go on from. None: it is asked to do without."""
+    """The engine's own folder for this run, which may not exist yet. The engine may resume from files of the same
+    run there. None: no folder is available."""
 
     outer: FlowField | None = None
-    """The flow all over, on wider cells, where only the close-up of the sac is to be computed; None: the whole vessel
+    """Flow in the whole vessel on a coarser grid, if only the refined sac is to be computed; None: the whole vessel
     is."""
 
     coarsening: ClassVar[float | None] = None
-    """Cells of a first guess by the same engine over those of the answer; None: it finds its own way from the start."""
+    """Grid spacing of the coarse run that provides a first guess, over that of the result; None: no coarse run."""
     refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm",)
-    """Settings that the result converges with as they become smaller; the cell size is the first."""
+    """Settings whose reduction makes the result converge; the grid spacing comes first."""
     closes_up: ClassVar[bool] = False
-    """Whether it can be given an `outer` flow."""
+    """Whether the engine can compute a refined sac inside an `outer` flow."""
     runs_on_gpu: ClassVar[bool] = False
-    """Whether it heeds ``device_gpu``; where it does not, it is not asked."""
+    """Whether the engine supports the setting ``device_gpu``."""
 
     def cost(self, case: FlowCase) -> str:
-        """Say in a sentence what a flow will cost.
+        """Return a sentence on the expected run time and memory.
 
         Raises
         ------
         FlowError
-            When it does not fit in the free memory.
+            The case does not fit in the free memory.
         """
-        return "What a flow costs with this engine is not known beforehand."
+        return "The run time and memory of this engine cannot be estimated in advance."
 
     def calmer(self, case: FlowCase) -> FlowCase | None:
-        """Return how to try once more what diverged; None: not at all."""
+        """Return a modified case to retry after divergence; None: do not retry."""
         return None
 
     @abstractmethod
     def init(self, case: FlowCase, start: FlowField | None) -> State:
-        """Build the domain and the first guess: at rest, or a field on any grid."""
+        """Build the domain and the initial state: at rest, or from a field on any grid."""
 
     @abstractmethod
     def step(self, state: State) -> State:
-        """Advance by a few seconds, no further than to the next check."""
+        """Advance by a few seconds of run time, at most to the next check."""
 
     @abstractmethod
     def terminate(self, state: State) -> float | None:
-        """Return the largest fraction that any monitored quantity has left to go; nan when diverged.
+        """Return the residual: the largest expected remaining change of any monitored quantity, as a fraction.
 
-        None between checks.
+        nan when the flow has diverged, None between checks.
         """
 
     @abstractmethod
     def save(self, state: State) -> Saved | None:
-        """Return the run as arrays; None: what lies in the engine's folder is enough to go on."""
+        """Return the state as arrays; None: the files in the engine's folder suffice to resume."""
 
     @abstractmethod
     def resume(self, case: FlowCase, saved: Saved) -> State:
-        """Return the run as it was saved: what follows is the same to the last bit."""
+        """Restore a saved state; the run then gives the same result to the last bit."""
 
     @abstractmethod
     def trouble(self, state: State) -> str:
-        """Say in one sentence why the run diverged, the last good state, and what to do."""
+        """Return a sentence on a diverged run: the likely cause, the last good state, and what to do."""
 
     @abstractmethod
     def max_checks(self, state: State) -> int:
-        """Return the limit of the loop."""
+        """Return the maximum number of checks."""
 
     @abstractmethod
     def result(self, state: State, outcome: Outcome) -> FlowField:
-        """Return the field reached."""
+        """Return the computed flow."""
 
 
 def run(
@@ -149,12 +149,25 @@ def run(
     progress: Callable[[Progress], None] | None = None,
     bookmark: Bookmark | None = None,
 ) -> FlowField:
-    """Drive an engine until its residual is below the case's tolerance or its limit is reached.
+    """Run an engine until its residual is below the case's tolerance or its maximum number of checks is reached.
+
+    Parameters
+    ----------
+    engine : AbstractEngine
+        The engine.
+    case : FlowCase
+        The flow to compute.
+    start : FlowField, optional
+        Initial guess, on any grid; None: from rest.
+    progress : callable, optional
+        Called at every check.
+    bookmark : Bookmark, optional
+        State to resume from, and where to save it.
 
     Raises
     ------
     DivergenceError
-        When the computation diverges.
+        The computation diverged.
     """
     began = perf_counter()
     saved = None if bookmark is None else bookmark.saved
@@ -182,16 +195,18 @@ def run(
 
 
 class _Saver:
-    """Saves a run every so often."""
+    """Saves a run at intervals."""
 
     def __init__(self, bookmark: Bookmark | None) -> None:
         self._bookmark = bookmark
         self._due_s = perf_counter() + SAVE_EVERY_S
 
     def is_due(self) -> bool:
+        """Return whether the run is to be saved now."""
         return self._bookmark is not None and perf_counter() >= self._due_s
 
     def save(self, saved: Saved | None, **more: Sequence[float]) -> None:
+        """Save the run and schedule the next time."""
         began = perf_counter()
         if self._bookmark is not None and saved is not None:
             self._bookmark.save(saved | {name: np.array(values) for name, values in more.items()})
@@ -200,7 +215,7 @@ class _Saver:
 
 
 def _step(engine: AbstractEngine[State], state: State) -> State:
-    """Step; Ctrl-C that arrives inside a compiled kernel comes out of it as a SystemError and is put right."""
+    """Advance the engine; convert the SystemError of a Ctrl-C inside a compiled kernel to KeyboardInterrupt."""
     try:
         return engine.step(state)
     except SystemError as error:
@@ -210,7 +225,7 @@ def _step(engine: AbstractEngine[State], state: State) -> State:
 
 
 def _progress(residual: list[float], limit: int, tolerance: float, seconds: float) -> Progress:
-    """Extrapolate the residual's decay over the last half of the checks."""
+    """Estimate the progress by extrapolating the decay of the residual over the last half of the checks."""
     done = len(residual)
     total = float(limit)
     half = residual[done // 2 :]

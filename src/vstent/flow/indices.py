@@ -1,4 +1,4 @@
-"""Numbers that a flow is judged by, and their change when a stent is in."""
+"""Hemodynamic indices of a flow, and their ratios with and without a stent."""
 
 from typing import Final
 
@@ -12,13 +12,14 @@ from vstent.kernels.arrays import Bools, Floats
 from vstent.units import M_PER_MM
 
 LOW_SHEAR_PA = 0.4
-"""Below this wall shear stress endothelium degenerates (Malek, Alper and Izumo 1999, JAMA 282, 2035)."""
+"""Threshold of low wall shear stress, Pa: below it endothelium degenerates (Malek, Alper and Izumo 1999, JAMA 282,
+2035)."""
 LOW_SHEAR_SHARE = 0.1
-"""Low shear relative to the parent artery's mean (Xiang et al. 2011, Stroke 42, 144)."""
+"""Threshold of low shear relative to the parent artery's mean wall shear stress (Xiang et al. 2011, Stroke 42, 144)."""
 FAST_M_S = 0.08
-"""Blood faster than this in a sac counts as its jet (design.md section 5)."""
+"""Speed, m/s, above which blood in a sac counts as part of the inflow jet."""
 NEAR_MM = 10.0
-"""The parent wall is the wall within this distance of the neck (Cebral et al. 2011, AJNR 32, 145)."""
+"""Distance from the neck, mm, within which wall belongs to the parent artery (Cebral et al. 2011, AJNR 32, 145)."""
 QUANTITIES: Final = (
     "neck_inflow_mL_s",
     "mean_sac_velocity_m_s",
@@ -26,36 +27,45 @@ QUANTITIES: Final = (
     "mean_wss_Pa",
     "pressure_drop_Pa",
 )
-"""Indices that are followed from grid to grid, as far as the vessel has them."""
+"""Indices compared between grids, as far as the vessel has them."""
 
 
 def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None = None) -> dict[str, float]:
-    """Every index of a flow, its unit in its key.
+    """Compute all hemodynamic indices of a flow, with the unit in each key.
 
     Of the vessel: ``inlet_flow_mL_s``, ``outlet_K_flow_mL_s``, ``inlet_pressure_Pa``, ``pressure_drop_Pa`` (inlet to
-    widest outlet), ``mean_wss_Pa``; where there are several inlets, ``inlet_K_flow_mL_s`` and ``inlet_K_pressure_Pa``
-    too. With a sac (closed) and its ostium (normals into the sac), besides:
+    widest outlet), ``mean_wss_Pa``; with several inlets also ``inlet_K_flow_mL_s`` and ``inlet_K_pressure_Pa``. With a
+    sac and its ostium also:
 
-    - ``neck_inflow_mL_s`` = integral over the ostium of max(u.n, 0), ``neck_outflow_mL_s`` of max(-u.n, 0), the
-      velocity tricubic between cells;
-      ``inflow_area_fraction`` = part of the ostium where u.n > 0; ``turnover_time_s`` = sac volume / inflow;
+    - ``neck_inflow_mL_s`` = integral over the ostium of max(u.n, 0) and ``neck_outflow_mL_s`` of max(-u.n, 0), with
+      tricubic interpolation of the velocity; ``inflow_area_fraction`` = part of the ostium where u.n > 0;
+      ``turnover_time_s`` = sac volume / neck inflow;
     - ``mean_sac_velocity_m_s``, ``max_sac_velocity_m_s``, ``mean_sac_pressure_Pa`` over the sac's cells;
       ``sac_kinetic_energy_J`` = integral of rho u^2 / 2; ``fast_sac_volume_mm3`` where u > 0.08 m/s;
     - ``mean_sac_wss_Pa``, ``max_sac_wss_Pa`` over the sac's wall; ``parent_wss_Pa`` over the other wall within 10 mm of
       the neck; ``low_shear_area_fraction`` of the sac's wall below 0.4 Pa, ``relative_low_shear_area_fraction`` below a
-      tenth of the parent's mean;
-    - ``inflow_concentration_index`` = (inflow / flow of all inlets) / inflow area fraction (Cebral et al. 2011, AJNR
-      32, 145).
+      tenth of the parent artery's mean;
+    - ``inflow_concentration_index`` = (neck inflow / flow of all inlets) / inflow area fraction (Cebral et al. 2011,
+      AJNR 32, 145).
 
-    Of a pulsatile flow, the means over its cycle, and quotients of these, but the largest of all its moments where one
-    is called ``max``; wall shear stress is then its magnitude's time average (TAWSS), and
-    ``mean_sac_oscillatory_shear_fraction`` (OSI) is given besides. Of a steady flow that
-    moves, the means of speed, stress and neck inflow too, not those of the mean flow, in which what goes to and fro
-    cancels; only where blood enters is told from the mean flow.
+    In a pulsatile flow every index is the mean over the cycle, or a quotient of such means; an index called ``max`` is
+    the maximum over the cycle. Wall shear stress is the time average of its magnitude (TAWSS), and
+    ``mean_sac_oscillatory_shear_fraction`` (OSI) is added. In an unsteady flow at constant inflow, speed, wall shear
+    stress and neck inflow are time averages of magnitudes, because oscillations cancel in the mean flow. Only the
+    inflow area is computed from the mean flow.
+
+    Parameters
+    ----------
+    field : FlowField
+        The flow.
+    sac : Surface, optional
+        Closed surface of the sac.
+    ostium : Surface, optional
+        Opening of the sac, with normals into the sac.
     """
     result = _of_vessel(field)
     if sac is not None and ostium is not None:
-        # One moment at a time: each unpacks a whole field.
+        # A generator, so that only one moment's full field is in memory at a time.
         moments = (field.at_phase(phase) for phase in field.phases) if field.phases else (field,)
         of_moments = [_of_ostium(now, ostium) | _of_sac(now, sac) for now in moments]
         result |= {key: _over_cycle(key, [one[key] for one in of_moments]) for key in of_moments[0]}
@@ -64,16 +74,17 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
 
 
 def _over_cycle(key: str, of_moments: list[float]) -> float:
-    """What a cycle is told by: the largest of its moments where that is asked for, else their mean."""
+    """Return the maximum over a cycle of an index called ``max``, else the mean."""
     return max(of_moments) if key.startswith("max_") else float(np.mean(of_moments))
 
 
 def compare(bare: dict[str, float], stented: dict[str, float]) -> dict[str, float]:
-    """Ratios stented over bare of the indices that both have, ``KEY_ratio``; those that are zero when bare drop out."""
+    """Return the ratios stented over bare, ``KEY_ratio``, of the indices in both that are not 0 when bare."""
     return {f"{key}_ratio": stented[key] / value for key, value in bare.items() if key in stented and value != 0}
 
 
 def _of_vessel(field: FlowField) -> dict[str, float]:
+    """Return the indices of the whole vessel."""
     openings = roles(len(field.inlets_mL_s), len(field.outlets_mL_s))
     through_mL_s = np.concatenate([field.inlets_mL_s, field.outlets_mL_s]).tolist()
     return {
@@ -85,6 +96,7 @@ def _of_vessel(field: FlowField) -> dict[str, float]:
 
 
 def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
+    """Return the indices of the flow through the ostium."""
     points_mm, area_mm2 = sampling.surface_samples(ostium, field.cell_size_mm)
     points = (points_mm - field.origin_mm) / field.cell_size_mm
     through_mL_s = sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2)
@@ -99,7 +111,7 @@ def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
 
 
 def _quotients(mean: dict[str, float], entering_mL_s: float, sac: Surface) -> dict[str, float]:
-    """Quotients of means over the cycle: those of moments are without bound where the flow stands still."""
+    """Return quotients of means over the cycle; quotients at single moments are unbounded where the flow is at rest."""
     inflow_mL_s, share = mean["neck_inflow_mL_s"], mean["inflow_area_fraction"]
     return {
         "turnover_time_s": abs(sac.volume_mm3) * 1e-3 / max(inflow_mL_s, 1e-12),
@@ -108,9 +120,10 @@ def _quotients(mean: dict[str, float], entering_mL_s: float, sac: Surface) -> di
 
 
 def _of_sac(field: FlowField, sac: Surface) -> dict[str, float]:
+    """Return the indices of the flow in the sac."""
     cells = sampling.cells_inside(sac, field.centers_mm, field.cell_size_mm)
     speed_m_s = field.speed_m_s[cells]
-    # Cells cut by the sac's wall count as a whole or not at all: integrals are scaled to the true volume.
+    # Cells cut by the sac's wall count fully or not at all, so integrals are scaled to the true volume.
     volume_mm3 = abs(sac.volume_mm3)
     energy_J = 0.5 * field.blood.density_kg_m3 * float((speed_m_s**2).mean()) * volume_mm3 * M_PER_MM**3
     return {
@@ -123,6 +136,7 @@ def _of_sac(field: FlowField, sac: Surface) -> dict[str, float]:
 
 
 def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, float]:
+    """Return the indices of wall shear stress on the sac and the parent artery."""
     stress_Pa = field.shear_Pa
     area_mm2 = _vertex_areas_mm2(field.wall)
     is_sac = on_sac(field.wall, sac, 0.2 * field.cell_size_mm)
@@ -142,14 +156,16 @@ def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, f
 
 
 def on_sac(wall: Surface, sac: Surface, tolerance_mm: float) -> Bools:
-    """Tell which vertices (v,) of the wall lie on the sac's surface."""
+    """Return which vertices (v,) of the wall are within a tolerance of the sac's surface."""
     return sac.closest(wall.vertices_mm)[1] < tolerance_mm
 
 
 def _vertex_areas_mm2(surface: Surface) -> Floats:
+    """Return the area (v,) of every vertex: a third of its faces."""
     area_mm2 = np.repeat(surface.areas_mm2 / 3, 3)
     return np.bincount(surface.faces.ravel(), area_mm2, len(surface.vertices_mm)).astype(np.float64)
 
 
 def _mean(values: Floats | Bools, weights: Floats, chosen: Bools) -> float:
+    """Return the weighted mean of the chosen values."""
     return float(np.average(values[chosen], weights=weights[chosen]))

@@ -1,14 +1,15 @@
-"""Free memory of the machine, or of the container that it runs in."""
+"""Free memory of the machine or of the container that vstent runs in."""
 
 from pathlib import Path
 
 
 def free_memory_bytes() -> float:
-    """Memory that can be had: the machine's, or the container's where that is less; infinite where neither says."""
+    """Return the free memory of the machine or its container, whichever is less; infinite if both are unknown."""
     return min(_available_bytes(), _container_bytes())
 
 
 def _available_bytes() -> float:
+    """Return the machine's available memory, infinite where it is not known."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
@@ -17,7 +18,7 @@ def _available_bytes() -> float:
 
 
 def _container_bytes() -> float:
-    """What a Linux control group leaves; file pages that it can drop count as free."""
+    """Return what a Linux control group has left, with its droppable file pages; infinite without a limit."""
     group = Path("/sys/fs/cgroup")
     try:
         limit, used = (float((group / name).read_text()) for name in ("memory.max", "memory.current"))

@@ -1,4 +1,4 @@
-"""The ostium: what blood crosses on its way between the parent artery and the sac."""
+"""The ostium: the surface through which blood passes between the parent artery and the sac."""
 
 import numpy as np
 
@@ -8,24 +8,26 @@ from vstent.geometry.vessel import Aneurysm
 from vstent.kernels import triangles
 
 ON_WALL_MM = 1e-3
-"""Faces of a sac nearer to the lumen's wall than this are wall: they were cut from it."""
+"""Distance to the lumen, mm, below which a face of a sac is wall: such faces are cut from the lumen."""
 
 
 def ostium(aneurysm: Aneurysm, lumen: Surface) -> Surface:
-    """Return the part of the sac's closed surface around its neck that is no wall, its normals into the sac.
+    """Return the part of the sac's closed surface that is not wall, around its neck and with normals into the sac.
 
-    The neck is that part as far as it lies on the landing surface. Where the sac's flank was continued down to it
-    through the blood, blood crosses the flank as well: only through both together does as much leave as enters.
+    The neck is the part of it on the landing surface. Where the sac's flank was continued to that surface through the
+    blood, blood also passes through the flank; only through both together do inflow and outflow balance.
 
     Raises
     ------
     FlowError
-        When the sac has no opening.
+        The sac has no opening.
     """
     sac = aneurysm.sac
     is_open = lumen.closest(sac.corners_mm.mean(axis=1))[1] > ON_WALL_MM
     if not is_open.any():
-        raise FlowError("the sac is wall all round, so no blood enters it: restore the vessel again")
+        raise FlowError(
+            "the sac has no opening to the artery, so no blood can enter it: restore the parent artery again"
+        )
     middle_mm = aneurysm.neck.vertices_mm[np.argmax(lumen.closest(aneurysm.neck.vertices_mm)[1])]
     vertices, faces = triangles.part_at(sac.vertices_mm, sac.faces[is_open], middle_mm)
     return Surface(vertices, faces[:, ::-1])

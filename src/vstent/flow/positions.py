@@ -1,4 +1,4 @@
-"""How much a flow's numbers depend on how the vessel lies on the grid: as it lies, and turned two ways."""
+"""Sensitivity of the results to the vessel's position on the grid: original, and rotated in two ways."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -12,11 +12,11 @@ from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
 
 POSITIONS: Final = {
-    "as it lies": Rotation.identity(),
+    "as given": Rotation.identity(),
     "45 deg about x": Rotation.from_euler("x", 45, degrees=True),
     "45 deg about y": Rotation.from_euler("y", 45, degrees=True),
 }
-"""Turns of the vessel: a bend along two of the grid's axes lies between them in another position."""
+"""Rotations of the vessel by name; a bend along two of the grid's axes is diagonal to them in another position."""
 
 
 @dataclass(frozen=True)
@@ -24,21 +24,21 @@ class Scatter:
     """One quantity of the same flow in every position."""
 
     values: tuple[float, ...]
-    """In the order of `POSITIONS`."""
+    """Values in the order of `POSITIONS`."""
     mean: float
-    """Of all positions."""
+    """Mean over all positions."""
     uncertainty_fraction: float
     """Half the range, as a fraction of the mean."""
 
 
 def scatter(values: tuple[float, ...]) -> Scatter:
-    """Mean and half the range of a quantity in every position."""
+    """Return the mean and half the range of a quantity over all positions."""
     mean = float(np.mean(values))
     return Scatter(values, mean, float(np.ptp(values)) / 2 / max(abs(mean), 1e-300))
 
 
 def turned(case: FlowCase, turn: Rotation) -> FlowCase:
-    """Return a case with all that it holds turned about the origin: the same flow, on other cells."""
+    """Return a case rotated about the origin with everything in it: the same flow on a different grid."""
     matrix = turn.as_matrix()
     screen, stent = case.screen, case.stent
     return replace(
@@ -53,10 +53,12 @@ def turned(case: FlowCase, turn: Rotation) -> FlowCase:
 
 
 def _vessel(vessel: Vessel, matrix: Floats) -> Vessel:
+    """Return a rotated vessel."""
     openings = tuple(replace(o, center_mm=matrix @ o.center_mm, normal=matrix @ o.normal) for o in vessel.openings)
     lines = tuple(replace(line, points_mm=line.points_mm @ matrix.T) for line in vessel.centerlines)
     return replace(vessel, lumen=_surface(vessel.lumen, matrix), openings=openings, centerlines=lines)
 
 
 def _surface(surface: Surface, matrix: Floats) -> Surface:
+    """Return a rotated surface."""
     return Surface(surface.vertices_mm @ matrix.T, surface.faces)

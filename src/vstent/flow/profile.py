@@ -1,4 +1,4 @@
-"""Fully developed laminar profile on a section of any shape."""
+"""Fully developed laminar velocity profile in a section of any shape."""
 
 from typing import Final
 
@@ -10,14 +10,27 @@ from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats
 
 POINTS: Final = 64
-"""Grid points across a section."""
+"""Number of grid points across a section."""
 
 
 def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> Floats:
-    """Axial speed (n,), over its mean, at points (n, 3) of fully developed flow through a flat section (k, 3).
+    """Return the axial speed over its mean (n,) of fully developed flow in a flat section.
 
-    Laminar flow along a straight tube with this section: lap u = -1 with u = 0 on the polygon (White 2006, Viscous
-    Fluid Flow, eq. 3-30), by five-point differences, linear between the grid points and zero outside.
+    Laminar flow along a straight tube with this section: lap u = -1 with u = 0 on the polygon, solved with five-point
+    differences. The result is interpolated linearly between grid points and zero outside.
+
+    Parameters
+    ----------
+    section_mm : (k, 3) float
+        Polygon of the section.
+    normal : (3,) float
+        Unit normal of the section.
+    points_mm : (n, 3) float
+        Points at which the profile is evaluated.
+
+    References
+    ----------
+    White 2006, Viscous Fluid Flow, eq. 3-30.
     """
     center = section_mm.mean(axis=0)
     first = curves.any_perpendicular(normal)
@@ -35,7 +48,7 @@ def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> 
 
 
 def _depth(polygon: Floats, points: Floats) -> Floats:
-    """Distance (...) of points (..., 2) from a polygon (k, 2), negative outside."""
+    """Return the distance (...) of points (..., 2) from a polygon (k, 2), negative outside."""
     nearest = np.full(points.shape[:-1], np.inf)
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         along = np.clip((points - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-300), 0.0, 1.0)
@@ -44,7 +57,7 @@ def _depth(polygon: Floats, points: Floats) -> Floats:
 
 
 def _inside(polygon: Floats, points: Floats) -> Bools:
-    """Tell which points (..., 2) lie inside a polygon (k, 2): an odd number of edges to the right."""
+    """Return which points (..., 2) are inside a polygon (k, 2): those with an odd number of edges to their right."""
     result = np.zeros(points.shape[:-1], dtype=bool)
     x, y = points[..., 0], points[..., 1]
     for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
@@ -54,12 +67,14 @@ def _inside(polygon: Floats, points: Floats) -> Bools:
 
 
 _NEIGHBOURS: Final = ((1, 0), (-1, 0), (0, 1), (0, -1))
+"""Steps to the four neighbours of a grid point."""
 
 
 def _poisson(depth: Floats) -> Floats:
-    """Solve lap u = -1 where the depth is positive, u = 0 where it is zero, both in the unit of the grid; 0 outside.
+    """Return the solution of lap u = -1 in grid units, with u = 0 on the boundary and outside.
 
-    The zero is met between the grid points, to second order (Gibou et al. 2002, J. Comput. Phys. 176, 205).
+    `depth` is the distance to the boundary, positive inside. The boundary is resolved between grid points to second
+    order (Gibou et al. 2002, J. Comput. Phys. 176, 205).
     """
     inside = depth > 0
     number = np.full(inside.shape, -1)
@@ -80,7 +95,7 @@ def _poisson(depth: Floats) -> Floats:
 
 
 def _beyond(speed: Floats, depth: Floats) -> Floats:
-    """Continue a speed to the grid points just outside, so that it is zero at the edge between them, not beyond it."""
+    """Return the speed extrapolated to the points just outside, so that interpolation gives 0 on the boundary."""
     result = speed.copy()
     outside = depth <= 0
     total, count = np.zeros(speed.shape), np.zeros(speed.shape)

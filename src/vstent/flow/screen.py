@@ -1,4 +1,4 @@
-"""The stent as a screen: a thin, local, anisotropic resistance where the deployed wires are."""
+"""The screen model of a stent: a thin, local, anisotropic resistance at the position of the deployed wires."""
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -24,19 +24,26 @@ from vstent.units import M_PER_MM, MM_PER_UM
 SMOOTHING_PORES = 1.5
 """Radius of the neighbourhood in which wire length per area is measured, in mean wire spacings."""
 SAMPLE_REACHES = 0.2
-"""Longest edge between samples of the surface when its area is measured in such a neighbourhood, in radii of it."""
+"""Maximum edge between the surface samples that measure the area of such a neighbourhood, in its radii."""
 PIECE_MM = 0.05
-"""Longest piece of wire."""
+"""Maximum length of a piece of wire, mm."""
 ACROSS = 9
-"""Samples across a wire's band: closer than grid cells."""
+"""Number of samples across a wire's band; they are closer together than grid cells."""
 
 
 def screen(stent: Stent, blood: Blood) -> Screen:
-    """Lay the drag of a deployed stent's wires where they are.
+    """Build the porous screen of a deployed stent.
 
-    Every piece of wire resists as in a row of its spacing, across a band about it. So one law serves braids, laser-cut
-    cells and their mixtures of diameters, wherever bends have opened or closed them: the bands of a braid's wires melt
-    into a sheet, those of laser-cut struts leave open what lies between them.
+    Every piece of wire resists like a wire in a row with the local spacing, spread over a band around it. One law
+    therefore covers braids, laser-cut cells and mixed wire diameters, also where bends have opened or closed the cells.
+    The bands of a braid's wires merge into a sheet; those of laser-cut struts leave the cells between them open.
+
+    Parameters
+    ----------
+    stent : Stent
+        The deployed stent.
+    blood : Blood
+        The fluid, whose viscosity scales the resistance.
     """
     pieces = _pieces(stent)
     points_mm, along_mm, diameter_mm = pieces
@@ -54,15 +61,25 @@ def screen(stent: Stent, blood: Blood) -> Screen:
 
 
 def bands(points_mm: Floats, along_mm: Floats, normals: Floats, spacing_mm: Floats) -> tuple[Floats, Floats]:
-    """Spread pieces of wire over their bands: samples (p, `ACROSS`, 3), and the area (p,) of each of a piece's.
+    """Spread pieces of wire over their bands.
 
-    Of two families of wires so far apart either has half of it.
+    Each of two crossing families represents half of the surface.
 
     Parameters
     ----------
-    points_mm, along_mm : (p, 3) middles of the pieces, and their ways from end to end.
-    normals : (p, 3) unit normals of the surface that wires span.
-    spacing_mm : (p,) spacing of wires there.
+    points_mm, along_mm : (p, 3) float
+        Midpoints of the pieces, and the vectors from end to end.
+    normals : (p, 3) float
+        Unit normals of the surface that the wires span.
+    spacing_mm : (p,) float
+        Local distance between wires.
+
+    Returns
+    -------
+    samples_mm : (p, `ACROSS`, 3) float
+        Sample points across every band.
+    area_mm2 : (p,) float
+        Area that each sample of a piece represents.
     """
     length_mm = np.linalg.norm(along_mm, axis=1)
     sideways = np.cross(normals, along_mm) / length_mm[:, None]
@@ -73,10 +90,10 @@ def bands(points_mm: Floats, along_mm: Floats, normals: Floats, spacing_mm: Floa
 def _net(
     stent: Stent, sheet: Surface, face: Ints, pieces: tuple[Floats, Floats, Floats], reach_mm: float
 ) -> tuple[Floats, Floats, Floats]:
-    """How wires lie about their pieces (p,): spacing, mm; squared cosine to the device's length; diameter over spacing.
+    """Return for all pieces (p,) the wire spacing in mm, the squared cosine to the device's axis, and the solidity.
 
-    About every node of the sheet the length of wires per area, lambda, is measured over a few pores; two crossing
-    families then lie s = 2 / lambda apart. A piece has the mean of the corners of the face below it.
+    The length of wire per area, lambda, is measured around every node of the sheet over a few pores. The spacing of two
+    crossing families is then s = 2 / lambda. A piece takes the mean of the corners of the face below it.
     """
     points_mm, along_mm, diameter_mm = pieces
     nodes, corners, length_mm = cKDTree(sheet.vertices_mm), sheet.faces[face], np.linalg.norm(along_mm, axis=1)
@@ -90,7 +107,7 @@ def _net(
 
 
 def _sheet(contour: Surface, points_mm: Floats, length_mm: Floats, reach_mm: float) -> Surface:
-    """The contour, moved along its normals to the mean height of the wires near, of pieces (p,) at points (p, 3)."""
+    """Return the contour, moved along its normals to the mean height of the wires near it."""
     below_mm, _, face = contour.closest(points_mm)
     height_mm = np.einsum("pd,pd->p", points_mm - below_mm, contour.normals[face])
     weight = _kernel(cKDTree(contour.vertices_mm), points_mm, reach_mm)
@@ -99,16 +116,16 @@ def _sheet(contour: Surface, points_mm: Floats, length_mm: Floats, reach_mm: flo
 
 
 def _lengthwise(stent: Stent, corners: Ints, along_mm: Floats) -> Floats:
-    """Squared cosine (p,) of the angle of pieces of wire to the device's length, the mean over nodes (p, 3) beside."""
+    """Return the squared cosine (p,) of the angle between pieces of wire and the device's axis."""
     length_mm = np.gradient(stent.nodes_mm, axis=0).reshape(-1, 3)[corners].mean(axis=1)
     size_mm2 = (length_mm**2).sum(axis=1) * (along_mm**2).sum(axis=1)
     return np.asarray((length_mm * along_mm).sum(axis=1) ** 2 / size_mm2)
 
 
 def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
-    """Wires cut into pieces of at most `PIECE_MM`: midpoints (p, 3), ways along them (p, 3) and diameters (p,), mm.
+    """Return wires cut into pieces of at most `PIECE_MM`: midpoints (p, 3), vectors (p, 3) and diameters (p,) in mm.
 
-    A rectangular strut has the diameter of the round wire that drags as much.
+    A rectangular strut gets the diameter of the round wire with the same drag.
     """
     inner = stent.piece_starts
     a, b = stent.wire_points_mm[inner], stent.wire_points_mm[inner + 1]
@@ -122,7 +139,7 @@ def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
 
 
 def _drag_diameters_um(stent: Stent) -> Floats:
-    """Diameter (w,) of the round wires that drag as a stent's wires or struts do."""
+    """Return the diameter (w,) of the round wires with the same drag as a stent's wires or struts."""
     if not isinstance(stent.design, LaserCut):
         return stent.wire_diameter_um
     widths_um, which = np.unique(stent.wire_diameter_um, return_inverse=True)
@@ -130,6 +147,6 @@ def _drag_diameters_um(stent: Stent) -> Floats:
 
 
 def _kernel(nodes: cKDTree, points_mm: Floats, reach_mm: float) -> csr_matrix:
-    """Weights (nodes, points) (1 - r^2 / reach^2)^2 within the reach."""
+    """Return the weights (nodes, points) (1 - r^2 / reach^2)^2 within the reach."""
     near = nodes.sparse_distance_matrix(cKDTree(points_mm), reach_mm, output_type="coo_matrix")
     return csr_matrix(((1 - (near.data / reach_mm) ** 2) ** 2, (near.row, near.col)), shape=near.shape)

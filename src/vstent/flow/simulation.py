@@ -1,4 +1,4 @@
-"""Blood flow, before and after: `simulate` an anatomy with and without stents, or one case at a time."""
+"""Flow computation: `simulate` an anatomy with and without stents, or `simulate_case` for a single flow."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
@@ -26,30 +26,31 @@ from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats
 
 COARSE_SHARE = 0.12
-"""Part of the whole time that each coarse run takes, for the progress."""
+"""Assumed share of the run time of each coarse run, for the progress."""
 
 OUTER_SHARE = 0.35
-"""Part of the whole time that the flow around a close-up takes, for the progress."""
+"""Assumed share of the run time of the flow around a refined sac, for the progress."""
 
 CALMER_TRIES = 3
-"""Times that a run which diverged is tried again with a shorter time step."""
+"""Maximum number of retries of a diverged run, each with a shorter time step."""
 
 _BARE_GUESSES: WeakKeyDictionary[FlowField, dict[tuple[float, FlowSettings], FlowField]] = WeakKeyDictionary()
-"""Bare flows on wide cells, by the flow that they begin from: what every device's guess is compared with is computed
-once, for the first."""
+"""Coarse-grid flows without a device, by the fine flow they start from: computed once and shared by all devices."""
 
 OnProgress = Callable[[Progress], None]
+"""Callback that receives the progress."""
 Guess = Callable[[], FlowField | None]
+"""Function that returns a first guess, or None."""
 
 
 class Checkpoint(Protocol):
-    """Keeps the runs of one flow while they are under way, each by its name."""
+    """Storage for the unfinished runs of one flow, each under its name."""
 
     def load(self, run: str) -> Saved | None:
-        """Return what was saved of a run last; None where nothing was, or it is damaged."""
+        """Return the last saved state of a run; None if there is none or it is damaged."""
 
     def save(self, run: str, saved: Saved) -> None:
-        """Keep the state of a run instead of the one before."""
+        """Store the state of a run in place of the previous one."""
 
 
 def simulate(
@@ -59,16 +60,28 @@ def simulate(
     *,
     progress: OnProgress | None = None,
 ) -> tuple[FlowField, ...]:
-    """Compute the flow, steady or pulsatile, for every stent, None standing for the bare vessel.
+    """Compute the flow, steady or pulsatile, for each of several stents.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The patient's vessel and aneurysms.
+    stents : sequence of Stent or None
+        Deployed stents; None stands for the vessel without a device.
+    settings : FlowSettings, optional
+        Settings of the computation.
+    progress : callable, optional
+        Called at every check of every flow.
 
     Returns
     -------
-    One field per stent, in order; stented flows start from the first bare one.
+    tuple of FlowField
+        One field per stent, in order. Flows with a stent start from the first flow without one, if that comes before.
 
     Raises
     ------
     FlowError
-        When the vessel cannot be put on a grid, or the computation diverges.
+        The vessel cannot be discretized, or the computation diverges.
     """
     fields: list[FlowField] = []
     bare: FlowField | None = None
@@ -81,7 +94,17 @@ def simulate(
 
 
 def flow_case(anatomy: Anatomy, stent: Stent | None, settings: FlowSettings | None = None) -> FlowCase:
-    """State the flow problem: the patient's lumen, its largest sac, a stent as a screen or None."""
+    """Build the flow problem: the patient's lumen, its largest sac, and a stent or None.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The patient's vessel and aneurysms.
+    stent : Stent or None
+        Deployed stent, included both as a screen and as wires over necks and ostia.
+    settings : FlowSettings, optional
+        Settings of the computation.
+    """
     settings = settings or FlowSettings()
     largest = anatomy.aneurysms[0] if anatomy.aneurysms else None
     return FlowCase(
@@ -102,60 +125,67 @@ def simulate_case(
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> FlowField:
-    """Compute one flow: steady, or pulsatile where the settings have a waveform.
+    """Compute one flow: steady, or pulsatile if the settings contain a waveform.
 
     Parameters
     ----------
-    start : a flow in the same vessel without a stent, to start from.
-    folder : where an engine that works with files keeps them, and finds them again; None: they are not kept.
-    progress : called at every check; what it raises ends the run.
-    checkpoint : keeps what is under way; the same flow goes on from there, and its result is the same to the last bit.
+    case : FlowCase
+        The flow to compute.
+    start : FlowField, optional
+        Flow in the same vessel without a stent, to start from.
+    folder : Path, optional
+        Folder for the files of an engine that works with files, also used to resume; None: they are deleted.
+    progress : callable, optional
+        Called at every check; an exception that it raises ends the run.
+    checkpoint : Checkpoint, optional
+        Storage for unfinished runs. The same flow resumes from there, with an identical result to the last bit.
 
     Raises
     ------
     FlowError
-        When the vessel cannot be put on a grid, or the computation diverges.
+        The vessel cannot be discretized, or the computation diverges.
     """
     with nullcontext(folder) if folder is not None else TemporaryDirectory(prefix="vstent-") as own:
         return _Runs(engine_class(case.settings), Path(own), progress, checkpoint).answer(case, start)
 
 
 def foretell_cost(case: FlowCase) -> str:
-    """Say in a sentence what a flow will cost.
+    """Return a sentence on the expected run time and memory of a flow.
 
     Raises
     ------
     FlowError
-        When it does not fit in the free memory.
+        The case does not fit in the free memory.
     """
     return engine_class(case.settings)(default_cell_size_mm(case)).cost(case)
 
 
 def engine_class(settings: FlowSettings) -> type[AbstractEngine[Any]]:
-    """Return the engine of this name: one of vstent's own, or a plug-in's.
+    """Return the engine that the settings name: one of vstent's own or a plug-in.
 
     Raises
     ------
     PluginError
-        When there is none.
+        There is no engine of this name.
     InputError
-        When it is to run on a GPU or in a close-up and does not.
+        The settings request a GPU or a refined sac, and the engine does not support it.
     """
     engine = _engine_of(settings)
     if settings.close_up and not engine.closes_up:
         raise InputError(
-            f"the engine {settings.engine} does not compute a close-up: leave out --close-up (close_up), or take "
-            f"{LATTICE}"
+            f"the engine {settings.engine} does not support a finer grid in the sac alone: switch it off "
+            f"(--refine-sac), or choose the engine {LATTICE}"
         )
     if settings.device_gpu and not engine.runs_on_gpu:
         raise InputError(
-            f"the engine {settings.engine} does not compute on a GPU: leave out --device-gpu (device_gpu), or take "
-            f"{LATTICE}"
+            f"the engine {settings.engine} does not support a GPU: compute on the CPU (without --gpu), or choose the "
+            f"engine {LATTICE}"
         )
     return engine
 
 
 def _engine_of(settings: FlowSettings) -> type[AbstractEngine[Any]]:
+    """Return the engine's class by its name in the settings."""
     from vstent.flow.lattice.engine import LatticeBoltzmann
     from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
     from vstent.flow.openfoam.engine import OpenFoam
@@ -170,7 +200,7 @@ def _engine_of(settings: FlowSettings) -> type[AbstractEngine[Any]]:
 
 @dataclass(frozen=True, eq=False)
 class _Runs:
-    """The runs of one engine that make up a flow: guesses on a coarse grid, where it wants them, and the answer."""
+    """The runs that make up one flow: first guesses on coarse grids, if the engine uses them, and the result."""
 
     engine: type[AbstractEngine[Any]]
     folder: Path
@@ -178,7 +208,7 @@ class _Runs:
     checkpoint: Checkpoint | None
 
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
-        """Compute a flow, from a guess unless it is under way, or the coarse grid is too coarse for one."""
+        """Compute a flow, from a coarse-grid guess unless a saved run is resumed or the coarse grid is too coarse."""
         cell_size_mm = default_cell_size_mm(case)
         if case.settings.close_up:
             return self._close_up(case, start, cell_size_mm)
@@ -189,21 +219,22 @@ class _Runs:
         )
 
     def _close_up(self, case: FlowCase, start: FlowField | None, cell_size_mm: float) -> FlowField:
-        """Compute the vessel on wide cells, and then the sac and its neck on fine ones in it."""
+        """Compute the whole vessel on a coarse grid, then the sac and its neck on a fine grid inside it."""
         require_sac(case)
         steps = int(SHARE_AROUND * case.settings.max_steps)
-        # Without its ostium, steady or in a pulse: what swings at the neck takes most of the steps, and is done anew.
+        # Without the ostium: oscillations at the neck would need most of the steps, and the fine grid recomputes them.
         around = replace(case, ostium=None, settings=replace(case.settings, max_steps=steps))
         outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
         engine = self.engine(cell_size_mm, self.folder, outer)
         return self._run(engine, case, lambda: outer, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))
 
     def _guess(self, case: FlowCase, start: FlowField | None, cell_size_mm: float, depth: int = 0) -> FlowField | None:
-        """First guess for a grid, from coarser ones; only `start` where the next is too coarse, or diverges.
+        """Return a first guess for a grid from coarser ones, or `start` if the next one is too coarse or diverges.
 
-        Where a bare flow is known, the coarse grid only has to say what the screen changes (the correction scheme of
-        multigrid, Brandt 1977, Math. Comput. 31, 333). What the grids differ by in the bare flow is scaled by what the
-        screen leaves of the speed: in a sac nearly at rest it would be more than the flow itself.
+        If the flow without a device is known, the coarse grid only provides the change due to the screen (the
+        correction scheme of multigrid, Brandt 1977, Math. Comput. 31, 333). The difference between the grids in the
+        flow without a device is scaled by the ratio of speeds with and without the screen; otherwise it would exceed
+        the flow itself in a sac nearly at rest.
         """
         if self.engine.coarsening is None:
             return start
@@ -224,7 +255,7 @@ class _Runs:
     def _bare_guess(
         self, case: FlowCase, start: FlowField, coarse_mm: float, progress: OnProgress | None, depth: int
     ) -> FlowField:
-        """Compute the bare flow on wide cells from the one on the cells wanted, unless that has been done."""
+        """Return the coarse-grid flow without a device, started from the fine one and computed only once."""
         done, key = _BARE_GUESSES.setdefault(start, {}), (coarse_mm, case.settings)
         if key not in done:
             bare = replace(case, screen=None, stent=None)
@@ -240,7 +271,7 @@ class _Runs:
         progress: OnProgress | None,
         depth: int = 0,
     ) -> FlowField:
-        """Compute a flow on wider cells, itself from a guess; one deeper than the first takes no time to speak of."""
+        """Compute a flow on a coarser grid, itself from a guess; runs below the first level need negligible time."""
         name = depth * "coarser " + name
         engine = engine_class(case.settings)(cell_size_mm, self.folder / name)
         return self._run(
@@ -255,7 +286,7 @@ class _Runs:
         progress: OnProgress | None,
         bookmark: Bookmark | None,
     ) -> FlowField:
-        """Drive an engine from a guess, made once, or from where it left off; what diverges begins anew, calmer."""
+        """Run an engine from a guess or a saved state; after divergence start again with the engine's calmer case."""
         guess = cache(guess)
 
         def attempt() -> FlowField:
@@ -273,13 +304,14 @@ class _Runs:
         return attempt()
 
     def _bookmark(self, name: str) -> Bookmark | None:
+        """Return the bookmark of a run by its name, or None without a checkpoint."""
         checkpoint = self.checkpoint
         if checkpoint is None:
             return None
         return Bookmark(checkpoint.load(name), lambda saved: checkpoint.save(name, saved))
 
     def _part(self, begin: float, end: float) -> OnProgress | None:
-        """Progress of one run among several: its part of the whole."""
+        """Return a progress callback for one run among several, from `begin` to `end` of the whole."""
         whole = self.progress
         if whole is None:
             return None
@@ -294,7 +326,7 @@ class _Runs:
 
 
 def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowField:
-    """A bare flow, changed by what a screen changes on a coarser grid; of a pulse, its mean and its end."""
+    """Return a bare flow plus the change due to a screen on a coarser grid; if pulsatile, mean and last phase."""
     fields = start, bare, stented
     velocity_m_s, pressure_Pa = _changed(*fields)
     phases: tuple[Phase, ...] = ()
@@ -312,7 +344,7 @@ def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowFie
 
 
 def _changed(start: FlowField, bare: FlowField, stented: FlowField) -> tuple[Floats, Floats]:
-    """Velocity and pressure of a flow, changed by what differs between two on a coarser grid."""
+    """Return velocity and pressure of a flow plus the difference between two flows on a coarser grid."""
     before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))
     speed_before, speed_after = (np.linalg.norm(values[0], axis=1, keepdims=True) for values in (before, after))
     left = np.clip(speed_after / np.maximum(speed_before, 1e-9), 0.0, 1.0)
@@ -321,6 +353,7 @@ def _changed(start: FlowField, bare: FlowField, stented: FlowField) -> tuple[Flo
 
 
 def _coarse_runs(engine: type[AbstractEngine[Any]], case: FlowCase, start: FlowField | None) -> int:
+    """Return the number of coarse runs before the result."""
     if engine.coarsening is None:
         return 0
     if start is None:

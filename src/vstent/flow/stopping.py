@@ -1,4 +1,4 @@
-"""When a run may stop: how much its monitored quantities still change, and how well their means are known."""
+"""Stopping criteria of a run: remaining change of the monitored quantities, and standard error of their means."""
 
 from typing import Any, Final
 
@@ -7,32 +7,42 @@ import numpy as np
 from vstent.kernels.arrays import Floats
 
 CHECKS_AGREEING: Final = 3
-"""Checks that must agree that a flow has settled: a quantity that swings passes its end by chance."""
+"""Number of consecutive checks that must agree on convergence: an oscillating quantity passes its limit by chance."""
 BATCHES: Final = 6
-"""Batches of checks whose means tell how well the mean of all is known."""
+"""Number of batches of checks from which the standard error of a mean is estimated."""
 LEAST_IN_BATCH: Final = 4
-"""Fewest checks of a batch."""
+"""Minimum number of checks in a batch."""
 SURE: Final = 3
-"""Standard errors that a mean is told to be known to within: Student's 2.6 for six batches (95 %), and some more since
-runs end when it looks small (C0038 in cells of 0.4 mm, stopped at 1 %: off by 1.5 % root mean square)."""
+"""Number of standard errors reported as the uncertainty of a mean: Student's 2.6 for six batches (95 %), plus a
+margin because runs end when the estimate happens to be small (C0038 at a grid spacing of 0.4 mm, stopped at 1 %:
+error 1.5 % root mean square)."""
 LEAST_CROSSINGS: Final = 5
-"""Times that what swings about a mean must have passed it: what drifts passes it once."""
+"""Minimum number of times that an oscillating quantity must cross its mean; a drifting one crosses it once."""
 
 
 def quantities_left(history: Floats) -> float:
-    """Largest fraction that any column of a history (checks, quantities) has left to go, the worst of the last checks.
+    """Return the largest remaining change of any monitored quantity, the worst of the last `CHECKS_AGREEING` checks.
 
-    nan when it is not finite.
+    Parameters
+    ----------
+    history : (checks, quantities) float
+        Monitored quantities at every check.
+
+    Returns
+    -------
+    float
+        Fraction of the quantity; nan when the history is not finite, inf with too few checks.
     """
     return max(fraction_left(history[: len(history) - k]) for k in range(min(CHECKS_AGREEING, len(history))))
 
 
 def fraction_left(history: Floats) -> float:
-    """Largest fraction that any column of a history (checks, quantities) has left to go; nan when one is not finite.
+    """Return the largest expected remaining change of any monitored quantity, as a fraction of it.
 
-    What a quantity ranged over in the last third of the checks is compared with the third before: if it goes on
-    shrinking so from each third to the next, a geometric series is left. Of a quantity that swings as it settles, the
-    range tells how much; the change of its mean would pass through zero and tell nothing.
+    The range of a quantity in the last third of the checks is compared with that in the third before. If the ranges
+    keep shrinking at this ratio, the remaining change is the sum of a geometric series. The range is used because it
+    works for a quantity that oscillates while it converges; the change of its mean would pass through zero. nan when
+    the last check is not finite, inf with too few checks.
     """
     if not np.isfinite(history[-1]).all():
         return float("nan")
@@ -47,16 +57,22 @@ def fraction_left(history: Floats) -> float:
 
 
 def series_left(last: Any, before: Any) -> Any:
-    """What is left of changes that go on shrinking as from the one before to the last: a geometric series."""
+    """Return the remaining sum of changes that keep shrinking as from `before` to `last`: a geometric series."""
     shrinking = np.clip(last / np.maximum(before, 1e-30), 0.3, 0.9)
     return last * shrinking / (1 - shrinking)
 
 
 def standard_error(history: Floats) -> float:
-    """Largest standard error of the mean of any column of a history (checks, quantities), as a fraction of the mean.
+    """Return the largest standard error of the mean of any monitored quantity, as a fraction of the mean.
 
-    From the means of batches (Schmeiser 1982, Oper. Res. 30, 556), or of both halves where that is more, as it is of
-    what drifts. Of what has not swung about its mean often, the whole range is taken for it; inf of too few checks.
+    It is estimated from the means of batches (Schmeiser 1982, Oper. Res. 30, 556), or of the two halves where that is
+    larger, as for a drifting quantity. For a quantity that has crossed its mean fewer than `LEAST_CROSSINGS` times the
+    whole range is used. inf with too few checks.
+
+    Parameters
+    ----------
+    history : (checks, quantities) float
+        Monitored quantities at every check.
     """
     if len(history) < BATCHES * LEAST_IN_BATCH:
         return float("inf")
@@ -68,15 +84,15 @@ def standard_error(history: Floats) -> float:
 
 
 def _error_by(history: Floats, count: int) -> Floats:
-    """Standard error of the mean of every column, from the means of so many batches of the last checks."""
+    """Return the standard error of the mean of every column from the means of `count` batches."""
     batches = np.array_split(history, count)
     return np.asarray(np.std([batch.mean(axis=0) for batch in batches], axis=0, ddof=1) / np.sqrt(count))
 
 
 def swings(history: Floats, checks: int) -> tuple[float, float]:
-    """What any column of a history (checks, quantities) ranged over at most in the last so many checks.
+    """Return the largest range of any monitored quantity in the last `checks` checks and the largest shift of a mean.
 
-    And how far their mean is from the one of as many before, nan where there are not as many: fractions of the mean.
+    Both are fractions of the mean. The shift is relative to the mean of as many checks before, nan if there are fewer.
     """
     last, before = history[-checks:], history[-2 * checks : -checks]
     mean = last.mean(axis=0)

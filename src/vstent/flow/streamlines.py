@@ -12,21 +12,21 @@ from vstent.kernels import sampling as lattice_sampling
 from vstent.kernels.arrays import Floats, Ints, freeze
 
 STEP_CELLS = 0.4
-"""Length of a step, in cells."""
+"""Length of an integration step, in cells."""
 LONGEST_MM = 150.0
-"""A line caught in a vortex ends here."""
+"""Maximum length of a streamline in either direction, mm: ends lines caught in a vortex."""
 SLOWEST_M_S = 1e-4
-"""A line ends where blood stands."""
+"""Minimum speed, m/s: a streamline ends where the blood is slower."""
 
 
 @dataclass(frozen=True, eq=False)
 class Streamlines:
-    """Polylines along the flow."""
+    """Streamlines as polylines."""
 
     points_mm: Floats
-    """(p, 3) one line after another."""
+    """(p, 3) points of all lines, one line after another."""
     starts: Ints
-    """(s + 1,) first point of every line, and p at the end."""
+    """(s + 1,) index of the first point of every line, and p at the end."""
     speed_m_s: Floats
     """(p,) speed at every point."""
 
@@ -37,10 +37,10 @@ class Streamlines:
 
 
 def streamlines(field: FlowField, seeds_mm: Floats) -> Streamlines:
-    """Trace the flow through every seed (s, 3), upstream and downstream, to the vessel's openings.
+    """Trace streamlines through seeds (s, 3), upstream and downstream, to the vessel's openings.
 
-    Fourth-order Runge-Kutta in arc length on trilinear velocity; seeds outside the blood give no line. What blood does
-    in the extensions beyond the openings is no part of the vessel.
+    The method is fourth-order Runge-Kutta in arc length on trilinearly interpolated velocity. Seeds outside the blood
+    give no line. Lines end at the openings, because the extensions beyond them are not part of the vessel.
     """
     mouths = _mouths(field.wall, field.cell_size_mm)
     up, down = (_ways(field, mouths, seeds_mm, step_cells) for step_cells in (-STEP_CELLS, STEP_CELLS))
@@ -52,7 +52,7 @@ def streamlines(field: FlowField, seeds_mm: Floats) -> Streamlines:
 
 
 def _ways(field: FlowField, mouths: Surface, seeds_mm: Floats, step_cells: float) -> list[Floats]:
-    """Points in mm and speed (p, 4) from every seed (s, 3) on, as far as the blood stays in the vessel."""
+    """Return points in mm and speed (p, 4) from every seed (s, 3) in one direction, within the vessel."""
     seeds = np.ascontiguousarray((seeds_mm - field.origin_mm) / field.cell_size_mm)
     most = int(LONGEST_MM / field.cell_size_mm / STEP_CELLS)
     path, count = lattice_sampling.trace_all(field.index, field.velocity_m_s, seeds, step_cells, SLOWEST_M_S, most)
@@ -61,7 +61,7 @@ def _ways(field: FlowField, mouths: Surface, seeds_mm: Floats, step_cells: float
 
 
 def _mouths(wall: Surface, beyond_mm: float) -> Surface:
-    """What closes a vessel's openings, wider by as much as blood between cells may move outside the wall."""
+    """Return the caps of a vessel's openings, widened by `beyond_mm` to catch lines just outside the wall."""
     vertices_mm = wall.caps.vertices_mm.copy()
     for loop, center_mm in zip(wall.boundary_loops, wall.loop_centers_mm, strict=True):
         outward_mm = vertices_mm[loop] - center_mm
@@ -70,7 +70,7 @@ def _mouths(wall: Surface, beyond_mm: float) -> Surface:
 
 
 def _within(mouths: Surface, way: Floats) -> Floats:
-    """A way (p, 4) as far as the last point before it leaves through an opening, for the first time."""
+    """Return a line (p, 4) up to the last point before it first leaves through an opening."""
     step_mm = np.diff(way[:, :3], axis=0)
     length_mm = np.linalg.norm(step_mm, axis=1)
     ahead = step_mm / np.maximum(length_mm, 1e-12)[:, None]
@@ -80,7 +80,7 @@ def _within(mouths: Surface, way: Floats) -> Floats:
 
 
 def inlet_seeds_mm(field: FlowField, vessel: Vessel, count: int) -> Floats:
-    """About `count` cell centres (s, 3), evenly drawn from the sections of all inlets."""
+    """Return about `count` cell centres (s, 3) evenly drawn from the sections of all inlets."""
     near = np.zeros(len(field.cells), dtype=bool)
     for inlet in vessel.inlets:
         offset = field.centers_mm - inlet.center_mm
@@ -92,9 +92,10 @@ def inlet_seeds_mm(field: FlowField, vessel: Vessel, count: int) -> Floats:
 
 
 def neck_seeds_mm(field: FlowField, neck: Surface, count: int) -> Floats:
-    """About `count` points (s, 3), evenly drawn from the neck."""
+    """Return about `count` points (s, 3) evenly drawn from the neck."""
     return _drawn(sampling.surface_samples(neck, field.cell_size_mm)[0], count)
 
 
 def _drawn(points: Floats, count: int) -> Floats:
+    """Return about `count` of the points at equal intervals of their order."""
     return points[np.unique(np.linspace(0, max(len(points) - 1, 0), min(count, len(points))).round().astype(int))]

@@ -1,4 +1,4 @@
-"""Wall shear stress and pressure on the lumen, from the cells near the wall."""
+"""Wall shear stress and pressure on the lumen, computed from the cells near the wall."""
 
 import numpy as np
 
@@ -16,16 +16,21 @@ REACH = 4
 def wall_stress(
     domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, *, lumen: Surface, blood: Blood
 ) -> tuple[Floats, Floats]:
-    """Wall shear stress (v, 3) in Pa and pressure (v,) in Pa at the vertices of the lumen.
+    """Compute wall shear stress (v, 3) and pressure (v,) at the vertices of the lumen, both in Pa.
 
-    The stress is the traction along the wall, mu du/dn, from a least-squares fit that is exact for Poiseuille flow (see
-    `sampling.fit_wall`); it points the way the blood drags the wall.
+    The stress is the tangential traction mu du/dn of the blood on the wall. It comes from a least-squares fit that is
+    exact for Poiseuille flow (see `sampling.fit_wall`).
 
     Parameters
     ----------
-    domain : the cells, and how far they are from the wall.
-    velocity_m_s, pressure_Pa : (n, 3), (n,) of the cells.
-    lumen : the wall, open at its ends; its faces are outward.
+    domain : Domain
+        The cells and their distance from the wall.
+    velocity_m_s, pressure_Pa : (n, 3) float, (n,) float
+        Velocity and pressure of the cells.
+    lumen : Surface
+        The wall, open at its ends, with outward normals.
+    blood : Blood
+        The fluid.
     """
     shear_per_s, wall_pressure_Pa = _shear(domain, velocity_m_s, pressure_Pa, lumen)
     viscosity_Pa_s = blood.viscosity_at_Pa_s(np.linalg.norm(shear_per_s, axis=1))
@@ -33,11 +38,23 @@ def wall_stress(
 
 
 def mean_shear_Pa(domain: Domain, velocity_m_s: Floats, speed_m_s: Floats, *, lumen: Surface, blood: Blood) -> Floats:
-    """Mean magnitude (v,) of the wall shear stress from the mean velocity (n, 3) and the mean speed (n,) of the cells.
+    """Compute the time-averaged magnitude (v,) of the wall shear stress of an unsteady flow.
 
-    Beside a wall speed is shear rate times distance at every moment. So what it has beyond the mean velocity's size,
-    from what goes to and fro, tells what the shear rate has beyond that of the mean flow. The gradient of the speed
-    itself would tell too much beside blood that turns on its way, where velocities cancel and speeds do not.
+    Near a wall, speed is shear rate times distance at every moment. The excess of the mean speed over the magnitude of
+    the mean velocity therefore gives the excess of the mean shear rate over that of the mean flow. The gradient of the
+    mean speed alone would overestimate the stress where the flow direction rotates, because there velocities cancel and
+    speeds do not.
+
+    Parameters
+    ----------
+    domain : Domain
+        The cells and their distance from the wall.
+    velocity_m_s, speed_m_s : (n, 3) float, (n,) float
+        Time-averaged velocity and time-averaged speed of the cells.
+    lumen : Surface
+        The wall, open at its ends, with outward normals.
+    blood : Blood
+        The fluid.
     """
     shear_per_s, _ = _shear(domain, velocity_m_s, np.zeros(len(speed_m_s)), lumen)
     beyond_m_s = speed_m_s - np.linalg.norm(velocity_m_s, axis=1)
@@ -47,14 +64,14 @@ def mean_shear_Pa(domain: Domain, velocity_m_s: Floats, speed_m_s: Floats, *, lu
 
 
 def _shear(domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, lumen: Surface) -> tuple[Floats, Floats]:
-    """Shear rate (v, 3), as a vector along the wall, and pressure (v,) at the vertices of the lumen."""
+    """Return the shear rate (v, 3) as a vector along the wall, 1/s, and the pressure (v,) at the lumen's vertices."""
     gradient_per_s, wall_pressure_Pa = _fit(domain, velocity_m_s, pressure_Pa, lumen)
     normal = lumen.vertex_normals
     return gradient_per_s - np.einsum("ij,ij->i", gradient_per_s, normal)[:, None] * normal, wall_pressure_Pa
 
 
 def _fit(domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, lumen: Surface) -> tuple[Floats, Floats]:
-    """Gradient (v, 3) of the velocity away from the wall, 1/s, and pressure (v,) at the vertices of the lumen."""
+    """Return the wall-normal velocity gradient (v, 3), 1/s, and the pressure (v,) at the lumen's vertices."""
     fit = sampling.fit_wall(
         domain.index,
         domain.depth_mm / domain.cell_size_mm,

@@ -1,4 +1,4 @@
-"""Waveforms: the published pulse of the internal carotid artery, or one of the patient's own."""
+"""Inflow waveforms: the published one of the internal carotid artery, or a measured one."""
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -54,11 +54,11 @@ OLDER_ADULT_ICA = Waveform(
         0.00123,
     ),
 )
-"""Internal carotid artery of older adults (Hoi et al. 2010, Physiol. Meas. 31, 291): 20 harmonics."""
+"""Waveform of the internal carotid artery of older adults, 20 harmonics (Hoi et al. 2010, Physiol. Meas. 31, 291)."""
 HARMONICS = 20
-"""Harmonics kept of a measured waveform."""
+"""Number of harmonics kept of a measured waveform."""
 RESAMPLED = 512
-"""Equal times at which a measured waveform is read from its spline."""
+"""Number of equally spaced times at which the spline of a measured waveform is sampled."""
 
 
 def waveform_of(time_s: Floats, flow: Floats) -> Waveform:
@@ -66,25 +66,32 @@ def waveform_of(time_s: Floats, flow: Floats) -> Waveform:
 
     Parameters
     ----------
-    time_s, flow : (n,) times, increasing, and flow in any unit; the last sample is the first of the next cycle, and
-        takes its value.
+    time_s : (n,) float
+        Increasing times; the last is the start of the next cycle.
+    flow : (n,) float
+        Flow rate in any unit. The last sample is replaced by the first.
 
     Raises
     ------
     InputError
-        When there are fewer than 5 samples, the times do not increase, or the mean flow is not positive.
+        There are fewer than 5 samples, the times do not increase, or the mean flow is not positive.
     """
     time_s, flow = np.asarray(time_s, dtype=np.float64), np.array(flow, dtype=np.float64)
     if len(time_s) < 5 or len(time_s) != len(flow):
-        raise InputError(f"a waveform of {len(time_s)} samples is no cycle: give 5 or more times, each with its flow")
+        raise InputError(
+            f"the waveform has {len(time_s)} times and {len(flow)} flow rates: give at least 5 times, each with a flow "
+            "rate"
+        )
     if not (np.isfinite(time_s).all() and np.isfinite(flow).all() and (np.diff(time_s) > 0).all()):
-        raise InputError("the waveform's times do not increase, or a number is missing: mend the file")
+        raise InputError(
+            "the waveform's times do not increase, or a number is missing: correct the table of times and flow rates"
+        )
     flow[-1] = flow[0]
     period_s = float(time_s[-1] - time_s[0])
     times = time_s[0] + period_s * np.arange(RESAMPLED) / RESAMPLED
     spectrum = np.fft.rfft(CubicSpline(time_s, flow, bc_type="periodic")(times)) / RESAMPLED
     mean = float(spectrum[0].real)
     if mean <= 0:
-        raise InputError(f"the waveform's mean flow is {mean:.3g}: turn its sign, for blood must enter")
+        raise InputError(f"the waveform's mean flow rate is {mean:.3g}, but inflow must be positive: reverse its sign")
     kept = 2 * spectrum[1 : 1 + HARMONICS] / mean
     return Waveform(period_s, tuple(map(float, kept.real)), tuple(map(float, -kept.imag)))

@@ -1,4 +1,4 @@
-"""The artery's nouns: Opening, Centerline, Vessel, Aneurysm, Anatomy."""
+"""The artery: the data classes `Opening`, `Centerline`, `Vessel`, `Aneurysm` and `Anatomy`."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -106,6 +106,8 @@ class Vessel:
     shrinks where it is higher by as much; 0 for a vessel that is no scan's."""
     blur_mm: float | None = None
     """Standard deviation of the point spread through which the scan shows the wall; None where it is not known."""
+    voxel_mm: float | None = None
+    """Edge of a cube as large as a voxel of the scan; None for a vessel from a surface."""
 
     @property
     def closed(self) -> Surface:
@@ -163,6 +165,31 @@ class Aneurysm:
 
 
 @dataclass(frozen=True, eq=False)
+class Candidate:
+    """A bulge of the wall that may be an aneurysm: its class and the reasons for it."""
+
+    kind: str
+    """``saccular aneurysm``, ``branch stump``, ``infundibulum``, ``bleb`` or ``artifact``."""
+    point_mm: Floats
+    """(3,) a point inside it, by which it can be chosen."""
+    reasons: tuple[str, ...]
+    """What the class rests on, one clause each."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "point_mm", np.float64, (3,))
+
+    @property
+    def is_aneurysm(self) -> bool:
+        """Whether it is taken for an aneurysm unless another one is chosen."""
+        return self.kind == "saccular aneurysm"
+
+    @property
+    def described(self) -> str:
+        """Return class, place and reasons as one clause."""
+        return f"{self.kind} at {place(self.point_mm)}: {', '.join(self.reasons)}"
+
+
+@dataclass(frozen=True, eq=False)
 class Anatomy:
     """A traced vessel with its parent artery restored."""
 
@@ -180,6 +207,8 @@ class Anatomy:
     """The sacs found, the largest first; empty for a healthy artery."""
     notes: tuple[str, ...] = ()
     """What was found or assumed, one sentence each."""
+    candidates: tuple[Candidate, ...] = ()
+    """Every bulge that was looked at, with its class."""
 
     def __post_init__(self) -> None:
         freeze(self, "section_radius_mm", np.float64, (len(self.axis.points_mm),))

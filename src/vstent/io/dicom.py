@@ -333,7 +333,7 @@ def _one_acquisition(planes: list[_Slice], wanted: int | None) -> tuple[list[_Sl
             f"The series holds {len(groups)} acquisitions ({listed}), not {wanted}. Give one of these numbers."
         )
     chosen = int(np.argmax([_brightness(one) for _, one in groups])) if wanted is None else wanted - 1
-    why = "chosen because its vessels are the brightest; to read another, export it as a series of its own"
+    why = "chosen because its vessels are the brightest; choose another by its number (--acquisition)"
     note = f"The series holds {len(groups)} acquisitions ({listed}). Acquisition {chosen + 1} is used"
     return groups[chosen][1], (f"{note}, as requested." if wanted is not None else f"{note}, {why}.",)
 

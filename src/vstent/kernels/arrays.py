@@ -1,4 +1,4 @@
-"""Read-only arrays: the fields of every noun."""
+"""Read-only arrays, the fields of the data classes."""
 
 from typing import Any
 

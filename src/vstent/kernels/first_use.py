@@ -56,7 +56,7 @@ class _Refusal(event.Listener):
 
 
 class _Once(event.Listener):
-    """Tells of the first compilation."""
+    """Reports the first compilation."""
 
     def __init__(self, tell: Callable[[], None], command: tuple[str, ...]) -> None:
         """Keep whom to tell, and what to start."""

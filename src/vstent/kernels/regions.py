@@ -10,7 +10,7 @@ from vstent.kernels import triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 N_STEPS: Final = 40
-"""Most steps; a border has settled when none of its vertices changes sides."""
+"""Largest number of steps; a border has converged when none of its vertices changes sides."""
 FLATTEST: Final = 0.05
 """Cotangents below this count as this: weights stay positive on obtuse triangles."""
 

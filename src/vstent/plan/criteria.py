@@ -89,11 +89,11 @@ class Criterion(_Strict):
         if self.none == self.full:
             raise ValueError("none and full must differ")
         if (self.enough is None) != (self.beyond is None):
-            raise ValueError("enough and beyond come together")
+            raise ValueError("enough and beyond must be given together")
         if self.beyond is not None and not self.none < self.full <= self.enough < self.beyond:  # type: ignore[operator]
             raise ValueError("none < full <= enough < beyond must hold")
         if not _has_one_place(self.phrase):
-            raise ValueError("phrase must have one place for a number, as {:.1f}")
+            raise ValueError("phrase must have one place for a number, such as {:.1f}")
         return self
 
     def concerns(self, design: Design) -> bool:
@@ -119,7 +119,7 @@ class Criteria:
     """What a ranking goes by."""
 
     items: tuple[Criterion, ...]
-    """In the order in which they are told."""
+    """Criteria in the order of the report."""
 
     def of(self, design: Design) -> tuple[Criterion, ...]:
         """Return those that concern a device."""
@@ -149,7 +149,7 @@ def read_criteria(path: Path) -> Criteria:
     try:
         text = existing(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read as text: give a TOML file of criteria.") from error
+        raise InputError(f"{path} cannot be read as text. Give a TOML file of criteria.") from error
     return parse(text, str(path))
 
 
@@ -170,9 +170,9 @@ def parse(text: str, name: str = "The file of criteria") -> Criteria:
         where = ".".join(str(part) for part in first["loc"])
         raise InputError(f"{name} is wrong at {where}: {first['msg']}. Correct that entry.") from error
     if not any(item.weight > 0 for item in items):
-        raise InputError(f"{name} gives no criterion any weight: give one a weight above 0.")
+        raise InputError(f"{name} gives no criterion a weight. Give at least one a weight above 0.")
     for key in (item.key for item in items if item.key not in MEASURES):
         near = difflib.get_close_matches(key, MEASURES, n=1)
         hint = f"Did you mean {near[0]}?" if near else f"Choose one of: {', '.join(MEASURES)}."
-        raise InputError(f"{name} asks for {key}, which is no number that is measured of a device. {hint}")
+        raise InputError(f"{name} uses {key}, which is not a number that is measured of a device. {hint}")
     return Criteria(tuple(items))

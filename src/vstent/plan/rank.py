@@ -183,7 +183,7 @@ def bend_ratios(anatomy: Anatomy) -> Floats:
 def _reason(asked: Sequence[Criterion], grades: dict[str, float], measures: Measures) -> str:
     """One sentence: what rules it out, or what costs it most."""
     if not asked:
-        return "No criterion asks for anything that was measured of it."
+        return "None of the criteria could be measured."
     weight = sum(item.weight for item in asked)
     said = {item.key: item.phrase.format(measures[item.key]) for item in asked}
     out = [said[item.key] for item in asked if grades[item.key] == 0]
@@ -192,5 +192,7 @@ def _reason(asked: Sequence[Criterion], grades: dict[str, float], measures: Meas
     lost = {item.key: item.weight * (1 - grades[item.key]) / weight for item in asked}
     costly = sorted((key for key in lost if lost[key] > TELLING), key=lambda key: -lost[key])[:TOLD]
     if costly:
-        return f"Costs it most: {'; '.join(f'{said[key]} (-{lost[key]:.2f})' for key in costly)}."
-    return "Meets every criterion almost in full."
+        return (
+            f"Largest deductions from a score of 1: {'; '.join(f'{said[key]} (-{lost[key]:.2f})' for key in costly)}."
+        )
+    return "Meets almost every criterion in full."

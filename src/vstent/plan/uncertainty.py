@@ -67,15 +67,17 @@ class Ranges:
     def __post_init__(self) -> None:
         if self.samples < 2 or self.flow_samples < 0:
             raise InputError(
-                f"{self.samples} samples, {self.flow_samples} of them with flows, say nothing of a spread: take at "
-                "least 2, and no fewer than 0 flows"
+                f"{self.samples} samples, {self.flow_samples} of them with flows, are too few for a spread: "
+                "give at least 2 samples, and 0 or more flows"
             )
         for name in ("threshold_mm", "landing_mm", "device_mm", "inflow_fraction"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < math.inf:
-                raise InputError(f"{value:g} is no range of {name}: give how far to either side, 0 or more")
+                raise InputError(f"{value:g} is not a range of {name}: give 0 or more, to either side")
         if self.inflow_fraction >= 1:
-            raise InputError(f"an inflow that varies by {self.inflow_fraction:g} of itself may stop: give less than 1")
+            raise InputError(
+                f"an inflow that varies by a fraction of {self.inflow_fraction:g} could vanish: give less than 1"
+            )
 
     def of(self, anatomy: Anatomy) -> Floats:
         """Return the ranges (4,) in the order of `CAUSES`."""
@@ -85,7 +87,7 @@ class Ranges:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What came of varying."""
+    """Result of an uncertainty study."""
 
     ranges: Floats
     """(4,) plus and minus of every cause, in the order of `CAUSES`: mm, mm, mm, fraction."""
@@ -178,8 +180,8 @@ def vary(
     free_mm = stent.size.free_diameter_mm
     if ranges.device_mm >= WIDEST_FRACTION * free_mm:
         raise InputError(
-            f"no device {free_mm:.2f} mm wide when free is made {ranges.device_mm:g} mm wider or narrower: give a "
-            f"range of less than {WIDEST_FRACTION * free_mm:.2f} mm"
+            f"a device with a free diameter of {free_mm:.2f} mm is not made {ranges.device_mm:g} mm wider or "
+            f"narrower: give a range below {WIDEST_FRACTION * free_mm:.2f} mm"
         )
     middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
     rows = []

@@ -53,7 +53,7 @@ def spread(
             yield from pool.map(_answer, items)
         except BrokenProcessPool as error:
             raise VstentError(
-                "a worker process died, killed or out of memory: give the same command again, with fewer jobs"
+                "a worker process ended (killed, or out of memory): give the same command again with fewer jobs"
             ) from error
         finally:
             pool.shutdown(cancel_futures=True)

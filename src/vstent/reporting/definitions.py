@@ -22,25 +22,28 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     # the artery and the sac
     "parent_proximal_diameter_mm": Definition(
         "Parent diameter, proximal",
-        "Diameter of the circle with the area of the parent artery's section before the neck.",
+        "Mean diameter of the parent artery over 5 mm proximal to the neck (circle of the same area).",
     ),
     "parent_distal_diameter_mm": Definition(
-        "Parent diameter, distal", "Diameter of the circle with the area of the parent artery's section after the neck."
+        "Parent diameter, distal",
+        ("Mean diameter of the parent artery over 5 mm distal to the neck (circle of the same area)."),
     ),
     "sac_volume_mm3": Definition("Sac volume", "Volume of the lumen beyond the neck."),
     "sac_plane_volume_mm3": Definition(
-        "Sac volume, plane cut", "Volume of the sac beyond the neck plane: the neck curve's mean plane.", _RAGHAVAN
+        "Sac volume, plane cut", "Volume of the sac beyond the mean plane of the neck curve.", _RAGHAVAN
     ),
     "sac_area_mm2": Definition("Sac wall area", "Area of the sac's wall, without the neck."),
-    "sac_height_mm": Definition("Sac height", "Largest distance of the dome from the neck plane, square to it.", _DHAR),
+    "sac_height_mm": Definition(
+        "Sac height", ("Largest distance of the dome from the neck plane, perpendicular to it."), _DHAR
+    ),
     "sac_max_height_mm": Definition(
-        "Sac height, longest", "Longest distance from the neck's center to the dome.", _DHAR
+        "Sac height, longest", "Largest distance from the center of the neck to the dome.", _DHAR
     ),
     "sac_max_diameter_mm": Definition("Sac diameter, largest", "Largest distance between two points of the sac."),
-    "neck_area_mm2": Definition("Neck area", "Area of the neck curve projected on its own mean plane."),
+    "neck_area_mm2": Definition("Neck area", "Area enclosed by the neck curve, projected on its mean plane."),
     "neck_plane_area_mm2": Definition(
         "Neck area, plane cut",
-        "Area of the sac's largest section by the neck plane; left out where the artery's wall parts that section.",
+        "Area of the largest section of the sac by the neck plane; missing where the artery wall divides that section.",
         _RAGHAVAN,
     ),
     "neck_surface_area_mm2": Definition("Neck surface", "Area of the restored wall that closes the neck."),
@@ -51,34 +54,33 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "size_ratio": Definition("Size ratio", "Longest sac height divided by the parent artery's diameter.", _DHAR),
     "diameter_threshold_band_mm": Definition(
         "Diameter band",
-        "Every diameter grows by this where the scan's threshold is lower by 5 % of the step from tissue to lumen, and "
-        "shrinks by it where higher.",
+        "Change of every diameter when the threshold of the scan changes by 5 % of the step from tissue to lumen.",
     ),
     "parent_mean_curvature_per_mm": Definition(
-        "Parent curvature, mean", "Mean curvature of the parent axis, its ends left out.", _PICCINELLI
+        "Parent curvature, mean", "Mean curvature of the parent axis without its ends.", _PICCINELLI
     ),
     "parent_max_curvature_per_mm": Definition(
-        "Parent curvature, largest", "Largest curvature of the parent axis, its ends left out.", _PICCINELLI
+        "Parent curvature, largest", "Largest curvature of the parent axis without its ends.", _PICCINELLI
     ),
     "parent_mean_torsion_per_mm": Definition(
-        "Parent torsion, mean", "Mean magnitude of the torsion of the parent axis where that is bent.", _PICCINELLI
+        "Parent torsion, mean", "Mean magnitude of the torsion of the parent axis where it is bent.", _PICCINELLI
     ),
     "neck_mean_curvature_per_mm": Definition(
         "Parent curvature at the neck", "Mean curvature of the parent axis along the neck.", _PICCINELLI
     ),
     # the device
-    "label_diameter_mm": Definition("Diameter on the label", "Diameter the device is sold as."),
-    "label_length_mm": Definition("Length on the label", "Length the device is sold as."),
-    "deployed_length_mm": Definition(
-        "Deployed length", "Length along the parent axis between the ends; the wires keep their own length."
-    ),
+    "label_diameter_mm": Definition("Label diameter", "Nominal diameter of the size."),
+    "label_length_mm": Definition("Label length", "Nominal length of the size."),
+    "deployed_length_mm": Definition("Deployed length", "Length along the parent axis between the ends of the device."),
     "oversizing_fraction": Definition(
-        "Oversizing", "Label diameter divided by the artery's mean diameter where the device lies, less one."
+        "Oversizing", "Label diameter divided by the mean diameter of the artery along the device, minus one."
     ),
     "proximal_end_abscissa_mm": Definition(
-        "Proximal end", "Where the device begins, along the parent axis from the inlet."
+        "Proximal end", "Position of the proximal end along the parent axis, from the inlet."
     ),
-    "distal_end_abscissa_mm": Definition("Distal end", "Where the device ends, along the parent axis from the inlet."),
+    "distal_end_abscissa_mm": Definition(
+        "Distal end", ("Position of the distal end along the parent axis, from the inlet.")
+    ),
     "min_diameter_mm": Definition(
         "Deployed diameter, smallest", "Smallest perimeter of a row of the device, divided by pi."
     ),
@@ -87,103 +89,108 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "Deployed diameter, largest", "Largest perimeter of a row of the device, divided by pi."
     ),
     "neck_to_proximal_end_mm": Definition(
-        "Landing zone, proximal", "Length of device before the neck, along the parent axis."
+        "Landing zone, proximal", "Length of the device proximal to the neck, along the parent axis."
     ),
     "neck_to_distal_end_mm": Definition(
-        "Landing zone, distal", "Length of device after the neck, along the parent axis."
+        "Landing zone, distal", "Length of the device distal to the neck, along the parent axis."
     ),
     "neck_covered_fraction": Definition(
-        "Neck spanned", "100 % where the device begins before the neck and ends after it."
+        "Neck spanned", "100 % where the device spans the whole neck along the parent axis."
     ),
     "max_neck_gap_mm": Definition(
         "Neck gap, largest",
-        "Largest clearance between the device's outer face and the neck: large where the sac sits on a fork, of which "
-        "one branch alone is stented, or where the device stands off the wall.",
+        "Largest clearance between the outer face of the device and the neck. It is large where the sac is on "
+        "a fork with one branch stented, or where the device is not apposed.",
     ),
     "apposed_fraction": Definition(
-        "Apposed", "Part of the device's nodes beside the patient's own wall that are nearer to it than 0.1 mm."
+        "Apposed", "Fraction of the device's nodes over the patient's own wall with a gap below 0.1 mm."
     ),
-    "mean_wall_gap_mm": Definition("Wall gap, mean", "Mean clearance between the device's outer face and the wall."),
+    "mean_wall_gap_mm": Definition(
+        "Wall gap, mean", ("Mean clearance between the outer face of the device and the wall.")
+    ),
     "max_wall_gap_mm": Definition(
-        "Wall gap, largest", "Largest clearance between the device's outer face and the wall."
+        "Wall gap, largest", "Largest clearance between the outer face of the device and the wall."
     ),
     "malapposition_volume_mm3": Definition(
-        "Malapposition volume", "Volume between the device's outer face and the wall."
+        "Malapposition volume", "Volume between the outer face of the device and the wall."
     ),
     "max_outside_mm": Definition(
-        "Outside the artery, largest", "Largest distance of a node beyond the landing surface; a good deployment has 0."
+        "Outside the artery, largest", "Largest distance of a node outside the landing surface; 0 in a good deployment."
     ),
     "metal_coverage_fraction": Definition(
-        "Metal coverage", "Part of the device's surface under wires, measured on the wires as they lie."
+        "Metal coverage", "Fraction of the device's surface covered by metal, measured on the deployed wires."
     ),
     "metal_coverage_formula_fraction": Definition(
         "Metal coverage, formula",
-        "At the mean deployed diameter: 1 - (1 - f)² for crossing wires, f the part that the wires of one hand cover; "
-        "2 f for struts that meet without crossing.",
+        "At the mean deployed diameter: 1 - (1 - f)² for crossing wires, with f the fraction covered by the "
+        "wires of one direction; 2 f for struts that meet without crossing.",
     ),
     "neck_metal_coverage_fraction": Definition(
-        "Metal coverage on the neck", "Part of the device over the neck (on a fork: facing it) under wires."
+        "Metal coverage on the neck",
+        ("Fraction of the device's surface over the neck covered by metal (on a fork: the part that faces the neck)."),
     ),
     "pore_density_per_mm2": Definition(
-        "Pore density", "Pores per area of the device, measured on the wires as they lie."
+        "Pore density", "Number of pores per area of the device, measured on the deployed wires."
     ),
     "pore_density_formula_per_mm2": Definition(
         "Pore density, formula",
-        "At the mean deployed diameter D, for n wires at the angle a to the axis: 2 (n/2)² tan(a) / (pi D)².",
+        "At the mean deployed diameter D, for n wires at an angle a to the axis: 2 (n/2)² tan(a) / (pi D)².",
     ),
-    "neck_pore_density_per_mm2": Definition("Pore density on the neck", "Pores per area of the device over the neck."),
-    "iterations_count": Definition("Iterations", "Steps of the active contour until it stopped (the paper needs 7)."),
+    "neck_pore_density_per_mm2": Definition(
+        "Pore density on the neck", ("Number of pores per area of the device over the neck.")
+    ),
+    "iterations_count": Definition("Iterations", "Iterations of the active contour (the paper: 7 on average)."),
     "terminated_fraction": Definition(
-        "Nodes terminated", "Part of the nodes that reached the wall or the free diameter; the contour stops at 99 %."
+        "Nodes terminated",
+        ("Fraction of the nodes that reached the wall or the free diameter; the contour stops at 99 %."),
     ),
-    "jailed_branches_count": Definition("Jailed branches", "Branches that leave the artery between the device's ends."),
+    "jailed_branches_count": Definition(
+        "Jailed branches", ("Number of branches that leave the artery between the ends of the device.")
+    ),
     "proximal_end_to_branch_mm": Definition(
-        "Proximal end to branch", "Along the artery, from the proximal end of the device to the nearest branch."
+        "Proximal end to branch", "Distance along the artery from the proximal end of the device to the nearest branch."
     ),
     "distal_end_to_branch_mm": Definition(
-        "Distal end to branch", "Along the artery, from the distal end of the device to the nearest branch."
+        "Distal end to branch", "Distance along the artery from the distal end of the device to the nearest branch."
     ),
     "mean_wire_stretch_fraction": Definition(
-        "Wire stretch, mean", "By how much pieces of wire between crossings are longer than made: 0 is right."
+        "Wire stretch, mean", "Mean relative change of length of the wires between crossings; 0 is exact."
     ),
     "p95_wire_stretch_fraction": Definition(
-        "Wire stretch, 95 %", "95 % of the pieces of wire between crossings stretch or shorten by less than this."
+        "Wire stretch, 95 %", "95 % of the wires between crossings change their length by less than this."
     ),
     # the flow
-    "inlet_flow_mL_s": Definition("Inlet flow", "Blood that enters through the inlet."),
-    "outlet_flow_mL_s": Definition("Outlet flow", "Blood that leaves through the outlet."),
-    "neck_inflow_mL_s": Definition(
-        "Neck inflow", "Integral over the neck of the velocity where it points into the sac."
-    ),
+    "inlet_flow_mL_s": Definition("Inlet flow", "Flow of blood through the inlet."),
+    "outlet_flow_mL_s": Definition("Outlet flow", "Flow of blood through the outlet."),
+    "neck_inflow_mL_s": Definition("Neck inflow", "Integral over the neck of the velocity component into the sac."),
     "turnover_time_s": Definition("Turnover time", "Sac volume divided by neck inflow."),
     "mean_sac_velocity_m_s": Definition(
         "Mean sac velocity",
-        "Mean magnitude of the velocity over the sac; a reduction by 35 % or more has been associated with occlusion.",
+        "Mean speed in the sac. Studies associate a reduction of 35 % or more with occlusion.",
     ),
     "mean_sac_oscillatory_shear_fraction": Definition(
-        "Sac oscillatory shear index", "Area mean over the sac's wall of (1 - |mean stress| / mean |stress|) / 2."
+        "Sac oscillatory shear index", "Mean over the sac wall of (1 - |mean stress| / mean |stress|) / 2."
     ),
     "mean_sac_wss_Pa": Definition(
-        "Wall shear stress on the sac, mean", "Area mean over the sac's wall of the magnitude of the wall shear stress."
+        "Wall shear stress on the sac, mean", "Mean magnitude of the wall shear stress over the sac wall."
     ),
     "max_sac_wss_Pa": Definition(
         "Wall shear stress on the sac, largest",
-        "Largest magnitude of the wall shear stress on the sac's wall; of a pulse in any of its moments.",
+        "Largest magnitude of the wall shear stress on the sac wall; in a pulse at any time.",
     ),
     "parent_wss_Pa": Definition(
-        "Wall shear stress on the parent artery, mean", "Area mean of its magnitude over the parent artery's own wall."
+        "Wall shear stress on the parent artery, mean",
+        ("Mean magnitude of the wall shear stress over the parent artery's own wall."),
     ),
     "low_shear_area_fraction": Definition(
-        "Low shear area", "Part of the sac's wall with a wall shear stress below 0.4 Pa."
+        "Low shear area", "Fraction of the sac wall with a wall shear stress below 0.4 Pa."
     ),
-    "mean_sac_pressure_Pa": Definition("Sac pressure, mean", "Mean over the sac's volume, above that of the outlets."),
+    "mean_sac_pressure_Pa": Definition("Sac pressure, mean", "Mean pressure in the sac, relative to the outlets."),
     "fast_sac_volume_mm3": Definition("Fast sac volume", "Volume of the sac with a speed above 8 cm/s."),
-    "max_sac_velocity_m_s": Definition(
-        "Largest sac velocity", "Largest magnitude of the velocity in the sac; of a pulse in any of its moments."
-    ),
-    "neck_outflow_mL_s": Definition("Neck outflow", "Integral over the neck of the velocity where it leaves the sac."),
+    "max_sac_velocity_m_s": Definition("Largest sac velocity", "Largest speed in the sac; in a pulse at any time."),
+    "neck_outflow_mL_s": Definition("Neck outflow", "Integral over the neck of the velocity component out of the sac."),
     "sac_kinetic_energy_J": Definition("Kinetic energy of the sac", "Integral over the sac of density u² / 2."),
-    "inflow_area_fraction": Definition("Inflow area", "Part of the neck where blood enters the sac."),
+    "inflow_area_fraction": Definition("Inflow area", "Fraction of the neck where blood enters the sac."),
     "inflow_concentration_index": Definition(
         "Inflow concentration",
         "(Neck inflow / flow of all inlets) / (inflow area / neck area).",
@@ -191,21 +198,23 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     ),
     "relative_low_shear_area_fraction": Definition(
         "Low shear area, relative",
-        "Part of the sac's wall below a tenth of the parent artery's mean wall shear stress.",
+        "Fraction of the sac wall below a tenth of the parent artery's mean wall shear stress.",
     ),
-    "mean_wss_Pa": Definition("Wall shear stress, mean", "Area mean of its magnitude over the whole wall."),
-    "inlet_pressure_Pa": Definition("Inlet pressure", "Mean over the inlet's section, above that of the outlets."),
-    "pressure_drop_Pa": Definition("Pressure drop", "Inlet pressure less that of the widest outlet."),
+    "mean_wss_Pa": Definition(
+        "Wall shear stress, mean", ("Mean magnitude of the wall shear stress over the whole wall.")
+    ),
+    "inlet_pressure_Pa": Definition("Inlet pressure", "Mean pressure over the inlet, relative to the outlets."),
+    "pressure_drop_Pa": Definition("Pressure drop", "Pressure at the inlet minus pressure at the widest outlet."),
     "unsettled_fraction": Definition(
-        "Left to settle",
-        "What the sac's mean speed, neck inflow, inlet pressure or the vessel's mean speed has left to go; where they "
-        "swing, three standard errors of their means, or what they range over if checks are too few to tell; of a "
-        "pulse, what its last two cycles differ by.",
+        "Convergence error",
+        "Estimated relative distance from convergence of sac speed, neck inflow, inlet pressure and mean "
+        "speed. Of an unsteady flow: three standard errors of the means, or the range where there are too few "
+        "checks. Of a pulse: change between its last two cycles.",
     ),
 }
 
 OF_PULSE: Final = (
-    "Of a pulse every number of the flow is the mean over its last cycle, unless it is called largest; wall shear "
+    "In pulsatile flow every number is the mean over the last cycle, unless its name says largest; wall shear "
     "stress is the time average of its magnitude (TAWSS)."
 )
 """What holds for all numbers of the flow."""

@@ -20,7 +20,7 @@ _INK = "#16262e"
 _QUIET = "#54666f"
 _LIGHT = np.array([-0.35, 0.50, 0.79])
 _SUPERSAMPLING = 2
-ABOVE = "What is above the scale is drawn in its last colour."
+ABOVE = "Values above the scale have its last color."
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,18 +145,18 @@ def _anatomy(scene: Scene) -> Picture:
 def _contour(scene: Scene) -> Picture:
     ids = ("lumen", "contour", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
-    caption = "The deployed contour in the lumen, coloured by its gap to the wall of the parent artery."
-    return Picture("contour", "Where the devices lie", caption, sheet(scene, shots, "wall_gap"))
+    caption = "The deployed contour in the lumen, colored by its gap to the wall of the parent artery."
+    return Picture("contour", "Position of the devices", caption, sheet(scene, shots, "wall_gap"))
 
 
 def _coverage(scene: Scene) -> Picture:
     ids = ("lumen", "coverage", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
     caption = (
-        "Coverage map: the part of the contour that is under metal, measured on the wires and averaged over a few "
-        "pores; denser on the inside of a bend, wider on its outside."
+        "Metal coverage: fraction of the contour covered by metal, measured on the wires and averaged over a "
+        "few pores; higher on the inside of a bend, lower on its outside."
     )
-    return Picture("coverage", "How much metal covers the wall", caption, sheet(scene, shots, "coverage"))
+    return Picture("coverage", "Metal coverage of the wall", caption, sheet(scene, shots, "coverage"))
 
 
 def _wires(scene: Scene) -> Picture:
@@ -168,8 +168,7 @@ def _wires(scene: Scene) -> Picture:
         if view.id in looks
     ]
     caption = (
-        "The wires and the neck (red line); wires on the far side are paler. "
-        "Seen from the sac, close up, the wall is taken away."
+        "The wires and the neck (red line), seen from the sac with its wall removed; wires on the far side are paler."
     )
     return Picture("wires", "Wires across the neck", caption, sheet(scene, shots, ""))
 
@@ -177,7 +176,7 @@ def _wires(scene: Scene) -> Picture:
 def _streamlines(scene: Scene) -> Picture:
     ids = ("lumen", "streamlines", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes]
-    caption = f"Streamlines through artery and sac, coloured by speed on one scale. {ABOVE}"
+    caption = f"Streamlines through artery and sac, colored by speed on one scale. {ABOVE}"
     return Picture("streamlines", "Blood flow before and after", caption, sheet(scene, shots, "speed"))
 
 

@@ -48,13 +48,13 @@ def _restoration(scene: Scene) -> Picture:
     lumen, landing = scene.pick(("lumen",), BARE), scene.pick(("landing",), BARE)
     cut = scene.pick(("lumen", "sac", "neck"), BARE)
     shots = [
-        Shot("As it was found", _opaque(lumen), profile),
+        Shot("The wall as found", _opaque(lumen), profile),
         Shot("The sac and its neck", cut, profile),
-        Shot("The sac shrunk: the parent artery", landing, profile),
+        Shot("The parent artery, with the sac removed", landing, profile),
     ]
     caption = (
-        "The wall as it was found; the sac (red), cut off along its neck (red line); and what is left when the sac is "
-        "shrunk and the side branches are closed: the parent artery, against which a device opens."
+        "The wall as found; the sac (red), cut off along its neck (red line); and the parent artery with sac "
+        "and side branches closed, against which a device expands."
     )
     return Picture("restoration", "From the patient's artery to the parent artery", caption, sheet(scene, shots, ""))
 
@@ -66,8 +66,8 @@ def _spheres(anatomy: Anatomy, scene: Scene) -> Picture:
         Shot("Frontal", (*scene.pick(("lumen", "axis"), BARE), spheres), scene.view("frontal")),
     ]
     caption = (
-        "The axis of the parent artery (blue line) and spheres on it as wide as the artery lets them be (maximum "
-        "inscribed spheres): they set the diameter with which the contour begins."
+        "The axis of the parent artery (blue line) with its maximum inscribed spheres, which set the diameter "
+        "of the initial contour."
     )
     return Picture("spheres", "Centerline and maximum inscribed spheres", caption, sheet(scene, shots, ""))
 
@@ -101,10 +101,10 @@ def _first_contours(case: "CaseResult", scene: Scene) -> Picture:
         layers = (*scene.pick(("axis",), BARE), *_contour_layers(case.deployments[name].history_mm[0]))
         shots.append(Shot(title, (*_glass(scene), *layers), scene.view("profile")))
     caption = (
-        "The contour before the first iteration, in the parent artery (glass): rows of nodes on planes across the "
-        "axis, each as wide as the maximum inscribed sphere there. Every few rows are drawn as lines."
+        "The contour before the first iteration, in the parent artery (glass): rows of nodes on planes across "
+        "the axis, each as wide as the maximum inscribed sphere. Some rows are drawn as lines."
     )
-    return Picture("first", "The first contour", caption, sheet(scene, shots, ""))
+    return Picture("first", "The initial contour", caption, sheet(scene, shots, ""))
 
 
 def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
@@ -125,9 +125,9 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
         surface = replace(contour.surface, vertices_mm=nodes_mm)
         layer = replace(contour, surface=surface, values=gap_mm, frames_mm=None, frame_values=None)
         words = (
-            f"after {counted(number, 'iteration')}, {100 * reached[number]:.0f} % of the nodes at rest"
+            f"after {counted(number, 'iteration')}, {100 * reached[number]:.0f} % of the nodes terminated"
             if number
-            else "before the first"
+            else "initial contour"
         )
         shots.append(Shot(words[:1].upper() + words[1:], (*_glass(scene), layer), scene.view("profile")))
     # The scale of the deployed device is too narrow for the way there.
@@ -136,8 +136,8 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
     shown = replace(scene, scales=tuple(wide if scale is gap else scale for scale in scene.scales))
     title = f"Expansion of {dict(scene.panes)[name]}"
     caption = (
-        f"The active contour on its way to the wall of the parent artery (glass) in "
-        f"{counted(len(deployment.history_mm) - 1, 'iteration')}, coloured by the gap that is left."
+        "Expansion of the active contour to the wall of the parent artery (glass) in "
+        f"{counted(len(deployment.history_mm) - 1, 'iteration')}, colored by the remaining gap."
     )
     return Picture(f"expansion-{name}", title, caption, sheet(shown, shots, "wall_gap"))
 
@@ -152,10 +152,8 @@ def _fitted(scene: Scene) -> Picture:
             Shot(f"{title}: in the patient's artery", scene.pick(("lumen", "wires", "neck"), pane), profile),
         )
     ]
-    caption = (
-        "The wires on the expanded contour, and put back into the patient's own artery with its sac (neck: red line)."
-    )
-    return Picture("fitted", "The devices fitted", caption, sheet(scene, shots, ""))
+    caption = "The wires on the expanded contour, and in the patient's own artery with its sac (neck: red line)."
+    return Picture("fitted", "The deployed devices", caption, sheet(scene, shots, ""))
 
 
 def _glass(scene: Scene) -> tuple[MeshLayer | LineLayer, ...]:

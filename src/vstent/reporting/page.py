@@ -37,19 +37,19 @@ if TYPE_CHECKING:
 
 WEBP_QUALITY: Final = 90
 OF_CONTOUR: Final = (
-    "The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way: "
-    "how an artery and a device push each other is not computed."
+    "The contour is the active contour of Zhong et al. 2016 with a rigid wall: forces between artery and "
+    "device are not computed."
 )
-OF_USE: Final = "Research use only. Nothing here has been cleared for diagnosis or treatment."
+OF_USE: Final = "Research use only. Not cleared for diagnosis or treatment."
 AT_OUTLETS: Final = {
-    "zero_pressure": "the pressure at the outlets was set, not measured in a patient",
-    "murray": "the flow was split among the outlets by the cube of their radius, not measured in a patient",
+    "zero_pressure": "the pressure at the outlets is assumed, not measured in the patient",
+    "murray": "the flow is split among the outlets by their diameter cubed, not measured in the patient",
 }
 """Setting of the outlets -> what it leaves out."""
-AT_INLETS: Final = "What each of the inlets brings was set, not measured in a patient."
+AT_INLETS: Final = "The flow through each inlet is assumed, not measured in the patient."
 OF_DEVICE: Final = {
-    LATTICE: "In the flow a device is a thin resistance computed from its wires.",
-    OPENFOAM: "In the flow a device is its struts over the neck and over branches, meshed.",
+    LATTICE: "In the flow a device is a porous screen computed from its wires.",
+    OPENFOAM: "In the flow a device is its meshed wires over the neck and over branches.",
 }
 """Engine -> what it makes of a device."""
 
@@ -149,7 +149,7 @@ def limits_of(case: "CaseResult") -> tuple[str, ...]:
 
 def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
     thins = flow["blood"]["thinning"] is not None
-    blood = "Blood thins with the shear rate by a law fitted to others' blood" if thins else "Blood is Newtonian"
+    blood = "Blood is shear-thinning, with parameters from the literature" if thins else "Blood is Newtonian"
     told = [f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
     return [*told, OF_DEVICE[flow["engine"]]] if flow["engine"] in OF_DEVICE else told
 
@@ -211,7 +211,7 @@ def _sections(told: Contents) -> list[tuple[str, str]]:
         titles["flow"] = "Blood flow"
     if told.uncertainty:
         titles["uncertainty"] = "Uncertainty"
-    titles |= {"notes": "Notes and limits", "definitions": "Definitions", "provenance": "How this was made"}
+    titles |= {"notes": "Notes and limits", "definitions": "Definitions", "provenance": "Method"}
     return list(titles.items())
 
 
@@ -245,7 +245,7 @@ def _stent(name: str, deployment: Deployment, metrics: dict[str, Any]) -> dict[s
     values = flatten(measured.get("deployment", {}), ("stents", name, "deployment"))
     diameters = ", ".join(f"{d:g}" for d in np.unique(stent.wire_diameter_um))
     wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
-    how = "terminated" if deployment.outcome == "terminated" else "stopped at its limit"
+    how = "terminated" if deployment.outcome == "terminated" else "stopped at its iteration limit"
     count = len(deployment.terminated_fraction)
     steps = f"{count} iteration{'s' if count > 1 else ''}"
     return {

@@ -179,7 +179,7 @@ def _named(quantity: Quantity, skip: int) -> str:
 
 def _summary(paper: _Paper, told: Contents) -> None:
     paper.title(told.name)
-    paper.text("Virtual stenting report. Blood flow before and after each device; change is after / before − 1.")
+    paper.text("Virtual stenting report. Blood flow without and with each device; change is with / without − 1.")
     if told.headlines:
         paper.heading("Before and after")
         _changes(paper, told, told.headlines)
@@ -210,7 +210,7 @@ def _devices(paper: _Paper, told: Contents) -> None:
         paper.text(stent["words"])
         paper.text(stent["advice"])
         paper.table(_rows(stent["quantities"], 3), (0.66, 0.34))
-        paper.text("Where the device's numbers come from:", 8, color=_QUIET)
+        paper.text("Sources of the device's numbers:", 8, color=_QUIET)
         paper.table(stent["facts"], (0.26, 0.74))
 
 
@@ -241,7 +241,7 @@ def _words(paper: _Paper, told: Contents) -> None:
     for definition, unit in told.definitions:
         source = f" ({definition.source})" if definition.source else ""
         paper.text(f"{definition.name}{f' [{unit}]' if unit else ''}: {definition.meaning}{source}", 8)
-    paper.heading("How this was made")
+    paper.heading("Method")
     for title, lines in told.provenance:
         paper.text(title, 8.5, color=_ACCENT)
         paper.table(lines, (0.34, 0.66))

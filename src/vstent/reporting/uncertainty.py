@@ -8,7 +8,7 @@ from vstent.reporting.quantities import Quantity, format_value
 CAUSES: Final = {
     "threshold": "all diameters",
     "landing": "landing",
-    "device": "device as made",
+    "device": "manufacturing tolerance",
     "inflow": "inflow",
     "rest": "interplay",
 }

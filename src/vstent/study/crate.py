@@ -26,17 +26,19 @@ FORMATS: Final = {
     ".pdf": "application/pdf",
 }
 ABOUT: Final = {
-    "metrics.json": "Every number, its unit in its key",
+    "metrics.json": "All results as numbers, with the unit in each key",
     "run.json": "Versions, input with SHA-256, settings: enough to repeat the run",
     "report.html": "The case in 3-D, before, after and change",
-    "report.pdf": "The same on paper, with the pictures",
+    "report.pdf": "The report as PDF, with its pictures",
     "vessel.vtp": "The lumen",
-    "centerlines.vtp": "Centerlines, under VMTK's array names",
-    "landing_surface.vtp": "The parent artery, sac and branches closed: what the device expands against",
+    "centerlines.vtp": "Centerlines with VMTK's array names",
+    "landing_surface.vtp": (
+        "The parent artery with sac and side branches closed: the surface the device expands against"
+    ),
     "sac.vtp": "The sac",
     "neck.vtp": "The neck",
-    "openings.json": "Every opening, and what was repaired or guessed",
-    "contour.vtp": "Contour of the deployed device, with its distance from the wall",
+    "openings.json": "Every opening, and what was repaired or assumed",
+    "contour.vtp": "Contour of the deployed device with its gap to the wall",
     "wires.vtp": "Axes of the wires",
     "struts.stl": "Solids of the wires",
     "field.vtu": "Velocity and pressure",
@@ -59,7 +61,7 @@ def write_crate(folder: Path, provenance: Mapping[str, Any], when: str) -> None:
         There is no finished case in the folder.
     """
     if not (folder / "metrics.json").exists():
-        raise ReadError(f"{folder} holds no finished case: run it first.")
+        raise ReadError(f"{folder} holds no finished case. Run it first.")
     paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and _is_shown(path.relative_to(folder))]
     files = [_file(folder, path) for path in paths]
     write_json(
@@ -102,7 +104,7 @@ def _crate(folder: Path, files: list[dict[str, Any]], when: str) -> list[dict[st
             "name": f"Virtual stenting of {folder.resolve().name}",
             "description": "A virtual stenting by vstent. Research use only: not for diagnosis or treatment.",
             "datePublished": when,
-            "license": "Not for publication unless whoever holds the rights in the scan allows it",
+            "license": "Not for publication unless the holder of the rights in the scan agrees",
             "hasPart": [{"@id": file["@id"]} for file in files],
             "mentions": {"@id": "#run"},
         },

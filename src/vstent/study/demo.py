@@ -32,7 +32,7 @@ def truth(case: CaseResult) -> list[Row]:
     found_mm, true_mm = _radii_mm(case, phantom)
     rows = [("Artery radius, mean along the axis", float(found_mm.mean()), float(true_mm.mean()), "mm")]
     worst = np.argmax(np.abs(found_mm / true_mm - 1))
-    rows.append(("Artery radius, where it is worst", float(found_mm[worst]), float(true_mm[worst]), "mm"))
+    rows.append(("Artery radius, worst place", float(found_mm[worst]), float(true_mm[worst]), "mm"))
     sacs = case.anatomy.aneurysms
     rows.append(("Sac volume", sacs[0].sac.volume_mm3 if sacs else 0.0, phantom.sac_volume_mm3, "mm3"))
     rows.append(("Neck area", sacs[0].neck.area_mm2 if sacs else 0.0, phantom.neck_area_mm2, "mm2"))

@@ -1,4 +1,4 @@
-"""A case, or an input not yet studied, handed over to other solvers: an OpenFOAM case folder, or named patches."""
+"""Export a case or an input for other solvers: an OpenFOAM case folder, or named patches."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -32,7 +32,7 @@ GEOMETRY: Final = (
     *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
     *("neck_mm", "upstream_mm", "downstream_mm"),
 )
-"""Settings that say how the vessel is found."""
+"""Settings that determine the vessel."""
 
 
 def export_openfoam(
@@ -44,14 +44,14 @@ def export_openfoam(
     ----------
     path : a case folder of `run`, or a scan or surface.
     out : the folder to write.
-    settings : what is given; the struts of its first device, if it names one, are meshed.
-    foam : fields of `FoamSetup`; where they name no flavour it is that of the OpenFOAM on this machine.
-    progress : told of every stage.
+    settings : settings of the study; the wires of its first device, if any, are meshed.
+    foam : fields of `FoamSetup`; by default the flavor of the installed OpenFOAM.
+    progress : called at every stage.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        An input or option cannot be used; nothing has been written.
     """
     ledger = Ledger(out / CACHE, progress)
     anatomy = _anatomy(path, settings, ledger)
@@ -62,27 +62,27 @@ def export_openfoam(
     with ledger.stage("export") as tell:
         written = foam_case(case, setup)
         write(out, written)
-        tell(f"{len(written.files)} files, cells of {setup.cell_size_mm:.3g} mm, for {written.application}.")
+        tell(f"{len(written.files)} files for {written.application}, grid spacing {setup.cell_size_mm:.3g} mm.")
     return case, written
 
 
 def export_patches(path: Path, out: Path, settings: Settings, progress: Progress) -> list[dict[str, Any]]:
-    """Write the boundary of the blood as watertight named patches; return name, id, area, centre and normal of each.
+    """Write the boundary of the lumen as watertight named patches; return name, id, area, center and normal of each.
 
-    ``patches.stl`` has one named solid per patch, ``patches.vtp`` the same faces with their ``patch_id``, both in mm;
-    ``patches.json`` says which is which, ``neck.stl`` is what blood crosses into the sac.
+    ``patches.stl`` has one named solid per patch, ``patches.vtp`` the same faces with their ``patch_id``, both in mm.
+    ``patches.json`` describes the patches, and ``neck.stl`` is the surface through which blood enters the sac.
 
     Parameters
     ----------
     path : a case folder of `run`, or a scan or surface.
     out : the folder to write.
-    settings : what is given of the vessel.
-    progress : told of every stage.
+    settings : settings of the vessel.
+    progress : called at every stage.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        An input or option cannot be used; nothing has been written.
     """
     ledger = Ledger(out / CACHE, progress)
     case = flow_case(_anatomy(path, settings, ledger), None, FlowSettings())
@@ -111,14 +111,14 @@ def _middle(corners_mm: np.ndarray) -> dict[str, Any]:
 
 
 def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
-    """The anatomy kept in a case folder, or that of an input."""
+    """Return the anatomy stored in a case folder, or that of an input."""
     kept = sorted((path / CACHE).glob("anatomy-*.npz")) if path.is_dir() else []
     if not kept:
         return find_anatomy(path, hash_of(path), settings, ledger)
     given = [name for name in GEOMETRY if getattr(settings, name) is not None]
     if given:
         words = ", ".join(f"--{name.removesuffix('_mm')} ({name})" for name in given)
-        raise InputError(f"{path} is a case folder, and its vessel is taken as it lies there: leave out {words}")
+        raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
     with ledger.stage("anatomy") as tell:
         anatomy = load_data(kept[-1], Anatomy)
         tell(f"taken from {path}")
@@ -126,7 +126,7 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
 
 
 def _stent(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Stent | None:
-    """The first device, in the size and at the place that the case folder's own run gave it, or as proposed."""
+    """Return the first device with the size and position of the case folder's own run, or as proposed."""
     if not settings.devices:
         return None
     name = settings.devices[0]
@@ -137,7 +137,7 @@ def _stent(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> 
 
 
 def _told(path: Path, settings: Settings) -> Settings:
-    """What the run of a case folder was told; the settings given where there has been none."""
+    """Return the settings of the run of a case folder; those given where there is none."""
     run = path / RUN
     if not run.exists():
         return settings
@@ -145,7 +145,7 @@ def _told(path: Path, settings: Settings) -> Settings:
         return told_in(run)[1]
     except UNTOLD:
         raise ReadError(
-            f"{run} is not of this version, so where a device lies is not known: do the run again."
+            f"{run} is from another version, so the position of the device is unknown: run the case again"
         ) from None
 
 

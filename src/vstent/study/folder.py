@@ -49,7 +49,7 @@ def claimed(out: Path) -> Iterator[None]:
         lock = _locked(cache / "lock")
     except OSError as error:
         _drop(made)
-        raise FolderError(f"{out} cannot be written to ({error.strerror}): give another --out.") from None
+        raise FolderError(f"{out} cannot be written ({error.strerror}): give another --out") from None
     try:
         sweep(out)
         yield
@@ -95,5 +95,5 @@ def _lock(file: IO[str], path: Path) -> None:
         file.seek(0)
         who = file.read().strip() or "another process"
         raise FolderError(
-            f"{path.parent.parent} is in use by {who}: wait until that run ends, or give another --out."
+            f"{path.parent.parent} is in use by {who}: wait until that run ends, or give another --out"
         ) from None

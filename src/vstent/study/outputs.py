@@ -1,5 +1,6 @@
-"""The files of a case folder."""
+"""Write and remove the files of a case folder."""
 
+import json
 import shutil
 from collections.abc import Collection, Iterable
 from contextlib import suppress
@@ -30,44 +31,44 @@ OF_STUDY: Final = (
     *(f"stents/*/{name}" for name in STENT),
     *(f"flow/*/{name}" for name in FIELD),
 )
-"""What a study writes of devices and flows, and tells of them."""
+"""Files of devices, flows and reports."""
 OF_ANATOMY: Final = ("morphology.json", "convergence.json")
-"""What is found of an anatomy alone."""
+"""Files that describe an anatomy alone."""
 RESULTS: Final = (
     *("vessel.vtp", "centerlines.vtp", "openings.json", "landing_surface.vtp", *SACS),
     *("ranking.csv", "ranking.json", *OF_ANATOMY, *OF_STUDY),
 )
-"""All that is written into a case folder beside the cache and the folders of OpenFOAM."""
+"""All files of a case folder except the cache and OpenFOAM's folders."""
 
 
 def take_away_results(out: Path) -> None:
-    """Take away the results in a case folder; what is kept in the cache, and files of the user's own, stay."""
+    """Remove the results in a case folder; the cache and the user's own files stay."""
     _take_away(out, RESULTS, list(out.glob(f"flow/**/{KEY}")))
 
 
 def take_away_study(out: Path, kept: Collection[Path]) -> None:
-    """Take away what a study with other settings wrote, but for OpenFOAM's folders in `kept`: it goes on from them."""
+    """Remove the results of a study with other settings, except OpenFOAM's folders in `kept`, which are resumed."""
     _take_away(out, OF_STUDY, [key for key in out.glob(f"flow/*/*/{KEY}") if key.parent not in kept])
 
 
 def take_away_measures(out: Path) -> None:
-    """Take away what was found of another anatomy alone."""
+    """Remove the results that describe another anatomy alone."""
     _take_away(out, OF_ANATOMY, list(out.glob(f"flow/convergence/**/{KEY}")))
 
 
 def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None:
-    """Take away files, OpenFOAM's folders by their `keys`, and folders that are empty then."""
+    """Remove files, OpenFOAM's folders by their `keys`, and folders that are then empty."""
     for file in [file for pattern in patterns for file in out.glob(pattern)]:
         file.unlink()
     for key in keys:
         shutil.rmtree(key.parent)
     for folder in [*out.glob("stents/*/"), *out.glob("flow/*/"), out / "stents", out / "flow"]:
-        with suppress(OSError):  # it is not there, or not empty
+        with suppress(OSError):  # it does not exist, or is not empty
             folder.rmdir()
 
 
 def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
-    """Write the wall, the centerlines (and other axes beside them) and the openings."""
+    """Write the wall, the centerlines (and further axes) and the openings."""
     out.mkdir(parents=True, exist_ok=True)
     writers.write_surface(out / "vessel.vtp", vessel.lumen)
     writers.write_centerlines(out / "centerlines.vtp", (*vessel.centerlines, *axes))
@@ -76,13 +77,13 @@ def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
 
 
 def write_anatomy(out: Path, anatomy: Anatomy) -> None:
-    """Write the vessel, the parent artery and the sacs; sacs found before and no more are taken away."""
+    """Write the vessel, the parent artery and the sacs; files of sacs that no longer exist are removed."""
     write_vessel(out, anatomy.vessel, anatomy.axis)
     restored = {"is_restored": anatomy.is_restored.astype(np.uint8)}
     writers.write_surface(out / "landing_surface.vtp", anatomy.landing_surface, restored)
     written = set()
     for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
-        sac, neck = (f"{noun}.vtp" if number == 1 else f"{noun}_{number}.vtp" for noun in ("sac", "neck"))
+        sac, neck = (f"{part}.vtp" if number == 1 else f"{part}_{number}.vtp" for part in ("sac", "neck"))
         writers.write_surface(out / sac, aneurysm.sac)
         closed = np.concatenate([aneurysm.neck_mm, aneurysm.neck_mm[:1]])
         writers.write_lines(out / neck, closed, np.array([0, len(closed)], dtype=np.int32))
@@ -93,7 +94,7 @@ def write_anatomy(out: Path, anatomy: Anatomy) -> None:
 
 
 def write_stent(folder: Path, deployment: Deployment) -> str:
-    """Write contour, wires and struts; say how many."""
+    """Write contour, wires and struts, and return a sentence with their numbers."""
     stent = deployment.stent
     folder.mkdir(parents=True, exist_ok=True)
     writers.write_surface(folder / "contour.vtp", stent.contour, {"wall_gap_mm": deployment.wall_gap_mm.ravel()})
@@ -107,7 +108,7 @@ def write_stent(folder: Path, deployment: Deployment) -> str:
 
 
 def write_field(folder: Path, field: FlowField) -> None:
-    """Write the flow in the cells and on the wall."""
+    """Write the flow on the grid and on the wall."""
     folder.mkdir(parents=True, exist_ok=True)
     of_cell = {"velocity_m_s": field.velocity_m_s, "pressure_Pa": field.pressure_Pa}
     if field.swing:
@@ -124,8 +125,33 @@ def write_field(folder: Path, field: FlowField) -> None:
 
 
 def write_ranking(out: Path, ranking: Ranking) -> None:
-    """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``."""
-    rows = ranking.rows()
-    write_rows(out / "ranking.csv", rows)
+    """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``.
+
+    Rows of other devices that a former ranking by the same criteria has are kept.
+    """
     criteria = [item.model_dump(exclude_none=True) for item in ranking.criteria.items]
+    rows = _ranked([*ranking.rows(), *_former_rows(out / "ranking.json", ranking, criteria)])
+    write_rows(out / "ranking.csv", rows)
     writers.write_json(out / "ranking.json", {"criteria": criteria, "candidates": rows, "research_use_only": True})
+
+
+def _ranked(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows of a ranking in order: suitable ones by their score, then the rest, numbered anew."""
+    size = ("device", "label_diameter_mm", "label_length_mm")
+
+    def place(row: dict[str, Any]) -> tuple[Any, ...]:
+        return not row["is_suitable"], -row["score"], *(row[key] for key in size), abs(row["shift_mm"])
+
+    return [row | {"rank": number} for number, row in enumerate(sorted(rows, key=place), start=1)]
+
+
+def _former_rows(path: Path, ranking: Ranking, criteria: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of a former ranking by the same criteria whose devices the new one does not have."""
+    try:
+        former = json.loads(path.read_text(encoding="utf-8"))
+        if former["criteria"] != json.loads(json.dumps(criteria)):
+            return []
+        devices = {candidate.design.key for candidate in ranking.candidates}
+        return [dict(row) for row in former["candidates"] if row["device"] not in devices]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []

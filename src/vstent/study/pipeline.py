@@ -16,6 +16,7 @@ from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
 from vstent.study.crate import NAME as CRATE
 from vstent.study.folder import CACHE, claiming
+from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
 from vstent.study.ledger import ANATOMY, Ledger, hash_of
 from vstent.study.outputs import (
     take_away_measures,
@@ -42,34 +43,42 @@ from vstent.study.types import CaseResult, Progress, Settings
 
 
 @claiming
-def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseResult:
-    """Run one study and write its folder; a study already begun there goes on where it stopped.
+def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False) -> CaseResult:
+    """Run one study and write its folder; a study that was stopped there resumes.
+
+    Results that the folder holds of the same input and settings stay, and devices are added to those. A device that
+    does not fit, or whose flow cannot be computed, is reported in `CaseResult.failures`; the others are computed.
 
     Parameters
     ----------
     path : a scan or a surface.
     out : the case folder.
     settings : what is given; the rest is proposed.
-    progress : told of every stage.
+    progress : called at every stage.
+    replaces : whether results of another input or of other settings are replaced.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        An input or option cannot be used, no device fits, or the folder holds results that this run would invalidate;
+        nothing has been written.
     FlowError
-        A flow could not be computed; everything before it is kept.
+        The flow without a device could not be computed; everything before it is kept.
     FolderError
-        Another process works in the folder, or it cannot be written to.
+        Another process uses the folder, or it cannot be written.
     """
-    designs = {name: find_design(name) for name in settings.devices}
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
+    if not replaces:
+        settings = merged(out, source, settings)
+    designs = {name: find_design(name) for name in settings.devices}
     anatomy = find_anatomy(path, source, settings, ledger)
     check_inflow(anatomy, settings.flow)
-    deployments = deploy_all(designs, anatomy, settings, ledger)
+    deployments, failures = deploy_all(designs, anatomy, settings, ledger)
     told = provenance(path, source, settings)
-    has_former = is_of_another(out, told)
+    has_former = replaces and is_of_another(out, told)
     _settle(path, out, source, ledger)
+    note_begun(out, settings)
     if has_former:
         take_away_study(out, engine_folders(out, settings).values())
     (out / CRATE).unlink(missing_ok=True)  # it describes files that are written anew
@@ -77,22 +86,26 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress) -> CaseRe
     for name, deployment in deployments.items():
         with ledger.stage(f"struts {name}") as tell:
             tell(write_stent(out / "stents" / name, deployment))
-    fields = compute_flows(out, anatomy, deployments, settings, ledger, source)
+    fields, unflown = compute_flows(out, anatomy, deployments, settings, ledger, source)
+    failures |= unflown
     varied = vary_all(anatomy, deployments, settings, ledger, source)
     with ledger.stage("measure"):
         metrics = measure_all(anatomy, deployments, fields)
         for name, spread in varied.items():
             metrics["stents"][name]["uncertainty"] = spread
+        if failures:
+            metrics["failures"] = failures
         writers.write_json(out / METRICS, metrics)
     told[SECONDS] = ledger.seconds
     writers.write_json(out / RUN, told, is_exact=True)
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
-    notes = (*anatomy.vessel.notes, *anatomy.notes, *of_flows)
-    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, notes)
+    of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
+    notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
+    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, failures, notes)
 
 
 @claiming
-def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> Vessel:
+def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False) -> Vessel:
     """Find the vessel, its openings and its centerlines, untrimmed; write them into the folder `out`.
 
     Parameters
@@ -109,6 +122,7 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) 
     """
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
+    _refuse_loss(out, source, settings, replaces)
     vessel = find_vessel(path, source, settings, ledger)
     _settle(path, out, source, ledger)
     write_vessel(out, vessel)
@@ -116,7 +130,9 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress) 
 
 
 @claiming
-def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress) -> tuple[Anatomy, dict[str, Any]]:
+def restore_vessel(
+    path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False
+) -> tuple[Anatomy, dict[str, Any]]:
     """Shrink the sac: find the parent artery and measure it; write it into the folder `out`.
 
     A study begun in the same folder goes on from what is found here, and the other way round.
@@ -135,6 +151,7 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
     """
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
+    _refuse_loss(out, source, settings, replaces)
     anatomy = find_anatomy(path, source, settings, ledger)
     measures = morphology(anatomy)
     _settle(path, out, source, ledger)
@@ -144,7 +161,9 @@ def restore_vessel(path: Path, out: Path, settings: Settings, progress: Progress
 
 
 @claiming
-def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -> Sensitivity:
+def refine_flow(
+    path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False
+) -> Sensitivity:
     """Compute the flow without a device on three grids, time steps and positions; write ``convergence.json``.
 
     Parameters
@@ -163,6 +182,7 @@ def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -
     """
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
+    _refuse_loss(out, source, settings, replaces)
     anatomy = find_anatomy(path, source, settings, ledger)
     check_inflow(anatomy, settings.flow)
     _settle(path, out, source, ledger)
@@ -171,6 +191,13 @@ def refine_flow(path: Path, out: Path, settings: Settings, progress: Progress) -
     kept["grid_position"] = {key: asdict(one) for key, one in found.positions.items()}
     writers.write_json(out / "convergence.json", kept)
     return found
+
+
+def _refuse_loss(out: Path, source: str, settings: Settings, replaces: bool) -> None:
+    """Raise FolderError where a folder holds results of another input or anatomy, unless they are to be replaced."""
+    if not replaces:
+        refuse_other_input(out, source)
+        refuse_other_anatomy(out, settings)
 
 
 def _settle(path: Path, out: Path, source: str, ledger: Ledger) -> None:

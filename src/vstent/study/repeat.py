@@ -1,4 +1,4 @@
-"""Repeat: a run done again from what `run.json` says of it, and how far the two agree."""
+"""Repeat a run from its `run.json`, and compare the results."""
 
 import json
 from collections.abc import Mapping
@@ -20,28 +20,28 @@ if TYPE_CHECKING:
 
 MISSING: Final = "absent"
 SECONDS: Final = "seconds"
-"""Key of what every stage took."""
+"""Key of the seconds of every stage."""
 UNTOLD: Final = (OSError, ValueError, KeyError, TypeError)
-"""What comes of a file that is missing, damaged, or of another kind."""
+"""Exceptions that reading a missing, damaged or foreign file raises."""
 TOLERANCE: Final = 1e-3
-"""Relative, between machines: other processors round otherwise, and a count of pixels or an end of settling may turn on
-that. Measured on one processor with and without its wide and fused instructions: 2e-4, where the flow is steady."""
+"""Relative difference of metrics that another machine may cause, since processors round differently. Measured on one
+processor with and without wide and fused instructions: 2e-4 for a steady flow."""
 ROUNDING: Final = 1e-9
-"""In the unit of a metric: what differs by less is the rounding of a zero."""
+"""Absolute difference, in the unit of a metric, below which two values near zero are equal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A run as its `run.json` tells it."""
+    """A run as stated by its `run.json`."""
 
     folder: Path
     """The case folder."""
     input: Path
-    """Scan or surface: seen to be the same file."""
+    """Scan or surface, checked to be the same file."""
     settings: Settings
-    """All of them, to the last bit."""
+    """All settings, exactly."""
     differences: tuple[str, ...]
-    """What is not as it was then: versions, machine, devices; a sentence each."""
+    """What has changed since (versions, machine, devices), one sentence each."""
 
 
 def read_record(path: Path, moved_to: Path | None = None) -> Record:
@@ -50,26 +50,26 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
     Parameters
     ----------
     path : the file, in its case folder.
-    moved_to : where the input lies now; None: where it lay then.
+    moved_to : present path of the input; None: its former path.
 
     Raises
     ------
     ReadError
-        The file does not exist or is not of this version's kind, or the input is not where it was.
+        The file does not exist or is from another version, or the input is missing.
     InputError
-        The input is another one than then.
+        The input is another one.
     """
     try:
         told, settings = told_in(existing(path))
         sha256 = str(told["input"]["sha256"])
         differences = _differences(told, settings)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise ReadError(f"{path} is no run.json of this version: give the scan and the options again.") from None
+        raise ReadError(f"{path} is not a run.json of this version: give the scan and the options again") from None
     source = moved_to or _input(path.parent)
     if not source.exists():
-        raise ReadError(f"{source}, the input of {path}, is not there: say where it is now with --input.")
+        raise ReadError(f"{source}, the input of {path}, does not exist: give its present place with --input")
     if hash_of(source) != sha256:
-        raise InputError(f"{source} is not the input of {path}: it has changed since. Give that file with --input.")
+        raise InputError(f"{source} is not the input of {path}, or has changed since: give that input with --input")
     return Record(path.parent, source, settings, differences)
 
 
@@ -78,12 +78,12 @@ def _input(folder: Path) -> Path:
         return Path(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"])
     except UNTOLD:
         raise ReadError(
-            f"{folder} does not say where its input lay (its folder {CACHE} is gone): say it with --input."
+            f"{folder} does not state the place of its input (its folder {CACHE} is missing): give it with --input"
         ) from None
 
 
 def former_source(folder: Path) -> str | None:
-    """Return the hash of the input that a case folder's results are of; None where it does not say."""
+    """Return the hash of the input of a case folder's results; None where it is not stated."""
     with suppress(*UNTOLD):
         return str(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["sha256"])
     with suppress(*UNTOLD):
@@ -92,7 +92,7 @@ def former_source(folder: Path) -> str | None:
 
 
 def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
-    """Tell whether a case folder was begun by a run other than that with the provenance `told`, or one not ended."""
+    """Return whether a case folder was begun by a run with another provenance than `told`, or by an unfinished one."""
     with suppress(*UNTOLD):
         former = json.loads((folder / RUN).read_text(encoding="utf-8"))
         return {key: former[key] for key in former if key != SECONDS} != json.loads(json.dumps(told))
@@ -100,13 +100,13 @@ def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
 
 
 def told_in(run: Path) -> tuple[dict[str, Any], Settings]:
-    """What a `run.json` tells, and the settings among it; one of `UNTOLD` where this version cannot read it."""
+    """Return the content of a `run.json` and its settings; one of `UNTOLD` is raised where it cannot be read."""
     told = json.loads(run.read_text(encoding="utf-8"))
     return told, settings_of(told["settings"])
 
 
 def settings_of(told: Mapping[str, Any]) -> Settings:
-    """Rebuild the settings that a `run.json` tells; ValueError where this version does not know one."""
+    """Return the settings stated by a `run.json`; ValueError is raised where this version does not know one."""
     unknown = sorted(set(told) - {field.name for field in fields(Settings)})
     if unknown:
         raise ValueError(f"unknown settings: {unknown}")
@@ -123,7 +123,7 @@ def _adapter() -> "TypeAdapter[Settings]":
 def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]:
     now = {"versions": versions(), "machine": machine(settings), "devices": devices_of(settings.devices)}
     return tuple(
-        f"{name.replace('_', ' ')} ({part}): {told.get(part, {}).get(name, MISSING)} then, {value} now"
+        f"{name.replace('_', ' ')} ({part}): {told.get(part, {}).get(name, MISSING)} before, {value} now"
         for part, values in now.items()
         for name, value in values.items()
         if told.get(part, {}).get(name, MISSING) != value
@@ -131,31 +131,31 @@ def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]
 
 
 def agreement(first: Path, second: Path) -> str:
-    """Return a sentence on how far the metrics of two case folders agree.
+    """Return a sentence on how well the metrics of two case folders agree.
 
     Raises
     ------
     ReadError
-        One of them has none.
+        One of them has no metrics.
     """
     try:
         one, other = ((folder / METRICS).read_bytes() for folder in (first, second))
     except OSError as error:
-        raise ReadError(f"{error.filename} cannot be read: nothing to compare with.") from None
+        raise ReadError(f"{error.filename} cannot be read, so there is nothing to compare with") from None
     if one == other:
-        return "The metrics are the same to the last bit."
+        return "The metrics are identical to the last bit."
     then, now = dict(_numbers(json.loads(one))), dict(_numbers(json.loads(other)))
     if set(then) != set(now):
-        return f"The metrics differ: {len(set(then) ^ set(now))} of them are in one run only."
+        return f"The metrics differ: {len(set(then) ^ set(now))} of them exist in one run only."
     apart = {name: _relative(then[name], now[name]) for name in then}
     worst = max(apart, key=lambda name: apart[name])
     n_apart = sum(value > 0 for value in apart.values())
     if n_apart == 0:
-        return "The metrics are the same but for rounding."
+        return "The metrics agree except for rounding."
     verdict = "within" if apart[worst] <= TOLERANCE else "more than"
     return (
-        f"{n_apart} of {len(apart)} metrics differ, {worst} most: by {apart[worst]:.2g} of itself, "
-        f"{verdict} the {TOLERANCE:g} that another machine may make."
+        f"{n_apart} of {len(apart)} metrics differ, {worst} most (relative difference {apart[worst]:.2g}, "
+        f"{verdict} the {TOLERANCE:g} that another machine may cause)."
     )
 
 

@@ -1,6 +1,7 @@
 """Stages of a study: each timed and told of by the ledger."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from math import isfinite
@@ -22,7 +23,7 @@ from vstent.deployment.struts import over_restored
 from vstent.devices.catalogue import find_sizes
 from vstent.devices.design import BARE, Design, Size
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.errors import InputError
+from vstent.errors import DeviceError, FlowError, InputError, LandingError, VstentError
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.indices import compare, indices
@@ -44,16 +45,61 @@ SLOWEST_M_S: Final = 0.01
 FASTEST_M_S: Final = 2.0
 """Mean speeds at the inlet beyond which no artery of the brain's blood flows."""
 
+NEAR_MM: Final = 3.0
+"""Largest distance from the wall of a vessel at which another reading of a point is proposed."""
+
 
 def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) -> Anatomy:
-    """Read, segment, repair, trace, trim and restore; what was kept of this `source` (hash) is taken as it is.
+    """Read, segment, repair, trace, trim and restore; a result kept for this `source` (hash) is returned as it is.
 
-    What is found is held by the ledger: its `settle` keeps it.
+    The ledger holds the result until its `settle` keeps it.
+
+    Raises
+    ------
+    InputError
+        An input or option cannot be used. Where the point `at_mm` finds nothing, the message proposes the same point
+        in another frame or as a voxel index, if that finds a vessel.
     """
     key = anatomy_key(source, settings)
     kept = ledger.recall(ANATOMY, key, Anatomy)
     if kept is not None:
         return kept
+    try:
+        return _find_anatomy(path, source, settings, ledger, key)
+    except InputError as error:
+        if settings.at_mm is None or settings.neck_mm is not None:
+            raise
+        found = other_reading(path, settings)
+        if not found:
+            raise
+        raise type(error)(f"{error} {found}") from error
+
+
+def other_reading(path: Path, settings: Settings) -> str:
+    """Return a question that proposes another reading of the point `at_mm`, which finds a vessel; else nothing."""
+    for words, point_mm in _readings(path, settings):
+        with suppress(VstentError):
+            vessel = trace(_vessel(path, replace(settings, at_mm=point_mm)))
+            near_mm = vessel.lumen.closest(np.array([point_mm]))[1][0]
+            if near_mm < NEAR_MM:
+                return f"Did you mean {','.join(f'{x:.1f}' for x in point_mm)} ({words})?"
+    return ""
+
+
+def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
+    """Yield other readings of the point `at_mm`, in LPS mm, with their names."""
+    x, y, z = settings.at_mm or (0.0, 0.0, 0.0)
+    yield "the point given is RAS", (-x, -y, z)
+    if not (path.is_file() and is_surface_file(path)):
+        image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape, acquisition=settings.acquisition)
+        if all(0 <= i < n for i, n in zip((x, y, z), image.voxels.shape, strict=True)):
+            i, j, k = image.to_mm(np.array([[x, y, z]]))[0].tolist()
+            yield "the point given is a voxel index", (i, j, k)
+    yield "with the first sign changed", (-x, y, z)
+    yield "with the second sign changed", (x, -y, z)
+
+
+def _find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger, key: str) -> Anatomy:
     whole = find_vessel(path, source, settings, ledger)
     neck_mm = None if settings.neck_mm is None else np.array(settings.neck_mm, dtype=np.float64)
     at_mm = _array(settings.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
@@ -65,7 +111,7 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
         tell(" ".join(traced.notes[len(whole.notes) :]))
     with ledger.stage("restore") as tell:
         anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
-        tell(" ".join([*anatomy.notes, *(f"Sac of {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
+        tell(" ".join([*anatomy.notes, *(f"Sac volume {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
     ledger.hold(ANATOMY, key, anatomy)
     return anatomy
 
@@ -90,10 +136,10 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
 
 def _vessel(path: Path, settings: Settings) -> Vessel:
     if path.is_file() and is_surface_file(path):
-        surface, notes = read_surface(path, units=settings.units)
+        surface, notes = read_surface(path, units=settings.units, frame=settings.frame)
         vessel = Vessel(surface, notes=notes)
     else:
-        image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape)
+        image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape, acquisition=settings.acquisition)
         vessel = segment(image, threshold=settings.threshold, at_mm=_array(settings.at_mm))
     near_mm = _array(settings.inlet_mm if settings.at_mm is None else settings.at_mm)
     lumen, repairs = repair(vessel.lumen, at_mm=None if near_mm is None else np.atleast_2d(near_mm)[0])
@@ -102,14 +148,27 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
 
 def deploy_all(
     designs: Mapping[str, Design], anatomy: Anatomy, settings: Settings, ledger: Ledger
-) -> dict[str, Deployment]:
-    """Deploy every device, each in the given or the proposed size."""
-    deployments = {}
+) -> tuple[dict[str, Deployment], dict[str, str]]:
+    """Deploy every device, each in the given or the proposed size; return the deployments and the failures by name.
+
+    Raises
+    ------
+    InputError
+        No device can be deployed: the reason of the first.
+    """
+    deployments: dict[str, Deployment] = {}
+    failures: dict[str, str] = {}
     for name, design in designs.items():
-        with ledger.stage(f"deploy {name}") as tell:
-            deployments[name] = deploy_one(design, anatomy, settings.placing(name))
-            tell(deployments[name].advice)
-    return deployments
+        try:
+            with ledger.stage(f"deploy {name}") as tell:
+                deployments[name] = deploy_one(design, anatomy, settings.placing(name))
+                tell(deployments[name].advice)
+        except (DeviceError, LandingError) as error:
+            if len(failures) + 1 == len(designs):  # the last one too
+                raise
+            failures[name] = f"not deployed: {error}"
+            ledger.progress(f"deploy {name}", 1.0, failures[name])
+    return deployments, failures
 
 
 def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
@@ -142,9 +201,9 @@ def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
     for inlet, part_mL_s, speed_m_s in zip(case.vessel.inlets, case.inlets_mL_s, case.inlet_speeds_m_s, strict=True):
         if not SLOWEST_M_S <= speed_m_s <= FASTEST_M_S:
             raise InputError(
-                f"a mean inflow of {part_mL_s:g} mL/s through an inlet {inlet.diameter_mm:.1f} mm wide flows at "
-                f"{speed_m_s:.2g} m/s, and blood in arteries at {SLOWEST_M_S:g} to {FASTEST_M_S:g}: give mL/s (240 "
-                "mL/min are 4), or another inlet"
+                f"a mean inflow of {part_mL_s:g} mL/s through an inlet {inlet.diameter_mm:.1f} mm wide is "
+                f"{speed_m_s:.2g} m/s, but blood flows in arteries at {SLOWEST_M_S:g} to {FASTEST_M_S:g} m/s: "
+                "give mL/s (240 mL/min are 4 mL/s), or choose another inlet"
             )
 
 
@@ -162,36 +221,47 @@ def compute_flows(
     settings: Settings,
     ledger: Ledger,
     source: str,
-) -> dict[str, FlowField]:
-    """Compute the flow without and with each device; each is kept as soon as it is done."""
+) -> tuple[dict[str, FlowField], dict[str, str]]:
+    """Compute the flow without and with each device; each is kept as soon as it is done.
+
+    Returns the flows by name, and a sentence on every device whose flow could not be computed.
+    """
     if settings.flow is None:
-        return {}
+        return {}, {}
     fields: dict[str, FlowField] = {}
+    failures: dict[str, str] = {}
     folders = engine_folders(out, settings)
-    for name in (BARE, *deployments):
+    for name in (BARE, *(name for name in deployments if name not in settings.without_flow)):
         stent = None if name == BARE else deployments[name].stent
         stage, key = f"flow {name}", flow_key(source, settings, name, stent.design if stent else None)
         field = ledger.recall(stage, key, FlowField)
         if field is None:
             if name == BARE:
                 _plan(anatomy, {name: one.stent for name, one in deployments.items()}, settings.flow, ledger)
-            with ledger.stage(stage) as tell:
-                field = simulate_case(
-                    flow_case(anatomy, stent, settings.flow),
-                    start=fields.get(BARE),
-                    folder=folders[name],
-                    progress=ledger.teller(stage),
-                    checkpoint=FlowCheckpoint(ledger.folder, stage, key),
-                )
-                tell(field.advice)
+            try:
+                with ledger.stage(stage) as tell:
+                    field = simulate_case(
+                        flow_case(anatomy, stent, settings.flow),
+                        start=fields.get(BARE),
+                        folder=folders[name],
+                        progress=ledger.teller(stage),
+                        checkpoint=FlowCheckpoint(ledger.folder, stage, key),
+                    )
+                    tell(field.advice)
+            except FlowError as error:
+                if name == BARE:
+                    raise
+                failures[name] = f"flow not computed: {error}"
+                ledger.progress(stage, 1.0, failures[name])
+                continue
             ledger.keep(stage, key, field)
         fields[name] = field
         write_field(out / "flow" / name, field)
-    return fields
+    return fields, failures
 
 
 def flow_key(source: str, settings: Settings, name: str, design: Design | None) -> str:
-    """Key of one flow of an input: ``bare``, or behind a device of this design."""
+    """Return the key of one flow of an input: ``bare``, or with a device of this design."""
     placed = (design, settings.placing(name)) if design else ()
     return key_of(anatomy_key(source, settings), settings.flow, name, *placed)
 
@@ -225,7 +295,7 @@ def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings,
 def vary_all(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
 ) -> dict[str, dict[str, Any]]:
-    """Vary what is not sure about every deployment; return the metrics of each, none where it was not asked for."""
+    """Vary the uncertain inputs of every deployment; return the metrics of each, none where this is off."""
     if settings.uncertainty is None:
         return {}
     flow = settings.flow if settings.uncertainty.flow_samples else None
@@ -240,7 +310,7 @@ def vary_all(
                 told = partial(_tell_count, ledger, stage)
                 begun = FlowCheckpoint(ledger.folder, stage, key)
                 varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
-                tell(f"{len(varied.points)} deployments, {varied.n_failed} of them did not fit.")
+                tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
             ledger.keep(stage, key, varied)
         found[name] = varied.metrics()
     return found

@@ -1,4 +1,4 @@
-"""What a study is told, and what it finds."""
+"""Settings and result of a study."""
 
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -13,83 +13,91 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Placing:
-    """Size and place of one device; None means that it is proposed."""
+    """Size and position of one device; missing values are proposed."""
 
     diameter_mm: float | None = None
-    """Label diameter."""
+    """Label diameter in mm."""
     length_mm: float | None = None
-    """Label length."""
+    """Label length in mm."""
     center_mm: float | None = None
-    """Abscissa on the parent axis where the middle of the device is to lie."""
+    """Position of the device's middle along the parent axis, in mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """Everything that a study may be told; None means that it is proposed."""
+    """All settings of a study; None means that the value is proposed."""
 
     devices: tuple[str, ...] = ("silk", "enterprise")
-    """Names in the catalogue."""
+    """Names of the devices in the catalogue."""
     units: Literal["m", "cm", "mm"] | None = None
     """Length unit of a surface file."""
+    frame: Literal["lps", "ras"] | None = None
+    """Frame of a surface file and of the points given; None: as the file states, and LPS points."""
+    acquisition: int | None = None
+    """Acquisition of a DICOM series that holds several, counted from 1."""
     spacing_mm: Point | None = None
-    """Voxel edges of a raw volume."""
+    """Voxel spacing of a raw volume, in mm."""
     shape: tuple[int, int, int] | None = None
-    """Voxel counts of a raw volume."""
+    """Number of voxels of a raw volume."""
     threshold: float | None = None
-    """Intensity of the lumen's wall in a scan."""
+    """Intensity at the lumen wall of a scan."""
     at_mm: Point | None = None
-    """A point near the sac."""
+    """Point near the sac, LPS mm."""
     inlet_mm: Point | tuple[Point, ...] | None = None
-    """A point near the inlet; or one near each opening that brings blood, first that where the parent artery begins."""
+    """Point near the inlet, or near each inlet; the parent artery begins at the first."""
     outlet_mm: Point | None = None
-    """A point near the outlet that the parent artery leads to."""
+    """Point near the outlet of the parent artery."""
     neck_mm: tuple[Point, ...] | None = None
-    """A neck drawn by hand: a closed curve near the wall around the sac's mouth."""
+    """Neck drawn by hand: a closed curve near the wall around the mouth of the sac."""
     upstream_mm: float | None = None
-    """Length of artery to keep before the sac's middle."""
+    """Length of artery to keep proximal to the middle of the sac, in mm."""
     downstream_mm: float | None = None
-    """Length to keep of every way beyond the sac's middle."""
+    """Length of vessel to keep distal to the middle of the sac, in mm."""
     diameter_mm: float | None = None
-    """Label diameter of the devices."""
+    """Label diameter of all devices, in mm."""
     length_mm: float | None = None
-    """Label length of the devices."""
+    """Label length of all devices, in mm."""
     center_mm: float | None = None
-    """Abscissa on the parent axis where the middle of the device is to lie."""
+    """Position of the middle of all devices along the parent axis, in mm."""
     flow: FlowSettings | None = field(default_factory=FlowSettings)
-    """How to compute the flow; None: not at all."""
+    """Flow settings; None: no flow is computed."""
+    without_flow: tuple[str, ...] = ()
+    """Devices whose flow is not computed."""
     placings: dict[str, Placing] = field(default_factory=dict)
-    """Sizes and places of single devices, by name, instead of those above that hold for all."""
+    """Size and position by device; they replace the settings above that apply to all devices."""
 
     uncertainty: Ranges | None = None
-    """What of the deployment is varied, and how far; None: nothing."""
+    """Ranges of the uncertainty study; None: no uncertainty study."""
 
     def placing(self, device: str) -> Placing:
-        """Return what is given of the size and the place of a device."""
+        """Return size and position given for a device."""
         return self.placings.get(device) or Placing(self.diameter_mm, self.length_mm, self.center_mm)
 
 
 class Progress(Protocol):
-    """Told what a study does."""
+    """Called at every stage of a study."""
 
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
-        """`stage` has come to `fraction` (1: done); `detail` says what was found, or how long is left."""
+        """Report that `stage` is complete to `fraction` (1: done); `detail` is its result, or the remaining time."""
 
 
 @dataclass(frozen=True, eq=False)
 class CaseResult:
-    """All that a study found."""
+    """Result of a study."""
 
     name: str
-    """The case folder's name (a scan's own name may be the patient's)."""
+    """Name of the case folder (the name of a scan may be the patient's)."""
     anatomy: Anatomy
-    """Vessel, parent artery, sacs."""
+    """Vessel, parent artery and sacs."""
     deployments: dict[str, Deployment]
-    """By device name."""
+    """Deployments by device name."""
     fields: dict[str, FlowField]
-    """``bare``, then by device name; empty where flow was not asked for."""
+    """Flows by name: ``bare``, then devices; empty where no flow was requested."""
     metrics: dict[str, Any]
-    """``vessel``, ``bare``, ``stents.NAME.{deployment,flow,ratios}``; every number's key ends in its unit."""
+    """Metrics: ``vessel``, ``bare``, ``stents.NAME.{deployment,flow,ratios}``; the end of each key is its unit."""
     provenance: dict[str, Any]
-    """Versions, inputs with hashes, settings, seconds per stage."""
+    """Versions, input with hash, settings, seconds per stage."""
+    failures: dict[str, str]
+    """Reason why a device was not deployed or its flow not computed, by device name."""
     notes: tuple[str, ...]
-    """What was found, guessed or repaired, and how far every flow is to be relied on."""
+    """Findings, assumptions and repairs, and the reliability of every flow, one sentence each."""

@@ -289,7 +289,7 @@ def test_a_sac_that_trimming_takes_off_is_told() -> None:
     assert far.sac is not None
     wall = phantoms.phantom_surface(replace(near, blebs=(far.sac,)), edge_mm=0.4)
     vessel = trim(trace(Vessel(wall), inlet_mm=np.zeros(3)))
-    assert "Another sac, 5." in vessel.notes[-1]
+    assert "Another bulge, 5." in vessel.notes[-1]
     assert far.sac.implicit_mm(place_in(vessel.notes[-1])[None])[0] == pytest.approx(0.0, abs=0.1)
     assert len(restore(vessel).aneurysms) == 1
 

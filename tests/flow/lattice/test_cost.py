@@ -163,7 +163,7 @@ def test_what_diverges_after_it_was_resumed_begins_anew_from_the_guess(monkeypat
 def test_a_sac_smaller_than_a_cell_is_told_as_that():
     sac = Surface(sphere(0.08).vertices_mm + np.array([0.07, 0.07, 4.07]), sphere(0.08).faces)
     case = replace(case_of(cell_size_mm=0.4), sac=sac)
-    with pytest.raises(FlowError, match=r"no cell of 0\.4 mm lies in the sac .* near \(0\.1, 0\.1, 4\.1\) mm: set"):
+    with pytest.raises(FlowError, match=r"of 0\.4 mm no cell is inside the sac .* near \(0\.1, 0\.1, 4\.1\) mm: use"):
         simulate_case(case)
 
 

@@ -157,12 +157,12 @@ def test_the_command_line_says_so_before_it_reads_anything(
 ) -> None:
     monkeypatch.setattr(gpus, "find_spec", lambda name: None)
     for command in ("run", "flow", "batch"):
-        assert main([command, str(tmp_path), "--out", str(tmp_path / "out"), "--device-gpu"]) == 1
+        assert main([command, str(tmp_path), "--out", str(tmp_path / "out"), "--gpu"]) == 1
         assert "numba-cuda is not installed" in " ".join(capsys.readouterr().err.split())
 
 
 def test_an_engine_that_knows_no_gpu_is_not_asked_to_use_one() -> None:
-    with pytest.raises(InputError, match="the engine openfoam does not compute on a GPU"):
+    with pytest.raises(InputError, match="the engine openfoam does not support a GPU"):
         engine_class(replace(ASKED, engine="openfoam"))
 
 

@@ -206,10 +206,10 @@ def test_the_published_waveform_has_its_published_range() -> None:
 @pytest.mark.parametrize(
     ("time_s", "flow", "why"),
     [
-        ([0, 1, 2], [1, 1, 1], "5 or more"),
+        ([0, 1, 2], [1, 1, 1], "at least 5"),
         ([0, 1, 2, 2, 4], [1, 2, 3, 2, 1], "do not increase"),
         ([0, 1, 2, 3, 4], [1, np.nan, 3, 2, 1], "number is missing"),
-        ([0, 1, 2, 3, 4], [-1, -2, -3, -2, -1], "turn its sign"),
+        ([0, 1, 2, 3, 4], [-1, -2, -3, -2, -1], "reverse its sign"),
     ],
 )
 def test_a_bad_waveform_is_refused(time_s: list, flow: list, why: str) -> None:

@@ -243,7 +243,7 @@ def test_a_device_is_meshed_by_its_wires_over_an_ostium_or_refused() -> None:
     assert strut_solids(flow_case(branched, None)) is None
     with pytest.raises(LandingError, match="over a neck or a branch's ostium"):
         strut_solids(flow_case(healthy, stent))
-    with pytest.raises(FlowError, match="give the stent"):
+    with pytest.raises(FlowError, match="give the stent itself"):
         strut_solids(replace(flow_case(branched, stent), stent=None))
 
 
@@ -267,13 +267,13 @@ def test_what_struts_cost_is_told_and_what_does_not_fit_is_refused(monkeypatch: 
         assert _thousands(told) > times * _thousands(bare)
     silk = cases[0]
     monkeypatch.setattr("vstent.flow.openfoam.cost.free_memory_bytes", lambda: 1.2e9)
-    with pytest.raises(FlowError, match=r"million cells of 0.2 mm and less needs .* set a cell size of") as refusal:
+    with pytest.raises(FlowError, match=r"million cells at .* 0.2 mm needs .* set a grid spacing of") as refusal:
         tell_cost(silk, 0.2)
-    fitting_mm = float(str(refusal.value).split("cell size of ")[1].split(" mm")[0])
+    fitting_mm = float(str(refusal.value).split("set a grid spacing of ")[1].split(" mm")[0])
     assert 0.2 < fitting_mm < 0.4
     tell_cost(silk, fitting_mm)
     monkeypatch.setattr("vstent.flow.openfoam.cost.free_memory_bytes", lambda: 4e8)
-    with pytest.raises(FlowError, match="take the engine lattice_boltzmann"):
+    with pytest.raises(FlowError, match="choose the engine lattice_boltzmann"):
         tell_cost(silk, 0.2)
 
 

@@ -122,8 +122,8 @@ def _refuse_astray(tube: Tube, line: Centerline) -> None:
     worst = int(np.argmax(away_mm))
     if away_mm[worst] > ASTRAY * line.inscribed_radius_mm.max():
         raise VesselError(
-            f"no artery fits the wall: its axis would run {away_mm[worst]:.0f} mm off the centerline, to "
-            f"{place(tube.points_mm[worst])}; give a longer piece of the vessel, or one whose wall is whole"
+            f"no artery fits the wall: its axis would run {away_mm[worst]:.0f} mm from the centerline, to "
+            f"{place(tube.points_mm[worst])}: give a longer piece of the vessel, or one with a complete wall"
         )
 
 

@@ -1,6 +1,6 @@
 """Bulges: connected pieces of wall that stand out of the tubes far enough to be a sac."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,6 +41,8 @@ class Bulge:
     """(3,) the vertex that stands out furthest."""
     height_mm: float
     """How far that is."""
+    width_mm: float = 0.0
+    """Median depth of the lumen below its vertices; 0 where it is not measured."""
 
     def __post_init__(self) -> None:
         freeze(self, "points_mm", np.float64, (-1, 3))
@@ -70,10 +72,10 @@ class _Standing(NamedTuple):
 
 
 def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> list[Bulge]:
-    """Sacs on the lumen's wall, the highest first; with `at_mm` (3,) only the bulge nearest to it, however flat."""
+    """Sacs on the lumen's wall, the largest first; with `at_mm` (3,) only the bulge nearest to it, however flat."""
     found = _standing_out(lumen, tubes)
     if at_mm is None:
-        return _highest_first([one.bulge for one in found if one.is_wide and one.is_high])
+        return _largest_first([one.bulge for one in found if one.is_wide and one.is_high])
     point = np.asarray(at_mm, dtype=np.float64)[None]
     bulges = [one.bulge for one in found]
     near = [b for b in bulges if float(b.distances_mm(point)[0]) < max(2.0 * b.height_mm, 1.0)]
@@ -81,9 +83,9 @@ def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> li
 
 
 def flat_bulges(lumen: Surface, tubes: Tubes) -> list[Bulge]:
-    """Bulges as wide as sacs on the lumen's wall that are too flat or too low for one, the highest first."""
+    """Bulges as wide as sacs on the lumen's wall that are too flat or too low for one, the largest first."""
     found = [one.bulge for one in _standing_out(lumen, tubes) if one.is_wide and not one.is_high]
-    return _highest_first([bulge for bulge in found if bulge.height_mm > LOW_MM])
+    return _largest_first([bulge for bulge in found if bulge.height_mm > LOW_MM])
 
 
 def _standing_out(lumen: Surface, tubes: Tubes) -> list[_Standing]:
@@ -95,15 +97,16 @@ def _standing_out(lumen: Surface, tubes: Tubes) -> list[_Standing]:
     for member in _patches(lumen, height > FLANK * parent):
         typical = float(np.median(parent[member]))
         member = _about_dome(lumen.vertices_mm[member], height[member] / typical, SHOULDER * typical, member)
-        bulge = _bulge(lumen, height, member)
         width_mm = max(float(np.median(thickness[member])), 1e-6)
+        bulge = replace(_bulge(lumen, height, member), width_mm=width_mm)
         is_high = bulge.height_mm > max(HEIGHT * typical, HEIGHT_MM)
         found.append(_Standing(bulge, is_high, width_mm > WIDTH * typical and bulge.height_mm < LENGTH * width_mm))
     return found
 
 
-def _highest_first(bulges: list[Bulge]) -> list[Bulge]:
-    return sorted(bulges, key=lambda bulge: -bulge.height_mm)
+def _largest_first(bulges: list[Bulge]) -> list[Bulge]:
+    """Return bulges ordered by height or width, whichever is less: a stump is high, but not wide."""
+    return sorted(bulges, key=lambda bulge: -min(bulge.height_mm, bulge.width_mm))
 
 
 def _about_dome(points_mm: Floats, rise: Floats, reach_mm: float, member: Ints) -> Ints:

@@ -60,7 +60,9 @@ def cut_along(vessel: Vessel, neck_mm: Floats) -> Drawn:
     """
     given = np.asarray(neck_mm, dtype=np.float64)
     if given.ndim != 2 or given.shape[1] != 3 or len(given) < 3 or not np.isfinite(given).all():
-        raise InputError("the neck is no closed curve: give three points or more, each of three coordinates in mm")
+        raise InputError(
+            "the neck is not a closed curve: give at least three points with three coordinates each, in mm"
+        )
     lumen = vessel.lumen
     edge_mm = _edge_mm(lumen)
     ring = np.concatenate([given, given[:1]])
@@ -85,8 +87,8 @@ def _on_wall(lumen: Surface, curve_mm: Floats) -> Floats:
     worst = int(distance.argmax())
     if distance[worst] > FAR_MM:
         raise InputError(
-            f"the neck lies {distance[worst]:.1f} mm off the wall at {place(curve_mm[worst])}: "
-            f"draw it no more than {FAR_MM:g} mm off"
+            f"the neck is {distance[worst]:.1f} mm from the wall at {place(curve_mm[worst])}: draw it within "
+            f"{FAR_MM:g} mm of the wall"
         )
     return points
 
@@ -135,7 +137,9 @@ def _is_sac(vessel: Vessel, label: Ints) -> Bools:
     count[at_end[0]] = 0
     sac = int(count.argmax())
     if count[sac] < FEWEST_VERTICES:
-        raise InputError("the neck parts nothing from the artery: draw it as one closed curve around the sac's mouth")
+        raise InputError(
+            "the neck separates nothing from the artery: draw one closed curve around the mouth of the sac"
+        )
     if sac in at_end[1:] and at_end[0] not in at_end[1:]:
-        raise InputError("the neck goes around the artery itself: draw it around the sac's mouth alone")
+        raise InputError("the neck runs around the artery itself: draw it around the mouth of the sac only")
     return np.asarray(label == sac)

@@ -1,5 +1,6 @@
-"""What is told of an anatomy: one sentence on everything that was found, assumed, or would be taken for a mistake."""
+"""Notes on an anatomy: one sentence on every finding and assumption, and on everything that may look like an error."""
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -8,20 +9,20 @@ from vstent.anatomy.restore.bulges import Bulge
 from vstent.anatomy.restore.path import PASSING, is_off_sacs, reach_of
 from vstent.anatomy.restore.sac import is_in_one
 from vstent.anatomy.trace import parent_radius_mm
-from vstent.geometry.vessel import Aneurysm, Centerline, Opening, Vessel
+from vstent.geometry.vessel import Aneurysm, Candidate, Centerline, Opening, Vessel
 from vstent.kernels import curves
 from vstent.units import counted, place
 
 FUSIFORM: Final = 1.5
-"""An artery that is wider by this factor than at both its ends is told..."""
+"""An artery wider by this factor than at both its ends is reported as fusiform."""
 END_MM: Final = 2.0
-"""... which are as wide as they are over this length."""
+"""Length over which the width of an end is measured, in mm."""
 NEAR_SAC_MM: Final = 4.0
-"""An opening so near to a sac's wall is told."""
+"""Distance between an opening and the wall of a sac below which it is reported, in mm."""
 STENOSED: Final = 0.7
-"""An artery narrower by this factor beside a neck than beyond that and across the neck is told..."""
+"""Ratio of the width beside a neck to the widths beyond and across it, below which a stenosis is reported."""
 STENOSED_REACH: Final = 2.0
-"""... where that is within this many diameters of the neck."""
+"""Largest distance of a reported stenosis from the neck, in diameters."""
 
 
 def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
@@ -37,13 +38,22 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
     )
 
 
+def candidates_told(aneurysms: Sequence[Aneurysm], candidates: Sequence[Candidate]) -> tuple[str, ...]:
+    """Return a sentence on bulges that were not taken for aneurysms, and how to choose one."""
+    others = [one.described for one in candidates if not one.is_aneurysm]
+    if not others:
+        return ()
+    begins = "Not taken for aneurysms" if aneurysms else "No convincing aneurysm was found; candidates"
+    return (f"{begins}: {'; '.join(others)}. Choose one by a point in it (--at).",)
+
+
 def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
     """A sentence on a bulge that is a sac only for whoever asks for it."""
     if bulge is None:
         return ()
     return (
-        f"A bulge {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)} is too flat to be taken for a sac "
-        "unasked: give --at there.",
+        f"A bulge {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)} is too flat to be used as a sac "
+        "unless it is chosen by that point (--at).",
     )
 
 
@@ -55,7 +65,7 @@ def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges:
         notes.append("No sac was found: the landing surface is the artery's own wall with its side branches closed.")
     if n_bulges > len(aneurysms) > 0:
         more = counted(n_bulges - len(aneurysms), "more bulge")
-        notes.append(f"{more}, flat, a sac's lobe, or on another branch: no sac of its own.")
+        notes.append(f"{more} not used: flat, a lobe of a sac, or on another branch.")
     return tuple(notes)
 
 
@@ -64,8 +74,8 @@ def _before_another(vessel: Vessel, path: int, bulges: list[Bulge]) -> tuple[str
     if not bulges or reach_of(vessel.centerlines[path], bulges[0]) <= PASSING:
         return ()
     return tuple(
-        f"The bulge {bulges[0].height_mm:.1f} mm high at {place(bulges[0].dome_mm)} hangs on the "
-        f"artery from {end.role}, {end.described}: give that as the first --inlet."
+        f"The bulge {bulges[0].height_mm:.1f} mm high at {place(bulges[0].dome_mm)} is on the artery from "
+        f"{end.role}, {end.described}: give that opening as the first inlet (--inlet)."
         for end, line in zip(vessel.far_ends, vessel.centerlines, strict=True)
         if end.is_inlet and reach_of(line, bulges[0]) <= PASSING
     )
@@ -81,15 +91,16 @@ def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
     if radius[widest] < FUSIFORM * ends_mm:
         return ()
     return (
-        f"The artery is {2 * radius[widest]:.1f} mm wide at {place(line.points_mm[widest])} and {2 * ends_mm:.1f} mm "
-        "at its wider end: a fusiform aneurysm is no sac here, has no neck, and stays part of the landing surface.",
+        f"The artery is {2 * radius[widest]:.1f} mm wide at {place(line.points_mm[widest])} and "
+        f"{2 * ends_mm:.1f} mm at its wider end. A fusiform aneurysm has no neck; it remains part of the "
+        "landing surface.",
     )
 
 
 def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
     """Sentences where the artery along a centerline narrows beside a neck, and is wide again beyond and across it.
 
-    How wide the artery is under a neck is told by how wide it is beside it: little is, where it is stenosed there.
+    The width of the artery under a neck is estimated from its width beside it, which a stenosis makes too small.
     """
     abscissa, radius = line.abscissa_mm, line.inscribed_radius_mm
     at_neck = curves.project(line.points_mm, aneurysm.neck_mm)[0]
@@ -108,9 +119,9 @@ def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
         if radius[throat] < STENOSED * around_mm:
             notes.append(
                 f"The artery is {2 * radius[throat]:.1f} mm wide at {place(line.points_mm[throat])}, "
-                f"{gap_mm[throat]:.1f} mm from a neck, and {2 * around_mm:.1f} mm on both sides of that: it is "
-                "stenosed. The landing surface may lie inside its wall between there and the neck: look at it, and "
-                "give --neck where the neck found is too large."
+                f"{gap_mm[throat]:.1f} mm from a neck, and {2 * around_mm:.1f} mm on both sides of it: a "
+                "stenosis. The landing surface may lie inside the wall between there and the neck. Look at "
+                "it, and draw the neck by hand if it is too large (--neck)."
             )
     return tuple(notes)
 
@@ -122,24 +133,22 @@ def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
         gap_mm = min((float(bulge.distances_mm(opening.center_mm[None])[0]) for bulge in bulges), default=np.inf)
         if gap_mm < NEAR_SAC_MM:
             notes.append(
-                f"{opening.role}, {opening.described}, lies {gap_mm:.1f} mm from a sac's wall: close it where it is a "
-                "hole; give --outlet where the parent artery leads elsewhere."
+                f"{opening.role}, {opening.described}, is {gap_mm:.1f} mm from the wall of a sac. Close it in "
+                "the surface if it is a hole, or choose another outlet if the parent artery leads elsewhere "
+                "(--outlet)."
             )
     return tuple(notes)
 
 
 def _from_sacs(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
-    """Sentences on the branches that leave from a sac: their blood goes on passing through it behind a device."""
+    """Return sentences on branches that arise from a sac: their blood flows through it with any device."""
     branches = [one for k, one in enumerate(zip(vessel.far_ends, vessel.centerlines, strict=True)) if k != path]
     return tuple(_through_sac(opening) for opening, line in branches if any(_leaves(line, one) for one in aneurysms))
 
 
 def _through_sac(opening: Opening) -> str:
-    way, beside = ("opens into", ", and is none of the neck inflow") if opening.is_inlet else ("leaves from", "")
-    return (
-        f"{opening.role}, {opening.described}, {way} a sac: what it carries goes on through the sac behind any "
-        f"device{beside}."
-    )
+    way, beside = ("opens into", ", and is not part of the neck inflow") if opening.is_inlet else ("leaves from", "")
+    return f"{opening.role}, {opening.described}, {way} a sac: its blood flows through the sac with any device{beside}."
 
 
 def _leaves(line: Centerline, aneurysm: Aneurysm) -> bool:

@@ -10,17 +10,20 @@ and holds the sac's dome is the sac (`sac`).
 from collections.abc import Sequence
 from typing import Final
 
+import numpy as np
+
 from vstent.anatomy.restore.axis import Mouth, fit_axis
 from vstent.anatomy.restore.bulges import Bulge, find_bulges, flat_bulges
-from vstent.anatomy.restore.drawn import cut_along
+from vstent.anatomy.restore.candidates import classified
+from vstent.anatomy.restore.drawn import Drawn, cut_along
 from vstent.anatomy.restore.landing import Landing, close_landing
-from vstent.anatomy.restore.notes import flat_told, told
+from vstent.anatomy.restore.notes import candidates_told, flat_told, told
 from vstent.anatomy.restore.path import parent_path
 from vstent.anatomy.restore.sac import cut_sac, drawn_sac, is_in_one
 from vstent.anatomy.restore.tubes import tubes_of
 from vstent.errors import InputError, VesselError
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Vessel
+from vstent.geometry.vessel import Anatomy, Aneurysm, Candidate, Centerline, Vessel
 from vstent.kernels.arrays import Floats
 from vstent.units import place
 
@@ -55,11 +58,20 @@ def restore(
     drawn = None if neck_mm is None else cut_along(vessel, neck_mm)
     bulges = [drawn.bulge] if drawn else find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
     if at_mm is not None and not bulges:
-        raise InputError(f"no sac stands out of the artery near {place(at_mm)}: give a point in its dome")
-    path = parent_path(vessel, bulges, outlet_mm)
-    landing = _landing(vessel, path, bulges, drawn.artery if drawn else None)
-    side_lines = _all_but(path, vessel.centerlines)
-    sacs = [drawn_sac(vessel, landing, side_lines, drawn)] if drawn else _sacs(vessel, landing, side_lines, bulges)
+        raise InputError(
+            f"nothing bulges out of the artery near {place(at_mm)}: give a point in the dome of the sac, in LPS mm"
+        )
+    path, landing, sacs = _closed(vessel, bulges, outlet_mm, drawn)
+    candidates = [_classified(vessel, landing, sac) for sac in sacs]
+    if drawn is None and at_mm is None:
+        others: list[Candidate] = []
+        while bulges and not any(one.is_aneurysm for one in candidates):
+            others += candidates
+            bulges = _but(bulges, sacs)
+            path, landing, sacs = _closed(vessel, bulges, outlet_mm)
+            candidates = [_classified(vessel, landing, sac) for sac in sacs]
+        sacs = [sac for sac, one in zip(sacs, candidates, strict=True) if one.is_aneurysm]
+        candidates += others
     aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
     flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm, path, landing)
     return Anatomy(
@@ -69,8 +81,33 @@ def restore(
         landing.surface,
         landing.is_restored.ravel(),
         aneurysms,
-        (*told(vessel, path, bulges, aneurysms), *flat_told(flat)),
+        (*told(vessel, path, bulges, aneurysms), *candidates_told(aneurysms, candidates), *flat_told(flat)),
+        tuple(candidates),
     )
+
+
+def _closed(
+    vessel: Vessel, bulges: Sequence[Bulge], outlet_mm: Floats | None, drawn: Drawn | None = None
+) -> tuple[int, Landing, list[Aneurysm]]:
+    """Return the number of the parent artery's centerline, its landing surface, and the sacs cut off from it."""
+    path = parent_path(vessel, list(bulges), outlet_mm)
+    landing = _landing(vessel, path, bulges, drawn.artery if drawn else None)
+    side_lines = _all_but(path, vessel.centerlines)
+    if drawn:
+        return path, landing, [drawn_sac(vessel, landing, side_lines, drawn)]
+    return path, landing, _sacs(vessel, landing, side_lines, list(bulges))
+
+
+def _classified(vessel: Vessel, landing: Landing, sac: Aneurysm) -> Candidate:
+    """Return the class of a sac beside the parent artery's diameter at its neck."""
+    middle_mm = 0.5 * (sac.proximal_abscissa_mm + sac.distal_abscissa_mm)
+    return classified(vessel, sac, 2 * float(np.interp(middle_mm, landing.axis.abscissa_mm, landing.section_radius_mm)))
+
+
+def _but(bulges: Sequence[Bulge], sacs: Sequence[Aneurysm]) -> list[Bulge]:
+    """Return the bulges that are in none of the sacs; all but the first where that leaves them all."""
+    left = [bulge for bulge in bulges if not is_in_one(bulge.points_mm, sacs)]
+    return left if len(left) < len(bulges) else list(bulges[1:])
 
 
 def _landing(vessel: Vessel, path: int, bulges: Sequence[Bulge], own: Surface | None = None) -> Landing:

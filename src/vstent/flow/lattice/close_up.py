@@ -29,18 +29,18 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.directions import VELOCITIES
 
 WIDTH = 2
-"""Cells elsewhere over those of the close-up."""
+"""Ratio of the grid spacing elsewhere to that in the refined region."""
 UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 3.0, 1.0
-"""How far the close-up reaches from the sac, in mean diameters 4 V / A of the vessel: towards the inlet, and to the
-others. What turns into the sac is made upstream: one diameter takes 9 % off the demo's neck inflow, two 2.4 %."""
+"""Extent of the refined region from the sac towards the inlet and the outlets, in mean diameters 4 V / A of the vessel.
+The flow into the sac forms upstream: with one diameter the demo's neck inflow is 9 % too low, with two 2.4 %."""
 STRETCH = 4 / 3
-"""Time steps of a steady close-up over those of a whole vessel, where they would be too long: a fork lost 0.3 per cent
-of its blood. What passes the ends of a close-up is given. The means of C0038's sac and neck, bare and behind Silk and
-Enterprise, differ by 0.4 per cent at most from what shorter steps make of them in as much time, the demo's by 0.5. A
-pulse's are as long as elsewhere: with longer ones C0038's diverged in a close-up of 0.2 mm."""
+"""Ratio of the time step of a steady flow in the refined region to that in a whole vessel, where it would be too long
+(a fork lost 0.3 % of its blood). The flow through the ends of the region is imposed. The means of C0038's sac and neck,
+bare and with Silk and Enterprise, change by at most 0.4 % with shorter steps, the demo's by 0.5 %. In a pulse the ratio
+is 1: with longer steps C0038 diverged at 0.2 mm."""
 SHARE_WITHIN = 1 / 6
-"""Part of a steady flow's time steps that a close-up makes at most: it begins from what surrounds it, and where it
-swings, which is what takes so many, the mean is over its last checks anyway (`lattice_settling.LATEST`)."""
+"""Largest fraction of a steady flow's time steps that the refined region may take: it starts from the coarser flow, and
+of an unsteady flow, which needs the most steps, only the last checks are averaged (`settling.LATEST`)."""
 SHARE_AROUND = 1 / 2
 """Part of them that what surrounds it makes at most: the sac is computed anew."""
 RIM_CELLS = 4
@@ -120,7 +120,9 @@ def require_sac(case: FlowCase) -> Surface:
         When there is none.
     """
     if case.sac is None:
-        raise FlowError("a close-up is of a sac, and this vessel has none: leave out --close-up (close_up)")
+        raise FlowError(
+            "the grid cannot be refined in the sac, because this vessel has none: switch that off (--refine-sac)"
+        )
     return case.sac
 
 
@@ -284,7 +286,7 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
         is_converged=inner.is_converged and outer.is_converged,
         unsettled_fraction=max(inner.unsettled_fraction, outer.unsettled_fraction),
         advice=(
-            f"{inner.advice} Cells are {inner.cell_size_mm:.3g} mm wide in the sac and near it, "
+            f"{inner.advice} The grid spacing is {inner.cell_size_mm:.3g} mm in and near the sac and "
             f"{outer.cell_size_mm:.3g} mm elsewhere; there: {outer.advice}"
         ),
     )

@@ -34,9 +34,9 @@ GPU_BYTES_PER_CELL = 320
 BYTES_AT_LEAST = 4.5e8
 """Memory of the program itself, its compiled kernels and one surface."""
 WHOLE_OVER_BLOCK = 3.5
-"""Time of a flow over that of its steps in a block of blood, which a cache holds: walls, openings, checks, the first
-guess, and memory (the demo in cells of 0.14 mm, with Silk: 123 million updates a second, the block 440; 3.4 for C0038
-in 0.2 mm, 4.8 for a small bifurcation)."""
+"""Ratio of the run time of a flow to that of its steps in a block of blood that fits the cache. The rest is walls,
+openings, checks, the first guess and memory. Measured: demo with Silk at 0.14 mm, 123 million updates per second
+against 440 in the block; 3.4 for C0038 at 0.2 mm, 4.8 for a small bifurcation."""
 BLOCK_ROWS = 4095
 """Rows of the block that the rate is measured on, an odd number (see `setup.address`)."""
 BLOCK_BAND = 15
@@ -63,8 +63,9 @@ class Cost:
     def __str__(self) -> str:
         """One sentence."""
         return (
-            f"{self.cells / 1e3:,.0f} thousand cells of {self.cell_size_mm:.3g} mm, {self.memory_bytes / 1e9:.2g} GB, "
-            f"at most {self.steps:,} time steps or {self.seconds / 60:.2g} min a flow."
+            f"Grid spacing {self.cell_size_mm:.3g} mm ({self.cells:,.0f} cells), memory "
+            f"{self.memory_bytes / 1e9:.2g} GB, run time at most {self.seconds / 60:.2g} min per flow "
+            f"({self.steps:,} time steps)."
         )
 
 
@@ -92,8 +93,8 @@ def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes:
     cell_size_mm = default_cell_size_mm(case)
     if (cells := _size(case, cell_size_mm)[0]) > MOST_CELLS:
         raise FlowError(
-            f"the flow on {cells / 1e6:.3g} million cells of {cell_size_mm:.3g} mm has more than the "
-            f"{MOST_CELLS / 1e6:.0f} million that can be numbered: set a cell size of "
+            f"a grid spacing of {cell_size_mm:.3g} mm gives {cells / 1e6:.3g} million cells, more than the "
+            f"largest number of {MOST_CELLS / 1e6:.0f} million: use a grid spacing of "
             f"{_fitting_mm(case, lambda cell_mm: _size(case, cell_mm)[0], MOST_CELLS):.2g} mm"
         )
     _refuse(case, lambda cell_mm: _size(case, cell_mm)[1], free_bytes, "memory")
@@ -108,9 +109,9 @@ def _refuse(case: FlowCase, needed_bytes: Callable[[float], float], free_bytes: 
     if needed_bytes(cell_size_mm) <= free_bytes:
         return
     raise FlowError(
-        f"the flow on {_size(case, cell_size_mm)[0] / 1e6:.3g} million cells of {cell_size_mm:.3g} mm needs "
-        f"{needed_bytes(cell_size_mm) / 1e9:.2g} GB, but {free_bytes / 1e9:.2g} GB of {of} are free: set a cell size "
-        f"of {_fitting_mm(case, needed_bytes, free_bytes):.2g} mm"
+        f"a grid spacing of {cell_size_mm:.3g} mm gives {_size(case, cell_size_mm)[0] / 1e6:.3g} million cells "
+        f"and needs {needed_bytes(cell_size_mm) / 1e9:.2g} GB, but {free_bytes / 1e9:.2g} GB of {of} are free: "
+        f"use a grid spacing of {_fitting_mm(case, needed_bytes, free_bytes):.2g} mm"
     )
 
 

@@ -23,7 +23,7 @@ VISCOSITY = (RELAXATION_STEPS - 0.5) / 3
 DEFER_PAIRS, DEFER_PART = 4, 0.3
 """Step pairs between updates of the quadratic reflection, and the part of the way that each goes."""
 CHECK_PAIRS = 50
-"""Step pairs between looks at whether the flow has settled."""
+"""Step pairs between checks of convergence."""
 SETTLED = 3e-4
 """Change of the mean velocity between looks at which it has."""
 MAX_CHECKS = 600
@@ -98,7 +98,7 @@ def flow_through(wires: Wires, force: Floats) -> CellFlow:
         if np.abs(mean - before).max() < SETTLED * np.abs(mean).max():
             return CellFlow(velocity, force * is_blood.size, is_blood)
         before = mean
-    raise ValueError(f"the flow through the cell {wires.shape} has not settled: use a smaller force")
+    raise ValueError(f"the flow through the cell {wires.shape} has not converged: use a smaller force")
 
 
 def sheet_speed(flow: CellFlow, force: Floats) -> float:
@@ -184,7 +184,7 @@ class _Grid:
         first = np.flatnonzero(np.r_[True, ~follows])
         self._length = np.diff(np.r_[first, len(cells)]).astype(np.int32)
         if self._length.max() > d3q19.SEGMENT:
-            raise ValueError(f"a cell may be {d3q19.SEGMENT} high at most")
+            raise ValueError(f"a cell may be at most {d3q19.SEGMENT} high")
         start = cells[first]
         behind = [self._number(start - c) for c in directions.VELOCITIES]
         self._populations = d3q19.addresses(self._place[first], behind, self._stride)

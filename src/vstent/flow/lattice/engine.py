@@ -25,7 +25,7 @@ from vstent.units import M_PER_MM
 CHECK_DIAMETERS = 0.5
 """Flow time between checks, in inlet diameters over mean inlet speed."""
 LEAST_CHECKS = 24
-"""The limit of time steps leaves room for at least this many checks: fewer cannot tell whether the flow has settled."""
+"""Fewest checks within the limit of time steps: fewer cannot show convergence."""
 
 INFLOW_WEIGHT: Final = 3
 """What the flow through an inlet has left to go, which is known, counts so many times as much as what is foretold."""
@@ -111,10 +111,10 @@ class LatticeBoltzmann(AbstractLattice):
         return max(4, int(steps // state.steps_per_check))
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
-        """Return the last check of a flow that has settled, or the mean of what it swings about."""
+        """Return the last check of a converged flow, or the time average of an unsteady one."""
         left = _left(state)
         if left < state.case.settings.tolerance:
-            return field_of(state, read(state, [state.snapshots[-1]]), outcome, left, "The flow has settled.")
+            return field_of(state, read(state, [state.snapshots[-1]]), outcome, left, "The flow has converged.")
         mean = _mean(state)
         uncertain, advice = _of_mean(state, mean, is_converged=outcome.is_converged)
         return field_of(state, read_moving(state, state.blocks[-mean.blocks :]), outcome, uncertain, advice)
@@ -143,21 +143,25 @@ def _mean(state: State) -> Mean:
 
 
 def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, str]:
-    """How uncertain the means of a flow that has not settled are, as a fraction of them, and that in words."""
+    """Return the statistical uncertainty of the means of an unconverged flow, as a fraction and in words."""
     swing, moved = swings(np.array(state.history), mean.checks)
     means = (
-        f"means over its last {1e3 * mean.checks * state.check_s:.0f} ms, in which what is monitored ranged over up to "
-        f"{100 * swing:.1f} % of its mean"
+        f"averages over the last {1e3 * mean.checks * state.check_s:.0f} ms, in which the monitored quantities "
+        f"varied by up to {100 * swing:.1f} % of their mean"
     )
     of_means, of_field = (100 * SURE * error for error in (mean.standard_error, mean.field_error))
     known = (
-        f"they are known to within {of_means:.1f} %, the sac's velocity, place by place, to within {of_field:.0f} % "
-        f"({SURE} standard errors)"
+        f"their statistical uncertainty ({SURE} standard errors) is {of_means:.1f} %, and {of_field:.0f} % for "
+        "the local velocity in the sac"
     )
     if is_converged:
-        return of_means / 100, f"The flow goes on moving about its mean: these are {means}; {known}."
-    unsettled = f"The flow has not settled in {state.steps} time steps and may be unsteady by nature: these are {means}"
+        return of_means / 100, f"The flow is unsteady. The results are {means}; {known}."
+    unsettled = f"The flow has not converged in {state.steps} time steps and may be unsteady. The results are {means}"
     if np.isfinite(mean.left):
-        return of_means / 100, f"{unsettled}; {known}: allow more steps to know them better."
-    drift = "" if np.isnan(moved) else f"; from the means of as long before, they differ by up to {100 * moved:.1f} %"
+        return of_means / 100, f"{unsettled}; {known}. Allow more steps to reduce it."
+    drift = (
+        ""
+        if np.isnan(moved)
+        else (f"; they differ by up to {100 * moved:.1f} % from the averages over an equal time before")
+    )
     return float(np.nanmax([swing, moved])), f"{unsettled}{drift}."

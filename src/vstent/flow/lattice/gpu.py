@@ -9,12 +9,12 @@ from vstent.errors import FlowError
 
 PACKAGE: Final = "numba_cuda"
 """Compiles kernels for a GPU; an extra."""
-ELSE: Final = "or compute on the processor, without --device-gpu (device_gpu)"
+ELSE: Final = "or compute on the processor (without --gpu)"
 """What can be done in any case."""
 
 
 def require_gpu() -> None:
-    """See that there is a GPU and what it takes to use it.
+    """Check that there is a usable GPU.
 
     Raises
     ------
@@ -25,8 +25,8 @@ def require_gpu() -> None:
 
     if find_spec(PACKAGE) is None and not numba.config.ENABLE_CUDASIM:
         raise FlowError(
-            "the flow cannot be computed on a GPU, for numba-cuda is not installed: give pip install 'vstent[gpu]', "
-            f"{ELSE}"
+            "the flow cannot be computed on a GPU, because numba-cuda is not installed: run pip install "
+            f"'vstent[gpu]', {ELSE}"
         )
     try:
         from numba import cuda
@@ -38,12 +38,12 @@ def require_gpu() -> None:
         complaint = None
     if complaint is None:
         raise FlowError(
-            "the flow cannot be computed on this GPU, for CUDA's compiler is not installed: give "
-            f"pip install 'numba-cuda[cu12]' (cu13 with a driver from 580 on), {ELSE}"
+            "the flow cannot be computed on this GPU, because CUDA's compiler is not installed: run pip "
+            f"install 'numba-cuda[cu12]' (cu13 for drivers from 580), {ELSE}"
         )
     raise FlowError(
-        "the flow cannot be computed on a GPU, for no NVIDIA GPU with its driver is found on this machine: see what "
-        f"nvidia-smi lists, {ELSE}"
+        "the flow cannot be computed on a GPU, because no NVIDIA GPU with its driver was found: check the "
+        f"list of nvidia-smi, {ELSE}"
     )
 
 
@@ -60,9 +60,7 @@ def told() -> Iterator[None]:
         yield
     except Exception as error:  # each of them raises its own
         words = next(iter(str(error).splitlines()), type(error).__name__)
-        raise FlowError(
-            f"the GPU did not compute the flow ({words}): see what nvidia-smi says of it, {ELSE}"
-        ) from error
+        raise FlowError(f"the GPU failed to compute the flow ({words}): check nvidia-smi, {ELSE}") from error
 
 
 def gpu_name() -> str:

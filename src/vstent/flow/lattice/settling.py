@@ -1,4 +1,4 @@
-"""Whether a steady lattice-Boltzmann run is at its end: it has settled, or it swings about a mean that is known."""
+"""Whether a steady lattice-Boltzmann run may stop: it has converged, or its time averages are known well enough."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,35 +12,35 @@ from vstent.flow.stopping import quantities_left, series_left, standard_error
 from vstent.kernels.arrays import Floats, Ints
 
 CHECKS_APART: Final = 3
-"""Checks between the fields whose difference tells what the velocity has left to go."""
+"""Number of checks between the fields whose difference estimates the distance of the velocity from convergence."""
 SHARE_OF_FIELD: Final = 0.5
-"""What means have left to go, at most, over what the field has (behind Silk and Enterprise: 0.1 to 0.5)."""
+"""Largest ratio of the distance of means from convergence to that of the field (with Silk and Enterprise: 0.1-0.5)."""
 SHARE_OF_MEAN_FIELD: Final = 0.1
-"""The same for the error of a mean about which they move: place by place it is much less well known (C0038: 6 %)."""
+"""The same ratio for the error of time averages, which is much larger for local values (C0038: 6 %)."""
 BLOCKS: Final = 8
-"""Most blocks of checks whose means a run keeps."""
+"""Largest number of blocks of checks whose means are kept."""
 NO_MEAN: Final = 0.05
-"""What is `left` of a mean that tells less than the last checks do."""
+"""Error of a mean above which the last checks are used instead."""
 LATEST: Final = 8
-"""These checks."""
+"""Number of the last checks that are averaged then."""
 
 
 @dataclass(frozen=True)
 class Mean:
-    """What is known of the mean over the last checks of a run."""
+    """The mean over the last checks of a run, and its error."""
 
     checks: int
-    """How many."""
+    """Number of checks."""
     blocks: int
-    """Blocks that they are."""
+    """Number of blocks that they form."""
     standard_error: float
-    """Of any monitored quantity's mean, the largest, as a fraction of it; inf where the checks do not tell."""
+    """Largest relative standard error of the monitored quantities; inf where there are too few checks."""
     field_error: float
-    """The same of the sac's mean velocity, place by place, root mean square."""
+    """Root-mean-square relative error of the local mean velocity in the sac."""
 
     @property
     def left(self) -> float:
-        """What the tolerance is asked of."""
+        """Error that is compared with the tolerance."""
         return max(self.standard_error, SHARE_OF_MEAN_FIELD * self.field_error)
 
 

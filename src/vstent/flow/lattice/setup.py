@@ -21,7 +21,8 @@ CELL_REYNOLDS_AT_END = 25.0
 """Largest speed x cell / viscosity in the openings' extensions, whose ends are where fast blood becomes unstable first
 (30 to 50 were seen to fail): faster blood is made thicker there."""
 CELL_REYNOLDS: Final = 75.0
-"""The same in the vessel. C0038's systole diverged with 100 in cells of 0.4 mm and with 150 in cells of 0.2 mm."""
+"""Grid Reynolds number in the vessel above which the viscosity is raised. The systole of C0038 diverged with 100 at a
+grid spacing of 0.4 mm and with 150 at 0.2 mm."""
 CUT_CELLS = 6
 """Cells at the cuts of a close-up that count as such an extension."""
 CELL_REYNOLDS_IN_CUT: Final = 5.0
@@ -140,7 +141,7 @@ def in_extensions(case: FlowCase, domain: Domain) -> Bools:
 
 
 def thickest(case: FlowCase, domain: Domain) -> NDArray[np.float32]:
-    """Largest cell Reynolds number (n,) of every cell: faster blood is computed thicker."""
+    """Return the largest grid Reynolds number (n,) of every cell, above which the viscosity is raised."""
     limit = np.where(in_extensions(case, domain), CELL_REYNOLDS_AT_END, CELL_REYNOLDS)
     cut = np.zeros(domain.cells.max(axis=0) + 2, dtype=bool)
     cut[tuple(domain.cells[domain.link_cell[domain.link_patch > len(case.vessel.openings)]].T)] = True

@@ -118,7 +118,7 @@ def step(state: State) -> None:
     advance(state, min(_slice_steps(state), state.steps_per_check - state.since_check))
     state.loop_seconds += perf_counter() - began
     if state.since_check == state.steps_per_check:
-        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is told of, not warned of
+        with np.errstate(over="ignore", invalid="ignore"):  # divergence is reported as an error, not as a warning
             state.snapshots.append(_snapshot(state))
             state.history.append(_monitor(state, state.snapshots[-1]))
             state.since_check = 0

@@ -17,8 +17,8 @@ def trouble(state: State) -> str:
     when_ms = 1e3 * state.time_s
     if not good:
         return (
-            f"the flow diverged within the first {when_ms:.3g} ms, before any good check: the time step is too long"
-            " for its speed; halve the lattice speed or the cell size"
+            f"the flow diverged within the first {when_ms:.3g} ms, because the time step is too long for its "
+            "speed: use half the lattice speed or half the grid spacing"
         )
     last = good[-1]
     speed = np.linalg.norm(last.velocity, axis=1)
@@ -26,7 +26,7 @@ def trouble(state: State) -> str:
     behind = next(k for k, one in enumerate(reversed(state.snapshots)) if one is last)
     good_ms = when_ms - 1e3 * behind * state.check_s
     return (
-        f"the flow diverged between {good_ms:.3g} and {when_ms:.3g} ms; at the last good check the fastest blood moved "
+        f"the flow diverged between {good_ms:.3g} and {when_ms:.3g} ms; the fastest blood before was "
         f"{speed[fastest] * last.scales.speed_m_s:.2g} m/s at {place(state.domain.centers_mm[fastest])}: "
         + _cause(state, last, speed, fastest)
     )
@@ -35,20 +35,20 @@ def trouble(state: State) -> str:
 def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
     if speed[fastest] > FAST:
         return (
-            f"the time step is too long, for that is {speed[fastest]:.2g} cells a step; halve the lattice speed "
+            f"the time step is too long ({speed[fastest]:.2g} cells per step): use half the lattice speed "
             f"({state.case.settings.lattice_speed:.3g})"
         )
     outlets = [(k, one) for k, one in enumerate(state.case.vessel.openings) if not one.is_inlet]
     coming_back = [one.role for k, one in outlets if _backflow(state, last, k) > FAST * speed[fastest]]
     if coming_back:
         role = coming_back[0]
-        return f"blood comes back through {role}; cut the vessel further from there, or share the outflow (murray)"
-    otherwise = "" if state.close_up is None else ", or leave out --close-up (close_up)"
+        return f"blood flows back through {role}: cut the vessel further away, or split the outflow by Murray's law"
+    otherwise = "" if state.close_up is None else ", or switch off the refinement in the sac (--refine-sac)"
     cell_reynolds = speed[fastest] / last.scales.viscosity
     return (
-        f"the grid is too coarse for it (speed x cell / viscosity = {cell_reynolds:.0f}, while blood is computed "
-        f"thicker from {CELL_REYNOLDS:.0f} on, behind openings from {CELL_REYNOLDS_AT_END:.0f}); "
-        f"set a cell size of {0.7 * state.domain.cell_size_mm:.2g} mm{otherwise}"
+        f"the grid is too coarse (grid Reynolds number {cell_reynolds:.0f}; the viscosity is raised above "
+        f"{CELL_REYNOLDS:.0f}, and above {CELL_REYNOLDS_AT_END:.0f} beyond the openings): use a grid spacing "
+        f"of {0.7 * state.domain.cell_size_mm:.2g} mm{otherwise}"
     )
 
 

@@ -1,5 +1,5 @@
-"""OpenFOAM as an engine: a `FlowCase` in, a case folder that OpenFOAM runs, and a `FlowField` read back.
+"""OpenFOAM as a flow engine: a `FlowCase` becomes a case folder, and its result a `FlowField`.
 
-Open ``engine.py`` first; ``case.py`` states the flow in OpenFOAM's syntax, ``folder.py`` writes it, and ``bridge.py``
-reads the results.
+Start reading in ``engine.py``. ``case.py`` builds the files in OpenFOAM's syntax, ``folder.py`` writes them, and
+``bridge.py`` reads the results.
 """

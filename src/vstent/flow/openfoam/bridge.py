@@ -1,4 +1,4 @@
-"""From OpenFOAM's cells and faces to the grid, the ostium and the wall that every result of vstent lies on."""
+"""Transfer of OpenFOAM's fields from its mesh to the regular grid, the ostium and the lumen."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,59 +17,71 @@ from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
 OSTIUM_SPACING: Final = 0.5
-"""Spacing of points on the ostium, in cells. Between wires finer ones lie: at 1 Silk's neck inflow in the demo is 0.7 %
-off, at 0.5 it is 0.02 %."""
+"""Spacing of sample points on the ostium, in grid cells. The mesh is finer between wires: the neck inflow of the
+demo with Silk is off by 0.7 % at a spacing of 1 and by 0.02 % at 0.5."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bridge:
-    """Sparse matrices; the velocity's sources are the cells and then the faces of the patches that hold theirs."""
+    """Sparse interpolation matrices from OpenFOAM's mesh.
+
+    The sources (s) of velocity are the cells, followed by the faces of the patches with known velocity.
+    """
 
     to_cells: csr_matrix
-    """(n, s) velocity -> grid cells."""
+    """(n, s) velocity to the cells of the grid."""
     pressure_to_cells: csr_matrix
-    """(n, c) cells -> grid cells."""
+    """(n, c) cell values to the cells of the grid."""
     to_ostium: csr_matrix
-    """(o, s) velocity -> points on the ostium."""
+    """(o, s) velocity to sample points on the ostium."""
     ostium_area_mm2: Floats
     """(o, 3) area vectors of these points."""
     wall_to_lumen: csr_matrix
-    """(v, f) faces of the walls -> vertices of the lumen."""
+    """(v, f) values on the wall's faces to the vertices of the lumen."""
     pressure_to_lumen: csr_matrix
-    """(v, c) cells -> vertices of the lumen."""
+    """(v, c) cell values to the vertices of the lumen."""
     walls: dict[str, int]
-    """Faces of every patch that is wall, in the order of the sources."""
+    """Number of faces of every wall patch, in the order of the sources."""
     n_cells: int
-    """Cells of OpenFOAM's mesh."""
+    """Number of cells in OpenFOAM's mesh."""
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A moment of the flow, in SI units."""
+    """The flow at one time, in SI units."""
 
     time: str
-    """Its name: iterations, or seconds."""
+    """Name of the time: a number of iterations, or seconds."""
     velocity_m_s: Floats
-    """(n, 3) in the grid's cells."""
+    """(n, 3) velocity in the cells of the grid."""
     pressure_Pa: Floats
-    """(n,) in the grid's cells."""
+    """(n,) pressure in the cells of the grid."""
     wall_shear_stress_Pa: Floats
-    """(v, 3) at the lumen's vertices."""
+    """(v, 3) wall shear stress at the lumen's vertices."""
     wall_pressure_Pa: Floats
-    """(v,) at the lumen's vertices."""
+    """(v,) pressure at the lumen's vertices."""
     outflow_mL_s: Floats
-    """(k,) through every opening."""
+    """(k,) flow rate out through every opening."""
     neck_inflow_mL_s: float
-    """Into the sac; 0 where there is none."""
+    """Neck inflow; 0 without a sac."""
 
 
 def bridge(case: FlowCase, domain: Domain, folder: Path) -> Bridge:
-    """Build the matrices for a meshed case.
+    """Build the interpolation matrices of a meshed case.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow.
+    domain : Domain
+        The grid of the result.
+    folder : Path
+        The case folder.
 
     Raises
     ------
     ReadError
-        When the cells' centres are missing or damaged.
+        The cell centres are missing or damaged.
     """
     centers = results.read_field(folder, "0", "C")
     inside_mm = centers.inside / M_PER_MM
@@ -93,7 +105,7 @@ def bridge(case: FlowCase, domain: Domain, folder: Path) -> Bridge:
 
 
 def _wall_to_lumen(case: FlowCase, faces_mm: Floats, reach_mm: float) -> csr_matrix:
-    """Means of the faces near a vertex; those of a wall back to back with it are far off by their normals."""
+    """Return the matrix of means over the faces near each vertex, excluding a wall back to back with its own."""
     lumen = case.vessel.lumen
     facing = lumen.normals[lumen.closest(faces_mm)[2]]
     sources = np.hstack([faces_mm, reach_mm * facing])
@@ -101,12 +113,23 @@ def _wall_to_lumen(case: FlowCase, faces_mm: Floats, reach_mm: float) -> csr_mat
 
 
 def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
-    """Read a time of a case.
+    """Read the flow at one time of a case.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow.
+    across : Bridge
+        The interpolation matrices.
+    folder : Path
+        The case folder.
+    time : str
+        Name of the time.
 
     Raises
     ------
     ReadError
-        When a field is missing or damaged.
+        A field is missing or damaged.
     """
     density = case.blood.density_kg_m3
     velocity = results.read_field(folder, time, "U")
@@ -114,7 +137,7 @@ def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
     known = np.concatenate([velocity.inside, at_rest, *_at_inlets(case, velocity, float(time))])
     pressure_Pa = density * results.read_field(folder, time, "p").inside[:, 0]
     stress = results.read_field(folder, time, "wallShearStress").patches
-    # OpenFOAM's is what the wall does to the blood, over density.
+    # OpenFOAM writes the traction of the wall on the blood, divided by the density.
     traction_Pa = across.wall_to_lumen @ (-density * np.concatenate([stress[name] for name in across.walls]))
     normal = case.vessel.lumen.vertex_normals
     through_mL_s = sampling.through_mL_s(across.to_ostium @ known, across.ostium_area_mm2)
@@ -130,7 +153,10 @@ def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
 
 
 def _at_inlets(case: FlowCase, velocity: results.VolumeField, time: float) -> list[Floats]:
-    """Velocity (f, 3) on every inlet's faces: a pulse is written as what its factor multiplies."""
+    """Return the velocity (f, 3) on every inlet's faces.
+
+    With a waveform, OpenFOAM's files hold the velocity divided by the waveform's factor.
+    """
     factor = float(case.settings.inflow_factor(np.array([time]))[0])
     multiples = {name: factor * values for name, values in velocity.references.items()}
     return [(multiples | velocity.patches)[inlet.role] for inlet in case.vessel.inlets]

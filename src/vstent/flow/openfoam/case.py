@@ -1,4 +1,4 @@
-"""A flow case as OpenFOAM's case folder, in memory: relative path to text."""
+"""Build an OpenFOAM case folder in memory: the text of every file by its relative path."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -16,68 +16,71 @@ from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
 README: Final = """\
-OpenFOAM case written by vstent (research use only). Lengths are metres: the vessel's millimetres, LPS, times 0.001.
+OpenFOAM case written by vstent (research use only). Lengths are in m, in the vessel's LPS axes.
 
-  ./Allrun             mesh and compute here; given again it goes on from the last time written
+  ./Allrun             mesh and compute on this machine; run it again to resume from the last time written
   sbatch submit.slurm  the same on a cluster
-  ./Allclean           back to what was exported
+  ./Allclean           delete all results and restore the case as exported
 
 Patches: wall{sac}, {inlets}, outlet_1, ... (from the widest to the narrowest), each outlet at the end of a straight
-extension. p is pressure over density ({density:.6g} kg/m3). wallShearStress is what the wall does to the blood, over
-density: the wall's own stress is its negative times the density.
+extension. p is pressure divided by density ({density:.6g} kg/m3). wallShearStress is the traction of the wall on the
+blood, divided by density: multiply it by minus the density to obtain the wall shear stress.
 Mean inflow: {inflow:.6g} mL/s.
 """
+"""README file of a case."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoamCase:
-    """The files of a case and the names in them."""
+    """The files of an OpenFOAM case."""
 
     files: dict[str, str]
-    """Text by path relative to the case folder; those of `executable` are scripts."""
+    """Text of every file by its path relative to the case folder."""
     executable: tuple[str, ...]
-    """Paths of the scripts."""
+    """Paths of the files that are scripts."""
     application: str
-    """The solver's program."""
+    """Name of the solver program."""
 
 
 def strut_solids(case: FlowCase) -> Surface | None:
-    """Return the solids of a case's wires, or None where there is no device.
+    """Return the solids of a case's wires, or None without a device.
 
     Raises
     ------
     FlowError
-        When there is a screen, and no wires for it.
+        The case has a screen but no wires.
     LandingError
-        When no wire lies where blood passes it.
+        No wire is over a neck or a branch's ostium.
     """
     if case.stent is None and case.screen is None:
         return None
     if case.stent is None:
         raise FlowError(
-            "OpenFOAM's porous zones resist alike in every cell, a screen does not: give the stent, whose struts are "
-            "meshed, or take the embedded engine"
+            "the engine openfoam does not support the screen model of a stent: give the stent itself, whose struts are "
+            "meshed, or choose the embedded engine"
         )
     if not len(case.stent.wire_points_mm):
         raise LandingError(
-            "no wire of the device lies over a neck or a branch's ostium, where OpenFOAM meshes its struts: land it "
-            "across one, or leave it away"
+            "no wire of the device is over a neck or a branch's ostium, the only places where OpenFOAM meshes struts: "
+            "move the landing zone across one, or compute without the device"
         )
     return struts(case.stent)
 
 
 def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
-    """Write a case that OpenFOAM meshes and computes: steady, or transient where the case has a waveform.
+    """Build a case that OpenFOAM meshes and computes: steady, or transient if the case has a waveform.
 
     Parameters
     ----------
-    case : lumen, sac, ostium, blood, inflow; a screen is left out, for OpenFOAM meshes struts instead.
-    setup : mesh, machine, dialect, struts.
+    case : FlowCase
+        The flow. A screen is ignored, because OpenFOAM meshes struts instead.
+    setup : FoamSetup
+        Mesh, parallel processes, OpenFOAM flavour and struts.
 
     Raises
     ------
     FlowError
-        When an opening has no open end of the lumen.
+        An opening does not match any open end of the lumen.
     """
     patches, sections = named_patches(case)
     kinds = {one.name: "wall" if one.name in ("wall", "sac") else "patch" for one in patches}
@@ -115,7 +118,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
 
 
 def _ends(case: FlowCase, sections: tuple[Floats, ...]) -> dict[str, mesh.End]:
-    """Where the patches of the openings lie: the extension, and as much of the vessel as the opening is wide."""
+    """Return where each opening's patch is: its extension, and one diameter of the vessel before it."""
     ends = {}
     for one, section in zip(case.vessel.openings, sections, strict=True):
         end_mm = section.mean(axis=0)
@@ -125,6 +128,7 @@ def _ends(case: FlowCase, sections: tuple[Floats, ...]) -> dict[str, mesh.End]:
 
 
 def _application(case: FlowCase, setup: FoamSetup) -> str:
+    """Return the name of the solver program."""
     if setup.flavour == "org":
         return "foamRun"
     return "simpleFoam" if case.settings.waveform is None else "pimpleFoam"
@@ -133,6 +137,7 @@ def _application(case: FlowCase, setup: FoamSetup) -> str:
 def _system(
     case: FlowCase, setup: FoamSetup, patches: tuple[Patch, ...], walls: list[str], sections: tuple[Floats, ...]
 ) -> dict[str, str]:
+    """Return the files in the folder system/."""
     is_steady = case.settings.waveform is None
     step_s = 0.2 * setup.cell_size_mm * M_PER_MM / (2 * float(case.inlet_speeds_m_s.max()))
     return {
@@ -145,6 +150,7 @@ def _system(
 
 
 def _surfaces(case: FlowCase, setup: FoamSetup, patches: tuple[Patch, ...]) -> dict[str, str]:
+    """Return the STL files of the case's surfaces."""
     openings = [opening.role for opening in case.vessel.openings]
     corners = {one.name: one.corners_mm for one in patches}
     surfaces = {mesh.LUMEN: corners, mesh.ENDS: {name: corners[name] for name in openings}}
@@ -156,6 +162,6 @@ def _surfaces(case: FlowCase, setup: FoamSetup, patches: tuple[Patch, ...]) -> d
 
 
 def _inside_mm(case: FlowCase, sections: tuple[Floats, ...]) -> Floats:
-    """A point in the inlet's straight extension, off every plane of the grid."""
+    """Return a point in the inlet's straight extension that is not on a plane of the background grid."""
     inlet = case.vessel.inlet
     return np.asarray(sections[0].mean(axis=0) - inlet.normal * 0.1137 * inlet.diameter_mm)

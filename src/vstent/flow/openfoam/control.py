@@ -1,4 +1,4 @@
-"""Dictionaries of the computation: schemes, solvers, times, fluid, what is sampled, how it is cut into parts."""
+"""OpenFOAM dictionaries of the computation: schemes, solvers, time control, fluid, sampling, decomposition."""
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -12,12 +12,13 @@ from vstent.flow.openfoam.setup import FoamSetup
 from vstent.kernels.arrays import Floats
 
 MAX_COURANT: Final = 2.0
-"""Largest Courant number of a transient flow: implicit steps may pass 1 where cells are flat or small."""
+"""Maximum Courant number of a transient flow; implicit steps may exceed 1 in flat or small cells."""
 FIELD_LIBRARY: Final = ['"libfieldFunctionObjects.so"']
+"""Library of OpenFOAM's function objects for fields."""
 
 
 def schemes(*, is_steady: bool) -> str:
-    """fvSchemes: second order in space, and in time where it counts."""
+    """Return fvSchemes: second order in space, and in time for transient flow."""
     bounded = "bounded Gauss" if is_steady else "Gauss"
     entries = {
         "ddtSchemes": {"default": "steadyState" if is_steady else "backward"},
@@ -35,7 +36,7 @@ def schemes(*, is_steady: bool) -> str:
 
 
 def solution() -> str:
-    """fvSolution: SIMPLE for steady flow, PISO (PIMPLE with one outer loop) for transient."""
+    """Return fvSolution: SIMPLE for steady flow, PISO (PIMPLE with one outer loop) for transient flow."""
     pressure = {"solver": "GAMG", "smoother": "GaussSeidel", "tolerance": 1e-9, "relTol": 0.05}
     velocity = {"solver": "smoothSolver", "smoother": "symGaussSeidel", "tolerance": 1e-9, "relTol": 0.05}
     entries = {
@@ -60,14 +61,20 @@ def solution() -> str:
 
 
 def control(case: FlowCase, setup: FoamSetup, step_s: float, *, walls: Sequence[str], has_neck: bool) -> str:
-    """controlDict: steady in iterations, or transient in seconds with steps bounded by the Courant number.
+    """Return controlDict: iterations for steady flow, or seconds with a bounded Courant number for transient flow.
 
     Parameters
     ----------
-    case, setup : what is computed, and where.
-    step_s : first time step of a transient flow.
-    walls : names of the patches that are wall.
-    has_neck : whether the flow through the neck is sampled.
+    case : FlowCase
+        The flow.
+    setup : FoamSetup
+        Setup of the OpenFOAM case.
+    step_s : float
+        First time step of a transient flow.
+    walls : sequence of str
+        Names of the wall patches.
+    has_neck : bool
+        Whether to sample the flow through the neck.
     """
     is_org, is_steady = setup.flavour == "org", case.settings.waveform is None
     program = "foamRun" if is_org else "simpleFoam" if is_steady else "pimpleFoam"
@@ -86,11 +93,13 @@ def control(case: FlowCase, setup: FoamSetup, step_s: float, *, walls: Sequence[
 
 
 def _steady_times(setup: FoamSetup) -> dict[str, Any]:
+    """Return the entries of a steady flow's iterations and output."""
     every = {"writeControl": "timeStep", "writeInterval": 50, "purgeWrite": 2}
     return {"endTime": setup.iterations, "deltaT": 1} | every
 
 
 def _transient_times(case: FlowCase, step_s: float) -> dict[str, Any]:
+    """Return the entries of a transient flow's time steps and output."""
     waveform = case.settings.waveform
     assert waveform is not None
     return {
@@ -106,6 +115,7 @@ def _transient_times(case: FlowCase, step_s: float) -> dict[str, Any]:
 
 
 def _functions(setup: FoamSetup, patches: Sequence[str], walls: Sequence[str], has_neck: bool) -> dict[str, Any]:
+    """Return the function objects: flow rates and pressures of openings, wall shear stress, flow through the neck."""
     functions: dict[str, Any] = {}
     for name in patches:
         functions[f"flow_{name}"] = _over_patch(name, "sum", "phi")
@@ -129,7 +139,8 @@ def _functions(setup: FoamSetup, patches: Sequence[str], walls: Sequence[str], h
 
 
 def _over_patch(name: str, operation: str, field: str) -> dict[str, Any]:
-    # The first two lines are openfoam.com's name of a patch, the third openfoam.org's.
+    """Return a function object that sums or averages a field over a patch."""
+    # The first two entries name the patch for openfoam.com, the third for openfoam.org.
     where = {"regionType": "patch", "name": name, "patch": name}
     what = {"operation": operation, "fields": [field], "writeFields": False, "log": False}
     when = {"writeControl": "timeStep", "writeInterval": 1}
@@ -137,7 +148,17 @@ def _over_patch(name: str, operation: str, field: str) -> dict[str, Any]:
 
 
 def decomposition(setup: FoamSetup, extent_mm: Floats) -> str:
-    """decomposeParDict: cut along the axes, the longest most often: Debian's Scotch is a stub."""
+    """Return decomposeParDict: the domain is cut along the axes, most often along the longest.
+
+    Scotch is not used because Debian's build of it is a stub.
+
+    Parameters
+    ----------
+    setup : FoamSetup
+        Setup with the number of processes.
+    extent_mm : (3,) float
+        Size of the domain along the axes.
+    """
     parts = np.ones(3, dtype=int)
     for factor in _prime_factors(setup.processes):
         parts[np.argmax(extent_mm / parts)] *= factor
@@ -147,7 +168,7 @@ def decomposition(setup: FoamSetup, extent_mm: Floats) -> str:
 
 
 def _prime_factors(number: int) -> list[int]:
-    """Prime factors, the largest first."""
+    """Return the prime factors, the largest first."""
     factors, divisor = [], 2
     while number > 1:
         if number % divisor == 0:
@@ -159,7 +180,7 @@ def _prime_factors(number: int) -> list[int]:
 
 
 def fluid(blood: Blood, setup: FoamSetup) -> dict[str, str]:
-    """Properties of the blood by file name: kinematic viscosity, its law where it thins, no turbulence."""
+    """Return the fluid's files by name: kinematic viscosity, the shear-thinning law if there is one, laminar flow."""
     note = f"Blood: {blood.viscosity_Pa_s:.6g} Pa s at {blood.density_kg_m3:.6g} kg/m3; p is pressure over density."
     nu, nu_at_rest, law = _viscosity(blood)
     laminar: dict[str, Any] = {"simulationType": "laminar"}
@@ -181,7 +202,7 @@ def fluid(blood: Blood, setup: FoamSetup) -> dict[str, str]:
 
 
 def _viscosity(blood: Blood) -> tuple[str, str, dict[str, str]]:
-    """Kinematic viscosity at high shear and at rest, and what else Carreau and Yasuda's law (BirdCarreau) needs."""
+    """Return the kinematic viscosity at high and at zero shear rate, and the other Carreau-Yasuda entries."""
     nu, law = f"[0 2 -1 0 0 0 0] {blood.kinematic_viscosity_m2_s:.9g}", blood.thinning
     if law is None:
         return nu, nu, {}

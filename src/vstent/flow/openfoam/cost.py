@@ -1,4 +1,4 @@
-"""What a flow by OpenFOAM will cost, told before it is spent; what does not fit in the memory is refused."""
+"""Estimate run time and memory of an OpenFOAM flow; refuse one that does not fit in the free memory."""
 
 from typing import Final
 
@@ -12,50 +12,54 @@ from vstent.flow.openfoam.case import strut_solids
 from vstent.flow.openfoam.setup import FoamSetup
 
 CELLS_PER_CUBE: Final = 1.6
-"""Cells of the mesh over the blood's volume in cells: layers and the refined neck (1.5 to 1.65 measured)."""
+"""Number of mesh cells over the blood's volume in cubic grid spacings: more than 1 because of layers and the refined
+neck (measured: 1.5 to 1.65)."""
 CELLS_ALONG_WIRE: Final = 25.0, 13.0
-"""Cells for every length of one along a wire, and more for each that lies across it (within a sixth of what is
-measured: Silk's wires 2.7 and 5.4 cells across, Enterprise's 5.5)."""
+"""Number of cells per cell length of wire: a constant, and the increase per cell across the wire. Within a sixth of
+measurements (Silk's wires 2.7 and 5.4 cells across, Enterprise's 5.5)."""
 BYTES_AT_LEAST: Final = 3e8
-"""Memory that does not hang on the cells."""
+"""Memory that does not depend on the number of cells, bytes."""
 BYTES_PER_CELL: Final = 2_000
-"""Peak memory a cell besides: snappyHexMesh's (in all 0.43 GB on 86,000 cells, 1.0 on 339,000, 2.2 on 990,000)."""
+"""Additional peak memory per cell, bytes, reached by snappyHexMesh (measured in all: 0.43 GB for 86,000 cells, 1.0
+GB for 339,000, 2.2 GB for 990,000)."""
 WIDER, TRIED = 1.02, 100
-"""So much wider are the cells that are tried next where the memory does not hold the mesh; the last are 7 times as
-wide."""
+"""Ratio between the grid spacings tried when the memory is too small, and their number plus one; the largest is 7
+times the original."""
 SECONDS_PER_CELL: Final = 1e-3
-"""Time of one core a cell of a steady bare flow, half of it for the mesh (0.8 to 1.1 ms measured)."""
+"""Run time of one core per cell of a steady flow without a device, s, half of it for the mesh (measured: 0.8 to 1.1
+ms)."""
 SECONDS_PER_STRUT_CELL: Final = 1.7e-3
-"""The same at struts (the demo with Silk, 990,000 cells)."""
+"""The same for cells at struts (the demo with Silk, 990,000 cells)."""
 
 
 def tell_cost(case: FlowCase, cell_size_mm: float) -> str:
-    """Return a sentence on cells, memory and time of a steady flow, behind the struts of a case that has a stent.
+    """Return a sentence on cells, memory and run time of a steady flow, including struts if the case has a stent.
 
     Raises
     ------
     FlowError
-        When it does not fit in the free memory, naming the cell size that would.
+        The case does not fit in the free memory; the message names a grid spacing that does.
     LandingError
-        When no wire lies where blood passes it.
+        No wire is over a neck or a branch's ostium.
     """
     bare, at_struts = _cells(case, cell_size_mm)
     needed, free = _bytes(bare + at_struts), free_memory_bytes()
     if needed > free:
         raise FlowError(
-            f"OpenFOAM's mesh of {(bare + at_struts) / 1e6:.3g} million cells of {cell_size_mm:.3g} mm and less needs "
-            f"{needed / 1e9:.2g} GB, but {free / 1e9:.2g} GB of memory are free: {_what_fits(case, cell_size_mm, free)}"
+            f"OpenFOAM's mesh of {(bare + at_struts) / 1e6:.3g} million cells at a grid spacing of {cell_size_mm:.3g} "
+            f"mm needs {needed / 1e9:.2g} GB of memory, but only {free / 1e9:.2g} GB are free: "
+            f"{_what_fits(case, cell_size_mm, free)}"
         )
     seconds = bare * SECONDS_PER_CELL + at_struts * SECONDS_PER_STRUT_CELL
-    of_struts = f", {at_struts / 1e3:,.0f} thousand more at its struts" if at_struts else ""
+    of_struts = f", {at_struts / 1e3:,.0f} thousand more at the struts" if at_struts else ""
     return (
-        f"OpenFOAM: about {bare / 1e3:,.0f} thousand cells of {cell_size_mm:.3g} mm{of_struts}, {needed / 1e9:.2g} GB, "
-        f"{seconds / 60:.2g} min of one core for a steady flow."
+        f"OpenFOAM: about {bare / 1e3:,.0f} thousand cells at a grid spacing of {cell_size_mm:.3g} mm{of_struts}, "
+        f"{needed / 1e9:.2g} GB of memory, {seconds / 60:.2g} min on one core for a steady flow."
     )
 
 
 def _cells(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
-    """Cells of the bare vessel, and of the halved ones at the struts."""
+    """Return the number of cells of the bare vessel, and of the refined ones at the struts."""
     bare = CELLS_PER_CUBE * extended_volume_mm3(case.vessel) / cell_size_mm**3
     if case.stent is None:
         return bare, 0.0
@@ -66,12 +70,13 @@ def _cells(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
 
 
 def _what_fits(case: FlowCase, cell_size_mm: float, free_bytes: float) -> str:
-    """What to do instead: take wider cells, or, where struts alone are too many, none."""
+    """Return advice for a mesh that fits: a coarser grid spacing, or another engine if the struts need too much."""
     for size_mm in cell_size_mm * WIDER ** np.arange(1, TRIED):
         if _bytes(sum(_cells(case, size_mm))) < free_bytes:
-            return f"set a cell size of {size_mm:.2g} mm"
-    return f"take the engine {LATTICE}, which needs no cells as small as the device's wires"
+            return f"set a grid spacing of {size_mm:.2g} mm"
+    return f"choose the engine {LATTICE}, which does not have to resolve the device's wires"
 
 
 def _bytes(cells: float) -> float:
+    """Return the peak memory for a number of cells."""
     return BYTES_AT_LEAST + BYTES_PER_CELL * cells

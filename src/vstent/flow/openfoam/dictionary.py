@@ -1,4 +1,4 @@
-"""OpenFOAM's dictionaries: mappings to text and back."""
+"""Write and read OpenFOAM's dictionary syntax."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -7,21 +7,28 @@ from typing import Any, Final
 from vstent.errors import ReadError
 
 Entries = Mapping[str, Any]
+"""Entries of a dictionary, by key."""
 
 _TOKEN: Final = re.compile(r'"[^"]*"|[{}();]|\[[^\]]*\]|[^\s{}();"\[]+')
+"""Matches one token."""
 _COMMENT: Final = re.compile(r"/\*.*?\*/|//[^\n]*", re.DOTALL)
+"""Matches a comment."""
 
 
 def foam_file(name: str, entries: Entries | str, *, kind: str = "dictionary", note: str = "") -> str:
-    """Return a file of OpenFOAM.
+    """Return the text of an OpenFOAM file.
 
     Parameters
     ----------
-    name : its object name.
-    entries : what it says; nested mappings become sub-dictionaries, sequences lists, booleans ``yes`` and ``no``. A
-        string stands as it is.
-    kind : its class.
-    note : a comment beneath the header.
+    name : str
+        Object name in the header.
+    entries : mapping or str
+        Contents. Nested mappings become sub-dictionaries, sequences lists, booleans ``yes`` and ``no``; a string is
+        written unchanged.
+    kind : str
+        Class in the header.
+    note : str
+        Comment below the header.
     """
     header = _entry("FoamFile", {"version": "2.0", "format": "ascii", "class": kind, "object": name}, "")
     body = entries if isinstance(entries, str) else "".join(_entry(key, value, "") for key, value in entries.items())
@@ -30,6 +37,7 @@ def foam_file(name: str, entries: Entries | str, *, kind: str = "dictionary", no
 
 
 def _entry(key: str, value: Any, indent: str) -> str:
+    """Return the text of one entry."""
     if isinstance(value, Mapping):
         inside = "".join(_entry(k, v, indent + "    ") for k, v in value.items())
         return f"{indent}{key}\n{indent}{{\n{inside}{indent}}}\n"
@@ -37,7 +45,7 @@ def _entry(key: str, value: Any, indent: str) -> str:
 
 
 def value_text(value: Any, indent: str = "") -> str:
-    """Return a value as OpenFOAM writes it."""
+    """Return a value in OpenFOAM's syntax."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
@@ -51,22 +59,24 @@ def value_text(value: Any, indent: str = "") -> str:
 
 
 def parse(text: str) -> dict[str, Any]:
-    """Read a dictionary: sub-dictionaries as mappings, every other value as the list of its tokens.
+    """Parse a dictionary: sub-dictionaries become mappings, every other value the list of its tokens.
 
     Raises
     ------
     ReadError
-        When a bracket or a semicolon is missing.
+        A bracket or a semicolon is missing, or there is a bracket too many.
     """
     tokens = _TOKEN.findall(_COMMENT.sub(" ", text))
     entries, rest = _parsed(tokens, 0)
     if rest != len(tokens):
-        raise ReadError(f"an OpenFOAM dictionary closes a bracket too many, at token {rest}: write it anew")
+        raise ReadError(
+            f"an OpenFOAM dictionary has an unmatched closing bracket at token {rest}: write the file again"
+        )
     return entries
 
 
 def _parsed(tokens: list[str], place: int) -> tuple[dict[str, Any], int]:
-    """Entries up to the bracket that closes them, and where it stands."""
+    """Return the entries up to the closing bracket, and the position of that bracket."""
     entries: dict[str, Any] = {}
     while place < len(tokens) and tokens[place] != "}":
         key, place = tokens[place], place + 1
@@ -84,6 +94,7 @@ def _parsed(tokens: list[str], place: int) -> tuple[dict[str, Any], int]:
 
 
 def _end_of_value(tokens: list[str], place: int) -> int:
+    """Return the position of the token after a value."""
     depth = 0
     while place < len(tokens) and (depth > 0 or tokens[place] not in ";}"):
         depth += {"(": 1, "{": 1, ")": -1, "}": -1}.get(tokens[place], 0)
@@ -92,5 +103,6 @@ def _end_of_value(tokens: list[str], place: int) -> int:
 
 
 def _expect(tokens: list[str], place: int, wanted: str, key: str) -> None:
+    """Raise a ReadError unless the token at a position is the expected one."""
     if place >= len(tokens) or tokens[place] != wanted:
-        raise ReadError(f"an OpenFOAM dictionary lacks the {wanted!r} that ends {key!r}: write it anew")
+        raise ReadError(f"an OpenFOAM dictionary has no {wanted!r} at the end of {key!r}: write the file again")

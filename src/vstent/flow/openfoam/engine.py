@@ -1,7 +1,7 @@
-"""The engine that hands the flow to OpenFOAM: meshes, computes from check to check, reads the fields back.
+"""Flow engine that runs OpenFOAM: it meshes the case, computes from check to check, and reads the fields.
 
-The finite volumes of OpenFOAM are of any shape; what is returned lies on the same regular grid as the embedded engine's
-flow, so that every index, streamline and picture takes either.
+OpenFOAM's mesh is unstructured. The result is interpolated to the same regular grid as that of the embedded engine, so
+that all indices, streamlines and pictures work with either.
 """
 
 from collections import deque
@@ -27,33 +27,33 @@ from vstent.flow.stopping import quantities_left
 from vstent.kernels.arrays import Floats, Ints
 
 CHECK_ITERATIONS: Final = 50
-"""Iterations of a steady flow between checks."""
+"""Number of iterations of a steady flow between checks."""
 CHECKS_AVERAGED: Final = 8
-"""Checks whose mean is the result where a steady flow does not settle."""
+"""Number of last checks that are averaged if a steady flow does not converge."""
 CHECKS_HELD: Final = 3
-"""Checks at which the inflow is corrected for every inlet's meshed area."""
+"""Number of first checks at which the inflow is corrected for the meshed area of each inlet."""
 
 
 @dataclass(eq=False)
 class State:
-    """A run under way in a folder; its files change."""
+    """An unfinished run; its files are in a folder."""
 
     case: FlowCase
-    """What is computed."""
+    """The flow to compute."""
     setup: FoamSetup
-    """How."""
+    """Setup of the OpenFOAM case."""
     found: program.Program
-    """OpenFOAM."""
+    """The OpenFOAM installation."""
     application: str
-    """The solver's program."""
+    """Name of the solver program."""
     folder: Path
     """The case folder."""
     domain: domains.Domain
     """The grid of the result."""
     bridge: Bridge
-    """From OpenFOAM's cells to it."""
+    """Interpolation from OpenFOAM's mesh to the grid."""
     sac_cells: Ints
-    """Cells of the sac, or of the whole lumen where there is none."""
+    """Grid cells in the sac, or in the whole lumen if there is no sac."""
     snapshots: deque[Snapshot]
     """The flow at the last checks."""
     is_settled: bool = False
@@ -61,7 +61,7 @@ class State:
     history: list[Floats] = field(default_factory=list)
     """Monitored quantities at every check."""
     loop_seconds: float = 0.0
-    """Time in the solver."""
+    """Run time of the solver."""
 
     @property
     def is_pulse(self) -> bool:
@@ -71,25 +71,25 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class OpenFoam(AbstractEngine[State]):
-    """OpenFOAM's laminar solvers on a mesh by snappyHexMesh: simpleFoam, or pimpleFoam along a waveform.
+    """Engine that uses OpenFOAM's laminar solvers (simpleFoam, or pimpleFoam for a waveform) and snappyHexMesh.
 
-    The cell size is that of the mesh in the vessel, before layers and refinement; a run of the same case that
-    stopped in the folder goes on from the last time written. A stent is meshed as its struts over necks and ostia.
+    The grid spacing is that of the mesh in the vessel, before layers and refinement. A run of the same case in the same
+    folder resumes from the last time written. A stent is meshed as its struts over necks and ostia.
     """
 
     layers: int = 2
-    """Layers of flat cells along the wall."""
+    """Number of flat cell layers along the wall."""
     grid_size_mm: float | None = None
-    """Edge of a cell of the result's grid; None: as OpenFOAM's."""
+    """Grid spacing of the result; None: that of the mesh."""
 
     def cost(self, case: FlowCase) -> str:
-        """Say how many cells, how much memory and time; with a stent's struts where there is one."""
+        """Return a sentence on cells, memory and run time, including a stent's struts."""
         return tell_cost(case, self.cell_size_mm)
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
-        """Find OpenFOAM, write the case, mesh it, and find the way from its cells to the grid."""
+        """Find OpenFOAM, write and mesh the case, and build the interpolation from its mesh to the grid."""
         if self.folder is None:
-            raise FlowError("OpenFOAM needs a folder to work in: name one")
+            raise FlowError("the engine openfoam needs a folder for its files: name one")
         solids, found = strut_solids(case), program.find()
         setup = FoamSetup(
             self.cell_size_mm, found.flavour, self.layers, processes=case.settings.processes, struts=solids
@@ -109,7 +109,7 @@ class OpenFoam(AbstractEngine[State]):
         return state
 
     def step(self, state: State) -> State:
-        """Run the solver to the next check and read what it wrote."""
+        """Run the solver to the next check and read its output."""
         began = perf_counter()
         reached = results.times(state.folder)
         end = _next_end(state, float(reached[-1]) if reached else 0.0)
@@ -121,7 +121,7 @@ class OpenFoam(AbstractEngine[State]):
         return state
 
     def terminate(self, state: State) -> float:
-        """Fraction that the monitored quantities have left to go, or the change from cycle to cycle."""
+        """Return the largest expected remaining change of a monitored quantity, or the change between cycles."""
         history = np.array(state.history)
         if not np.isfinite(history[-1]).all():
             return float("nan")
@@ -132,34 +132,35 @@ class OpenFoam(AbstractEngine[State]):
         return quantities_left(history)
 
     def save(self, state: State) -> None:
-        """Return nothing: OpenFOAM's own times in the case folder are what a run goes on from."""
+        """Return None: a run resumes from OpenFOAM's own output in the case folder."""
 
     def resume(self, case: FlowCase, saved: Saved) -> State:
-        """Go on from the last time written."""
+        """Resume from the last time written."""
         return self.init(case, None)
 
     def trouble(self, state: State) -> str:
-        """Say where the run diverged."""
+        """Return a sentence on where the run diverged and what to do."""
         good = state.snapshots[-2].time if len(state.snapshots) > 1 else "none"
         return (
-            f"OpenFOAM's flow diverged at time {state.snapshots[-1].time} (last good state: {good}) in {state.folder}: "
-            "change the cell size a little or take fewer layers"
+            f"the flow in OpenFOAM diverged at time {state.snapshots[-1].time} (last good time: {good}) in "
+            f"{state.folder}: change the grid spacing slightly or use fewer wall layers"
         )
 
     def max_checks(self, state: State) -> int:
-        """Checks within the limit of iterations, or phases of all cycles."""
+        """Return the number of checks within the limit of iterations, or of remaining phases of all cycles."""
         if state.is_pulse:
             left = PHASES * state.case.settings.max_cycles - _phases_done(state)
             return left if left > 0 else PHASES
         return state.setup.iterations // CHECK_ITERATIONS
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
-        """Return the last check, or the mean: of the last checks where the flow has not settled, of a pulse's cycle."""
+        """Return the last check's flow, or a mean: of the last checks if not converged, of the cycle if pulsatile."""
         is_last = outcome.is_converged and not state.is_pulse
         return _field_of(state, [state.snapshots[-1]] if is_last else list(state.snapshots), outcome)
 
 
 def _next_end(state: State, reached: float) -> float:
+    """Return the iteration or time of the next check."""
     if not state.is_pulse:
         return reached + CHECK_ITERATIONS
     phase_s = pulse_of(state.case).period_s / PHASES
@@ -167,7 +168,7 @@ def _next_end(state: State, reached: float) -> float:
 
 
 def _whole_cycles(case: FlowCase, written: list[str]) -> list[str]:
-    """Times from the beginning of the first cycle of which all are still there; none of a steady flow."""
+    """Return the times from the start of the first complete cycle on; none for a steady flow."""
     if case.settings.waveform is None:
         return []
     phase_s = case.settings.waveform.period_s / PHASES
@@ -176,20 +177,20 @@ def _whole_cycles(case: FlowCase, written: list[str]) -> list[str]:
 
 
 def _phases_done(state: State) -> int:
-    """Phases since the pulse began, in this run and those that it goes on from."""
+    """Return the number of phases since the start of the waveform, including earlier runs that this one resumed."""
     if not state.snapshots:
         return 0
     return round(float(state.snapshots[-1].time) * PHASES / pulse_of(state.case).period_s)
 
 
 def _note(state: State, time: str) -> None:
-    """Read what was written at a time, and what is monitored of it."""
+    """Read the output at one time and record the monitored quantities."""
     state.snapshots.append(read(state.case, state.bridge, state.folder, time))
     state.history.append(_monitored(state, state.snapshots[-1]))
 
 
 def _monitored(state: State, now: Snapshot) -> Floats:
-    """Mean speed of the sac, pressure at the inlet, mean speed of the vessel, neck inflow: as the embedded engine."""
+    """Return the quantities of the embedded engine: mean speed in sac and vessel, inlet pressure, neck inflow."""
     speed = np.linalg.norm(now.velocity_m_s, axis=1)
     inlet = state.domain.link_cell[state.domain.link_patch == 1]
     values = [speed[state.sac_cells].mean(), now.pressure_Pa[inlet].mean(), speed.mean()]
@@ -197,7 +198,7 @@ def _monitored(state: State, now: Snapshot) -> Floats:
 
 
 def _correct_inflow(state: State) -> bool:
-    """Correct the inlets' mean speeds for their meshed areas, less than the sections'; tell whether that was due."""
+    """Correct the inlets' mean speeds for their smaller meshed areas; return whether a correction was made."""
     case, now = state.case, state.snapshots[-1]
     share = float(case.settings.inflow_factor(np.array([float(now.time)]))[0])
     if len(state.history) > CHECKS_HELD or abs(share) < 0.2:
@@ -212,6 +213,8 @@ def _correct_inflow(state: State) -> bool:
 
 
 def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField:
+    """Return the mean of the snapshots as a flow field."""
+
     def mean(name: str) -> Floats:
         return np.asarray(np.mean([getattr(one, name) for one in kept], axis=0))
 
@@ -248,14 +251,14 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
 
 
 def swing_of(kept: list[Snapshot]) -> Swing:
-    """What the mean of a steady solver's last checks does not tell."""
+    """Return the mean magnitudes over the last checks of a steady solver that does not converge."""
     speed_m_s = np.mean([np.linalg.norm(one.velocity_m_s, axis=1) for one in kept], axis=0)
     shear_Pa = np.mean([np.linalg.norm(one.wall_shear_stress_Pa, axis=1) for one in kept], axis=0)
     return Swing(speed_m_s, shear_Pa)
 
 
 def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
-    """The last cycle; its times are those of the waveform."""
+    """Return the last cycle as phases, with times of the waveform."""
     phase_s = pulse_of(case).period_s / PHASES
 
     def phase(k: int, one: Snapshot) -> Phase:
@@ -267,14 +270,15 @@ def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
 
 
 def _advice(state: State, outcome: Outcome) -> str:
+    """Return a sentence on convergence and what to do, followed by the size of the mesh."""
     mesh = f"OpenFOAM on {state.bridge.n_cells} cells ({state.folder})."
     if state.is_pulse:
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])
         cycles = _phases_done(state) // PHASES
         return f"{cycles_advice(changes, cycles, is_converged=outcome.is_converged)} {mesh}"
     if outcome.is_converged:
-        return f"The flow has settled. {mesh}"
+        return f"The flow has converged. {mesh}"
     return (
-        f"The steady solver has not settled in {state.setup.iterations} iterations: the flow may be unsteady by "
-        f"nature; follow it in time with a waveform. {mesh}"
+        f"The steady solver did not converge within {state.setup.iterations} iterations, perhaps because the flow is "
+        f"unsteady: compute it in time with an inflow waveform. {mesh}"
     )

@@ -1,4 +1,4 @@
-"""A case folder on disk: written, meshed, begun from another flow, sent to its next stop, read for its flow rates."""
+"""An OpenFOAM case folder on disk: write, mesh, initialize, set the next stop, read flow rates."""
 
 import hashlib
 import re
@@ -18,24 +18,24 @@ from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
 
 KEY: Final = "vstent.key"
-"""File that names what a folder's run depends on."""
+"""File with a hash of everything that a folder's run depends on."""
 MESHED: Final = "log.meshed"
-"""File that says that the mesh is complete."""
+"""File that marks the mesh as complete."""
 BETWEEN_PARTS: Final = re.compile(r"(procBoundary\w*\s*\{[^}]*?)\s*value\s[^;]*;")
-"""What a field's file says of a patch between two parts of the mesh, up to its value."""
+"""Matches the entry of a patch between two parts of the mesh in a field's file, up to and including its value."""
 PRODUCTS: Final = ("constant/polyMesh", "postProcessing", "processor*", "log.*", "[0-9]*", KEY)
-"""What a run leaves in a case folder."""
+"""Files that a run leaves in a case folder."""
 
 
 def write(folder: Path, foam: FoamCase) -> None:
-    """Write the files of a case, its scripts executable."""
+    """Write the files of a case and make its scripts executable."""
     for name, text in foam.files.items():
         write_text(folder / name, text)
         (folder / name).chmod(0o755 if name in foam.executable else 0o644)
 
 
 def prepare(folder: Path, foam: FoamCase) -> None:
-    """Write a case to be run, unless the same case lies there already; what another run left is taken away."""
+    """Write a case to run, unless the folder already contains the same case; delete what another run left."""
     digest = hashlib.sha256("".join(f"{name}\0{text}\0" for name, text in sorted(foam.files.items())).encode())
     key = folder / KEY
     if key.exists() and key.read_text() == digest.hexdigest():
@@ -50,12 +50,21 @@ def prepare(folder: Path, foam: FoamCase) -> None:
 
 
 def mesh(found: program.Program, folder: Path, setup: FoamSetup) -> None:
-    """Mesh, cut into parts and note the cells' centres, unless that has been done.
+    """Mesh the case, decompose it and write the cell centres, unless that is already done.
+
+    Parameters
+    ----------
+    found : Program
+        The OpenFOAM installation.
+    folder : Path
+        The case folder.
+    setup : FoamSetup
+        Setup of the OpenFOAM case.
 
     Raises
     ------
     FlowError
-        When a program of OpenFOAM fails.
+        A program of OpenFOAM fails.
     """
     if (folder / MESHED).exists():
         return
@@ -74,7 +83,7 @@ def mesh(found: program.Program, folder: Path, setup: FoamSetup) -> None:
 
 
 def begin_from(folder: Path, start: FlowField) -> None:
-    """Put a flow on any grid into the first velocity and pressure of a meshed case."""
+    """Write a flow on any grid as the initial velocity and pressure of a meshed case."""
     for part in list(folder.glob("processor[0-9]*")) or [folder]:
         centers_mm = results.read_field(part, "0", "C").inside / M_PER_MM
         velocity_m_s, pressure_Pa = sampling.values_at(start, centers_mm)
@@ -83,10 +92,10 @@ def begin_from(folder: Path, start: FlowField) -> None:
 
 
 def _put(path: Path, kind: str, row: str, values: Floats) -> None:
-    """Replace what a uniform field has inside by values (n, d).
+    """Replace the uniform internal value of a field by values (n, d).
 
-    On the faces between parts of a mesh the uniform value would stay, and blood at rest there would dam the flow up:
-    it is taken away, and OpenFOAM takes that of the cells beside.
+    The uniform values on faces between parts of the mesh are removed, so that OpenFOAM uses those of the adjacent
+    cells. Kept, they would act as blood at rest there and block the flow.
     """
     rows = "\n".join(row % tuple(value) for value in values)
     head, _, tail = path.read_text().partition("internalField")
@@ -95,7 +104,7 @@ def _put(path: Path, kind: str, row: str, values: Floats) -> None:
 
 
 def stop_at(folder: Path, end: float, *, every: int | None) -> None:
-    """Let the solver stop, and write, at a time; write `every` so many iterations besides."""
+    """Set the iteration or time at which the solver stops and writes, and optionally the interval of further output."""
     path = folder / "system" / "controlDict"
     text = re.sub(r"endTime .*;", f"endTime         {end:.9g};", path.read_text())
     if every is not None:
@@ -104,7 +113,7 @@ def stop_at(folder: Path, end: float, *, every: int | None) -> None:
 
 
 def flow_mL_s(folder: Path, patch: str, time: str) -> float:
-    """Flow out through a patch at a time, as the function objects noted it; the last run's, where several did."""
+    """Return the flow rate out through a patch at a time, from the latest run whose function objects recorded it."""
     files = sorted(
         (folder / "postProcessing" / f"flow_{patch}").glob("*/*.dat"), key=lambda path: float(path.parent.name)
     )
@@ -113,7 +122,7 @@ def flow_mL_s(folder: Path, patch: str, time: str) -> float:
 
 
 def scale_inflow(folder: Path, inlet: str, factor: float) -> bool:
-    """Multiply the mean speed that an inlet is held to; False where it is held to its flow anyway."""
+    """Multiply the mean speed prescribed at an inlet; return False if the inlet prescribes its flow rate instead."""
     path = folder / "constant" / "boundaryData" / inlet / "0" / "U"
     if not path.exists():
         return False

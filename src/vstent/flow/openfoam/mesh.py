@@ -1,4 +1,4 @@
-"""Dictionaries of the mesh: a block of cubes, cut to the vessel by snappyHexMesh."""
+"""OpenFOAM dictionaries of the mesh: a block of cubes, cut to the vessel by snappyHexMesh."""
 
 from dataclasses import dataclass
 from math import ceil, log2
@@ -12,13 +12,13 @@ from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
 LUMEN, ENDS, NECK, STRUTS = "lumen", "ends", "neck", "struts"
-"""Surfaces in the case: the whole boundary with named regions, its flat ends, the ostium, the device."""
+"""Names of the surfaces: the whole boundary with named regions, its flat ends, the ostium, the device."""
 NECK_REACH = 2.0
-"""Distance from the neck, in cells, within which cells are halved."""
+"""Distance from the neck, in grid spacings, within which cells are refined."""
 
 
 CELLS_ACROSS_END = 8
-"""Cells that every opening is to be wide at least; with fewer, snappyHexMesh may close it."""
+"""Minimum number of cells across an opening; with fewer, snappyHexMesh may close it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,19 +26,19 @@ class End:
     """An opening and the straight piece of vessel before it."""
 
     begin_mm: Floats
-    """(3,) on its axis, in the vessel."""
+    """(3,) point on its axis, inside the vessel."""
     end_mm: Floats
-    """(3,) the opening's middle."""
+    """(3,) centre of the opening."""
     diameter_mm: float
-    """Of the opening."""
+    """Diameter of the opening."""
 
     def levels(self, cell_size_mm: float) -> int:
-        """Times that cells must be halved there."""
+        """Return how many times the cells there must be halved."""
         return max(0, ceil(log2(CELLS_ACROSS_END * cell_size_mm / self.diameter_mm)))
 
 
 def block_mesh(vertices_mm: Floats, cell_size_mm: float) -> str:
-    """blockMeshDict: cubes `2**BASE_LEVEL` times as wide as the vessel's cells, all round the vertices (n, 3)."""
+    """Return blockMeshDict: cubes `2**BASE_LEVEL` times the grid spacing, with a margin around the vertices (n, 3)."""
     size_mm = cell_size_mm * 2**BASE_LEVEL
     low = vertices_mm.min(axis=0) - size_mm * np.array([1.1327, 1.2171, 1.1733])
     count = np.ceil((vertices_mm.max(axis=0) - low) / size_mm + 1).astype(int)
@@ -57,7 +57,7 @@ def block_mesh(vertices_mm: Floats, cell_size_mm: float) -> str:
 
 
 def feature_extract(setup: FoamSetup) -> tuple[str, str]:
-    """Name and text of the dictionary that finds the rims of the flat ends."""
+    """Return name and text of the dictionary that extracts the rims of the flat ends."""
     rims = {"includedAngle": 150, "geometricTestOnly": True}
     subset = {"subsetFeatures": {"nonManifoldEdges": False, "openEdges": True}}
     if setup.flavour == "org":
@@ -71,15 +71,20 @@ def feature_extract(setup: FoamSetup) -> tuple[str, str]:
 def snappy(
     setup: FoamSetup, patches: dict[str, str], ends: dict[str, End], inside_mm: Floats, *, has_neck: bool
 ) -> str:
-    """SnappyHexMeshDict.
+    """Return snappyHexMeshDict.
 
     Parameters
     ----------
-    setup : cells and layers.
-    patches : ``wall`` or ``patch`` by the name of every patch.
-    ends : where the openings' patches lie, by name; those too narrow for the cells get finer ones.
-    inside_mm : (3,) a point in the blood.
-    has_neck : whether there is a neck to refine over.
+    setup : FoamSetup
+        Grid spacing, layers and struts.
+    patches : dict of str
+        ``wall`` or ``patch`` for the name of every patch.
+    ends : dict of End
+        Position of every opening's patch, by name; cells are refined at those too narrow for the grid spacing.
+    inside_mm : (3,) float
+        A point in the blood.
+    has_neck : bool
+        Whether there is a neck to refine at.
     """
     walls = [name for name, kind in patches.items() if kind == "wall"]
     narrow = {name: end for name, end in ends.items() if end.levels(setup.cell_size_mm)}
@@ -99,6 +104,8 @@ def snappy(
 
 
 def _geometry(setup: FoamSetup, patches: dict[str, str], narrow: dict[str, End], has_neck: bool) -> dict[str, Any]:
+    """Return the surfaces and cylinders that snappyHexMesh uses."""
+
     def surface(name: str) -> dict[str, Any]:
         return {"type": "triSurfaceMesh", "file": f'"{name}.stl"'}
 
@@ -113,10 +120,12 @@ def _geometry(setup: FoamSetup, patches: dict[str, str], narrow: dict[str, End],
 
 
 def _before(name: str) -> str:
+    """Return the name of the refinement region at an opening."""
     return f"before_{name}"
 
 
 def _cylinder(end: End) -> dict[str, Any]:
+    """Return a cylinder around an opening and the piece of vessel before it."""
     first, second = (tuple(float(x) for x in point * M_PER_MM) for point in (end.begin_mm, end.end_mm))
     return {
         "type": "searchableCylinder",
@@ -129,6 +138,7 @@ def _cylinder(end: End) -> dict[str, Any]:
 def _castellated(
     setup: FoamSetup, patches: dict[str, str], narrow: dict[str, End], inside_mm: Floats, has_neck: bool
 ) -> dict[str, Any]:
+    """Return the refinement settings."""
     finer = {name: BASE_LEVEL + end.levels(setup.cell_size_mm) for name, end in narrow.items()}
     level = (BASE_LEVEL, BASE_LEVEL)
     regions = {
@@ -160,11 +170,12 @@ def _castellated(
 
 
 def _inside(setup: FoamSetup, level: int) -> dict[str, Any]:
-    """Cells inside a surface halved so many times."""
+    """Return a refinement level for the inside of a surface."""
     return {"mode": "inside"} | ({"level": level} if setup.flavour == "org" else {"levels": [(1e15, level)]})
 
 
 def _snap() -> dict[str, Any]:
+    """Return the snapping settings."""
     return {
         "nSmoothPatch": 3,
         "tolerance": 2.0,
@@ -178,6 +189,7 @@ def _snap() -> dict[str, Any]:
 
 
 def _layers(setup: FoamSetup, walls: list[str]) -> dict[str, Any]:
+    """Return the layer settings."""
     return {
         "relativeSizes": True,
         "layers": {name: {"nSurfaceLayers": setup.layers} for name in walls},
@@ -201,7 +213,8 @@ def _layers(setup: FoamSetup, walls: list[str]) -> dict[str, Any]:
 
 
 def _quality() -> dict[str, Any]:
-    # Volumes and areas are those of cells of a few hundredths of a millimetre, in m3 and m2.
+    """Return the mesh quality limits."""
+    # Volumes and areas, in m3 and m2, suit cells of a few hundredths of a millimetre.
     return {
         "maxNonOrtho": 60,
         "maxBoundarySkewness": 20,

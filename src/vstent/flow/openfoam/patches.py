@@ -1,4 +1,4 @@
-"""The blood's boundary as named patches, watertight together."""
+"""The boundary of the blood as named patches that together form a closed surface."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats, Ints, freeze
 
 ON_SAC_MM = 1e-3
-"""Faces of the wall nearer to the sac's surface than this are the sac's."""
+"""Distance to the sac's surface, mm, below which a face of the wall belongs to the sac."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,38 +20,40 @@ class Patch:
     name: str
     """``wall``, ``sac``, or the role of an opening: ``inlet``, ``outlet_1``, ..."""
     surface: Surface
-    """The whole boundary; shared by all patches."""
+    """The whole boundary, shared by all patches."""
     face_id: Ints
-    """(f,) faces of it that are this patch."""
+    """(f,) indices of this patch's faces in the boundary."""
 
     def __post_init__(self) -> None:
         freeze(self, "face_id", np.int32, (-1,))
 
     @property
     def corners_mm(self) -> Floats:
-        """(f, 3, 3) corners of its faces."""
+        """Corners (f, 3, 3) of the faces."""
         return self.surface.corners_mm[self.face_id]
 
     @property
     def area_mm2(self) -> float:
-        """Its area."""
+        """Area of the patch."""
         return float(self.surface.areas_mm2[self.face_id].sum())
 
 
 def named_patches(case: FlowCase) -> tuple[tuple[Patch, ...], tuple[Floats, ...]]:
-    """Cut the boundary of the blood into patches: ``wall``, ``sac`` where there is one, ``inlet``, ``outlet_1``, ...
+    """Divide the boundary of the blood into patches: ``wall``, ``sac`` if there is one, ``inlet``, ``outlet_1``, ...
 
-    Every opening stands at the end of the straight extension that all engines give it (see `domain.extend`).
+    Every opening is at the end of the straight extension that all engines use (see `domain.extend`).
 
     Returns
     -------
-    patches : all of one closed surface, every face in one patch.
-    sections : for every opening the polygon (k, 3) of its end, mm.
+    patches : tuple of Patch
+        Patches of one closed surface; every face is in exactly one.
+    sections : tuple of (k, 3) float
+        For every opening the polygon of its end, in mm.
 
     Raises
     ------
     FlowError
-        When an opening has no open end of the lumen.
+        An opening does not match any open end of the lumen.
     """
     surface, face_patch, sections = extend(case.vessel)
     wall = np.flatnonzero(face_patch == 0)
@@ -64,11 +66,20 @@ def named_patches(case: FlowCase) -> tuple[tuple[Patch, ...], tuple[Floats, ...]
 
 
 def stl_text(solids: dict[str, Floats], scale: float) -> str:
-    """Return named solids, each the corners (f, 3, 3) of its faces, as one ASCII STL; lengths times `scale`."""
+    """Return named solids as the text of one ASCII STL file.
+
+    Parameters
+    ----------
+    solids : dict of (f, 3, 3) float
+        Corners of each solid's faces, by name.
+    scale : float
+        Factor on all lengths.
+    """
     return "".join(_solid(name, corners * scale) for name, corners in solids.items())
 
 
 def _solid(name: str, corners: Floats) -> str:
+    """Return the STL text of one solid."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     rows = np.concatenate([normal, corners.reshape(-1, 9)], axis=1)

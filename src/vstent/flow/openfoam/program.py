@@ -1,4 +1,4 @@
-"""OpenFOAM itself, a separate program: found on this machine, run in a folder, its failures put into a sentence."""
+"""The OpenFOAM installation: find it, run its programs, and summarize their failures."""
 
 import os
 import re
@@ -13,22 +13,24 @@ from vstent.errors import FlowError
 from vstent.flow.openfoam.setup import FEATURES, Flavour
 
 DEBIAN_FOLDER: Final = Path("/usr/share/openfoam")
-"""Where Debian's package keeps the settings its programs look for."""
+"""Folder with the settings that the programs of Debian's package look for."""
 INSTALLED: Final = ("/usr/lib/openfoam/openfoam*", "/opt/openfoam*", "/opt/OpenFOAM/OpenFOAM-*")
-"""Where the packages of openfoam.com and openfoam.org lie; each has an etc/bashrc."""
+"""Folders where the packages of openfoam.com and openfoam.org install; each has an etc/bashrc."""
 MARKS: Final[dict[str, Flavour]] = {"foamRun": "org", FEATURES["com"]: "com"}
-"""A program of each one's current releases: those of openfoam.org before 11 have neither, and read other settings."""
-INSTALL: Final = "install it (Debian, Ubuntu: sudo apt-get install openfoam), or take the embedded engine"
+"""A program found only in current releases of each flavour. Releases of openfoam.org before 11 have neither of them
+and use other settings."""
+INSTALL: Final = "install it (Debian, Ubuntu: sudo apt-get install openfoam), or choose the embedded engine"
+"""Advice when OpenFOAM is missing."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """An OpenFOAM found on this machine."""
+    """An OpenFOAM installation on this machine."""
 
     flavour: Flavour
-    """Whose it is."""
+    """Which OpenFOAM it is."""
     bashrc: Path | None
-    """What to source before its programs run; None where they are on the path."""
+    """File to source before running its programs; None where they are on the path."""
 
     def command(self, *words: str) -> list[str]:
         """Return the command line that runs one of its programs."""
@@ -38,12 +40,12 @@ class Program:
 
 
 def find() -> Program:
-    """Find OpenFOAM: on the path, or where its packages install it, the newest of each kind of package first.
+    """Find OpenFOAM on the path or in its install folders, the newest release of each kind of package first.
 
     Raises
     ------
     FlowError
-        When there is none.
+        OpenFOAM is not found.
     """
     if flavour := _flavour(None):
         return Program(flavour, None)
@@ -56,23 +58,34 @@ def find() -> Program:
 
 
 def _flavour(folders: Iterable[Path] | None) -> Flavour | None:
-    """Whose current programs lie in folders, those of the path without any given; None where none do."""
+    """Return the flavour whose programs are in the folders (default: the path), or None."""
     path = None if folders is None else os.pathsep.join(map(str, folders))
     return next((flavour for mark, flavour in MARKS.items() if shutil.which(mark, path=path)), None)
 
 
 def _release(folder: Path) -> int:
-    """Number of a release in its folder's name, 0 where it has none: 13 is after 9."""
+    """Return the release number in a folder's name, 0 without one; compared as a number, because 13 is after 9."""
     return int(re.sub(r"\D", "", folder.name) or 0)
 
 
 def run(program: Program, folder: Path, words: list[str], *, processes: int = 1) -> str:
-    """Run a program of OpenFOAM in a case folder, its output appended to log.NAME; return what it said this time.
+    """Run a program of OpenFOAM in a case folder, append its output to log.NAME, and return the new output.
+
+    Parameters
+    ----------
+    program : Program
+        The installation.
+    folder : Path
+        The case folder.
+    words : list of str
+        Name of the program and its arguments.
+    processes : int
+        Number of MPI processes.
 
     Raises
     ------
     FlowError
-        When it fails, with its reason.
+        The program fails; the message gives the reason.
     """
     name = words[0]
     if processes > 1:
@@ -91,50 +104,53 @@ def run(program: Program, folder: Path, words: list[str], *, processes: int = 1)
                 check=False,
             )
         except FileNotFoundError:
-            raise FlowError(f"{words[0]} was not found beside OpenFOAM: {INSTALL}") from None
+            raise FlowError(f"the program {words[0]} was not found in the OpenFOAM installation: {INSTALL}") from None
     with log.open("rb") as stream:
         stream.seek(before)
         said = stream.read().decode(errors="replace")
     if done.returncode != 0 or "FOAM FATAL" in said:
-        raise FlowError(f"{name} failed: {cause(said, done.returncode)} ({log} has the whole of it)")
+        raise FlowError(f"{name} failed: {cause(said, done.returncode)} (full output: {log})")
     return said
 
 
 def _environment() -> dict[str, str]:
+    """Return the environment variables for a program of OpenFOAM."""
     environment = dict(os.environ)
     if DEBIAN_FOLDER.is_dir():
         environment.setdefault("WM_PROJECT_DIR", str(DEBIAN_FOLDER))
-    if hasattr(os, "geteuid") and os.geteuid() == 0:  # in containers; Open MPI refuses root unless told twice
+    if hasattr(os, "geteuid") and os.geteuid() == 0:  # in containers: Open MPI refuses root without both variables
         environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     return environment
 
 
 def cause(said: str, code: int) -> str:
-    """One sentence for what a program of OpenFOAM stopped at.
+    """Return a phrase on why a program of OpenFOAM failed.
 
     Parameters
     ----------
-    said : its output.
-    code : its exit status.
+    said : str
+        Output of the program.
+    code : int
+        Exit status.
     """
     if code == -9 or "Killed" in said or "bad_alloc" in said:
-        return "it was ended for want of memory; take a larger cell size or fewer processes"
+        return "the memory was not sufficient; use a coarser grid spacing or fewer processes"
     if fatal := re.search(
         r"FOAM FATAL(?: IO)? ERROR:?\s*(?:\(openfoam-[^)]*\)\s*)?(.*?)(?:\n\s*\n\s*From|\n\nfile:|\Z)", said, re.DOTALL
     ):
         return " ".join(fatal[1].split())[:300]
     if "sigFpe" in said or "Floating point exception" in said or code == 136:
         return f"the flow diverged, {_divergence(said)}"
-    return f"it ended with status {code}; {' '.join(said.splitlines()[-1:])}"
+    return f"exit status {code}; {' '.join(said.splitlines()[-1:])}"
 
 
 def _divergence(said: str) -> str:
-    """Which of the usual three it was: the time step, a backflow at an outlet, or the mesh."""
+    """Return the likely cause of divergence: the time step, backflow at an outlet, or the mesh."""
     courant = [float(number) for number in re.findall(r"Courant Number mean: \S+ max: (\S+)", said)]
     if courant and courant[-1] > 20:
-        return f"the time step is too long (Courant number {courant[-1]:.0f}); shorten it or take a smaller cell size"
+        return f"the time step is too long (Courant number {courant[-1]:.0f}); reduce it or use a finer grid spacing"
     times = re.findall(r"^Time = (\S+?)s?$", said, re.MULTILINE)
     return (
-        f"at {times[-1] if times else 'the start'}: a cell of the mesh is too flat or blood rushes back through an "
-        "outlet; change the cell size a little, take fewer layers, or lengthen the outlets"
+        f"at {times[-1] if times else 'the start'}: a cell of the mesh is too flat, or there is strong backflow at an "
+        "outlet; change the grid spacing slightly, use fewer wall layers, or lengthen the outlets"
     )

@@ -1,4 +1,4 @@
-"""From scattered points to others: local fits as one sparse matrix."""
+"""Interpolation between scattered points: local fits as one sparse matrix."""
 
 from typing import Final
 
@@ -9,18 +9,25 @@ from scipy.spatial import cKDTree
 from vstent.kernels.arrays import Floats
 
 NEIGHBOURS: Final = 32
-"""Points of a fit."""
+"""Number of source points in a fit."""
 RIDGE: Final = 1e-5
-"""Pull of slopes and curvatures towards zero, over the weight of the points."""
+"""Regularization of slopes and curvatures, relative to the weight of the points."""
 BLOCK: Final = 20_000
-"""Fits solved at once."""
+"""Number of fits solved at once."""
 
 
 def fits(sources: Floats, targets: Floats) -> csr_matrix:
-    """Matrix (t, s) that takes values at sources (s, 3) to targets (t, 3): exact for quadratic functions.
+    """Return the matrix (t, s) that interpolates from scattered sources to targets, exact for quadratics.
 
-    Moving least squares (Lancaster and Salkauskas 1981, Math. Comput. 37, 141) over the nearest sources. Where these
-    lie on a plane, what they cannot tell is taken for zero.
+    Moving least squares over the nearest sources (Lancaster and Salkauskas 1981, Math. Comput. 37, 141). Where the
+    sources are in one plane, the derivatives that they do not determine are taken as zero.
+
+    Parameters
+    ----------
+    sources : (s, 3) float
+        Points with known values.
+    targets : (t, 3) float
+        Points at which values are wanted.
     """
     count = min(NEIGHBOURS, len(sources))
     tree = cKDTree(sources)
@@ -36,7 +43,7 @@ def fits(sources: Floats, targets: Floats) -> csr_matrix:
 
 
 def _fit(offset: Floats, distance: Floats) -> Floats:
-    """Weights (t, k) of the neighbours at offsets (t, k, 3)."""
+    """Return the weights (t, k) of the neighbours at offsets (t, k, 3)."""
     reach = 1.05 * distance[:, -1:]
     weight = (1 - (distance / reach) ** 2) ** 2
     x, y, z = np.moveaxis(offset / reach[..., None], 2, 0)
@@ -50,7 +57,17 @@ def _fit(offset: Floats, distance: Floats) -> Floats:
 
 
 def near_means(sources: Floats, targets: Floats, reach: float) -> csr_matrix:
-    """Matrix (t, s) of inverse-distance means over the four nearest sources; points (.., d) of any dimension."""
+    """Return the matrix (t, s) of inverse-distance weighted means over the four nearest sources.
+
+    Parameters
+    ----------
+    sources : (s, d) float
+        Points with known values, of any dimension.
+    targets : (t, d) float
+        Points at which values are wanted.
+    reach : float
+        Length scale: a tenth of it is added to the distances, squared, to limit the weights.
+    """
     count = min(4, len(sources))
     distance, near = cKDTree(sources).query(targets, k=count)
     weight = 1 / (np.asarray(distance).reshape(-1, count) ** 2 + (0.1 * reach) ** 2)

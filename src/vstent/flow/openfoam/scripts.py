@@ -1,15 +1,16 @@
-"""Shell scripts beside a case: run it here, run it on a cluster, begin again."""
+"""Shell scripts of an OpenFOAM case: run it here, run it on a cluster, clean it."""
 
 from vstent.flow.openfoam.setup import FEATURES, FoamSetup
 
 _DEBIAN = """\
-# Debian's package has no folder of its own to source; its programs only need to know where their settings lie.
+# Debian's package has no bashrc to source; its programs only need the folder of their settings.
 if [ -z "$WM_PROJECT_DIR" ] && [ -d /usr/share/openfoam/etc ]; then export WM_PROJECT_DIR=/usr/share/openfoam; fi
 """
+"""Lines that set the environment of Debian's package."""
 
 
 def all_run(setup: FoamSetup, application: str) -> str:
-    """Allrun: mesh once, then compute; given again it goes on from the last time written."""
+    """Return Allrun, which meshes once and then computes; run again, it resumes from the last time written."""
     features, solve = FEATURES[setup.flavour], application
     before = after = ""
     if setup.processes > 1:
@@ -33,7 +34,7 @@ fi
 
 
 def slurm(setup: FoamSetup) -> str:
-    """Slurm script: the same over the processes asked for."""
+    """Return the Slurm script, which runs Allrun with the setup's number of processes."""
     return f"""\
 #!/bin/sh
 #SBATCH --job-name=vstent
@@ -42,13 +43,13 @@ def slurm(setup: FoamSetup) -> str:
 #SBATCH --mem-per-cpu=2G
 #SBATCH --output=slurm-%j.log
 # Load your site's OpenFOAM here, for example: module load openfoam
-# A job that ran out of time goes on where it stopped: submit it again.
+# If the job runs out of time, submit it again: it resumes where it stopped.
 ./Allrun
 """
 
 
 def all_clean() -> str:
-    """Allclean: back to what was exported."""
+    """Return Allclean, which restores the case as exported."""
     return """\
 #!/bin/sh
 cd "${0%/*}" || exit 1

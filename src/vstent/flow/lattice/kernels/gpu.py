@@ -4,7 +4,7 @@ Storage, steps and arithmetic are the same; what a cell or an opening does is th
 that does not depend on who comes first, so that a GPU repeats itself to the last bit. It differs from a processor in
 the last bits: that one's compiler fuses and reorders otherwise.
 
-Import it only where a GPU was asked for (`vstent.flow.lattice.gpu`).
+Import it only where a GPU is requested (`vstent.flow.lattice.gpu`).
 """
 
 from typing import Any, Final

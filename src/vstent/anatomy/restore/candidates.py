@@ -1,0 +1,93 @@
+"""Whether a bulge that was cut off is a saccular aneurysm, or a branch stump, an infundibulum, a bleb or an artifact.
+
+The classes and their criteria are vstent's own. An infundibulum is a funnel of at most 3 mm that is widest at its base
+(Saltzman 1959, Acta Radiol. 51:133); a stump is a tube; a saccular aneurysm is about as wide as it is high.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from vstent.geometry.vessel import Aneurysm, Candidate, Vessel
+from vstent.kernels import curves, triangles
+from vstent.kernels.arrays import Floats
+from vstent.units import counted
+
+HEIGHTS: Final = np.linspace(0.1, 0.95, 12)
+"""Heights above the neck plane at which a sac's width is measured, as fractions of its height."""
+SLENDER: Final = 2.2
+"""A sac that reaches more than this many of its largest widths is a tube; those of the real cases reach 0.7 to 1.7."""
+STRAIGHT: Final = 1.15
+"""A sac whose largest width is less than this many times its neck's has no dome."""
+NARROW: Final = 0.75
+"""A sac narrower than this fraction of the artery is as narrow as a branch."""
+FUNNEL_MM: Final = 3.0
+"""Largest height of an infundibulum (Saltzman 1959)."""
+BLEB: Final = 0.4
+"""A sac whose sphere of the same volume is smaller than this fraction of the artery's diameter is a bleb."""
+FEWEST_VOXELS: Final = 4.0
+"""Fewest voxels across a sac that can be distinguished from noise and blur."""
+
+
+def classified(vessel: Vessel, aneurysm: Aneurysm, artery_diameter_mm: float) -> Candidate:
+    """Return the class of a sac that was cut off, with its reasons.
+
+    Parameters
+    ----------
+    vessel : the vessel; a scan's states its voxel edge.
+    aneurysm : sac and neck.
+    artery_diameter_mm : diameter of the parent artery at the neck.
+    """
+    neck_mm, widths_mm, reach_mm = _profile(aneurysm)
+    widest_mm = float(widths_mm.max())
+    sphere_mm = float(np.cbrt(6 * abs(aneurysm.sac.volume_mm3) / np.pi))
+    slenderness = reach_mm / max(widest_mm, 1e-9)
+    is_narrow = widest_mm < NARROW * artery_diameter_mm
+    size = f"{widest_mm:.1f} mm wide and {reach_mm:.1f} mm long"
+    kind, reasons = "saccular aneurysm", [f"its dome is {widest_mm / neck_mm:.1f} times as wide as its neck", size]
+    if slenderness > SLENDER:
+        kind, reasons = "branch stump", [f"it is {slenderness:.1f} times as long as wide", size]
+    elif vessel.voxel_mm is not None and widest_mm < FEWEST_VOXELS * vessel.voxel_mm:
+        kind, reasons = "artifact", ["it is too small for the voxels of the scan", size]
+    elif widest_mm < STRAIGHT * neck_mm and is_narrow and _tapers(widths_mm) and reach_mm <= FUNNEL_MM:
+        kind, reasons = "infundibulum", ["it tapers from its base", size]
+    elif widest_mm < STRAIGHT * neck_mm and is_narrow and slenderness > 1.0:
+        kind, reasons = "branch stump", ["it is a tube no wider than its neck", size]
+    elif sphere_mm < BLEB * artery_diameter_mm:
+        kind, reasons = "bleb", [f"it is small beside the artery of {artery_diameter_mm:.1f} mm", size]
+    if vessel.voxel_mm is not None and kind != "artifact":
+        reasons.append(f"{counted(round(widest_mm / vessel.voxel_mm), 'voxel')} across")
+    return Candidate(kind, _dome_mm(aneurysm), tuple(reasons))
+
+
+def _profile(aneurysm: Aneurysm) -> tuple[float, Floats, float]:
+    """Return the width of the neck, those (12,) of the sac above it, and the farthest reach from the neck, in mm.
+
+    A width is the diameter of the circle with the area of the section parallel to the neck plane.
+    """
+    rim_mm, dome_mm = aneurysm.neck_mm, aneurysm.sac.vertices_mm
+    center_mm, vector = triangles.polygon_centroid(rim_mm), triangles.polygon_area_vector(rim_mm)
+    area_mm2 = float(np.linalg.norm(vector))
+    normal = vector / area_mm2 * np.sign((dome_mm.mean(axis=0) - center_mm) @ vector)
+    height_mm = (dome_mm - center_mm) @ normal
+    widths = [_width_mm(aneurysm, fraction * height_mm.max() - height_mm) for fraction in HEIGHTS]
+    reach_mm = float(curves.lengths(dome_mm - center_mm).max())
+    return 2 * float(np.sqrt(area_mm2 / np.pi)), np.array(widths), reach_mm
+
+
+def _width_mm(aneurysm: Aneurysm, below_mm: Floats) -> float:
+    """Return the width of the largest section of a sac at a level that lies `below_mm` (n,) under its vertices."""
+    vertices, faces, _ = triangles.clip(aneurysm.sac.vertices_mm, aneurysm.sac.faces, below_mm)
+    loops = triangles.boundary_loops(vertices, faces)
+    areas = [float(np.linalg.norm(triangles.polygon_area_vector(vertices[loop]))) for loop in loops]
+    return 2 * float(np.sqrt(max(areas, default=0.0) / np.pi))
+
+
+def _tapers(widths_mm: Floats) -> bool:
+    """Return whether a sac becomes narrower all the way up."""
+    return bool((np.diff(widths_mm) < 0.05 * widths_mm.max()).all() and widths_mm.argmax() <= len(widths_mm) // 4)
+
+
+def _dome_mm(aneurysm: Aneurysm) -> Floats:
+    """Return the point (3,) in the middle of the sac, which picks it."""
+    return np.asarray(aneurysm.sac.vertices_mm.mean(axis=0))

@@ -1,0 +1,122 @@
+"""What a case folder holds from former runs: settings are merged where they agree, and refused where they do not.
+
+Results that were computed are kept: a run with another device adds it. A change of the input or of a setting that would
+invalidate results is refused, unless the user asks to replace them.
+"""
+
+import json
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.errors import InputError
+from vstent.io.writers import write_json
+from vstent.study.folder import CACHE
+from vstent.study.provenance import RUN
+from vstent.study.repeat import UNTOLD, former_source, settings_of
+from vstent.study.types import Placing, Settings
+
+BEGUN: Final = "settings.json"
+"""File in the cache folder with the settings of the run begun last, finished or not."""
+_OF_DEVICES: Final = (
+    "devices",
+    "diameter_mm",
+    "length_mm",
+    "center_mm",
+    "placings",
+    "flow",
+    "without_flow",
+    "uncertainty",
+)
+"""Fields of the settings that do not change the anatomy."""
+
+
+def former_settings(out: Path) -> Settings | None:
+    """Return the settings of the former run of a case folder; None where there was none, or they cannot be read."""
+    for path in (out / CACHE / BEGUN, out / RUN):
+        with suppress(*UNTOLD):
+            told = json.loads(path.read_text(encoding="utf-8"))
+            return settings_of(told["settings"])
+    return None
+
+
+def note_begun(out: Path, settings: Settings) -> None:
+    """Write the settings of a run that begins to write into a case folder."""
+    write_json(out / CACHE / BEGUN, {"settings": asdict(settings)}, is_exact=True)
+
+
+def merged(out: Path, source: str, settings: Settings) -> Settings:
+    """Return the settings of a run together with what the case folder holds of former runs.
+
+    Former devices stay, first, with their sizes, places and flows; new ones are added. Where a run asks for no flow,
+    new devices get none and former flows stay.
+
+    Raises
+    ------
+    InputError
+        The folder holds results of another input, or of settings that the new ones would invalidate.
+    """
+    refuse_other_input(out, source)
+    former = former_settings(out)
+    if former is None:
+        return settings
+    refuse_other_anatomy(out, settings, former)
+    flow = _same(out, "flow settings", former.flow, settings.flow)
+    uncertainty = _same(out, "ranges of uncertainty", former.uncertainty, settings.uncertainty)
+    devices = tuple(dict.fromkeys((*former.devices, *settings.devices)))
+    placings = {}
+    for name in devices:
+        before = former.placing(name) if name in former.devices else None
+        now = settings.placing(name) if name in settings.devices else None
+        placings[name] = _same(out, f"size or place of {name}", before, now if now != Placing() else None) or Placing()
+    without = {name for name in former.without_flow if name not in settings.devices or settings.flow is None}
+    if settings.flow is None and former.flow is not None:
+        without |= set(settings.devices) - set(former.devices)
+    if settings.flow is not None and former.flow is None:
+        without |= set(former.devices) - set(settings.devices)
+    return replace(
+        former,
+        devices=devices,
+        diameter_mm=None,
+        length_mm=None,
+        center_mm=None,
+        placings={name: one for name, one in placings.items() if one != Placing()},
+        flow=flow,
+        without_flow=tuple(name for name in devices if name in without),
+        uncertainty=uncertainty,
+    )
+
+
+def refuse_other_input(out: Path, source: str) -> None:
+    """Raise InputError where a case folder holds results of another input than that of the hash `source`."""
+    if former_source(out) not in (source, None):
+        raise InputError(f"{out} holds the results of another input. Give another --out, or --replace to replace them.")
+
+
+def refuse_other_anatomy(out: Path, settings: Settings, former: Settings | None = None) -> None:
+    """Raise InputError where a case folder holds results of an anatomy that was found with other settings."""
+    former = former or former_settings(out)
+    if former is None:
+        return
+    before, now = (
+        {key: value for key, value in asdict(one).items() if key not in _OF_DEVICES} for one in (former, settings)
+    )
+    changed = [key for key in now if now[key] != before[key]]
+    if changed:
+        raise InputError(
+            f"{out} holds results with another {', '.join(map(_named, changed))}. Give another --out, or --replace to "
+            "replace them."
+        )
+
+
+def _named(key: str) -> str:
+    """Return what a setting is called: its field without the unit."""
+    return key.removesuffix("_mm").replace("_", " ")
+
+
+def _same(out: Path, what: str, former: Any, given: Any) -> Any:
+    """Return a setting that either run states; raise InputError where both do and differ."""
+    if former is not None and given is not None and former != given and asdict(former) != asdict(given):
+        raise InputError(f"{out} holds results with other {what}. Give another --out, or --replace to replace them.")
+    return given if former is None else former

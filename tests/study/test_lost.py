@@ -1,0 +1,206 @@
+"""Nothing that was computed is lost: every pair of an existing case and a new command."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vstent import phantoms
+from vstent.devices.catalogue import find_design
+from vstent.errors import FlowError, InputError, LandingError
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.geometry.surface import Surface
+from vstent.io.surfaces import read_surface
+from vstent.io.writers import write_stl
+from vstent.plan.rank import rank
+from vstent.plan.uncertainty import Ranges
+from vstent.study import stages
+from vstent.study.ledger import anatomy_key, key_of
+from vstent.study.outputs import write_ranking
+from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
+from vstent.study.types import Placing, Settings
+
+FLOW = FlowSettings(cell_size_mm=0.5, max_steps=20, inflow_mL_s=2.0)
+PLAIN = Settings(devices=("silk",), units="mm", flow=None)
+
+
+@pytest.fixture(scope="module")
+def arteries(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two patients."""
+    folder = tmp_path_factory.mktemp("arteries")
+    for name, length_mm in (("first", 34.0), ("second", 36.0)):
+        artery = phantoms.with_sac(phantoms.tube(length_mm=length_mm), abscissa_mm=17.0, width_mm=5.0, neck_mm=3.5)
+        write_stl(folder / f"{name}.stl", phantoms.phantom_surface(artery, edge_mm=0.6))
+    return folder / "first.stl", folder / "second.stl"
+
+
+@pytest.fixture(autouse=True)
+def bare_flow_for_all(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Compute a flow without a device once; with one it is the same. Returns what was computed, in order."""
+    real, computed = stages.simulate_case, []
+
+    def quick(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
+        computed.append("bare" if case.screen is None else "device")
+        return start if start is not None else real(case, start=start, **given)
+
+    monkeypatch.setattr(stages, "simulate_case", quick)
+    return computed
+
+
+def quiet(*_: object) -> None:
+    """Hear nothing."""
+
+
+def held(folder: Path) -> dict[str, bytes]:
+    """Return the files of devices and flows of a case folder, and what was found of other kinds."""
+    names = ("stents/**/*", "flow/**/*", "morphology.json", "ranking.csv", "convergence.json", "report.html")
+    files = [path for name in names for path in folder.glob(name) if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+EXISTING = {
+    "a device": PLAIN,
+    "two devices": replace(PLAIN, devices=("silk", "enterprise")),
+    "a device and its flow": replace(PLAIN, flow=FLOW),
+    "a size": replace(PLAIN, placings={"silk": Placing(4.0, 20.0)}),
+    "a spread": replace(PLAIN, uncertainty=Ranges(samples=2)),
+}
+COMMANDS = {
+    "another device": replace(PLAIN, devices=("pipeline",)),
+    "another device and its flow": replace(PLAIN, devices=("enterprise",), flow=FLOW),
+    "the same device": PLAIN,
+    "the same device and its flow": replace(PLAIN, flow=FLOW),
+    "the same and another": replace(PLAIN, devices=("silk", "leo")),
+    "another size": replace(PLAIN, diameter_mm=4.0, length_mm=15.0),
+    "another flow": replace(PLAIN, flow=replace(FLOW, inflow_mL_s=3.0)),
+    "less artery": replace(PLAIN, upstream_mm=12.0),
+    "another spread": replace(PLAIN, uncertainty=Ranges(samples=3)),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("existing", EXISTING)
+def test_after_any_command_all_that_a_folder_held_is_there_or_the_command_is_refused(
+    arteries: tuple[Path, Path], tmp_path: Path, existing: str, command: str
+) -> None:
+    out = tmp_path / "out"
+    run(arteries[0], out, EXISTING[existing], quiet)
+    before, metrics = held(out), json.loads((out / "metrics.json").read_text())
+    refused = ""
+    try:
+        run(arteries[0], out, COMMANDS[command], quiet)
+    except InputError as error:
+        refused = str(error)
+    if refused:
+        assert "--replace" in refused
+        assert held(out) == before
+        assert json.loads((out / "metrics.json").read_text()) == metrics
+        return
+    after = held(out)
+    assert {name: after.get(name) for name in before} == before
+    told = json.loads((out / "metrics.json").read_text())
+    for name, of_device in metrics["stents"].items():
+        assert of_device.items() <= told["stents"][name].items()
+    assert set(told["stents"]) == set(metrics["stents"]) | set(COMMANDS[command].devices)
+
+
+@pytest.mark.parametrize("command", [run, restore_vessel, trace_vessel, refine_flow])
+def test_another_input_is_refused_unless_it_is_to_replace(
+    arteries: tuple[Path, Path], tmp_path: Path, command: object
+) -> None:
+    out = tmp_path / "out"
+    run(arteries[0], out, PLAIN, quiet)
+    before = held(out)
+    with pytest.raises(InputError, match=r"results of another input\. Give another --out, or --replace"):
+        command(arteries[1], out, PLAIN, quiet)
+    assert held(out) == before
+
+
+def test_added_devices_are_what_they_are_in_a_folder_of_their_own(arteries: tuple[Path, Path], tmp_path: Path) -> None:
+    out, anew = tmp_path / "out", tmp_path / "anew"
+    run(arteries[0], out, replace(PLAIN, flow=FLOW), quiet)
+    run(arteries[0], out, replace(PLAIN, devices=("enterprise",), flow=FLOW), quiet)
+    run(arteries[0], anew, replace(PLAIN, devices=("silk", "enterprise"), flow=FLOW), quiet)
+    assert (out / "metrics.json").read_bytes() == (anew / "metrics.json").read_bytes()
+
+
+def test_a_device_added_without_flow_gets_none_and_the_flows_stay(
+    arteries: tuple[Path, Path], tmp_path: Path, bare_flow_for_all: list[str]
+) -> None:
+    out = tmp_path / "out"
+    run(arteries[0], out, replace(PLAIN, flow=FLOW), quiet)
+    case = run(arteries[0], out, replace(PLAIN, devices=("pipeline",)), quiet)
+    assert bare_flow_for_all == ["bare", "device"]
+    assert set(case.fields) == {"bare", "silk"}
+    assert set(case.deployments) == {"silk", "pipeline"}
+    assert "flow" not in case.metrics["stents"]["pipeline"]
+    later = run(arteries[0], out, replace(PLAIN, devices=("pipeline",), flow=FLOW), quiet)
+    assert bare_flow_for_all == ["bare", "device", "device"]
+    assert set(later.fields) == {"bare", "silk", "pipeline"}
+
+
+def test_a_device_that_does_not_fit_is_a_row_with_its_reason(
+    arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = replace(PLAIN, devices=("silk", "enterprise"))
+    real = stages.deploy_one
+
+    def too_long(design: object, *given: object) -> object:
+        if design.key == "silk":
+            raise LandingError("No size of Silk fits: choose another device.")
+        return real(design, *given)
+
+    monkeypatch.setattr(stages, "deploy_one", too_long)
+    case = run(arteries[0], tmp_path / "out", settings, quiet)
+    assert set(case.deployments) == {"enterprise"}
+    assert case.failures == {"silk": "not deployed: No size of Silk fits: choose another device."}
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["failures"] == case.failures
+    assert case.notes[0] == f"silk: {case.failures['silk']}"
+    with pytest.raises(LandingError, match="No size of Silk"):
+        run(arteries[0], tmp_path / "none", PLAIN, quiet)
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_flow_that_diverges_is_a_row_with_its_reason(
+    arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings, real = replace(PLAIN, devices=("silk", "enterprise"), flow=FLOW), stages.simulate_case
+
+    def diverging(case: FlowCase, **given: object) -> FlowField:
+        if case.stent is not None and case.stent.design.key == "silk":
+            raise FlowError("the flow diverged: use a finer grid spacing")
+        return real(case, **given)
+
+    monkeypatch.setattr(stages, "simulate_case", diverging)
+    case = run(arteries[0], tmp_path, settings, quiet)
+    assert set(case.fields) == {"bare", "enterprise"}
+    assert case.failures == {"silk": "flow not computed: the flow diverged: use a finer grid spacing"}
+    assert "deployment" in case.metrics["stents"]["silk"]
+
+
+def test_keys_are_those_of_version_0_1_where_newer_settings_are_not_used() -> None:
+    assert anatomy_key("source", replace(PLAIN, without_flow=("silk",))) == anatomy_key("source", PLAIN)
+    assert key_of(Settings()) != key_of(Settings(without_flow=("silk",)))
+
+
+def test_a_ranking_of_another_device_keeps_the_rows_of_the_former_one(
+    arteries: tuple[Path, Path], tmp_path: Path
+) -> None:
+    anatomy, _ = restore_vessel(arteries[0], tmp_path / "out", PLAIN, quiet)
+    designs = [replace(find_design(name), sizes=find_design(name).sizes[:3]) for name in ("silk", "leo")]
+    for design in designs:
+        write_ranking(tmp_path / "out", rank(anatomy, [design]))
+    write_ranking(tmp_path, rank(anatomy, designs))
+    assert (tmp_path / "out" / "ranking.csv").read_text() == (tmp_path / "ranking.csv").read_text()
+
+
+def test_a_point_in_another_frame_is_recognized(arteries: tuple[Path, Path], tmp_path: Path) -> None:
+    surface, _ = read_surface(arteries[0], units="mm")
+    moved = tmp_path / "moved.stl"
+    write_stl(moved, Surface(surface.vertices_mm + np.array([40.0, 25.0, 0.0]), surface.faces))
+    anatomy, _ = restore_vessel(moved, tmp_path / "out", PLAIN, quiet)
+    x, y, z = anatomy.aneurysms[0].sac.vertices_mm.mean(axis=0).tolist()
+    with pytest.raises(InputError, match=rf"Did you mean {x:.1f},{y:.1f},{z:.1f} \(the point given is RAS\)\?"):
+        restore_vessel(moved, tmp_path / "other", replace(PLAIN, at_mm=(-x, -y, z)), quiet)
