@@ -39,7 +39,7 @@ EDGE_MM = 0.6
 """Edges of the coarsest mesh of the table of centerlines; it is halved twice."""
 VOXELS_MM = (0.15, 0.25, 0.4)
 NECKS = ("neck_plane_area_mm2", "neck_surface_area_mm2", "neck_area_mm2")
-"""Cut by a plane, closed by the artery's wall, and the neck's curve projected (docs/cut.md)."""
+"""Cut by a plane, closed by the artery's wall, and the neck's curve projected (docs/concepts/parent_artery.rst)."""
 SIZES = {20_000: 0.325, 80_000: 0.163, 320_000: 0.0814}
 """Triangles of the demo's artery, and the edge that makes about so many."""
 

@@ -2,7 +2,7 @@
 From a scan to the flow before and after
 ========================================
 
-The whole of vstent in Python: every call takes nouns and returns a noun.
+From a scan to the blood flow in Python: every function takes data objects and returns a data object.
 """
 
 # %%

@@ -69,7 +69,7 @@ def test_triangle_soup_is_welded():
     assert len(surface.vertices_mm) == len(SOUND.vertices_mm)
     assert capped_volume(surface) == pytest.approx(capped_volume(SOUND))
     assert notes == (
-        f"{3 * len(SOUND.faces) - len(SOUND.vertices_mm)} duplicate vertices welded (closer than 2e-05 mm).",
+        f"{3 * len(SOUND.faces) - len(SOUND.vertices_mm)} duplicate vertices merged (closer than 2e-05 mm).",
     )
 
 
@@ -82,7 +82,7 @@ def test_duplicate_and_degenerate_faces_are_dropped_and_counted():
 
 def test_inside_out_is_turned():
     surface, notes = repair(Surface(SOUND.vertices_mm, SOUND.faces[:, ::-1]))
-    assert notes == ("The surface was inside out; all faces turned.",)
+    assert notes == ("The surface was inside out; all faces were reversed.",)
     assert capped_volume(surface) == pytest.approx(capped_volume(SOUND))
 
 
@@ -90,14 +90,14 @@ def test_faces_turned_at_random_agree_again():
     turned = np.random.default_rng(0).random(len(SOUND.faces)) < 0.4
     surface, notes = repair(Surface(SOUND.vertices_mm, np.where(turned[:, None], SOUND.faces[:, ::-1], SOUND.faces)))
     assert is_sound(surface)
-    assert notes == (f"{turned.sum()} faces turned to agree with the others.",)
+    assert notes == (f"{turned.sum()} faces reoriented.",)
 
 
 def test_the_one_face_that_disagrees_is_turned_even_if_it_is_the_first():
     faces = np.array(SOUND.faces)
     faces[0] = faces[0, ::-1]
     surface, notes = repair(Surface(SOUND.vertices_mm, faces))
-    assert notes == ("1 face turned to agree with the others.",)
+    assert notes == ("1 face reoriented.",)
     assert capped_volume(surface) == pytest.approx(capped_volume(SOUND))
 
 
@@ -142,13 +142,13 @@ def test_membrane_across_the_lumen_is_dropped():
     center = len(SOUND.vertices_mm)
     membrane = np.stack([ring, np.roll(ring, -1), np.full(AROUND, center)], axis=1)
     surface, notes = repair(with_faces(SOUND, membrane, [0, 0, 7.5]))
-    assert notes == (f"{AROUND} faces of sheets inside the lumen dropped.",)
+    assert notes == (f"{AROUND} faces of sheets inside the lumen removed.",)
     np.testing.assert_array_equal(surface.faces, SOUND.faces)
 
 
 def test_fin_is_dropped():
     surface, notes = repair(with_faces(SOUND, [AROUND, AROUND + 1, len(SOUND.vertices_mm)], [3.0, 0, 0.5]))
-    assert notes == ("1 face of sheets inside the lumen dropped.",)
+    assert notes == ("1 face of sheets inside the lumen removed.",)
     np.testing.assert_array_equal(surface.faces, SOUND.faces)
 
 
@@ -157,8 +157,8 @@ def test_loose_piece_is_dropped_and_its_size_told():
     surface, notes = repair(with_faces(SOUND, other.faces + len(SOUND.vertices_mm), other.vertices_mm))
     np.testing.assert_array_equal(surface.faces, SOUND.faces)
     assert notes == (
-        f"1 loose piece dropped (80.0% of the area kept), the notable of {other.area_mm2:.1f} mm2 about (20.0, 9.0, "
-        "3.8) mm: give --at to keep another one.",
+        f"1 loose piece removed (80.0% of the area kept), the largest of them {other.area_mm2:.1f} mm2 about (20.0, 9.0, "
+        "3.8) mm; choose another piece by a point near it (--at).",
     )
 
 
@@ -168,7 +168,7 @@ def test_an_opening_that_looks_sideways_out_of_the_wall_is_told_with_its_place()
     surface, notes = repair(Surface(wall.vertices_mm, wall.faces[keep]))
     assert len(surface.boundary_loops) == 3
     (note,) = notes
-    assert note.endswith(" mm looks sideways out of the wall: fill it in the surface if no artery leaves there.")
+    assert " mm faces sideways out of the wall. If no artery leaves there, close it in" in note
     np.testing.assert_allclose(place_in(note), [1.8, 0, 7.5], atol=0.25)
 
 
@@ -178,7 +178,7 @@ def test_the_piece_at_a_point_is_kept_however_small_but_for_debris():
     debris = with_faces(both, CUBE_FACES + len(both.vertices_mm), 0.1 * CUBE + [24.0, 0, 3.0])
     surface, notes = repair(debris, at_mm=np.array([23.9, 0, 3.0]))
     np.testing.assert_allclose(surface.vertices_mm, other.vertices_mm, atol=1e-9)
-    assert f"2 loose pieces dropped (20.0% of the area kept), the notable of {SOUND.area_mm2:.1f} mm2 about" in notes[0]
+    assert f"2 loose pieces removed (20.0% of the area kept), the largest of them {SOUND.area_mm2:.1f} mm2 about" in notes[0]
 
 
 def test_two_cubes_that_kiss_along_an_edge_part():
@@ -209,7 +209,7 @@ def test_holes_in_the_wall_are_filled_and_the_ends_stay_open(missing):
     assert is_sound(surface)
     assert len(surface.boundary_loops) == 2
     assert capped_volume(surface) == pytest.approx(capped_volume(SOUND), rel=1e-3)
-    assert notes[-1].startswith(("1 hole in the wall filled", "2 holes in the wall filled"))
+    assert notes[-1].startswith(("1 hole in the wall closed", "2 holes in the wall closed"))
 
 
 def test_an_end_partly_closed_by_a_torn_cap_is_closed_again_or_left_open_but_sound():
@@ -280,10 +280,10 @@ def mended_or_none(surface):
         ("aneurisk_C0038.vtp", 9, ""),
         ("aneurisk_beta.vtp", 6, ""),
         ("aneurisk_C0015_no_sac.vtp", 3, "6 degenerate faces"),
-        ("visc2011_metres.stl", 1, "holes in the wall filled"),
-        ("siphon_dirty.stl", 0, "5673 duplicate faces dropped.|1125 faces of sheets inside the lumen dropped."),
+        ("visc2011_metres.stl", 1, "holes in the wall closed"),
+        ("siphon_dirty.stl", 0, "5673 duplicate faces removed.|1125 faces of sheets inside the lumen removed."),
         ("healthy_siphon.vtk", 4, "inside out"),
-        ("bifurcation_coarse.vtp", 0, "1613 faces turned to agree"),
+        ("bifurcation_coarse.vtp", 0, "1613 faces reoriented"),
         ("bifurcation_with_sac.stl", 3, ""),
     ],
 )

@@ -125,7 +125,7 @@ def test_given_threshold_is_kept_and_the_wall_lies_on_it(demo):
         image.voxels.astype(float), image.to_index(vessel.lumen.vertices_mm).T, order=1, mode="nearest"
     )
     assert np.median(value) == pytest.approx(700.0, abs=30.0)
-    assert any(note.startswith("Threshold 700 as given; 10") for note in vessel.notes)
+    assert any(note.startswith("Threshold 700 as given; the proposed one is 10") for note in vessel.notes)
 
 
 def test_the_band_told_for_five_per_cent_is_what_happens(demo):
@@ -171,7 +171,7 @@ def test_what_is_wider_than_any_artery_is_refused():
     voxels = np.zeros((60, 60, 60))
     voxels[8:52, 8:52] = 1000
     with pytest.raises(
-        VesselError, match=r"about \(29\.5, 29\.5, 29\.5\) mm is 45 mm wide, and no artery is wider than"
+        VesselError, match=r"near \(29\.5, 29\.5, 29\.5\) mm is 45 mm wide, and no artery is wider than"
     ):
         segment(Image(gaussian_filter(voxels, 0.8), np.eye(4)), threshold=500.0)
 
@@ -242,7 +242,7 @@ def test_a_vessel_beside_a_far_larger_bone_is_found_at_a_point():
 def test_a_point_far_from_any_vessel_is_refused(two_vessels):
     image, in_thin = two_vessels
     for away in ([0, 0, 40.0], [500.0, 0, 0]):
-        with pytest.raises(VesselError, match=r"no lumen within 5 mm .* brighter than threshold \d+; check --at"):
+        with pytest.raises(VesselError, match=r"no lumen within 5 mm .* than threshold \d+\. Check the point, .* LPS mm"):
             segment(image, at_mm=in_thin + np.array(away))
 
 
@@ -255,7 +255,7 @@ def test_a_scan_without_a_lumen_is_refused(voxels):
 
 
 def test_a_threshold_above_everything_is_refused(demo):
-    with pytest.raises(VesselError, match=r"largest piece has 0 voxels \(the scan's range is"):
+    with pytest.raises(VesselError, match=r"largest object has 0 voxels \(intensities range from"):
         segment(demo[1], threshold=1e5)
 
 
@@ -263,7 +263,7 @@ def test_a_threshold_above_everything_is_refused(demo):
 def test_a_threshold_below_everything_is_refused(demo, below):
     _, image, _ = demo
     low, high = image.voxels.min(), image.voxels.max()
-    with pytest.raises(VesselError, match=rf"no voxel is below threshold .* \(the scan's range is {low} to {high}\)"):
+    with pytest.raises(VesselError, match=rf"No voxel is below threshold .* \(intensities range from {low} to {high}\)"):
         segment(image, threshold=low - below)
 
 
@@ -272,7 +272,7 @@ def test_fine_meshes_are_decimated_without_losing_volume(demo, monkeypatch):
     monkeypatch.setattr(import_module("vstent.anatomy.segment"), "MOST_FACES", 12_000)
     vessel = segment(image)
     assert len(vessel.lumen.faces) <= 12_000 < len(whole.lumen.faces)
-    assert f"{len(whole.lumen.faces)} triangles decimated to {len(vessel.lumen.faces)} (volume" in vessel.notes[-1]
+    assert f"{len(whole.lumen.faces)} triangles reduced to {len(vessel.lumen.faces)} (volume" in vessel.notes[-1]
     assert topology.edges_of(vessel.lumen.faces).n_uses.max() == 2
     assert capped_volume(vessel.lumen) == pytest.approx(capped_volume(whole.lumen), rel=2e-3)
     error, _ = wall_error_mm(phantom, vessel.lumen)

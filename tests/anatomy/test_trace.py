@@ -197,7 +197,7 @@ def test_a_thin_branch_with_a_coarse_cap_is_opened() -> None:
 
 
 def test_a_sphere_has_no_way_in() -> None:
-    with pytest.raises(VesselError, match=r"about .* has \d openings.*may be bone: give --at"):
+    with pytest.raises(VesselError, match=r"near .* has \d openings.*may be bone: choose a point in the artery \(--at\)"):
         open_ends(Vessel(sphere(3.0)))
 
 
@@ -217,7 +217,7 @@ def test_a_point_far_from_every_opening_chooses_none(fork: Vessel) -> None:
     within = fork.centerlines[1].points_mm[-len(fork.centerlines[1].points_mm) // 3]
     assert np.linalg.norm(within - outlet.center_mm) > reach_mm
     assert opening_at(untraced, within) is outlet
-    assert "mm from the point given" in trace(untraced, inlet_mm=within).notes[-1]
+    assert "mm from the given point" in trace(untraced, inlet_mm=within).notes[-1]
     assert trace(untraced, inlet_mm=near).notes == untraced.notes
 
 
@@ -227,9 +227,9 @@ def test_an_outlet_nearly_as_wide_as_the_inlet_is_told_once_with_both_places(
 ) -> None:
     untraced = Vessel(phantoms.phantom_surface(phantoms.bifurcation(daughter_radius_mm=daughter_radius_mm)))
     vessel = trace(untraced)
-    told = [note for note in vessel.notes if "is a guess" in note]
+    told = [note for note in vessel.notes if "because it is the widest opening" in note]
     assert len(told) == is_told
-    assert not any("is a guess" in note for note in trace(untraced, inlet_mm=vessel.inlet.center_mm).notes)
+    assert not any("because it is the widest opening" in note for note in trace(untraced, inlet_mm=vessel.inlet.center_mm).notes)
     for note in told:
         places = [[float(x) for x in place.split(")")[0].split(",")] for place in note.split("(")[1:]]
         np.testing.assert_allclose(places, [vessel.inlet.center_mm, vessel.outlets[0].center_mm], atol=0.05)
@@ -241,7 +241,7 @@ def test_a_guess_of_the_inlet_is_not_made_anew_by_trimming() -> None:
     phantom = phantoms.with_sac(phantoms.tube(length_mm=40.0), abscissa_mm=20.0, width_mm=5.0, neck_mm=3.5)
     whole = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.35)))
     trimmed = trim(whole, upstream_mm=10.0, downstream_mm=10.0)
-    assert [note for note in trimmed.notes if "is a guess" in note] == [whole.notes[-1]]
+    assert [note for note in trimmed.notes if "because it is the widest opening" in note] == [whole.notes[-1]]
 
 
 def test_real_centerlines_agree_with_vmtk(shared_data) -> None:

@@ -131,7 +131,7 @@ def test_voxels_without_a_header_wait_for_their_number_and_size(client):
 def test_a_case_takes_one_scan(client, case, artery):
     answer = client.put(f"{case}/input", params={"name": "other.stl"}, content=artery.read_bytes())
     assert answer.status_code == 422
-    assert "make another case for other.stl" in answer.json()["detail"]
+    assert "Make another case for other.stl." in answer.json()["detail"]
     two = f"/api/cases/{client.post('/api/cases', json={'name': 'two'}).json()['id']}"
     for name in ("one.stl", "other.stl"):
         assert client.put(f"{two}/input", params={"name": name}, content=artery.read_bytes()).status_code == 200
@@ -154,8 +154,8 @@ def test_a_header_and_the_voxels_that_it_names_are_one_scan(tmp_path):
 @pytest.mark.parametrize(
     ("way", "status", "words"),
     [
-        ("/api/cases/unheard-of", 404, "no such case"),
-        ("/assets/unheard-of", 404, "no such file"),
+        ("/api/cases/unheard-of", 404, "This case does not exist."),
+        ("/assets/unheard-of", 404, "This file does not exist."),
         ("{case}/section?abscissa_mm=nan", 422, "finite"),
         ("{case}/image/surface?threshold=inf", 422, "finite"),
     ],
@@ -241,7 +241,7 @@ def test_a_dragged_end_lies_where_the_hand_is_and_where_the_deployment_puts_it(c
 
 @pytest.mark.parametrize(
     ("anchor", "abscissa_mm", "said"),
-    [("proximal", -5, "is not on the parent artery"), ("distal", 5, "leaves the artery")],
+    [("proximal", -5, "is not on the parent artery"), ("distal", 5, "beyond the proximal end")],
 )
 def test_a_device_dragged_out_of_the_artery_is_refused_with_a_sentence(client, case, anchor, abscissa_mm, said):
     answer = client.post(f"{case}/sketch", json={"device": SILK, "anchor": anchor, "abscissa_mm": abscissa_mm})
@@ -418,7 +418,7 @@ def test_flows_of_other_settings_are_not_taken_for_those_of_the_results(flown, t
         view = client.get(case).json()
         assert not view["has_flow"]
         assert (view["steps"]["flow"], view["steps"]["report"]) == ("todo", "done")
-        assert "run the step Flow" in client.get(f"{case}/flow").json()["detail"]
+        assert "Run the step Flow" in client.get(f"{case}/flow").json()["detail"]
         (folder / "report.html").unlink()
         assert client.get(case).json()["steps"]["report"] == "todo"
     (folder / "app.json").unlink()
@@ -554,7 +554,7 @@ def test_uncertainty_is_told_in_the_order_of_the_devices_with_its_causes():
     assert (silk["title"], enterprise["title"]) == ("Silk 4 x 15 mm", "Enterprise")
     (row,) = silk["rows"]
     assert [row[key].replace("\u202f", " ") for key in ("mean", "low", "high")] == ["16.5 mm", "15.0 mm", "18.0 mm"]
-    assert [cause for cause, _ in row["shares"]] == ["device as made", "landing", "interplay"]
+    assert [cause for cause, _ in row["shares"]] == ["manufacturing tolerance", "landing", "interplay"]
     assert "16 deployments, of which 1 did not fit" in silk["words"]
     assert sheets.uncertainty({"stents": {"silk": {}}}, {"silk": "Silk"}) == []
 

@@ -47,7 +47,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 BAD = {
     "a text file named .stl": ("text.stl", b"hello\n", [], "not a .stl"),
-    "an empty mesh": ("empty.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", [], "no triangles"),
+    "an empty mesh": ("empty.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", [], "holds no surface"),
     "a volume without spacing": ("scan.raw", bytes(4096), ["--shape", "16,16,16"], "spacing"),
     "a volume without shape": ("scan.raw", bytes(4096), ["--spacing", "0.4"], "shape"),
     "a volume of zeros": ("scan.raw", bytes(4096), ["--shape", "16,16,16", "--spacing", "0.4"], "lumen"),
@@ -62,7 +62,7 @@ BAD = {
         "pulse.csv",
         b"ms,flow\n0,1\n200,3\n400,2\n600,1.5\n800,1.2\n1000,1\n",
         ["--pulsatile", "FILE"],
-        "its times in seconds",
+        "with times in seconds",
     ),
     "a device that does not exist": ("text.stl", b"hello\n", ["--device", "slik"], "silk"),
 }
@@ -169,7 +169,7 @@ def test_a_device_longer_than_the_artery_leaves_nothing_behind(
         ["run", str(artery), "--out", str(out), "--device", "silk", "--length", "40", "--diameter", "5", "--no-flow"]
     )
     assert code == 2
-    assert _complaint(capsys, "longer than the artery")
+    assert _complaint(capsys, "exceeds the artery")
     assert not out.exists()
 
 
@@ -260,7 +260,7 @@ def test_points_where_the_vessel_was_cut_are_taken_and_what_they_choose_is_told(
     cut = json.loads((tmp_path / "first" / "openings.json").read_text())["openings"]
     centers = [",".join(map(str, opening["center_mm"])) for opening in cut]
     assert main([*command, "--out", str(tmp_path / "again"), "--inlet", centers[0], "--outlet", centers[1]]) == 0
-    assert "mm from the point given" in " ".join(capsys.readouterr().err.split())
+    assert "mm from the given point" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize("port", ["65536", "99999", "-1", "http", "8e3"])

@@ -31,7 +31,7 @@ def test_flow_alone_in_a_tube_is_poiseuilles_and_is_not_computed_twice(
     assert main(command) == 0
     said = capsys.readouterr()
     assert "Inlet flow" in said.out
-    assert "thousand cells of 0.25 mm" in said.err
+    assert "Grid spacing 0.25 mm (" in said.err
     assert sorted(file.name for file in (out / "flow" / "bare").iterdir()) == ["field.vtu", "wall.vtp"]
     bare = json.loads((out / "metrics.json").read_text())["bare"]
     assert bare["inlet_flow_mL_s"] == pytest.approx(INFLOW_ML_S, rel=5e-3)

@@ -107,7 +107,7 @@ def test_a_device_whose_flow_fails_leaves_the_files_of_the_others(scans, tmp_pat
     def failing(out, anatomy, deployments, *_):
         if "enterprise" in deployments:
             raise FlowError("it diverged")
-        return {}
+        return {}, {}
 
     monkeypatch.setattr("vstent.study.pipeline.compute_flows", failing)
     (case, *_) = find_cases(scans, SETTINGS)
@@ -208,7 +208,7 @@ def test_parquet_holds_what_the_rows_hold(table, tmp_path):
 
 BAD_LISTS = {
     "an unknown column": ("input,sac\na.stl,1\n", "column 'sac'"),
-    "no input": ("case\nfirst\n", "names no input"),
+    "no input": ("case\nfirst\n", "has no input"),
     "a point of two numbers": ("input,at\na.stl,1 2\n", "three numbers"),
     "a threshold in words": ("input,threshold\na.stl,high\n", "threshold is 'high'"),
     "a threshold that is no number": ("input,threshold\na.stl,500\na.stl,nan\n", "line 3 of"),
@@ -301,7 +301,7 @@ def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_k
             for name in "bc":
                 row_path(tmp_path / "cases" / name, device).unlink()
         tasks = left_to_do(cases, tmp_path)
-        with pytest.raises(VstentError, match="scheduler is lost"):
+        with pytest.raises(VstentError, match="scheduler was lost"):
             run_cohort(tasks, tmp_path, DaskCluster(scheduler.address, held), lambda *_: scheduler.process.kill())
     assert [task.case.name for task in left_to_do(cases, tmp_path)] == ["c"]
     run_cohort(left_to_do(cases, tmp_path), tmp_path, Processes(1), told)

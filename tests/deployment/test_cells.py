@@ -78,7 +78,7 @@ def test_where_a_bent_artery_is_wider_than_the_device_struts_keep_their_length_a
 
 def test_gaps_of_a_bend_are_not_taken_for_those_of_a_narrow_device():
     wide = deploy(ENTERPRISE, tube(line(40), 2.6), size=SIZE)
-    assert "outside the bend is longer" in deployed().advice
+    assert "around the outside of the bend is longer" in deployed().advice
     assert "its free diameter is 4.50 mm" in wide.advice
 
 

@@ -188,7 +188,7 @@ def test_a_neck_off_the_artery_is_measured_on_what_faces_it_and_the_gap_told(des
     assert found["neck_metal_coverage_fraction"] == pytest.approx(usual["neck_metal_coverage_fraction"])
     assert usual["max_neck_gap_mm"] == pytest.approx(usual["max_wall_gap_mm"], abs=0.01)
     assert found["max_neck_gap_mm"] == pytest.approx(1.2 + usual["max_neck_gap_mm"], abs=0.01)
-    told = " The neck lies on a fork: it reaches up to 1.2 mm off this artery, where blood enters beside any device"
+    told = " The neck is on a fork and extends up to 1.2 mm beyond this artery; blood enters there beside any device"
     assert off.advice == f"{near.advice}{told} in it."
 
 

@@ -140,9 +140,9 @@ def test_a_catalogue_entry_becomes_a_design():
         ),
         ("diameter_um = 40", "diameter_um = 0.04", "0.04 um is thinner than any wire or strut, give micrometres"),
         ("diameter_um = 40", "diameter_um = 900", "has no room for its wires or struts: side by side they take 1."),
-        ("lengths_mm = [10,", "lengths_mm = [1,", "3.00 x 1 mm is shorter than two rows of its cells, 0."),
-        ('key = "x"', 'key = "bare"', "as the flow without a device is called"),
-        ('name = "X"', 'name = "Bare"', "as the flow without a device is called"),
+        ("lengths_mm = [10,", "lengths_mm = [1,", "3.00 x 1 mm is shorter than two rows of its cells, which are 0."),
+        ('key = "x"', 'key = "bare"', "'bare', which is reserved for the flow without a device"),
+        ('name = "X"', 'name = "Bare"', "'bare', which is reserved for the flow without a device"),
         ("[[device]]", "[[device", "not valid TOML"),
     ],
 )
@@ -204,10 +204,10 @@ def test_a_device_of_ones_own_joins_the_catalogue_and_can_be_replaced(own_folder
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (OWN.replace('"own"', '"silk"'), "names a device that the catalogue has already, silk"),
+        (OWN.replace('"own"', '"silk"'), "names a device that the catalogue already has, silk"),
         (
             OWN.replace('"Own"', '"SILK"'),
-            "names a device that the catalogue has already, silk: give it another key and",
+            "names a device that the catalogue already has, silk. Give it another key and",
         ),
         (OWN.replace(', confidence = "derived"', ""), "is wrong at device.0.braid.braid_angle_rad.confidence"),
         (OWN.replace("value = 1.2", "value = 2.0"), "has an angle of 2.000 rad"),

@@ -81,7 +81,7 @@ def test_inlets_have_the_order_given_and_the_rest_are_outlets(ends: Sequence[int
             r"two inlets are the same opening, 3.5 mm wide at .* \(0.0, 0.0, 0.0\) mm and \(0.0, 1.0",
         ),
         ([[0, 0, 0], [0, 90, 0]], r"no opening of the vessel is near \(0.0, 90.0, 0.0\) mm"),
-        (at_ends(TRUNK, RIGHT, LEFT), "blood enters through all 3 openings of the vessel and leaves through none"),
+        (at_ends(TRUNK, RIGHT, LEFT), "all 3 openings of the vessel are inlets and none is an outlet"),
     ],
 )
 def test_inlets_that_cannot_be_are_refused(points_mm: Floats, said: str) -> None:
@@ -113,7 +113,7 @@ def test_outlets_are_numbered_by_those_that_are_left() -> None:
     vessel = trace(Vessel(phantoms.phantom_surface(with_interrupted_branch(tube), edge_mm=0.2)))
     assert [opening.role for opening in vessel.openings] == ["inlet", "outlet_1", "outlet_2"]
     assert vessel.outlets[1].center_mm[0] < -5.0
-    assert any("is cut off from the inlet: closed" in note for note in vessel.notes)
+    assert any("has no connection to the inlet and was closed." in note for note in vessel.notes)
 
 
 # -- geometry ----------------------------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ def test_inlets_behind_one_cut_are_one() -> None:
     assert [opening.role for opening in cut.openings] == ["inlet", "outlet_1"]
     assert cut.inlet.center_mm[2] == pytest.approx(3.5 + 4.5, abs=0.3)
     (note,) = (note for note in cut.notes if "inlet_2" in note)
-    assert "lies beyond that: its blood enters by another inlet" in note
+    assert "was cut off: its blood enters elsewhere." in note
 
 
 def arch(*knots_mm: Sequence[float], radius_mm: float) -> Centerline:
@@ -175,7 +175,7 @@ def test_a_cut_beyond_which_more_leaves_than_enters_is_an_outlet() -> None:
     cut = trim(siphon(10.0, second=2), upstream_mm=9.0, downstream_mm=6.0)
     assert [opening.role for opening in cut.openings] == ["inlet", "outlet_1"]
     (note,) = (note for note in cut.notes if "inlet_2" in note)
-    assert note.endswith("lies beyond that: through that cut more leaves than enters.")
+    assert note.endswith("was cut off: that cut is an outlet now.")
 
 
 def test_the_parent_artery_leads_to_an_inlet_only_where_it_is_told_to() -> None:
@@ -191,8 +191,8 @@ def test_a_sac_on_the_artery_from_another_inlet_is_told_with_what_to_give() -> N
     vessel = siphon(sac_at_mm=30.0)
     anatomy = restore(vessel)
     assert not anatomy.aneurysms
-    (note,) = (note for note in anatomy.notes if "hangs on the artery from inlet_2" in note)
-    assert note.endswith("give that as the first --inlet.")
+    (note,) = (note for note in anatomy.notes if "is on the artery from inlet_2" in note)
+    assert note.endswith("give that opening as the first inlet (--inlet).")
     turned = trace(Vessel(vessel.lumen), inlet_mm=np.array([inlet.center_mm for inlet in vessel.inlets[::-1]]))
     assert len(restore(turned).aneurysms) == 1
 

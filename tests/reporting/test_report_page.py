@@ -173,13 +173,13 @@ def test_of_a_pulse_it_is_said_which_numbers_are_means(page):
     [
         (
             FlowSettings(),
-            ("Blood is Newtonian", "pressure at the outlets was set", "thin resistance"),
-            ("thins", "cube"),
+            ("Blood is Newtonian", "pressure at the outlets is assumed", "porous screen"),
+            ("shear-thinning", "cubed"),
         ),
         (
             FlowSettings(blood=Blood(thinning=CarreauYasuda()), outlets="murray", engine="openfoam"),
-            ("Blood thins", "by the cube of their radius", "struts over the neck"),
-            ("Newtonian", "pressure at the outlets", "thin resistance"),
+            ("Blood is shear-thinning", "by their diameter cubed", "meshed wires over the neck"),
+            ("Newtonian", "pressure at the outlets", "porous screen"),
         ),
         (FlowSettings(engine="my_engine"), ("Blood is Newtonian",), ("a device is",)),
         (None, (), ("Blood", "outlets", "a device is")),
@@ -191,7 +191,7 @@ def test_limits_are_those_of_the_flow_that_was_computed(settings, told, untold):
     words = " ".join(limits)
     assert all(one in words for one in told)
     assert not any(one in words for one in untold)
-    assert "does not give way" in limits[0]
+    assert "with a rigid wall" in limits[0]
     assert "Research use only" in limits[-1]
 
 
@@ -203,7 +203,7 @@ def test_that_a_flow_was_shared_among_inlets_is_told(n_inlets):
     fed = replace(vessel, openings=(vessel.inlet, *feeding, *vessel.openings[n_inlets:]))
     settings = {"flow": asdict(FlowSettings())}
     case = bare_case(anatomy=replace(anatomy, vessel=fed), provenance={"settings": settings})
-    assert any("each of the inlets" in one for one in limits_of(case)) == (n_inlets > 1)
+    assert any("through each inlet is assumed" in one for one in limits_of(case)) == (n_inlets > 1)
 
 
 def test_provenance_is_whole(page):
@@ -279,8 +279,8 @@ def test_how_sure_a_flow_is_is_no_change_but_told():
     assert [row.before.key for row in compare(metrics)] == ["mean_sac_velocity_m_s"]
     html = as_html(replace(report_case.contents(), metrics=metrics, changes=compare(metrics)))
     text = Page(html).text.replace("\u202f", " ")
-    assert "Left to settle 2.79 %" in text
-    assert "Left to settle 0.762 %" in text
+    assert "Convergence error 2.79 %" in text
+    assert "Convergence error 0.762 %" in text
 
 
 def test_ratios_and_openings_go_by_the_words_of_what_they_are_of():

@@ -319,7 +319,7 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     report = (out / "report.html").read_text()
     assert all(f"Flow, {name}: The flow has " in report for name in ("bare", "silk"))
     left = metrics["bare"]["unsettled_fraction"]
-    assert (left < 0.01) == ("Flow, bare: The flow has settled" in report)
+    assert (left < 0.01) == ("Flow, bare: The flow has converged" in report)
     assert metrics["stents"]["silk"]["flow"]["unsettled_fraction"] == left > 0
     assert not any("unsettled" in key for key in ratios)
     provenance = json.loads((out / "run.json").read_text())

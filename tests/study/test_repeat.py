@@ -40,7 +40,7 @@ def case(tmp_path_factory):
 def test_a_repeated_run_is_the_same_to_the_last_bit(case, capsys):
     assert main(["run", str(case / "first" / "run.json"), "--out", str(case / "again"), "--ro-crate"]) == 0
     said = capsys.readouterr()
-    assert "the same to the last bit" in said.out
+    assert "The metrics are identical to the last bit." in said.out
     assert "Not as then" not in said.err
     assert "already done" not in said.err
     first, again = case / "first", case / "again"
@@ -98,9 +98,9 @@ def test_other_versions_and_devices_are_told(case):
     del told["machine"]
     (case / "first" / "other.json").write_text(json.dumps(told))
     differences = repeating.read_record(case / "first" / "other.json").differences
-    assert any("numpy (versions): 1.0 then" in sentence for sentence in differences)
-    assert any("silk (devices): other wires then" in sentence for sentence in differences)
-    assert sum("(machine): absent then" in sentence for sentence in differences) == 2
+    assert any("numpy (versions): 1.0 before" in sentence for sentence in differences)
+    assert any("silk (devices): other wires before" in sentence for sentence in differences)
+    assert sum("(machine): absent before" in sentence for sentence in differences) == 2
     assert len(differences) == 4
     (case / "first" / "other.json").unlink()
 
@@ -109,13 +109,13 @@ def test_other_versions_and_devices_are_told(case):
 def test_what_is_no_record_is_refused_in_a_sentence(text, tmp_path, capsys):
     (tmp_path / "run.json").write_text(text)
     assert main(["run", str(tmp_path / "run.json"), "--out", str(tmp_path / "out")]) == 2
-    assert "no run.json of this version" in capsys.readouterr().err
+    assert "is not a run.json of this version" in capsys.readouterr().err
 
 
 def test_a_record_takes_no_other_settings_nor_its_own_folder(case, capsys):
     record = str(case / "first" / "run.json")
     assert main(["run", record, "--out", str(case / "x"), "--threshold", "3"]) == 2
-    assert "give no option" in capsys.readouterr().err
+    assert "states all settings: give only --out" in capsys.readouterr().err
     assert main(["run", record, "--out", str(case / "first")]) == 2
     assert "another --out" in capsys.readouterr().err
 
@@ -133,10 +133,10 @@ def test_settings_come_back_from_json_to_the_last_bit(tmp_path):
 @pytest.mark.parametrize(
     ("length_mm", "told"),
     [
-        (11.0, "1 of 2 metrics differ, stents.silk.b_mm most: by 0.091 of itself, more than the 0.001 that another"),
-        (10.005, "1 of 2 metrics differ, stents.silk.b_mm most: by 0.0005 of itself, within the 0.001 that another"),
-        (10.0 + 1e-12, "The metrics are the same but for rounding."),
-        (10.0, "The metrics are the same to the last bit."),
+        (11.0, "1 of 2 metrics differ, stents.silk.b_mm most (relative difference 0.091, more than the 0.001 that another"),
+        (10.005, "1 of 2 metrics differ, stents.silk.b_mm most (relative difference 0.0005, within the 0.001 that another"),
+        (10.0 + 1e-12, "The metrics agree except for rounding."),
+        (10.0, "The metrics are identical to the last bit."),
     ],
 )
 def test_disagreement_is_told_by_its_worst(length_mm, told, tmp_path):

@@ -148,8 +148,8 @@ def guessed(vessel: Vessel) -> Vessel:
         return vessel
     note = (
         f"The inlet, {vessel.inlet.described}, was chosen because it is the widest opening, but "
-        f"{widest.described} is nearly as wide. Choose the inlet if this is wrong, and every further inlet "
-        "(--inlet)."
+        f"the outlet, {widest.described}, is nearly as wide. Choose the inlet if this is wrong, and every further "
+        "inlet (--inlet)."
     )
     return replace(vessel, notes=(*vessel.notes, note))
 

@@ -40,7 +40,7 @@ STAGES: Final = {
     "report": "report",
 }
 """Step of the page for the first word of a study's stage."""
-SETTLING: Final = re.compile(r"([\d.]+)% left to settle, (?:.*?)(\d+) s left")
+SETTLING: Final = re.compile(r"([\d.]+)% from convergence, (?:.*?)(\d+) s left")
 """Form of the progress message of a flow (`vstent.study.ledger.Ledger.teller`)."""
 STOPPED: Final = "Stopped. Finished results are kept."
 LAST_WORDS: Final = ".worker.log"

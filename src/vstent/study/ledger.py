@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass, replace
-from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -19,6 +18,8 @@ from vstent.io.writers import write_json
 from vstent.study.types import Progress, Settings
 
 Kept = TypeVar("Kept")
+RESULTS_VERSION: Final = "0.1.0"
+"""Version of the computations: it changes only when results change, so that a new release keeps stored results."""
 ANATOMY: Final = "anatomy"
 """Name under which an anatomy is stored."""
 
@@ -143,9 +144,9 @@ def vessel_key(source: str, settings: Settings) -> str:
 
 
 def key_of(*parts: Any) -> str:
-    """Return a short digest of everything that a result depends on, the version of its computation included."""
+    """Return a short digest of everything that a result depends on, including `RESULTS_VERSION`."""
     plain = [_plain(part) if is_dataclass(part) and not isinstance(part, type) else part for part in parts]
-    return hashlib.sha256(json.dumps([version("vstent"), plain], sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps([RESULTS_VERSION, plain], sort_keys=True).encode()).hexdigest()[:16]
 
 
 _LATER: Final = {"without_flow": (), "acquisition": None, "frame": None}

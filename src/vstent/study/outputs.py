@@ -17,7 +17,7 @@ from vstent.flow.case import FlowField
 from vstent.flow.openfoam.folder import KEY
 from vstent.geometry.vessel import Anatomy, Centerline, Vessel
 from vstent.io import writers
-from vstent.io.tables import write_rows
+from vstent.io.tables import columns_of, write_rows
 from vstent.io.three_mf import write_3mf
 from vstent.plan.rank import Ranking
 from vstent.study.crate import NAME as CRATE
@@ -130,7 +130,11 @@ def write_ranking(out: Path, ranking: Ranking) -> None:
     Rows of other devices that a former ranking by the same criteria has are kept.
     """
     criteria = [item.model_dump(exclude_none=True) for item in ranking.criteria.items]
-    rows = _ranked([*ranking.rows(), *_former_rows(out / "ranking.json", ranking, criteria)])
+    new = ranking.rows()
+    columns = columns_of(new)
+    former = _former_rows(out / "ranking.json", ranking, criteria)
+    # JSON files have sorted keys: a former row in first place must not order the columns of the table.
+    rows = _ranked([*new, *({name: row[name] for name in columns if name in row} | row for row in former)])
     write_rows(out / "ranking.csv", rows)
     writers.write_json(out / "ranking.json", {"criteria": criteria, "candidates": rows, "research_use_only": True})
 

@@ -256,7 +256,7 @@ def test_without_a_sac_the_landing_surface_is_the_wall() -> None:
 
 def test_a_point_far_from_any_sac_is_refused() -> None:
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.torus_arc())))
-    with pytest.raises(InputError, match="no sac"):
+    with pytest.raises(InputError, match="nothing bulges out of the artery near"):
         restore(vessel, at_mm=np.array([0.0, 10.0, 8.0]))
 
 
@@ -301,7 +301,7 @@ def test_trimming_keeps_the_lengths_that_are_given() -> None:
     low, high = sorted(opening.center_mm[2] for opening in vessel.openings)
     assert low == pytest.approx(13.0, abs=0.1)
     assert high == pytest.approx(34.0, abs=0.1)
-    assert "12 mm of vessel before the sac's middle and 9 mm beyond" in vessel.notes[-1]
+    assert "Trimmed to 12 mm of vessel proximal and 9 mm distal to the middle of the sac." in vessel.notes[-1]
     with pytest.raises(InputError, match="above zero"):
         trim(traced, downstream_mm=0.0)
 
@@ -338,10 +338,10 @@ def test_a_neck_drawn_up_the_sac_cuts_it_there() -> None:
 @pytest.mark.parametrize(
     ("neck_mm", "complaint"),
     [
-        (np.zeros((2, 3)), "three points or more"),
-        (np.array([[np.nan, 0, 0], [1, 0, 0], [0, 1, 0]]), "three points or more"),
-        (circle(np.array([40.0, 0, 20]), 2.0), r"mm off the wall at \(40.0"),
-        (circle(np.array([2.0, 0, 30]), 0.02), "parts nothing"),
+        (np.zeros((2, 3)), "at least three points"),
+        (np.array([[np.nan, 0, 0], [1, 0, 0], [0, 1, 0]]), "at least three points"),
+        (circle(np.array([40.0, 0, 20]), 2.0), r"mm from the wall at \(40.0"),
+        (circle(np.array([2.0, 0, 30]), 0.02), "separates nothing from the artery"),
         (circle(np.array([30.0, 0, 0]), 2.0)[:, [1, 2, 0]], "around the artery"),
     ],
 )

@@ -49,8 +49,8 @@ def test_a_short_branch_out_of_the_sac_is_not_the_parent_artery(demo) -> None:
 @pytest.mark.parametrize(("length_mm", "radius_mm"), [(1.0, 0.7), (2.0, 1.2)])
 def test_an_opening_on_a_sac_is_told_with_its_place(length_mm: float, radius_mm: float) -> None:
     vessel = traced(demo_with_a_stub_in_its_dome(length_mm=length_mm, radius_mm=radius_mm))
-    (note,) = (note for note in restore(vessel).notes if "from a sac's wall" in note)
-    assert note.startswith(f"outlet_2, {2 * radius_mm:.1f} mm wide at {place(vessel.outlets[1].center_mm)}, lies ")
+    (note,) = (note for note in restore(vessel).notes if "from the wall of a sac" in note)
+    assert note.startswith(f"outlet_2, {2 * radius_mm:.1f} mm wide at {place(vessel.outlets[1].center_mm)}, is ")
 
 
 @pytest.mark.parametrize("anatomy", ["demo", "a branch from the dome"])
@@ -62,7 +62,7 @@ def test_a_branch_that_leaves_from_the_sac_is_told(anatomy: str, demo) -> None:
 
 
 def test_openings_far_from_the_sac_are_not_told(demo) -> None:
-    assert not any("from a sac's wall" in note for note in demo.notes)
+    assert not any("from the wall of a sac" in note for note in demo.notes)
 
 
 def test_a_lobe_of_a_sac_is_no_sac_of_its_own(demo, monkeypatch) -> None:
@@ -72,7 +72,7 @@ def test_a_lobe_of_a_sac_is_no_sac_of_its_own(demo, monkeypatch) -> None:
     monkeypatch.setattr(import_module("vstent.anatomy.restore.restore"), "find_bulges", lambda *_: [bulge, lobe])
     anatomy = restore(demo.vessel)
     assert len(anatomy.aneurysms) == 1
-    assert anatomy.notes[1:] == ("1 more bulge, flat, a sac's lobe, or on another branch: no sac of its own.",)
+    assert anatomy.notes[1:] == ("1 more bulge not used: flat, a lobe of a sac, or on another branch.",)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def sac_on_a_tube() -> Vessel:
 @pytest.mark.parametrize("side", ["upstream", "downstream"])
 def test_a_trim_that_would_cut_the_sac_is_refused_with_the_least_length(sac_on_a_tube, side: str) -> None:
     with pytest.raises(
-        InputError, match=rf"^2 mm of artery .* mm would be cut .*; give --{side} [\d.]+ or more"
+        InputError, match=rf"^2 mm of artery .* mm would be a cut .*: give --{side} [\d.]+ or more"
     ) as refused:
         trim(sac_on_a_tube, **{f"{side}_mm": 2.0})
     least_mm = float(str(refused.value).split()[-3])
@@ -102,16 +102,16 @@ def test_a_length_that_was_not_given_grows_until_the_cut_clears_the_sac(
 ) -> None:
     monkeypatch.setattr(import_module("vstent.anatomy.trim"), usual, 2.0)
     trimmed = trim(sac_on_a_tube)
-    (note,) = (note for note in trimmed.notes if "not 2: the neck reaches" in note)
-    assert f"mm {side} the sac's middle" in note
-    kept_mm = float(note.split()[2])
+    (note,) = (note for note in trimmed.notes if "instead of 2, because the neck extends" in note)
+    assert f"mm are kept {side} the middle of the sac" in note
+    kept_mm = float(note.split()[0])
     assert 2.0 + 2.0 < kept_mm < 2.0 + 2.0 + 1.5
     low, high = sorted(opening.center_mm[2] for opening in trimmed.openings)
     assert (20.0 - low if side == "before" else high - 20.0) == pytest.approx(kept_mm, abs=0.3)
     np.testing.assert_allclose(
         restore(trimmed).aneurysms[0].neck.area_mm2, restore(sac_on_a_tube).aneurysms[0].neck.area_mm2, rtol=0.05
     )
-    with pytest.raises(InputError, match="through the sac or beside it"):
+    with pytest.raises(InputError, match="through the sac or next to it"):
         trim(sac_on_a_tube, **{"upstream_mm" if side == "before" else "downstream_mm": 2.0})
 
 
@@ -263,7 +263,7 @@ def test_a_stenosis_beside_a_neck_is_no_measure_of_the_artery_across_it(lost: fl
 
 @pytest.mark.parametrize(("lost", "throat_mm"), [(0.5, -6.0), (0.6, 5.0), (0.0, 6.0), (0.2, 6.0)])
 def test_a_stenosis_beside_a_neck_is_told_with_its_place(lost: float, throat_mm: float) -> None:
-    notes = [note for note in restore(traced(sac_beside_a_stenosis(lost, throat_mm))).notes if "stenosed" in note]
+    notes = [note for note in restore(traced(sac_beside_a_stenosis(lost, throat_mm))).notes if "a stenosis" in note]
     assert len(notes) == (lost > 0.3)
     for note in notes:
         width_mm, rest = note.removeprefix("The artery is ").split(" mm wide at ")
@@ -275,4 +275,4 @@ def test_an_artery_that_goes_on_narrow_beyond_a_neck_is_not_called_stenosed() ->
     phantom = sac_beside_a_stenosis(0.5, 6.0)
     radius = np.minimum.accumulate(phantom.parent.inscribed_radius_mm)
     tapered = replace(phantom, parent=replace(phantom.parent, inscribed_radius_mm=radius))
-    assert not any("stenosed" in note for note in restore(traced(tapered)).notes)
+    assert not any("a stenosis" in note for note in restore(traced(tapered)).notes)

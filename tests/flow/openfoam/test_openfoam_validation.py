@@ -1,4 +1,4 @@
-"""The embedded engine against OpenFOAM, bare, on the demo and on a real carotid; `docs/openfoam.md` keeps the table."""
+"""The embedded engine against OpenFOAM, bare, on the demo and on a real carotid; `docs/validation/openfoam.rst` keeps the table."""
 
 import os
 import resource
@@ -82,7 +82,7 @@ def restored(vessel: Vessel, cell_size_mm: float) -> FlowCase:
 
 
 def test_the_demo(tmp_path: Path) -> None:
-    # In wider cells OpenFOAM's sac is the slower one, by 6 % in 0.14 mm (docs/openfoam.md).
+    # In wider cells OpenFOAM's sac is the slower one, by 6 % in 0.14 mm (docs/validation/openfoam.rst).
     case = restored(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)), 0.1)
     embedded = simulate_case(case)
     # A flow that settles does not depend on where it begins.

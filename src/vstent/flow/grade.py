@@ -1,0 +1,152 @@
+"""Grade of a computed flow: good, fair or not usable, from stated criteria of grid, convergence and balance."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from vstent.flow.case import LATTICE, FlowCase, FlowField
+from vstent.flow.domain import mean_diameter_mm
+from vstent.flow.lattice.setup import CELL_REYNOLDS
+from vstent.kernels.arrays import Floats
+from vstent.units import M_PER_MM
+
+Level = Literal["good", "fair", "not usable"]
+GOOD: Final = "good"
+FAIR: Final = "fair"
+NOT_USABLE: Final = "not usable"
+NEAR_NECK_MM: Final = 10.0
+"""Distance from the neck within which the parent artery is measured, mm (as in `indices`)."""
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """One measure of a flow, with the limits of the grades."""
+
+    key: str
+    """Key of the measure."""
+    good: float
+    """Limit of a good flow."""
+    fair: float
+    """Limit of a fair flow; beyond it the flow is not usable."""
+    phrase: str
+    """Reason, a format of the measured value."""
+    is_at_least: bool = True
+    """Whether larger values are better."""
+
+    def level(self, value: float) -> Level:
+        """Return the grade by this measure alone."""
+        sign = 1 if self.is_at_least else -1
+        if sign * value >= sign * self.good:
+            return "good"
+        return "fair" if sign * value >= sign * self.fair else "not usable"
+
+
+CRITERIA: Final = (
+    Criterion("cells_across_neck_count", 18.0, 12.0, "{:.0f} cells across the neck"),
+    Criterion("cells_across_sac_count", 20.0, 12.0, "{:.0f} cells across the sac"),
+    Criterion("cells_across_parent_count", 16.0, 10.0, "{:.0f} cells across the parent artery"),
+    Criterion("cells_across_outlet_count", 6.0, 4.0, "{:.1f} cells across the narrowest outlet"),
+    Criterion("raised_viscosity_fraction", 0.005, 0.05, "viscosity raised in {:.1%} of the sac and neck", False),
+    Criterion("unsettled_fraction", 0.03, 0.1, "uncertainty of convergence {:.1%}", False),
+    Criterion("neck_imbalance_fraction", 0.03, 0.08, "inflow and outflow of the neck differ by {:.1%}", False),
+)
+"""Criteria of the grades; their limits are checked by ``benchmarks/grades.py``."""
+
+
+@dataclass(frozen=True)
+class Grade:
+    """The grade of a flow and its reasons."""
+
+    level: Level
+    """``good``, ``fair`` or ``not usable``: the worst of all criteria."""
+    reasons: tuple[str, ...]
+    """The criteria that keep it from being good, the worst first."""
+    measures: dict[str, float]
+    """The measures that it rests on."""
+
+    @property
+    def words(self) -> str:
+        """The grade with its reasons, for a table or a sentence."""
+        return f"{self.level} ({'; '.join(self.reasons)})" if self.reasons else self.level
+
+
+def grade(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> Grade:
+    """Grade a flow.
+
+    Parameters
+    ----------
+    case : FlowCase
+        What was computed.
+    field : FlowField
+        The flow.
+    found : mapping
+        Its indices (`vstent.flow.indices.indices`).
+    """
+    return grade_of(measures_of(case, field, found))
+
+
+def grade_of(measures: Mapping[str, float]) -> Grade:
+    """Return the grade that belongs to measures; a measure that is missing is not judged."""
+    order: tuple[Level, ...] = ("not usable", "fair", "good")
+    judged = [(one, measures[one.key]) for one in CRITERIA if one.key in measures]
+    poor = [(one.level(value), one.phrase.format(value)) for one, value in judged if one.level(value) != GOOD]
+    poor.sort(key=lambda pair: order.index(pair[0]))
+    level = poor[0][0] if poor else order[-1]
+    return Grade(level, tuple(phrase for _, phrase in poor), {one.key: value for one, value in judged})
+
+
+def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> dict[str, float]:
+    """Return the measures of a flow that its grade rests on; counts are in cells, fractions from 0 to 1."""
+    spacing_mm = field.cell_size_mm
+    measures = {"cells_across_parent_count": mean_diameter_mm(case.vessel) / spacing_mm}
+    if len(case.vessel.outlets) > 1 and case.settings.outlets != "murray":
+        narrowest_mm = min(outlet.diameter_mm for outlet in case.vessel.outlets)
+        measures["cells_across_outlet_count"] = narrowest_mm / spacing_mm
+    if np.isfinite(field.unsettled_fraction):
+        measures["unsettled_fraction"] = field.unsettled_fraction
+    if case.sac is None or case.ostium is None:
+        return measures
+    measures["cells_across_parent_count"] = _parent_mm(case) / spacing_mm
+    measures["cells_across_neck_count"] = float(np.sqrt(4 * case.ostium.area_mm2 / np.pi)) / spacing_mm
+    measures["cells_across_sac_count"] = float(np.cbrt(6 * abs(case.sac.volume_mm3) / np.pi)) / spacing_mm
+    measures["neck_imbalance_fraction"] = _imbalance(field, found)
+    if case.settings.engine == LATTICE:
+        measures["raised_viscosity_fraction"] = _raised_fraction(case, field)
+    return measures
+
+
+def _parent_mm(case: FlowCase) -> float:
+    """Return the diameter of the parent artery beside the neck: a low quartile, because a sac widens the spheres."""
+    ostium = case.ostium
+    assert ostium is not None
+    diameters = [
+        2 * line.inscribed_radius_mm[ostium.closest(line.points_mm)[1] < NEAR_NECK_MM]
+        for line in case.vessel.centerlines
+    ]
+    near_mm = np.concatenate(diameters) if diameters else np.zeros(0)
+    return float(np.quantile(near_mm, 0.25)) if len(near_mm) else mean_diameter_mm(case.vessel)
+
+
+def _imbalance(field: FlowField, found: Mapping[str, float]) -> float:
+    """Return the part of the neck inflow that neither leaves by the neck nor through one branch of the sac."""
+    net_mL_s = found["neck_inflow_mL_s"] - found["neck_outflow_mL_s"]
+    branches: Floats = np.concatenate([[0.0], field.outlets_mL_s, -field.inlets_mL_s])
+    return float(np.nanmin(np.abs(net_mL_s - branches)) / max(found["neck_inflow_mL_s"], 1e-12))
+
+
+def _raised_fraction(case: FlowCase, field: FlowField) -> float:
+    """Return the fraction of the cells of sac and neck in which the viscosity is raised at some time."""
+    ostium, sac = case.ostium, case.sac
+    assert ostium is not None
+    assert sac is not None
+    width_mm = float(np.sqrt(4 * ostium.area_mm2 / np.pi))
+    moments = [np.linalg.norm(phase.velocity_m_s, axis=1) for phase in field.phases] or [field.speed_m_s]
+    fastest_m_s = np.max(moments, axis=0)
+    middle_mm, reach_mm = sac.vertices_mm.mean(axis=0), np.ptp(sac.vertices_mm, axis=0).max()
+    near = np.linalg.norm(field.centers_mm - middle_mm, axis=1) < reach_mm + width_mm
+    points_mm = field.centers_mm[near]
+    counts = (ostium.closest(points_mm)[1] < 0.5 * width_mm) | (sac.closest(points_mm)[1] < field.cell_size_mm)
+    reynolds = fastest_m_s[near] * field.cell_size_mm * M_PER_MM / field.blood.kinematic_viscosity_m2_s
+    return float((reynolds[counts] > CELL_REYNOLDS).mean()) if counts.any() else 0.0
