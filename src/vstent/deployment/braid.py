@@ -272,13 +272,7 @@ class ConstantWire(AbstractMethod):
         return replace(opened, contour=after)
 
     def _marched(self, placement: Placement, opened: Opened) -> Opened:
-        """Return the device with its rows moved according to their measured diameters until they have converged.
-
-        Raises
-        ------
-        LandingError
-            A row leaves the artery.
-        """
+        """Return the device with its rows moved according to their measured diameters until they have converged."""
         design, size, axis = placement.design, placement.size, placement.anatomy.axis
         profile = expected_profile(design, size, placement.anatomy)
         for done in range(ROUNDS):
