@@ -1,8 +1,8 @@
 """Move the joints of a laser-cut device so that its struts keep the length to which they were cut.
 
-Struts do not stretch. Outside a bend, the cells open along the axis as far as their struts allow. Where that is not
-enough, the joints leave the wall for a shorter path. Each joint moves along, around and off the wall. The moves
-minimise
+Struts do not stretch. On the outer side of a bend, the cells open along the axis as far as their struts allow. Where
+that is not enough, the joints leave the wall for a shorter path. Each joint moves along, around and off the wall. The
+moves minimise
 
     sum over struts of (length - length as cut)^2
     +  sum over cells of (SPRINGINESS (width - free width^2 / width) / 2)^2, and the same for their heights
@@ -35,9 +35,9 @@ SPRINGINESS: Final = 0.015
 BENDING: Final = 0.06
 """Weight of a joint whose distance from the wall differs from its neighbours', relative to an equal stretch of a strut.
 
-An estimate, without unit. For a device in a bend of 7 mm, without this term the device folds and gaps reach most of its
-radius. With BENDING equal to SPRINGINESS the gap is 0.6 mm, with four times that value 0.2 mm. Larger values trade gaps
-for stretched struts.
+An estimate, without unit. In a bend of 7 mm, a device without this term folds up, and gaps reach most of its radius.
+With BENDING equal to SPRINGINESS the gap is 0.6 mm, with four times that value 0.2 mm. Larger values trade gaps for
+stretched struts.
 """
 LEVEL: Final = 0.01
 """Weight of a joint that moves out of its row or around the device, relative to an equal stretch of a strut."""
@@ -186,7 +186,7 @@ def _points_mm(net: Net, moves: Floats, laid: Laid) -> Floats:
 
 def _lengths(points_mm: Floats, change: Floats, ends: Ints, bulge_mm2: Floats) -> tuple[Floats, coo_matrix]:
     """Return lengths (p,) between pairs of joints `ends` (2, p), along the wall, and their derivatives (p, 3 c)."""
-    # The bulge is what the squared arc along the wall exceeds the squared chord by.
+    # The bulge is the squared arc along the wall minus the squared chord.
     way_mm = points_mm[ends[1]] - points_mm[ends[0]]
     length_mm = np.sqrt(np.einsum("pk,pk->p", way_mm, way_mm) + bulge_mm2)
     ahead = way_mm / length_mm[:, None]

@@ -6,8 +6,8 @@ inner side they spread. Rows tilt, and on average they move closer together: in 
 the device, so the device is shorter.
 
 Crossings are moved by `vstent.kernels.net`. Its first aim is the right length of all pieces of wire. Many nets of wires
-meet it, and among them it takes the one nearest to the original rows. Outside a very tight bend even a straight wire
-can be too short. There no net meets the aim, and a penalty keeps the cells open.
+meet it, and among them it takes the one nearest to the original rows. On the outer side of a very tight bend even a
+straight wire can be too short. There no net meets the aim, and a penalty keeps the cells open.
 
 Joints of a laser-cut device may also leave the wall and are moved by `vstent.deployment.cells`.
 """

@@ -37,9 +37,9 @@ APPOSED_GAP_MM: Final = 0.1
 LOOSE_FRACTION: Final = 0.05
 """Fraction of a device that may have gaps without a note and without a wider size being proposed."""
 OVERSIZED_FRACTION: Final = 0.8
-"""Fraction by which the label may exceed the artery's diameter without a note.
+"""Fraction by which the label diameter may exceed the artery's diameter without a note.
 
-The label of 4.5 mm of the Enterprise fits arteries from 2.5 mm on.
+Enterprise, for example, has a label diameter of 4.5 mm and is made for arteries from 2.5 mm on.
 """
 
 

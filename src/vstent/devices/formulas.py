@@ -19,7 +19,7 @@ from vstent.devices.design import (
 from vstent.errors import DeviceError
 
 BEND_SAMPLES, BEND_STEPS = 12, 6
-"""Number of angles around half of the axis (the other half is symmetric), and of Newton steps, for rows in a bend."""
+"""Row spacing in a bend: angles around half of the axis (the other half is symmetric), and number of Newton steps."""
 STEEPEST_BEND = 0.9
 """Largest ratio of the artery's radius to the radius of its bend. Sharper bends occur only where the wall is folded."""
 STRAIGHTEST = 0.995
@@ -125,11 +125,11 @@ def row_spacing_mm(
 
     Notes
     -----
-    Where the axis bends, rows are h (1 + k cos(theta)) apart at the angle theta around the axis, with k = curvature D /
-    2. Pieces of wire keep their length l, so that cos(alpha) = h (1 + k cos(theta)) / l, and a column occupies l
-    sin(alpha) of the circumference. The n columns fill the circumference where the mean of 1 / sin(alpha) around it is
-    n l / (pi D). The spacing h is smaller than in a straight artery: columns narrow on the outer side of the bend,
-    where wires are drawn along the axis, more than they widen on the inner side.
+    Let k = curvature D / 2. In a bend, rows are h (1 + k cos(theta)) apart at the angle theta around the axis. Pieces
+    of wire keep their length l, so that cos(alpha) = h (1 + k cos(theta)) / l. A column occupies l sin(alpha) of the
+    circumference. The n columns fill the circumference where the mean of 1 / sin(alpha) around it is n l / (pi D). The
+    spacing h is smaller than in a straight artery: columns narrow on the outer side of the bend, where wires are drawn
+    along the axis, more than they widen on the inner side.
 
     The only assumption is that pieces keep their length between crossings, and that the wires keep their crossings. The
     formula therefore holds for the joined struts of a laser-cut device as well, as long as its cells can be apposed.

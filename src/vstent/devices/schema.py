@@ -35,41 +35,59 @@ _Lengths_mm = Annotated[list[Annotated[float, Field(gt=0, le=LARGEST_MM)]], Fiel
 
 
 class _Strict(BaseModel):
+    """Entry without unknown keys."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class _Sourced(_Strict):
+    """Entry with a source and a confidence."""
+
     source: str = Field(min_length=3)
     confidence: Confidence
 
 
 class _Number(_Sourced):
+    """Positive number."""
+
     value: _Positive
 
 
 class _Width(_Sourced):
+    """Width or thickness of a strut, in um."""
+
     value: _Width_um
 
 
 class _Count(_Sourced):
+    """Number of wires or columns."""
+
     value: _Whole
 
 
 class _Margin(_Sourced):
+    """Free diameter minus label diameter, in mm."""
+
     value: Annotated[float, Field(ge=0, le=1)]
 
 
 class _Wires(_Sourced):
+    """Group of equal wires."""
+
     count: _Whole
     diameter_um: _Width_um
 
 
 class _Sizes(_Sourced):
+    """Block of sizes: all pairs of its diameters and lengths."""
+
     diameters_mm: _Lengths_mm
     lengths_mm: _Lengths_mm
 
 
 class _Device(_Strict):
+    """Entry of a device of either family."""
+
     key: str = Field(pattern=r"^[a-z0-9_]+$")
     name: str
     maker: str
@@ -92,6 +110,8 @@ class _Device(_Strict):
 
 
 class _Braid(_Device):
+    """Entry of a braid."""
+
     kind: Literal["braid"]
     wires: list[_Wires] = Field(min_length=1)
     braid_angle_rad: _Number
@@ -112,6 +132,8 @@ class _Braid(_Device):
 
 
 class _LaserCut(_Device):
+    """Entry of a laser-cut device."""
+
     kind: Literal["laser_cut"]
     n_columns: _Count
     strut_width_um: _Width
@@ -135,6 +157,8 @@ class _LaserCut(_Device):
 
 
 class _Catalogue(_Strict):
+    """Content of a catalogue file."""
+
     device: list[Annotated[_Braid | _LaserCut, Field(discriminator="kind")]]
 
 

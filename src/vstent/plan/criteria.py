@@ -57,6 +57,8 @@ MEASURES: Final = (
 
 
 class _Strict(BaseModel):
+    """Entry without unknown keys."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
@@ -129,6 +131,8 @@ class Criteria:
 
 
 class _File(_Strict):
+    """Content of a file of criteria."""
+
     criterion: list[Criterion] = Field(min_length=1)
 
 

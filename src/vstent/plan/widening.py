@@ -60,6 +60,7 @@ class _Shift:
         return _Shift(before, np.concatenate([new.vertices_mm - old.vertices_mm for old, new in moved]))
 
     def __call__(self, points_mm: Floats) -> Floats:
+        """Return points (n, 3) moved like the nearest vertex of the wall, in mm."""
         return points_mm + self.shift_mm[self.tree.query(points_mm)[1]]
 
 
