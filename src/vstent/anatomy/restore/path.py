@@ -79,7 +79,7 @@ def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> fl
         return 0.0
     fork_mm = line.abscissa_mm[apart[0]]
     beyond = (line.abscissa_mm >= fork_mm) & (line.abscissa_mm <= fork_mm + REACH_MM)
-    # A path that is mostly in the sac is a branch of the sac, whose width says nothing about the branch.
+    # A path that is mostly in the sac leads to a branch of the sac. The width of the sac is not that of the branch.
     own = beyond & is_off if (beyond & is_off).sum() < 0.5 * beyond.sum() else beyond
     share = BACK if _turns_back(line, float(fork_mm)) else 1.0
     return share * float(np.median(line.inscribed_radius_mm[own]))

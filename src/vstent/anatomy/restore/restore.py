@@ -1,8 +1,8 @@
 """Restore the parent artery: find the sac, and close its neck and the ostia of the side branches.
 
-Zhong et al. 2016 shrink the sac by hand ("aneurysm scaling"). Here it is found automatically. Wall outside the tubes
-around all centerlines is a sac where it is farther out than the artery's radius. The parent artery is a tube around its
-own axis (`axis`). Its wall is the patient's own, except across necks and ostia, where the smoothest surface through the
+Zhong et al. 2016 shrink the sac by hand ("aneurysm scaling"). Here it is found automatically: a sac is wall that rises
+above the tubes around all centerlines by more than the artery's own radius. The parent artery is a tube around its own
+axis (`axis`). Its wall is the patient's own, except across necks and ostia, where the smoothest surface through the
 surrounding wall closes it (`landing`). The sac is the lumen outside that tube that contains the dome (`sac`).
 """
 
@@ -27,8 +27,8 @@ from vstent.kernels.arrays import Floats
 from vstent.units import place
 
 ON_FOOT: Final = 1.5
-"""Points of a bulge's foot up to this many artery radii above the artery belong to it. A foot rises to half a radius
-above the nearest artery."""
+"""Points of a bulge's foot up to this many artery radii above the artery are on that artery. A foot rises to half a
+radius above the nearest artery."""
 MOST_FLAT: Final = 3
 """Number of flat bulges that are examined at most: one on a branch takes as long as restoring the artery."""
 

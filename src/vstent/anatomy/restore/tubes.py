@@ -46,8 +46,8 @@ class Tubes:
         sphere = np.array(nearest, dtype=np.int32)
         own_mm = self.radius_mm[sphere]
         height = np.asarray(distance - own_mm)
-        # Within a group of spheres of similar radius, the nearest wall belongs to one of the nearest centers. Only a
-        # sphere wider than that at the nearest center can have a nearer wall.
+        # Within a group of spheres of similar radius, the nearest wall is that of the sphere with the nearest center.
+        # Across groups, only a sphere wider than the one at the nearest center can have a nearer wall.
         for members in np.array_split(np.argsort(-self.radius_mm), min(N_CLASSES, len(self.radius_mm))):
             widest = float(self.radius_mm[members[0]])
             open_ = np.flatnonzero(own_mm < widest)
