@@ -15,7 +15,13 @@ ZONE_MM: Final = 5.0
 def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
     """Return where the largest aneurysm's neck begins and ends on the parent axis, in mm.
 
-    Without an aneurysm, both values are the middle of the axis.
+    Parameters
+    ----------
+    anatomy : restored parent artery.
+
+    Returns
+    -------
+    proximal_mm, distal_mm : abscissae in mm; both are the middle of the axis without an aneurysm.
     """
     if anatomy.aneurysms:
         return anatomy.aneurysms[0].proximal_abscissa_mm, anatomy.aneurysms[0].distal_abscissa_mm
@@ -24,7 +30,12 @@ def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
 
 
 def neck_points_mm(anatomy: Anatomy) -> Floats:
-    """Return the vertices (n, 3) of the largest aneurysm's neck in mm; empty without an aneurysm."""
+    """Return the vertices (n, 3) of the largest aneurysm's neck in mm; empty without an aneurysm.
+
+    Parameters
+    ----------
+    anatomy : restored parent artery.
+    """
     if not anatomy.aneurysms:
         return np.zeros((0, 3))
     neck = anatomy.aneurysms[0].neck
@@ -32,7 +43,16 @@ def neck_points_mm(anatomy: Anatomy) -> Floats:
 
 
 def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
-    """Return the mean diameter of the parent artery in the proximal and in the distal landing zone, in mm."""
+    """Return the mean diameters of the parent artery in the landing zones beside the neck.
+
+    Parameters
+    ----------
+    anatomy : restored parent artery.
+
+    Returns
+    -------
+    proximal_mm, distal_mm : mean diameter of each zone in mm.
+    """
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     length_mm = anatomy.axis.length_mm
     before = np.linspace(max(0.0, proximal_mm - ZONE_MM), max(0.0, proximal_mm), 51)

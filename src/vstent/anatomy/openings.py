@@ -160,7 +160,12 @@ def _refuse_twice(inlets: Sequence[Opening], inlets_mm: Floats) -> None:
 
 
 def guessed(vessel: Vessel) -> Vessel:
-    """Return the vessel with a note if an outlet is nearly as wide as its automatically chosen inlet."""
+    """Return the vessel with a note if an outlet is nearly as wide as its automatically chosen inlet.
+
+    Parameters
+    ----------
+    vessel : vessel whose inlet is its widest opening.
+    """
     # The note gives the position of the outlet, because its number changes when ends are trimmed.
     widest = vessel.outlets[0]
     if widest.diameter_mm <= NEARLY * vessel.inlet.diameter_mm:
@@ -184,9 +189,17 @@ def _is_far(opening: Opening, point_mm: Floats) -> bool:
 
 
 def still_open(vessel: Vessel) -> Vessel | None:
-    """Return the vessel with those of its openings that its lumen still has; None if inlet or outlet is missing.
+    """Return the vessel with those of its openings that its lumen still has.
 
     If all inlets are gone, the widest remaining opening is the inlet.
+
+    Parameters
+    ----------
+    vessel : vessel with openings, some of which its lumen may have lost.
+
+    Returns
+    -------
+    vessel : vessel without centerlines; None if fewer than two openings, or no outlet, remain.
     """
     tree = cKDTree(vessel.lumen.loop_centers_mm) if len(vessel.lumen.boundary_loops) else None
     left = [o for o in vessel.openings if tree is not None and tree.query(o.center_mm)[0] < STILL * o.diameter_mm]

@@ -65,8 +65,11 @@ class _Mesh:
     """A mesh during repair, with the notes on the steps so far."""
 
     vertices: Floats
+    """(n, 3) positions in mm."""
     faces: Ints
+    """(m, 3) vertex indices."""
     notes: tuple[str, ...]
+    """One sentence for each change."""
 
     @property
     def geometry(self) -> tuple[Floats, Ints]:

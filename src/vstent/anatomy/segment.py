@@ -125,8 +125,8 @@ def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[
        the medians of tissue and lumen, the full width at half maximum (Hoogeveen et al. 1998).
 
     The wall of a cylinder of radius R, blurred with standard deviation s, is not at one half but at Phi(-s / (2 R)) of
-    the step (mean curvature flow, to first order). The slope of the profile gives s. R is that of the whole vessel;
-    `_unblurred` corrects branches and sacs.
+    the step (mean curvature flow, to first order), where Phi is the standard normal distribution. The slope of the
+    profile gives s. R is that of the whole vessel; `_unblurred` corrects branches and sacs.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[
     -------
     lumen : voxels of the vessel, with the proposed threshold.
     notes : how the threshold was found.
-    profile : mean profile across the wall.
+    profile : median profile across the wall.
 
     References
     ----------

@@ -6,7 +6,7 @@ Two cases are corrected, because the artery that the path leaves out would be lo
   second path is sought that avoids wide spheres. It is used where it is an artery beside a sac.
 - Blood enters through one arm of a fork, such as a vertebral artery, and the path to the other arm turns back at the
   fork. It cuts through the crotch between the arms, which is a sac or two walls joined by the scan, and misses the
-  junction. The path is led along both arms by way of the path to a third opening.
+  junction. The corrected path follows both arms, along the path to a third opening and back.
 """
 
 from collections.abc import Iterator, Sequence
@@ -48,7 +48,7 @@ arteries have less."""
 
 
 def along_arms(graph: medial.Medial, paths: Sequence[Ints], radius_cap: Floats) -> list[Ints]:
-    """Lead each path along both arms of a fork where it cuts through the crotch between them.
+    """Correct each path to follow both arms of a fork where it cuts through the crotch between them.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def along_arms(graph: medial.Medial, paths: Sequence[Ints], radius_cap: Floats) 
 
 
 def around_sacs(graph: medial.Medial, path: Ints, speed_cap: float) -> tuple[Ints, list[str]]:
-    """Lead a path around the sacs that it runs through, where there is an artery beside them.
+    """Correct a path to follow the artery around each sac that it runs through, where there is one.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def _led(path: Ints, instead: Sequence[tuple[Ints, Ints]]) -> Ints:
 
 
 def _is_artery(graph: medial.Medial, through: Ints, around: Ints, parent_mm: Floats) -> bool:
-    """Return whether a path around a sac (k,) is an artery beside the sac."""
+    """Return whether the path around a sac, vertices (k,), is an artery beside it."""
     taken_mm = graph.radius[around]
     if graph.radius[through].max() < SAC * taken_mm.max():
         return False
@@ -171,7 +171,7 @@ def _is_lumen_between(graph: medial.Medial, through: Ints, around: Ints) -> bool
 
 
 def _sentence(graph: medial.Medial, through: Ints) -> str:
-    """Return the note on a sac that a path is led around."""
+    """Return the note on a sac around which a path is corrected."""
     widest = through[graph.radius[through].argmax()]
     place = ", ".join(f"{x:.0f}" for x in graph.points[widest])
     return (

@@ -17,8 +17,8 @@ from vstent.kernels.medial import widest_in_section
 N_RAYS: Final = 24
 """Number of directions in which the wall is sought around a center."""
 NEAR: Final = 0.01
-"""Scale of the movement of a center, in radii. A center moves a few of these at most, so that it does not move into a
-sac, whose sphere is larger."""
+"""Scale of the movement of a center, in radii. A center moves a few of these at most, and longer movements are damped:
+in the mouth of a sac the largest sphere is that of the sac."""
 GAIN: Final = 0.5
 """Smallest growth of a sphere per distance that its center moves. In a flat section many spheres are nearly as large,
 and the path is kept."""

@@ -46,7 +46,13 @@ class Opening:
 
 
 def roles(n_inlets: int, n_outlets: int) -> list[str]:
-    """Return the roles of a vessel's openings in their order: inlets first, then outlets."""
+    """Return the roles of a vessel's openings in their order: inlets first, then outlets.
+
+    Parameters
+    ----------
+    n_inlets : number of inlets.
+    n_outlets : number of outlets.
+    """
     inlets = ["inlet", *(f"inlet_{k}" for k in range(2, n_inlets + 1))]
     return [*inlets, *(f"outlet_{k}" for k in range(1, n_outlets + 1))]
 

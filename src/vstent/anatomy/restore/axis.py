@@ -243,7 +243,17 @@ def section_rays(lumen: Surface, points_mm: Floats, n_rays: int) -> Floats:
 
 
 def section_directions(points_mm: Floats, n_rays: int) -> Floats:
-    """Return unit vectors (n, n_rays, 3) of the rays around axis points (n, 3), counter-clockwise about the axis."""
+    """Return the unit vectors of the rays around axis points.
+
+    Parameters
+    ----------
+    points_mm : (n, 3) axis points in mm.
+    n_rays : number of rays in a section.
+
+    Returns
+    -------
+    directions : (n, n_rays, 3) unit vectors, counter-clockwise about the direction of the axis.
+    """
     frames = curves.parallel_frames(points_mm)
     angle = 2 * np.pi * np.arange(n_rays) / n_rays
     return np.cos(angle)[None, :, None] * frames[:, None, 1] + np.sin(angle)[None, :, None] * frames[:, None, 2]

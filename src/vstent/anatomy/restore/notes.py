@@ -47,7 +47,13 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
 
 
 def candidates_told(aneurysms: Sequence[Aneurysm], candidates: Sequence[Candidate]) -> tuple[str, ...]:
-    """Return a note on bulges that were not used as aneurysms, with how to choose one."""
+    """Return a note on bulges that are not used as aneurysms, with how to choose one.
+
+    Parameters
+    ----------
+    aneurysms : sacs that are used.
+    candidates : all bulges with their class.
+    """
     others = [one.described for one in candidates if not one.is_aneurysm]
     if not others:
         return ()
@@ -56,7 +62,12 @@ def candidates_told(aneurysms: Sequence[Aneurysm], candidates: Sequence[Candidat
 
 
 def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
-    """Return a note on a bulge that is used as a sac only on request."""
+    """Return a note on a bulge that is used as a sac only on request.
+
+    Parameters
+    ----------
+    bulge : flat bulge; None where there is none.
+    """
     if bulge is None:
         return ()
     return (

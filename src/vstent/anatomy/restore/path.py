@@ -53,7 +53,17 @@ def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -
 
 
 def is_off_sacs(line: Centerline, bulges: list[Bulge]) -> Bools:
-    """Return whether each point (n,) of a centerline has an inscribed sphere that no bulge widens."""
+    """Return whether each point of a centerline has an inscribed sphere that no bulge widens.
+
+    Parameters
+    ----------
+    line : centerline of n points.
+    bulges : bulges that may be sacs.
+
+    Returns
+    -------
+    is_off : (n,) whether the sphere reaches into no bulge.
+    """
     off = np.ones(len(line.points_mm), dtype=bool)
     for bulge in bulges:
         off &= bulge.distances_mm(line.points_mm) > IN_SAC * line.inscribed_radius_mm
@@ -61,7 +71,13 @@ def is_off_sacs(line: Centerline, bulges: list[Bulge]) -> Bools:
 
 
 def reach_of(line: Centerline, bulge: Bulge) -> float:
-    """Return the smallest distance from a centerline to a bulge's foot, in parent radii; the artery's wall is at 1."""
+    """Return the smallest distance from a centerline to a bulge's foot, in parent radii.
+
+    Parameters
+    ----------
+    line : centerline of an artery; its wall is at a distance of 1.
+    bulge : bulge that may be a sac.
+    """
     radius = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
     return float((cKDTree(bulge.foot_mm).query(line.points_mm)[0] / radius).min())
 

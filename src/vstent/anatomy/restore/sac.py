@@ -104,7 +104,13 @@ def _low_mm(vessel: Vessel, landing: Landing, bulge: Bulge) -> float:
 
 
 def is_in_one(points_mm: Floats, aneurysms: Sequence[Aneurysm]) -> bool:
-    """Return whether most of the points (n, 3) of a sac or bulge, in mm, lie in or on one of the aneurysms."""
+    """Return whether most points of a sac or bulge lie in or on one of the aneurysms.
+
+    Parameters
+    ----------
+    points_mm : (n, 3) points in mm.
+    aneurysms : sacs that are already cut off.
+    """
     return any(np.median(one.sac.signed_distance(points_mm)) < ON_SAC_MM for one in aneurysms)
 
 
