@@ -1,5 +1,5 @@
-"""From a scan or a surface to the parent artery: an `Image` or a `Surface` in, an `Anatomy` (sac, neck, artery) out.
+"""From a scan or a surface to the parent artery: from an `Image` or a `Surface` to an `Anatomy` (sac, neck, artery).
 
 The steps run in this order: ``segment``, ``repair``, ``openings``, ``trace``, ``trim``, ``restore``, ``morphology``.
-Open ``trace.py`` first.
+Read ``trace.py`` first.
 """

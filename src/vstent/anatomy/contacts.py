@@ -1,9 +1,10 @@
-"""Contacts: arteries that touch, so that a scan shows one lumen where there are two.
+"""Find and separate arteries that touch, so that the scan shows one lumen where there are two.
 
-Where two walls come nearer to each other than the scan resolves, its surface joins the lumens by a window, and a
-centerline may slip through it. A way through a stenosis goes straight on, and one into a branch follows the branch; a
-way through a window turns off one artery, crosses, and turns into another, and both arteries go on beside it as if it
-were not there. A communicating artery has that shape too, but the arteries it joins lie further apart than their radii.
+Where two walls are closer than the resolution of the scan, its surface joins the two lumens by a window, and a
+centerline may pass through it. The course of the path identifies a window. A path through a stenosis is straight, and a
+path into a branch follows the branch. A path through a window turns off one artery, crosses, and turns into another,
+and both arteries continue as if there were no window. A communicating artery has this shape too, but the arteries that
+it joins are farther apart than their radii.
 """
 
 from dataclasses import replace
@@ -21,39 +22,40 @@ from vstent.kernels.medial import Medial
 from vstent.units import place
 
 STEP_MM: Final = 0.05
-"""Paths are looked at in steps of this length."""
+"""Spacing in mm of the points at which a path is examined."""
 WAIST: Final = 0.85
-"""The inscribed sphere of a window is narrower than this fraction of those of both arteries..."""
+"""Largest radius of the inscribed sphere in a window, as a fraction of the radius of the thinner artery."""
 SMALL: Final = 0.4
-"""... and than this one where what is beyond it hangs on it alone and has less than two openings of its own: blood
-comes to it through a wider window, or not at all."""
+"""The same, where the part beyond the window is connected only through it and has fewer than two openings: blood
+reaches that part through a wider window or not at all."""
 NEAR: Final = 2.5
-"""A window lies within this many radii of both arteries' axes along the way: one that leaves an axis tangentially and
-enters the window at a right angle is a quarter of a circle of one radius..."""
+"""Largest distance along the path from a window to the axis of either artery, in radii. A path that leaves an axis
+tangentially and enters the window at a right angle is a quarter circle of one radius."""
 APART: Final = 1.15
-"""... and the axes are no further apart than this many times the sum of both radii: the walls touch."""
+"""Largest distance between the two axes, relative to the sum of both radii, at which the walls touch."""
 TURN_RAD: Final = np.radians(50.0)
-"""On both sides of a window the way turns by more than this."""
+"""Smallest angle, in rad, by which the path turns on both sides of a window."""
 AHEAD: Final = 1.5
-"""So many radii further along either axis the artery goes on..."""
+"""Distance along either axis beyond the window, in radii, at which the artery must continue."""
 SAME: Final = 0.75
-"""... as a sphere of at least this many of its radii, off the straight line by at most as many."""
+"""Smallest sphere, in artery radii, and largest distance from the straight line, in artery radii, with which an artery
+continues."""
 REACH: Final = 1.5
-"""The crevice around a window reaches no further from its middle than this many radii of the thinner artery."""
+"""Largest extent of the crevice around a window from its center, in radii of the thinner artery."""
 
 
 class Artery(NamedTuple):
-    """An artery beside a window, as straight and round as it is there."""
+    """An artery beside a window, as a straight cylinder."""
 
     point_mm: Floats
-    """(3,) on its axis."""
+    """(3,) point on its axis."""
     direction: Floats
-    """(3,) unit vector along it."""
+    """(3,) unit vector along its axis."""
     radius_mm: float
-    """Its radius."""
+    """Radius in mm."""
 
     def height_mm(self, points_mm: Floats) -> Floats:
-        """Distance (n,) of points (n, 3) to its wall, negative inside."""
+        """Return the distance (n,) of points (n, 3) to its wall, in mm; negative inside."""
         offset = points_mm - self.point_mm
         along = (offset @ self.direction)[:, None] * self.direction
         return np.asarray(np.linalg.norm(offset - along, axis=1) - self.radius_mm)
@@ -63,22 +65,33 @@ class Contact(NamedTuple):
     """A window between two arteries."""
 
     center_mm: Floats
-    """(3,) its middle."""
+    """(3,) center of the window."""
     radius_mm: float
-    """Radius of the inscribed sphere in it."""
+    """Radius of the inscribed sphere in the window."""
     before: Artery
-    """The artery that the way comes from."""
+    """Artery from which the path comes."""
     after: Artery
-    """The artery that it goes to."""
+    """Artery into which the path turns."""
 
     @property
     def artery_mm(self) -> float:
-        """Radius of the thinner artery."""
+        """Radius of the thinner artery in mm."""
         return min(self.before.radius_mm, self.after.radius_mm)
 
 
 def find_contact(path_mm: Floats, radius_mm: Floats, spheres: Medial) -> Contact | None:
-    """Find the narrowest window on a path (n, 3) with inscribed radii (n,) along the medial axis of a lumen."""
+    """Find the narrowest window between two arteries on a path.
+
+    Parameters
+    ----------
+    path_mm : (n, 3) points of the path in mm, along the medial axis of the lumen.
+    radius_mm : (n,) inscribed radii in mm.
+    spheres : inscribed spheres of the lumen.
+
+    Returns
+    -------
+    contact : None where the path crosses no window.
+    """
     place = curves.arc_length(path_mm)
     even = np.arange(0.0, place[-1], STEP_MM)
     points, radius = curves.interpolate(place, path_mm, even), np.interp(even, place, radius_mm)
@@ -89,7 +102,7 @@ def find_contact(path_mm: Floats, radius_mm: Floats, spheres: Medial) -> Contact
 
 
 def _contact_at(points: Floats, radius: Floats, waist: int, spheres: Medial) -> Contact | None:
-    """The window at a waist of the path; None for a stenosis, a branch or a communicating artery."""
+    """Return the window at a waist of the path; None for a stenosis, a branch or a communicating artery."""
     before, after = (_artery(points[waist::sense], radius[waist::sense]) for sense in (-1, 1))
     if before is None or after is None:
         return None
@@ -105,14 +118,14 @@ def _contact_at(points: Floats, radius: Floats, waist: int, spheres: Medial) -> 
 
 
 def _goes_on(spheres: Medial, artery: Artery) -> bool:
-    """Tell whether an artery goes on beyond the point where the way turns off it."""
+    """Return whether an artery continues beyond the point where the path turns off it."""
     ahead = artery.point_mm + AHEAD * artery.radius_mm * artery.direction
     near = cKDTree(spheres.points).query_ball_point(ahead, SAME * artery.radius_mm)
     return bool((spheres.radius[near] > SAME * artery.radius_mm).any())
 
 
 def _artery(points: Floats, radius: Floats) -> Artery | None:
-    """The artery that a path (n, 3) comes to from a waist, directed towards the waist; None where there is none."""
+    """Return the artery that a path (n, 3) reaches from a waist, directed to the waist; None where there is none."""
     widest = np.maximum.accumulate(radius)
     shrinks = np.flatnonzero(radius < 0.9 * widest)
     end = int(shrinks[0]) if len(shrinks) else len(radius)
@@ -126,24 +139,24 @@ def _artery(points: Floats, radius: Floats) -> Artery | None:
 
 
 def _angle(one: Floats, other: Floats) -> float:
-    """Angle between two lines along vectors (3,), from 0 to a right angle."""
+    """Return the angle between two lines along vectors (3,), in rad, from 0 to a right angle."""
     cosine = abs(float(one @ other)) / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-12)
     return float(np.arccos(min(cosine, 1.0)))
 
 
 def part(vessel: Vessel, contact: Contact, *, holds_inlet: bool) -> Vessel | None:
-    """Close a window from both sides.
+    """Separate two arteries by closing the window between them on both sides.
 
     Parameters
     ----------
     vessel : lumen and openings.
-    contact : the window.
-    holds_inlet : where the vessel falls apart, keep the part with the inlet; the larger part otherwise.
+    contact : window between the arteries.
+    holds_inlet : where the vessel falls into two parts, keep the part with the inlet; otherwise keep the larger part.
 
     Returns
     -------
-    vessel : with a note of what was cut and where, to be traced anew; None where there is no clean cut, where it
-        would leave fewer than two openings, or take off an inlet, or what a window feeds that is not small.
+    vessel : vessel without centerlines, with a note on the cut. None where no clean cut exists, or where the cut would
+        leave fewer than two openings, remove an inlet, or remove a part fed through a window that is not small.
     """
     lumen = vessel.lumen
     ring = _ring(lumen, contact)
@@ -168,7 +181,7 @@ def part(vessel: Vessel, contact: Contact, *, holds_inlet: bool) -> Vessel | Non
 
 
 def _ring(lumen: Surface, contact: Contact) -> Bools | None:
-    """Faces (m,) around the window, in the crevice between the two arteries; None where it is no ring about it."""
+    """Return whether each face (m,) is in the crevice around the window; None where these faces form no ring."""
     points = lumen.vertices_mm
     nearer = contact.before.height_mm(points) > contact.after.height_mm(points)
     is_after = nearer[lumen.faces]
@@ -187,7 +200,7 @@ def _ring(lumen: Surface, contact: Contact) -> Bools | None:
 
 
 def _kept(vertices: Floats, faces: Ints, inlet_mm: Floats | None) -> Bools:
-    """Faces (m,) of the part at the inlet (3,), or of the part of largest area."""
+    """Return whether each face (m,) is in the part at the inlet (3,), or in the part of largest area."""
     label = triangles.components(faces, len(vertices))
     if inlet_mm is not None:
         return np.asarray(label == label[np.linalg.norm(vertices[faces].mean(axis=1) - inlet_mm, axis=1).argmin()])
@@ -195,6 +208,7 @@ def _kept(vertices: Floats, faces: Ints, inlet_mm: Floats | None) -> Bools:
 
 
 def _note(contact: Contact, lost: float) -> str:
+    """Return the note on two separated arteries."""
     left = f"; the part connected only through it ({lost:.0%} of the wall) was removed" if lost > 0 else ""
     return (
         f"Two touching arteries were separated at {place(contact.center_mm)} (window of "

@@ -1,4 +1,4 @@
-"""The neck on the parent axis, and the landing zones beside it."""
+"""Position of the neck on the parent axis, and the landing zones on both sides of it."""
 
 from typing import Final
 
@@ -9,11 +9,20 @@ from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats
 
 ZONE_MM: Final = 5.0
-"""Length of a landing zone beside the neck."""
+"""Length of a landing zone beside the neck, in mm."""
 
 
 def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
-    """Where the neck of the largest aneurysm begins and ends on the parent axis; the axis's middle without one."""
+    """Return where the largest aneurysm's neck begins and ends on the parent axis, in mm.
+
+    Parameters
+    ----------
+    anatomy : restored parent artery.
+
+    Returns
+    -------
+    proximal_mm, distal_mm : abscissae in mm; both are the middle of the axis without an aneurysm.
+    """
     if anatomy.aneurysms:
         return anatomy.aneurysms[0].proximal_abscissa_mm, anatomy.aneurysms[0].distal_abscissa_mm
     middle_mm = 0.5 * anatomy.axis.length_mm
@@ -21,7 +30,12 @@ def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
 
 
 def neck_points_mm(anatomy: Anatomy) -> Floats:
-    """Corners (n, 3) of the faces of the largest aneurysm's neck; none without one."""
+    """Return the vertices (n, 3) of the largest aneurysm's neck in mm; empty without an aneurysm.
+
+    Parameters
+    ----------
+    anatomy : restored parent artery.
+    """
     if not anatomy.aneurysms:
         return np.zeros((0, 3))
     neck = anatomy.aneurysms[0].neck
@@ -29,7 +43,16 @@ def neck_points_mm(anatomy: Anatomy) -> Floats:
 
 
 def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
-    """Mean diameter of the parent artery in the proximal and in the distal landing zone."""
+    """Return the mean diameters of the parent artery in the landing zones beside the neck.
+
+    Parameters
+    ----------
+    anatomy : restored parent artery.
+
+    Returns
+    -------
+    proximal_mm, distal_mm : mean diameter of each zone in mm.
+    """
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     length_mm = anatomy.axis.length_mm
     before = np.linspace(max(0.0, proximal_mm - ZONE_MM), max(0.0, proximal_mm), 51)

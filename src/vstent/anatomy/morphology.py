@@ -1,4 +1,4 @@
-"""Morphology of the aneurysm: sac, neck and parent artery in numbers."""
+"""Measure the aneurysm: sac, neck and parent artery in numbers."""
 
 from dataclasses import replace
 from typing import Final
@@ -13,29 +13,48 @@ from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 
 Measures = dict[str, float | str]
-"""Numbers by names that end in their unit; a few names hold words."""
+"""Values by name; names of numbers end in their unit, and a few values are text."""
 Morphology = dict[str, float | str | Measures]
-"""The same, with the measures of each further sac under a name of their own: ``sac_2``, ``sac_3``, ..."""
+"""Measures of the largest sac, with those of each further sac under ``sac_2``, ``sac_3``, ..."""
 PARTED: Final = 0.9
-"""A section by the neck plane of less than so much of the neck is a piece: the artery's wall rises through it."""
+"""The section by the neck plane is left out where its largest piece is below this fraction of the neck area: the
+artery's wall rises through the plane there."""
 FEWEST_AXIS_POINTS: Final = 9
-"""A shorter axis is too short to tell how it bends."""
+"""Fewest axis points from which curvature and torsion are computed."""
 BENT: Final = 0.1
-"""An axis is bent, and has a torsion, where its curvature exceeds this over the artery's diameter."""
+"""An axis is bent, and has a torsion, where its curvature exceeds this value divided by the artery's diameter."""
 
 
 def morphology(anatomy: Anatomy) -> Morphology:
-    """Measure the parent artery and its aneurysms: the largest first, others under ``sac_2``, ``sac_3`` and so on.
+    """Measure the parent artery and its aneurysms.
 
-    Height, aspect ratio and size ratio as defined by Dhar et al. 2008 (Neurosurgery 63:185): the height is measured
-    square to the neck plane; the size ratio takes the longest distance from the neck's center to the dome; the neck's
-    diameter in the aspect ratio is twice the mean distance from its center to its rim. Volume and area are those of
-    the sac, closed across the neck, which is curved like the artery's wall. Most of the literature cuts a sac by a
-    plane instead (Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355): the sac beyond the neck plane, which goes
-    through the neck's center square to its vector area, and its section by it stand beside; the section is left out
-    where the artery's wall rises through the plane and parts it. Curvature and torsion are those of the parent axis
-    (Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141), of a quartic through one diameter of it to both sides;
-    that much is left out at its ends.
+    Height, aspect ratio and size ratio follow Dhar et al. 2008. The height is measured perpendicular to the neck plane.
+    The size ratio uses the longest distance from the center of the neck to the dome. The neck diameter in the aspect
+    ratio is twice the mean distance from the center of the neck to its rim.
+
+    Volume and area are those of the sac closed across the curved neck. Most of the literature cuts the sac by a plane
+    instead (Raghavan et al. 2005). For comparison, the volume beyond the neck plane and the area of the section are
+    listed too. That plane passes through the center of the neck, perpendicular to its vector area. The section is left
+    out where the artery's wall rises through the plane and divides it.
+
+    Curvature and torsion are those of the parent axis (Piccinelli et al. 2009), from a quartic fitted over one diameter
+    on both sides. The same length is left out at both ends of the axis.
+
+    Parameters
+    ----------
+    anatomy : restored parent artery with its aneurysms.
+
+    Returns
+    -------
+    measures : values by name, for the largest aneurysm; those of further ones under ``sac_2``, ``sac_3`` and so on.
+
+    References
+    ----------
+    Dhar et al. 2008, Neurosurgery 63:185.
+
+    Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355.
+
+    Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141.
     """
     found: Morphology = {**_parent(anatomy)}
     if anatomy.vessel.threshold_band_mm > 0:
@@ -49,13 +68,13 @@ def morphology(anatomy: Anatomy) -> Morphology:
 
 
 def _parent(anatomy: Anatomy) -> dict[str, float]:
-    """Diameters of the parent artery beside the neck of the largest aneurysm."""
+    """Return the diameters of the parent artery on both sides of the largest aneurysm's neck."""
     proximal_mm, distal_mm = landing_diameters_mm(anatomy)
     return {"parent_proximal_diameter_mm": proximal_mm, "parent_distal_diameter_mm": distal_mm}
 
 
 def _course(anatomy: Anatomy) -> Measures:
-    """How the parent axis bends and twists; nothing for an axis of a few points."""
+    """Return curvature and torsion of the parent axis; empty for an axis of few points."""
     axis = anatomy.axis
     diameter_mm = 2 * float(np.median(anatomy.section_radius_mm))
     inner = (axis.abscissa_mm >= diameter_mm) & (axis.abscissa_mm <= axis.length_mm - diameter_mm)
@@ -77,6 +96,7 @@ def _course(anatomy: Anatomy) -> Measures:
 
 
 def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
+    """Return the measures of a sac and its neck."""
     rim_mm, dome_mm = aneurysm.neck_mm, aneurysm.sac.vertices_mm
     center_mm = triangles.polygon_centroid(rim_mm)
     vector_mm2 = triangles.polygon_area_vector(rim_mm)
@@ -108,7 +128,7 @@ def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
 
 
 def _beyond(sac: Surface, center_mm: Floats, normal: Floats) -> tuple[float, float]:
-    """Area of the largest piece of a sac's section by a plane, and the volume beyond that plane."""
+    """Return the area of the largest piece of a sac's section by a plane, and the volume beyond that plane."""
     below_mm = -(sac.vertices_mm - center_mm) @ normal
     vertices, faces, _ = triangles.clip(sac.vertices_mm, sac.faces, below_mm)
     loops = triangles.boundary_loops(vertices, faces)
@@ -118,7 +138,7 @@ def _beyond(sac: Surface, center_mm: Floats, normal: Floats) -> tuple[float, flo
 
 
 def _diameter_mm(points_mm: Floats) -> float:
-    """Largest distance between points (n, 3), sought among those that are outermost in 600 directions."""
+    """Return the largest distance between points (n, 3) that are outermost in one of 600 directions."""
     turn = np.pi * (3 - np.sqrt(5)) * np.arange(600)
     z = np.linspace(-1, 1, 600)
     directions = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
@@ -127,7 +147,7 @@ def _diameter_mm(points_mm: Floats) -> float:
 
 
 def _widths_mm(rim_mm: Floats, normal: Floats) -> Floats:
-    """Widths (180,) of a closed curve in every direction of the plane square to `normal`, one per degree."""
+    """Return the widths (180,) of a closed curve in the plane perpendicular to `normal`, one per degree."""
     first = curves.any_perpendicular(normal)
     second = np.cross(normal, first)
     angle = np.pi * np.arange(180) / 180

@@ -1,7 +1,7 @@
-"""Find the vessel's ends and open them: open loops, flat caps, and arms that end blind.
+"""Find the ends of a vessel and open them: open loops, flat caps, and arms that end blind.
 
-A lumen comes from three kinds of sources and ends in three ways: an exported surface is open at its ends or closed by
-flat caps; a surface from a scan is open where the vessel leaves the image, and blunt where the contrast fades.
+An exported surface is open at its ends or closed by flat caps. A surface from a scan is open where the vessel leaves
+the image, and ends blind where the contrast fades.
 """
 
 from collections.abc import Sequence
@@ -19,43 +19,54 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import counted, place
 
 CAP_ANGLE_RAD: Final = np.radians(6.0)
-"""Neighbouring faces of a flat cap differ by less than this."""
+"""Largest angle between neighbouring faces of a flat cap, in rad."""
 CAP_RIM_RAD: Final = np.radians(35.0)
-"""Along its rim a cap meets the wall at more than this on average."""
+"""Smallest angle between cap and wall at a sharp edge of the rim, in rad."""
 CAP_RIM_EDGES: Final = 8
-"""A cap's outline has at least this many edges: fewer may make a large triangle of a coarse wall, not a cap..."""
+"""Fewest edges in the outline of a cap; a patch with fewer may be a large triangle of a coarse wall."""
 FEWEST_RIM_EDGES: Final = 6
-"""... but for a cap of at least this many behind which the lumen is no wider than it."""
+"""Fewest edges in the outline of a cap where the lumen behind the patch is as narrow as the patch."""
 CAP_AREA_MM2: Final = 0.3
-"""The smallest cap: a vessel 0.6 mm wide."""
+"""Smallest area of a cap in mm2: a vessel 0.6 mm wide."""
 ARM_SLENDERNESS: Final = 6.0
-"""A blind arm longer than this many of its mean radii is a vessel; shorter ones are sacs and bumps."""
+"""A blind arm longer than this many of its median radii is a vessel; a shorter one is a sac or a bump."""
 STUMP_SLENDERNESS: Final = 2.5
-"""The same where that leaves blood no way in and out: of a piece cut out close to a sac the ends are short."""
+"""The same where the vessel would otherwise have fewer than two openings: a piece cut out close to a sac has short
+ends."""
 ARM_SWELLING: Final = 1.35
-"""An arm whose widest sphere exceeds its median by more than this factor near the tip is a sac on a stalk."""
+"""An arm is a sac on a stalk if its widest sphere near the tip exceeds its median radius by this factor."""
 ARM_SHARE: Final = 0.15
-"""Opening an arm takes off its tip and the twigs on it: no more than this fraction of the wall."""
+"""Largest fraction of the wall that opening an arm removes: its tip with the small branches on it."""
 ARM_RADIUS_MM: Final = 0.5
-"""Thinner blind arms are left closed: no flow worth computing leaves through them."""
+"""Blind arms with a smaller radius, in mm, stay closed: their flow is negligible."""
 FARTHEST_MM: Final = 5.0
+"""Largest distance of a given point from its opening, in mm; `FARTHEST_DIAMETERS` applies where that is larger."""
 FARTHEST_DIAMETERS: Final = 2.0
-"""How far from an opening a point beside it may lie: the greater of the two."""
+"""Largest distance of a given point from its opening, in diameters of the opening."""
 STILL: Final = 0.1
-"""An end whose middle is within this many diameters of an opening's is that opening still."""
+"""An end is the same opening as before if its center moved by less than this many diameters."""
 NEARLY: Final = 0.8
-"""An outlet wider than this fraction of an inlet that was not given may be the inlet."""
+"""An outlet wider than this fraction of an automatically chosen inlet may be the true inlet."""
 
 
 def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
-    """Return the vessel with its ends cut open and listed, and its inscribed spheres.
+    """Cut open and list the ends of a vessel.
 
-    The widest end is the inlet; the outlets are numbered by width.
+    The widest end is the inlet. The outlets are numbered from the widest to the narrowest.
+
+    Parameters
+    ----------
+    vessel : vessel without openings.
+
+    Returns
+    -------
+    vessel : vessel with openings.
+    spheres : inscribed spheres of its lumen.
 
     Raises
     ------
     VesselError
-        When fewer than two ends can be found.
+        When fewer than two ends are found.
     """
     lumen, n_caps = _without_caps(vessel.lumen)
     notes = [f"{counted(n_caps, 'flat cap')} removed to open the vessel."] if n_caps else []
@@ -87,12 +98,17 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
 
 
 def opening_at(vessel: Vessel, point_mm: Floats) -> Opening:
-    """Return the opening nearest to a point (3,) beside it, or within the lumen that leads to it.
+    """Return the opening nearest to a point beside it or in the lumen.
+
+    Parameters
+    ----------
+    vessel : vessel with openings.
+    point_mm : (3,) point in mm.
 
     Raises
     ------
     InputError
-        When the point lies outside the lumen, farther than 5 mm and two diameters from every opening.
+        When the point is outside the lumen and farther than 5 mm and two diameters from the nearest opening.
     """
     nearest = min(vessel.openings, key=lambda opening: _away_mm(opening, point_mm))
     if _is_far(nearest, point_mm) and vessel.lumen.closed.signed_distance(point_mm[None])[0] > 0:
@@ -104,12 +120,17 @@ def opening_at(vessel: Vessel, point_mm: Floats) -> Opening:
 
 
 def with_inlets(vessel: Vessel, inlets_mm: Floats) -> Vessel:
-    """Return the vessel with the openings at `inlets_mm` (k, 3), see `opening_at`, as its inlets; notes tell far ones.
+    """Return the vessel with the openings at given points as its inlets, with a note on each distant point.
+
+    Parameters
+    ----------
+    vessel : vessel with openings.
+    inlets_mm : (k, 3) points in mm, see `opening_at`; the first one is where the parent artery begins.
 
     Raises
     ------
     InputError
-        When a point is near no opening, two are at the same one, or no opening is left for blood to leave through.
+        When a point is near no opening, two points are near the same one, or no opening is left as an outlet.
     """
     inlets = [opening_at(vessel, inlet_mm) for inlet_mm in inlets_mm]
     _refuse_twice(inlets, inlets_mm)
@@ -128,7 +149,7 @@ def with_inlets(vessel: Vessel, inlets_mm: Floats) -> Vessel:
 
 
 def _refuse_twice(inlets: Sequence[Opening], inlets_mm: Floats) -> None:
-    """Refuse points (k, 3) of which two are nearest to the same opening."""
+    """Raise an InputError where two of the points (k, 3) have the same nearest opening."""
     for k, inlet in enumerate(inlets):
         first = inlets.index(inlet)
         if first < k:
@@ -139,10 +160,13 @@ def _refuse_twice(inlets: Sequence[Opening], inlets_mm: Floats) -> None:
 
 
 def guessed(vessel: Vessel) -> Vessel:
-    """Return the vessel; where an outlet is nearly as wide as its inlet, which is only the widest end, a note says so.
+    """Return the vessel with a note if an outlet is nearly as wide as its automatically chosen inlet.
 
-    The outlet is named by its place: its number changes where ends are trimmed off.
+    Parameters
+    ----------
+    vessel : vessel whose inlet is its widest opening.
     """
+    # The note gives the position of the outlet, because its number changes when ends are trimmed.
     widest = vessel.outlets[0]
     if widest.diameter_mm <= NEARLY * vessel.inlet.diameter_mm:
         return vessel
@@ -155,17 +179,27 @@ def guessed(vessel: Vessel) -> Vessel:
 
 
 def _away_mm(opening: Opening, point_mm: Floats) -> float:
+    """Return the distance of a point (3,) from the center of an opening, in mm."""
     return float(np.linalg.norm(opening.center_mm - point_mm))
 
 
 def _is_far(opening: Opening, point_mm: Floats) -> bool:
+    """Return whether a point (3,) is too far from an opening to belong to it."""
     return _away_mm(opening, point_mm) > max(FARTHEST_MM, FARTHEST_DIAMETERS * opening.diameter_mm)
 
 
 def still_open(vessel: Vessel) -> Vessel | None:
-    """Return the vessel with those of its openings that its lumen still has; None where no way in and out is left.
+    """Return the vessel with those of its openings that its lumen still has.
 
-    The inlet is the widest of them where all old ones are gone.
+    If all inlets are gone, the widest remaining opening is the inlet.
+
+    Parameters
+    ----------
+    vessel : vessel with openings, some of which its lumen may have lost.
+
+    Returns
+    -------
+    vessel : vessel without centerlines; None if fewer than two openings, or no outlet, remain.
     """
     tree = cKDTree(vessel.lumen.loop_centers_mm) if len(vessel.lumen.boundary_loops) else None
     left = [o for o in vessel.openings if tree is not None and tree.query(o.center_mm)[0] < STILL * o.diameter_mm]
@@ -176,21 +210,28 @@ def still_open(vessel: Vessel) -> Vessel | None:
 
 
 def _opening(loop_mm: Floats) -> Opening:
-    # A loop runs with the faces beside it: seen from outside the opening it runs clockwise.
+    """Return the opening at a boundary loop (n, 3)."""
+    # A loop follows the orientation of its faces, so it is clockwise seen from outside the opening.
     vector = -triangles.polygon_area_vector(loop_mm)
     area = float(np.linalg.norm(vector))
     return Opening(triangles.polygon_centroid(loop_mm), vector / max(area, 1e-300), area, "outlet")
 
 
 def named(inlets: Sequence[Opening], openings: Sequence[Opening]) -> tuple[Opening, ...]:
-    """Return the openings with their roles, the inlets in this order."""
+    """Return the openings with their roles.
+
+    Parameters
+    ----------
+    inlets : openings through which blood enters, in the order of their roles.
+    openings : all openings; the outlets among them are sorted from the widest to the narrowest.
+    """
     outlets = sorted((o for o in openings if o not in inlets), key=lambda opening: -opening.area_mm2)
     in_order = zip([*inlets, *outlets], roles(len(inlets), len(outlets)), strict=True)
     return tuple(replace(opening, role=role) for opening, role in in_order)
 
 
 def _without_caps(lumen: Surface) -> tuple[Surface, int]:
-    """Take off the flat caps: round patches of coplanar faces that meet the wall in a sharp rim."""
+    """Return the surface without its flat caps (round coplanar patches with a sharp rim), and the number of caps."""
     pairs = triangles.face_neighbours(lumen.faces)
     turn = np.arccos(np.clip(np.einsum("ij,ij->i", lumen.normals[pairs[:, 0]], lumen.normals[pairs[:, 1]]), -1, 1))
     label = triangles.joined(pairs[turn < CAP_ANGLE_RAD], len(lumen.faces))
@@ -210,7 +251,7 @@ def _without_caps(lumen: Surface) -> tuple[Surface, int]:
 
 
 def _is_disc(lumen: Surface, member: Bools) -> bool:
-    """Tell whether the faces lie in a plane and fill a nearly round outline."""
+    """Return whether the faces lie in a plane and have a nearly round outline."""
     weight = lumen.areas_mm2[member]
     mean = weight @ lumen.normals[member] / weight.sum()
     edges = triangles.open_edges(lumen.faces[member])
@@ -219,7 +260,7 @@ def _is_disc(lumen: Surface, member: Bools) -> bool:
 
 
 def _is_across_lumen(lumen: Surface, member: Bools) -> bool:
-    """Tell whether two of its radii behind a flat patch the lumen is as narrow as the patch."""
+    """Return whether the lumen two patch radii behind a flat patch is as narrow as the patch."""
     weight = lumen.areas_mm2[member]
     radius = float(np.sqrt(weight.sum() / np.pi))
     center = weight @ lumen.corners_mm[member].mean(axis=1) / weight.sum()
@@ -228,7 +269,7 @@ def _is_across_lumen(lumen: Surface, member: Bools) -> bool:
 
 
 def _with_open_arms(lumen: Surface, slenderness: float) -> tuple[Surface, int]:
-    """Cut open the arms that end blind and are more than so many of their mean radii long."""
+    """Return the surface with its long blind arms cut open, and the number of these arms."""
     graph = lumen.medial
     roots = np.asarray(cKDTree(graph.points).query(lumen.loop_centers_mm)[1], dtype=np.int32)
     paths = medial.arms(graph, roots, slenderness, ARM_RADIUS_MM)
@@ -236,17 +277,15 @@ def _with_open_arms(lumen: Surface, slenderness: float) -> tuple[Surface, int]:
     n_cut = 0
     for cut in [_cut_of(graph.points[path], graph.radius[path], slenderness) for path in blind]:
         opened = None if cut is None else cut_square(lumen, *cut, ARM_SHARE)
-        # A cut makes one end more; one that takes an end off has run into another artery.
+        # A cut must add one end. A cut that also removes an end has reached another artery.
         if opened is not None and len(opened.boundary_loops) > len(lumen.boundary_loops):
             lumen, n_cut = opened, n_cut + 1
     return (Surface(*triangles.largest_part(lumen.vertices_mm, lumen.faces)) if n_cut else lumen), n_cut
 
 
 def _is_blind(graph: medial.Medial, path: Ints) -> bool:
-    """Tell whether an arm's tip is reached along its path (k,) only: a loop of an artery has two ways to its middle.
-
-    Ways less than half as wide as the arm, or too thin for an arm, are no way for blood.
-    """
+    """Return whether the tip of an arm is reached only along its path (k,), and not also through a loop of arteries."""
+    # Connections less than half as wide as the arm, or thinner than the thinnest arm, carry no relevant flow.
     abscissa, typical = curves.arc_length(graph.points[path]), float(np.median(graph.radius[path]))
     behind = graph.points[path[np.searchsorted(abscissa, abscissa[-1] - 3.0 * typical)]]
     passable = graph.radius > max(0.5 * typical, ARM_RADIUS_MM)
@@ -257,7 +296,7 @@ def _is_blind(graph: medial.Medial, path: Ints) -> bool:
 
 
 def _cut_of(points_mm: Floats, radius_mm: Floats, slenderness: float) -> tuple[Floats, Floats, float] | None:
-    """Where to cut an arm (path from the tree to its tip), where its tip lies, how wide it is; None for a sac."""
+    """Return center and direction of the cut that opens an arm (path to its tip), and its radius; None for a sac."""
     abscissa = curves.arc_length(points_mm)
     outside = abscissa > 1.5 * radius_mm[0]
     if outside.sum() < 3:
@@ -276,18 +315,19 @@ def _cut_of(points_mm: Floats, radius_mm: Floats, slenderness: float) -> tuple[F
 def cut_square(
     lumen: Surface, center_mm: Floats, direction: Floats, radius_mm: float, most: float = 1.0
 ) -> Surface | None:
-    """Take off the wall beyond the plane through `center_mm` (3,) that hangs together with the section there.
+    """Cut off the wall beyond a plane, where it is connected to the section at a given center.
 
     Parameters
     ----------
-    lumen : the wall.
-    center_mm, direction : (3,) a point of the plane and its unit normal, out of what is kept.
-    radius_mm : radius of the vessel there.
-    most : nothing is cut if more than this fraction of the wall would come off.
+    lumen : wall of the vessel.
+    center_mm : (3,) point of the plane in mm.
+    direction : (3,) unit normal of the plane, away from the part that is kept.
+    radius_mm : radius of the vessel there in mm.
+    most : largest fraction of the wall that may be removed.
 
     Returns
     -------
-    lumen : what is left; None where nothing is cut.
+    lumen : remaining wall; None where nothing is cut.
     """
     height = (lumen.vertices_mm - center_mm) @ direction
     distance = np.linalg.norm(lumen.vertices_mm - center_mm, axis=1)

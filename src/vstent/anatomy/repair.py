@@ -1,4 +1,4 @@
-"""Repair: a surface as it comes from a file -> one oriented manifold whose open loops are the vessel's ends."""
+"""Repair a surface from a file: make it one oriented manifold whose open loops are the ends of the vessel."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -13,45 +13,48 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import counted, place
 
 WELD_OF_EXTENT: Final = 1e-6
-"""Vertices closer than this fraction of the bounding box's diagonal are one."""
+"""Vertices closer than this fraction of the bounding box's diagonal are merged."""
 ALWAYS_HOLE_OF_DIAMETER: Final = 0.1
-"""Loops shorter round than a circle of this fraction of the vessel's mean diameter are holes."""
+"""A loop shorter than a circle of this fraction of the vessel's mean diameter is a hole."""
 WALL_HOLE_OF_DIAMETER: Final = 0.5
-"""Loops up to this size are holes where the wall lies in the plane of the loop (at an end it stands on that plane)."""
+"""A loop up to this fraction of the mean diameter is a hole if the wall lies in its plane; at an end the wall is
+perpendicular to the plane."""
 SLIT_ROUNDNESS: Final = 0.4
-"""Loops of less area than this fraction of the circle as long as they are slits: no artery is cut so."""
+"""A loop with less area than this fraction of the circle of equal length is a slit, and no end of an artery."""
 LONGEST_PATCHED: Final = 120
-"""Holes of more vertices are closed by a fan: the better patch costs the cube of their number."""
+"""Holes with more vertices are closed by a fan: the run time of the least-area patch grows with the cube of their
+number."""
 NOTABLE_OF_AREA: Final = 0.02
 """Removed pieces larger than this fraction of the area are reported one by one."""
 
 
 def repair(surface: Surface, *, at_mm: Floats | None = None) -> tuple[Surface, tuple[str, ...]]:
-    """Make a sound surface of a faulty one, and say what was done.
+    """Repair a surface and report what was changed.
 
-    Duplicate vertices are welded, degenerate and duplicate faces dropped, faces turned to agree and then outward,
-    non-manifold edges and vertices cut apart, one piece kept, holes in the wall filled. Nothing is moved. The result
-    is a manifold with boundary, outward oriented; its open loops are the vessel's ends.
+    Duplicate vertices are merged, degenerate and duplicate faces are dropped, and faces are oriented consistently and
+    outward. Non-manifold edges and vertices are separated, one piece is kept, and holes in the wall are closed. No
+    vertex is moved. The result is an outward-oriented manifold with boundary, and its open loops are the ends of the
+    vessel.
 
     Parameters
     ----------
-    surface : any triangles, in mm.
-    at_mm : (3,) a point near the piece to keep, debris left out; the piece of largest area where not given.
+    surface : any triangle mesh in mm.
+    at_mm : (3,) point in mm near the piece to keep, small debris ignored; the piece of largest area where not given.
 
     Returns
     -------
-    surface : the repaired one.
-    notes : one sentence for each thing that was done; empty for a sound surface.
+    surface : repaired surface.
+    notes : one sentence for each change; empty for a sound surface.
 
     Raises
     ------
     VesselError
-        Nothing is left of the surface.
+        When nothing is left of the surface.
     """
     if not len(surface.faces):
         raise VesselError("The surface has no triangles. Check the file.")
     mesh = _once(_Mesh(surface.vertices_mm, surface.faces, ()), at_mm)
-    if mesh.notes:  # filling a hole that a pinched vertex runs through leaves needles: a second pass finds them
+    if mesh.notes:  # closing a hole at a pinched vertex leaves needle faces, and a second pass removes them
         mesh = _Mesh(*_once(_Mesh(mesh.vertices, mesh.faces, ()), at_mm).geometry, mesh.notes)
     vertices, faces = triangles.compact(mesh.vertices, mesh.faces)
     return Surface(vertices, faces), mesh.notes
@@ -59,9 +62,14 @@ def repair(surface: Surface, *, at_mm: Floats | None = None) -> tuple[Surface, t
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
+    """A mesh during repair, with the notes on the steps so far."""
+
     vertices: Floats
+    """(n, 3) positions in mm."""
     faces: Ints
+    """(m, 3) vertex indices."""
     notes: tuple[str, ...]
+    """One sentence for each change."""
 
     @property
     def geometry(self) -> tuple[Floats, Ints]:
@@ -69,11 +77,12 @@ class _Mesh:
         return self.vertices, self.faces
 
     def after(self, vertices: Floats, faces: Ints, note: str = "") -> "_Mesh":
-        """Return the mesh after a step, with what the step did."""
+        """Return the mesh after a step, with the note on that step."""
         return _Mesh(vertices, faces, (*self.notes, note) if note else self.notes)
 
 
 def _once(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
+    """Return the mesh after one pass of all repair steps."""
     one_piece = partial(_one_piece, at_mm=at_mm)
     for step in (_welded, _cleaned, _opened, _turned, _unzipped, one_piece, _outward, _filled):
         mesh = step(mesh)
@@ -83,6 +92,7 @@ def _once(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
 
 
 def _welded(mesh: _Mesh) -> _Mesh:
+    """Return the mesh with duplicate vertices merged."""
     vertices, faces = triangles.compact(mesh.vertices, mesh.faces)
     extent = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     welded, faces = topology.weld(vertices, faces, WELD_OF_EXTENT * extent)
@@ -94,6 +104,7 @@ def _welded(mesh: _Mesh) -> _Mesh:
 
 
 def _cleaned(mesh: _Mesh) -> _Mesh:
+    """Return the mesh without degenerate and duplicate faces."""
     ordered = np.sort(mesh.faces, axis=1)
     is_degenerate = (ordered[:, :-1] == ordered[:, 1:]).any(axis=1)
     is_sound = topology.sound_faces(mesh.faces)
@@ -105,7 +116,7 @@ def _cleaned(mesh: _Mesh) -> _Mesh:
 
 
 def _opened(mesh: _Mesh) -> _Mesh:
-    """Drop membranes across the lumen, and fins."""
+    """Return the mesh without membranes across the lumen and fins."""
     total = 0
     faces = mesh.faces
     while (is_inner := topology.inner_sheets(mesh.vertices, faces)).any():
@@ -117,6 +128,7 @@ def _opened(mesh: _Mesh) -> _Mesh:
 
 
 def _turned(mesh: _Mesh) -> _Mesh:
+    """Return the mesh with consistently oriented faces."""
     faces, turned = topology.oriented(mesh.faces)
     n = int(turned.sum())
     mesh = mesh.after(mesh.vertices, faces, f"{counted(n, 'face')} reoriented." if n else "")
@@ -127,6 +139,7 @@ def _turned(mesh: _Mesh) -> _Mesh:
 
 
 def _unzipped(mesh: _Mesh) -> _Mesh:
+    """Return the mesh with non-manifold edges and vertices separated."""
     n_edges = int((topology.edges_of(mesh.faces).n_uses > 2).sum())
     vertices, faces = topology.unzipped(mesh.vertices, mesh.faces)
     while (is_bad := topology.overused(faces)).any():
@@ -139,7 +152,7 @@ def _unzipped(mesh: _Mesh) -> _Mesh:
 
 
 def _one_piece(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
-    """Keep the largest piece, or the notable one nearest to a point (3,)."""
+    """Return the mesh with the largest piece only, or the notable piece nearest to a point (3,)."""
     label = topology.face_components(mesh.faces)
     area = np.bincount(label, triangles.areas(mesh.vertices[mesh.faces]))
     if len(area) <= 1:
@@ -154,15 +167,17 @@ def _one_piece(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
 
 
 def _gap_mm(mesh: _Mesh, member: Bools, at_mm: Floats) -> float:
-    """Distance of a point (3,) to a piece of the mesh."""
+    """Return the distance of a point (3,) from a piece of the mesh, in mm."""
     return float(Surface(mesh.vertices, mesh.faces[member]).closest(at_mm[None])[1][0])
 
 
 def _middle(mesh: _Mesh, member: Bools) -> str:
+    """Return the mean position of a piece of the mesh, as text."""
     return place(mesh.vertices[np.unique(mesh.faces[member])].mean(axis=0))
 
 
 def _outward(mesh: _Mesh) -> _Mesh:
+    """Return the mesh with its faces oriented outward."""
     vertices, faces = triangles.cap(mesh.vertices, mesh.faces, triangles.boundary_loops(mesh.vertices, mesh.faces))
     if triangles.volume(vertices[faces]) >= 0:
         return mesh
@@ -170,6 +185,7 @@ def _outward(mesh: _Mesh) -> _Mesh:
 
 
 def _filled(mesh: _Mesh) -> _Mesh:
+    """Return the mesh with the holes in its wall closed."""
     loops = triangles.boundary_loops(mesh.vertices, mesh.faces)
     vertices, faces = triangles.cap(mesh.vertices, mesh.faces, loops)
     diameter = 4 * triangles.volume(vertices[faces]) / float(triangles.areas(mesh.vertices[mesh.faces]).sum())
@@ -190,11 +206,13 @@ def _filled(mesh: _Mesh) -> _Mesh:
 
 
 def _hole_note(holes_mm: list[Floats]) -> str:
+    """Return the note on closed holes."""
     widest_mm = max(triangles.perimeter(points) for points in holes_mm)
     return f"{counted(len(holes_mm), 'hole')} in the wall closed (the largest {widest_mm:.2g} mm around)."
 
 
 def _sideways_note(points: Floats) -> str:
+    """Return the note on an opening in the side of the wall."""
     return (
         f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at "
         f"{place(triangles.polygon_centroid(points))} faces sideways out of the wall. If no artery leaves "
@@ -203,7 +221,7 @@ def _sideways_note(points: Floats) -> str:
 
 
 def _is_hole(points: Floats, wall_normal: Floats, diameter: float) -> bool:
-    """Tell a hole in the wall from an end: it is tiny, or a slit, or it is small and the wall lies in its plane."""
+    """Return whether a loop is a hole in the wall: tiny, a slit, or small with the wall in its plane."""
     width = triangles.perimeter(points) / np.pi
     smooth = _without_teeth(points)
     size = float(np.linalg.norm(triangles.polygon_area_vector(smooth)))
@@ -216,22 +234,23 @@ def _is_hole(points: Floats, wall_normal: Floats, diameter: float) -> bool:
 
 
 def _is_in_wall(points: Floats, wall_normal: Floats) -> bool:
-    """Tell whether the wall around a loop (n, 3) lies in its plane; at an end it stands on it."""
+    """Return whether the wall around a loop (n, 3) lies in its plane; at an end it is perpendicular to the plane."""
     area = triangles.polygon_area_vector(_without_teeth(points))
     return float(np.abs(wall_normal @ area).mean()) > 0.7 * float(np.linalg.norm(area))
 
 
 def _without_teeth(points: Floats) -> Floats:
+    """Return a loop (n, 3) with its sawtooth removed, where it has enough vertices."""
     return points if len(points) < 8 else _rounded(_rounded(points))
 
 
 def _rounded(points: Floats) -> Floats:
-    """Take the teeth off a closed polygon (n, 3)."""
+    """Return a closed polygon (n, 3) smoothed once with weights 1/4, 1/2, 1/4."""
     return 0.25 * (np.roll(points, 1, axis=0) + 2 * points + np.roll(points, -1, axis=0))
 
 
 def _fill(vertices: Floats, faces: Ints, loop: Ints) -> tuple[Floats, Ints]:
-    """Close a loop with the vertices it has; with a fan about its centroid where it is very long or that cannot be."""
+    """Return the mesh with a loop closed by a least-area patch, or by a fan where it is long or no patch exists."""
     ring = loop[::-1]
     patch = None if len(ring) > LONGEST_PATCHED else topology.least_area(vertices[ring], _joined(faces, ring))
     if patch is None:
@@ -240,7 +259,7 @@ def _fill(vertices: Floats, faces: Ints, loop: Ints) -> tuple[Floats, Ints]:
 
 
 def _joined(faces: Ints, ring: Ints) -> Bools:
-    """Tell for each pair (n, n) of ring vertices whether the mesh has an edge between them already."""
+    """Return for each pair (n, n) of ring vertices whether the mesh already has an edge between them."""
     place = np.full(faces.max() + 1, -1)
     place[ring] = np.arange(len(ring))
     a, b = place[triangles.directed_edges(faces)].T

@@ -1,4 +1,4 @@
-"""Segment: a scan -> the wall of the contrast-filled lumen."""
+"""Segment a scan: find the wall of the contrast-filled lumen."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
@@ -21,56 +21,58 @@ from vstent.units import place
 FEWEST_VOXELS: Final = 300
 """A lumen of fewer voxels is noise."""
 NOTABLE_PIECE: Final = 0.02
-"""Pieces with less than this fraction of the voxels of the largest about the point given are not taken for the vessel
-there."""
+"""Pieces with less than this fraction of the voxels of the largest piece near the given point are ignored."""
 BAND: Final = 0.05
 """Assumed uncertainty of the threshold, as a fraction of the step from tissue to lumen."""
 FARTHEST_MM: Final = 5.0
-"""How far from the point given the lumen may be."""
+"""Largest distance of the lumen from the given point, in mm."""
 AROUND_MM: Final = 15.0
-"""Where a point is given, the first threshold is that of the scan within this distance of it."""
+"""Where a point is given, the first threshold is computed from the scan within this distance of it, in mm."""
 FILLS: Final = 0.2
-"""What fills more of the scan than this fraction, and is wider than vessels are, is a head or a field of view..."""
+"""An object that fills more than this fraction of the scan, and is wider than vessels, is a head or a field of view."""
 AIR_MM: Final = 2.0
-"""... and what lies no further than this from the air or padding around it says nothing of vessels."""
+"""Voxels this close to surrounding air or padding, in mm, are not used to find a vessel's threshold."""
 MOST_GROUNDS: Final = 3
-"""Padding, air and tissue: no more levels than these lie below a vessel's."""
+"""Largest number of intensity levels below that of the vessel: padding, air and tissue."""
 MOST_FACES: Final = 120_000
-"""Meshes of more triangles are decimated to this number."""
+"""Meshes with more triangles are decimated to this number."""
 SMOOTHING_STEPS: Final = 12
+"""Iterations of Taubin smoothing."""
 PASS_BAND: Final = 0.1
+"""Pass band of Taubin smoothing."""
 CURVATURE_ROUNDS: Final = 25
-"""The wall's curvature is averaged so many times with the neighbours': over some three voxels."""
+"""Number of averages of the wall's curvature with that of neighbouring vertices, over about three voxels."""
 CREVICE_ROUNDS: Final = 4
-"""Where the curvature averaged so many times is hollow, there is a crevice between two parts of the vessel..."""
+"""A crevice between two parts of the vessel is where the curvature is concave after this many averages."""
 CREVICE_RINGS: Final = 3
-"""... which reaches this many rings of vertices further."""
+"""Number of rings of vertices by which a crevice is widened."""
 PROFILE_VOXELS: Final = 4.0
-"""How far into the lumen and into the tissue the profiles across the wall reach."""
+"""Length of the profiles across the wall, into the lumen and into the tissue, in voxels."""
 PROFILES: Final = 8000
+"""Largest number of profiles across the wall."""
 
 
 def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | None = None) -> Vessel:
-    """Find the wall of the lumen where the scan crosses a threshold.
+    """Find the wall of the lumen as an iso-surface of the scan.
+
+    The wall is smoothed (Taubin 1995). The change of volume by smoothing is measured, reported and corrected.
 
     Parameters
     ----------
-    image : a scan in which the blood is brighter than what surrounds it.
-    threshold : intensity of the wall; proposed where not given: half way between tissue and lumen, see `propose`.
-    at_mm : (3,) point in or near the vessel wanted; the largest vessel where not given.
+    image : scan in which blood is brighter than the surrounding tissue.
+    threshold : intensity of the wall; where not given, half way between tissue and lumen, see `propose`.
+    at_mm : (3,) point in or near the requested vessel in mm; the largest vessel where not given.
 
     Returns
     -------
-    vessel : the lumen's wall in LPS mm, open where it meets the border of the scan; its openings are not named yet.
-        Notes say how the threshold was found and what it does to the diameter.
+    vessel : wall of the lumen in LPS mm, open where it meets the border of the scan, without named openings. Its notes
+        state how the threshold was found and how the diameter depends on it.
 
     Raises
     ------
     VesselError
-        There is no lumen: nothing, or almost nothing, is brighter than the threshold, or nothing near the point, or
-        what is brighter is wider than any artery.
-
-    Smoothing is that of Taubin 1995; what volume it takes is measured, said and given back.
+        When no lumen is found: no object of sufficient size is brighter than the threshold or near the point, or the
+        object is wider than any artery.
     """
     lumen, notes, profile = propose(image, at_mm=at_mm) if threshold is None else _at(image, float(threshold), at_mm)
     _refuse_wide(lumen, profile)
@@ -81,7 +83,8 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     size = " x ".join(f"{h:.3g}" for h in image.spacing_mm)
     share = lumen.n_voxels / lumen.n_above
     found = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all voxels above the threshold."
-    # Not of the threshold itself: where a scan's intensities begin is arbitrary.
+    # The uncertainty is relative to the step, not to the threshold, because the zero of a scan's intensities is
+    # arbitrary.
     off = BAND * (profile.lumen - profile.tissue)
     band_mm = 2 * off / profile.slope_per_mm
     band = f"A change of the threshold by {off:.3g} ({BAND:.0%} of the step from tissue to lumen) changes diameters by "
@@ -92,35 +95,55 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
 
 @dataclass(frozen=True, eq=False)
 class Lumen:
-    """The voxels of one vessel, and the intensity of its wall."""
+    """Voxels of one vessel, and the intensity of its wall."""
 
     field: NDArray[np.float32]
-    """(i, j, k) intensities of the part of the scan about the vessel; other vessels are put below the threshold."""
+    """(i, j, k) intensities of the part of the scan around the vessel; other vessels are set below the threshold."""
     affine_mm: Floats
-    """(4, 4) index in `field` -> LPS mm."""
+    """(4, 4) transform from an index in `field` to LPS mm."""
     threshold: float
     """Intensity of the wall."""
     n_voxels: int
-    """Voxels in the vessel."""
+    """Number of voxels in the vessel."""
     n_above: int
-    """Voxels of the whole scan above the threshold."""
+    """Number of voxels of the whole scan above the threshold."""
 
     @property
     def voxel_mm(self) -> float:
-        """Edge of a cube as large as a voxel."""
+        """Edge length in mm of a cube with the volume of a voxel."""
         return float(np.abs(np.linalg.det(self.affine_mm[:3, :3])) ** (1 / 3))
 
 
 def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[str, ...], "Profile"]:
-    """Propose a threshold; return the lumen, how it was found, and the profile across its wall.
+    """Propose a threshold for the wall of the lumen.
 
-    Vessels are far less than a tenth of the voxels, so the histogram of the scan does not show them. A first threshold
-    is the mean intensity weighted with the squared gradient (Kittler, Illingworth and Foeglein 1985, Comput. Vis.
-    Graph. Image Process. 30:125). The vessel found with it is crossed by profiles along the normals of its wall, and
-    the threshold set half way between the medians of tissue and lumen: full width at half maximum (Hoogeveen, Bakker
-    and Viergever 1998, Magn. Reson. Med. 40:751). The wall of a cylinder of radius R, blurred with standard deviation
-    s, does not lie at one half but at Phi(-s / (2 R)) of the step (mean curvature flow, to first order); s is taken
-    from the slope of the profile. R is the whole vessel's; `_unblurred` sees to branches and sacs.
+    Vessels are far less than a tenth of the voxels, so the histogram of the scan does not show them. The threshold is
+    found in two steps:
+
+    1. The first threshold is the mean intensity weighted with the squared gradient (Kittler et al. 1985).
+    2. The vessel found with it is sampled by profiles along the normals of its wall. The threshold is half way between
+       the medians of tissue and lumen, the full width at half maximum (Hoogeveen et al. 1998).
+
+    The wall of a cylinder of radius R, blurred with standard deviation s, is not at one half but at Phi(-s / (2 R)) of
+    the step (mean curvature flow, to first order), where Phi is the standard normal distribution. The slope of the
+    profile gives s. R is that of the whole vessel; `_unblurred` corrects branches and sacs.
+
+    Parameters
+    ----------
+    image : scan in which blood is brighter than the surrounding tissue.
+    at_mm : (3,) point in or near the requested vessel in mm; the largest vessel where not given.
+
+    Returns
+    -------
+    lumen : voxels of the vessel, with the proposed threshold.
+    notes : how the threshold was found.
+    profile : median profile across the wall.
+
+    References
+    ----------
+    Kittler, Illingworth and Foeglein 1985, Comput. Vis. Graph. Image Process. 30:125.
+
+    Hoogeveen, Bakker and Viergever 1998, Magn. Reson. Med. 40:751.
     """
     first, profile = _first(image, at_mm)
     second = replace(first, threshold=profile.wall_level)
@@ -135,6 +158,7 @@ def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[
 
 
 def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tuple[str, ...], "Profile"]:
+    """Return the lumen at a given threshold, a note, and the profile across its wall."""
     lumen = _lumen(image, threshold, at_mm)
     profile = _profile(lumen)
     note = f"Threshold {threshold:.4g} as given; the proposed one is {profile.wall_level:.4g}."
@@ -142,6 +166,7 @@ def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tu
 
 
 def _refuse_wide(lumen: Lumen, profile: "Profile") -> None:
+    """Raise a VesselError if the object is wider than any artery."""
     if 2 * profile.radius_mm <= GIANT_DIAMETER_MM:
         return
     middle_mm = lumen.affine_mm[:3] @ [*(0.5 * (np.array(lumen.field.shape) - 1)), 1.0]
@@ -157,11 +182,9 @@ def _refuse_wide(lumen: Lumen, profile: "Profile") -> None:
 
 
 def _first(image: Image, at_mm: Floats | None) -> tuple[Lumen, "Profile"]:
-    """Pick the vessel at a first threshold, and sample the profile across its wall.
-
-    The strongest edges of a scan may be those between a head and the air, or a field of view and its padding. What is
-    brighter than such a threshold fills the scan: then the next threshold is looked for within that.
-    """
+    """Return the vessel at a first threshold, and the profile across its wall."""
+    # The strongest edges of a scan may be those between head and air, or between field of view and padding. The object
+    # above such a threshold fills the scan, and the next threshold is computed within that object.
     voxels = image.voxels[_around(image, at_mm)]
     lumen = _lumen(image, _edge_level(voxels), at_mm)
     profile = _profile(lumen)
@@ -176,7 +199,7 @@ def _first(image: Image, at_mm: Floats | None) -> tuple[Lumen, "Profile"]:
 
 
 def _around(image: Image, at_mm: Floats | None) -> tuple[slice, ...]:
-    """Box of the voxels within `AROUND_MM` of a point (3,); the whole scan without one, or far from it."""
+    """Return the box of voxels within `AROUND_MM` of a point (3,); the whole scan without a point or far from it."""
     whole = tuple(slice(0, n) for n in image.voxels.shape)
     if at_mm is None:
         return whole
@@ -185,7 +208,7 @@ def _around(image: Image, at_mm: Floats | None) -> tuple[slice, ...]:
 
 
 def _reach(image: Image, at_mm: Floats, reach_mm: float) -> tuple[Ints, Ints]:
-    """First (3,) and behind the last (3,) index of the voxels in a box about a point (3,), within the scan."""
+    """Return the first (3,) and last-plus-one (3,) voxel index of a box around a point (3,), clipped to the scan."""
     reach = np.ceil(reach_mm / image.spacing_mm).astype(int) + 1
     middle = np.round(image.to_index(np.asarray(at_mm, dtype=np.float64)[None])[0]).astype(int)
     low = np.clip(middle - reach, 0, image.voxels.shape)
@@ -193,15 +216,12 @@ def _reach(image: Image, at_mm: Floats, reach_mm: float) -> tuple[Ints, Ints]:
 
 
 def _clear_of(is_ground: Bools, spacing_mm: Floats) -> Bools:
-    """Tell the voxels further than `AIR_MM` from the ground."""
+    """Return whether each voxel is farther than `AIR_MM` from the background."""
     return np.asarray(ndimage.distance_transform_edt(~is_ground, sampling=spacing_mm) > AIR_MM)
 
 
 def _edge_level(voxels: NDArray[Any], is_within: Bools | None = None) -> float:
-    """Mean intensity weighted with the squared gradient, on every other voxel; gradients of the noise do not count.
-
-    With `is_within`, as large as the scan, on those of its voxels alone.
-    """
+    """Return the mean intensity weighted with the squared gradient above noise, where `is_within` holds."""
     if min(voxels.shape) < 3:
         raise VesselError(
             f"A scan of {' x '.join(map(str, voxels.shape))} voxels is too thin to contain a lumen. Give the "
@@ -224,18 +244,18 @@ def _edge_level(voxels: NDArray[Any], is_within: Bools | None = None) -> float:
 
 
 class _Pieces(NamedTuple):
-    """The connected pieces of what is brighter than a threshold."""
+    """Connected pieces above a threshold."""
 
     label: NDArray[Any]
-    """(i, j, k) number of the piece that a voxel is of, 0 for none."""
+    """(i, j, k) number of the piece of each voxel, 0 for none."""
     size: NDArray[Any]
-    """(pieces + 1,) voxels in each; 0 in the first."""
+    """(pieces + 1,) number of voxels in each piece; 0 in the first entry."""
     threshold: float
-    """The threshold."""
+    """Intensity above which voxels belong to a piece."""
 
 
 def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
-    """Pick the connected voxels above the threshold: the piece nearest to the point, or the largest."""
+    """Return the connected voxels above the threshold: the piece nearest to the point, or the largest."""
     above = image.voxels >= threshold
     if above.all():
         raise VesselError(
@@ -262,10 +282,10 @@ def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
 
 
 def _nearest(image: Image, pieces: _Pieces, at_mm: Floats) -> int:
-    """Number of the piece nearest to a point (3,), debris left out."""
+    """Return the number of the piece nearest to a point (3,), small debris ignored."""
     low, high = _reach(image, at_mm, FARTHEST_MM)
     part = pieces.label[tuple(map(slice, low, high))]
-    # Counted about the point alone: the bone of a head has a hundred times an artery's voxels.
+    # Voxels are counted near the point only: the bone of a head has a hundred times as many voxels as an artery.
     n_near = np.bincount(part.ravel(), minlength=len(pieces.size))
     n_near[pieces.size < FEWEST_VOXELS] = 0
     index = np.argwhere(np.isin(part, np.flatnonzero(n_near > NOTABLE_PIECE * n_near.max())))
@@ -285,7 +305,7 @@ def _nearest(image: Image, pieces: _Pieces, at_mm: Floats) -> int:
 
 
 def _with_margin(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
-    """Widen a box by the reach of the profiles, within the scan."""
+    """Return a box widened by the length of the profiles, clipped to the scan."""
     margin = int(PROFILE_VOXELS) + 2
     return tuple(slice(max(0, s.start - margin), min(n, s.stop + margin)) for s, n in zip(box, shape, strict=True))
 
@@ -295,38 +315,38 @@ def _with_margin(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice,
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """How the intensity falls from the lumen to the tissue."""
+    """Intensity across the wall, from lumen to tissue."""
 
     lumen: float
-    """Median intensity inside, where the vessel is thick."""
+    """Median intensity in the lumen, where the vessel is thick."""
     tissue: float
-    """Median intensity outside."""
+    """Median intensity in the tissue."""
     slope_per_mm: float
-    """How steeply it falls at half height."""
+    """Steepest slope around half height, per mm."""
     radius_mm: float
     """Hydraulic radius 2 V / A of the vessel."""
     voxel_mm: float
-    """Edge of a cube as large as a voxel."""
+    """Edge length in mm of a cube with the volume of a voxel."""
 
     @property
     def blur_mm(self) -> float:
-        """Standard deviation of the Gaussian that makes such a slope of a step.
+        """Standard deviation in mm of the Gaussian blur that turns a step into this slope.
 
-        Reading between voxels by linear interpolation blurs once more, with a variance of voxel^2 / 6: that is not the
-        scan's and is taken off.
+        Linear interpolation between voxels adds a variance of voxel^2 / 6, which is subtracted because it is not the
+        scan's.
         """
         read_mm = (self.lumen - self.tissue) / (np.sqrt(2 * np.pi) * self.slope_per_mm)
         return float(np.sqrt(max(read_mm**2 - self.voxel_mm**2 / 6, 0.0)))
 
     @property
     def wall_level(self) -> float:
-        """Intensity of the wall of a blurred cylinder."""
+        """Intensity at the wall of a blurred cylinder."""
         share = float(ndtr(-0.5 * min(self.blur_mm / self.radius_mm, 1.0)))
         return self.tissue + share * (self.lumen - self.tissue)
 
 
 def _profile(lumen: Lumen) -> Profile:
-    """Sample the scan along the normals of a smoothed wall."""
+    """Return the median profile along the normals of the smoothed wall."""
     surface = _taubin(_wall(lumen))
     some = np.random.default_rng(0).permutation(len(surface.vertices_mm))[:PROFILES]
     depth_mm = np.arange(-PROFILE_VOXELS, PROFILE_VOXELS + 0.01, 0.25) * lumen.voxel_mm
@@ -336,7 +356,7 @@ def _profile(lumen: Lumen) -> Profile:
     value = ndimage.map_coordinates(lumen.field, index.T, order=1, mode="nearest").reshape(len(some), -1)
     value = value[_is_thick(value, depth_mm, lumen)]
     course, outer = np.median(value, axis=0), depth_mm > 0.55 * PROFILE_VOXELS * lumen.voxel_mm
-    # The plateau is where the blur reaches least; in a thin vessel that is its axis, not the deepest sample.
+    # The plateau is where the blur has the least effect. In a thin vessel that is its axis, not the deepest sample.
     plateau, tissue = float(course.max()), float(np.median(value[:, outer]))
     slope = _slope(course, depth_mm, 0.5 * (plateau + tissue))
     radius_mm = 2 * lumen.n_voxels * lumen.voxel_mm**3 / surface.area_mm2
@@ -344,7 +364,7 @@ def _profile(lumen: Lumen) -> Profile:
 
 
 def _is_thick(value: NDArray[Any], depth_mm: Floats, lumen: Lumen) -> Bools:
-    """Tell the profiles (n,) that stay in the lumen all the way in; the thicker half of all where hardly any do."""
+    """Return whether each profile (n,) stays in the lumen on its inner side; the deeper half where hardly any do."""
     stays = value[:, depth_mm < 0].min(axis=1) >= lumen.threshold
     if stays.mean() > 0.05:
         return stays
@@ -353,7 +373,7 @@ def _is_thick(value: NDArray[Any], depth_mm: Floats, lumen: Lumen) -> Bools:
 
 
 def _slope(profile: NDArray[Any], depth_mm: Floats, level: float) -> float:
-    """Steepest descent of a profile about a level, per mm."""
+    """Return the steepest descent of a profile around a level, per mm."""
     steps = -np.gradient(profile, depth_mm)
     near = np.abs(profile - level) <= 0.35 * np.ptp(profile)
     return max(float(steps[near].max(initial=0.0)), 1e-6 * float(np.ptp(profile)) + 1e-300)
@@ -363,7 +383,7 @@ def _slope(profile: NDArray[Any], depth_mm: Floats, level: float) -> float:
 
 
 def _wall(lumen: Lumen) -> Surface:
-    """Outermost iso-surface in LPS mm, outward; cavities in the lumen are pieces of their own and so left out."""
+    """Return the outermost iso-surface in LPS mm, oriented outward; cavities in the lumen are left out."""
     index, faces = isosurface(lumen.field, lumen.threshold)
     label = topology.face_components(faces)
     area = np.bincount(label, triangles.areas(index[faces]))
@@ -374,12 +394,13 @@ def _wall(lumen: Lumen) -> Surface:
 
 
 def _taubin(surface: Surface) -> Surface:
+    """Return the smoothed surface."""
     vertices = smoothing.taubin(surface.vertices_mm, surface.faces, iterations=SMOOTHING_STEPS, pass_band=PASS_BAND)
     return Surface(vertices, surface.faces)
 
 
 def _smooth(rough: Surface) -> tuple[Surface, str]:
-    """Smooth, and give back the volume that this takes."""
+    """Return the smoothed surface with its volume restored, and a note."""
     volume = _capped_volume_mm3(rough)
     smooth = _taubin(rough)
     lost = volume - _capped_volume_mm3(smooth)
@@ -390,12 +411,10 @@ def _smooth(rough: Surface) -> tuple[Surface, str]:
 
 
 def _unblurred(surface: Surface, profile: Profile) -> Surface:
-    """Move the wall to where it was before the blur: by s^2 times its mean curvature, less that of the whole vessel.
-
-    The threshold is right for the whole vessel's radius. A thin branch comes out too narrow with it and a sac too wide;
-    no shift is larger than half a voxel. A crevice turns faster than the blur resolves: it says nothing of how the wall
-    beside it is curved, and has no part in the average.
-    """
+    """Return the wall shifted by s^2 times the excess of its mean curvature over that of the whole vessel."""
+    # The threshold is right for the radius of the whole vessel. With it, a thin branch is too narrow and a sac too
+    # wide. No shift exceeds half a voxel. A crevice curves more sharply than the blur resolves and has no relation to
+    # the curvature of the adjacent wall, so it is left out of the average.
     curvature = smoothing.mean_curvature(surface.vertices_mm, surface.faces, rounds=CREVICE_ROUNDS)
     mean = smoothing.averaging(len(curvature), surface.faces)
     is_wall = curvature > 0
@@ -412,7 +431,7 @@ def _unblurred(surface: Surface, profile: Profile) -> Surface:
 
 
 def _decimated(fine: Surface) -> tuple[Surface, tuple[str, ...]]:
-    """Decimate a very fine mesh: collapse edges by the quadric error (Garland and Heckbert 1997, SIGGRAPH)."""
+    """Return a mesh reduced to `MOST_FACES` by quadric error (Garland and Heckbert 1997, SIGGRAPH), and a note."""
     if len(fine.faces) <= MOST_FACES:
         return fine, ()
     import fast_simplification
@@ -426,5 +445,6 @@ def _decimated(fine: Surface) -> tuple[Surface, tuple[str, ...]]:
 
 
 def _capped_volume_mm3(surface: Surface) -> float:
+    """Return the volume of a surface with its open loops capped, in mm3."""
     vertices, faces = triangles.cap(surface.vertices_mm, surface.faces, surface.boundary_loops)
     return triangles.volume(vertices[faces])

@@ -1,11 +1,12 @@
-"""Short cuts: where a path of least time does not follow the arteries, what it leaves out of them would be lost.
+"""Correct shortcuts: places where the path of shortest travel time does not follow the arteries.
 
-A sac that touches its artery a second time leads from the one place to the other, or a scan's blur joins them. So a
-second way is sought, which shuns what is wider than the artery, and taken where it is an artery beside a sac.
+Two cases are corrected, because the artery that the path leaves out would be lost:
 
-And where blood comes in by one arm of a fork, as by a vertebral artery, the path to the other arm turns back at the
-fork: it cuts through the crotch, be it a sac or two walls that the scan has joined, and misses where they meet. Along
-the path to a third opening, and back from there, it would not.
+- A sac touches its artery a second time, or the blur of the scan joins them, and the path runs through the sac. A
+  second path is sought that avoids wide spheres. It is used where it is an artery beside a sac.
+- Blood enters through one arm of a fork, such as a vertebral artery, and the path to the other arm turns back at the
+  fork. It cuts through the crotch between the arms, which is a sac or two walls joined by the scan, and misses the
+  junction. The corrected path follows both arms, along the path to a third opening and back.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,38 +19,46 @@ from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
 
 STEP_MM: Final = 0.1
-"""Spacing of the points at which a path is looked at."""
+"""Spacing in mm of the points at which a path is examined."""
 WIDE: Final = 1.3
-"""Where a path is wider by this factor than the artery around, it may run through a sac..."""
+"""A path may run through a sac where it is wider than the surrounding artery by this factor."""
 WIDE_WINDOW_MM: Final = 60.0
+"""Length in mm, longer than a giant sac, over which the width of the surrounding artery is estimated."""
 WIDE_PERCENTILE: Final = 25.0
-"""... the artery being as wide as this percentile within this length: longer than a giant sac."""
+"""Percentile of the inscribed radii over that length that is the artery's radius."""
 SHUN: Final = 3.0
-"""A way around a sac is sought at a speed that falls with this power of the width beyond that."""
+"""Exponent with which the travel speed falls where a sphere is wider than the artery by more than `WIDE`."""
 AS_WIDE: Final = 0.75
-"""... and is the artery where it is nowhere narrower than this fraction of it..."""
+"""A second path is the artery only if it is nowhere narrower than this fraction of the artery."""
 SAC: Final = 1.5
-"""... the sac wider by this factor than all of it..."""
+"""A second path is the artery only if the sac is wider than all of it by this factor."""
 BESIDE: Final = 0.5
-"""... and its axis somewhere outside the sac by this many of its radii."""
+"""A second path is the artery only if it is somewhere outside the sac by this many of its own radii."""
 CROTCH_SAC: Final = 1.2
-"""Between two arms of a fork a path runs through a sac where it is wider by this factor than all of the way..."""
+"""Between two arms of a fork, a path runs through a sac where it is wider by this factor than the path along the
+arms."""
 CROTCH: Final = 1.25
-"""... by the fork, and slips between two walls where it is narrower by this one."""
+"""Between two arms of a fork, a path runs between two joined walls where it is narrower by this factor than the path
+along the arms."""
 N_BETWEEN: Final = 8
-"""Points at which the lumen is sought on the way across from the one path to the other..."""
+"""Number of points between two paths at which the lumen is tested."""
 LUMEN: Final = 0.9
-"""... of which at least this fraction lies in it: a crevice beside a sac does not, nor does the middle of a ring."""
+"""Smallest fraction of these points in the lumen for a crotch. A crevice beside a sac and the middle of a ring of
+arteries have less."""
 
 
 def along_arms(graph: medial.Medial, paths: Sequence[Ints], radius_cap: Floats) -> list[Ints]:
-    """Return the paths, each led by the fork where it cuts through the crotch from one arm to another.
+    """Correct each path to follow both arms of a fork where it cuts through the crotch between them.
 
     Parameters
     ----------
-    graph : the medial graph.
-    paths : (k,) vertices each, of the paths of least time from the inlet to every outlet.
-    radius_cap : (n,) cap on the travel speed on them.
+    graph : medial graph.
+    paths : vertices (k,) of each path of shortest travel time from the inlet to an outlet.
+    radius_cap : (n,) limit of the travel speed.
+
+    Returns
+    -------
+    paths : corrected paths, in the same order.
     """
     times, led = medial.cost_graph(graph, radius_cap), []
     for path in paths:
@@ -63,13 +72,18 @@ def along_arms(graph: medial.Medial, paths: Sequence[Ints], radius_cap: Floats) 
 
 
 def around_sacs(graph: medial.Medial, path: Ints, speed_cap: float) -> tuple[Ints, list[str]]:
-    """Return the way around the sacs that a path runs through, where the artery has one, and a sentence on each.
+    """Correct a path to follow the artery around each sac that it runs through, where there is one.
 
     Parameters
     ----------
-    graph : the medial graph.
-    path : (k,) vertices of the path of least time.
-    speed_cap : the travel speed is at most this many radii of the artery.
+    graph : medial graph.
+    path : (k,) vertices of the path of shortest travel time.
+    speed_cap : limit of the travel speed, in radii of the artery.
+
+    Returns
+    -------
+    path : corrected path.
+    notes : one sentence on each sac.
     """
     points, artery_mm = _artery_along(graph, path)
     tree = cKDTree(points)
@@ -82,7 +96,7 @@ def around_sacs(graph: medial.Medial, path: Ints, speed_cap: float) -> tuple[Int
 
 
 def _artery_along(graph: medial.Medial, path: Ints) -> tuple[Floats, Floats]:
-    """Points (n, 3) along a path, evenly spaced, and the radius (n,) that the artery has there, whatever sac it is."""
+    """Return evenly spaced points (n, 3) along a path and the radius (n,) of the artery there, without its sacs."""
     abscissa = curves.arc_length(graph.points[path])
     even = np.linspace(0.0, abscissa[-1], max(2, round(abscissa[-1] / STEP_MM)))
     radius = np.interp(even, abscissa, graph.radius[path])
@@ -91,20 +105,20 @@ def _artery_along(graph: medial.Medial, path: Ints) -> tuple[Floats, Floats]:
 
 
 def _shunning(graph: medial.Medial, path: Ints, parent_mm: Floats, speed_cap: float) -> Ints:
-    """The way between a path's ends at a speed that falls where a sphere is wider than the artery (n,) nearby."""
+    """Return the path between a path's ends that avoids spheres wider than the artery nearby."""
     speed = speed_cap * parent_mm * np.minimum(1.0, WIDE * parent_mm / graph.radius) ** SHUN
     _, before = medial.shortest_paths(medial.cost_graph(graph, speed), int(path[0]))
     return medial.path_to(before, int(path[-1]))
 
 
 def _by_way_of(other: Ints, onward: Ints) -> Ints:
-    """The way along a path as far as to where it meets the one on from its end, and along that."""
+    """Return a path up to where it meets another one, continued along that one."""
     fork = int(np.isin(other, onward).argmax())
     return np.concatenate([other[:fork], onward[np.flatnonzero(onward == other[fork])[0] :]])
 
 
 def _apart(path: Ints, other: Ints) -> Iterator[tuple[Ints, Ints]]:
-    """The pieces of two paths that part, from one vertex that they share to the next, in the order of the first."""
+    """Yield the pieces of two paths between vertices that they share, in the order of the first path."""
     place = {int(vertex): k for k, vertex in enumerate(path)}
     left = here = 0
     for k, vertex in enumerate(other):
@@ -116,7 +130,7 @@ def _apart(path: Ints, other: Ints) -> Iterator[tuple[Ints, Ints]]:
 
 
 def _led(path: Ints, instead: Sequence[tuple[Ints, Ints]]) -> Ints:
-    """A path that takes others (k,) instead of some of its pieces."""
+    """Return a path with some of its pieces replaced."""
     for through, around in instead:
         first, last = (int(np.flatnonzero(path == end)[0]) for end in through[[0, -1]])
         path = np.concatenate([path[:first], around, path[last + 1 :]])
@@ -124,7 +138,7 @@ def _led(path: Ints, instead: Sequence[tuple[Ints, Ints]]) -> Ints:
 
 
 def _is_artery(graph: medial.Medial, through: Ints, around: Ints, parent_mm: Floats) -> bool:
-    """Tell whether, where a path runs through a sac, a way around (k,) is an artery (n,) beside it."""
+    """Return whether the path around a sac, vertices (k,), is an artery beside it."""
     taken_mm = graph.radius[around]
     if graph.radius[through].max() < SAC * taken_mm.max():
         return False
@@ -134,7 +148,7 @@ def _is_artery(graph: medial.Medial, through: Ints, around: Ints, parent_mm: Flo
 
 
 def _is_crotch(graph: medial.Medial, through: Ints, around: Ints) -> bool:
-    """Tell whether a path runs through the crotch of a fork that a way around (k,) goes by along its arms."""
+    """Return whether a path runs through the crotch of a fork while the other (k,) follows its arms."""
     cut_mm, taken_mm = graph.radius[through], graph.radius[around]
     is_sac = cut_mm.max() > CROTCH_SAC * taken_mm.max() and taken_mm.min() > AS_WIDE * cut_mm.min()
     is_between = taken_mm.min() > CROTCH * cut_mm.min() and taken_mm.max() < SAC * cut_mm.max()
@@ -142,13 +156,13 @@ def _is_crotch(graph: medial.Medial, through: Ints, around: Ints) -> bool:
 
 
 def _is_beside(graph: medial.Medial, through: Ints, around: Ints) -> bool:
-    """Tell whether a way (k,) runs outside the spheres of a path somewhere."""
+    """Return whether a path (k,) is somewhere outside the spheres of another."""
     apart_mm = np.linalg.norm(graph.points[around, None] - graph.points[through], axis=2) - graph.radius[through]
     return bool((apart_mm.min(axis=1) > BESIDE * graph.radius[around]).any())
 
 
 def _is_lumen_between(graph: medial.Medial, through: Ints, around: Ints) -> bool:
-    """Tell whether lumen lies between two ways: in a ring of arteries tissue does."""
+    """Return whether the space between two paths is lumen; in a ring of arteries it is tissue."""
     ends = graph.points[around], graph.points[through]
     across = ends[1][cKDTree(ends[1]).query(ends[0])[1]] - ends[0]
     between = ends[0] + np.linspace(0.0, 1.0, N_BETWEEN + 2)[1:-1, None, None] * across
@@ -157,6 +171,7 @@ def _is_lumen_between(graph: medial.Medial, through: Ints, around: Ints) -> bool
 
 
 def _sentence(graph: medial.Medial, through: Ints) -> str:
+    """Return the note on a sac around which a path is corrected."""
     widest = through[graph.radius[through].argmax()]
     place = ", ".join(f"{x:.0f}" for x in graph.points[widest])
     return (

@@ -1,9 +1,9 @@
-"""Trace a vessel: from a wall to openings, centerlines and maximum inscribed spheres.
+"""Trace a vessel: from its wall to openings, centerlines and maximum inscribed spheres.
 
-A centerline is the path from the inlet to another opening, along the Voronoi vertices inside the lumen, of the shortest
-travel time at the speed of the inscribed radius (Antiga et al. 2003, IEEE Trans. Med. Imaging 22:674; Piccinelli et
-al. 2009, IEEE Trans. Med. Imaging 28:1141). There the wide spheres of a sac attract the path; here the speed is capped
-at `SPEED_CAP` times the radius that the artery has on both sides, so that a sac is not worth a detour.
+A centerline is the path of shortest travel time from the inlet to another opening, along the Voronoi vertices inside
+the lumen, with the inscribed radius as speed (Antiga et al. 2003, IEEE Trans. Med. Imaging 22:674; Piccinelli et al.
+2009, IEEE Trans. Med. Imaging 28:1141). With this speed the wide spheres of a sac attract the path. Here the speed is
+limited to `SPEED_CAP` times the radius of the artery on both sides of the sac, so that no path detours into a sac.
 """
 
 from collections.abc import Sequence
@@ -25,33 +25,41 @@ from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
 
 SPEED_CAP: Final = 1.1
-"""The travel speed is at most this many parent radii."""
+"""Upper limit of the travel speed, in parent radii."""
 STEP_MM: Final = 0.1
-"""Spacing of centerline points."""
+"""Spacing of the centerline points in mm."""
 PARENT_WINDOW_MM: Final = 16.0
-"""The parent radius is a low percentile of the inscribed radii within a window of this length: a neck is shorter."""
+"""Length in mm, longer than a neck, of the window over which the parent radius is a percentile of the inscribed
+radii."""
 PARENT_PERCENTILE: Final = 35.0
+"""Percentile of the inscribed radii that is the parent radius."""
 SMOOTHED_DIAMETERS: Final = 0.75
-"""Waves of a centerline shorter than this many local diameters are smoothed away."""
+"""Longest wavelength that is smoothed out of a centerline, in local diameters."""
 THIN: Final = 0.3
-"""An outlet narrower than this fraction of the inlet may be left closed where the lumen to it is interrupted."""
+"""An outlet without a connection to the inlet is closed if it is narrower than this fraction of the inlet."""
 MOST_CONTACTS: Final = 12
-"""No more contacts between arteries than this are parted."""
+"""Largest number of contacts between arteries that are separated."""
 
 
 def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
-    """Return the vessel with its ends opened and a centerline from the inlet to every other opening.
+    """Find the openings of a vessel and a centerline from the inlet to every other opening.
 
     Parameters
     ----------
-    vessel : a repaired lumen, open or closed by flat caps, ends found or not.
-    inlet_mm : (3,) a point near the opening to take as inlet, or (k, 3) one near each opening that brings blood, first
-        that where the parent artery begins; the widest opening otherwise, with a note where another is nearly as wide.
+    vessel : repaired lumen, open or closed by flat caps, with or without openings.
+    inlet_mm : (3,) point near the opening that is the inlet, or (k, 3) points near all openings through which blood
+        enters, in mm; the first is where the parent artery begins. Where not given, the widest opening is the inlet,
+        with a note if another one is nearly as wide.
+
+    Returns
+    -------
+    vessel : vessel with openings and centerlines; touching arteries are separated.
 
     Raises
     ------
     InputError
-        When no opening is near a point of `inlet_mm`, two are near the same, or none is left to be an outlet.
+        When a point of `inlet_mm` is near no opening, two points are near the same one, or no opening is left as an
+        outlet.
     VesselError
         When fewer than two ends are found, or an opening cannot be reached from the inlet.
     """
@@ -71,7 +79,7 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
 
 
 def _paths(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.Medial, list[Ints]]:
-    """The vessel with the openings that can be reached, the medial graph, and the path to each of them."""
+    """Return the vessel with its reachable openings, the medial graph, and the path to each of these openings."""
     vessel, graph = _reachable(vessel, _graph(vessel, spheres))
     paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
     cap_mm = _radius_cap(graph, paths)
@@ -82,30 +90,35 @@ def _paths(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.Media
 
 
 def _parted(vessel: Vessel, graph: medial.Medial, paths: list[Ints], *, holds_inlet: bool) -> Vessel | None:
-    """The vessel without the first contact that a path slips through; None where there is none to be parted."""
+    """Return the vessel without the first contact between arteries that a path crosses; None without such a contact."""
     contacts = (find_contact(graph.points[path], graph.radius[path], graph) for path in paths)
     parted = (part(vessel, contact, holds_inlet=holds_inlet) for contact in contacts if contact is not None)
     return next((one for one in parted if one is not None), None)
 
 
 def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
-    """Radius (n,) that the artery has around each point of a path, whatever sac it passes.
+    """Return the radius (n,) of the artery at each point of a path in mm, without the sacs that it passes.
 
-    A running low percentile of the inscribed radii (n,), evenly spaced, over `PARENT_WINDOW_MM`.
+    The result is a running percentile of the inscribed radii over `PARENT_WINDOW_MM`.
+
+    Parameters
+    ----------
+    abscissa_mm : (n,) evenly spaced arc lengths in mm.
+    radius_mm : (n,) inscribed radii in mm.
     """
     step = float(abscissa_mm[-1]) / max(len(abscissa_mm) - 1, 1)
     return curves.running_percentile(radius_mm, PARENT_PERCENTILE, round(PARENT_WINDOW_MM / step))
 
 
 def _graph(vessel: Vessel, spheres: medial.Medial) -> medial.Medial:
-    """Join the openings to the medial graph; they are its last vertices, in their order."""
+    """Return the medial graph with the openings joined to it as its last vertices, in their order."""
     ends = np.array([opening.center_mm for opening in vessel.openings])
     reach = np.array([0.25 * opening.diameter_mm for opening in vessel.openings])
     return medial.with_terminals(spheres, ends, reach)
 
 
 def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Medial]:
-    """Leave thin outlets that the inlet does not reach closed; complain of wide ones, and of further inlets."""
+    """Return vessel and graph without unreachable narrow outlets; raise an error for other unreachable openings."""
     first = len(graph.points) - len(vessel.openings)
     cost, _ = medial.shortest_paths(medial.cost_graph(graph, np.full(len(graph.radius), np.inf)), first)
     is_reached = np.isfinite(cost[first:])
@@ -122,7 +135,7 @@ def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Med
 
 
 def _radius_cap(graph: medial.Medial, paths: Sequence[Ints]) -> Floats:
-    """Cap (n,) on the travel speed: `SPEED_CAP` times the parent radius of the nearest path point."""
+    """Return the limit (n,) of the travel speed: `SPEED_CAP` times the parent radius of the nearest path point."""
     points, parents = [], []
     for path in paths:
         abscissa = curves.arc_length(graph.points[path])
@@ -134,13 +147,14 @@ def _radius_cap(graph: medial.Medial, paths: Sequence[Ints]) -> Floats:
 
 
 def _shortest(vessel: Vessel, graph: medial.Medial, radius_cap: Floats) -> list[Ints]:
-    """Path from the inlet to each far end, as vertices of the graph."""
+    """Return the path from the inlet to each other opening, as vertices of the graph."""
     inlet = len(graph.points) - len(vessel.openings)
     _, before = medial.shortest_paths(medial.cost_graph(graph, radius_cap), inlet)
     return [medial.path_to(before, end) for end in range(inlet + 1, len(graph.points))]
 
 
 def _unreachable(inlet: Opening, opening: Opening) -> str:
+    """Return the error message for an opening that is not connected to the inlet."""
     return (
         f"{opening.role}, {opening.described}, is not connected to the inlet (diameter {inlet.diameter_mm:.1f} "
         "mm), because the lumen is interrupted between them: lower the threshold, or remove that part"
@@ -148,17 +162,19 @@ def _unreachable(inlet: Opening, opening: Opening) -> str:
 
 
 def _centerline(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Centerline:
+    """Return a smooth, evenly spaced centerline along a path with inscribed radii."""
     points = curves.resample(path_mm, STEP_MM)
     abscissa, along = curves.arc_length(path_mm), np.linspace(0.0, 1.0, len(points))
     radius = np.maximum(np.interp(along * abscissa[-1], abscissa, radius_mm), STEP_MM)
-    # Voronoi vertices jitter on a scale finer than a diameter: longer waves pass. Third differences leave a bend as it
-    # is where second ones would pull it inwards.
+    # Voronoi vertices scatter at scales below a diameter, so only longer waves are kept. Third differences preserve
+    # bends. Second differences would pull them inwards.
     waves = 2.0 * radius * SMOOTHED_DIAMETERS / (2 * np.pi * STEP_MM)
     points = centered(wall, curves.smooth(points, _held_ends(len(points)), waves**6, order=3), radius)
     return Centerline(points, wall.inscribed_radius(points))
 
 
 def _held_ends(n: int) -> Floats:
+    """Return smoothing weights (n,) that fix both ends."""
     weight = np.ones(n)
     weight[[0, -1]] = 1e6
     return weight

@@ -1,8 +1,8 @@
-"""Trim the vessel to what the device and the flow need: a stated length of artery on both sides of the sac.
+"""Trim the vessel to a given length of artery on both sides of the sac.
 
-A scan shows the whole tree; blood far from the sac costs time and tells nothing. Every way out of the sac's
-neighbourhood is cut square to its centerline where it has run the stated length, branches included. Through a cut goes
-what the openings beyond it brought or took: it is an inlet where, by Murray's law, they brought more.
+A scan shows the whole tree, but flow far from the sac adds run time and no information. Every artery that leads away
+from the sac, branches included, is cut perpendicular to its centerline at the given length. A cut carries the flow of
+the openings beyond it. It is an inlet where, by Murray's law, more blood enters through these openings than leaves.
 """
 
 from dataclasses import replace
@@ -24,88 +24,89 @@ from vstent.kernels.arrays import Floats
 from vstent.units import place
 
 UPSTREAM_MM: Final = 35.0
-"""Length of artery kept before the sac's middle: half of the longest device, five diameters for the flow to develop."""
+"""Default length of artery upstream of the sac's middle, in mm: half of the longest device, and five diameters for the
+flow to develop."""
 DOWNSTREAM_MM: Final = 25.0
-"""Length of every other way kept, beyond the sac's middle or to another inlet."""
+"""Default length in mm of every other artery, downstream of the sac's middle or to another inlet."""
 SPARE_MM: Final = 5.0
-"""Nothing is cut for less than this."""
+"""By default, an artery is cut only if more than this length is removed, in mm."""
 SAME_MM: Final = 1e-6
-"""Vertices nearer than this are the same."""
+"""Vertices closer than this are the same, in mm."""
 STRIDE_MM: Final = 1.0
-"""The direction of a cut is that of the centerline over this length."""
+"""Length in mm of the centerline that defines the direction of a cut."""
 
 
 class _Way(NamedTuple):
     """The artery on one side of the sac's middle."""
 
     side: str
-    """Which: before or beyond the sac."""
+    """Name of the side: before or beyond the sac."""
     option: str
-    """What gives the length to keep of it."""
+    """Option that sets the length to keep."""
     usual_mm: float
-    """The length kept where none is given."""
+    """Default length to keep."""
     given_mm: float | None
-    """The length given."""
+    """Length given by the user; None for the default."""
     neck_mm: float
-    """How far the sac's neck reaches."""
+    """Distance from the sac's middle to the edge of the neck."""
     clear_mm: float
-    """A cut comes no nearer to the neck than this."""
+    """Smallest distance between a cut and the neck."""
     whole_mm: float
-    """How long the artery is."""
+    """Length of the artery."""
 
     @property
     def asked_mm(self) -> float:
-        """The length given, or the usual one."""
+        """The given length, or the default."""
         return self.usual_mm if self.given_mm is None else self.given_mm
 
     @property
     def is_short(self) -> bool:
-        """Whether that would cut the sac or beside it."""
+        """Whether a cut at that length would be in the sac or too close to it."""
         return self.asked_mm < min(self.neck_mm + self.clear_mm, self.whole_mm)
 
     @property
     def has_grown(self) -> bool:
-        """Whether the usual length is too short, and the least is kept in its place."""
+        """Whether the default length is too short and the least length is used instead."""
         return self.given_mm is None and self.is_short
 
     @property
     def least_mm(self) -> float:
-        """The least length that clears the neck, in full tenths."""
+        """Least length that clears the neck, rounded up to 0.1 mm."""
         return float(np.ceil(10 * (self.neck_mm + self.clear_mm)) / 10)
 
     @property
     def kept_mm(self) -> float:
-        """The length to keep."""
+        """Length to keep."""
         return self.least_mm if self.has_grown else self.asked_mm
 
     @property
     def spare_mm(self) -> float:
-        """Nothing is cut for less than this."""
+        """The artery is cut only if more than this length is removed."""
         return SPARE_MM if self.given_mm is None else 0.0
 
 
 class _Cut(NamedTuple):
-    """Where the artery was cut."""
+    """A cut through the artery."""
 
     center_mm: Floats
-    """(3,) on a centerline."""
+    """(3,) point on a centerline."""
     radius_mm: float
-    """Radius of the artery there."""
+    """Radius of the artery at the cut."""
     sense: int
-    """Whether the part behind (-1) or ahead (1) came off."""
+    """Side that is removed: behind (-1) or ahead (1) along the centerline."""
 
 
 class _Site(NamedTuple):
-    """Where the sac hangs on its artery."""
+    """Position of the sac on its artery."""
 
     parent: Centerline
-    """The artery's centerline."""
+    """Centerline of the artery."""
     sac_mm: float
     """Abscissa of the sac's middle on it."""
     before: _Way
-    """The artery before it."""
+    """Artery upstream of the sac's middle."""
     beyond: _Way
-    """The artery beyond it."""
+    """Artery downstream of the sac's middle."""
 
 
 def trim(
@@ -115,23 +116,27 @@ def trim(
     upstream_mm: float | None = None,
     downstream_mm: float | None = None,
 ) -> Vessel:
-    """Return a traced vessel cut down around its highest sac, and traced anew.
+    """Trim a traced vessel around its largest sac, and trace it again.
 
-    A vessel without a sac, or short enough, is returned as it is.
+    A vessel without a sac, or one that is already short enough, is returned unchanged.
 
     Parameters
     ----------
-    vessel : a vessel with centerlines.
-    at_mm : (3,) a point near the sac to keep; the highest otherwise.
-    upstream_mm : length of artery to keep before the sac's middle, above zero; 35 mm, and nothing is cut for less
-        than 5 mm more, where it is not given.
-    downstream_mm : length to keep of every way beyond the sac's middle, likewise; 25 mm where it is not given.
+    vessel : vessel with centerlines.
+    at_mm : (3,) point in mm near the sac to keep; the largest sac where not given.
+    upstream_mm : length of artery to keep upstream of the sac's middle, in mm, above zero. Where not given, 35 mm are
+        kept and an excess of up to 5 mm is not cut.
+    downstream_mm : length to keep of every artery downstream of the sac's middle, in mm, above zero. Where not given,
+        25 mm are kept and an excess of up to 5 mm is not cut.
+
+    Returns
+    -------
+    vessel : trimmed vessel. Default lengths that are too short for the neck are extended, with a note.
 
     Raises
     ------
     InputError
-        When a length is not above zero, or so short that the cut would come within an artery's radius of the sac; one
-        that is not given grows by what it needs, and a note says so.
+        When a given length is not above zero, or so short that the cut would be within one artery radius of the neck.
     """
     _refuse_none(upstream_mm, downstream_mm)
     bulges = find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
@@ -146,7 +151,7 @@ def trim(
         radius = float(np.interp(abscissa_mm, line.abscissa_mm, line.inscribed_radius_mm))
         cut = cut_square(lumen, center, direction, radius)
         part = None if cut is None else Surface(*triangles.part_at(cut.vertices_mm, cut.faces, bulges[0].dome_mm))
-        # What lies beyond a cut may hang on the sac as well, where the sac touches its artery a second time.
+        # The part beyond a cut may belong to the sac, where the sac touches its artery a second time.
         if part is not None and _holds(part, bulges[0]):
             lumen = part
             cuts.append(_Cut(center, radius, sense))
@@ -158,10 +163,8 @@ def trim(
 
 
 def _ends_mm(vessel: Vessel, cuts: list[_Cut], lumen: Surface) -> Floats:
-    """Where (k, 3) the blood of every opening of a vessel passes an end of what the cuts leave of it, the lumen.
-
-    That is the first cut along the opening's centerline; the one before the sac, where it lies behind that.
-    """
+    """Return where the blood of each opening of the vessel passes an end of the trimmed lumen, (k, 3), in mm."""
+    # This is the first cut along the opening's centerline, or the cut upstream of the sac for an opening beyond that.
     loops = cKDTree(lumen.loop_centers_mm)
     before = [cut.center_mm for cut in cuts if cut.sense < 0]
     ahead = [cut for cut in cuts if cut.sense > 0]
@@ -178,10 +181,7 @@ def _ends_mm(vessel: Vessel, cuts: list[_Cut], lumen: Surface) -> Floats:
 
 
 def _inlets_of(vessel: Vessel, ends_mm: Floats, lumen: Surface) -> tuple[Floats, list[str]]:
-    """Middles (i, 3) of a lumen's inlets, and sentences on those of the vessel that are no openings of their own.
-
-    Blood of each opening of the vessel passes an end of the lumen at `ends_mm` (k, 3).
-    """
+    """Return the centers (i, 3) of a lumen's inlets, and notes on inlets of the vessel that were cut off."""
     loop = np.asarray(cKDTree(lumen.loop_centers_mm).query(ends_mm)[1])
     brought = np.bincount(loop, np.concatenate([murray_shares(vessel.inlets), -murray_shares(vessel.outlets)]))
     of_inlets = dict.fromkeys(loop[: len(vessel.inlets)].tolist())
@@ -196,12 +196,12 @@ def _inlets_of(vessel: Vessel, ends_mm: Floats, lumen: Surface) -> tuple[Floats,
 
 
 def _holds(lumen: Surface, bulge: Bulge) -> bool:
-    """Tell whether a lumen still has all of a bulge's vertices."""
+    """Return whether a lumen still has all vertices of a bulge."""
     return bool(np.asarray(cKDTree(lumen.vertices_mm).query(bulge.points_mm)[0]).max() < SAME_MM)
 
 
 def _refuse_none(*lengths_mm: float | None) -> None:
-    """Refuse lengths that are not above zero."""
+    """Raise an InputError for lengths that are not above zero."""
     for length_mm in lengths_mm:
         if length_mm is not None and not 0 < length_mm < np.inf:
             raise InputError(
@@ -210,7 +210,7 @@ def _refuse_none(*lengths_mm: float | None) -> None:
 
 
 def _trimmed(site: _Site) -> list[str]:
-    """Sentences on what is kept."""
+    """Return notes on the lengths that are kept."""
     before, beyond = site.before, site.beyond
     return [
         f"Trimmed to {before.kept_mm:.4g} mm of vessel proximal and {beyond.kept_mm:.4g} mm distal to the "
@@ -225,7 +225,7 @@ def _trimmed(site: _Site) -> list[str]:
 
 
 def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
-    """Sentences on the sacs that are not in what is left of the lumen."""
+    """Return notes on sacs that were cut off."""
     return [
         f"Another bulge, {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)}, was cut off; choose it by "
         "that point (--at)."
@@ -235,13 +235,7 @@ def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
 
 
 def _site(vessel: Vessel, bulge: Bulge, upstream_mm: float | None, downstream_mm: float | None) -> _Site:
-    """Where a sac hangs on its artery, and what is to be kept of it on both sides: the lengths given, if any.
-
-    Raises
-    ------
-    InputError
-        When with a length given a cut would come within a radius of the sac's foot.
-    """
+    """Return the position of a sac on its artery and the lengths to keep; raise an InputError if one is too short."""
     foot = cKDTree(bulge.foot_mm)
     gaps = [np.asarray(foot.query(line.points_mm)[0]) for line in vessel.centerlines]
     parent = vessel.centerlines[int(np.argmin([gap.min() for gap in gaps]))]
@@ -260,6 +254,7 @@ def _site(vessel: Vessel, bulge: Bulge, upstream_mm: float | None, downstream_mm
 
 
 def _short(way: _Way, bulge: Bulge) -> str:
+    """Return the error message for a length that is too short."""
     return (
         f"{way.asked_mm:g} mm of artery {way.side} the middle of the sac at "
         f"{place(bulge.foot_mm.mean(axis=0))} would be a cut through the sac or next to it, because its neck "
@@ -268,12 +263,12 @@ def _short(way: _Way, bulge: Bulge) -> str:
 
 
 def _cuts(vessel: Vessel, site: _Site) -> list[tuple[Centerline, float, int]]:
-    """Where to cut: a centerline, the abscissa on it, and whether the part behind (-1) or ahead (1) comes off."""
+    """Return for each cut its centerline, its abscissa, and the side to remove: behind (-1) or ahead (1)."""
     parent, sac_mm, before, beyond = site
     cuts = [(parent, sac_mm - before.kept_mm, -1)] if sac_mm > before.kept_mm + before.spare_mm else []
     for line in vessel.centerlines:
         fork_mm = min(_fork_mm(line, parent), line.length_mm)
-        # A branch that leaves before the sac has run from the sac back to its fork already.
+        # A branch that leaves upstream of the sac is measured from the sac back to its fork and then along the branch.
         way_mm = beyond.kept_mm
         abscissa_mm = sac_mm + way_mm if fork_mm >= sac_mm else 2 * fork_mm - sac_mm + way_mm
         root_mm = fork_mm + 4.0 * float(np.interp(fork_mm, line.abscissa_mm, line.inscribed_radius_mm))
@@ -284,6 +279,6 @@ def _cuts(vessel: Vessel, site: _Site) -> list[tuple[Centerline, float, int]]:
 
 
 def _fork_mm(line: Centerline, parent: Centerline) -> float:
-    """Abscissa where a centerline leaves the parent's; its length for the parent itself."""
+    """Return the abscissa where a centerline leaves that of the parent artery; its length for the parent itself."""
     apart = np.flatnonzero(curves.project(parent.points_mm, line.points_mm)[1] > line.inscribed_radius_mm)
     return float(line.abscissa_mm[apart[0]]) if len(apart) else line.length_mm

@@ -1,4 +1,4 @@
-"""Virtual stenting: a device, an `Anatomy` and a landing in, a `Deployment` with wires and wall gaps out.
+"""Virtual stenting: turn a device, an `Anatomy` and a landing into a `Deployment` with wires and gaps to the wall.
 
-Open ``deploy.py`` first; ``active_contour.py`` holds equations (1) to (7) of Zhong et al. 2016.
+Start reading in ``deploy.py``. ``active_contour.py`` holds equations (1) to (7) of Zhong et al. 2016.
 """

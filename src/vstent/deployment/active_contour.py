@@ -1,4 +1,4 @@
-"""The active contour of Zhong et al. 2016: a closed tube of nodes that grows until it meets the wall (eq. 1-7)."""
+"""The active contour of Zhong et al. 2016: a tube of nodes that grows until it meets the wall (eq. 1-7)."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -13,17 +13,17 @@ from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 SAFELY: Final = 1 - 1e-9
-"""Balls without a wall in them are taken smaller by this, so that rounding cannot hide a crossing."""
+"""Factor that shrinks the balls known to contain no wall, so that rounding errors cannot hide a crossing."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Stiffness:
-    """The factored matrix I + tau K of the internal energy on a grid that is free in s and periodic in r.
+    """Factored matrix I + tau K of the internal energy, on a grid with free ends in s and periodic in r.
 
-    The variation of eq. (2) is K v = -a1 v_ss + a2 v_ssss - a3 v_rr + a4 v_rrrr + 2 a5 v_ssrr, grid spacing 1. K is
-    block-circulant in r: after a Fourier transform in r every harmonic is a pentadiagonal matrix in s; all of them
-    lie one after another in one banded Cholesky factor.
+    The variation of eq. (2) is K v = -a1 v_ss + a2 v_ssss - a3 v_rr + a4 v_rrrr + 2 a5 v_ssrr, for a grid spacing of 1.
+    K is block-circulant in r. A Fourier transform in r therefore leaves one pentadiagonal matrix in s per harmonic. All
+    of them are stored one after another in one banded Cholesky factor.
     """
 
     factor: Floats
@@ -36,7 +36,7 @@ class Stiffness:
     @staticmethod
     @lru_cache(maxsize=8)
     def of(contour: "ActiveContour", rows: int, columns: int) -> "Stiffness":
-        """Factor I + tau K once for a grid."""
+        """Factor I + tau K for a grid of rows by columns; the result is cached."""
         wave = 2 - 2 * np.cos(2 * np.pi * np.arange(columns // 2 + 1) / columns)
         tension, bending = _free_differences(rows, 1), _free_differences(rows, 2)
         identity = np.zeros((3, rows))
@@ -61,7 +61,7 @@ class Stiffness:
 
 
 def _free_differences(rows: int, order: int) -> Floats:
-    """Bands (3, rows), upper form, of D^T D for differences D of an order: energy of a curve with free ends."""
+    """Return bands (3, rows), upper form, of D^T D for differences D of an order on a curve with free ends."""
     stencil = (-1.0, 1.0) if order == 1 else (1.0, -2.0, 1.0)
     bands = np.zeros((3, rows))
     for i, left in enumerate(stencil):
@@ -76,30 +76,56 @@ class State:
     """The contour between two iterations."""
 
     nodes_mm: Floats
-    """(rows, columns, 3) nodes."""
+    """(rows, columns, 3) nodes, in mm."""
     centers_mm: Floats
-    """(rows, columns, 3) fiducial point inside the lumen for every node: its row's center, the paper's "center"."""
+    """(rows, columns, 3) fiducial point of every node inside the lumen, in mm: the center of its row."""
     clearance_mm: Floats
-    """(rows, columns) no wall is nearer to the fiducial point than this."""
+    """(rows, columns) distance from the fiducial point within which there is no wall, in mm."""
     is_terminated: Bools
     """(rows, columns) nodes that no longer move."""
     contact: Contact
-    """The nearest wall of every node, flattened to (rows * columns,)."""
+    """Nearest wall of every node, flattened to (rows * columns,)."""
     stiffness: Stiffness
-    """I + tau K, factored."""
+    """Factored matrix I + tau K."""
 
     def about(self, centers_mm: Floats, rows: Ints) -> "State":
-        """Return the contour with other fiducial points (rows, columns, 3), each near that of a row (rows, columns).
+        """Return the contour with other fiducial points.
 
-        The clearance falls off from there no faster than one moves away.
+        The clearance of a new point is that of the old one less the distance between them.
+
+        Parameters
+        ----------
+        centers_mm : (rows, columns, 3) array, mm
+            New fiducial points inside the lumen.
+        rows : (rows, columns) array of int
+            Row of this contour whose fiducial point is near each new one.
+
+        Returns
+        -------
+        State
+            The contour with the new fiducial points.
         """
         off_mm = curves.lengths(centers_mm - self.centers_mm[rows, 0])
         return replace(self, centers_mm=centers_mm, clearance_mm=np.maximum(self.clearance_mm[rows, 0] - off_mm, 0.0))
 
     def near(self, points_mm: Floats, centers_mm: Floats, rows: Ints, columns: Ints) -> "State":
-        """Return points (n, 3) with fiducial points (n, 3) as a contour of one column; each is near one of the nodes.
+        """Return points between the nodes as a contour of one column.
 
-        Whether it terminated, and on what wall, is what that node, at (n,) rows and columns, did.
+        Each point takes the terminated state and the wall contact of one node near it.
+
+        Parameters
+        ----------
+        points_mm : (n, 3) array, mm
+            The points.
+        centers_mm : (n, 3) array, mm
+            Their fiducial points.
+        rows, columns : (n,) array of int
+            The node near each point.
+
+        Returns
+        -------
+        State
+            Contour of n rows and one column.
         """
         number = rows * self.nodes_mm.shape[1] + columns
         return replace(
@@ -111,49 +137,76 @@ class State:
 
     @cached_property
     def terminated_fraction(self) -> float:
-        """Part of the nodes that no longer move."""
+        """Fraction of the nodes that no longer move."""
         return float(self.is_terminated.mean())
 
 
 @final
 @dataclass(frozen=True)
 class ActiveContour:
-    """The paper's contour: eq. (1-7), one explicit force step and one implicit elastic step per iteration.
+    """Weights and steps of the active contour: one explicit force step and one implicit elastic step per iteration.
 
-    The elastic weights act on differences between neighbouring nodes, without units; forces are displacements in mm
-    per unit of tau. The defaults are argued from a study (``benchmarks/contour_weights.py``, an artery of lobed
-    sections): from no elasticity at all to ten times this much the contour ends on the same wall; at a hundred times
-    (tension 1, bending 20) it hangs in front of it, for the tension pulls a tube shut. So the weights are a tenth of
-    what changes nothing. k1 below 1 aims short of the wall, so that eq. (7) is for accidents; far below, it creeps (8
-    iterations at 0.05) and nodes drift together. k2 only matters close to the wall; from 0.2 on it crowds the nodes.
-    See `vstent.deployment.method` for the loop.
+    The elastic weights act on differences between neighbouring nodes and have no unit. Forces are displacements in mm
+    per unit of tau. See `vstent.deployment.method` for the loop.
+
+    Notes
+    -----
+    The default elastic weights come from a study on an artery with lobed sections (``benchmarks/contour_weights.py``).
+    The contour ends on the same wall from no elasticity up to ten times the defaults. At a hundred times the defaults
+    (tension 1, bending 20) the contour stops before the wall, because the tension contracts the tube. The defaults are
+    therefore a tenth of the largest tested weights without influence.
+
+    With k1 below 1 the nodes stop short of the wall, so that eq. (7) is needed only rarely. With a much smaller k1 the
+    contour is slow (8 iterations at 0.05) and nodes drift together. k2 matters only close to the wall. From 0.2 on it
+    crowds the nodes.
+
+    References
+    ----------
+    Zhong et al. (2016), eq. 1-7.
     """
 
     a1: float = 0.01
-    """Tension along the device, |v_s|^2."""
+    """Tension along the device, weight of |v_s|^2."""
     a2: float = 0.02
-    """Bending along the device, |v_ss|^2."""
+    """Bending along the device, weight of |v_ss|^2."""
     a3: float = 0.01
-    """Tension around the device, |v_r|^2."""
+    """Tension around the device, weight of |v_r|^2."""
     a4: float = 0.02
-    """Bending around the device, |v_rr|^2."""
+    """Bending around the device, weight of |v_rr|^2."""
     a5: float = 0.01
-    """Twist, |v_sr|^2; it enters eq. (2) twice."""
+    """Twist, weight of |v_sr|^2. It enters eq. (2) twice."""
     k1: float = 0.8
-    """Balloon: part of the distance to the wall that a node goes along the contour's normal, eq. (4)."""
+    """Balloon force: fraction of the distance to the wall by which a node moves along the contour's normal, eq. (4)."""
     k2: float = 0.05
-    """Vessel: pull straight to the wall, mm, eq. (5)."""
+    """Vessel force: displacement straight towards the wall, in mm, eq. (5)."""
     tau: float = 1.0
-    """Length of a step."""
+    """Step length, without unit."""
     dd_mm: float = 0.03
-    """Distance from the wall at which nodes terminate: the device's wire width, eq. (6, 7)."""
+    """Distance from the wall at which nodes terminate, in mm: the wire width of the device, eq. (6, 7)."""
     terminated_goal: float = 0.99
-    """Part of the nodes that must terminate."""
+    """Fraction of the nodes that must terminate."""
     iteration_limit: int = 60
-    """Iterations after which the contour gives up."""
+    """Largest number of iterations."""
 
     def init(self, nodes_mm: Floats, centers_mm: Floats, clearance_mm: Floats, wall: AbstractWall) -> State:
-        """Start from a contour (rows, columns, 3) with row centers (rows, 3) inside the lumen, (rows,) off the wall."""
+        """Create the state before the first iteration.
+
+        Parameters
+        ----------
+        nodes_mm : (rows, columns, 3) array, mm
+            Nodes of the closed contour.
+        centers_mm : (rows, 3) array, mm
+            Centers of the rows, inside the lumen.
+        clearance_mm : (rows,) array, mm
+            Distances from the centers to the wall.
+        wall : AbstractWall
+            Wall of the artery.
+
+        Returns
+        -------
+        State
+            The contour, with no node terminated.
+        """
         shape = nodes_mm.shape
         return State(
             nodes_mm,
@@ -165,24 +218,25 @@ class ActiveContour:
         )
 
     def step(self, state: State, wall: AbstractWall) -> State:
-        """Move the nodes that continue, then terminate those that reach the wall or cross it."""
+        """Move the nodes that have not terminated, then terminate those that have reached or crossed the wall."""
         force_mm = np.where(state.is_terminated[..., None], 0.0, self.force_mm(state))
         moved = state.stiffness.solve(state.nodes_mm + self.tau * force_mm)
         nodes_mm = np.where(state.is_terminated[..., None], state.nodes_mm, moved)
         return self.classify(replace(state, nodes_mm=nodes_mm), ~state.is_terminated, wall)
 
     def force_mm(self, state: State) -> Floats:
-        """Balloon (eq. 4) plus vessel force (eq. 5), (rows, columns, 3)."""
+        """Return the sum of balloon force (eq. 4) and vessel force (eq. 5), (rows, columns, 3), in mm."""
         shape = state.nodes_mm.shape
         distance_mm = state.contact.distance_mm.reshape(shape[:2])[..., None]
         to_wall = -state.contact.inward(state.nodes_mm.reshape(-1, 3)).reshape(shape)
         return self.k1 * distance_mm * normals(state.nodes_mm) + self.k2 * to_wall
 
     def energy_mm2(self, state: State) -> float:
-        """Energy of the contour, eq. (1): the internal energy of eq. (2) and the potential of the forces.
+        """Return the energy of the contour (eq. 1), in mm2: internal energy (eq. 2) plus the potential of the forces.
 
-        Along the way to the wall, where the contour's normal points to it, eq. (4, 5) have the potential
-        k1 d^2 + 2 k2 d (an iteration descends half of eq. 2, whose variation is 2 K v).
+        Where the contour's normal points to the nearest wall, the forces of eq. (4, 5) have the potential k1 d^2 + 2 k2
+        d, with d the distance to the wall. The factor 2 is due to the variation of eq. (2), which is 2 K v: an
+        iteration descends half of that energy.
         """
         v = state.nodes_mm
         along, around = np.diff(v, axis=0), np.roll(v, -1, axis=1) - v
@@ -195,16 +249,31 @@ class ActiveContour:
             (self.a4, bent),
             (2 * self.a5, twisted),
         )
-        # No product of vectors: that of numpy wakes threads that then spin, and its last bits depend on how many.
+        # numpy's dot product is avoided: it starts threads, and its last bits depend on their number.
         internal = sum(weight * float((d * d).sum()) for weight, d in terms)
         distance_mm = state.contact.distance_mm
         return internal + float((self.k1 * distance_mm**2 + 2 * self.k2 * distance_mm).sum())
 
     def classify(self, state: State, is_asked: Bools, wall: AbstractWall) -> State:
-        """Sort the nodes asked about (rows, columns) into the paper's three states and relocate those that terminate.
+        """Sort nodes into the three states of the paper, and relocate those that terminate.
 
-        1. inside and further than dd from the wall: continues; 2. inside and nearer: terminates, eq. (6);
-        3. outside (the segment from its row's center crosses the wall): terminates, eq. (7).
+        1. Inside and farther than dd from the wall: the node continues. 2. Inside and nearer than dd: the node
+        terminates, eq. (6). 3. Outside (the segment from the center of its row crosses the wall): the node terminates,
+        eq. (7).
+
+        Parameters
+        ----------
+        state : State
+            The contour.
+        is_asked : (rows, columns) array of bool
+            Nodes to sort. All others stay the same.
+        wall : AbstractWall
+            Wall of the artery.
+
+        Returns
+        -------
+        State
+            The contour with these nodes sorted and relocated.
         """
         asked = is_asked.ravel()
         points_mm = state.nodes_mm.reshape(-1, 3).copy()
@@ -221,22 +290,35 @@ class ActiveContour:
         return replace(state, nodes_mm=nodes_mm, is_terminated=is_terminated, contact=contact)
 
     def relocated_mm(self, points_mm: Floats, is_outside: Bools, contact: Contact) -> Floats:
-        """Put points (n, 3) at dd from their closest wall points, on the lumen's side: eq. (6) inside, (7) outside."""
+        """Return points (n, 3) moved to the distance dd from their closest wall points, into the lumen, eq. (6, 7).
+
+        Parameters
+        ----------
+        points_mm : (n, 3) array, mm
+            The points.
+        is_outside : (n,) array of bool
+            Points outside the lumen, for which eq. (7) applies.
+        contact : Contact
+            Their nearest wall.
+
+        Returns
+        -------
+        (n, 3) array, mm
+            Points at the distance dd from the wall.
+        """
         away = contact.inward(points_mm)
         side = np.where(is_outside & (contact.distance_mm > ON_WALL_MM), -1.0, 1.0)
         return contact.closest_mm + self.dd_mm * side[:, None] * away
 
     def terminate(self, state: State) -> bool:
-        """Tell whether enough nodes have terminated."""
+        """Return whether enough nodes have terminated."""
         return state.terminated_fraction >= self.terminated_goal
 
 
 def _is_outside(state: State, asked: Bools, distance_mm: Floats, wall: AbstractWall) -> Bools:
-    """Tell of the nodes asked about, (n,) of all, whether the segment from their center crosses the wall.
-
-    No wall lies within the clearance of the center nor within the distance of the node: only what is left of the
-    segment between these two balls is tested, if anything is.
-    """
+    """Return whether the segment from the row center to each of the nodes `asked` crosses the wall."""
+    # No wall lies within the clearance of a center or within the distance of a node. Only the part of the
+    # segment between these two balls is tested, if there is one.
     centers_mm, points_mm = state.centers_mm.reshape(-1, 3)[asked], state.nodes_mm.reshape(-1, 3)[asked]
     clearance_mm = SAFELY * state.clearance_mm.ravel()[asked]
     way_mm = points_mm - centers_mm

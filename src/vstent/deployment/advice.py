@@ -1,4 +1,4 @@
-"""Advice: where a device lies, what to do when it does not fit, and what no device there covers."""
+"""Advice on a deployment: where the device lies, what to do if it does not fit, and a neck on a fork."""
 
 from functools import lru_cache
 from math import inf
@@ -22,27 +22,45 @@ from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats
 
 SHORT_MM: Final = 0.1
-"""A device reaches far enough beyond the neck when no more than this is missing: its length was only foreseen."""
+"""Length, in mm, by which the margin beyond the neck may be missed, since the deployed length is only estimated."""
 
 OFF_MM: Final = 0.5
-"""A neck that reaches further than this off the parent artery opens into another branch besides."""
+"""Distance from the parent artery, in mm, beyond which a neck also opens into another branch."""
 
 
 class Gaps(NamedTuple):
-    """How a device lies on the wall."""
+    """Gaps between a device and the wall."""
 
     gap_mm: Floats
-    """(rows, columns) clearance between its outer face and the wall."""
+    """(rows, columns) gap between the outer face of the device and the wall, in mm."""
     is_at_patient: Bools
     """(rows, columns) whether that wall is the patient's own."""
 
 
 def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
-    """One sentence on where the device lies and what to do when it does not fit; one on a neck on a fork, if it is."""
+    """Describe where the device lies and what to do if it does not fit.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    stent : Stent
+        The deployed device.
+    course : Course
+        Record of the deployment.
+    gaps : Gaps
+        Gaps between the device and the wall.
+
+    Returns
+    -------
+    str
+        One sentence, and a second one if the neck is on a fork.
+    """
     return f"{_lies(anatomy, stent, course, gaps)}{_of_fork(anatomy)}"
 
 
 def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
+    """Return the sentence on where the device lies, its apposition and what to do."""
     gap_mm, is_at_patient = gaps
     lies = (
         f"{stent.design.name} {stent.size.label} spans "
@@ -64,7 +82,7 @@ def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
 
 @lru_cache(maxsize=8)
 def _of_fork(anatomy: Anatomy) -> str:
-    """A sentence that begins with a space where the neck opens into more than the parent artery; else nothing."""
+    """Return a sentence that starts with a space if the neck opens into more than the parent artery, else nothing."""
     off_mm = anatomy.landing_surface.closest(neck_points_mm(anatomy))[1].max(initial=0.0)
     if off_mm < OFF_MM:
         return ""
@@ -75,7 +93,7 @@ def _of_fork(anatomy: Anatomy) -> str:
 
 
 def _width(anatomy: Anatomy, stent: Stent) -> str:
-    """A clause that begins with a comma where a device is labelled for far wider arteries; else nothing."""
+    """Return a clause that starts with a comma if the label diameter is far wider than the artery, else nothing."""
     over = oversizing_fraction(anatomy, stent)
     if over <= OVERSIZED_FRACTION:
         return ""
@@ -85,7 +103,7 @@ def _width(anatomy: Anatomy, stent: Stent) -> str:
 
 
 def _reach(anatomy: Anatomy, stent: Stent) -> str:
-    """A clause that begins with a comma where a device misses the neck or hardly reaches beyond it; else nothing."""
+    """Return a clause that starts with a comma if the margin beyond the neck is missing or too short, else nothing."""
     if not anatomy.aneurysms:
         return ""
     proximal_mm, distal_mm = neck_span_mm(anatomy)
@@ -103,7 +121,7 @@ def _reach(anatomy: Anatomy, stent: Stent) -> str:
 
 
 def _remedy_of_reach(anatomy: Anatomy, stent: Stent, beyond_mm: Floats, move: str) -> str:
-    """What to do, in brackets, about a device that reaches (2,) `beyond_mm` the neck; nothing where nothing helps."""
+    """Return advice in brackets for a device that extends by `beyond_mm` (2,) beyond the neck, or nothing."""
     half_mm, center_mm = 0.5 * stent.deployed_length_mm, float(np.mean(neck_span_mm(anatomy)))
     fits = half_mm < center_mm < anatomy.axis.length_mm - half_mm
     if fits and beyond_mm.mean() >= wanted_margin_mm(anatomy):
@@ -132,7 +150,7 @@ def _remedy(anatomy: Anatomy, stent: Stent, gap_mm: Floats, is_loose: Bools) -> 
     wider = [size for size in stent.design.sizes if size.diameter_mm > stent.size.diameter_mm]
     if not wider:
         return f"{its}. Choose a device of larger diameter."
-    # The shortest first: where a wider size fits at all, it is most likely one of those.
+    # The shortest sizes come first because they are the most likely to fit.
     wider.sort(key=lambda size: (size.length_mm, size.diameter_mm))
     if all(reach_mm(stent.design, anatomy, size) == -inf for size in wider):
         return f"{its}, and wider sizes are too long for this artery. Choose another device."

@@ -11,7 +11,22 @@ from vstent.kernels.arrays import Floats
 
 
 def apposition(anatomy: Anatomy, deployment: Deployment) -> Measures:
-    """Measure the gaps to the patient's own wall, in mm, and how far nodes lie outside the landing surface."""
+    """Measure the gaps to the patient's own wall, and how far nodes lie outside the landing surface.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    deployment : Deployment
+        The deployed device.
+
+    Returns
+    -------
+    dict
+        Apposed fraction of the nodes, mean and largest gap (mm), volume between device and wall (mm3), and largest
+        distance of a node outside the landing surface (mm). Only the last is given where the whole device lies over
+        restored wall.
+    """
     stent = deployment.stent
     points_mm = stent.nodes_mm.reshape(-1, 3)
     surface = anatomy.landing_surface
@@ -32,6 +47,7 @@ def apposition(anatomy: Anatomy, deployment: Deployment) -> Measures:
 
 
 def _node_areas_mm2(stent: Stent) -> Floats:
+    """Return the area (rows, columns) of the contour that belongs to every node, in mm2."""
     quarter = 0.25 * quad_areas_mm2(stent)
     beside = quarter + np.roll(quarter, 1, axis=1)
     empty = np.zeros((1, beside.shape[1]))

@@ -1,4 +1,4 @@
-"""Constant wire, the default method: rows marched along the parent axis by wires that cannot stretch."""
+"""The default deployment method: wires of constant length set the distance between the rows of the device."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,40 +18,56 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM
 
 ROUNDS = 8
-"""Rows are marched anew at most so often."""
+"""Largest number of times that row positions are recomputed."""
 SETTLED_MM = 0.1
 """Largest movement of a row between two rounds at which the rows have converged, in mm."""
 LAST_STEPS = 5
-"""Steps at most for the last nodes, once 99 % have terminated."""
+"""Largest number of extra steps for the remaining nodes after 99 % have terminated."""
 TABLE_ROWS = 501
-"""Samples of the row spacing along the artery."""
+"""Number of samples of the row spacing along the artery."""
 FREELY = 0.999
-"""A row this near to the free perimeter stopped there, not at the wall."""
+"""Fraction of the free perimeter above which a row counts as stopped there and not at the wall."""
 BEYOND_MM = 500.0
-"""Rows are counted so far beyond the artery, to say by how much a device misses it."""
+"""Length, in mm, by which row positions are computed beyond both ends of the artery.
+
+It lets the error state how far the device would extend beyond the artery.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """The contour's diameter along the parent axis, and how the axis bends."""
+    """Diameter of the contour along the parent axis, and curvature of the axis."""
 
     abscissa_mm: Floats
-    """(k,) arc lengths."""
+    """(k,) arc lengths along the axis, in mm."""
     diameter_mm: Floats
-    """(k,) diameters of the circles of the same perimeter."""
+    """(k,) diameters of circles with the perimeter of the contour, in mm."""
     bend: tuple[Floats, Floats] = (np.zeros(1), np.zeros(1))
-    """(m,) arc lengths and (m,) the axis's curvature there, per mm."""
+    """(m,) arc lengths in mm and (m,) curvatures of the axis there, per mm."""
 
     def at(self, abscissa_mm: Floats) -> Floats:
-        """Return the diameter at arc lengths; beyond the ends it stays what it is there."""
+        """Return the diameter at arc lengths, in mm; beyond the ends it equals the end value."""
         return np.interp(abscissa_mm, self.abscissa_mm, self.diameter_mm)
 
     def spacing_mm(self, design: Design, size: Size, abscissa_mm: Floats) -> Floats:
-        """Return the distance between lattice rows of a device at arc lengths."""
+        """Return the distance between lattice rows of a device at arc lengths, in mm."""
         return row_spacing_mm(design, size, self.at(abscissa_mm), np.interp(abscissa_mm, *self.bend))
 
     def corrected(self, abscissa_mm: Floats, diameter_mm: Floats) -> "Profile":
-        """Return the profile through (r,) measured diameters; beyond them it keeps its shape, shifted."""
+        """Return a profile that passes through measured diameters.
+
+        Parameters
+        ----------
+        abscissa_mm : (r,) array, mm
+            Increasing arc lengths of the measurements.
+        diameter_mm : (r,) array, mm
+            Measured diameters.
+
+        Returns
+        -------
+        Profile
+            Profile through the measurements. Beyond them it keeps its shape, shifted to meet the outermost ones.
+        """
         error_mm = np.interp(self.abscissa_mm, abscissa_mm, diameter_mm - self.at(abscissa_mm))
         outside = (self.abscissa_mm < abscissa_mm[0]) | (self.abscissa_mm > abscissa_mm[-1])
         together = np.concatenate([self.abscissa_mm[outside], abscissa_mm])
@@ -61,10 +77,28 @@ class Profile:
 
 
 def expected_profile(design: Design, size: Size, anatomy: Anatomy) -> Profile:
-    """Diameter that the contour will have, against the landing surface or free, and the bends its rows heed.
+    """Predict the diameter of the contour before deployment, and the curvature that affects the row spacing.
 
-    Rows of a laser-cut device are put as in a straight artery: in a tight bend its cells leave the wall, and its rows
-    do not come as near together as those of a braid. From there `vstent.deployment.cells` moves them.
+    The diameter is that of the landing surface, less the offset of the contour, or the free diameter if that is
+    smaller.
+
+    For a laser-cut device the curvature is left out, so its rows start as in a straight artery. In a tight bend its
+    cells leave the wall, and its rows do not come as close together as those of a braid. `vstent.deployment.cells` then
+    moves them.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    anatomy : Anatomy
+        The artery.
+
+    Returns
+    -------
+    Profile
+        Expected diameter along the parent axis, with its curvature for a braid.
     """
     offset_mm = design.wall_offset_um * MM_PER_UM
     diameter_mm = np.minimum(2 * (anatomy.section_radius_mm - offset_mm), size.free_diameter_mm)
@@ -74,22 +108,38 @@ def expected_profile(design: Design, size: Size, anatomy: Anatomy) -> Profile:
 
 
 def bend(anatomy: Anatomy) -> tuple[Floats, Floats]:
-    """Return arc lengths (m,) and how the parent axis bends there (m,), per mm."""
+    """Return arc lengths (m,) along the parent axis, in mm, and its curvature (m,), per mm."""
     across = planes(anatomy.axis)
     return across.abscissa_mm, across.curvature_per_mm
 
 
 def landed_row(design: Design, size: Size, landing: Landing) -> int:
-    """Return the row of nodes that lies where the device is landed."""
+    """Return the number of the row of nodes that lies at the landing point."""
     rows = grid(design, size).rows
     return {"proximal": 0, "center": (rows - 1) // 2, "distal": rows - 1}[landing.anchor]
 
 
 def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Floats:
-    """Arc lengths (rows,) of the rows: from each to the next it is h(D), so rows are counted by the integral of ds/h.
+    """Compute the arc length of every row from the row spacing that the wires impose.
 
-    The landing point is the middle row, the first (proximal) or the last (distal). Rows may leave the artery, where
-    the diameter is that of its end.
+    The distance from one row to the next is h(D), the row spacing at the local diameter. Row numbers are therefore the
+    integral of ds / h, counted from the landing point.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    landing : Landing
+        Where the proximal, middle or distal row lies.
+    profile : Profile
+        Diameter and curvature along the axis.
+
+    Returns
+    -------
+    (rows,) array, mm
+        Arc lengths of the rows. They may lie beyond the artery, where the diameter is taken as that at its end.
     """
     shape = grid(design, size)
     start = landed_row(design, size, landing)
@@ -104,13 +154,26 @@ def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Flo
 @final
 @dataclass(frozen=True)
 class FreeDiameter:
-    """Stops a row when its perimeter reaches the device's free one: a wider artery stays untouched."""
+    """Limit of the perimeter of a row: it stops where it reaches that of the free device, even in a wider artery."""
 
     diameter_mm: float
-    """The free diameter."""
+    """Free diameter, in mm."""
 
     def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
-        """Let every row go from `before_mm` towards `after_mm` only as far as its perimeter may grow."""
+        """Move every row as far as its perimeter may grow.
+
+        Parameters
+        ----------
+        before_mm, after_mm : (rows, columns, d) array, mm
+            Nodes before and after an unlimited step.
+
+        Returns
+        -------
+        nodes_mm : (rows, columns, d) array, mm
+            Nodes after the limited step.
+        is_over : (rows, columns) array of bool
+            Nodes in rows that have reached the free perimeter.
+        """
         allowed = np.pi * self.diameter_mm
         old, new = perimeters(before_mm), perimeters(after_mm)
         is_over = new >= allowed
@@ -123,26 +186,38 @@ class FreeDiameter:
 @final
 @dataclass(frozen=True, eq=False)
 class ConstantWire(AbstractMethod):
-    """The device's own mechanics round the paper's contour: wires keep their length, rows their free diameter.
+    """Deployment method in which wires keep their length and rows do not exceed the free diameter.
 
-    Rows are as far apart as the wires put them (`march`), so length and ends are predictions; a row stops growing at
-    the free diameter; where the artery bends, crossings slide along the wall until the single pieces of wire are as
-    long as they were made, as far as that goes (`pieces`).
+    The active contour of Zhong et al. 2016 carries the device to the wall. This method adds the mechanics of the
+    device:
+
+    - Rows are as far apart as the wires require (`march`), so the length and the ends of the device are predictions.
+    - A row stops growing at the free diameter.
+    - Where the artery bends, crossings slide along the wall until each piece of wire has, as far as possible, its
+      original length (`vstent.deployment.pieces`).
     """
 
     def init(self, placement: Placement) -> Opened:
-        """Put rows where they would lie if the device filled the artery."""
+        """Return the closed device, its rows where they would lie if the device filled the artery."""
         profile = expected_profile(placement.design, placement.size, placement.anatomy)
         rows_mm = march(placement.design, placement.size, placement.landing, profile)
         return Opened(placement.start(self.contour, rows_mm, placement.size.free_diameter_mm), rows_mm)
 
     def step(self, placement: Placement, opened: Opened) -> Opened:
-        """Let the contour grow, no row wider than the free device; once it lies, march the rows anew."""
+        """Return the device after one step of the contour; once it is open, its row positions are recomputed."""
         opened = self._grown(placement, opened)
         return self._marched(placement, opened) if self.terminate(opened) else opened
 
     def result(self, placement: Placement, opened: Opened) -> Opened:
-        """Let crossings slide until pieces of wire have their length; put nodes to the wall, or off it as cells ask."""
+        """Return the device after its crossings have moved to restore the wire lengths, with its nodes at the wall.
+
+        Nodes of a laser-cut device keep the distance from the wall that its cells require.
+
+        Raises
+        ------
+        LandingError
+            The device extends beyond the artery.
+        """
         for _ in range(LAST_STEPS):
             if opened.contour.is_terminated.all():
                 break
@@ -157,7 +232,7 @@ class ConstantWire(AbstractMethod):
         centers_mm = placement.across.middle(where_mm.ravel()).reshape(slid.nodes_mm.shape)
         state = opened.contour.about(centers_mm, _nearest(slid.row, len(rows)))
         everywhere = np.ones_like(state.is_terminated)
-        if isinstance(design, LaserCut):  # its cells' springs hold it to its free width
+        if isinstance(design, LaserCut):  # the springs of its cells already limit its diameter
             on_wall_mm = laid(slid.nodes_mm.reshape(-1, 3), slid.row.ravel(), slid.column.ravel())
             state = replace(state, nodes_mm=on_wall_mm.reshape(slid.nodes_mm.shape) + slid.lift_mm)
             return Opened(self.contour.classify(state, everywhere, placement.wall), rows_mm)
@@ -165,10 +240,7 @@ class ConstantWire(AbstractMethod):
         return Opened(replace(state, nodes_mm=self._no_wider(state.nodes_mm, laid_mm, size.free_diameter_mm)), rows_mm)
 
     def _between(self, placement: Placement, opened: Opened, points_mm: Floats, row: Floats, column: Floats) -> Floats:
-        """Where (n, 3) points between the nodes, at fractional rows and columns (n,), lie: against the wall as they do.
-
-        What is between rows that stopped at the free diameter stays, unless it is outside.
-        """
+        """Return (n, 3) points between the nodes, put on the wall like their nearest node, in mm."""
         contour = opened.contour
         rows, columns = (
             _nearest(row, contour.nodes_mm.shape[0]),
@@ -176,13 +248,14 @@ class ConstantWire(AbstractMethod):
         )
         where_mm = pieces.extrapolated(np.arange(len(opened.abscissa_mm)), opened.abscissa_mm, row)
         state = contour.near(points_mm, placement.across.middle(where_mm), rows, columns)
+        # Points of rows that stopped at the free diameter stay in place unless they are outside the wall.
         is_narrow = perimeters(contour.nodes_mm)[rows] < FREELY * np.pi * placement.size.free_diameter_mm
         state = replace(state, is_terminated=state.is_terminated & is_narrow[:, None])
         return self._laid(placement, state, np.ones_like(state.is_terminated))[1].reshape(-1, 3)
 
     @staticmethod
     def _no_wider(slid_mm: Floats, laid_mm: Floats, free_mm: float) -> Floats:
-        """Lay rows on the wall only as far as they stay no wider, seen along the device, than it is when free."""
+        """Return rows on the wall as far as their diameter, seen along the device, does not exceed the free one."""
         old, new = row_diameters_mm(slid_mm), row_diameters_mm(laid_mm)
         share = np.where(new > free_mm, (free_mm - old) / np.maximum(new - old, 1e-12), 1.0)
         nodes_mm = slid_mm + np.clip(share, 0.0, 1.0)[:, None, None] * (laid_mm - slid_mm)
@@ -191,7 +264,7 @@ class ConstantWire(AbstractMethod):
         return middle_mm + shrunk * (nodes_mm - middle_mm)
 
     def _grown(self, placement: Placement, opened: Opened) -> Opened:
-        """One step of the contour; a row that reaches the free diameter stops there."""
+        """Return the device after one step of the contour; a row that reaches the free diameter stops there."""
         before, after = opened.contour, self.contour.step(opened.contour, placement.wall)
         free = FreeDiameter(placement.size.free_diameter_mm)
         nodes_mm, is_stopped = free(before.nodes_mm, after.nodes_mm)
@@ -199,13 +272,7 @@ class ConstantWire(AbstractMethod):
         return replace(opened, contour=after)
 
     def _marched(self, placement: Placement, opened: Opened) -> Opened:
-        """March the rows by their measured diameters until they stay where they are.
-
-        Raises
-        ------
-        LandingError
-            When a row leaves the artery.
-        """
+        """Return the device with its rows moved according to their measured diameters until they have converged."""
         design, size, axis = placement.design, placement.size, placement.anatomy.axis
         profile = expected_profile(design, size, placement.anatomy)
         for done in range(ROUNDS):
@@ -218,16 +285,14 @@ class ConstantWire(AbstractMethod):
         return opened
 
     def _moved(self, placement: Placement, opened: Opened, rows_mm: Floats) -> Opened:
-        """Move the rows along the axis, keeping the contour's shape, and space nodes evenly.
-
-        Rows beyond where the contour was are put to the wall; those between stay near it until the result is.
-        """
+        """Return the device with its rows at `rows_mm` (rows,), its shape kept and its nodes evenly spaced."""
         across, state, before_mm = placement.across, opened.contour, opened.abscissa_mm
         in_plane_mm = evenly_spaced(across.coordinates(before_mm, state.nodes_mm))
         nodes_mm = across.place(rows_mm, _interpolated(before_mm, in_plane_mm, rows_mm))
         near = np.rint(np.interp(rows_mm, before_mm, np.arange(len(before_mm)))).astype(int)
         centers_mm = np.broadcast_to(across.middle(rows_mm)[:, None], nodes_mm.shape)
         state = state.about(centers_mm, np.broadcast_to(near[:, None], nodes_mm.shape[:2]))
+        # Only rows beyond the old ends have no measured shape: they are put to the wall now, all others in `result`.
         is_beyond = (rows_mm < before_mm[0]) | (rows_mm > before_mm[-1])
         is_asked = np.broadcast_to(is_beyond[:, None], nodes_mm.shape[:2])
         state, laid_mm = self._laid(placement, replace(state, nodes_mm=nodes_mm), is_asked)
@@ -235,11 +300,8 @@ class ConstantWire(AbstractMethod):
         return Opened(replace(state, nodes_mm=free(state.nodes_mm, laid_mm)[0]), rows_mm)
 
     def _laid(self, placement: Placement, state: State, is_asked: Bools) -> tuple[State, Floats]:
-        """Put nodes asked about (rows, columns) out of the wall's way; return also where all lie against it.
-
-        A node that had terminated goes back to the wall by eq. (6, 7); one that still moves does so only where it
-        would be outside or nearer than dd.
-        """
+        """Return the contour with the nodes in `is_asked` inside the wall, and all nodes as they lie on the wall."""
+        # Terminated nodes return to the wall (eq. 6, 7). Moving nodes do so only if outside or nearer than dd.
         held = state.is_terminated & is_asked
         state = self.contour.classify(state, is_asked, placement.wall)
         points_mm = state.nodes_mm.reshape(-1, 3)
@@ -249,12 +311,12 @@ class ConstantWire(AbstractMethod):
 
 
 def _nearest(row: Floats, rows: int) -> Ints:
-    """Return the row of nodes that each fractional one is nearest to."""
+    """Return the row of nodes nearest to each fractional row."""
     return np.clip(np.rint(row), 0, rows - 1).astype(int)
 
 
 def _interpolated(old_mm: Floats, values: Floats, new_mm: Floats) -> Floats:
-    """Values (n, m, d) known at arc lengths (n,), linear between them and constant beyond, at (k,)."""
+    """Return values (k, m, d) at `new_mm` (k,), linear between known values (n, m, d) and constant beyond them."""
     i = np.clip(np.searchsorted(old_mm, new_mm, side="right") - 1, 0, len(old_mm) - 2)
     share = np.clip((new_mm - old_mm[i]) / (old_mm[i + 1] - old_mm[i]), 0.0, 1.0)[:, None, None]
     return (1 - share) * values[i] + share * values[i + 1]

@@ -1,15 +1,17 @@
-"""Cells: joints of a laser-cut device move along the wall, and off it, until its struts are as long as they were cut.
+"""Move the joints of a laser-cut device so that its struts keep the length to which they were cut.
 
-Struts do not stretch: outside a bend, cells are drawn out as far as their struts reach and, where that is not enough,
-leave the wall for a shorter way. Joints move along, around and off the wall until they have least
+Struts do not stretch. On the outer side of a bend, the cells open along the axis as far as their struts allow. Where
+that is not enough, the joints leave the wall for a shorter path. Each joint moves along, around and off the wall. The
+moves minimise
 
     sum over struts of (length - length as cut)^2
-    +  sum over cells of (springiness times (width - free width^2 / width) / 2)^2, and the same of their heights
-    +  sum over joints of (bending times the second difference of how far they and their neighbours are off the wall)^2
-    +  terms that keep rows level, and what joints on a line of struts do alike,
+    +  sum over cells of (SPRINGINESS (width - free width^2 / width) / 2)^2, and the same for their heights
+    +  sum over joints of (BENDING times the second difference, between neighbours, of the distance from the wall)^2
+    +  penalties on moves out of a row, moves around, and unequal moves of joints on one line of struts,
 
-none behind the wall. The springs open the device against the wall and keep its cells from closing; a strut is as thick
-as it is wide, so cells bend off the wall about as hard as they are drawn out. Levenberg's and Marquardt's steps.
+with no joint outside the wall. The cell springs open the device against the wall and keep cells from closing. A strut
+is as thick as it is wide, so cells resist bending off the wall about as much as they resist being drawn out. The sum is
+minimised by the Levenberg-Marquardt method.
 """
 
 from collections.abc import Callable
@@ -23,70 +25,89 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.net import Net
 
 Laid = Callable[[Floats, Floats, Floats], Floats]
-"""Tells where (n, 3) points of the chart, at fractional rows (n,) and columns (n,) of it, lie on the wall itself."""
+"""Callable that puts points on the wall: points (n, 3) in mm, rows (n,) and columns (n,) of the chart in, (n, 3) out.
+
+Rows and columns may be fractional.
+"""
 
 SPRINGINESS: Final = 0.015
-"""How much a cell that is drawn out weighs against a strut that stretches by as much."""
+"""Weight of the change of a cell's width or height relative to an equal stretch of a strut, without unit."""
 BENDING: Final = 0.06
-"""How much joints that leave the wall otherwise than their neighbours weigh against a strut that stretches by as much.
+"""Weight of a joint whose distance from the wall differs from its neighbours', relative to an equal stretch of a strut.
 
-An estimate. Without it a device in a bend of 7 mm folds up, gaps reach most of its radius; as much as a cell's spring
-leaves 0.6 mm, four times as much 0.2 mm, and more than that gives gaps up for struts that stretch.
+An estimate, without unit. In a bend of 7 mm, a device without this term folds up, and gaps reach most of its radius.
+With BENDING equal to SPRINGINESS the gap is 0.6 mm, with four times that value 0.2 mm. Larger values trade gaps for
+stretched struts.
 """
 LEVEL: Final = 0.01
-"""How much a joint that leaves its row weighs against a strut that stretches by as much."""
+"""Weight of a joint that moves out of its row or around the device, relative to an equal stretch of a strut."""
 STIFFNESS: Final = 0.015
-"""How much a line of struts that bends otherwise on the wall weighs against a strut that stretches by as much."""
+"""Weight of the bending of a line of struts on the wall, relative to an equal stretch of a strut."""
 STEPS: Final = 40
-"""Steps at most."""
+"""Largest number of steps."""
 GAIN: Final = 0.002
-"""Less gained by a step, relative, ends them."""
+"""Relative decrease of the cost below which the iteration stops."""
 INERTIA: Final = 0.03
-"""Weight, squared, of moves in the first step."""
+"""Levenberg-Marquardt damping of the first step: squared weight of the moves."""
 CALMING: Final = 3.0
-"""It falls by this factor with every step that helps, and rises by its square when one does not."""
+"""Factor that divides the damping after a successful step. A failed step multiplies the damping by its square."""
 STUCK: Final = 1e3
-"""With more inertia than this nothing moves any more."""
+"""Damping above which no further step is tried."""
 TINY_MM: Final = 0.02
-"""Moves by which the chart is differentiated."""
+"""Step of the central differences by which joint positions are differentiated, in mm."""
 
 
 class _Frame(NamedTuple):
-    """What the joints heed, wherever they are."""
+    """Data of the least-squares problem that stay the same in every step."""
 
     net: Net
-    """Joints and struts, on the wall."""
+    """Joints and struts on the wall."""
     laid: Laid
-    """What puts them there: the chart is flat between its nodes."""
+    """Callable that puts points on the wall. It is needed because the chart is flat between its nodes."""
     length_mm: float
-    """Length of a strut as cut."""
+    """Length of a strut as cut, in mm."""
     pairs: Ints
-    """(2, k) joints at both ends of every cell's width and height."""
+    """(2, k) joints at both ends of the width and the height of every cell."""
     free_mm: Floats
-    """(k,) how far they are apart in the free device."""
+    """(k,) distances between these joints in the free device, in mm."""
     keeping: csc_matrix
-    """(n, 3 c) what is kept small besides, of the moves."""
+    """(n, 3 c) matrix of the penalties that are linear in the moves."""
 
 
 class _Model(NamedTuple):
-    """How far joints are from what they heed."""
+    """Residuals of the least-squares problem and their derivatives."""
 
     residual: Floats
-    """(r,) what is squared and summed."""
+    """(r,) residuals in mm."""
     slopes: csc_matrix
-    """(r, 3 c) its derivatives by the moves."""
+    """(r, 3 c) derivatives of the residuals with respect to the moves."""
 
     @property
     def cost(self) -> float:
-        """The sum of the squares."""
+        """Sum of the squared residuals, in mm2."""
         return float(self.residual @ self.residual)
 
 
 def relax(net: Net, length_mm: float, width_mm: float, held: float, laid: Laid) -> Floats:
-    """Moves (c, 3) of the joints along, around and off the wall, mm.
+    """Compute the moves that restore the strut lengths of a laser-cut device.
 
-    Struts are `length_mm` long, cells of the free device `width_mm` wide; in the mean, row number `held` of the joints
-    (or what lies between two rows) stays where it is. `laid` puts joints from the chart on to the wall.
+    Parameters
+    ----------
+    net : Net
+        Joints and struts on the wall, with c joints.
+    length_mm : float
+        Length of a strut as cut, in mm.
+    width_mm : float
+        Width of a cell of the free device, in mm.
+    held : float
+        Row of joints whose mean move along the device is held at zero. A fraction lies between two rows.
+    laid : callable
+        Puts points of the chart on the wall.
+
+    Returns
+    -------
+    (c, 3) array, mm
+        Moves of the joints along, around and off the wall (positive: into the lumen).
     """
     pairs, free_mm = _diagonals(net, length_mm, width_mm)
     frame = _Frame(net, laid, length_mm, pairs, free_mm, _keeping(net, held))
@@ -109,7 +130,7 @@ def relax(net: Net, length_mm: float, width_mm: float, held: float, laid: Laid) 
 
 
 def _stepped(here: _Model, x: Floats, inertia: float) -> Floats:
-    """One step from moves x (3 c,); joints on the wall stay there unless they are drawn off it."""
+    """Return the moves (3 c,) after one damped step from moves x (3 c,), none of them outside the wall."""
     downhill = -here.slopes.T @ here.residual
     free = np.flatnonzero(~_is_pressed(x, downhill))
     slopes = here.slopes[:, free]
@@ -120,13 +141,14 @@ def _stepped(here: _Model, x: Floats, inertia: float) -> Floats:
 
 
 def _is_pressed(x: Floats, downhill: Floats) -> Bools:
-    """Tell which moves (3 c,) are those of joints that lie on the wall and would go behind it."""
+    """Return which moves (3 c,) belong to joints on the wall that the step would push through it."""
     pressed = np.zeros(len(x), dtype=bool)
     pressed[2::3] = (x[2::3] <= 0) & (downhill[2::3] <= 0)
     return pressed
 
 
 def _model(frame: _Frame, x: Floats) -> _Model:
+    """Return residuals and derivatives at moves x (3 c,)."""
     net, moves = frame.net, x.reshape(-1, 3)
     points_mm = _points_mm(net, moves, frame.laid)
     ways = TINY_MM * np.eye(3)
@@ -142,12 +164,12 @@ def _model(frame: _Frame, x: Floats) -> _Model:
 
 
 def as_drawn(points_mm: Floats, row: Floats, column: Floats) -> Floats:
-    """Leave points on the chart."""
+    """Return the points unchanged: a `Laid` for a chart that already lies on the wall."""
     return points_mm
 
 
 def _points_mm(net: Net, moves: Floats, laid: Laid) -> Floats:
-    """Where (c, 3) the joints are."""
+    """Return the positions (c, 3) of the joints after moves (c, 3), in mm."""
     rows, columns = net.chart.shape[:2]
     along = net.row + moves[:, 0] / net.spacing[0]
     around = net.column + moves[:, 1] / net.spacing[1]
@@ -163,10 +185,8 @@ def _points_mm(net: Net, moves: Floats, laid: Laid) -> Floats:
 
 
 def _lengths(points_mm: Floats, change: Floats, ends: Ints, bulge_mm2: Floats) -> tuple[Floats, coo_matrix]:
-    """Lengths (p,) between pairs of joints (2, p) and their derivatives (p, 3 c); `change` (c, 3 moves, 3) is theirs.
-
-    What follows the wall is longer than its chord: squared, by the bulge (p,).
-    """
+    """Return lengths (p,) between pairs of joints `ends` (2, p), along the wall, and their derivatives (p, 3 c)."""
+    # The bulge is the squared arc along the wall minus the squared chord.
     way_mm = points_mm[ends[1]] - points_mm[ends[0]]
     length_mm = np.sqrt(np.einsum("pk,pk->p", way_mm, way_mm) + bulge_mm2)
     ahead = way_mm / length_mm[:, None]
@@ -178,7 +198,7 @@ def _lengths(points_mm: Floats, change: Floats, ends: Ints, bulge_mm2: Floats) -
 
 
 def _diagonals(net: Net, length_mm: float, width_mm: float) -> tuple[Ints, Floats]:
-    """Joints at both ends of every cell's width and height (2, k), and how far apart they are when free (k,)."""
+    """Return the joints at both ends of every cell's width and height (2, k), and their free distances (k,) in mm."""
     stride, n = net.chart.shape[1], len(net.line)
     key = net.line.astype(int) * stride + net.column
     ahead = np.searchsorted(key, key + 2 * stride)
@@ -189,7 +209,7 @@ def _diagonals(net: Net, length_mm: float, width_mm: float) -> tuple[Ints, Float
 
 
 def _keeping(net: Net, held: float) -> csc_matrix:
-    """Matrix (k, 3 c) of moves that are kept small: out of a row, bends, and that of the row held in the mean."""
+    """Return the matrix (k, 3 c) of the penalties on moves out of a row or around, on bending, and on the held row."""
     n, bends = len(net.line), net.bends.astype(int)
     member = coo_matrix((np.ones(n), (net.line, np.arange(n)))).tocsr()
     mean = diags(1 / np.bincount(net.line)) @ member

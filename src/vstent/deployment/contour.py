@@ -1,4 +1,4 @@
-"""Contour: rows of nodes on planes across the parent axis, and the plane coordinates they are moved in."""
+"""The contour of a device: rows of nodes, the planes across the parent axis that hold them, and plane coordinates."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -11,22 +11,26 @@ from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, freeze
 
 STEP_MM = 0.1
-"""Sampling of the axis for planes."""
+"""Distance between samples of the axis at which planes are computed, in mm."""
 CROSSING_MARGIN = 0.8
-"""Neighbouring planes meet no nearer to the axis than the wall's radius divided by this."""
+"""Largest product of the planes' turn per length and the wall's radius, without unit.
+
+Neighbouring planes then meet no nearer to the axis than the radius divided by this value.
+"""
 MAX_SMOOTHINGS = 12
+"""Largest number of times that plane normals are smoothed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """Planes across the parent axis that do not cross inside the lumen, with axes that do not twist."""
+    """Planes across the parent axis that do not cross inside the lumen, with in-plane axes that do not twist."""
 
     abscissa_mm: Floats
-    """(k,) arc lengths of the samples."""
+    """(k,) arc lengths of the samples, in mm."""
     centers_mm: Floats
-    """(k, 3) points of the axis."""
+    """(k, 3) points of the axis, in mm."""
     frames: Floats
-    """(k, 3, 3) rows: plane normal and the two axes in the plane, right-handed."""
+    """(k, 3, 3) right-handed unit vectors in rows: the plane normal and two axes in the plane."""
 
     def __post_init__(self) -> None:
         freeze(self, "abscissa_mm", np.float64, (-1,))
@@ -35,15 +39,15 @@ class Planes:
 
     @cached_property
     def curvature_per_mm(self) -> Floats:
-        """(k,) by how much the normals turn, rad per mm."""
+        """(k,) angle by which the normals turn per length, in rad per mm."""
         return np.linalg.norm(np.gradient(self.frames[:, 0], self.abscissa_mm, axis=0), axis=1)
 
     def middle(self, abscissa_mm: Floats) -> Floats:
-        """Return centers (n, 3) at arc lengths (n,)."""
+        """Return centers (n, 3), in mm, at arc lengths (n,), in mm."""
         return curves.interpolate(self.abscissa_mm, self.centers_mm, abscissa_mm)
 
     def at(self, abscissa_mm: Floats) -> tuple[Floats, Floats]:
-        """Return centers (n, 3) and frames (n, 3, 3) at arc lengths (n,)."""
+        """Return centers (n, 3), in mm, and frames (n, 3, 3) at arc lengths (n,), in mm."""
         flat = np.concatenate([self.frames[:, 0], self.frames[:, 1]], axis=1)
         found = curves.interpolate(self.abscissa_mm, flat, abscissa_mm)
         normal = found[:, :3] / np.linalg.norm(found[:, :3], axis=1, keepdims=True)
@@ -52,22 +56,32 @@ class Planes:
         return self.middle(abscissa_mm), np.stack([normal, first, np.cross(normal, first)], axis=1)
 
     def place(self, abscissa_mm: Floats, in_plane_mm: Floats) -> Floats:
-        """Return the points (n, m, 3) whose plane coordinates (n, m, 2) are given at arc lengths (n,)."""
+        """Return points (n, m, 3), in mm, from plane coordinates (n, m, 2), in mm, at arc lengths (n,), in mm."""
         centers_mm, frames = self.at(abscissa_mm)
         return centers_mm[:, None] + in_plane_mm @ frames[:, 1:]
 
     def coordinates(self, abscissa_mm: Floats, points_mm: Floats) -> Floats:
-        """Return the plane coordinates (n, m, 2) of points (n, m, 3) at arc lengths (n,)."""
+        """Return plane coordinates (n, m, 2), in mm, of points (n, m, 3), in mm, at arc lengths (n,), in mm."""
         centers_mm, frames = self.at(abscissa_mm)
         return (points_mm - centers_mm[:, None]) @ frames[:, 1:].transpose(0, 2, 1)
 
 
 @lru_cache(maxsize=8)
 def planes(axis: Centerline) -> Planes:
-    """Planes across the axis.
+    """Compute planes across an axis that do not cross inside the lumen.
 
-    Their normals are the axis's tangents, smoothed along it just until neighbouring planes meet outside the wall:
-    in a bend sharper than the artery's radius, true cross-sections would run through each other.
+    The plane normals are the tangents of the axis, smoothed along it just enough for neighbouring planes to meet
+    outside the wall. In a bend sharper than the artery's radius, true cross-sections would intersect inside the lumen.
+
+    Parameters
+    ----------
+    axis : Centerline
+        Axis of the parent artery.
+
+    Returns
+    -------
+    Planes
+        Planes along the whole axis. The result is cached.
     """
     n = max(8, round(axis.length_mm / STEP_MM) + 1)
     abscissa_mm = np.linspace(0.0, axis.length_mm, n)
@@ -86,7 +100,7 @@ def planes(axis: Centerline) -> Planes:
 
 
 def _smooth(values: Floats, sigma: float) -> Floats:
-    """Gaussian mean along the first axis; beyond the ends values go on by point reflection, so lines stay lines."""
+    """Return the Gaussian mean along the first axis; values are continued by point reflection, so lines stay lines."""
     pad = min(len(values) - 1, int(4 * sigma) + 1)
     before = 2 * values[0] - values[pad:0:-1]
     after = 2 * values[-1] - values[-2 : -pad - 2 : -1]
@@ -94,7 +108,8 @@ def _smooth(values: Floats, sigma: float) -> Floats:
 
 
 def _untwisted(normals: Floats, start: Floats) -> Floats:
-    """Frames (n, 3, 3) that do not twist; the first one looks along `start`, so that they turn with the artery."""
+    """Return frames (n, 3, 3) that do not twist, their first in-plane axis starting along `start`."""
+    # Starting along a direction of the artery makes the frames turn with it when the artery is rotated.
     frames = np.zeros((len(normals), 3, 3))
     first = start - (start @ normals[0]) * normals[0]
     if np.linalg.norm(first) < 1e-6 * np.linalg.norm(start):
@@ -108,16 +123,26 @@ def _untwisted(normals: Floats, start: Floats) -> Floats:
 
 
 def circles(radius_mm: Floats, columns: int) -> Floats:
-    """Plane coordinates (n, columns, 2) of nodes on circles of radii (n,), counter-clockwise."""
+    """Return plane coordinates (n, columns, 2), in mm, of nodes on circles of radii (n,), in mm, counter-clockwise."""
     angle = 2 * np.pi * np.arange(columns) / columns
     return radius_mm[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def perimeters(nodes: Floats) -> Floats:
-    """Length (n,) of the closed rows (n, m, d), as smooth curves.
+    """Compute the lengths of closed rows as smooth curves.
 
-    An arc is longer than its chord by 8/3 of the squared height over it, per chord; four points in a row show the
-    height. What that leaves of a circle is put back.
+    An arc is longer than its chord by 8/3 h^2 / chord, with h its height. Four nodes in a row give h. A factor corrects
+    the remaining error of this formula for a circle.
+
+    Parameters
+    ----------
+    nodes : (n, m, d) array
+        Nodes of n closed rows.
+
+    Returns
+    -------
+    (n,) array
+        Lengths, in the unit of the nodes.
     """
     m = nodes.shape[1]
     length = curves.closed_lengths(nodes)
@@ -127,9 +152,19 @@ def perimeters(nodes: Floats) -> Floats:
 
 
 def evenly_spaced(nodes: Floats) -> Floats:
-    """Slide the nodes of every closed row (n, m, d) along it until they are equally far apart.
+    """Slide the nodes of every closed row along it until their distances are equal.
 
-    A row is turned as little as possible and keeps its length.
+    Each row is turned as little as possible and keeps its length.
+
+    Parameters
+    ----------
+    nodes : (n, m, d) array
+        Nodes of n closed rows.
+
+    Returns
+    -------
+    (n, m, d) array
+        Evenly spaced nodes.
     """
     n, m = nodes.shape[:2]
     closed = np.concatenate([nodes, nodes[:, :1]], axis=1)
@@ -138,18 +173,18 @@ def evenly_spaced(nodes: Floats) -> Floats:
     arc *= m / arc[:, -1:]
     wanted = (np.arange(m) + (arc[:, :m] - np.arange(m)).mean(axis=1, keepdims=True)) % m
     row = np.arange(n)[:, None]
-    apart = (m + 1.0) * row  # rows one after another on one line, so that one search serves all
+    apart = (m + 1.0) * row  # all rows one after another on one line, so that one search finds all nodes
     left = np.searchsorted((arc + apart).ravel(), (wanted + apart).ravel(), side="right").reshape(n, m)
     left = np.clip(left - 1 - (m + 1) * row, 0, m - 1)
     share = ((wanted - arc[row, left]) / (arc[row, left + 1] - arc[row, left]))[..., None]
     result = (1 - share) * closed[row, left] + share * closed[row, left + 1]
-    # Nodes slide along chords, which cuts corners: the row's length is put back.
+    # Nodes slide along chords and cut corners, so the length of the row is restored.
     middle = result.mean(axis=1, keepdims=True)
     return middle + (perimeters(nodes) / perimeters(result))[:, None, None] * (result - middle)
 
 
 def normals(nodes_mm: Floats) -> Floats:
-    """Outward unit normals (rows, columns, 3) of the contour at its nodes, by central differences."""
+    """Return outward unit normals (rows, columns, 3) of a contour (rows, columns, 3) by central differences."""
     along = np.gradient(nodes_mm, axis=0)
     around = np.roll(nodes_mm, -1, axis=1) - np.roll(nodes_mm, 1, axis=1)
     normal = np.cross(around, along)

@@ -1,4 +1,4 @@
-"""Metal coverage and pores of a deployed device, on its drawn wires."""
+"""Metal coverage and pores of a deployed device, measured on its drawn wires."""
 
 from functools import lru_cache
 from typing import Final
@@ -15,18 +15,18 @@ from vstent.kernels.arrays import Bools, Floats
 from vstent.units import MM_PER_UM
 
 NECK_TOLERANCE_MM: Final = 0.02
-"""The neck's triangles lie on the landing surface to within this: they are other triangles than its own."""
+"""Largest distance between the neck and the landing surface, in mm, since the two have different triangles."""
 SAMPLES_PER_QUAD: Final = 8
-"""Points per direction at which coverage is tried in every quad of the contour."""
+"""Number of points per direction at which coverage is sampled in every quad of the contour."""
 
 
 def quad_areas_mm2(stent: Stent) -> Floats:
-    """Area (rows - 1, columns) of every quad of the contour."""
+    """Return the area (rows - 1, columns) of every quad of the contour, in mm2."""
     return stent.contour.areas_mm2.reshape(2, len(stent.nodes_mm) - 1, -1).sum(axis=0)
 
 
 def coverage_fractions(stent: Stent) -> Floats:
-    """Part (rows - 1, columns) of every quad of the contour under metal, seen square to the contour."""
+    """Return the fraction (rows - 1, columns) of every quad of the contour that metal covers, seen along its normal."""
     from vstent.kernels.coverage import covered_fractions  # compiles on first use
 
     here = stent.piece_starts
@@ -36,9 +36,21 @@ def coverage_fractions(stent: Stent) -> Floats:
 
 
 def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats]:
-    """Area (p,) of every whole pore and its center (p, 3).
+    """Compute the area and the center of every whole pore.
 
-    Pores sit where the lattice has no junction; each fills half of the four lattice cells around it.
+    Pores lie where the lattice has no junction. Each fills half of the four lattice cells around it.
+
+    Parameters
+    ----------
+    stent : Stent
+        The deployed device.
+
+    Returns
+    -------
+    area_mm2 : (p,) array, mm2
+        Areas of the pores.
+    centers_mm : (p, 3) array, mm
+        Centers of the pores.
     """
     shape = grid(stent.design, stent.size)
     lattice_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
@@ -54,7 +66,21 @@ def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats]:
 
 
 def density(anatomy: Anatomy, stent: Stent) -> Measures:
-    """Measure metal coverage (fraction) and pore density (1/mm2), of the whole device and over the neck."""
+    """Measure metal coverage and pore density of the whole device and over the neck.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    stent : Stent
+        The deployed device.
+
+    Returns
+    -------
+    dict
+        Coverage (fraction) and pore density (1/mm2), with the closed formulas at the mean diameter. Numbers over the
+        neck are left out where nothing of the device lies over it.
+    """
     quads_mm = 0.25 * (stent.nodes_mm[1:] + stent.nodes_mm[:-1])
     quads_mm = (quads_mm + np.roll(quads_mm, -1, axis=1)).reshape(-1, 3)
     hidden, area_mm2 = coverage_fractions(stent).ravel(), quad_areas_mm2(stent).ravel()
@@ -79,14 +105,28 @@ def density(anatomy: Anatomy, stent: Stent) -> Measures:
 
 @lru_cache(maxsize=8)
 def _neck_on_landing(anatomy: Anatomy) -> Surface:
-    """The largest aneurysm's neck moved to the landing surface, which it faces from afar where a sac sits on a fork."""
+    """Return the neck of the largest aneurysm projected to the landing surface."""
+    # Where a sac is on a fork, its neck is at a distance from the landing surface.
     neck = anatomy.aneurysms[0].neck
     vertices_mm, faces = triangles.compact(neck.vertices_mm, neck.faces)
     return Surface(anatomy.landing_surface.closest(vertices_mm)[0], faces)
 
 
 def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
-    """Tell for (n, 3) points on the device whether the landing surface there closes or faces the largest neck."""
+    """Return whether points on the device lie over the neck of the largest aneurysm.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    points_mm : (n, 3) array, mm
+        Points on the device.
+
+    Returns
+    -------
+    (n,) array of bool
+        Points where the landing surface closes or faces the neck.
+    """
     neck = _neck_on_landing(anatomy)
     at_most_mm = anatomy.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM
     low_mm, high_mm = neck.vertices_mm.min(axis=0), neck.vertices_mm.max(axis=0)

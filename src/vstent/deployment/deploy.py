@@ -1,4 +1,4 @@
-"""Deploy: an active contour grows to the wall, rows of a braid that cannot stretch follow it, wires are drawn on it."""
+"""Deploy a device: an active contour grows to the wall, rows follow the constant wire length, and wires are drawn."""
 
 import time
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from vstent.geometry.vessel import Anatomy
 from vstent.units import MM_PER_UM
 
 METHODS: dict[str, type[ConstantWire] | type[Zhong2016]] = {"constant_wire": ConstantWire, "zhong2016": Zhong2016}
-"""Ways to deploy, by name."""
+"""Deployment methods by name."""
 
 APPOSED_GAP_MM = sizing.APPOSED_GAP_MM
 propose_landing = sizing.propose_landing
@@ -41,29 +41,42 @@ def deploy(
 
     Parameters
     ----------
-    design : the device; see `vstent.devices.catalogue.catalogue`.
-    anatomy : the artery, restored.
-    size : the size; None proposes one.
-    landing : where its center, proximal or distal end is to lie; None centers it on the neck of the largest aneurysm,
-        or as near to it as the artery's ends let it lie.
-    method : ``constant_wire``, ``zhong2016`` (the paper's contour and nothing else), or one with its own weights.
-    compaction_fraction : part by which pushing shortens a braid against its natural length (pulling: below zero).
-    inside : devices that lie in the artery already, in which this one opens where they overlap (telescoping).
-    progress : called after every iteration with its number and the fraction of nodes terminated.
+    design : Design
+        The device; see `vstent.devices.catalogue.catalogue`.
+    anatomy : Anatomy
+        The restored artery.
+    size : Size, optional
+        Size of the device; None proposes one.
+    landing : Landing, optional
+        Where the center, the proximal or the distal end lies. None centers the device on the neck of the largest
+        aneurysm, or as near to it as the ends of the artery allow.
+    method : AbstractMethod or str, optional
+        ``constant_wire``, ``zhong2016`` (the contour of the paper alone), or a method with other weights.
+    compaction_fraction : float, optional
+        Fraction by which pushing shortens a braid relative to its natural length; negative when pulled.
+    inside : sequence of Stent, optional
+        Devices that are already in the artery. Where they overlap, this device opens inside them (telescoping).
+    progress : callable, optional
+        Called after every iteration with its number and the fraction of nodes terminated.
+
+    Returns
+    -------
+    Deployment
+        The deployed device, its gaps to the wall and the record of the iterations.
 
     Raises
     ------
     LandingError
-        When the device does not fit the artery there.
+        The device does not fit the artery at this place.
     DeviceError
-        When the device cannot be compacted so much.
+        The device cannot be compacted by this fraction.
     InputError
-        When there is no such method, or its weights make the contour run away.
+        There is no such method, or the contour diverges because its weights are too large.
 
     Notes
     -----
-    Length and ends are predictions: rows are as far apart as the wires, which cannot stretch, put them. Where the
-    artery is wider than the free device, the device stays at its free diameter and the gap is in ``wall_gap_mm``.
+    Length and ends are predictions: the wires cannot stretch, and they set the distance between rows. Where the artery
+    is wider than the free device, the device keeps its free diameter, and ``wall_gap_mm`` holds the gap.
     """
     began = time.perf_counter()
     chosen = _method(method).beside(design.wall_offset_um * MM_PER_UM)
@@ -93,6 +106,7 @@ def deploy(
 
 
 def _method(method: AbstractMethod | str) -> AbstractMethod:
+    """Return the deployment method, looked up by its name where a name is given."""
     if isinstance(method, AbstractMethod):
         return method
     if method not in METHODS:

@@ -1,4 +1,4 @@
-"""Measure how a deployed device lies in its artery: position, apposition, coverage, stretch of wires, branches."""
+"""Measure a deployed device: position, apposition, coverage, wire stretch and covered branches."""
 
 from functools import lru_cache
 
@@ -19,13 +19,25 @@ from vstent.units import MM_PER_UM
 
 
 def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
-    """Measure how a device lies in its artery.
+    """Measure a deployed device in its artery.
 
-    What there is nothing to measure by is left out: the neck without an aneurysm, pores where none is whole, gaps where
-    all of the device lies over restored wall.
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    deployment : Deployment
+        The deployed device.
 
+    Returns
+    -------
+    dict
+        Numbers whose names end in their unit. Numbers that cannot be measured are left out: those of the neck without
+        an aneurysm, pores where none is whole, and gaps where the whole device lies over restored wall.
+
+    Notes
+    -----
     Fractions over the "neck" concern the part of the contour that closes the largest aneurysm. Coverage and pore
-    density are measured on the drawn wires; the closed formulas at the same mean diameter stand beside them.
+    density are measured on the drawn wires. The values of the closed formulas at the same mean diameter are listed too.
     """
     return (
         _position(anatomy, deployment.stent)
@@ -41,6 +53,7 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
 
 
 def _position(anatomy: Anatomy, stent: Stent) -> Measures:
+    """Return length, ends, diameters and the distances from the neck."""
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     before_mm, after_mm = proximal_mm - stent.proximal_abscissa_mm, stent.distal_abscissa_mm - distal_mm
     diameter_mm = stent.row_diameter_mm
@@ -67,7 +80,18 @@ def _position(anatomy: Anatomy, stent: Stent) -> Measures:
 
 
 def wire_stretches(stent: Stent) -> Floats:
-    """By how much every piece of wire (strut) between junctions is longer than it was made, (p,) fractions."""
+    """Return the relative elongation (p,) of every piece of wire or strut between junctions.
+
+    Parameters
+    ----------
+    stent : Stent
+        The deployed device.
+
+    Returns
+    -------
+    (p,) array
+        Length of each piece over its length as made, less one.
+    """
     shape = grid(stent.design, stent.size)
     junctions_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
     row, column = np.meshgrid(np.arange(shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
@@ -78,6 +102,7 @@ def wire_stretches(stent: Stent) -> Floats:
 
 
 def _stretch(stent: Stent) -> Measures:
+    """Return the mean and the 95th percentile of the wire stretch."""
     stretch = wire_stretches(stent)
     return {
         "mean_wire_stretch_fraction": float(stretch.mean()),
@@ -87,9 +112,19 @@ def _stretch(stent: Stent) -> Measures:
 
 @lru_cache(maxsize=8)
 def branch_abscissas_mm(anatomy: Anatomy) -> Floats:
-    """Where on the parent axis (b,) branches leave the parent artery.
+    """Return the arc lengths (b,) on the parent axis, in mm, at which branches leave the parent artery.
 
-    Centerlines that leave it at one place, within the branch's radius, go through one branch.
+    Centerlines that leave it at one place, within the radius of the branch, count as one branch.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+
+    Returns
+    -------
+    (b,) array, mm
+        Arc lengths of the branches. The result is cached.
     """
     axis, left_mm = anatomy.axis, []
     ostia_mm: list[Floats] = []
@@ -106,7 +141,7 @@ def branch_abscissas_mm(anatomy: Anatomy) -> Floats:
 
 
 def _branches(anatomy: Anatomy, stent: Stent) -> Measures:
-    """Branches between the ends of the device, and how far the nearest branch is from each end."""
+    """Return the number of branches between the ends of the device, and each end's distance to the nearest branch."""
     left_mm = branch_abscissas_mm(anatomy)
     first_mm, last_mm = stent.proximal_abscissa_mm, stent.distal_abscissa_mm
     found: Measures = {"jailed_branches_count": float(((left_mm >= first_mm) & (left_mm <= last_mm)).sum())}

@@ -1,4 +1,4 @@
-"""Method: what every way to deploy answers, and the one loop that drives them all."""
+"""The interface of deployment methods, and the loop that runs them."""
 
 import time
 from abc import ABC, abstractmethod
@@ -19,47 +19,65 @@ from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats
 
 Progress = Callable[[int, float], None]
-"""Called after every iteration with its number and the fraction of nodes terminated."""
+"""Callable that receives the number of each finished iteration and the fraction of nodes that have terminated."""
 Laid = TypeVar("Laid")
+"""Type of a deployed or previewed device."""
 MOVES: Final = 4
-"""A device is moved so often at most from where it was proposed."""
+"""Largest number of times that a device is moved from its proposed place."""
 SPARE_MM: Final = 0.1
-"""So much further it is moved than it left the artery: moved, it is a little longer or shorter."""
+"""Extra distance, in mm, by which a device that extends beyond the artery is moved.
+
+It allows for the change of its deployed length at the new place.
+"""
 TOLD_MM: Final = 0.1
-"""What is asked for in a sentence is rounded up to a multiple of this."""
+"""Distances in messages are rounded up to a multiple of this, in mm."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """One device opening at one place of one artery."""
+    """A device, where it is landed, and the artery around it."""
 
     design: Design
     """The device."""
     size: Size
     """Its size."""
     landing: Landing
-    """Where it is to lie."""
+    """Where the device is landed."""
     anatomy: Anatomy
     """The artery."""
     wall: AbstractWall
-    """What the device opens against."""
+    """Wall against which the device opens."""
 
     def __post_init__(self) -> None:
         check_landing(self.landing, self.anatomy.axis.length_mm)
 
     @property
     def across(self) -> Planes:
-        """Planes on which rows lie."""
+        """Planes across the parent axis that hold the rows."""
         return planes(self.anatomy.axis)
 
     def start(self, contour: ActiveContour, rows_mm: Floats, widest_mm: float = np.inf) -> State:
-        """Start with circles of the maximum inscribed spheres on rows at arc lengths (rows,), nowhere wider than given.
+        """Create the closed contour from circles of the maximum inscribed spheres.
+
+        Parameters
+        ----------
+        contour : ActiveContour
+            The active contour with its weights.
+        rows_mm : (rows,) array, mm
+            Arc lengths of the rows.
+        widest_mm : float, optional
+            Largest diameter of a row, in mm.
+
+        Returns
+        -------
+        State
+            The contour before the first iteration.
 
         Raises
         ------
         LandingError
-            When a row lies beyond the artery.
+            A row lies beyond the artery.
         """
         check_inside(self.design, self.size, rows_mm, self.anatomy.axis.length_mm)
         axis = self.anatomy.axis
@@ -74,72 +92,90 @@ class Placement:
 @final
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """A device on its way to the wall."""
+    """A device during deployment."""
 
     contour: State
     """Its contour."""
     abscissa_mm: Floats
-    """(rows,) arc length of every row on the parent axis."""
+    """(rows,) arc length of every row on the parent axis, in mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class AbstractMethod(ABC):
-    """A way to deploy. Final classes answer; `run` owns the loop, its limit, the checks, the records and the time."""
+    """Interface of a deployment method.
+
+    A subclass defines the start, one step and the result. `run` owns the loop, the iteration limit, the checks, the
+    records and the time.
+    """
 
     contour: ActiveContour = field(default_factory=ActiveContour)
-    """The active contour, eq. (1-7) of the paper, that carries the device to the wall: a1..a5, k1, k2, dd."""
+    """Active contour that carries the device to the wall, with its weights (Zhong et al. 2016, eq. 1-7)."""
     wall: str = TREE
     """How the wall is searched: ``tree``, or the name of a plug-in (`vstent.plugins`)."""
 
     def beside(self, dd_mm: float) -> Self:
-        """Return the method for a device whose contour keeps `dd_mm` from the wall."""
+        """Return the method with the distance `dd_mm`, in mm, between contour and wall."""
         return replace(self, contour=replace(self.contour, dd_mm=dd_mm))
 
     @abstractmethod
     def init(self, placement: Placement) -> Opened:
-        """Put the device, closed, where it is to open."""
+        """Return the closed device where it is to open."""
 
     @abstractmethod
     def step(self, placement: Placement, opened: Opened) -> Opened:
-        """Open it by one iteration."""
+        """Return the device after one iteration."""
 
     def terminate(self, opened: Opened) -> bool:
-        """Tell whether enough nodes have reached the wall."""
+        """Return whether enough nodes have reached the wall."""
         return self.contour.terminate(opened.contour)
 
     @abstractmethod
     def result(self, placement: Placement, opened: Opened) -> Opened:
-        """Return the device as it stays."""
+        """Return the deployed device after the last iteration."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What a method did."""
+    """Record of a deployment."""
 
     opened: Opened
-    """The device as it stays."""
+    """The deployed device."""
     outcome: Literal["terminated", "iteration_limit"]
-    """Whether enough nodes terminated."""
+    """Whether enough nodes terminated, or the iteration limit ended the deployment."""
     terminated_fraction: tuple[float, ...]
-    """After every iteration."""
+    """Fraction of nodes that have terminated, after every iteration."""
     energy_mm2: tuple[float, ...]
-    """Energy (eq. 1) before the first and after every iteration."""
+    """Energy (eq. 1) before the first and after every iteration, in mm2."""
     history_mm: tuple[Floats, ...]
-    """Contour (rows, columns, 3) before the first and after every iteration."""
+    """Contour (rows, columns, 3) before the first and after every iteration, in mm."""
     seconds: float
-    """Wall time."""
+    """Wall time, in s."""
 
 
 def run(method: AbstractMethod, placement: Placement, progress: Progress | None = None) -> Course:
-    """Iterate `method` until enough nodes terminate or its iteration limit.
+    """Iterate a method until enough nodes terminate or the iteration limit is reached.
+
+    Parameters
+    ----------
+    method : AbstractMethod
+        The deployment method.
+    placement : Placement
+        The device and where it is landed.
+    progress : callable, optional
+        Called after every iteration.
+
+    Returns
+    -------
+    Course
+        The deployed device and the record of the iterations.
 
     Raises
     ------
     LandingError
-        When the device does not fit the artery.
+        The device does not fit the artery.
     InputError
-        When the weights make the contour run away.
+        The contour diverges because its weights are too large.
     """
     began = time.perf_counter()
     opened = method.init(placement)
@@ -161,6 +197,7 @@ def run(method: AbstractMethod, placement: Placement, progress: Progress | None 
 
 
 def _check_finite(state: State, iteration: int) -> None:
+    """Raise an InputError if the contour has diverged."""
     if not np.isfinite(state.nodes_mm).all():
         raise InputError(
             f"The active contour diverged in iteration {iteration}, because its weights are too large. Use a "
@@ -169,12 +206,26 @@ def _check_finite(state: State, iteration: int) -> None:
 
 
 def laid_inside(lay: Callable[[Landing], Laid], proposed: Landing) -> Laid:
-    """Lay a device at the place proposed, moved along the artery where it would leave it: its ends were only foreseen.
+    """Deploy a device at the proposed place, and move it along the artery while it extends beyond an end.
+
+    The move is needed because the deployed length can only be estimated before deployment.
+
+    Parameters
+    ----------
+    lay : callable
+        Deploys or previews the device at a landing and raises a LandingError if it does not fit there.
+    proposed : Landing
+        Where the device is tried first.
+
+    Returns
+    -------
+    object
+        Return value of `lay` for the first landing that fits.
 
     Raises
     ------
     LandingError
-        When it leaves the artery wherever it is moved to.
+        The device extends beyond the artery at every place tried, or moving it does not help.
     """
     landing = proposed
     for _ in range(MOVES):
@@ -188,12 +239,12 @@ def laid_inside(lay: Callable[[Landing], Laid], proposed: Landing) -> Laid:
 
 
 def check_landing(landing: Landing, artery_mm: float) -> None:
-    """See that a landing point lies on an artery of length `artery_mm`.
+    """Check that a landing point lies on an artery of length `artery_mm`, in mm.
 
     Raises
     ------
     LandingError
-        When it does not.
+        The landing point lies beyond the artery.
     """
     if not 0 <= landing.abscissa_mm <= artery_mm:
         raise LandingError(
@@ -203,12 +254,13 @@ def check_landing(landing: Landing, artery_mm: float) -> None:
 
 
 def check_inside(design: Design, size: Size, abscissa_mm: Floats, artery_mm: float) -> None:
-    """See that the rows (rows,) lie on an artery of length `artery_mm`.
+    """Check that rows at arc lengths (rows,), in mm, lie on an artery of length `artery_mm`, in mm.
 
     Raises
     ------
     LandingError
-        When they do not; the sentence says where the device would lie and what to do, the error how far to move it.
+        A row lies beyond the artery. The message states where the device would lie and what to do. The attribute
+        `move_mm` of the error is the distance by which to move the device.
     """
     first, last = float(abscissa_mm[0]), float(abscissa_mm[-1])
     if first >= 0 and last <= artery_mm:

@@ -1,11 +1,15 @@
-"""Pieces: crossings slide along the wall until every piece of wire between two of them is as long as it was made.
+"""Slide the wire crossings of a device along the wall so that every piece of wire keeps its length.
 
-In a bend, rows that lie in planes across the axis stretch the wires outside and press them together inside. Wires do
-not stretch: columns come closer together outside, where rows are farther apart, and spread inside, rows tilt, and all
-of them move nearer together: what a bend takes from the wires' room round the device, its length gives. The crossings
-are those of `vstent.kernels.net`: pieces of wire of the right length first, then the nearest among the many nets that
-allow it, with cells kept open where none does: outside a bend so tight that the straightened wire is still too short.
-Joints of a laser-cut device are those of `vstent.deployment.cells`: they may leave the wall.
+In a bend, rows that lie in planes across the axis stretch the wires on the outer side and compress them on the inner
+side. Real wires do not stretch. On the outer side, where rows are farther apart, columns move closer together. On the
+inner side they spread. Rows tilt, and on average they move closer together: in a bend the wires have less room around
+the device, so the device is shorter.
+
+Crossings are moved by `vstent.kernels.net`. Its first aim is the right length of all pieces of wire. Many nets of wires
+meet it, and among them it takes the one nearest to the original rows. On the outer side of a very tight bend even a
+straight wire can be too short. There no net meets the aim, and a penalty keeps the cells open.
+
+Joints of a laser-cut device may also leave the wall and are moved by `vstent.deployment.cells`.
 """
 
 from functools import cache
@@ -21,36 +25,53 @@ from vstent.kernels import net
 from vstent.kernels.arrays import Floats, Ints
 
 RESISTANCE: Final = 0.01
-"""How much a crossing that slides out of its row weighs against a piece of wire that stretches by as much."""
+"""Weight of a crossing that leaves its row, relative to an equal stretch of a piece of wire, without unit."""
 CROWDING: Final = 0.1
-"""How much neighbours in a row that come nearer together weigh against a piece of wire that stretches by as much.
+"""Weight of neighbours in a row that approach each other, relative to an equal stretch of a piece of wire.
 
-The least that keeps every cell open in tight siphons.
+It is the smallest value that keeps every cell open in tight siphons.
 """
 STIFFNESS: Final = 0.1
-"""How much a wire that bends otherwise weighs against a piece of wire that stretches by as much."""
+"""Weight of a change in the bending of a wire, relative to an equal stretch of a piece of wire."""
 DESCENT: Final = net.Descent(steps=8, gain=0.03, tolerance=0.2)
-"""When the crossings have gone far enough."""
+"""Stopping criteria of the iteration that moves the crossings."""
 
 
 class Slid(NamedTuple):
-    """A contour whose crossings have slid."""
+    """A contour after its crossings have moved."""
 
     nodes_mm: Floats
-    """(rows, columns, 3) nodes."""
+    """(rows, columns, 3) nodes, in mm."""
     row: Floats
-    """(rows, columns) where on the old contour every node lies, in rows."""
+    """(rows, columns) fractional row of the original contour at which each node lies."""
     column: Floats
-    """(rows, columns) and in columns."""
+    """(rows, columns) fractional column of the original contour at which each node lies."""
     lift_mm: Floats
-    """(rows, columns, 3) by how much, and where to, nodes leave the wall."""
+    """(rows, columns, 3) displacement of each node from the wall into the lumen, in mm; not included in `nodes_mm`."""
 
 
 def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.Laid) -> Slid:
-    """Let the crossings of a device slide on its contour (rows, columns, 3); nodes between them go along.
+    """Move the crossings of a device along its contour until the pieces of wire have their length.
 
-    In the mean, row number `held` of the nodes stays where it is. `laid` puts points from between the contour's nodes
-    on to the wall: joints of a laser-cut device heed it.
+    Nodes between crossings move with them.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    nodes_mm : (rows, columns, 3) array, mm
+        Contour before the crossings move.
+    held : int
+        Row of nodes whose mean position along the device stays the same.
+    laid : callable
+        Puts points between the contour's nodes on the wall. Only laser-cut devices use it.
+
+    Returns
+    -------
+    Slid
+        The contour after the crossings have moved.
     """
     shape = grid(design, size)
     continued_mm = _continued(nodes_mm)
@@ -84,10 +105,8 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.L
 
 
 def _bulge_mm2(nodes_mm: Floats) -> Floats:
-    """By how much (rows,) the wall's arc from column to column exceeds its chord, both squared, in the mean.
-
-    An arc exceeds its chord by 8/3 of the squared height over it; four points in a row show the height.
-    """
+    """Return the mean excess (rows,) of the squared arc over the squared chord between columns, in mm2."""
+    # An arc exceeds its chord by 8/3 h^2 / chord, h being its height. Four points in a row give h.
     ahead = np.roll(nodes_mm, -1, axis=1)
     bend_mm = nodes_mm + ahead - np.roll(nodes_mm, 1, axis=1) - np.roll(ahead, -1, axis=1)
     return 16 / 3 * ((bend_mm / 16) ** 2).sum(axis=2).mean(axis=1)
@@ -99,27 +118,27 @@ class _Lattice(NamedTuple):
     line: Ints
     """(c,) lattice row of every crossing."""
     row: Ints
-    """(c,) and its row of nodes."""
+    """(c,) row of nodes of every crossing."""
     column: Ints
-    """(c,) and its column of nodes."""
+    """(c,) column of nodes of every crossing."""
     beside: Ints
     """(c,) next crossing in the same row."""
     ends: Ints
-    """(2, p) crossings at the two ends of every piece."""
+    """(2, p) crossings at the two ends of every piece of wire."""
     bends: Ints
-    """(3, b) every three crossings that follow on each other on a wire."""
+    """(3, b) all triples of consecutive crossings on a wire."""
 
 
 @cache
 def _lattice(shape: Grid) -> _Lattice:
-    """Crossings lie where lattice rows and columns of one parity meet."""
+    """Return the crossings of a grid: they lie where the lattice row and column are both even or both odd."""
     rows, columns = shape.lattice_rows, shape.lattice_columns
     line, column = np.nonzero(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)
     number = np.full((rows, columns), -1)
     number[line, column] = np.arange(len(line))
     first, beside = np.flatnonzero(line < rows - 1), number[line, (column + 2) % columns]
     ends = [[first, number[line[first] + 1, (column[first] + hand) % columns]] for hand in (1, -1)]
-    # Pieces of one row after the other: what a loop over them reads lies close together.
+    # Pieces are ordered by row so that a loop over them reads neighbouring memory.
     both = np.array(ends).transpose(1, 2, 0).reshape(2, -1)
     inner = np.flatnonzero((line > 0) & (line < rows - 1))
     ways = [
@@ -132,7 +151,7 @@ def _lattice(shape: Grid) -> _Lattice:
 
 
 def _continued(nodes_mm: Floats) -> Floats:
-    """Put one more row before and behind a contour, shaped as its end: a tilted end reaches a little beyond it."""
+    """Return the contour with one extra row (rows + 2, columns, 3) at each end, because tilted ends reach beyond it."""
     middle_mm = nodes_mm.mean(axis=1)
     before = nodes_mm[:1] - (middle_mm[1] - middle_mm[0])
     behind = nodes_mm[-1:] + (middle_mm[-1] - middle_mm[-2])
@@ -140,18 +159,29 @@ def _continued(nodes_mm: Floats) -> Floats:
 
 
 def extrapolated(known: Floats | Ints, values: Floats, wanted: Floats) -> Floats:
-    """Linear interpolation of values (n,) at increasing places (n,), going on in a straight line beyond the ends."""
+    """Interpolate linearly between increasing places, and extrapolate linearly beyond the ends.
+
+    Parameters
+    ----------
+    known : (n,) array
+        Increasing places.
+    values : (n,) array
+        Values at these places.
+    wanted : array of any shape
+        Places to interpolate at.
+
+    Returns
+    -------
+    array of the shape of `wanted`
+        Interpolated values.
+    """
     i = np.clip(np.searchsorted(known, wanted, side="right") - 1, 0, len(known) - 2)
     share = (wanted - known[i]) / (known[i + 1] - known[i])
     return (1 - share) * values[i] + share * values[i + 1]
 
 
 def _spread(values: Floats, crossings: _Lattice, shape: Grid) -> Floats:
-    """Values (rows, columns) at every node from those at the crossings (c,).
-
-    A pore's middle gets the mean of the crossings round it; nodes between rows and columns of the lattice get what is
-    linear between them.
-    """
+    """Return values (rows, columns) at all nodes from those at crossings (c,), bilinear, pore centers by their mean."""
     known = np.zeros((2, shape.lattice_rows, shape.lattice_columns))
     known[:, crossings.line, crossings.column // shape.column_split] = values, np.ones_like(values)
     beside = np.roll(known, 1, axis=2) + np.roll(known, -1, axis=2)
@@ -164,7 +194,7 @@ def _spread(values: Floats, crossings: _Lattice, shape: Grid) -> Floats:
 
 
 def _bilinear(grid_values: Floats, row: Floats, column: Floats) -> Floats:
-    """Values (..., d) of a grid (n, m, d), periodic in its columns; beyond the rows it goes on in straight lines."""
+    """Return bilinear values (..., d) of a grid (n, m, d), periodic in columns, extrapolated linearly beyond rows."""
     n, m = grid_values.shape[:2]
     i = np.clip(np.floor(row).astype(int), 0, n - 2)
     j = np.floor(column).astype(int)

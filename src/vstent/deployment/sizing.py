@@ -1,9 +1,11 @@
-"""Sizing: which size, and where.
+"""Propose the size of a device and where it is landed.
 
-The rule (vstent's own, after common practice in manual sizing): the label diameter is the smallest that is not below
-the wider of the two landing zones, or the next one where only that lies against the wall beside the neck; the length
-is the shortest whose *deployed* length covers the neck and a margin on both sides, because in a narrower artery a braid
-becomes longer than its label says.
+The rule is vstent's own, after common practice in manual sizing:
+
+- The label diameter is the smallest that is not below the diameter of the wider landing zone. If only the next larger
+  one is apposed beside the neck, that one is proposed.
+- The length is the shortest whose *deployed* length covers the neck and a margin on both sides, because a braid is
+  longer than its label states where the artery is narrower.
 """
 
 from functools import cache, partial
@@ -22,43 +24,63 @@ from vstent.errors import LandingError
 from vstent.geometry.vessel import Anatomy
 
 MARGIN_MM: Final = 4.0
-"""The device reaches beyond the neck by at least this, or by one artery diameter where that is more."""
+"""Smallest length, in mm, by which a device extends beyond the neck; one artery diameter if that is more."""
 END_MM: Final = 0.5
-"""A proposed device stays this far from the artery's ends: its length is only foreseen before it is deployed."""
+"""Distance, in mm, that a proposed device keeps from the ends of the artery.
+
+It allows for the deployed length, which can only be estimated before deployment.
+"""
 DIAMETER_SLACK_MM: Final = 0.05
-"""A label this much below the landing zone still counts as not below it."""
+"""Amount, in mm, by which a label diameter may be below that of the landing zone and still count as not below it."""
 APPOSED_GAP_MM: Final = 0.1
-"""A node is apposed when the device's outer face is nearer to the wall than this."""
+"""Gap between the outer face of the device and the wall, in mm, below which a node is apposed."""
 LOOSE_FRACTION: Final = 0.05
 """Fraction of a device that may have gaps without a note and without a wider size being proposed."""
 OVERSIZED_FRACTION: Final = 0.8
-"""A label may be this much wider than the artery without a word: Enterprise's, 4.5 mm, is from 2.5 mm on."""
+"""Fraction by which the label diameter may exceed the artery's diameter without a note.
+
+Enterprise, for example, has a label diameter of 4.5 mm and is made for arteries from 2.5 mm on.
+"""
 
 
 def wanted_margin_mm(anatomy: Anatomy) -> float:
-    """How far a device is to reach beyond the neck, on either side."""
+    """Return the length by which a device should extend beyond the neck on either side, in mm."""
     return max(MARGIN_MM, *landing_diameters_mm(anatomy))
 
 
 def oversizing_fraction(anatomy: Anatomy, stent: Stent) -> float:
-    """Label diameter over the artery's mean diameter where the device lies, less one."""
+    """Return the label diameter over the mean diameter of the artery along the device, less one."""
     artery_mm = 2 * np.interp(stent.row_abscissa_mm, anatomy.axis.abscissa_mm, anatomy.section_radius_mm)
     return stent.size.diameter_mm / float(artery_mm.mean()) - 1
 
 
 def propose_size(design: Design, anatomy: Anatomy) -> Size:
-    """Propose the size for the largest aneurysm; narrower ones where the artery is too short for it.
+    """Propose the size of a device for the largest aneurysm.
+
+    Narrower sizes are proposed where the artery is too short for a wider one.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    anatomy : Anatomy
+        The artery.
+
+    Returns
+    -------
+    Size
+        The proposed size.
 
     Raises
     ------
     LandingError
-        When even the shortest size that is not too wide for the artery is too long for it.
+        All sizes that are not too wide for the artery are too long for it.
     """
     wider_mm = max(landing_diameters_mm(anatomy))
     labels = sorted({size.diameter_mm for size in design.sizes})
     zone = next((i for i, label in enumerate(labels) if label >= wider_mm - DIAMETER_SLACK_MM), len(labels) - 1)
     of_label = cache(partial(_of_label, design, anatomy))
-    # No size follows a bulge: where the next one would have gaps too, the size of the landing zone stays.
+    # No size can follow a bulge. If the next one would have gaps too, the size for the landing zone is proposed.
     held = (size for label in labels[zone : zone + 2] if (size := of_label(label)) and _lies(design, anatomy, size))
     fitting = (size for label in reversed(labels[: zone + 1]) if (size := of_label(label)))
     proposed = next(chain(held, fitting), None)
@@ -75,11 +97,26 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
 
 
 def propose_landing(design: Design, anatomy: Anatomy, size: Size) -> Landing:
-    """Propose to center the deployed device on the neck, moved as little as the artery's ends demand."""
+    """Propose to center the deployed device on the neck, moved only as far as the ends of the artery require.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    anatomy : Anatomy
+        The artery.
+    size : Size
+        Size of the device.
+
+    Returns
+    -------
+    Landing
+        Where the middle row lies.
+    """
     profile = expected_profile(design, size, anatomy)
     target_mm = float(np.mean(neck_span_mm(anatomy)))
     wanted_mm = target_mm
-    for _ in range(4):  # the middle row is not the middle of the length where the artery tapers
+    for _ in range(4):  # where the artery tapers, the middle row is not in the middle of the length
         rows_mm = march(design, size, Landing(wanted_mm), profile)
         first, last = float(rows_mm[0]), float(rows_mm[-1])
         spare_mm = anatomy.axis.length_mm - (last - first)
@@ -92,13 +129,28 @@ def propose_landing(design: Design, anatomy: Anatomy, size: Size) -> Landing:
 
 
 def reach_mm(design: Design, anatomy: Anatomy, size: Size) -> float:
-    """How far a size, landed as proposed, reaches beyond the neck on its shorter side; -inf where it does not fit."""
+    """Return the length by which a size, landed as proposed, extends beyond the neck, in mm.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    anatomy : Anatomy
+        The artery.
+    size : Size
+        Size of the device.
+
+    Returns
+    -------
+    float
+        Length on the shorter side, in mm; -inf where the size does not fit the artery.
+    """
     first_mm, last_mm = _span(design, anatomy, size)
     return _margin(anatomy, first_mm, last_mm) if _fits(anatomy, first_mm, last_mm) else -inf
 
 
 def _of_label(design: Design, anatomy: Anatomy, label_mm: float) -> Size | None:
-    """The shortest size of a label that reaches far enough, or the longest that fits."""
+    """Return the shortest size of a label diameter that extends far enough, the longest that fits, or None."""
     same = sorted((size for size in design.sizes if size.diameter_mm == label_mm), key=lambda size: size.length_mm)
     spans = {size: _span(design, anatomy, size) for size in same}
     fitting = [size for size in same if _fits(anatomy, *spans[size])]
@@ -109,7 +161,7 @@ def _of_label(design: Design, anatomy: Anatomy, label_mm: float) -> Size | None:
 
 
 def _lies(design: Design, anatomy: Anatomy, size: Size) -> bool:
-    """Tell whether a size, landed as proposed, will lie against the wall beside the neck, as it finds it there."""
+    """Return whether a size, landed as proposed, is expected to be apposed beside the neck."""
     first_mm, last_mm = _span(design, anatomy, size)
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     found = bed(design, size, anatomy)
@@ -120,14 +172,17 @@ def _lies(design: Design, anatomy: Anatomy, size: Size) -> bool:
 
 
 def _span(design: Design, anatomy: Anatomy, size: Size) -> tuple[float, float]:
+    """Return the expected proximal and distal end of a size, landed as proposed, in mm."""
     rows_mm = march(design, size, propose_landing(design, anatomy, size), expected_profile(design, size, anatomy))
     return float(rows_mm[0]), float(rows_mm[-1])
 
 
 def _fits(anatomy: Anatomy, first_mm: float, last_mm: float) -> bool:
+    """Return whether both ends lie on the artery."""
     return first_mm > 0 and last_mm < anatomy.axis.length_mm
 
 
 def _margin(anatomy: Anatomy, first_mm: float, last_mm: float) -> float:
+    """Return the length beyond the neck on the shorter side, in mm."""
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     return min(proximal_mm - first_mm, last_mm - distal_mm)

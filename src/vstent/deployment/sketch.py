@@ -1,8 +1,9 @@
-"""Sketch: where a device will lie, fast enough to follow a hand that drags it; `deploy` answers in full.
+"""Fast preview of a deployment, for a landing point that is moved interactively.
 
-The wall as the device will find it does not depend on where the device lies: it is measured once, on rays across the
-parent axis, no wider than the free device (`Bed`). A sketch marches the rows over it, lets the crossings slide and
-draws the wires. What it leaves out is to put every node to the wall again afterwards, and to march the rows once more.
+The wall against which a device opens does not depend on where the device is landed. It is therefore measured once, on
+rays across the parent axis, up to the free diameter of the device (`Bed`). A sketch places the rows on this wall,
+slides the crossings and draws the wires. Unlike `vstent.deployment.deploy.deploy`, it does not put the nodes to the
+wall again after the crossings have moved, and it does not recompute the row positions from the deployed diameters.
 """
 
 from dataclasses import dataclass, replace
@@ -26,14 +27,14 @@ from vstent.kernels.arrays import Bools, Floats
 from vstent.units import MM_PER_UM
 
 STEP_MM: Final = 0.2
-"""Distance between the rings of rays."""
+"""Distance between the rings of rays, in mm."""
 ASSUMED_BAND_MM: Final = 0.1
-"""Uncertainty of a diameter where the vessel is no scan's and does not say."""
+"""Uncertainty of a diameter, in mm, where the vessel does not come from a scan and does not state one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bed:
-    """The wall of an artery as a device of one size finds it."""
+    """Wall of an artery as it limits a device of one size."""
 
     design: Design
     """The device."""
@@ -42,39 +43,54 @@ class Bed:
     across: Planes
     """Planes across the parent axis."""
     abscissa_mm: Floats
-    """(k,) arc lengths of the rings."""
+    """(k,) arc lengths of the rings, in mm."""
     in_plane_mm: Floats
-    """(k, columns, 2) where the device's contour lies on every ring, in its plane."""
+    """(k, columns, 2) plane coordinates of the device's contour on every ring, in mm."""
     gap_mm: Floats
-    """(k, columns) clearance between the device's outer face and the wall."""
+    """(k, columns) gap between the outer face of the device and the wall, in mm."""
     expected: Profile
-    """What its rows heed of the axis's bends."""
+    """Expected profile. Its curvature sets the row spacing."""
     diameter_band_mm: float
-    """How sure the artery's diameters are."""
+    """Uncertainty of the artery's diameters, in mm."""
 
     @cached_property
     def profile(self) -> Profile:
-        """Diameter of the device's contour along the axis."""
+        """Diameter of the device's contour along the axis, with the curvature of the axis."""
         diameter_mm = perimeters(self.in_plane_mm) / np.pi
         return replace(self.expected, abscissa_mm=self.abscissa_mm, diameter_mm=diameter_mm)
 
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """A device where it will lie."""
+    """Previewed device and the uncertainty of its ends."""
 
     stent: Stent
     """The device."""
     gap_mm: Floats
-    """(rows, columns) clearance between the device's outer face and the wall."""
+    """(rows, columns) gap between the outer face of the device and the wall, in mm."""
     proximal_band_mm: tuple[float, float]
-    """Where it begins if the artery's diameters are as small, and as large, as they may be."""
+    """Arc lengths of the proximal end, in mm, for the smallest and the largest plausible diameters of the artery."""
     distal_band_mm: tuple[float, float]
-    """Where it ends, likewise."""
+    """Arc lengths of the distal end, in mm, for the smallest and the largest plausible diameters of the artery."""
 
 
 def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
-    """Measure the wall of an artery for a device."""
+    """Measure the wall of an artery for a device, independent of where the device is landed.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    anatomy : Anatomy
+        The artery.
+
+    Returns
+    -------
+    Bed
+        Contour of the device and its gap to the wall along the whole artery.
+    """
     axis, columns = anatomy.axis, grid(design, size).columns
     across = planes(axis)
     abscissa_mm = np.linspace(0.0, axis.length_mm, max(8, round(axis.length_mm / STEP_MM) + 1))
@@ -85,7 +101,7 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     rays = circles(np.ones(len(abscissa_mm)), columns) @ frames[:, 1:]
     origins_mm = np.repeat(centers_mm, columns, axis=0)
     reach_mm = anatomy.landing_surface.first_hit(origins_mm, rays.reshape(-1, 3)).reshape(-1, columns)
-    # A ray that leaves through an end of the artery, or runs along a bend, says nothing of the wall.
+    # Rays that leave through an end of the artery or run along a bend do not measure the wall.
     section_mm = np.interp(abscissa_mm, axis.abscissa_mm, anatomy.section_radius_mm)[:, None]
     reach_mm = np.where(reach_mm < 1.6 * section_mm, reach_mm, section_mm)
     outer = np.maximum(reach_mm - dd_mm, 0.1)[..., None] * circles(np.ones(len(abscissa_mm)), columns)
@@ -97,12 +113,24 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
 
 
 def sketch(wall: Bed, landing: Landing) -> Sketch:
-    """Lay a device on the wall measured.
+    """Preview the device on a measured wall.
+
+    Parameters
+    ----------
+    wall : Bed
+        Wall measured for this device and size.
+    landing : Landing
+        Where the device is landed.
+
+    Returns
+    -------
+    Sketch
+        The device and the uncertainty of its ends.
 
     Raises
     ------
     LandingError
-        When it would leave the artery.
+        The device would extend beyond the artery.
     """
     design, size = wall.design, wall.size
     check_landing(landing, float(wall.abscissa_mm[-1]))
@@ -125,25 +153,26 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
 
 
 def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> Floats:
-    """Return the proximal and distal end (2,), mm along the axis, for an artery wider by a given amount."""
+    """Return the proximal and distal end (2,), mm along the axis, for an artery wider by `wider_mm`."""
     diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.free_diameter_mm)
     profile = replace(wall.profile, diameter_mm=diameter_mm)
     return march(wall.design, wall.size, landing, profile)[[0, -1]]
 
 
 def _wires(wall: Bed, nodes_mm: Floats) -> Wires:
+    """Return the wires of the device on its contour."""
     return draw(wall.design, wall.size, nodes_mm, _Nothing())
 
 
 @final
 class _Nothing(AbstractWall):
-    """No wall at all: the contour keeps the wires off it already."""
+    """Wall that is nowhere, because the contour already keeps the wires inside the artery."""
 
     def contact(self, points_mm: Floats) -> Contact:
-        """Tell that every wall is infinitely far away."""
+        """Return an infinite distance to the wall for every point."""
         n = len(points_mm)
         return Contact(points_mm, np.full(n, np.inf), np.zeros((n, 3)), np.zeros(n, dtype=np.int32))
 
     def crosses(self, starts_mm: Floats, ends_mm: Floats) -> Bools:
-        """Tell that no segment crosses a wall."""
+        """Return False for every segment."""
         return np.zeros(len(starts_mm), dtype=bool)

@@ -1,4 +1,4 @@
-"""Struts: the wires of a deployed device as closed solids."""
+"""The wires of a deployed device as closed solids."""
 
 from dataclasses import replace
 from typing import Any, Final
@@ -16,14 +16,24 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM
 
 SIDES: Final = 6
-"""Sides of a round wire's section; a flat side faces the wall."""
+"""Number of sides of a round wire's section. A flat side faces the wall."""
 
 
 def struts(stent: Stent) -> Surface:
-    """Sweep every wire's section along its axis: one closed solid per wire, outward, nothing shared between wires.
+    """Build one closed solid per wire by sweeping the wire's section along its axis.
 
-    A round wire becomes a prism of six sides with the circle's area; a laser-cut strut has its rectangular section,
-    standing on the wall. Open wires end in flat caps; a ring whose last point is its first runs into itself.
+    A round wire becomes a prism of six sides with the area of the circle. A laser-cut strut keeps its rectangular
+    section, with its thickness perpendicular to the wall. Open wires end in flat caps, and rings are closed.
+
+    Parameters
+    ----------
+    stent : Stent
+        The deployed device.
+
+    Returns
+    -------
+    Surface
+        Solids of all wires, with outward normals. No two wires share a vertex.
     """
     is_joined, is_last = _ring_ends(stent)
     points_mm = stent.wire_points_mm
@@ -38,11 +48,23 @@ def struts(stent: Stent) -> Surface:
 
 
 def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
-    """Return the pieces of a stent's wires over necks and ostia, with a margin of one wire spacing.
+    """Return a stent with only the pieces of its wires over necks and ostia, and a margin of one wire spacing.
 
-    There is no flow across wires on the patient's own wall. Around a rim blood also passes along gaps and obliquely
-    through pores. Compared with the whole device, the neck inflow of the demo with Enterprise's screen is 11 % higher
-    with a margin of half a spacing, and 1 % higher with one spacing.
+    Wires on the patient's own wall have no flow across them. Near the rim of a neck, blood also passes along gaps and
+    obliquely through pores, so a margin is needed. Compared with the whole device, the neck inflow of the demo with the
+    screen of an Enterprise is 11 % higher with a margin of half a spacing and 1 % higher with one spacing.
+
+    Parameters
+    ----------
+    stent : Stent
+        The deployed device.
+    anatomy : Anatomy
+        The artery.
+
+    Returns
+    -------
+    Stent
+        The stent with fewer and shorter wires.
     """
     is_over = is_over_restored(stent, anatomy, stent.wire_points_mm)
     wire = stent.point_wires
@@ -59,9 +81,21 @@ def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
 
 
 def is_over_restored(stent: Stent, anatomy: Anatomy, points_mm: Floats) -> Bools:
-    """Tell of points (n, 3) on a stent whether the landing surface under them closes a neck or an ostium.
+    """Return whether points on a stent lie over a neck or an ostium, or within one wire spacing of it.
 
-    So it does also within the spacing of the stent's wires around.
+    Parameters
+    ----------
+    stent : Stent
+        The deployed device.
+    anatomy : Anatomy
+        The artery.
+    points_mm : (n, 3) array, mm
+        Points on the stent.
+
+    Returns
+    -------
+    (n,) array of bool
+        Points whose closest point of the landing surface is within one spacing of restored wall.
     """
     surface = anatomy.landing_surface
     closing = Surface(surface.vertices_mm, surface.faces[anatomy.is_restored_face])
@@ -71,28 +105,51 @@ def is_over_restored(stent: Stent, anatomy: Anatomy, points_mm: Floats) -> Bools
 
 
 def united(solid: Surface) -> Surface:
-    """Return the struts as one solid, where wires touch or run into each other included (exact boolean union).
+    """Merge the struts into one solid by an exact boolean union, including where wires touch or intersect.
+
+    Parameters
+    ----------
+    solid : Surface
+        Solids of all wires, from `struts`.
+
+    Returns
+    -------
+    Surface
+        The merged solid.
 
     Raises
     ------
     DeviceError
-        When the solid is not closed, or the library manifold3d is missing.
+        The solid is not closed, or the package manifold3d is missing.
     """
     return _surface(_union(solid))
 
 
 def blood(anatomy: Anatomy, solid: Surface) -> Surface:
-    """Return what blood fills in the patient's own lumen with the struts in it: lumen, sac and branches, less metal.
+    """Compute the volume of blood: lumen, sac and branches of the patient minus the struts.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    solid : Surface
+        Solids of all wires, from `struts`.
+
+    Returns
+    -------
+    Surface
+        Boundary of the blood.
 
     Raises
     ------
     DeviceError
-        When lumen or struts are not closed, or the library manifold3d is missing.
+        The lumen or the struts are not closed, or the package manifold3d is missing.
     """
     return _surface(_manifold(anatomy.vessel.closed) - _union(solid))
 
 
 def _union(solid: Surface) -> Any:
+    """Return the union of the solids as a manifold3d body."""
     body = _manifold(solid)
     import manifold3d
 
@@ -100,6 +157,7 @@ def _union(solid: Surface) -> Any:
 
 
 def _manifold(surface: Surface) -> Any:
+    """Return a closed surface as a manifold3d body."""
     try:
         import manifold3d
     except ImportError as error:
@@ -113,12 +171,13 @@ def _manifold(surface: Surface) -> Any:
 
 
 def _surface(body: Any) -> Surface:
+    """Return a manifold3d body as a surface."""
     mesh = body.to_mesh64()
     return Surface(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts, dtype=np.int32))
 
 
 def _ring_ends(stent: Stent) -> tuple[Bools, Bools]:
-    """Which wires (w,) are rings, and which points (p,) are the last of their wire."""
+    """Return which wires (w,) are rings, and which points (p,) are the last of their wire."""
     first, last = stent.wire_starts[:-1], stent.wire_starts[1:] - 1
     is_joined = np.all(np.abs(stent.wire_points_mm[first] - stent.wire_points_mm[last]) < 1e-9, axis=1)
     is_last = np.zeros(len(stent.wire_points_mm), dtype=bool)
@@ -127,7 +186,7 @@ def _ring_ends(stent: Stent) -> tuple[Bools, Bools]:
 
 
 def _tangents(points_mm: Floats, starts: Ints, is_joined: Bools) -> Floats:
-    """Tangents (p, 3): central differences inside a wire, one-sided at its ends, across the joint of a ring."""
+    """Return unit tangents (p, 3) by central differences, one-sided at open ends and across the joint of a ring."""
     step = np.diff(points_mm, axis=0)
     step = step / np.linalg.norm(step, axis=1, keepdims=True).clip(1e-12)
     first, last = starts[:-1], starts[1:] - 1
@@ -140,7 +199,8 @@ def _tangents(points_mm: Floats, starts: Ints, is_joined: Bools) -> Floats:
 
 
 def _outward(stent: Stent, points_mm: Floats, tangent: Floats) -> Floats:
-    """Directions (p, 3) out of the contour, square to the wire: they turn with the wall, so no wire twists."""
+    """Return unit directions (p, 3) out of the contour and perpendicular to the wire."""
+    # Directions that follow the wall keep the sections from twisting along the wire.
     normal = normals(stent.nodes_mm).reshape(-1, 3)
     distance, nearest = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(points_mm, k=4)
     weight = 1 / (distance + 1e-6)
@@ -150,7 +210,7 @@ def _outward(stent: Stent, points_mm: Floats, tangent: Floats) -> Floats:
 
 
 def _sections_mm(stent: Stent) -> Floats:
-    """Section (p, sides, 2) at every point: (sideways, outward), counter-clockwise about the tangent."""
+    """Return section corners (p, sides, 2), in mm, as (sideways, outward), counter-clockwise about the tangent."""
     width_mm = (stent.wire_diameter_um * MM_PER_UM)[stent.point_wires][:, None, None]
     if isinstance(stent.design, LaserCut):
         corner = 0.5 * np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
@@ -162,6 +222,7 @@ def _sections_mm(stent: Stent) -> Floats:
 
 
 def _side_faces(starts: Ints, is_joined: Bools, is_last: Bools, sides: int) -> Ints:
+    """Return the triangles (f, 3) of the lateral faces of all wires."""
     here = np.flatnonzero(~is_last)
     there = here + 1
     rings = np.flatnonzero(is_joined)
@@ -174,6 +235,7 @@ def _side_faces(starts: Ints, is_joined: Bools, is_last: Bools, sides: int) -> I
 
 
 def _cap_faces(starts: Ints, is_joined: Bools, sides: int) -> Ints:
+    """Return the triangles (f, 3) of the flat caps at the ends of open wires."""
     fan = np.array([[0, i, i + 1] for i in range(1, sides - 1)])
     first = starts[:-1][~is_joined, None, None] * sides + fan[None, :, ::-1]
     last = (starts[1:] - 1)[~is_joined, None, None] * sides + fan[None]
@@ -181,7 +243,7 @@ def _cap_faces(starts: Ints, is_joined: Bools, sides: int) -> Ints:
 
 
 def _compacted(vertices_mm: Floats, faces: Ints) -> Surface:
-    """Drop the vertices of the rings' last points, which no face uses."""
+    """Return the surface without unused vertices: those at the last points of rings, which no face uses."""
     is_used = np.zeros(len(vertices_mm), dtype=bool)
     is_used[faces] = True
     number = (np.cumsum(is_used) - 1).astype(np.int32)

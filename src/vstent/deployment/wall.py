@@ -1,4 +1,4 @@
-"""Wall: what the contour asks of the artery: where is the nearest wall, and is it between two points."""
+"""The wall of the artery as the contour uses it: the nearest wall point, and whether a segment crosses the wall."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -17,34 +17,34 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM
 
 TREE: Final = "tree"
-"""Name of the wall that is searched through a tree."""
+"""Name of the built-in wall search, by a tree of bounding boxes."""
 OVERLAP_MM: Final = 0.5
-"""The artery's wall is kept this far behind the ends of a device that lies in it."""
+"""Length, in mm, by which the artery's wall is kept inside each end of a device that is already in it."""
 ON_WALL_MM: Final = 1e-9
-"""A point this near to the wall lies on it: the direction to its closest point says nothing."""
+"""Distance, in mm, below which a point lies on the wall, so that the direction to its closest point is undefined."""
 
 
 class Contact(NamedTuple):
-    """The nearest wall for every one of n points."""
+    """Nearest wall of n points."""
 
     closest_mm: Floats
-    """(n, 3) closest points of the wall."""
+    """(n, 3) closest points of the wall, in mm."""
     distance_mm: Floats
-    """(n,) distances to them, never negative."""
+    """(n,) distances to them, in mm, never negative."""
     normal: Floats
-    """(n, 3) unit wall normals there, out of the lumen."""
+    """(n, 3) unit normals of the wall there, out of the lumen."""
     face: Ints
-    """(n,) the wall's triangle there."""
+    """(n,) triangles of the wall there."""
 
     def replaced(self, where: Bools, new: "Contact") -> "Contact":
-        """Return the contact with that of the points chosen (n,) replaced by `new`."""
+        """Return a contact in which the points selected by `where` (n,) have the values of `new`."""
         copies = Contact(self.closest_mm.copy(), self.distance_mm.copy(), self.normal.copy(), self.face.copy())
         for values, others in zip(copies, new, strict=True):
             values[where] = others
         return copies
 
     def inward(self, points_mm: Floats) -> Floats:
-        """Return unit directions (n, 3) from the wall to points; the wall's own normal, reversed, for points on it."""
+        """Return unit directions (n, 3) from the wall to points (n, 3); for points on the wall, the reversed normal."""
         away = points_mm - self.closest_mm
         length = curves.lengths(away)
         is_on_wall = length < ON_WALL_MM
@@ -54,44 +54,60 @@ class Contact(NamedTuple):
 
 
 class AbstractWall(ABC):
-    """An artery's wall. Final classes differ in how they search, never in what they answer."""
+    """Interface of an artery's wall. Implementations differ in how they search, not in their results."""
 
     @abstractmethod
     def contact(self, points_mm: Floats) -> Contact:
-        """Return the nearest wall of (n, 3) points."""
+        """Return the nearest wall of points (n, 3), in mm."""
 
     @abstractmethod
     def crosses(self, starts_mm: Floats, ends_mm: Floats) -> Bools:
-        """Tell for each of n segments, (n, 3) starts to (n, 3) ends, whether it crosses the wall."""
+        """Return whether each segment from `starts_mm` (n, 3) to `ends_mm` (n, 3) crosses the wall, (n,)."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class TreeWall(AbstractWall):
-    """The exact wall, searched through a tree of axis-aligned bounding boxes."""
+    """Exact wall, searched by a tree of axis-aligned bounding boxes."""
 
     surface: Surface
-    """The landing surface, normals out of the lumen."""
+    """Landing surface, with normals out of the lumen."""
 
     def contact(self, points_mm: Floats) -> Contact:
-        """Return the nearest wall of (n, 3) points."""
+        """Return the nearest wall of points (n, 3), in mm."""
         closest_mm, distance_mm, face = self.surface.closest(points_mm)
         return Contact(closest_mm, distance_mm, self.surface.normals[face], face)
 
     def crosses(self, starts_mm: Floats, ends_mm: Floats) -> Bools:
-        """Tell for each of n segments, (n, 3) starts to (n, 3) ends, whether it crosses the wall."""
+        """Return whether each segment from `starts_mm` (n, 3) to `ends_mm` (n, 3) crosses the wall, (n,)."""
         return self.surface.crosses(starts_mm, ends_mm)
 
 
 def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = TREE) -> tuple[AbstractWall, Bools]:
-    """Return what a device opens against, and which of its faces (m,) are the patient's own wall.
+    """Build the wall against which a device opens.
 
-    That is the landing surface or, where devices already lie in it, their inner faces, the last one foremost.
+    It is the landing surface. Where devices are already deployed, it is the inner face of the last of them instead.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    inside : sequence of Stent, optional
+        Devices that are already in the artery, in the order of their deployment.
+    search : str, optional
+        ``tree``, or the name of a plug-in.
+
+    Returns
+    -------
+    wall : AbstractWall
+        The wall.
+    is_patient : (m,) array of bool
+        Faces that are the patient's own wall, neither restored wall nor device.
 
     Raises
     ------
     PluginError
-        When no plug-in is called `search`.
+        There is no plug-in called `search`.
     """
     kind = TreeWall if search == TREE else plugins.load("vstent.walls", search, built_in=TREE)
     surface = anatomy.landing_surface
@@ -107,11 +123,12 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = T
 
 
 def inner_face(stent: Stent) -> Surface:
-    """Return a device's inner face: its contour, nearer to the axis by the wire that fits between it and the wall."""
+    """Return the inner face of a device: its contour moved inward by the wire that fits between contour and wall."""
     nodes_mm = stent.nodes_mm - stent.design.wall_offset_um * MM_PER_UM * normals(stent.nodes_mm)
     return Surface(nodes_mm.reshape(-1, 3), stent.contour.faces)
 
 
 def _joined(first: Surface, second: Surface) -> Surface:
+    """Return two surfaces as one."""
     vertices_mm = np.concatenate([first.vertices_mm, second.vertices_mm])
     return Surface(vertices_mm, np.concatenate([first.faces, second.faces + np.int32(len(first.vertices_mm))]))

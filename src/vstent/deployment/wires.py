@@ -1,4 +1,4 @@
-"""Wires: the axes of braided wires, woven over and under, and of laser-cut rings, drawn on the deployed contour."""
+"""Wire axes on the deployed contour: braided wires woven over and under, and rings of laser-cut struts."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -16,30 +16,47 @@ from vstent.kernels.arrays import Floats, Ints
 from vstent.units import MM_PER_UM
 
 POINT_SPACING_MM = 0.1
-"""Wire axes are sampled at least this finely, and at least four times between crossings."""
+"""Largest distance between points of a braided wire's axis, in mm. There are at least four points between crossings."""
 CROWN_SHARE = 0.2
-"""Half-width of a laser-cut crown's rounding, in columns."""
+"""Half-width of the rounding of a laser-cut crown, in lattice columns."""
 POINTS_PER_STRUT = 16
-"""Samples of a laser-cut strut, crowns included."""
+"""Points on a laser-cut strut, crowns included."""
 PAD = 8
-"""Rows and columns by which the contour is continued, so that its spline does not feel the rim."""
+"""Rows and columns by which the contour is continued, so that its spline is not affected by the rim."""
 
 
 class Wires(NamedTuple):
-    """Axes of all wires."""
+    """Axes of all wires of a device."""
 
     points_mm: Floats
-    """(p, 3) points, one polyline after another."""
+    """(p, 3) points, in mm, one polyline after another."""
     starts: Ints
-    """(w + 1,) first point of every polyline, and p at the end."""
+    """(w + 1,) first point of every polyline, followed by p."""
     diameter_um: Floats
-    """(w,) diameter or strut width of every polyline."""
+    """(w,) wire diameter or strut width of every polyline, in um."""
 
 
 def draw(design: Design, size: Size, nodes_mm: Floats, wall: AbstractWall) -> Wires:
-    """Draw the wires of a device on its contour (rows, columns, 3).
+    """Draw the wires of a device on its contour.
 
-    A wire's outer face never passes the wall: where it would, its axis is put at half its diameter from it.
+    The outer face of a wire never passes the wall. Where it would, the axis is moved to half the wire's depth from the
+    wall.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    nodes_mm : (rows, columns, 3) array, mm
+        Nodes of the contour.
+    wall : AbstractWall
+        Wall of the artery.
+
+    Returns
+    -------
+    Wires
+        Axes of all wires or rings of struts.
     """
     shape = grid(design, size)
     if isinstance(design, Braid):
@@ -50,6 +67,7 @@ def draw(design: Design, size: Size, nodes_mm: Floats, wall: AbstractWall) -> Wi
 
 
 def _kept_inside(points_mm: Floats, clearance_mm: Floats, wall: AbstractWall) -> Floats:
+    """Return points (p, 3) moved to at least `clearance_mm` (p,) from the wall, inside the lumen."""
     contact = wall.contact(points_mm)
     height_mm = np.einsum("ij,ij->i", contact.closest_mm - points_mm, contact.normal)
     is_near = (contact.distance_mm < clearance_mm) | ((height_mm < 0) & (contact.distance_mm < 0.1))
@@ -58,7 +76,7 @@ def _kept_inside(points_mm: Floats, clearance_mm: Floats, wall: AbstractWall) ->
 
 
 def _samples(shape: Grid, row: Floats, column: Floats) -> csr_matrix:
-    """Weights (n, k) of the k coefficients of a contour's spline at fractional rows and columns (n,) of its grid."""
+    """Return weights (n, k) of a contour's k spline coefficients at fractional rows and columns (n,) of its grid."""
     pad = min(PAD, shape.rows - 1)
     height, width = shape.rows + 2 * pad, shape.columns + 2 * PAD
     (i, down), (j, right) = _knots(row + pad, height), _knots(column % shape.columns + PAD, width)
@@ -69,7 +87,7 @@ def _samples(shape: Grid, row: Floats, column: Floats) -> csr_matrix:
 
 
 def _knots(where: Floats, n: int) -> tuple[Ints, Floats]:
-    """Four knots (m, 4) of n about each of (m,) places and what cubic B-splines weigh there (m, 4)."""
+    """Return the four of n knots (m, 4) around each place (m,), and the weights (m, 4) of cubic B-splines there."""
     first = np.floor(where).astype(int)
     t = where - first
     weights = [(1 - t) ** 3, (3 * t - 6) * t**2 + 4, ((3 - 3 * t) * t + 3) * t + 1, t**3]
@@ -77,10 +95,7 @@ def _knots(where: Floats, n: int) -> tuple[Ints, Floats]:
 
 
 def _spline(nodes_mm: Floats) -> Floats:
-    """Coefficients (k, 6) of the contour (rows, columns, 3) and its normals as smooth surfaces (cubic splines).
-
-    Rows are open, columns periodic.
-    """
+    """Return cubic spline coefficients (k, 6) of a contour (rows, columns, 3) and its normals, columns periodic."""
     values, pad = np.concatenate([nodes_mm, normals(nodes_mm)], axis=2), min(PAD, len(nodes_mm) - 1)
     before = 2 * values[:1] - values[pad:0:-1]
     after = 2 * values[-1:] - values[-2 : -pad - 2 : -1]
@@ -92,25 +107,24 @@ def _spline(nodes_mm: Floats) -> Floats:
 
 
 def _drawn(spline: Floats, samples: csr_matrix) -> tuple[Floats, Floats]:
-    """Points (n, 3) and outward unit normals (n, 3) of a contour's spline (k, 6) at samples (n, k)."""
+    """Return points (n, 3) and outward unit normals (n, 3) of a contour's spline (k, 6) at samples (n, k)."""
     found = samples @ spline
     return found[:, :3], found[:, 3:] / curves.lengths(found[:, 3:])[:, None]
 
 
 def wire_diameters_um(design: Braid) -> Floats:
-    """Diameters (n/2,) of the wires of one hand, every group spread evenly round the device."""
+    """Return the diameters (n/2,), in um, of the wires of one hand, each group spread evenly around the device."""
     places = [((i + 0.5) / (count / 2), diameter) for count, diameter in design.wires for i in range(count // 2)]
     return np.array([diameter for _, diameter in sorted(places)])
 
 
 def _braided(design: Braid, size: Size, shape: Grid, nodes_mm: Floats) -> tuple[Wires, Floats]:
-    """Weave two hands of wires one over, one under (a diamond braid).
-
-    Wire k of the first hand passes column (2 k + row) mod n on every row, wire k of the second (2 k - row) mod n: all
-    meet on every second column. On even rows the first hand is outside, on odd rows the second, so every wire goes
-    over and under in turn. At a crossing both axes are (d1 + d2) / 4 from the contour, just touching; between
-    crossings a wire changes sides along a cosine.
-    """
+    """Return the wires of a diamond braid (one over, one under) and their diameters (p,) in mm at every point."""
+    # Wire k of the first hand passes column (2 k + row) mod n on every row, wire k of the second hand column
+    # (2 k - row) mod n. All wires therefore cross on every second column. The first hand is outside on even rows,
+    # the second on odd rows, so that every wire goes over and under in turn. At a crossing both axes are
+    # (d1 + d2) / 4 from the contour, so that the wires just touch. Between crossings a wire changes
+    # sides along a cosine.
     rows, half = shape.lattice_rows, shape.lattice_columns // 2
     diameter_um = wire_diameters_um(design)
     k, row = np.meshgrid(np.arange(half), np.arange(rows), indexing="ij")
@@ -131,7 +145,7 @@ def _braided(design: Braid, size: Size, shape: Grid, nodes_mm: Floats) -> tuple[
 
 @lru_cache(maxsize=8)
 def _along_wires(shape: Grid, hand: int, samples: int) -> csr_matrix:
-    """Samples along all wires of one hand of a braid, so many from each row to the next."""
+    """Return the samples along all wires of one hand of a braid, `samples` of them from each row to the next."""
     fraction = np.arange((shape.lattice_rows - 1) * samples + 1) / samples
     column = 2 * np.arange(shape.lattice_columns // 2)[:, None] + hand * fraction
     along = np.broadcast_to(fraction, column.shape)
@@ -139,18 +153,16 @@ def _along_wires(shape: Grid, hand: int, samples: int) -> csr_matrix:
 
 
 def _eased(values: Floats, position: Floats) -> Floats:
-    """Values (w, rows) at fractional rows (p,): half a cosine from each row to the next, so flat on every row."""
+    """Return values (w, p) at fractional rows (p,), half a cosine from each row to the next, of values (w, rows)."""
     i = np.minimum(position.astype(int), values.shape[1] - 2)
     share = 0.5 - 0.5 * np.cos(np.pi * (position - i))
     return (1 - share) * values[:, i] + share * values[:, i + 1]
 
 
 def _laser_cut(design: LaserCut, shape: Grid, nodes_mm: Floats) -> tuple[Wires, Floats]:
-    """Zigzag rings between consecutive lattice rows; each is one closed polyline (its last point is its first).
-
-    Ring j runs from row j, where its crowns lie on the columns of j's parity, to row j + 1, where they meet the
-    crowns of ring j + 1. Crowns are rounded to parabolas. The outer face lies against the wall.
-    """
+    """Return zigzag rings between lattice rows, each a closed polyline, and their strut thickness (p,) in mm."""
+    # The crowns of ring j lie on row j, on the columns whose parity is that of j, and on row j + 1, where they meet
+    # the crowns of ring j + 1. Crowns are rounded to parabolas. The outer face of the struts lies on the wall.
     rings, n = shape.lattice_rows - 1, shape.lattice_columns
     column = np.arange(n * POINTS_PER_STRUT + 1) / POINTS_PER_STRUT
     ring = np.arange(rings)[:, None]
@@ -166,7 +178,7 @@ def _laser_cut(design: LaserCut, shape: Grid, nodes_mm: Floats) -> tuple[Wires, 
 
 
 def _rounded_zigzag(x: Floats) -> Floats:
-    """Zigzag of period 2 from 0 at even to 1 at odd x, its corners rounded to parabolas of half-width CROWN_SHARE."""
+    """Return a zigzag, 0 at even and 1 at odd x, with corners rounded to parabolas of half-width CROWN_SHARE."""
     sharp = np.abs((x + 1) % 2 - 1)
     corner = np.minimum(sharp, 1 - sharp)
     rounded = np.where(corner < CROWN_SHARE, (corner**2 + CROWN_SHARE**2) / (2 * CROWN_SHARE), corner)

@@ -1,4 +1,4 @@
-"""Stents as data: a catalogue file in, designs with their sizes, formulas, and deployed stents out.
+"""Stents as data: a catalogue file, designs with their sizes, closed formulas and deployed stents.
 
-Open ``design.py`` first (`Braid`, `LaserCut`, `Size`); ``catalogue.toml`` holds every number with its source.
+Start reading in ``design.py`` (`Braid`, `LaserCut`, `Size`). ``catalogue.toml`` lists every number with its source.
 """

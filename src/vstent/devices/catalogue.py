@@ -1,4 +1,4 @@
-"""The catalogue of devices: vstent's own, those of plug-ins, and those that the user has added."""
+"""The device catalogue: devices of vstent, of plug-ins, and those added by the user."""
 
 import difflib
 import os
@@ -13,18 +13,23 @@ from vstent.errors import DeviceError
 
 @cache
 def catalogue() -> dict[str, Design]:
-    """Return every device by its key: those of the catalogue, of plug-ins, then those that the user has added.
+    """Read all devices: those of the catalogue, of plug-ins and those added by the user.
+
+    Returns
+    -------
+    dict
+        Designs by their key. The result is cached.
 
     Raises
     ------
     DeviceError
-        When a catalogue breaks its schema or names a device that another one names.
+        A catalogue breaks its schema or repeats a device of another catalogue.
     PluginError
-        When a plug-in cannot be loaded.
+        A plug-in cannot be loaded.
     """
     from importlib.resources import files
 
-    from vstent.devices.schema import parse  # pydantic is loaded only when the catalogue is
+    from vstent.devices.schema import parse  # so that pydantic is loaded only with the catalogue
 
     designs = parse(files("vstent.devices").joinpath("catalogue.toml").read_text(encoding="utf-8"))
     for name, entry in plugins.plugins("vstent.devices").items():
@@ -40,20 +45,30 @@ def catalogue() -> dict[str, Design]:
 
 
 def user_folder() -> Path:
-    """Return where the user's own device files are kept: ``$XDG_CONFIG_HOME/vstent/devices``, or in ``~/.config``."""
+    """Return the folder of the user's device files: ``vstent/devices`` in ``$XDG_CONFIG_HOME`` or ``~/.config``."""
     home = os.environ.get("XDG_CONFIG_HOME") or os.environ.get("APPDATA") or "~/.config"
     return Path(home).expanduser() / "vstent" / "devices"
 
 
 def add_devices(path: Path) -> dict[str, Design]:
-    """Check a device file (TOML, as ``catalogue.toml``) and keep a copy of it: its devices join the catalogue.
+    """Check a device file and copy it to the user's folder, so that its devices join the catalogue.
 
-    A file of the same name that was added before is replaced.
+    A file of the same name that is already there is replaced.
+
+    Parameters
+    ----------
+    path : Path
+        TOML file in the form of ``catalogue.toml``.
+
+    Returns
+    -------
+    dict
+        Added designs by their key.
 
     Raises
     ------
     DeviceError
-        When it is no readable text, breaks the schema or names a device that the catalogue has already.
+        The file is not readable text, breaks the schema or repeats a device of the catalogue.
     """
     from vstent.devices.schema import parse
 
@@ -70,6 +85,7 @@ def add_devices(path: Path) -> dict[str, Design]:
 
 
 def _text(path: Path) -> str:
+    """Return the text of a device file."""
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -79,6 +95,7 @@ def _text(path: Path) -> str:
 
 
 def _check_new(added: Mapping[str, Design], known: Mapping[str, Design], source: object) -> None:
+    """Raise a DeviceError if a device of `added` has a key or name that is already used."""
     twice = sorted(set(called(added.values())) & set(called(known.values())))
     if twice:
         raise DeviceError(
@@ -87,12 +104,22 @@ def _check_new(added: Mapping[str, Design], known: Mapping[str, Design], source:
 
 
 def find_design(name: str) -> Design:
-    """Return the device called `name` (its key or its name, any case).
+    """Find a device by its key or name, in upper or lower case.
+
+    Parameters
+    ----------
+    name : str
+        Key or name.
+
+    Returns
+    -------
+    Design
+        The device.
 
     Raises
     ------
     DeviceError
-        When there is none; the sentence says which there are and the nearest.
+        There is no such device. The message lists all devices and suggests the most similar name.
     """
     designs = catalogue()
     by_name = {word: design for design in designs.values() for word in called([design])}
@@ -105,12 +132,26 @@ def find_design(name: str) -> Design:
 
 
 def find_sizes(design: Design, *, diameter_mm: float | None = None, length_mm: float | None = None) -> tuple[Size, ...]:
-    """Return all sizes with this label diameter and length, the smallest and shortest first; None matches any.
+    """Find all sizes of a device with a label diameter and length.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    diameter_mm : float, optional
+        Label diameter, in mm; None matches any.
+    length_mm : float, optional
+        Label length, in mm; None matches any.
+
+    Returns
+    -------
+    tuple of Size
+        Sizes by increasing diameter, then length.
 
     Raises
     ------
     DeviceError
-        When the device is not made in that size; the sentence says what there is.
+        The device is not made in this size. The message lists what is available.
     """
     fits = [
         size for size in design.sizes if diameter_mm in (None, size.diameter_mm) and length_mm in (None, size.length_mm)
@@ -125,9 +166,30 @@ def find_sizes(design: Design, *, diameter_mm: float | None = None, length_mm: f
 
 
 def find_size(design: Design, *, diameter_mm: float | None = None, length_mm: float | None = None) -> Size:
-    """Return the smallest and shortest size of `find_sizes`, and raise what that raises."""
+    """Return the first of `find_sizes`, that is the smallest diameter with its shortest length.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    diameter_mm : float, optional
+        Label diameter, in mm; None matches any.
+    length_mm : float, optional
+        Label length, in mm; None matches any.
+
+    Returns
+    -------
+    Size
+        The size.
+
+    Raises
+    ------
+    DeviceError
+        The device is not made in this size.
+    """
     return find_sizes(design, diameter_mm=diameter_mm, length_mm=length_mm)[0]
 
 
 def _listed(values: Iterable[float]) -> str:
+    """Return the sorted values as text, separated by commas."""
     return ", ".join(f"{value:g}" for value in sorted(set(values)))

@@ -1,9 +1,10 @@
 """Designs of stents: braids and laser-cut tubes with their sizes, as frozen data classes.
 
-Both families share one lattice. n columns run round the device; on every row, n/2 junctions (crossings of wires, or
-the places where laser-cut cells meet) sit on every second column, and the next row is shifted by one column. The
-piece of wire (or strut) between junctions of consecutive rows cannot stretch. At local diameter D it spans one
-column, pi D / n, and the row spacing is what is left: h(D) = sqrt((l/n)^2 - (pi D / n)^2) with l/n its length.
+Both families share one lattice with n columns around the device. Junctions are crossings of wires, or the places where
+laser-cut cells meet. Every row has n/2 of them, on every second column, and each row is shifted by one column against
+the one before. The piece of wire (or strut) between junctions of consecutive rows cannot stretch. At the local diameter
+D it spans one column, pi D / n, around the device. The row spacing follows from its length l/n: h(D) = sqrt((l/n)^2 -
+(pi D / n)^2).
 """
 
 from collections.abc import Iterable
@@ -16,51 +17,52 @@ from vstent.errors import DeviceError
 from vstent.units import MM_PER_UM
 
 Confidence = Literal["cited", "derived", "estimated"]
+"""How sure a number of the catalogue is; see `Fact.confidence`."""
 BARE = "bare"
-"""Name of the flow without a device, so no device's."""
+"""Name of the flow without a device. No device may have it."""
 STEEP_RAD = 0.1, 1.5
-"""Angles between wire and axis that a device may have at its free diameter."""
+"""Smallest and largest angle between wire and axis at the free diameter, in rad."""
 
 
 @dataclass(frozen=True)
 class Fact:
-    """Where one number of the catalogue comes from."""
+    """Source of one number of the catalogue."""
 
     name: str
-    """The field it fills."""
+    """Field that the number belongs to."""
     source: str
-    """Publication, or how it was obtained."""
+    """Publication, or how the number was obtained."""
     confidence: Confidence
     """``cited`` from the source, ``derived`` from cited numbers, or ``estimated``."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """One size of a device; its diameters are compared with the contour's, which runs through the wires' middle."""
+    """One size of a device. Its diameters are those of the contour, which runs through the middle of the wires."""
 
     diameter_mm: float
-    """Label diameter."""
+    """Label diameter, in mm."""
     length_mm: float
-    """Label length: the length at the label diameter."""
+    """Label length, in mm: the length at the label diameter."""
     free_diameter_mm: float
-    """Diameter without an artery around it; the device never gets wider."""
+    """Diameter outside an artery, in mm; the device never becomes wider."""
     compaction_fraction: float = 0.0
-    """Part by which pushing has shortened a braid at its label diameter; below zero where it was pulled."""
+    """Fraction by which pushing has shortened a braid at its label diameter; negative when pulled."""
 
     @property
     def compacted_length_mm(self) -> float:
-        """Length at the label diameter, pushed together as it is."""
+        """Length at the label diameter after compaction, in mm."""
         return self.length_mm * (1 - self.compaction_fraction)
 
     @property
     def label(self) -> str:
-        """The size as one reads it on the box."""
+        """Size as printed on the box."""
         return f"{self.diameter_mm:.2f} x {self.length_mm:g} mm"
 
 
 @dataclass(frozen=True, eq=False)
 class Braid:
-    """A tube braided from two hands of round wires."""
+    """A tube braided from round wires of two hands."""
 
     key: str
     """Short lower-case name."""
@@ -69,15 +71,15 @@ class Braid:
     wires: tuple[tuple[int, float], ...]
     """Groups of wires: (count, diameter in um)."""
     braid_angle_rad: float
-    """Angle between wire and axis at the free diameter."""
+    """Angle between wire and axis at the free diameter, in rad."""
     sizes: tuple[Size, ...]
-    """Sizes on offer."""
+    """Available sizes."""
     maker: str = ""
-    """Who makes it."""
+    """Manufacturer."""
     facts: tuple[Fact, ...] = ()
     """Source and confidence of every number."""
     kind: Literal["braid"] = field(default="braid", init=False)
-    """Family, for tables."""
+    """Device family."""
 
     def __post_init__(self) -> None:
         _check_columns(self.name, self.n_wires)
@@ -92,7 +94,7 @@ class Braid:
 
     @property
     def n_wires(self) -> int:
-        """Number of wires, both hands together."""
+        """Number of wires of both hands."""
         return sum(count for count, _ in self.wires)
 
     @property
@@ -102,12 +104,12 @@ class Braid:
 
     @property
     def angle_rad(self) -> float:
-        """Angle between wire and axis at the free diameter."""
+        """Angle between wire and axis at the free diameter, in rad."""
         return self.braid_angle_rad
 
     @property
     def wall_offset_um(self) -> float:
-        """Distance from the wall to the contour, the paper's dd: one wire (the thickest) fits between them."""
+        """Distance from the wall to the contour, in um (dd in Zhong et al. 2016): the diameter of the thickest wire."""
         return max(diameter for _, diameter in self.wires)
 
 
@@ -120,21 +122,21 @@ class LaserCut:
     name: str
     """Name as the maker writes it."""
     n_columns: int
-    """Columns of the lattice: struts round one ring, twice the number of cells round."""
+    """Columns of the lattice: struts around one ring, twice the number of cells around the device."""
     strut_width_um: float
-    """Width of a strut along the wall."""
+    """Width of a strut along the wall, in um."""
     strut_thickness_um: float
-    """Thickness of a strut across the wall."""
+    """Thickness of a strut perpendicular to the wall, in um."""
     cell_angle_rad: float
-    """Angle between strut and axis at the free diameter."""
+    """Angle between strut and axis at the free diameter, in rad."""
     sizes: tuple[Size, ...]
-    """Sizes on offer."""
+    """Available sizes."""
     maker: str = ""
-    """Who makes it."""
+    """Manufacturer."""
     facts: tuple[Fact, ...] = ()
     """Source and confidence of every number."""
     kind: Literal["laser_cut"] = field(default="laser_cut", init=False)
-    """Family, for tables."""
+    """Device family."""
 
     def __post_init__(self) -> None:
         _check_columns(self.name, self.n_columns)
@@ -143,30 +145,33 @@ class LaserCut:
 
     @property
     def angle_rad(self) -> float:
-        """Angle between strut and axis at the free diameter."""
+        """Angle between strut and axis at the free diameter, in rad."""
         return self.cell_angle_rad
 
     @property
     def wall_offset_um(self) -> float:
-        """Distance from the wall to the contour, the paper's dd: one strut fits between them."""
+        """Distance from the wall to the contour, in um (dd in Zhong et al. 2016): the thickness of a strut."""
         return self.strut_thickness_um
 
 
 Design = Braid | LaserCut
+"""A device of either family."""
 
 
 def _check_columns(name: str, n_columns: int) -> None:
+    """Raise a DeviceError if the number of wires or struts around the device is odd or below 6."""
     if n_columns < 6 or n_columns % 2:
         raise DeviceError(f"{name} has {n_columns} wires or struts around. Give an even number of at least 6.")
 
 
 def _check_angle(name: str, angle_rad: float) -> None:
+    """Raise a DeviceError if the angle to the axis is out of range."""
     if not STEEP_RAD[0] < angle_rad < STEEP_RAD[1]:
         raise DeviceError(f"{name} has an angle of {angle_rad:.3f} rad to the axis. Give 0.1 to 1.5 rad.")
 
 
 def _check_sizes(design: Design) -> None:
-    """See that wires have room round every size, and that it is long enough to hold two rows of cells."""
+    """Raise a DeviceError if the wires of a size have no room side by side, or it is shorter than two rows of cells."""
     for size in design.sizes:
         taken = strips_fraction(design, size, size.free_diameter_mm)
         if taken >= 1:
@@ -183,12 +188,12 @@ def _check_sizes(design: Design) -> None:
 
 
 def piece_length_mm(design: Design, size: Size) -> float:
-    """Length l/n of the wire or strut between junctions: an artery cannot change it."""
+    """Return the length l/n of the wire or strut between junctions, in mm; it is the same at every diameter."""
     return float(np.pi * size.free_diameter_mm / (design.n_columns * free_sine(design, size)))
 
 
 def free_sine(design: Design, size: Size) -> float:
-    """Sine of the angle between wire and axis at the free diameter; a compacted braid's may exceed 1: it is none."""
+    """Return the sine of the angle between wire and axis at the free diameter; above 1 if compacted too far."""
     if size.compaction_fraction == 0.0:
         return float(np.sin(design.angle_rad))
     cosine = np.sqrt(1 - (np.sin(design.angle_rad) * size.diameter_mm / size.free_diameter_mm) ** 2)
@@ -197,12 +202,42 @@ def free_sine(design: Design, size: Size) -> float:
 
 
 def angle_rad(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np.ndarray:
-    """Angle between wire and axis at a local diameter: sin(alpha) = sin(alpha_free) D / D_free."""
+    """Compute the angle between wire and axis at a local diameter: sin(alpha) = sin(alpha_free) D / D_free.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    diameter_mm : float or array, mm
+        Local diameter; values above the free diameter count as the free diameter.
+
+    Returns
+    -------
+    array of the shape of `diameter_mm`, rad
+        Angle between wire and axis.
+    """
     return np.arcsin(free_sine(design, size) * np.minimum(diameter_mm, size.free_diameter_mm) / size.free_diameter_mm)
 
 
 def strips_fraction(design: Design, size: Size, diameter_mm: float) -> float:
-    """Part of the circumference that all struts, or the wires of one hand, take side by side; 1 and more: no room."""
+    """Compute the fraction of the circumference that wires of one hand, or all struts, occupy side by side.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    diameter_mm : float
+        Local diameter, in mm.
+
+    Returns
+    -------
+    float
+        Fraction; from 1 on there is no room for them.
+    """
     per_axis_mm = np.pi * diameter_mm * float(np.cos(angle_rad(design, size, diameter_mm)))
     if isinstance(design, LaserCut):
         return float(design.n_columns * design.strut_width_um * MM_PER_UM / per_axis_mm)
@@ -211,5 +246,5 @@ def strips_fraction(design: Design, size: Size, diameter_mm: float) -> float:
 
 
 def called(designs: Iterable[Design]) -> list[str]:
-    """Return what devices are called, their keys and names in lower case; two that clash are in it twice."""
+    """Return the keys and names of devices in lower case; a word is listed twice if two devices share it."""
     return [word for design in designs for word in sorted({design.key.casefold(), design.name.casefold()})]

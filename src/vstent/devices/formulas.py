@@ -1,4 +1,4 @@
-"""Closed formulas of braids and of laser-cut cells: row spacing, deployed length, coverage and pore density."""
+"""Closed formulas for braids and laser-cut cells: row spacing, deployed length, coverage and pore density."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -19,26 +19,26 @@ from vstent.devices.design import (
 from vstent.errors import DeviceError
 
 BEND_SAMPLES, BEND_STEPS = 12, 6
-"""Angles round half the axis (the other half mirrors it), and Newton steps, for the spacing of rows in a bend."""
+"""Row spacing in a bend: angles around half of the axis (the other half is symmetric), and number of Newton steps."""
 STEEPEST_BEND = 0.9
-"""Artery's radius over the bend's, at most: sharper ones are only sharp where the wall is folded."""
+"""Largest ratio of the artery's radius to the radius of its bend. Sharper bends occur only where the wall is folded."""
 STRAIGHTEST = 0.995
-"""Cosine of the angle that wires outside a bend have to the axis, at most."""
+"""Largest cosine of the angle between the axis and the wires on the outer side of a bend."""
 NODE_SPACING_LIMIT_MM = 0.35
-"""A contour's nodes are never further apart than this at the label diameter."""
+"""Largest distance between nodes of a contour at the label diameter, in mm."""
 
 
 class Grid(NamedTuple):
-    """How a device's lattice is laid on the contour's nodes."""
+    """Numbers of nodes and lattice rows and columns of a contour."""
 
     rows: int
     """Rows of nodes."""
     columns: int
-    """Nodes of a row."""
+    """Nodes in a row."""
     row_split: int
-    """Node rows per lattice row."""
+    """Rows of nodes per lattice row."""
     column_split: int
-    """Node columns per lattice column."""
+    """Columns of nodes per lattice column."""
 
     @property
     def lattice_rows(self) -> int:
@@ -52,7 +52,7 @@ class Grid(NamedTuple):
 
 
 def grid(design: Design, size: Size) -> Grid:
-    """Return the contour's grid: one node per junction column and row, finer where cells are large."""
+    """Return the grid of the contour: one node per lattice row and column, more where cells are large."""
     spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
     rows = max(2, round(size.compacted_length_mm / spacing_mm) + 1)
     row_split = int(np.ceil(spacing_mm / NODE_SPACING_LIMIT_MM))
@@ -61,15 +61,30 @@ def grid(design: Design, size: Size) -> Grid:
 
 
 def compacted(design: Design, size: Size, fraction: float) -> Size:
-    """Return a size of a braid pushed together (pulled apart: below zero) by a part of its length.
+    """Compact a braid: push it together by a fraction of its length, or pull it apart with a negative one.
 
-    The wires' ends are free: pushed, wires wind more often round the device and cross more often. A wire of the same
-    length over the fraction (1 - q) of the axis has cos(alpha) = (1 - q) cos(alpha of the label).
+    The ends of the wires are free. When the braid is pushed, its wires wind more often around it and cross more often.
+    A wire of the same length over the fraction (1 - q) of the axis has cos(alpha) = (1 - q) cos(alpha at the label
+    diameter).
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    fraction : float
+        Fraction q of the length.
+
+    Returns
+    -------
+    Size
+        The compacted size.
 
     Raises
     ------
     DeviceError
-        When the wires of such a device would stand too steep, or the device has none.
+        The wires would become too steep or too straight, or the device is not a braid.
     """
     if fraction == 0.0:
         return size
@@ -90,16 +105,40 @@ def compacted(design: Design, size: Size, fraction: float) -> Size:
 def row_spacing_mm(
     design: Design, size: Size, diameter_mm: float | np.ndarray, curvature_per_mm: float | np.ndarray = 0.0
 ) -> np.ndarray:
-    """Distance h along the axis between rows of junctions at a local diameter, at most the free one.
+    """Compute the distance h along the axis between rows of junctions at a local diameter.
 
-    Where the axis bends, rows are h (1 + k cos(theta)) apart at the angle theta round it, k = curvature D / 2. Pieces
-    of wire keep their length l, so that cos(alpha) = h (1 + k cos(theta)) / l, and a column takes l sin(alpha) of the
-    circumference: n of them fill it when the mean of 1 / sin(alpha) round it is n l / (pi D). h is less than in a
-    straight artery: what columns lose outside, where wires are drawn along the axis, is more than what they gain
-    inside. This is the net of inextensible threads (Chebyshev 1878, Sur la coupe des vetements) on a torus. It asks
-    nothing but that pieces keep their length between crossings that all their wires keep, so it holds for the joined
-    struts of a laser-cut device as for a braid, as long as its cells can lie against the wall: where h (1 + k) would
-    have to exceed l in a straight artery's rows they begin to leave it outside, and the device is longer than this.
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    diameter_mm : float or array, mm
+        Local diameter D; values above the free diameter count as the free diameter.
+    curvature_per_mm : float or array, per mm, optional
+        Curvature of the axis.
+
+    Returns
+    -------
+    array, mm
+        Row spacing h.
+
+    Notes
+    -----
+    Let k = curvature D / 2. In a bend, rows are h (1 + k cos(theta)) apart at the angle theta around the axis. Pieces
+    of wire keep their length l, so that cos(alpha) = h (1 + k cos(theta)) / l. A column occupies l sin(alpha) of the
+    circumference. The n columns fill the circumference where the mean of 1 / sin(alpha) around it is n l / (pi D). The
+    spacing h is smaller than in a straight artery: columns narrow on the outer side of the bend, where wires are drawn
+    along the axis, more than they widen on the inner side.
+
+    The only assumption is that pieces keep their length between crossings, and that the wires keep their crossings. The
+    formula therefore holds for the joined struts of a laser-cut device as well, as long as its cells can be apposed.
+    Where h (1 + k), with the h of a straight artery, would exceed l, cells on the outer side begin to leave the wall,
+    and the device is longer than this formula predicts.
+
+    References
+    ----------
+    Chebyshev (1878), Sur la coupe des vetements: the net of inextensible threads, here on a torus.
     """
     piece_mm, angle = piece_length_mm(design, size), angle_rad(design, size, diameter_mm)
     if not np.any(curvature_per_mm):
@@ -109,7 +148,7 @@ def row_spacing_mm(
     apart = 1 + np.multiply.outer(bend, np.cos(np.pi * (np.arange(BEND_SAMPLES) + 0.5) / BEND_SAMPLES))
     longest = STRAIGHTEST / (1 + bend)
     cosine = np.minimum(np.cos(angle), longest)
-    for _ in range(BEND_STEPS):  # Newton's; the mean grows faster than linearly with the cosine
+    for _ in range(BEND_STEPS):  # Newton steps; the mean is convex in the cosine
         width = 1 / np.sqrt(1 - (cosine[..., None] * apart) ** 2)
         excess = width.mean(axis=-1) - 1 / np.sin(angle)
         slope = cosine * (apart * apart * width * width * width).mean(axis=-1)
@@ -118,28 +157,74 @@ def row_spacing_mm(
 
 
 def deployed_length_mm(design: Design, size: Size, diameter_mm: float) -> float:
-    """Length in a straight tube where the contour's diameter is `diameter_mm` all along."""
+    """Return the length of the device in a straight tube with the contour diameter `diameter_mm`, in mm."""
     rows = grid(design, size).lattice_rows
     return float((rows - 1) * row_spacing_mm(design, size, diameter_mm))
 
 
 def foreshortening_fraction(design: Design, size: Size, diameter_mm: float) -> float:
-    """Shortening at a local diameter against the label: 1 - L(D)/L_label = 1 - (1 - q) cos(alpha)/cos(alpha_label)."""
+    """Compute the shortening at a local diameter relative to the label.
+
+    It is 1 - L(D)/L_label = 1 - (1 - q) cos(alpha)/cos(alpha_label), with q the compaction.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    diameter_mm : float
+        Local diameter D, in mm.
+
+    Returns
+    -------
+    float
+        Shortening as a fraction of the label length.
+    """
     here, label = angle_rad(design, size, np.array([diameter_mm, size.diameter_mm]))
     return float(1 - (1 - size.compaction_fraction) * np.cos(here) / np.cos(label))
 
 
 def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
-    """Part of the wall under metal at a local diameter.
+    """Compute the fraction of the wall under metal at a local diameter.
 
-    Two hands of strips cover 1 - (1 - f)^2, f = sum of wire diameters of one hand / (pi D cos(alpha)); struts that
-    meet without crossing cover 2 f.
+    With f = sum of the wire diameters of one hand / (pi D cos(alpha)), the two hands of a braid cover 1 - (1 - f)^2.
+    For laser-cut struts, which meet without crossing, f counts all struts and is the coverage.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    diameter_mm : float
+        Local diameter D, in mm.
+
+    Returns
+    -------
+    float
+        Metal coverage.
     """
     strips = min(1.0, strips_fraction(design, size, diameter_mm))
     return strips if isinstance(design, LaserCut) else 1 - (1 - strips) ** 2
 
 
 def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> float:
-    """Pores per area of wall at a local diameter: 2 (n/2)^2 tan(alpha) / (pi D)^2."""
+    """Compute the number of pores per area of wall at a local diameter: 2 (n/2)^2 tan(alpha) / (pi D)^2.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    diameter_mm : float
+        Local diameter D, in mm.
+
+    Returns
+    -------
+    float
+        Pore density, per mm2.
+    """
     tangent = float(np.tan(angle_rad(design, size, diameter_mm)))
     return float(0.5 * design.n_columns**2 * tangent / (np.pi * diameter_mm) ** 2)

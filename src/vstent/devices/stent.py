@@ -1,4 +1,4 @@
-"""A device in an artery: the data classes `Landing`, `Stent` and `Deployment`."""
+"""Data classes of a device in an artery: `Landing`, `Stent` and `Deployment`."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,18 +13,19 @@ from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints, freeze
 
 Anchor = Literal["center", "distal", "proximal"]
-"""A point of a device by which it can be landed."""
+"""Point of a device that is placed at the landing position."""
 ANCHORS: Final[tuple[str, ...]] = get_args(Anchor)
+"""All values of `Anchor`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Landing:
-    """Where one point of the device is to lie on the parent axis."""
+    """Position on the parent axis at which a point of the device lies."""
 
     abscissa_mm: float
-    """Arc length on the parent axis."""
+    """Arc length on the parent axis, in mm."""
     anchor: Anchor = "center"
-    """Which point of the device lies there."""
+    """Point of the device that lies there."""
 
     def __post_init__(self) -> None:
         if self.anchor not in ANCHORS:
@@ -38,19 +39,19 @@ class Stent:
     """A deployed device: its contour and its wires."""
 
     design: Design
-    """The device, from the catalogue."""
+    """The device from the catalogue."""
     size: Size
-    """The size chosen."""
+    """Its size."""
     nodes_mm: Floats
-    """(rows, columns, 3) the contour's nodes, row 0 proximal; each row runs once round."""
+    """(rows, columns, 3) nodes of the contour, in mm. Row 0 is proximal, and each row is one closed loop."""
     row_abscissa_mm: Floats
-    """(rows,) arc length of every row on the parent axis."""
+    """(rows,) arc length of every row on the parent axis, in mm."""
     wire_points_mm: Floats
-    """(p, 3) axes of all wires or struts, one polyline after another; a laser-cut ring ends in its first point."""
+    """(p, 3) axes of all wires or rings of struts, in mm, polyline after polyline. A ring ends in its first point."""
     wire_starts: Ints
-    """(w + 1,) first point of every polyline, and p at the end."""
+    """(w + 1,) first point of every polyline, followed by p."""
     wire_diameter_um: Floats
-    """(w,) diameter (a laser-cut strut: its width) of every polyline."""
+    """(w,) wire diameter, or strut width of a laser-cut device, of every polyline, in um."""
 
     def __post_init__(self) -> None:
         freeze(self, "nodes_mm", np.float64, (-1, -1, 3))
@@ -61,73 +62,73 @@ class Stent:
 
     @cached_property
     def contour(self) -> Surface:
-        """The contour as triangles, normals outward; vertex (row, column) is number row * columns + column."""
+        """Contour as triangles with outward normals; vertex (row, column) has the number row * columns + column."""
         rows, columns = self.nodes_mm.shape[:2]
         return Surface(self.nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
 
     @property
     def point_wires(self) -> Ints:
-        """(p,) the wire that every point belongs to."""
+        """(p,) wire to which every point belongs."""
         return np.repeat(np.arange(len(self.wire_starts) - 1), np.diff(self.wire_starts))
 
     @property
     def piece_starts(self) -> Ints:
-        """(m,) points at which pieces of wire begin, each to the next point: all but the last of every wire."""
+        """(m,) first points of all straight pieces of wire: every point but the last of each wire."""
         is_last = np.zeros(len(self.wire_points_mm), dtype=bool)
         is_last[self.wire_starts[1:] - 1] = True
         return np.flatnonzero(~is_last)
 
     @property
     def wire_length_mm(self) -> float:
-        """Length of all wires together."""
+        """Total length of all wires, in mm."""
         return float(curves.lengths(np.diff(self.wire_points_mm, axis=0)[self.piece_starts]).sum())
 
     @property
     def spacing_mm(self) -> float:
-        """Distance between neighbouring wires of one family, of two that share all wires: 2 area / length of wire."""
+        """Distance between neighbouring wires of one of two hands, in mm: 2 area / length of all wires."""
         return 2 * self.contour.area_mm2 / self.wire_length_mm
 
     @cached_property
     def row_diameter_mm(self) -> Floats:
-        """(rows,) diameter of the circle of every row's perimeter, seen along the device: a row may be tilted."""
+        """(rows,) diameters of circles with the rows' perimeters, in mm, seen along the device."""
         return row_diameters_mm(self.nodes_mm)
 
     @property
     def proximal_abscissa_mm(self) -> float:
-        """Where the device begins on the parent axis."""
+        """Arc length of the proximal end on the parent axis, in mm."""
         return float(self.row_abscissa_mm[0])
 
     @property
     def distal_abscissa_mm(self) -> float:
-        """Where the device ends on the parent axis."""
+        """Arc length of the distal end on the parent axis, in mm."""
         return float(self.row_abscissa_mm[-1])
 
     @property
     def deployed_length_mm(self) -> float:
-        """Length along the parent axis between the ends."""
+        """Length between the ends along the parent axis, in mm."""
         return self.distal_abscissa_mm - self.proximal_abscissa_mm
 
 
 @dataclass(frozen=True, eq=False)
 class Deployment:
-    """What the active contour did."""
+    """Result of a deployment."""
 
     stent: Stent
     """The deployed device."""
     outcome: Literal["terminated", "iteration_limit"]
-    """Whether 99 % of the nodes terminated."""
+    """``terminated`` if 99 % of the nodes terminated, else ``iteration_limit``."""
     advice: str
-    """One plain sentence: what to know or do about this deployment."""
+    """Where the device lies, and what to do if it does not fit, in plain words."""
     terminated_fraction: Floats
-    """(iterations,) fraction of nodes terminated after every iteration."""
+    """(iterations,) fraction of nodes that have terminated, after every iteration."""
     seconds: float
-    """Wall time of the deployment."""
+    """Wall time of the deployment, in s."""
     wall_gap_mm: Floats
-    """(rows, columns) clearance between the device's outer face and the landing surface."""
+    """(rows, columns) gap between the outer face of the device and the landing surface, in mm."""
     history_mm: Floats
-    """(iterations + 1, rows, columns, 3) contour before the first and after every iteration."""
+    """(iterations + 1, rows, columns, 3) contour before the first and after every iteration, in mm."""
     energy_mm2: Floats
-    """(iterations + 1,) energy of the contour (Zhong et al. 2016, eq. 1) before the first and after every iteration."""
+    """(iterations + 1,) energy (Zhong et al. 2016, eq. 1) before the first and after every iteration, in mm2."""
 
     def __post_init__(self) -> None:
         freeze(self, "terminated_fraction", np.float64, (-1,))
@@ -137,25 +138,48 @@ class Deployment:
 
 
 def row_diameters_mm(nodes_mm: Floats) -> Floats:
-    """Diameters (rows,) of the circles of the perimeters of rows (rows, columns, 3), seen along the device."""
+    """Compute the diameters of circles with the perimeters of the rows, seen along the device.
+
+    The perimeters are projected along the device because rows may be tilted.
+
+    Parameters
+    ----------
+    nodes_mm : (rows, columns, 3) array, mm
+        Nodes of the contour.
+
+    Returns
+    -------
+    (rows,) array, mm
+        Diameters.
+    """
     around_mm = np.roll(nodes_mm, -1, axis=1) - nodes_mm
     columns = nodes_mm.shape[1]
     center_mm = nodes_mm.mean(axis=1)
-    # The direction of the device is taken over about one diameter: centers of rows wobble.
+    # The direction of the device is averaged over about one diameter, since the centers of single rows fluctuate.
     radius_mm = curves.lengths(around_mm).sum(axis=1).mean() / (2 * np.pi)
     step_mm = np.linalg.norm(np.diff(center_mm, axis=0), axis=1).mean()
     reach, row = max(1, round(radius_mm / step_mm)), np.arange(len(center_mm))
     ahead = center_mm[np.minimum(row + reach, row[-1])] - center_mm[np.maximum(row - reach, 0)]
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     across_mm = around_mm - np.einsum("ijk,ik->ij", around_mm, ahead)[..., None] * ahead[:, None]
-    # A regular polygon is shorter than its circle by (pi/n) / sin(pi/n).
+    # The perimeter of a circle is (pi/n) / sin(pi/n) times that of its regular n-gon.
     return curves.lengths(across_mm).sum(axis=1) / (columns * np.sin(np.pi / columns))
 
 
 def tube_faces(rows: int, columns: int) -> Ints:
-    """Triangles (2 (rows - 1) columns, 3) of a tube of `rows` rings of `columns` vertices.
+    """Build the triangles of a tube of rings of vertices.
 
-    Outward when each ring runs counter-clockwise about the direction of growing rows.
+    Parameters
+    ----------
+    rows : int
+        Number of rings.
+    columns : int
+        Number of vertices in a ring.
+
+    Returns
+    -------
+    (2 (rows - 1) columns, 3) array of int
+        Triangles. They face outward if each ring runs counter-clockwise about the direction of increasing rows.
     """
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
     a = row * columns + column

@@ -1,4 +1,4 @@
-"""The data classes of images, surfaces and vessels: arrays in, frozen objects with derived quantities out.
+"""Data classes of images, surfaces and vessels: immutable arrays with derived quantities.
 
-Open ``vessel.py`` first: `Vessel`, `Aneurysm` and `Anatomy` are what every other package exchanges.
+Read ``vessel.py`` first: all other packages exchange `Vessel`, `Aneurysm` and `Anatomy`.
 """

@@ -1,4 +1,4 @@
-"""Image: a scan on a regular, possibly oblique grid in the LPS frame."""
+"""A scan on a regular, possibly oblique grid in the LPS frame."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,13 +15,13 @@ class Image:
     """A three-dimensional scan."""
 
     voxels: NDArray[Any]
-    """(i, j, k) intensities, any real dtype."""
+    """(i, j, k) intensities of any real dtype."""
     affine_mm: Floats
-    """(4, 4) voxel index -> LPS mm."""
+    """(4, 4) transform from a voxel index to LPS mm."""
     modality: str = ""
-    """DICOM modality, empty where the file does not say."""
+    """DICOM modality; empty where the file does not state it."""
     notes: tuple[str, ...] = ()
-    """What was guessed in reading it, one sentence each."""
+    """Assumptions made while reading the scan, one sentence each."""
 
     def __post_init__(self) -> None:
         freeze(self, "voxels", np.asarray(self.voxels).dtype, (-1, -1, -1))
@@ -33,10 +33,10 @@ class Image:
         return np.linalg.norm(self.affine_mm[:3, :3], axis=0)
 
     def to_mm(self, index: Floats) -> Floats:
-        """Map (n, 3) voxel indices to LPS mm."""
+        """Return the positions (n, 3) in LPS mm of voxel indices (n, 3)."""
         return np.asarray(index, dtype=np.float64) @ self.affine_mm[:3, :3].T + self.affine_mm[:3, 3]
 
     def to_index(self, points_mm: Floats) -> Floats:
-        """Map (n, 3) LPS mm to fractional voxel indices."""
+        """Return the fractional voxel indices (n, 3) of positions (n, 3) in LPS mm."""
         inverse = np.linalg.inv(self.affine_mm)
         return np.asarray(points_mm, dtype=np.float64) @ inverse[:3, :3].T + inverse[:3, 3]

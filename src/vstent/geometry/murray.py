@@ -9,6 +9,19 @@ from vstent.kernels.arrays import Floats
 
 
 def murray_shares(openings: Sequence[Opening]) -> Floats:
-    """Return the parts (k,) of a flow that openings take: as diameter cubed (Murray 1926, PNAS 12, 207)."""
+    """Return the fraction of the flow through each opening, proportional to its diameter cubed.
+
+    Parameters
+    ----------
+    openings : k openings that share a flow.
+
+    Returns
+    -------
+    shares : (k,) fractions with a sum of 1.
+
+    References
+    ----------
+    Murray 1926, PNAS 12:207.
+    """
     cubes = np.array([opening.diameter_mm**3 for opening in openings])
     return np.asarray(cubes / cubes.sum())

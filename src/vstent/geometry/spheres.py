@@ -1,8 +1,8 @@
-"""Maximum inscribed spheres against the smooth wall of which a mesh is a sample.
+"""Move the points of a path to the centers of maximum inscribed spheres of a smooth wall sampled by a mesh.
 
-A triangle is a chord: it lies inside a convex wall by the square of its edge, and a sphere that touches it is narrower
-than the artery by as much. Here a wall is curved over every triangle as its corners' normals tell, a quadratic, and the
-centre of a sphere is moved to where the largest one in its section is.
+A triangle is a chord of the wall. On a convex wall it lies inside by an amount that grows with the square of its edge
+length, so a sphere that touches it is too small. Here the wall over every triangle is curved according to the normals
+at its corners (a quadratic patch), and the center of a sphere is moved to that of the largest sphere in its section.
 """
 
 from typing import Final
@@ -15,29 +15,34 @@ from vstent.kernels.arrays import Floats, Ints
 from vstent.kernels.medial import widest_in_section
 
 N_RAYS: Final = 24
-"""Directions in which the wall is sought around a centre."""
+"""Number of directions in which the wall is sought around a center."""
 NEAR: Final = 0.01
-"""Centres are moved by a few of so many radii at most; in a sac's mouth, where the largest sphere is the sac's, not."""
+"""Scale of the movement of a center, in radii. A center moves a few of these at most, and longer movements are damped:
+in the mouth of a sac the largest sphere is that of the sac."""
 GAIN: Final = 0.5
-"""A sphere grows by at least this fraction of the way that its centre is moved: a flat section has many spheres
-that are about as large, and the path is left where it is among them."""
+"""Smallest growth of a sphere per distance that its center moves. In a flat section many spheres are nearly as large,
+and the path is kept."""
 OPEN: Final = 0.15
-"""A section is a fork's, and says less of its middle, where its wall is further away than the nearest by more than this
-fraction on average."""
+"""Mean excess of the wall's distance over the nearest distance, as a fraction, above which a section is that of a fork
+and its center is less reliable."""
 STRIDE: Final = 2
-"""The movement of every so manieth point is computed, and interpolated between them."""
+"""The movement is computed at every n-th point and interpolated between."""
 SMOOTHED_DIAMETERS: Final = 0.25
-"""Waves of the movement shorter than this many local diameters are left out."""
+"""Longest wavelength that is smoothed out of the movement, in local diameters."""
 
 
 def centered(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Floats:
-    """Move the points of a smooth path (n, 3) to the centres of the largest spheres in its sections; its ends stay.
+    """Move the points of a smooth path to the centers of the largest spheres in its sections; its ends stay.
 
     Parameters
     ----------
-    wall : the lumen's wall.
-    path_mm : (n, 3) evenly spaced points near the medial axis.
-    radius_mm : (n,) radii of the inscribed spheres there, about.
+    wall : wall of the lumen.
+    path_mm : (n, 3) evenly spaced points near the medial axis, in mm.
+    radius_mm : (n,) approximate radii of the inscribed spheres there, in mm.
+
+    Returns
+    -------
+    path_mm : (n, 3) moved points in mm.
     """
     step_mm = curves.arc_length(path_mm)[-1] / (len(path_mm) - 1)
     waves = 2.0 * radius_mm * SMOOTHED_DIAMETERS / (2 * np.pi * step_mm)
@@ -52,10 +57,8 @@ def centered(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Floats:
 
 
 def _to_widest(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Floats:
-    """Way (n, 3) from the points of a path to the centres of the largest spheres in its sections, if it is short.
-
-    The wall is taken as its tangent planes where rays of the section meet it.
-    """
+    """Return the vectors (n, 3) from points of a path to the centers of the largest nearby spheres in its sections."""
+    # The wall is represented by its tangent planes where the rays of the section meet it.
     frames = curves.parallel_frames(path_mm)
     angle = 2 * np.pi * np.arange(N_RAYS) / N_RAYS
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -74,14 +77,14 @@ def _to_widest(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Floats:
 
 
 def _trust(ring_mm: Floats) -> Floats:
-    """Trust (n,) in the middle of a section whose wall is so far away (n, rays): 1 where it is round, 0 in a fork."""
+    """Return the reliability (n,) of the center of sections with wall distances (n, rays): 1 if round, 0 in a fork."""
     nearest = np.nan_to_num(np.maximum(ring_mm.min(axis=1, keepdims=True), 1e-300), posinf=1e-300)
     excess = np.clip(ring_mm / nearest, 1.0, 3.0).mean(axis=1) - 1.0
     return np.asarray(1.0 / (1.0 + (excess / OPEN) ** 4))
 
 
 def _bulge(wall: Surface, points_mm: Floats, face: Ints) -> tuple[Floats, Floats]:
-    """How far the smooth wall lies outside of points (n, 3) of its faces (n,), and its unit normals (n, 3) there."""
+    """Return the height (n,) of the smooth wall above points (n, 3) of its faces (n,), and its unit normals (n, 3)."""
     corners, normal = wall.corners_mm[face], wall.smooth_normals[face]
     weight = triangles.barycentric(corners, points_mm)
     height = 0.5 * (weight * np.roll(weight, -1, axis=1) * triangles.edge_rises(corners, normal)).sum(axis=1)

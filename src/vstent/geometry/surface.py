@@ -1,4 +1,4 @@
-"""Surface: a triangle mesh in mm, and the questions one asks of it."""
+"""A triangle mesh in mm, with geometric queries."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,17 +11,17 @@ from vstent.kernels import medial, tree, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 
 CREASE_RAD: Final = np.radians(35.0)
-"""A mesh is not taken for a smooth surface where its vertices' normals lean so far from its faces'."""
+"""A mesh is creased where vertex and face normals differ by more than this angle, in rad."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangle mesh; faces are counter-clockwise seen from outside."""
+    """A triangle mesh with counter-clockwise faces seen from outside."""
 
     vertices_mm: Floats
-    """(n, 3) vertex positions."""
+    """(n, 3) positions of the vertices."""
     faces: Ints
-    """(m, 3) vertex indices."""
+    """(m, 3) vertex indices of the faces."""
 
     def __post_init__(self) -> None:
         freeze(self, "vertices_mm", np.float64, (-1, 3))
@@ -34,25 +34,25 @@ class Surface:
 
     @cached_property
     def areas_mm2(self) -> Floats:
-        """(m,) face areas."""
+        """(m,) areas of the faces."""
         return triangles.areas(self.corners_mm)
 
     @cached_property
     def normals(self) -> Floats:
-        """(m, 3) unit face normals, outward; zero for a degenerate face."""
+        """(m, 3) outward unit normals of the faces; zero for a degenerate face."""
         return triangles.normals(self.corners_mm)
 
     @cached_property
     def vertex_normals(self) -> Floats:
-        """(n, 3) unit vertex normals, angle weighted."""
+        """(n, 3) unit normals at the vertices, weighted by angle."""
         return triangles.vertex_normals(self.vertices_mm, self.faces)
 
     @cached_property
     def smooth_normals(self) -> Floats:
-        """(m, 3, 3) unit normals, at every face's corners, of the smooth surface through the vertices.
+        """(m, 3, 3) unit normals of the smooth surface through the vertices, at the corners of every face.
 
-        Where a corner's normal leans from its face's by more than `CREASE_RAD` the mesh is creased: all three are the
-        face's own there.
+        Where one of a face's corner normals differs from the face normal by more than `CREASE_RAD`, the mesh is
+        creased. The face normal is then used at all three corners.
         """
         normals = triangles.smooth_normals(self.vertices_mm, self.faces)[self.faces]
         least = np.einsum("fkd,fd->fk", normals, self.normals).min(axis=1)
@@ -60,7 +60,7 @@ class Surface:
 
     @cached_property
     def curved(self) -> tree.Curved:
-        """Bounding-box tree over the smooth surface through the vertices."""
+        """Bounding-box tree of the smooth surface through the vertices."""
         return tree.curved(self.tree, self.smooth_normals)
 
     @property
@@ -75,12 +75,12 @@ class Surface:
 
     @cached_property
     def tree(self) -> tree.Tree:
-        """Bounding-box tree over the faces."""
+        """Bounding-box tree of the faces."""
         return tree.build(self.vertices_mm, self.faces)
 
     @cached_property
     def boundary_loops(self) -> tuple[Ints, ...]:
-        """Vertex loops along the open edges, largest perimeter first; empty for a closed surface."""
+        """Loops of vertices along the open edges, longest first; empty for a closed surface."""
         return triangles.boundary_loops(self.vertices_mm, self.faces)
 
     @cached_property
@@ -96,17 +96,17 @@ class Surface:
 
     @cached_property
     def caps(self) -> "Surface":
-        """What closes the boundary loops: the openings of a vessel's wall, facing outward."""
+        """The caps of the boundary loops, facing outward: the openings of a vessel's wall."""
         return Surface(self.closed.vertices_mm, self.closed.faces[len(self.faces) :])
 
     @cached_property
     def medial(self) -> medial.Medial:
-        """Centres and radii of the maximum inscribed spheres, and which are neighbours.
+        """Centers, radii and adjacency of the maximum inscribed spheres.
 
         Raises
         ------
         VesselError
-            When none fits inside.
+            When no sphere fits inside.
         """
         samples, normals = triangles.sample(self.vertices_mm, self.faces)
         found = medial.spheres(samples, normals, self.closed.tree, self.loop_centers_mm)
@@ -117,29 +117,66 @@ class Surface:
         return found
 
     def closest(self, points_mm: Floats) -> tuple[Floats, Floats, Ints]:
-        """Return the closest point (n, 3), its distance (n,) in mm and its face (n,) for (n, 3) points."""
+        """Return the closest points of the surface.
+
+        Parameters
+        ----------
+        points_mm : (n, 3) points in mm.
+
+        Returns
+        -------
+        closest_mm : (n, 3) closest points of the surface in mm.
+        distance_mm : (n,) distances in mm.
+        face : (n,) indices of the faces with the closest points.
+        """
         return tree.closest_points(self.tree, points_mm)
 
     def inscribed_radius(self, centers_mm: Floats) -> Floats:
-        """Return the radius (n,) in mm of the largest sphere about each of (n, 3) points inside the smooth surface.
+        """Return the radius of the largest sphere around each point inside the smooth surface.
 
-        A triangle is a chord: it lies inside a convex wall by the square of its edge, and a sphere that touches it is
-        too small by as much. So the wall is curved over every face as its corners' normals tell.
+        A triangle is a chord of the wall. On a convex wall it lies inside by an amount that grows with the square of
+        its edge length, so a sphere that touches it is too small. The wall is therefore curved over every face
+        according to the normals at its corners.
+
+        Parameters
+        ----------
+        centers_mm : (n, 3) centers in mm.
+
+        Returns
+        -------
+        radius_mm : (n,) radii in mm.
         """
         return tree.inscribed_radii(self.curved, centers_mm)
 
     def signed_distance(self, points_mm: Floats) -> Floats:
-        """Return the distance (n,) in mm of (n, 3) points, negative inside; the surface must be closed."""
+        """Return the distance (n,) in mm from points (n, 3) to the closed surface, negative inside."""
         return tree.signed_distances(self.tree, points_mm)
 
     def crosses(self, starts_mm: Floats, ends_mm: Floats) -> Bools:
-        """Tell for each segment start -> end, both (n, 3), whether it crosses the surface."""
+        """Return whether each segment (n,) crosses the surface.
+
+        Parameters
+        ----------
+        starts_mm : (n, 3) first points of the segments in mm.
+        ends_mm : (n, 3) last points of the segments in mm.
+        """
         return tree.segments_cross(self.tree, starts_mm, ends_mm)
 
     def first_hit(self, origins_mm: Floats, directions: Floats) -> Floats:
-        """Return the distance (n,) in mm along (n, 3) unit rays to the first face; inf where there is none."""
+        """Return the distance (n,) in mm along unit rays (n, 3) to the first face; inf where there is none."""
         return self.first_hits(origins_mm, directions)[0]
 
     def first_hits(self, origins_mm: Floats, directions: Floats) -> tuple[Floats, Ints]:
-        """Return the distance (n,) in mm along (n, 3) unit rays to the first face (inf: none), and that face (n,)."""
+        """Return the distance along rays to the first face, and that face.
+
+        Parameters
+        ----------
+        origins_mm : (n, 3) origins of the rays in mm.
+        directions : (n, 3) unit vectors.
+
+        Returns
+        -------
+        distance_mm : (n,) distances in mm; inf where a ray hits no face.
+        face : (n,) indices of the faces.
+        """
         return tree.first_hits(self.tree, origins_mm, directions)

@@ -1,4 +1,4 @@
-"""The artery: the data classes `Opening`, `Centerline`, `Vessel`, `Aneurysm` and `Anatomy`."""
+"""Data classes of an artery: `Opening`, `Centerline`, `Vessel`, `Aneurysm`, `Candidate` and `Anatomy`."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +13,7 @@ from vstent.units import place
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """A flat end of the vessel, through which blood enters or leaves."""
+    """A flat end of the vessel through which blood enters or leaves."""
 
     center_mm: Floats
     """(3,) centroid of the section."""
@@ -22,7 +22,7 @@ class Opening:
     area_mm2: float
     """Area of the section."""
     role: str
-    """``inlet``, where the parent artery begins; ``inlet_2``, ``inlet_3``, ... in the order given; ``outlet_1``,
+    """``inlet`` where the parent artery begins; ``inlet_2``, ``inlet_3``, ... in the order given; ``outlet_1``,
     ``outlet_2``, ... from the widest outlet to the narrowest."""
 
     def __post_init__(self) -> None:
@@ -36,7 +36,7 @@ class Opening:
 
     @property
     def described(self) -> str:
-        """Width and place in words: ``3.5 mm wide at (1.0, -2.5, 30.2) mm``."""
+        """Width and position as text: ``3.5 mm wide at (1.0, -2.5, 30.2) mm``."""
         return f"{self.diameter_mm:.1f} mm wide at {place(self.center_mm)}"
 
     @property
@@ -46,7 +46,13 @@ class Opening:
 
 
 def roles(n_inlets: int, n_outlets: int) -> list[str]:
-    """Roles of so many openings in a vessel's order."""
+    """Return the roles of a vessel's openings in their order: inlets first, then outlets.
+
+    Parameters
+    ----------
+    n_inlets : number of inlets.
+    n_outlets : number of outlets.
+    """
     inlets = ["inlet", *(f"inlet_{k}" for k in range(2, n_inlets + 1))]
     return [*inlets, *(f"outlet_{k}" for k in range(1, n_outlets + 1))]
 
@@ -56,7 +62,7 @@ class Centerline:
     """A curve along the lumen with the maximum inscribed sphere at every point."""
 
     points_mm: Floats
-    """(n, 3) points, from the inlet towards another opening."""
+    """(n, 3) points, from the inlet to another opening."""
     inscribed_radius_mm: Floats
     """(n,) radius of the maximum inscribed sphere."""
 
@@ -76,15 +82,15 @@ class Centerline:
 
     @cached_property
     def frames(self) -> Floats:
-        """(n, 3, 3) rows: tangent and two normals, parallel-transported (no twist)."""
+        """(n, 3, 3) tangent and two normals as rows, parallel-transported (no twist)."""
         return curves.parallel_frames(self.points_mm)
 
     def at(self, abscissa_mm: Floats) -> Floats:
-        """Return the points (k, 3) at arc lengths (k,), linear between points."""
+        """Return the points (k, 3) in mm at arc lengths (k,) in mm, linear between points."""
         return curves.interpolate(self.abscissa_mm, self.points_mm, abscissa_mm)
 
     def nearest_abscissa_mm(self, points_mm: Floats) -> Floats:
-        """Return the arc length (k,) of the foot of each of (k, 3) points on the curve."""
+        """Return the arc length (k,) in mm of the nearest curve point for each of the points (k, 3) in mm."""
         return curves.project(self.points_mm, points_mm)[0]
 
 
@@ -95,38 +101,38 @@ class Vessel:
     lumen: Surface
     """The wall, open at every opening."""
     openings: tuple[Opening, ...] = ()
-    """The inlet, further inlets as they were given, the outlets from the widest to the narrowest; empty before
+    """The inlet, further inlets in the order given, and the outlets from the widest to the narrowest; empty before
     tracing."""
     centerlines: tuple[Centerline, ...] = ()
-    """One from the inlet to each of `far_ends`, in their order; empty before tracing."""
+    """One centerline from the inlet to each of `far_ends`, in their order; empty before tracing."""
     notes: tuple[str, ...] = ()
-    """What was found, guessed or repaired on the way, one sentence each."""
+    """Findings, assumptions and repairs so far, one sentence each."""
     threshold_band_mm: float = 0.0
-    """By how much a diameter grows where the scan's threshold is lower by 5 % of the step from tissue to lumen, and
-    shrinks where it is higher by as much; 0 for a vessel that is no scan's."""
+    """Change of a diameter where the threshold of the scan changes by 5 % of the step from tissue to lumen; a lower
+    threshold gives a larger diameter. 0 for a vessel that is not from a scan."""
     blur_mm: float | None = None
-    """Standard deviation of the point spread through which the scan shows the wall; None where it is not known."""
+    """Standard deviation of the point spread with which the scan shows the wall; None where unknown."""
     voxel_mm: float | None = None
-    """Edge of a cube as large as a voxel of the scan; None for a vessel from a surface."""
+    """Edge length of a cube with the volume of a voxel; None for a vessel from a surface."""
 
     @property
     def closed(self) -> Surface:
-        """The lumen with every open loop capped: what is inside it is blood."""
+        """The lumen with every open loop capped: its inside is blood."""
         return self.lumen.closed
 
     @property
     def inlet(self) -> Opening:
-        """The opening where the parent artery begins, and the centerlines."""
+        """The opening where the parent artery and the centerlines begin."""
         return self.openings[0]
 
     @property
     def far_ends(self) -> tuple[Opening, ...]:
-        """The openings that the centerlines lead to: all but the inlet."""
+        """The openings where the centerlines end: all but the inlet."""
         return self.openings[1:]
 
     @property
     def inlets(self) -> tuple[Opening, ...]:
-        """The openings through which blood enters: the inlet, and those given besides."""
+        """The openings through which blood enters: the inlet and further given ones."""
         return tuple(opening for opening in self.openings if opening.is_inlet)
 
     @property
@@ -135,32 +141,32 @@ class Vessel:
         return tuple(opening for opening in self.openings if not opening.is_inlet)
 
     def of_inlets_and_outlets(self, values: Floats) -> tuple[Floats, Floats]:
-        """Part values (k,) of all openings into those of the inlets (i,) and those of the outlets."""
+        """Split values (k,) of all openings into those of the inlets (i,) and those of the outlets (k - i,)."""
         n_inlets = len(self.inlets)
         return values[:n_inlets], values[n_inlets:]
 
 
 @dataclass(frozen=True, eq=False)
 class Aneurysm:
-    """A sac and the neck through which it hangs on the parent artery."""
+    """A sac and the neck that connects it to the parent artery."""
 
     sac: Surface
     """The lumen outside the landing surface, closed across the neck."""
     neck: Surface
     """The part of the landing surface that closes the sac; its normals point into the sac."""
     neck_mm: Floats
-    """(k, 3) closed curve where lumen and landing surface part (the last point joins the first)."""
+    """(k, 3) closed curve where lumen and landing surface separate (the last point joins the first)."""
     proximal_abscissa_mm: float
-    """Where the neck begins on the parent axis."""
+    """Abscissa on the parent axis where the neck begins."""
     distal_abscissa_mm: float
-    """Where the neck ends on the parent axis."""
+    """Abscissa on the parent axis where the neck ends."""
 
     def __post_init__(self) -> None:
         freeze(self, "neck_mm", np.float64, (-1, 3))
 
     @property
     def center_abscissa_mm(self) -> float:
-        """Middle of the neck on the parent axis."""
+        """Abscissa of the neck's middle on the parent axis."""
         return 0.5 * (self.proximal_abscissa_mm + self.distal_abscissa_mm)
 
 
@@ -171,21 +177,21 @@ class Candidate:
     kind: str
     """``saccular aneurysm``, ``branch stump``, ``infundibulum``, ``bleb`` or ``artifact``."""
     point_mm: Floats
-    """(3,) a point inside it, by which it can be chosen."""
+    """(3,) point inside it, by which it can be chosen."""
     reasons: tuple[str, ...]
-    """What the class rests on, one clause each."""
+    """Reasons for the class, one clause each."""
 
     def __post_init__(self) -> None:
         freeze(self, "point_mm", np.float64, (3,))
 
     @property
     def is_aneurysm(self) -> bool:
-        """Whether it is taken for an aneurysm unless another one is chosen."""
+        """Whether it is used as an aneurysm unless another one is chosen."""
         return self.kind == "saccular aneurysm"
 
     @property
     def described(self) -> str:
-        """Return class, place and reasons as one clause."""
+        """Class, position and reasons as one clause."""
         return f"{self.kind} at {place(self.point_mm)}: {', '.join(self.reasons)}"
 
 
@@ -194,21 +200,22 @@ class Anatomy:
     """A traced vessel with its parent artery restored."""
 
     vessel: Vessel
-    """The patient's lumen, with sac and branches: what blood flows through."""
+    """The patient's lumen with sac and branches, through which blood flows."""
     axis: Centerline
-    """The parent artery's own axis, inlet to outlet; radius = distance to the landing surface."""
+    """Axis of the parent artery from inlet to outlet; its radius is the distance to the landing surface."""
     section_radius_mm: Floats
     """(n,) radius of the circle with the area of the landing surface's section at every axis point."""
     landing_surface: Surface
-    """The parent artery with sac and side branches closed: an open tube, what a stent expands against."""
+    """The parent artery with sac and side branches closed, as an open tube: the surface against which a stent
+    expands."""
     is_restored: Bools
-    """(v,) per landing-surface vertex: closes a neck or an ostium, is not the patient's own wall."""
+    """(v,) whether each vertex of the landing surface closes a neck or an ostium and is not the patient's own wall."""
     aneurysms: tuple[Aneurysm, ...]
     """The sacs found, the largest first; empty for a healthy artery."""
     notes: tuple[str, ...] = ()
-    """What was found or assumed, one sentence each."""
+    """Findings and assumptions, one sentence each."""
     candidates: tuple[Candidate, ...] = ()
-    """Every bulge that was looked at, with its class."""
+    """Every bulge that was examined, with its class."""
 
     def __post_init__(self) -> None:
         freeze(self, "section_radius_mm", np.float64, (len(self.axis.points_mm),))
@@ -216,5 +223,5 @@ class Anatomy:
 
     @cached_property
     def is_restored_face(self) -> Bools:
-        """(f,) per landing-surface triangle: every corner of it is restored."""
+        """(f,) whether all corners of each triangle of the landing surface are restored."""
         return np.asarray(self.is_restored[self.landing_surface.faces].all(axis=1))

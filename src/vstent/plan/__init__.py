@@ -1,4 +1,4 @@
-"""Which stent, and how sure: an `Anatomy` and devices in, a `Ranking` or an `Uncertainty` out.
+"""Choose a stent and estimate the uncertainty: turn an `Anatomy` and devices into a `Ranking` or an `Uncertainty`.
 
-Open ``rank.py`` first; ``criteria.toml`` holds the criteria with their sources.
+Start reading in ``rank.py``. ``criteria.toml`` lists the criteria with their sources.
 """

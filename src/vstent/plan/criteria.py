@@ -1,4 +1,4 @@
-"""Criteria: what makes a device and a size good, each with its numbers, its weight and its source."""
+"""Criteria for devices and sizes, each with its limits, its weight and its source."""
 
 import difflib
 import tomllib
@@ -53,39 +53,42 @@ MEASURES: Final = (
     "longest_landing_mm",
     "end_to_branch_mm",
 )
-"""What a criterion can ask for: the numbers of `vstent.measure` and of `vstent.rank.landing_measures`."""
+"""Measures for criteria, from `vstent.deployment.measure.measure` and `vstent.plan.rank.landing_measures`."""
 
 
 class _Strict(BaseModel):
+    """Entry without unknown keys."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Criterion(_Strict):
-    """One measure, and what it is worth."""
+    """Rule that grades one measure of a deployed device."""
 
     key: str
     """Name of the measure."""
     title: str
-    """What it is, in words."""
+    """Title of the criterion."""
     weight: Annotated[FiniteFloat, Field(ge=0)]
     """Weight of its grade in the score; 0 leaves it out."""
     none: FiniteFloat
-    """Value worth nothing."""
+    """Value with the grade 0."""
     full: FiniteFloat
-    """Value worth everything."""
+    """Value with the grade 1; grades between `none` and `full` are linear."""
     enough: FiniteFloat | None = None
-    """Up to here it stays worth everything; None: however far."""
+    """Largest value with the grade 1; None: no upper limit."""
     beyond: FiniteFloat | None = None
-    """From here on it is worth nothing again."""
+    """Value from which the grade is 0 again."""
     kind: Literal["braid", "laser_cut"] | None = None
-    """Family of devices that it concerns; None: all."""
+    """Device family to which the criterion applies; None: all."""
     phrase: str
-    """The measure in words, with a place for its value."""
+    """Text for reasons, with a placeholder for the value."""
     source: Annotated[str, Field(min_length=3)]
-    """Where its numbers come from."""
+    """Source of the limits and the weight."""
 
     @model_validator(mode="after")
     def _check(self) -> "Criterion":
+        """Return the criterion, or raise a ValueError if its limits or its phrase are invalid."""
         if self.none == self.full:
             raise ValueError("none and full must differ")
         if (self.enough is None) != (self.beyond is None):
@@ -97,17 +100,18 @@ class Criterion(_Strict):
         return self
 
     def concerns(self, design: Design) -> bool:
-        """Tell whether a device is graded by it."""
+        """Return whether the criterion applies to a device."""
         return self.weight > 0 and self.kind in (None, design.kind)
 
     def grade(self, value: float) -> float:
-        """What a value is worth, 0 to 1."""
+        """Return the grade of a value, 0 to 1."""
         rising = (value - self.none) / (self.full - self.none)
         falling = inf if self.beyond is None else (self.beyond - value) / (self.beyond - self.enough)  # type: ignore[operator]
         return float(np.clip(min(rising, falling), 0.0, 1.0))
 
 
 def _has_one_place(phrase: str) -> bool:
+    """Return whether a phrase can be formatted with one number and shows it."""
     try:
         return phrase.format(0.0) != phrase.format(1.0)
     except (LookupError, ValueError, AttributeError, TypeError):
@@ -116,35 +120,47 @@ def _has_one_place(phrase: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Criteria:
-    """What a ranking goes by."""
+    """Criteria of a ranking."""
 
     items: tuple[Criterion, ...]
     """Criteria in the order of the report."""
 
     def of(self, design: Design) -> tuple[Criterion, ...]:
-        """Return those that concern a device."""
+        """Return the criteria that apply to a device."""
         return tuple(item for item in self.items if item.concerns(design))
 
 
 class _File(_Strict):
+    """Content of a file of criteria."""
+
     criterion: list[Criterion] = Field(min_length=1)
 
 
 @cache
 def default_criteria() -> Criteria:
-    """Return vstent's own criteria, ``vstent/plan/criteria.toml``."""
+    """Return the default criteria, read from ``vstent/plan/criteria.toml``."""
     from importlib.resources import files
 
     return parse(files("vstent.plan").joinpath("criteria.toml").read_text(encoding="utf-8"))
 
 
 def read_criteria(path: Path) -> Criteria:
-    """Read criteria from a TOML file, written like ``vstent/plan/criteria.toml``.
+    """Read criteria from a TOML file in the form of ``vstent/plan/criteria.toml``.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    Criteria
+        The criteria.
 
     Raises
     ------
     InputError
-        When it does not exist, is no readable text or breaks the schema.
+        The file does not exist, is not readable text or breaks the schema.
     """
     try:
         text = existing(path).read_text(encoding="utf-8")
@@ -154,12 +170,24 @@ def read_criteria(path: Path) -> Criteria:
 
 
 def parse(text: str, name: str = "The file of criteria") -> Criteria:
-    """Read criteria (TOML) called `name`.
+    """Read criteria from TOML text.
+
+    Parameters
+    ----------
+    text : str
+        Content of the file.
+    name : str, optional
+        Name of the file in messages.
+
+    Returns
+    -------
+    Criteria
+        The criteria.
 
     Raises
     ------
     InputError
-        When it is no TOML, breaks the schema, gives no criterion any weight or asks for what is not measured.
+        The text is not TOML or breaks the schema, all weights are 0, or a measure does not exist.
     """
     try:
         items = _File.model_validate(tomllib.loads(text)).criterion

@@ -1,4 +1,4 @@
-"""Rank: every size of the chosen devices deployed, measured and graded; the best first, each with its reason."""
+"""Rank devices: every size is deployed, measured and graded, and the ranking gives a reason for each score."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -20,40 +20,40 @@ from vstent.plan.criteria import Criteria, Criterion, default_criteria
 from vstent.plan.workers import spread
 
 TELLING: Final = 0.005
-"""A criterion is named in a reason where it costs more of the score than this."""
+"""Loss of score above which a reason names a criterion."""
 TOLD: Final = 2
-"""So many criteria a reason names."""
+"""Largest number of criteria that a reason names."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One size of one device at one place, graded."""
+    """One size of a device at one place, with its grades."""
 
     design: Design
     """The device."""
     size: Size
-    """The size."""
+    """Its size."""
     shift_mm: float
-    """How far from the proposed place it was landed, distally."""
+    """Distance from the proposed place, in mm, positive distally."""
     measures: Measures
-    """What `vstent.measure` and `landing_measures` say; empty where it could not be deployed."""
+    """Results of `vstent.deployment.measure.measure` and `landing_measures`; empty if it could not be deployed."""
     grades: dict[str, float]
-    """0 to 1 by the criteria's keys."""
+    """Grades, 0 to 1, by the key of the criterion."""
     score: float
-    """Weighted mean of the grades; 0 where it could not be deployed."""
+    """Weighted mean of the grades; 0 if it could not be deployed."""
     is_suitable: bool
-    """No grade is 0."""
+    """Whether no grade is 0."""
     reason: str
-    """One sentence: what holds it back most, or why it could not be deployed."""
+    """One sentence: the largest deductions, or why it could not be deployed."""
 
     @property
     def label(self) -> str:
-        """Device and size."""
+        """Names of device and size."""
         return f"{self.design.name} {self.size.label}"
 
     @property
     def order(self) -> tuple[bool, float, str, float, float, float]:
-        """Sorts the best first; ties by name, size and shift, so that an order never depends on chance."""
+        """Sort key that puts the best first; ties are sorted by name, size and shift, so the order is reproducible."""
         return (
             not self.is_suitable,
             -self.score,
@@ -69,21 +69,22 @@ class Ranking:
     """All candidates, the best first."""
 
     candidates: tuple[Candidate, ...]
-    """The suitable ones by their score, then the rest."""
+    """Suitable candidates by decreasing score, then the others."""
     criteria: Criteria = field(default_factory=default_criteria)
-    """What they were graded by."""
+    """Criteria by which they were graded."""
 
     @property
     def suitable(self) -> tuple[Candidate, ...]:
-        """Those that no criterion rules out."""
+        """Candidates that no criterion rules out."""
         return tuple(candidate for candidate in self.candidates if candidate.is_suitable)
 
     def rows(self) -> list[dict[str, Any]]:
-        """One flat row a candidate: rank, device, size, shift, score, reason, grades, measures."""
+        """Return one flat row per candidate: rank, device, size, shift, score, reason, grades and measures."""
         return [_row(number, candidate) for number, candidate in enumerate(self.candidates, start=1)]
 
 
 def _row(number: int, candidate: Candidate) -> dict[str, Any]:
+    """Return a candidate as one flat row."""
     return {
         "rank": number,
         "device": candidate.design.key,
@@ -107,21 +108,32 @@ def rank(
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Ranking:
-    """Deploy every size of every device at every shift, measure and grade it.
+    """Deploy every size of every device at every shift, then measure and grade it.
 
     Parameters
     ----------
-    anatomy : the artery, restored.
-    designs : the devices; every size of each is tried, none is left out beforehand.
-    criteria : what they are graded by; None: `default_criteria`.
-    shifts_mm : where each is landed, against the proposed place (centered on the neck), distally.
-    jobs : processes at work at once.
-    progress : told how many of how many are done.
+    anatomy : Anatomy
+        The restored artery.
+    designs : sequence of Design
+        The devices. Every size of each is tried.
+    criteria : Criteria, optional
+        Criteria for grading; None uses `default_criteria`.
+    shifts_mm : sequence of float, optional
+        Landing positions relative to the proposed one (centered on the neck), in mm, positive distally.
+    jobs : int, optional
+        Number of parallel processes.
+    progress : callable, optional
+        Called with the number of finished candidates and the number of all.
+
+    Returns
+    -------
+    Ranking
+        All candidates, the best first.
 
     Raises
     ------
     InputError
-        When there is nothing to try.
+        There is no device or no shift to try.
     """
     criteria = criteria or default_criteria()
     tasks = [(design, size, float(shift)) for design in designs for size in design.sizes for shift in shifts_mm]
@@ -136,10 +148,10 @@ def rank(
 
 
 def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) -> Candidate:
-    """Deploy, measure and grade one size at one shift."""
+    """Return one size at one shift, deployed, measured and graded."""
     (anatomy, criteria), (design, size, shift_mm) = common, task
     try:
-        # Unmoved it is for `deploy` to say where the proposed place is: near an end of the artery only it knows.
+        # Without a shift, `deploy` proposes the place itself, because near an end of the artery it may have to move it.
         landing = Landing(propose_landing(design, anatomy, size).abscissa_mm + shift_mm) if shift_mm else None
         deployment = deploy(design, anatomy, size=size, landing=landing)
     except LandingError as error:
@@ -156,7 +168,22 @@ def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) 
 
 
 def landing_measures(anatomy: Anatomy, measures: Measures) -> Measures:
-    """What the criteria ask besides `vstent.measure`: both sides of a device taken together, and where its ends lie."""
+    """Compute measures for criteria that combine both ends of a device or describe where its ends lie.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    measures : dict
+        Results of `vstent.deployment.measure.measure`.
+
+    Returns
+    -------
+    dict
+        Oversizing relative to the wider landing zone, the bend at the ends, the shorter and the longer length beyond
+        the neck (mm), and the distance from an end to the nearest branch (mm). Numbers that cannot be measured are left
+        out.
+    """
     wider_mm = max(landing_diameters_mm(anatomy))
     ends_mm = np.array([float(measures[f"{end}_end_abscissa_mm"]) for end in ("proximal", "distal")])
     found: Measures = {"landing_oversizing_fraction": float(measures["label_diameter_mm"]) / wider_mm - 1}
@@ -171,7 +198,18 @@ def landing_measures(anatomy: Anatomy, measures: Measures) -> Measures:
 
 
 def bend_ratios(anatomy: Anatomy) -> Floats:
-    """Artery's diameter over the radius of its bend (n,) along the parent axis."""
+    """Compute the ratio of the artery's diameter to the radius of its bend along the parent axis.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+
+    Returns
+    -------
+    (n,) array
+        Ratio at every point of the axis.
+    """
     axis = anatomy.axis
     diameter_mm = 2 * float(np.median(anatomy.section_radius_mm))
     even_mm = curves.resample_evenly(axis.points_mm, len(axis.points_mm))
@@ -181,7 +219,7 @@ def bend_ratios(anatomy: Anatomy) -> Floats:
 
 
 def _reason(asked: Sequence[Criterion], grades: dict[str, float], measures: Measures) -> str:
-    """One sentence: what rules it out, or what costs it most."""
+    """Return one sentence: what rules the candidate out, or its largest deductions."""
     if not asked:
         return "None of the criteria could be measured."
     weight = sum(item.weight for item in asked)

@@ -1,9 +1,10 @@
-"""Shares: how much of a result's variance each cause makes.
+"""Share of each cause in the variance of a result (first-order Sobol indices).
 
-The result is fitted by a constant and Legendre polynomials of the first and second degree in every cause alone. They
-are orthonormal where the causes are uniform and independent, so the variance that a cause makes is the sum of the
-squares of its coefficients (Sudret 2008, Reliab. Eng. Syst. Saf. 93:964): its first-order Sobol index, exact where the
-result is a sum of quadratics. What the fit leaves over is the causes' interplay, and curvature of higher degree.
+The result is fitted by a constant plus Legendre polynomials of first and second degree in each cause alone. For
+uniform, independent causes these polynomials are orthonormal. The variance due to one cause is then the sum of its
+squared coefficients (Sudret 2008, Reliab. Eng. Syst. Saf. 93:964). This is its first-order Sobol index, exact if the
+result is a sum of quadratic functions. The residual of the fit contains interactions of causes and curvature of higher
+degree.
 """
 
 import numpy as np
@@ -11,18 +12,29 @@ import numpy as np
 from vstent.kernels.arrays import Floats
 
 STEADY = 1e-9
-"""A result that varies less than this, relative, does not vary."""
+"""Relative range of a result below which it counts as constant."""
 
 
 def first_order_shares(points: Floats, values: Floats) -> Floats | None:
-    """Return the part of the variance of values (n,) that each of d causes makes, (d,); their sum is at most 1.
+    """Compute the fraction of the variance of a result that is due to each cause.
+
+    Degree 2 is left out if there are fewer than twice as many results as unknowns.
 
     Parameters
     ----------
-    points : (n, d) causes, -1 to 1 each.
-    values : (n,) results.
+    points : (n, d) array
+        Values of d causes, each scaled to -1 to 1.
+    values : (n,) array
+        Results.
 
-    None where there are too few results to tell. Degree 2 is left out where there are fewer than twice its unknowns.
+    Returns
+    -------
+    (d,) array or None
+        Fractions, with a sum of at most 1; None if there are too few results.
+
+    References
+    ----------
+    Sudret (2008), Reliab. Eng. Syst. Saf. 93:964.
     """
     n, d = points.shape
     if n < d + 2:

@@ -1,9 +1,9 @@
-"""Uncertainty: a deployment done again with what is not sure varied: intervals, and the share of each cause.
+"""Uncertainty of a deployment: intervals of its results, and the share of each cause.
 
-Four causes are varied, each uniformly within plus and minus its range and independently of the others: the threshold
-of the scan (all diameters), where the device is landed, how wide it was made, and the mean inflow. Points are those of
-Sobol's sequence (scipy.stats.qmc), each in the middle of its stratum, so that every cause alone is spread evenly and
-the same question gets the same answer.
+Four causes are varied, each uniformly within plus or minus its range and independently of the others: the threshold of
+the scan (all diameters), the landing position, the manufactured diameter of the device, and the mean inflow. Points are
+those of a Sobol sequence (scipy.stats.qmc), each in the middle of its stratum. Every cause alone is thus sampled
+evenly, and the same study gives the same result.
 """
 
 import math
@@ -29,7 +29,7 @@ from vstent.plan.shares import first_order_shares
 from vstent.plan.widening import widened
 
 CAUSES: Final = ("threshold", "landing", "device", "inflow")
-"""What is varied, in the order of the columns of the points."""
+"""Varied causes, in the order of the columns of the points."""
 RESULTS: Final = (
     "deployed_length_mm",
     "neck_to_proximal_end_mm",
@@ -38,31 +38,31 @@ RESULTS: Final = (
     "neck_metal_coverage_fraction",
     "neck_pore_density_per_mm2",
 )
-"""Measures of the deployment that get intervals."""
+"""Measures of the deployment for which intervals are computed."""
 FLOW_RESULTS: Final = ("neck_inflow_mL_s_ratio", "mean_sac_velocity_m_s_ratio", "mean_sac_wss_Pa_ratio")
-"""Ratios of the flow after to the flow before that get intervals."""
+"""Ratios of the flow with to the flow without the device for which intervals are computed."""
 WIDEST_FRACTION: Final = 0.1
-"""A device is made wider or narrower by less than this part of its free diameter."""
+"""Fraction of the free diameter below which the range of the device's diameter must be."""
 INTERVAL: Final = (0.025, 0.975)
-"""Quantiles of an interval: 95 % of the cases lie in it."""
+"""Quantiles at the ends of an interval: 95 % of the samples lie in it."""
 
 
 @dataclass(frozen=True)
 class Ranges:
-    """How far each cause goes to either side, and how often; the ranges are vstent's own where nothing is given."""
+    """Range of each cause and number of samples. The default ranges are vstent's own."""
 
     samples: int = 32
-    """Deployments; the next power of two is taken."""
+    """Number of deployments, rounded up to a power of two."""
     flow_samples: int = 0
-    """Of them, so many get their flows computed too, before and after: as dear as so many studies."""
+    """Number of deployments whose flow is computed without and with the device; each takes as long as a study."""
     threshold_mm: float | None = None
-    """Change of every diameter; None: the vessel's own `threshold_band_mm`, 0 for a surface."""
+    """Range of all diameters, in mm; None uses `threshold_band_mm` of the vessel, 0 for a surface."""
     landing_mm: float = 1.0
-    """Of the landing point along the axis."""
+    """Range of the landing position along the axis, in mm."""
     device_mm: float = 0.1
-    """Of the free diameter: a device as wide as it was made, braided of as many pieces of wire."""
+    """Range of the free diameter as made, in mm; the number of pieces of wire stays the same."""
     inflow_fraction: float = 0.2
-    """Of the mean inflow, relative."""
+    """Range of the mean inflow, relative."""
 
     def __post_init__(self) -> None:
         if self.samples < 2 or self.flow_samples < 0:
@@ -90,13 +90,13 @@ class Uncertainty:
     """Result of an uncertainty study."""
 
     ranges: Floats
-    """(4,) plus and minus of every cause, in the order of `CAUSES`: mm, mm, mm, fraction."""
+    """(4,) range of every cause to either side, in the order of `CAUSES`: mm, mm, mm, fraction."""
     points: Floats
-    """(n, 4) where in its range each cause was, -1 to 1."""
+    """(n, 4) value of every cause in its range, -1 to 1."""
     names: tuple[str, ...]
-    """The results."""
+    """Names of the results."""
     values: Floats
-    """(n, k) results; NaN where the device did not fit, or the flow was not computed."""
+    """(n, k) results; NaN if the device did not fit or the flow was not computed."""
 
     def __post_init__(self) -> None:
         freeze(self, "ranges", np.float64, (len(CAUSES),))
@@ -105,17 +105,17 @@ class Uncertainty:
 
     @property
     def n_failed(self) -> int:
-        """Deployments that did not fit the artery."""
+        """Number of samples in which the device did not fit the artery."""
         return int(np.isnan(self.values).all(axis=1).sum())
 
     def interval(self, name: str) -> tuple[float, float, float]:
-        """Return mean, lower and upper end (2.5 and 97.5 %) of a result."""
+        """Return the mean and the 2.5 % and 97.5 % quantiles of a result."""
         found = self._found(name)[1]
         low, high = np.quantile(found, INTERVAL)
         return float(found.mean()), float(low), float(high)
 
     def shares(self, name: str) -> dict[str, float]:
-        """Return the part of a result's variance that each cause makes alone, and the rest; empty where too few."""
+        """Return the share of each cause alone in a result's variance, and the rest; empty if samples are too few."""
         points, values = self._found(name)
         varied = np.flatnonzero(self.ranges > 0)
         found = first_order_shares(points[:, varied], values)
@@ -125,12 +125,13 @@ class Uncertainty:
         return shares | {"rest": max(0.0, 1.0 - sum(shares.values())) if any(shares.values()) else 0.0}
 
     def _found(self, name: str) -> tuple[Floats, Floats]:
+        """Return the points (m, 4) and values (m,) of a result where it was computed."""
         column = self.values[:, self.names.index(name)]
         is_found = ~np.isnan(column)
         return self.points[is_found], column[is_found]
 
     def metrics(self) -> dict[str, Any]:
-        """Return everything as numbers whose names end in their unit."""
+        """Return all results as numbers whose names end in their unit."""
         told = [name for name in self.names if len(self._found(name)[1]) > 1]
         ranges = dict(zip(("threshold_mm", "landing_mm", "device_mm", "inflow_fraction"), self.ranges, strict=True))
         return {
@@ -153,23 +154,34 @@ def vary(
     progress: Callable[[int, int], None] | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Uncertainty:
-    """Deploy a device again and again with the causes varied.
+    """Repeat a deployment with its causes varied.
 
     Parameters
     ----------
-    anatomy : the artery.
-    deployment : the device as it lies; its size and where its middle row lies are what is varied about.
-    ranges : how far.
-    flow : how the flow is computed, for ``ranges.flow_samples`` of the deployments.
-    progress : told how many of how many are done.
-    checkpoint : keeps every sample whose flow is done, so that varying again goes on after it.
+    anatomy : Anatomy
+        The artery.
+    deployment : Deployment
+        The deployed device. Its size and the position of its middle row are varied.
+    ranges : Ranges
+        Range of each cause and number of samples.
+    flow : FlowSettings, optional
+        Settings of the flow for the first ``ranges.flow_samples`` samples.
+    progress : callable, optional
+        Called with the number of finished samples and the number of all.
+    checkpoint : Checkpoint, optional
+        Storage for the samples whose flow is computed; an interrupted study resumes after the last of them.
+
+    Returns
+    -------
+    Uncertainty
+        Results of all samples.
 
     Raises
     ------
     InputError
-        When the range of the threshold would close the artery, or that of the device makes another device of it.
+        The range of the threshold would close the artery, or that of the device is too large for its diameter.
     FlowError
-        When a flow cannot be computed.
+        A flow cannot be computed.
     """
     spread, points = ranges.of(anatomy), _points(ranges)
     if 2 * spread[0] > anatomy.section_radius_mm.min():
@@ -188,7 +200,7 @@ def vary(
     for number, offset in enumerate(points * spread):
         wanted = flow if number < ranges.flow_samples else None
         sample = partial(_sample, anatomy, stent, middle_mm, offset, wanted)
-        # without its flow a sample is done again sooner than it is read back
+        # a sample without a flow is computed faster than it is read back
         rows.append(sample() if wanted is None or checkpoint is None else _once(sample, checkpoint, f"sample-{number}"))
         if progress is not None:
             progress(number + 1, len(points))
@@ -198,7 +210,7 @@ def vary(
 
 
 def _points(ranges: Ranges) -> Floats:
-    """Sobol's points (n, 4), -1 to 1, each in the middle of its stratum."""
+    """Return the points (n, 4) of a Sobol sequence, -1 to 1, each in the middle of its stratum."""
     from scipy.stats import qmc
 
     power = int(np.ceil(np.log2(ranges.samples)))
@@ -207,7 +219,7 @@ def _points(ranges: Ranges) -> Floats:
 
 
 def made_wider(design: Design, size: Size, by_mm: float) -> Size:
-    """A size as it came out of the machine: wider, of as many pieces, each longer in proportion."""
+    """Return a size made wider by `by_mm`, in mm, with the same number of pieces, each longer in proportion."""
     factor = 1 + by_mm / size.free_diameter_mm
     return replace(
         size,
@@ -218,7 +230,7 @@ def made_wider(design: Design, size: Size, by_mm: float) -> Size:
 
 
 def _once(sample: Callable[[], dict[str, float]], checkpoint: Checkpoint, name: str) -> dict[str, float]:
-    """Return a sample's results: those kept, or found now and kept."""
+    """Return the results of a sample: stored ones if there are any, otherwise computed and then stored."""
     kept = checkpoint.load(name)
     if kept is not None:
         return {result: float(value) for result, value in kept.items()}
@@ -230,7 +242,7 @@ def _once(sample: Callable[[], dict[str, float]], checkpoint: Checkpoint, name: 
 def _sample(
     anatomy: Anatomy, stent: Stent, middle_mm: float, offset: Floats, flow: FlowSettings | None
 ) -> dict[str, float]:
-    """Results with the causes off by `offset` (4,); empty where the device does not fit."""
+    """Return the results with the causes changed by `offset` (4,); empty if the device does not fit."""
     diameter_mm, along_mm, wider_mm, inflow_fraction = (float(value) for value in offset)
     other = widened(anatomy, diameter_mm) if diameter_mm else anatomy
     size = made_wider(stent.design, stent.size, wider_mm)
@@ -247,6 +259,7 @@ def _sample(
 
 
 def _flow_ratios(anatomy: Anatomy, stent: Stent, flow: FlowSettings) -> dict[str, float]:
+    """Return the ratios of the flow with to the flow without the device."""
     sac = anatomy.aneurysms[0]
     shapes = sac.sac, ostium(sac, anatomy.vessel.lumen)
     bare = simulate_case(flow_case(anatomy, None, flow))

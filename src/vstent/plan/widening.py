@@ -1,4 +1,4 @@
-"""Widening: the same anatomy had the scan's threshold been lower or higher."""
+"""Change all diameters of an anatomy, as a lower or higher threshold of the scan would."""
 
 from dataclasses import replace
 
@@ -11,10 +11,22 @@ from vstent.kernels.arrays import Floats
 
 
 def widened(anatomy: Anatomy, diameter_mm: float) -> Anatomy:
-    """Return an anatomy whose walls lie further out: every diameter grows by `diameter_mm` (below zero: shrinks).
+    """Return an anatomy with all walls moved along their normals.
 
-    The wall moves along its own normals, the landing surface along its; sac and neck move with what they lie on, so
-    that they keep meeting. Where the neck begins and ends on the axis is left as it is.
+    The lumen and the landing surface move along their own normals. Sac and neck move with the surfaces on which they
+    lie, so that they still meet. The arc lengths at which the neck begins and ends stay the same.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    diameter_mm : float
+        Increase of every diameter, in mm; negative values shrink the artery.
+
+    Returns
+    -------
+    Anatomy
+        The wider artery.
     """
     half_mm, vessel = 0.5 * diameter_mm, anatomy.vessel
     lumen, landing = (_moved_out(surface, half_mm) for surface in (vessel.lumen, anatomy.landing_surface))
@@ -36,29 +48,34 @@ def widened(anatomy: Anatomy, diameter_mm: float) -> Anatomy:
 
 
 class _Shift:
-    """How far the wall has moved at its nearest vertex."""
+    """Displacement of the wall at the vertex nearest to a point."""
 
     def __init__(self, before_mm: Floats, shift_mm: Floats) -> None:
         self.tree, self.shift_mm = cKDTree(before_mm), shift_mm
 
     @staticmethod
     def of(*moved: tuple[Surface, Surface]) -> "_Shift":
+        """Return the displacements of all vertices from pairs of surfaces before and after the move."""
         before = np.concatenate([old.vertices_mm for old, _ in moved])
         return _Shift(before, np.concatenate([new.vertices_mm - old.vertices_mm for old, new in moved]))
 
     def __call__(self, points_mm: Floats) -> Floats:
+        """Return points (n, 3) moved like the nearest vertex of the wall, in mm."""
         return points_mm + self.shift_mm[self.tree.query(points_mm)[1]]
 
 
 def _moved_out(surface: Surface, by_mm: float) -> Surface:
+    """Return a surface moved by `by_mm` along its normals, in mm."""
     return Surface(surface.vertices_mm + by_mm * surface.vertex_normals, surface.faces)
 
 
 def _line(line: Centerline, half_mm: float) -> Centerline:
+    """Return a centerline with its inscribed radii increased by `half_mm`, in mm."""
     return Centerline(line.points_mm, line.inscribed_radius_mm + half_mm)
 
 
 def _sac(aneurysm: Aneurysm, wall: _Shift, tube: _Shift) -> Aneurysm:
+    """Return an aneurysm moved with the wall (sac) and the landing surface (neck)."""
     return replace(
         aneurysm,
         sac=Surface(wall(aneurysm.sac.vertices_mm), aneurysm.sac.faces),

@@ -1,6 +1,6 @@
-"""Workers: the same work on many items, in this process or in several at once; answers come in the items' order.
+"""Apply one function to many items, in this process or in several; results keep the order of the items.
 
-Processes and not threads: compiled kernels that run in parallel themselves do not bear being called from two threads.
+Processes are used instead of threads because compiled kernels that run in parallel must not be called from two threads.
 """
 
 import multiprocessing
@@ -19,33 +19,43 @@ Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
 _SHARED: Final[dict[str, Any]] = {}
-"""What a worker process keeps between items: what it was started with."""
+"""Function and common data that a worker process keeps between items."""
 
 
 def spread(
     work: Callable[[Any, Item], Answer], common: Any, items: Sequence[Item], *, jobs: int = 1
 ) -> Iterator[Answer]:
-    """Yield ``work(common, item)`` for every item, in their order.
+    """Yield ``work(common, item)`` for every item, in order.
 
     Parameters
     ----------
-    work : a function at the top of a module.
-    common : what all items need; it is sent to every process once.
-    items : what to work on.
-    jobs : processes; 1 works in this one.
+    work : callable
+        Function at the top level of a module.
+    common : object
+        Data that all items need, sent to every process once.
+    items : sequence
+        Items to work on.
+    jobs : int, optional
+        Number of processes; with 1 the work is done in this process.
+
+    Yields
+    ------
+    object
+        Result for each item.
 
     Raises
     ------
     VstentError
-        When a process dies.
+        A worker process ended unexpectedly.
     """
     if jobs <= 1 or len(items) <= 1:
         yield from (work(common, item) for item in items)
         return
-    # Spawned, not forked: a fork copies locks that other threads hold.
+    # Processes are spawned because a fork copies locks that other threads hold.
     context = multiprocessing.get_context("spawn")
     with TemporaryDirectory() as folder:
-        # In a file: what is too long for a pipe blocks this process for ever where a new one dies before it reads it.
+        # Passed in a file: data too long for a pipe would block this process forever if a worker died
+        # before reading them.
         path = Path(folder) / "common.pickle"
         path.write_bytes(pickle.dumps((work, common)))
         pool = ProcessPoolExecutor(min(jobs, len(items)), context, _start, (path,))
@@ -60,13 +70,15 @@ def spread(
 
 
 def _start(path: Path) -> None:
+    """Store the function and the common data in a new worker process."""
     import numba
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the first process's to answer
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C
     numba.set_num_threads(1)
     work, common = pickle.loads(path.read_bytes())
     _SHARED.update(work=work, common=common)
 
 
 def _answer(item: Any) -> Any:
+    """Return the result for one item."""
     return _SHARED["work"](_SHARED["common"], item)

@@ -1,4 +1,5 @@
-"""Restore the parent artery: a traced `Vessel` in, an `Anatomy` with the sac removed and the neck closed out.
+"""Restore the parent artery: from a traced `Vessel` to an `Anatomy` with the sac cut off and the neck closed.
 
-Open ``restore.py`` first; ``neck.py`` finds the neck and ``landing.py`` builds the surface a stent expands against.
+Read ``restore.py`` first. ``neck.py`` finds the neck, and ``landing.py`` builds the surface against which a stent
+expands.
 """

@@ -1,10 +1,12 @@
-"""The parent artery's own axis: a smooth tube fitted to the wall that is not sac or branch.
+"""Fit the axis of the parent artery: a smooth tube through the wall that is neither sac nor branch.
 
-The medial line bulges into a sac. The wall opposite the neck does not: from a first guess of the axis, rays to the
-wall in every section give distances rho(s, theta); the centre of a section is that of the oval through those that are
-neither sac nor branch, and where a neck leaves few of them, smoothness along the artery decides. Rays, weights and
-fit alternate, the weights tightening. (With circles for ovals the axis of an artery 1.4 times as wide as high runs to
-one side of it, and its sac is lost.)
+The centerline of the lumen bulges into a sac, but the wall opposite the neck does not. From a first guess of the axis,
+rays in every section measure the distance to the wall, rho(s, theta). The center of a section is the center of the oval
+fitted to the rays that hit neither sac nor branch. Where a neck leaves few such rays, smoothness along the artery
+decides. Casting rays, weighting them and fitting alternate, with weights that become stricter.
+
+The sections are ovals because circles fail in flattened arteries: with circles, the axis of an artery 1.4 times as wide
+as high runs to one side, and its sac is lost.
 """
 
 from collections.abc import Sequence
@@ -24,81 +26,90 @@ from vstent.kernels.arrays import Bools, Floats
 from vstent.units import place
 
 STEP_MM: Final = 0.25
-"""Spacing of axis points."""
+"""Spacing of the axis points in mm."""
 N_RAYS: Final = 48
-"""Rays in a section."""
+"""Number of rays in a section."""
 WAVELENGTH: Final = 1.5
-"""The axis and its radius follow waves along the artery longer than this many diameters where the wall is whole."""
+"""Shortest wavelength of axis and radius along the artery, in diameters, where the wall is complete."""
 FLARE_LENGTH: Final = 1.5
-"""The artery flares into a neck over at most this many of its radii."""
+"""Largest length over which the artery flares into a neck, in artery radii."""
 FAR_SIDE: Final = -0.2
-"""A ray looks at the far side of the neck if the cosine of its angle with the sac's direction is below this."""
+"""A ray points to the wall opposite the neck if the cosine of its angle to the sac's direction is below this."""
 INTO: Final = 0.5
-"""A neck is looked for this many radii above the middle of its foot, which may lie on the artery's axis."""
+"""Height above the middle of a neck's foot, in artery radii, of the point that gives the direction of the sac. The
+middle of the foot may lie on the artery's axis and give none."""
 SIDE_TRUST: Final = 0.1
-"""Across the way into a neck the medial line counts as this fraction of all rays of a section."""
+"""Weight of the centerline across the direction into a neck, as a fraction of the weight of all rays of a section."""
 NECK_TRUST: Final = 10.0
-"""Weight of the interpolated oval across a neck against all rays of a section."""
+"""Weight of the interpolated oval under a neck, relative to all rays of a section."""
 THROAT: Final = 0.85
-"""An artery narrower by this factor beside a neck than further off on both its sides is stenosed there..."""
+"""An artery is stenosed beside a neck where it is narrower by this factor than farther away on both sides."""
 THROAT_REACH: Final = 2.0
-"""... and how wide it is without that is sought over this many diameters."""
+"""Length on each side of a neck, in diameters, over which the width without the stenosis is sought."""
 THROAT_TRUST: Final = 1.0
-"""Weight of the interpolated oval there: the artery regains its width within the neck, the far wall says where."""
+"""Weight of the interpolated oval beside a stenosis, relative to all rays of a section. The artery regains its width
+under the neck, so the opposite wall must decide."""
 OVAL_WAVES: Final = 4.0
-"""Ovals follow waves this many times as long: a fork widens a section in one direction too."""
+"""Shortest wavelength of the oval part, in multiples of `WAVELENGTH`: a fork widens a section in one direction too."""
 OVAL_MOST: Final = 0.4
-"""A section's radius departs from its mean by at most this fraction: it is then 2.3 times as wide as high."""
+"""Largest deviation of a section's radius from its mean, as a fraction of the mean. At 0.4 it is 2.3 times as wide as
+high."""
 ROUND_TRUST: Final = 0.02
-"""Weight of a circle beside all rays of a section: what few rays leave open is round."""
+"""Weight of a circle, relative to all rays of a section: sections with few rays become round."""
 TOLERANCE: Final = ((0.40, 1.00),) * 4 + ((0.20, 0.50),) * 4 + ((0.12, 0.35),) * 4
-"""Per iteration: relative excess of a ray over the oval up to which it counts fully, and from which not at all."""
+"""Per iteration, the relative excess of a ray over the oval up to which it counts fully and from which it is
+ignored."""
 
 ASTRAY: Final = 2.0
-"""An axis further from the centerline than this many of its widest radii is no artery's: real ones stay within 0.3."""
+"""The fit is rejected where the axis is farther from the centerline than this many times the largest inscribed radius.
+In real arteries this ratio stays below 0.3."""
 
 
 class Tube(NamedTuple):
-    """A tube of oval sections."""
+    """A tube with oval sections."""
 
     points_mm: Floats
-    """(n, 3) axis."""
+    """(n, 3) points of the axis."""
     oval_mm: Floats
-    """(n, 3) mean radius, and the parts of the radius that go with the cosine and the sine of twice the angle."""
+    """(n, 3) mean radius, and the amplitudes of the cosine and the sine of twice the angle."""
 
     @property
     def radius_mm(self) -> Floats:
-        """(n,) mean radius."""
+        """(n,) mean radius in mm."""
         return self.oval_mm[:, 0]
 
     def rho_mm(self, n_rays: int) -> Floats:
-        """Distance (n, n_rays) from the axis to the wall, at the angles of `section_rays`."""
+        """Return the distance (n, n_rays) from axis to wall, in mm, at the angles of `section_directions`."""
         return self.oval_mm @ _waves(n_rays)[[0, 3, 4]]
 
 
 class Mouth(NamedTuple):
-    """Where a sac opens into the artery."""
+    """Mouth of a sac on the artery."""
 
     foot_mm: Floats
-    """(k, 3) where its wall rises from the artery."""
+    """(k, 3) points where the sac's wall rises from the artery."""
     inward: Floats
     """(3,) unit vector into the sac."""
 
 
 def fit_axis(lumen: Surface, line: Centerline, mouths: Sequence[Mouth] = ()) -> Tube:
-    """Fit the axis and radius of the artery along a centerline, blind to sacs and branches.
+    """Fit axis and radius of the artery along a centerline, ignoring sacs and branches.
 
     Parameters
     ----------
-    lumen : the wall.
-    line : where to begin from.
-    mouths : of each sac: there the radius is interpolated between the healthy stations on both sides, because the wall
-        that is left flares into the neck.
+    lumen : wall of the vessel.
+    line : centerline from which the fit starts.
+    mouths : mouth of each sac. Under a mouth the radius is interpolated between the healthy stations on both sides,
+        because the remaining wall flares into the neck.
+
+    Returns
+    -------
+    tube : axis with a spacing of 0.25 mm, and its oval sections.
 
     Raises
     ------
     VesselError
-        When the wall is no tube's.
+        When no tube fits the wall along the centerline.
     """
     points = curves.resample(line.points_mm, STEP_MM)
     abscissa = curves.arc_length(points)
@@ -117,7 +128,7 @@ def fit_axis(lumen: Surface, line: Centerline, mouths: Sequence[Mouth] = ()) -> 
 
 
 def _refuse_astray(tube: Tube, line: Centerline) -> None:
-    """Refuse a wall through which the axis of a tube runs away from the centerline that it was to follow."""
+    """Raise a VesselError where the axis of a tube runs too far from its centerline."""
     away_mm = np.linalg.norm(_toward(line.points_mm, tube.points_mm), axis=1)
     worst = int(np.argmax(away_mm))
     if away_mm[worst] > ASTRAY * line.inscribed_radius_mm.max():
@@ -128,29 +139,34 @@ def _refuse_astray(tube: Tube, line: Centerline) -> None:
 
 
 class _Necks(NamedTuple):
+    """All necks on an artery, as they enter the fit."""
+
     tube: Tube
-    """The artery, its ovals interpolated across necks."""
+    """The artery with its ovals interpolated across necks."""
     trust: Floats
-    """(n,) weight of those ovals, in rays."""
+    """(n,) weight of these ovals, in rays."""
     is_sacward: Bools
-    """(n, rays) rays into a neck: only the wall on the far side says where the artery is."""
+    """(n, rays) whether a ray points into a neck; such rays are ignored."""
     across: Floats
-    """(n, 2) unit vector in the section, along its two normals, square to the way into the neck; zero off necks."""
+    """(n, 2) unit vector in the section, along its two normals, perpendicular to the sac's direction; zero off
+    necks."""
 
 
 class _Neck(NamedTuple):
+    """One neck on an artery."""
+
     is_under: Bools
-    """(n,) sections under a neck and its flares."""
+    """(n,) whether a section is under the neck or its flare."""
     diameter_mm: float
-    """The artery's there."""
+    """Diameter of the artery under the neck."""
     is_sacward: Bools
-    """(n, rays) rays into it."""
+    """(n, rays) whether a ray points into the neck."""
     across: Floats
-    """(n, 2) unit vector in the section square to the way into it; zero elsewhere."""
+    """(n, 2) unit vector in the section perpendicular to the sac's direction; zero elsewhere."""
 
 
 def _across_necks(tube: Tube, mouths: Sequence[Mouth]) -> _Necks:
-    """Where the necks are, and what the healthy stations on both sides of them say."""
+    """Return the necks of all mouths, with the artery interpolated across them from its healthy sections."""
     n = len(tube.points_mm)
     healthy, sacward, across = np.ones(n, dtype=bool), np.zeros((n, N_RAYS), dtype=bool), np.zeros((n, 2))
     necks = [neck for mouth in mouths if (neck := _neck(tube, mouth))]
@@ -172,7 +188,7 @@ def _across_necks(tube: Tube, mouths: Sequence[Mouth]) -> _Necks:
 
 
 def _neck(tube: Tube, mouth: Mouth) -> _Neck | None:
-    """The neck of a sac on a tube; None where its mouth is not on it."""
+    """Return the neck of a mouth on a tube; None where the mouth is not on it."""
     (points, radius), (foot_mm, inward) = (tube.points_mm, tube.radius_mm), mouth
     abscissa = curves.arc_length(points)
     place, distance = curves.project(points, foot_mm)
@@ -192,10 +208,8 @@ def _neck(tube: Tube, mouth: Mouth) -> _Neck | None:
 
 
 def _throat_beside(tube: Tube, neck: _Neck, healthy: Bools) -> Bools:
-    """Tell the healthy stations (n,) of a stenosis that a neck begins in: no measure of the artery across that neck.
-
-    An artery that tapers, or is thinner behind a fork, is no narrower there than on both sides.
-    """
+    """Return whether each section (n,) is in a stenosis beside a neck, and so not healthy."""
+    # A tapering artery, or one that is thinner beyond a fork, is not narrower there than on both sides.
     abscissa, (first, last) = curves.arc_length(tube.points_mm), np.flatnonzero(neck.is_under)[[0, -1]]
     reach_mm = THROAT_REACH * neck.diameter_mm
     upstream = healthy & (abscissa < abscissa[first]) & (abscissa > abscissa[first] - reach_mm)
@@ -211,37 +225,56 @@ def _throat_beside(tube: Tube, neck: _Neck, healthy: Bools) -> Bools:
 
 
 def section_rays(lumen: Surface, points_mm: Floats, n_rays: int) -> Floats:
-    """Distance (n, n_rays) from axis points (n, 3) to the wall around them; inf where a ray leaves an opening."""
+    """Return the distance from axis points to the wall along the rays of their sections.
+
+    Parameters
+    ----------
+    lumen : wall of the vessel.
+    points_mm : (n, 3) axis points in mm.
+    n_rays : number of rays in a section.
+
+    Returns
+    -------
+    distance : (n, n_rays) distance in mm; inf where a ray leaves through an opening.
+    """
     directions = section_directions(points_mm, n_rays)
     origins = np.repeat(points_mm, n_rays, axis=0)
     return lumen.first_hit(origins, directions.reshape(-1, 3)).reshape(len(points_mm), n_rays)
 
 
 def section_directions(points_mm: Floats, n_rays: int) -> Floats:
-    """Unit vectors (n, n_rays, 3) around each axis point, counter-clockwise about the direction of travel."""
+    """Return the unit vectors of the rays around axis points.
+
+    Parameters
+    ----------
+    points_mm : (n, 3) axis points in mm.
+    n_rays : number of rays in a section.
+
+    Returns
+    -------
+    directions : (n, n_rays, 3) unit vectors, counter-clockwise about the direction of the axis.
+    """
     frames = curves.parallel_frames(points_mm)
     angle = 2 * np.pi * np.arange(n_rays) / n_rays
     return np.cos(angle)[None, :, None] * frames[:, None, 1] + np.sin(angle)[None, :, None] * frames[:, None, 2]
 
 
 def _toward(line_mm: Floats, points: Floats) -> Floats:
-    """Way (n, 3) from points to the nearest ones of a polyline (k, 3)."""
+    """Return the vectors (n, 3) from points to their nearest points on a polyline (k, 3)."""
     return curves.interpolate(curves.arc_length(line_mm), line_mm, curves.project(line_mm, points)[0]) - points
 
 
 def _waves(n_rays: int) -> Floats:
-    """Constant, cosine and sine of the angle and of twice the angle (5, n_rays) at the rays of a section."""
+    """Return 1, cos a, sin a, cos 2a and sin 2a (5, n_rays) at the angles a of a section's rays."""
     angle = 2 * np.pi * np.arange(n_rays) / n_rays
     return np.stack([np.ones(n_rays), np.cos(angle), np.sin(angle), np.cos(2 * angle), np.sin(2 * angle)])
 
 
 def _fit(rho: Floats, weight: Floats, necks: _Necks, medial_mm: Floats) -> Tube:
-    """One least-squares step: rho = r + a cos + b sin + c cos 2 + d sin 2, with a smooth oval r, c, d.
-
-    The axis points + a n1 + b n2 is smooth too. Across the way into a neck it is drawn to the medial line (k, 3): a
-    wall of which a wide neck has left a slope is one along which a circle rolls, and the medial line bulges into the
-    sac, but not to its side.
-    """
+    """Return the tube after one least-squares fit of rho = r + a cos t + b sin t + c cos 2t + d sin 2t to the rays."""
+    # The oval (r, c, d) and the axis, points + a n1 + b n2, are smooth along the artery. Across the direction into a
+    # neck it is pulled to the centerline (k, 3): a wide neck leaves a wall along which a circle can roll sideways. The
+    # centerline bulges into the sac, but not sideways.
     points, (n, n_rays) = necks.tube.points_mm, rho.shape
     frames = curves.parallel_frames(points)
     normal, right = _equations(rho, weight, necks, frames, medial_mm)
@@ -256,7 +289,7 @@ def _fit(rho: Floats, weight: Floats, necks: _Necks, medial_mm: Floats) -> Tube:
 
 
 def _equations(rho: Floats, weight: Floats, necks: _Necks, frames: Floats, medial_mm: Floats) -> tuple[Floats, Floats]:
-    """Normal equations (5, 5, n) and their right side (5, n): of every section's rays, and of what is known beside."""
+    """Return the normal equations (5, 5, n) and right-hand sides (5, n) of every section's rays and priors."""
     (points, oval), n_rays = necks.tube, rho.shape[1]
     basis = _waves(n_rays)
     normal = np.einsum("ik,nk,jk->ijn", basis, weight, basis)
@@ -271,7 +304,7 @@ def _equations(rho: Floats, weight: Floats, necks: _Necks, frames: Floats, media
 
 
 def _stiffness(tube: Tube, frames: Floats, n_rays: int) -> tuple[list[list[Any]], Floats]:
-    """Stiffness (5 by 5 sparse blocks) of the oval and of the axis against short waves, and how (5, n) it bends now."""
+    """Return the stiffness of oval and axis against short waves (5 x 5 sparse blocks), and its present force (5, n)."""
     n = len(tube.points_mm)
     wave = WAVELENGTH * 2.0 * float(np.median(tube.radius_mm)) / (2 * np.pi * STEP_MM)
     radius, axis = n_rays * wave**4 * curves.roughness(n, 2), n_rays / 2 * wave**6 * curves.roughness(n, 3)
@@ -288,14 +321,14 @@ def _stiffness(tube: Tube, frames: Floats, n_rays: int) -> tuple[list[list[Any]]
 
 
 def _bounded(oval: Floats) -> Floats:
-    """Ovals (n, 3) as far from round as `OVAL_MOST` allows, none of them without width."""
+    """Return ovals (n, 3) with their deviation from a circle limited by `OVAL_MOST` and radii of at least 0.1 mm."""
     radius = np.maximum(oval[:, 0], 0.1)
     most = OVAL_MOST * radius / np.maximum(np.hypot(oval[:, 1], oval[:, 2]), 1e-12)
     return np.column_stack([radius, oval[:, 1:] * np.minimum(most, 1.0)[:, None]])
 
 
 def _turned(oval: Floats, frames: Floats, others: Floats) -> Floats:
-    """Ovals (n, 3) whose angles are counted in frames (n, 3, 3), counted in others."""
+    """Return ovals (n, 3) given in frames (n, 3, 3) expressed in other frames (n, 3, 3)."""
     along, across = (np.einsum("nd,nd->n", others[:, 1], frames[:, k]) for k in (1, 2))
     turned = (oval[:, 1] + 1j * oval[:, 2]) * np.exp(-2j * np.arctan2(across, along))
     return np.stack([oval[:, 0], turned.real, turned.imag], axis=1)

@@ -1,4 +1,4 @@
-"""Bulges: connected pieces of wall that stand out of the tubes far enough to be a sac."""
+"""Find bulges: connected parts of the wall that rise above the tubes and may be sacs."""
 
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
@@ -12,37 +12,38 @@ from vstent.kernels import triangles
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 
 FLANK: Final = 0.5
-"""A bulge is where the wall stands out by more than this many parent radii."""
+"""A bulge is wall that rises above the tubes by more than this many parent radii."""
 HEIGHT: Final = 1.0
-"""A sac stands out by at least this many parent radii..."""
+"""Smallest height of a sac above the tubes, in parent radii."""
 HEIGHT_MM: Final = 1.5
-"""... and by at least this much."""
+"""Smallest height of a sac above the tubes, in mm."""
 LOW_MM: Final = 1.0
-"""What stands out by less than this is an uneven wall, and not told."""
+"""Lower bulges, in mm, are uneven wall and are not reported."""
 SHOULDER: Final = 3.0
-"""A bulge goes no farther than this many parent radii from where it stands out by one: the wide sides of an oval
-artery, which stand out of round tubes all along it, are no part of a sac on them."""
+"""Largest distance, in parent radii, of a bulge's vertices from wall that is at least `HEIGHT` high. The wide sides of
+an oval artery rise above round tubes along its whole length, but are not part of a sac on it."""
 WIDTH: Final = 1.0
-"""A sac is at least this many parent radii wide inside (its diameter); what is thinner is a twig."""
+"""Smallest inner width of a sac, in parent radii; a thinner bulge is a small branch."""
 
 LENGTH: Final = 3.5
-"""A sac stands out by less than this many of its own widths; what is longer is a branch that ends blind."""
+"""A sac is lower than this many of its own widths; a higher bulge is a branch that ends blind."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bulge:
-    """A piece of the lumen's wall that stands out of the tubes."""
+    """Part of the lumen's wall that rises above the tubes."""
 
     points_mm: Floats
-    """(n, 3) its vertices."""
+    """(n, 3) vertices of the bulge."""
     foot_mm: Floats
-    """(k, 3) those at its edge, where it rises from the tubes: a sac may touch other arteries, it hangs on its foot."""
+    """(k, 3) vertices at its edge, where it rises from the tubes. A sac may touch other arteries, but it arises at its
+    foot."""
     dome_mm: Floats
-    """(3,) the vertex that stands out furthest."""
+    """(3,) highest vertex."""
     height_mm: float
-    """How far that is."""
+    """Height of the highest vertex above the tubes."""
     width_mm: float = 0.0
-    """Median depth of the lumen below its vertices; 0 where it is not measured."""
+    """Median depth of the lumen below its vertices; 0 where not measured."""
 
     def __post_init__(self) -> None:
         freeze(self, "points_mm", np.float64, (-1, 3))
@@ -51,13 +52,13 @@ class Bulge:
 
     @property
     def inward(self) -> Floats:
-        """(3,) unit vector square to the plane of its foot, into it: a sac may hang to the side of its mouth."""
+        """(3,) unit vector into the bulge, perpendicular to its foot: the dome may lie to the side of the mouth."""
         vector = triangles.polygon_area_vector(self.foot_mm)
         vector *= np.sign((self.points_mm.mean(axis=0) - self.foot_mm.mean(axis=0)) @ vector)
         return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))
 
     def distances_mm(self, points_mm: Floats) -> Floats:
-        """Distance (k,) of each of (k, 3) points to the nearest vertex of the bulge."""
+        """Return the distance (k,) of points (k, 3) to the nearest vertex of the bulge, in mm."""
         return np.asarray(cKDTree(self.points_mm).query(points_mm)[0])
 
 
@@ -65,14 +66,26 @@ class _Standing(NamedTuple):
     """A bulge that may be a sac."""
 
     bulge: Bulge
+    """The bulge."""
     is_high: bool
-    """It stands out far enough for a sac."""
+    """Whether it is high enough for a sac."""
     is_wide: bool
-    """It is wide enough for one, and neither a twig nor a branch that ends blind."""
+    """Whether it is wide enough for a sac, and not a branch that ends blind."""
 
 
 def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> list[Bulge]:
-    """Sacs on the lumen's wall, the largest first; with `at_mm` (3,) only the bulge nearest to it, however flat."""
+    """Find the sacs on the lumen's wall.
+
+    Parameters
+    ----------
+    lumen : wall of the vessel.
+    tubes : tubes around all centerlines.
+    at_mm : (3,) point in mm; where given, only the bulge nearest to it is returned, however flat.
+
+    Returns
+    -------
+    bulges : the largest first.
+    """
     found = _standing_out(lumen, tubes)
     if at_mm is None:
         return _largest_first([one.bulge for one in found if one.is_wide and one.is_high])
@@ -83,13 +96,19 @@ def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> li
 
 
 def flat_bulges(lumen: Surface, tubes: Tubes) -> list[Bulge]:
-    """Bulges as wide as sacs on the lumen's wall that are too flat or too low for one, the largest first."""
+    """Return bulges that are as wide as sacs but too low, the largest first.
+
+    Parameters
+    ----------
+    lumen : wall of the vessel.
+    tubes : tubes around all centerlines.
+    """
     found = [one.bulge for one in _standing_out(lumen, tubes) if one.is_wide and not one.is_high]
     return _largest_first([bulge for bulge in found if bulge.height_mm > LOW_MM])
 
 
 def _standing_out(lumen: Surface, tubes: Tubes) -> list[_Standing]:
-    """All bulges on the lumen's wall."""
+    """Return all bulges on the lumen's wall."""
     height, sphere = tubes.height_mm(lumen.vertices_mm)
     parent = tubes.radius_mm[sphere]
     thickness = _thickness_mm(lumen)
@@ -105,12 +124,12 @@ def _standing_out(lumen: Surface, tubes: Tubes) -> list[_Standing]:
 
 
 def _largest_first(bulges: list[Bulge]) -> list[Bulge]:
-    """Return bulges ordered by height or width, whichever is less: a stump is high, but not wide."""
+    """Return bulges ordered by the smaller of height and width: a branch stump is high, but not wide."""
     return sorted(bulges, key=lambda bulge: -min(bulge.height_mm, bulge.width_mm))
 
 
 def _about_dome(points_mm: Floats, rise: Floats, reach_mm: float, member: Ints) -> Ints:
-    """Those of a patch's vertices (n,) that lie within a reach of ones as high as a sac's; all where none is."""
+    """Return the members of a patch within `reach_mm` of vertices as high as a sac; all where none is that high."""
     is_high = rise > HEIGHT
     if not is_high.any():
         return member
@@ -118,24 +137,37 @@ def _about_dome(points_mm: Floats, rise: Floats, reach_mm: float, member: Ints) 
 
 
 def bulge_at(lumen: Surface, height_mm: Floats, is_out: Bools, dome_mm: Floats) -> Bulge | None:
-    """The connected patch of wall where `is_out` (n,) holds that reaches `dome_mm` (3,); None where it does not."""
+    """Return the connected part of the wall that contains a dome.
+
+    Parameters
+    ----------
+    lumen : wall of the vessel.
+    height_mm : (n,) height of its vertices in mm.
+    is_out : (n,) whether a vertex may belong to the bulge.
+    dome_mm : (3,) the dome in mm.
+
+    Returns
+    -------
+    bulge : None where `is_out` does not hold at the dome.
+    """
     dome = int(np.argmin(np.linalg.norm(lumen.vertices_mm - dome_mm, axis=1)))
     patches = [member for member in _patches(lumen, is_out) if dome in member]
     return _bulge(lumen, height_mm, patches[0]) if patches else None
 
 
 def _bulge(lumen: Surface, height_mm: Floats, member: Ints) -> Bulge:
+    """Return the bulge with the given vertices."""
     top = member[np.argmax(height_mm[member])]
     inside = np.zeros(len(height_mm), dtype=bool)
     inside[member] = True
     points = lumen.vertices_mm
-    # Where a sac touches another artery the patch has a second, shorter edge.
+    # Where a sac touches another artery, the patch has a second, shorter edge.
     edges = triangles.boundary_loops(points, lumen.faces[inside[lumen.faces].all(axis=1)])
     return Bulge(points[member], points[edges[0] if edges else member], points[top], float(height_mm[top]))
 
 
 def _patches(lumen: Surface, is_out: Bools) -> list[Ints]:
-    """Vertices of every connected patch of three faces or more where `is_out` (n,) holds."""
+    """Return the vertices of each connected patch, of at least five vertices, where `is_out` (n,) holds."""
     edges = triangles.directed_edges(lumen.faces)
     edges = edges[is_out[edges].all(axis=1)]
     label = triangles.joined(edges, len(is_out))
@@ -144,7 +176,7 @@ def _patches(lumen: Surface, is_out: Bools) -> list[Ints]:
 
 
 def _thickness_mm(lumen: Surface) -> Floats:
-    """Depth (n,) of the lumen straight below every vertex (Shapira et al. 2008, Visual Computer 24:249, one ray)."""
+    """Return the depth (n,) of the lumen below every vertex (Shapira et al. 2008, Visual Computer 24:249, one ray)."""
     inward = -lumen.vertex_normals
     depth = lumen.first_hit(lumen.vertices_mm + 1e-3 * inward, inward)
     return np.where(np.isfinite(depth), depth, 0.0)

@@ -1,7 +1,7 @@
-"""Whether a bulge that was cut off is a saccular aneurysm, or a branch stump, an infundibulum, a bleb or an artifact.
+"""Classify a bulge as saccular aneurysm, branch stump, infundibulum, bleb or artifact.
 
 The classes and their criteria are vstent's own. An infundibulum is a funnel of at most 3 mm that is widest at its base
-(Saltzman 1959, Acta Radiol. 51:133); a stump is a tube; a saccular aneurysm is about as wide as it is high.
+(Saltzman 1959, Acta Radiol. 51:133). A stump is a tube. A saccular aneurysm is about as wide as it is high.
 """
 
 from typing import Final
@@ -14,29 +14,33 @@ from vstent.kernels.arrays import Floats
 from vstent.units import counted
 
 HEIGHTS: Final = np.linspace(0.1, 0.95, 12)
-"""Heights above the neck plane at which a sac's width is measured, as fractions of its height."""
+"""Heights above the neck plane at which the width of a sac is measured, as fractions of its height."""
 SLENDER: Final = 2.2
-"""A sac that reaches more than this many of its largest widths is a tube; those of the real cases reach 0.7 to 1.7."""
+"""A sac longer than this many of its largest widths is a tube; the sacs of real cases have 0.7 to 1.7."""
 STRAIGHT: Final = 1.15
-"""A sac whose largest width is less than this many times its neck's has no dome."""
+"""A sac whose largest width is below this many neck widths has no dome."""
 NARROW: Final = 0.75
-"""A sac narrower than this fraction of the artery is as narrow as a branch."""
+"""A sac narrower than this fraction of the artery may be a branch."""
 FUNNEL_MM: Final = 3.0
-"""Largest height of an infundibulum (Saltzman 1959)."""
+"""Largest height of an infundibulum in mm (Saltzman 1959)."""
 BLEB: Final = 0.4
-"""A sac whose sphere of the same volume is smaller than this fraction of the artery's diameter is a bleb."""
+"""A sac is a bleb if the sphere of its volume is smaller than this fraction of the artery's diameter."""
 FEWEST_VOXELS: Final = 4.0
 """Fewest voxels across a sac that can be distinguished from noise and blur."""
 
 
 def classified(vessel: Vessel, aneurysm: Aneurysm, artery_diameter_mm: float) -> Candidate:
-    """Return the class of a sac that was cut off, with its reasons.
+    """Classify a sac that was cut off.
 
     Parameters
     ----------
-    vessel : the vessel; a scan's states its voxel edge.
+    vessel : vessel with its voxel size where it comes from a scan.
     aneurysm : sac and neck.
-    artery_diameter_mm : diameter of the parent artery at the neck.
+    artery_diameter_mm : diameter of the parent artery at the neck in mm.
+
+    Returns
+    -------
+    candidate : class of the sac, the reasons for it, and a point inside the sac.
     """
     neck_mm, widths_mm, reach_mm = _profile(aneurysm)
     widest_mm = float(widths_mm.max())
@@ -61,10 +65,8 @@ def classified(vessel: Vessel, aneurysm: Aneurysm, artery_diameter_mm: float) ->
 
 
 def _profile(aneurysm: Aneurysm) -> tuple[float, Floats, float]:
-    """Return the width of the neck, those (12,) of the sac above it, and the farthest reach from the neck, in mm.
-
-    A width is the diameter of the circle with the area of the section parallel to the neck plane.
-    """
+    """Return the neck's width, the widths (12,) of the sac above it, and its largest distance from the neck, in mm."""
+    # A width is the diameter of the circle with the area of the section parallel to the neck plane.
     rim_mm, dome_mm = aneurysm.neck_mm, aneurysm.sac.vertices_mm
     center_mm, vector = triangles.polygon_centroid(rim_mm), triangles.polygon_area_vector(rim_mm)
     area_mm2 = float(np.linalg.norm(vector))
@@ -76,7 +78,7 @@ def _profile(aneurysm: Aneurysm) -> tuple[float, Floats, float]:
 
 
 def _width_mm(aneurysm: Aneurysm, below_mm: Floats) -> float:
-    """Return the width of the largest section of a sac at a level that lies `below_mm` (n,) under its vertices."""
+    """Return the width of a sac's largest section where the field `below_mm` (n,) at its vertices is zero."""
     vertices, faces, _ = triangles.clip(aneurysm.sac.vertices_mm, aneurysm.sac.faces, below_mm)
     loops = triangles.boundary_loops(vertices, faces)
     areas = [float(np.linalg.norm(triangles.polygon_area_vector(vertices[loop]))) for loop in loops]
@@ -84,10 +86,10 @@ def _width_mm(aneurysm: Aneurysm, below_mm: Floats) -> float:
 
 
 def _tapers(widths_mm: Floats) -> bool:
-    """Return whether a sac becomes narrower all the way up."""
+    """Return whether a sac becomes narrower from its base to its top."""
     return bool((np.diff(widths_mm) < 0.05 * widths_mm.max()).all() and widths_mm.argmax() <= len(widths_mm) // 4)
 
 
 def _dome_mm(aneurysm: Aneurysm) -> Floats:
-    """Return the point (3,) in the middle of the sac, which picks it."""
+    """Return the mean point (3,) of the sac, by which it can be chosen."""
     return np.asarray(aneurysm.sac.vertices_mm.mean(axis=0))

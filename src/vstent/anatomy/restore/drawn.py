@@ -1,4 +1,4 @@
-"""A neck drawn by hand: the wall is cut beside the curve, and what that parts from the inlet is the sac."""
+"""Cut the wall along a neck drawn by hand: the part separated from the inlet is the sac."""
 
 from typing import Final, NamedTuple
 
@@ -14,33 +14,33 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import place
 
 FAR_MM: Final = 1.5
-"""A neck that is drawn further than this from the wall is not of this vessel."""
+"""Largest distance of a drawn neck from the wall, in mm; a farther curve belongs to another vessel."""
 STEP_EDGES: Final = 0.25
-"""The curve is followed in steps of this many edges of the mesh."""
+"""Spacing of the points on the curve, in edge lengths of the mesh."""
 RIBBON_EDGES: Final = 1.5
-"""The wall is cut by a ribbon along the curve that reaches so many edges into and out of the wall."""
+"""Half width of the ribbon along the curve that cuts the wall, in edge lengths of the mesh."""
 FEWEST_VERTICES: Final = 12
-"""A sac's wall has at least this many vertices."""
+"""Fewest vertices in the wall of a sac."""
 
 
 class Drawn(NamedTuple):
-    """A vessel's wall cut along a drawn neck."""
+    """Wall of a vessel, cut along a drawn neck."""
 
     vertices_mm: Floats
     """(n, 3) vertices of the sac's wall."""
     faces: Ints
-    """(m, 3) its faces."""
+    """(m, 3) vertex indices of its faces."""
     artery: Surface
-    """The wall without it."""
+    """The remaining wall."""
     bulge: Bulge
-    """What of the sac's wall stands out of the tubes around all centerlines; its foot is where it begins to."""
+    """Part of the sac's wall that rises above the tubes around all centerlines; its foot is where that part begins."""
     neck_mm: Floats
-    """(k, 3) the neck, evenly spaced; what was drawn outside the lumen lies on the wall."""
+    """(k, 3) evenly spaced points of the neck; points drawn outside the lumen are moved onto the wall."""
     cut_mm: Floats
-    """(k, 3) points of the wall nearest to these."""
+    """(k, 3) points of the wall nearest to the points of `neck_mm`."""
 
     def neck_of(self, rim_mm: Floats) -> Floats:
-        """Points (j, 3) of the neck beside points (j, 3) one after the other along the cut."""
+        """Return the points (j, 3) of the neck that belong to successive points (j, 3) along the cut."""
         ring = np.concatenate([self.cut_mm, self.cut_mm[:1]])
         place = curves.arc_length(ring)
         turn = np.unwrap(curves.project(ring, rim_mm)[0] / place[-1], period=1.0)
@@ -51,12 +51,21 @@ class Drawn(NamedTuple):
 
 
 def cut_along(vessel: Vessel, neck_mm: Floats) -> Drawn:
-    """Cut the wall beside a closed curve (k, 3).
+    """Cut the wall along a neck drawn by hand.
+
+    Parameters
+    ----------
+    vessel : vessel with centerlines.
+    neck_mm : (k, 3) points of a closed curve near the wall, in mm.
+
+    Returns
+    -------
+    drawn : wall of the sac, wall of the artery, and the neck.
 
     Raises
     ------
     InputError
-        When the curve is no curve, lies off the wall, parts nothing from it, or goes around the artery.
+        When `neck_mm` is not a curve, is too far from the wall, separates nothing from it, or runs around the artery.
     """
     given = np.asarray(neck_mm, dtype=np.float64)
     if given.ndim != 2 or given.shape[1] != 3 or len(given) < 3 or not np.isfinite(given).all():
@@ -76,13 +85,13 @@ def cut_along(vessel: Vessel, neck_mm: Floats) -> Drawn:
 
 
 def _edge_mm(lumen: Surface) -> float:
-    """Typical length of the mesh's edges."""
+    """Return the median edge length of the mesh in mm."""
     corners = lumen.corners_mm
     return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
 
 
 def _on_wall(lumen: Surface, curve_mm: Floats) -> Floats:
-    """Points (n, 3) of the wall nearest to those of a curve (n, 3)."""
+    """Return the points (n, 3) of the wall nearest to a curve (n, 3)."""
     points, distance, _ = lumen.closest(curve_mm)
     worst = int(distance.argmax())
     if distance[worst] > FAR_MM:
@@ -94,7 +103,7 @@ def _on_wall(lumen: Surface, curve_mm: Floats) -> Floats:
 
 
 def _bulge(vessel: Vessel, is_sac: Bools) -> Bulge:
-    """The part of a sac's wall, vertices (n,), that is no branch's as far as the centerlines tell."""
+    """Return the part of a sac's wall, vertices (n,), that does not belong to a branch according to the centerlines."""
     tubes = tubes_of(vessel.centerlines)
     height, sphere = tubes.height_mm(vessel.lumen.vertices_mm)
     height = np.where(is_sac, height, -np.inf)
@@ -105,7 +114,7 @@ def _bulge(vessel: Vessel, is_sac: Bools) -> Bulge:
 
 
 def _ribbon(lumen: Surface, curve_mm: Floats, reach_mm: float) -> Surface:
-    """A band square to the wall along a closed curve (n, 3) on it."""
+    """Return a band perpendicular to the wall along a closed curve (n, 3) on it."""
     normals = lumen.normals[lumen.closest(curve_mm)[2]]
     n_waves = triangles.perimeter(curve_mm) / (4.0 * reach_mm)
     across = reach_mm * curves.lowpass(normals, n_waves)
@@ -116,7 +125,7 @@ def _ribbon(lumen: Surface, curve_mm: Floats, reach_mm: float) -> Surface:
 
 
 def _level_mm(vessel: Vessel, curve_mm: Floats, reach_mm: float) -> Floats:
-    """Distance (n,) of the wall's vertices from the curve (k, 3), negative beyond it seen from the inlet."""
+    """Return the distance (n,) of the wall's vertices from the curve (k, 3), in mm; negative on the sac's side."""
     lumen = vessel.lumen
     ribbon = _ribbon(lumen, curve_mm, reach_mm)
     edges = triangles.directed_edges(lumen.faces)
@@ -130,7 +139,7 @@ def _level_mm(vessel: Vessel, curve_mm: Floats, reach_mm: float) -> Floats:
 
 
 def _is_sac(vessel: Vessel, label: Ints) -> Bools:
-    """Tell the vertices (n,) of the largest part, by label (n,), that is cut off from the inlet."""
+    """Return whether each vertex (n,) is in the largest part, by label (n,), that is separated from the inlet."""
     points = vessel.lumen.vertices_mm
     at_end = [label[int(np.linalg.norm(points - end.center_mm, axis=1).argmin())] for end in vessel.openings]
     count = np.bincount(label)

@@ -1,9 +1,9 @@
-"""The landing surface: the patient's own wall, closed across necks and ostia.
+"""Build the landing surface: the patient's own wall, closed across necks and the ostia of side branches.
 
-In sections along the parent axis the wall is rho(s, theta). A smooth baseline under it is found by asymmetric least
-squares (Eilers and Boelens 2005): a wall that stands out of the baseline, as sac and branch do, loses its weight.
-Where the wall stands out, and a little around, it is replaced by the smoothest surface through the wall around
-(a thin plate on the (s, theta) grid); elsewhere it stays what it is.
+In sections along the parent axis the wall is a function rho(s, theta). A smooth baseline of the wall is found by
+asymmetric least squares (Eilers and Boelens 2005): wall outside the baseline, such as a sac or a branch, loses its
+weight. Where the wall is outside the baseline, and in a margin around, it is replaced by the smoothest surface through
+the surrounding wall (a thin plate on the (s, theta) grid). Elsewhere the wall is kept.
 """
 
 from dataclasses import dataclass
@@ -25,31 +25,32 @@ from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 
 N_RAYS: Final = 72
-"""Vertices in a ring of the landing surface: every 5 degrees."""
+"""Vertices in a ring of the landing surface: one every 5 degrees."""
 OUT: Final = 0.20
-"""A wall that stands out of the baseline by this fraction of the radius is sac or branch..."""
+"""Wall that is outside the baseline by this fraction of the radius is sac or branch."""
 FLARE: Final = 0.06
-"""... and so is the wall around it that stands out by this fraction: the flare of its mouth."""
+"""Connected wall that is outside the baseline by this fraction of the radius is the flare of a mouth, and is replaced
+too."""
 MARGIN_MM: Final = 0.3
-"""The closed part reaches this far beyond."""
+"""Margin in mm around the replaced wall that is replaced too."""
 PRIOR: Final = 0.02
-"""Weight of the fitted tube beside the wall's 1: decides where there is no wall at all."""
+"""Weight of the fitted tube relative to the wall's weight of 1; it decides where there is no wall."""
 SAME_MM: Final = 1e-3
-"""A ray that goes on for less than this has met the same wall."""
+"""Two hits of a ray closer than this, in mm, are on the same wall."""
 N_PASSES: Final = 12
-"""Passes of asymmetric least squares; weights settle within 10."""
+"""Number of passes of asymmetric least squares; the weights converge within 10."""
 
 
 @dataclass(frozen=True, eq=False)
 class Landing:
-    """The landing surface on its grid of sections and angles."""
+    """Landing surface on a grid of sections and angles."""
 
     points_mm: Floats
     """(n, 3) axis of the parent artery."""
     rho_mm: Floats
-    """(n, rays) distance of the landing surface from the axis."""
+    """(n, rays) distance from the axis to the landing surface."""
     is_restored: Bools
-    """(n, rays) closes a neck or an ostium."""
+    """(n, rays) whether the surface closes a neck or an ostium there."""
 
     def __post_init__(self) -> None:
         freeze(self, "points_mm", np.float64, (-1, 3))
@@ -58,37 +59,37 @@ class Landing:
 
     @cached_property
     def surface(self) -> Surface:
-        """The landing surface as an open tube, one ring of vertices per axis point."""
+        """Landing surface as an open tube, one ring of vertices per axis point."""
         rings = self.points_mm[:, None] + self.rho_mm[..., None] * section_directions(self.points_mm, self.n_rays)
         return Surface(rings.reshape(-1, 3), tube_faces(*self.rho_mm.shape))
 
     @cached_property
     def solid(self) -> Surface:
-        """The landing surface closed at both ends."""
+        """Landing surface closed at both ends."""
         return Vessel(self.surface).closed
 
     @property
     def n_rays(self) -> int:
-        """Vertices in a ring."""
+        """Number of vertices in a ring."""
         return int(self.rho_mm.shape[1])
 
     @cached_property
     def section_radius_mm(self) -> Floats:
-        """(n,) radius of the circle of the section's area."""
+        """(n,) radius of the circle with the area of the section."""
         return np.sqrt((self.rho_mm**2).mean(axis=1))
 
     @cached_property
     def axis(self) -> Centerline:
-        """The parent axis with the distance to the landing surface."""
+        """Parent axis, with the distance to the landing surface as radius."""
         return Centerline(self.points_mm, self.surface.closest(self.points_mm)[1])
 
     @cached_property
     def frames(self) -> Floats:
-        """(n, 3, 3) frames that the angles are counted in."""
+        """(n, 3, 3) frames in which the angles are counted."""
         return curves.parallel_frames(self.points_mm)
 
     def grid_of(self, points_mm: Floats) -> Floats:
-        """Fractional grid position (k, 2), section and ray, of the points (k, 3) nearest sections."""
+        """Return the fractional grid position (k, 2), section and ray, of points (k, 3) in mm."""
         abscissa = curves.arc_length(self.points_mm)
         s = curves.project(self.points_mm, points_mm)[0]
         section = np.interp(s, abscissa, np.arange(len(abscissa)))
@@ -99,21 +100,28 @@ class Landing:
         return np.stack([section, ray], axis=1)
 
     def nearest_sections(self, points_mm: Floats) -> Ints:
-        """Number (k,) of the section nearest to each of (k, 3) points."""
+        """Return the index (k,) of the section nearest to each of the points (k, 3), in mm."""
         return np.asarray(cKDTree(self.points_mm).query(points_mm)[1])
 
     def at_grid(self, grid: Floats) -> Floats:
-        """Points (k, 3) of the landing surface at fractional grid positions (k, 2), bilinear."""
+        """Return the points (k, 3) of the landing surface at fractional grid positions (k, 2), bilinear."""
         wrapped = np.concatenate([self.surface.vertices_mm.reshape(*self.rho_mm.shape, 3)] * 2, axis=1)
         place = [np.clip(grid[:, 0], 0, len(self.points_mm) - 1), np.mod(grid[:, 1], self.n_rays)]
         return np.stack([map_coordinates(wrapped[..., k], place, order=1) for k in range(3)], axis=1)
 
 
 def close_landing(lumen: Surface, tube: Tube, own: Surface | None = None) -> Landing:
-    """Close the necks and ostia of the lumen's wall along a tube; with `own`, all of it that is not this wall too."""
+    """Close the necks and ostia of the lumen's wall along a tube.
+
+    Parameters
+    ----------
+    lumen : wall of the vessel.
+    tube : fitted axis and ovals of the artery.
+    own : the artery's own part of the wall, where a neck is drawn by hand. Where given, all other wall is replaced too.
+    """
     rho = section_rays(lumen, tube.points_mm, N_RAYS)
     radius = np.repeat(tube.radius_mm[:, None], N_RAYS, axis=1)
-    # Plates are as stiff against an oval as against other waves across: they are laid on what remains of a round tube.
+    # The plate is as stiff against an oval as against other waves around the section, so the oval is subtracted first.
     oval = tube.rho_mm(N_RAYS) - radius
     has_wall = np.isfinite(rho) & (rho < 4.0 * radius)
     if own is not None:
@@ -128,10 +136,8 @@ def close_landing(lumen: Surface, tube: Tube, own: Surface | None = None) -> Lan
 
 
 def _baseline(wall: Floats, has_wall: Bools, radius: Floats, scale_mm: float) -> Floats:
-    """Smooth surface under the wall, by asymmetric least squares on every second section and ray.
-
-    What the baseline can follow is longer than three radii: half the grid holds it, at an eighth of the cost.
-    """
+    """Return a smooth surface (n, rays) under the wall, by asymmetric least squares."""
+    # The baseline has no waves shorter than three radii, so half the grid resolves it at an eighth of the run time.
     fine, wall, has_wall, radius = wall, wall[::2, ::2], has_wall[::2, ::2], radius[::2, ::2]
     stiffness = _thin_plate(wall.shape[0], wall.shape[1], scale_mm / (2 * STEP_MM))
     baseline = radius
@@ -146,7 +152,7 @@ def _baseline(wall: Floats, has_wall: Bools, radius: Floats, scale_mm: float) ->
 
 
 def _closed(wall: Floats, restored: Bools, baseline: Floats, scale_mm: float) -> Floats:
-    """The wall, and where it is to be restored the smoothest continuation that stays near the baseline."""
+    """Return the wall with its restored part replaced by the smoothest surface near the baseline."""
     unknown = np.flatnonzero(restored)
     if not len(unknown):
         return wall
@@ -157,13 +163,14 @@ def _closed(wall: Floats, restored: Bools, baseline: Floats, scale_mm: float) ->
 
 
 def _with_values(wall: Floats, index: Ints, values: Floats) -> Floats:
+    """Return a copy of the wall with new values at flat indices."""
     closed = wall.ravel().copy()
     closed[index] = values
     return closed.reshape(wall.shape)
 
 
 def _solve(system: csc_matrix, right: Floats, bandwidth: int) -> Floats:
-    """Solve a symmetric positive definite banded system."""
+    """Return the solution of a symmetric positive definite banded system."""
     upper = system.tocoo()
     keep = upper.col >= upper.row
     band = np.zeros((bandwidth + 1, len(right)))
@@ -172,7 +179,7 @@ def _solve(system: csc_matrix, right: Floats, bandwidth: int) -> Floats:
 
 
 def _thin_plate(n: int, n_rays: int, radius_steps: float) -> csc_matrix:
-    """Stiffness of a thin plate on the grid, stiff against waves shorter than 3 radii along and a third of a turn."""
+    """Return the stiffness of a thin plate against waves below 3 radii along and a third of a turn around."""
     ring = eye(n_rays, format="csc")
     turn = 2.0 * ring - csc_matrix(np.roll(np.eye(n_rays), 1, axis=0) + np.roll(np.eye(n_rays), -1, axis=0))
     along = (3.0 * radius_steps / (2 * np.pi)) ** 2
@@ -182,16 +189,18 @@ def _thin_plate(n: int, n_rays: int, radius_steps: float) -> csc_matrix:
 
 
 def _around(grid: Bools) -> Bools:
-    """Three copies side by side: what touches across the seam of the ring hangs together."""
+    """Return three copies of the grid side by side, so that patches connect across the seam of the ring."""
     return np.concatenate([grid] * 3, axis=1)
 
 
 def _core(tripled: Bools) -> Bools:
+    """Return the middle copy of a tripled grid."""
     n_rays = tripled.shape[1] // 3
     return tripled[:, n_rays : 2 * n_rays]
 
 
 def _dilated(tripled: Bools, radius_mm: float) -> Bools:
+    """Return a tripled grid with its members widened by `MARGIN_MM`."""
     along = max(1, round(MARGIN_MM / STEP_MM))
     ray_mm = 2 * np.pi * radius_mm / N_RAYS
     round_ = max(1, round(MARGIN_MM / ray_mm))

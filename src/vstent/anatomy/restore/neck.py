@@ -1,11 +1,15 @@
-"""The neck: where the sac's flank, freed of the blur that rounds its edge, meets the parent artery.
+"""Find the neck: where the sac's wall, corrected for the blur of the scan, meets the parent artery.
 
-A scan's point spread fills the crevice between sac and artery: at its bottom the tissue is thinner than the blur, so
-the wall seen there lies outside of both, the more so the sharper the crevice. From a height of 1.9 standard deviations
-of the blur on, the artery's share in the flank's intensity is below 3 %, and what it does to the flank can be undone.
-So the flank is followed up from there along lines of steepest ascent, each line is continued downwards with its own
-slope and curvature (a parabola over its length), and the neck is where those parabolas meet the artery. The blur is
-the one measured in the scan; a surface does not tell it.
+The point spread of a scan fills the crevice between sac and artery. At the bottom of the crevice the tissue is thinner
+than the blur, so the segmented wall lies outside both lumens. The sharper the crevice, the larger the error. Above a
+height of 1.9 standard deviations of the blur, the artery contributes less than 3 % to the intensity at the flank (the
+lower part of the sac's wall), and this contribution can be corrected. The neck is found in three steps:
+
+1. From that height the flank is followed upwards along lines of steepest ascent.
+2. Each line is continued downwards by a parabola fitted to its points.
+3. The neck is the closed curve where these parabolas meet the artery.
+
+The blur is measured in the scan. It is unknown for a vessel that is read from a surface file.
 """
 
 from collections.abc import Sequence
@@ -22,60 +26,72 @@ from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints
 
 CLEAR: Final = 1.9
-"""Lower down than this many standard deviations of the blur the flank is not believed..."""
+"""The flank is used only above this height, in standard deviations of the blur."""
 CLEAR_EDGES: Final = 1.5
-"""... nor lower than this many edges of the mesh, which cuts off the bottom of the crevice by itself."""
+"""The flank is used only above this height, in edge lengths of the mesh: the mesh cuts off the bottom of the
+crevice."""
 UNTOLD_MM: Final = 0.5
-"""Where the blur is not known, lower down than this: 1.9 times 0.26 mm, by which 3DRA scans are blurred, voxel,
-reconstruction and smoothing of the mesh together..."""
+"""Height in mm above which the flank is used where the blur is unknown: 1.9 times 0.26 mm, the total blur of 3DRA scans
+from voxel size, reconstruction and mesh smoothing."""
 UNTOLD_EDGES: Final = 2.2
-"""... nor lower than this many edges: an iso-surface has edges of 0.9 voxel, and a scan is blurred by about a voxel."""
+"""The same height in edge lengths of the mesh; the larger one applies. An iso-surface has edges of 0.9 voxel, and the
+blur of a scan is about one voxel."""
 DEEPEST: Final = 0.45
-"""The artery's share in the flank's intensity is taken for no more than this."""
+"""Upper bound on the artery's share of the intensity at the flank."""
 BAND: Final = 3.0
-"""The flank is followed up to this many times the height at which it is believed..."""
+"""The flank is followed up to this many times the height above which it is used."""
 BAND_OF_HEIGHT: Final = 0.6
-"""... and no further than this fraction of the way from there to the dome's top."""
+"""The flank is followed over at most this fraction of the height between that level and the top of the dome."""
 N_LEVELS: Final = 9
-"""Heights at which the flank is followed."""
+"""Number of heights at which the flank is sampled."""
 DETAIL: Final = 6.0
-"""The neck follows waves along its rim longer than this many times the height from which it is extrapolated."""
+"""Shortest wavelength kept along the neck's rim, in multiples of the height from which the flank is extrapolated."""
 WAVES: Final = (4.0, 2.0, 1.4, 1.0, 0.7)
-"""Of those waves, so many times as many are left to a neck with hooks, one after the other until it has none."""
+"""Factors on the number of waves kept along the rim, tried in this order until the neck has no hook."""
 HOOK_RAD: Final = np.radians(40.0)
-"""A neck that turns by more than this over half the height from which it is extrapolated has a hook there."""
+"""A neck has a hook where it turns by more than this angle, in rad, over half the height from which it is extrapolated.
+Hooks arise where neighbouring flanks end on different walls: at forks, and where a branch runs along the sac."""
 LOOSE_MM: Final = 0.15
-"""A neck that has lost its hooks lies where that took it, off the artery's wall, where this is further than that."""
+"""Points of the smoothed neck that are farther than this from the artery's wall, in mm, are moved only part of the way
+to it."""
 REACH: Final = 3.0
-"""A flank that has not met the artery within this many times that height lies along it."""
+"""Longest continuation of a flank, in multiples of the height from which it is extrapolated. A flank that has not met
+the artery by then runs along it."""
 N_STEPS: Final = 36
-"""Steps in which the continuation of a flank is searched for the artery."""
+"""Number of steps in which the continuation of a flank is searched for the artery."""
 OUTSIDE_MM: Final = 0.05
-"""A continuation that leaves the lumen by more than this ends there: blur adds to the lumen in a crevice."""
+"""A continuation ends where it leaves the lumen by more than this distance, in mm: blur only adds to the lumen in a
+crevice."""
 BRANCH_SHARE: Final = 0.15
-"""A branch's own wall stands out of its tube by less than this many radii."""
+"""Wall less than this many branch radii above a branch's tube is the branch's own wall."""
 FACING: Final = 3.0
-"""A wall that looks straight at a branch counts as this many of its radii further away."""
+"""Height added to wall that directly faces a branch, in radii of the branch: such wall belongs to a sac beside the
+branch."""
 MOUTH: Final = 0.25
-"""A branch that leaves from the sac is cut off where the wall stands out of its own by this many of its radii..."""
+"""A branch that arises from the sac is cut off where the wall is this many branch radii above the branch's own wall."""
 ROOT: Final = 2.0
-"""... but no further than this many of them along it."""
+"""Length of a branch, in its radii, over which `MOUTH` applies. Farther along, the height from which a flank is used
+applies."""
 
 
 class Artery(NamedTuple):
-    """What is not sac: the parent artery, the arteries that pass the sac beside it, and all other branches."""
+    """Arteries around a sac: the parent artery, arteries that pass beside the sac, and all other branches."""
 
     landings: tuple[Landing, ...]
-    """The parent artery, and those that part from it under the sac."""
+    """Landing surfaces of the parent artery and of the arteries that leave it under the sac."""
     branches: Tubes
-    """All other branches, where they have left the parent artery and the sac."""
+    """Tubes of all other branches, from where they have left the parent artery and the sac."""
     apart_mm: Floats
-    """(n,) by how much the lumen's wall beside each sphere of the branches counts as further away, see `apart_mm`."""
+    """(n,) height added to the lumen's wall beside each sphere of `branches`, in mm; see the function `apart_mm`."""
 
     def height_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
-        """How far points (n, 3) stand out of all arteries' walls, negative inside.
+        """Return the height (n,) of points above the walls of all arteries, in mm; negative inside.
 
-        With `normals` (n, 3) the points are the lumen's wall: a wall that looks at a branch belongs to a sac beside it.
+        Parameters
+        ----------
+        points_mm : (n, 3) points in mm.
+        normals : (n, 3) unit normals of the lumen's wall at the points. With them, wall that faces a branch counts as
+            higher, because it belongs to a sac beside that branch.
         """
         height = np.minimum(self._above(self.landings[0], points_mm), self.above_branches_mm(points_mm, normals))
         for side in self.landings[1:]:
@@ -84,7 +100,13 @@ class Artery(NamedTuple):
         return height
 
     def above_branches_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
-        """How far points (n, 3) stand out of the branches' walls alone, likewise."""
+        """Return the height (n,) of points above the walls of the branches alone, in mm; negative inside.
+
+        Parameters
+        ----------
+        points_mm : (n, 3) points in mm.
+        normals : (n, 3) unit normals of the lumen's wall at the points; see `height_mm`.
+        """
         height, sphere = self.branches.height_mm(points_mm)
         if not len(self.branches.radius_mm):
             return height
@@ -96,7 +118,7 @@ class Artery(NamedTuple):
         return height + _turned_mm(*branches, points_mm, normals)
 
     def onto(self, points_mm: Floats) -> Floats:
-        """Move points (n, 3) onto the wall of the artery that they are in, or nearest to; those at a branch stay."""
+        """Move points (n, 3), in mm, onto the wall of the artery nearest to them; points at a branch stay."""
         for _ in range(len(self.landings)):
             above = np.stack([self._above(landing, points_mm) for landing in self.landings])
             nearest = above.argmin(axis=0)
@@ -109,16 +131,24 @@ class Artery(NamedTuple):
 
     @staticmethod
     def _above(landing: Landing, points_mm: Floats) -> Floats:
+        """Return the signed distance (n,) of points (n, 3) to a landing surface, in mm."""
         return landing.solid.signed_distance(points_mm)
 
 
 def apart_mm(landings: Sequence[Landing], branches: Tubes, along_mm: Floats, low_mm: float) -> Floats:
-    """By how much a flank counts as further from the spheres (n,) of branches that begin apart from all arteries.
+    """Return the height (n,) added to the sac's wall beside branches that begin away from all arteries, in mm.
 
-    Beside an artery a flank is believed from `low_mm` on, for from there it is continued to the neck. The mouth of a
-    branch that leaves from the sac is only closed: its own wall is enough to keep off. Were `low_mm` cut off around it
-    as well, a branch up to twice as far from the neck would be one with it, or not, as the noise has it. Further along
-    than `ROOT` radii, `along_mm` (n,) from where it begins, all of a branch is cut off, however uneven its wall is.
+    Beside an artery the flank is used only above `low_mm`, because it is extrapolated from there to the neck. The mouth
+    of a branch that arises from the sac is only capped, so a margin for the branch's own wall is enough. With the full
+    `low_mm` around such a branch, noise would decide whether it merges with a neck up to twice as far away. Beyond
+    `ROOT` radii along the branch the full `low_mm` applies, however uneven the branch's wall is.
+
+    Parameters
+    ----------
+    landings : landing surfaces of the arteries.
+    branches : n spheres along the branches.
+    along_mm : (n,) arc length of each sphere from the start of its branch, in mm.
+    low_mm : height above which the flank beside an artery is used, in mm.
     """
     if not len(branches.radius_mm):
         return np.zeros(0)
@@ -129,7 +159,7 @@ def apart_mm(landings: Sequence[Landing], branches: Tubes, along_mm: Floats, low
 
 
 def _turned_mm(centers_mm: Floats, radius_mm: Floats, points_mm: Floats, normals: Floats) -> Floats:
-    """By how much walls (n, 3) that look at a branch count as further away; its centers are theirs, or a line's."""
+    """Return the height (n,) added to wall (n, 3) that faces a branch with spheres at each point or along a line."""
     if len(centers_mm) != len(points_mm):
         nearest = cKDTree(centers_mm).query(points_mm)[1]
         centers_mm, radius_mm = centers_mm[nearest], radius_mm[nearest]
@@ -139,25 +169,25 @@ def _turned_mm(centers_mm: Floats, radius_mm: Floats, points_mm: Floats, normals
 
 
 class Flank(NamedTuple):
-    """The sac's wall above its rim."""
+    """Wall of a sac above its rim."""
 
     vertices_mm: Floats
     """(n, 3) vertices of the sac's wall."""
     faces: Ints
-    """(m, 3) its faces."""
+    """(m, 3) vertex indices of its faces."""
     height_mm: Floats
-    """(n,) how far the vertices stand out of the artery."""
+    """(n,) height of the vertices above the artery."""
     rim: Ints
-    """(k,) closed loop of vertices on the artery's side, at the lowest height that is believed."""
+    """(k,) closed loop of vertices on the artery's side, at the lowest height that is used."""
 
     def levelled(self, low_mm: float) -> "Flank":
-        """The flank with heights that are `low_mm` along the whole rim, and as they were far from it."""
+        """Return the flank with its rim at height `low_mm`; the correction decays with the distance from the rim."""
         distance, nearest = cKDTree(self.vertices_mm[self.rim]).query(self.vertices_mm)
         missing = low_mm - self.height_mm[self.rim]
         return self._replace(height_mm=self.height_mm + missing[nearest] * np.exp(-distance / low_mm))
 
     def isoline(self, height_mm: float) -> Floats:
-        """Points (j, 3) close together along the line of one height."""
+        """Return closely spaced points (j, 3) on the contour line at `height_mm`."""
         points = self.vertices_mm
         level = np.where(np.abs(self.height_mm - height_mm) < 1e-12, 1e-12, self.height_mm - height_mm)
         is_above = level[self.faces] > 0
@@ -174,7 +204,15 @@ class Flank(NamedTuple):
 
 
 def believed_from_mm(lumen: Surface, foot_mm: Floats, most_mm: float, blur_mm: float | None) -> float:
-    """Height from which on the flank around a bulge's foot (k, 3) is free of blur; no more than `most_mm`."""
+    """Return the height in mm above which the flank at a bulge's foot is free of blur.
+
+    Parameters
+    ----------
+    lumen : wall of the vessel.
+    foot_mm : (k, 3) foot of the bulge in mm.
+    most_mm : upper bound of the result in mm.
+    blur_mm : standard deviation of the blur in mm; None where it is unknown.
+    """
     near = np.asarray(cKDTree(foot_mm).query(lumen.vertices_mm, distance_upper_bound=most_mm)[0]) < most_mm
     corners = lumen.corners_mm[near[lumen.faces].any(axis=1)]
     edge_mm = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
@@ -184,11 +222,17 @@ def believed_from_mm(lumen: Surface, foot_mm: Floats, most_mm: float, blur_mm: f
 
 
 def unblurred(flank: Flank, blur_mm: float) -> Flank:
-    """The flank where it was before the blur.
+    """Return the flank with the blur of the artery below it removed.
 
-    At a distance d beside the flank and h above the artery the tissue between them is seen as Phi(d / s) - Phi(-h / s)
-    of its own intensity, s the blur's standard deviation, as if both walls were flat and parallel. The wall is seen
-    where that is one half: at d = s Phi^-1(1/2 + Phi(-h / s)).
+    Both walls are assumed flat and parallel. At distance d from the flank and height h above the artery, the tissue
+    between them appears with the fraction Phi(d / s) - Phi(-h / s) of its own intensity, where s is the standard
+    deviation of the blur and Phi the standard normal distribution. The segmented wall lies where this fraction is one
+    half, at d = s Phi^-1(1/2 + Phi(-h / s)). The vertices are moved back by d.
+
+    Parameters
+    ----------
+    flank : wall of the sac as segmented.
+    blur_mm : standard deviation of the blur in mm.
     """
     share = np.minimum(ndtr(-flank.height_mm / blur_mm), DEEPEST)
     normals = Surface(flank.vertices_mm, flank.faces).vertex_normals
@@ -196,14 +240,18 @@ def unblurred(flank: Flank, blur_mm: float) -> Flank:
 
 
 def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floats:
-    """Continue the flank to the artery: rings (n_rings + 1, k, 3) from the rim's vertices down to the neck.
+    """Continue the flank from its rim down to the artery.
 
     Parameters
     ----------
-    flank : the wall above the rim.
-    artery : what the flank stands on.
-    lumen : the closed lumen, which the continuation does not leave.
-    n_rings : strips of triangles between rim and neck.
+    flank : wall of the sac above the rim.
+    artery : arteries below the flank.
+    lumen : closed lumen; the continuation stays inside it.
+    n_rings : number of strips of triangles between rim and neck.
+
+    Returns
+    -------
+    rings : (n_rings + 1, k, 3) points in mm, from the k vertices of the rim down to the neck.
     """
     rim_mm = flank.vertices_mm[flank.rim]
     place = curves.arc_length(np.concatenate([rim_mm, rim_mm[:1]]))
@@ -219,16 +267,13 @@ def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floa
     bend, length = _between(bend.reshape(n, -1), where).reshape(-1, 3, 3), _between(length[:, None], where)
     share = np.linspace(0.0, 1.0, n_rings + 1)[:, None, None]
     down = -share * length
-    # The rings begin at the rim itself and forget its distance from the parabola on the way.
+    # The first ring is the rim itself. Its distance from the parabolas decays over the rings.
     rings = bend[:, 0] + down * bend[:, 1] + down**2 * bend[:, 2] + (1 - share) * (rim_mm - bend[:, 0])
     return np.asarray(rings + share * (neck - rings[-1]))
 
 
 def _settled(artery: Artery, feet_mm: Floats, low_mm: float, n_waves: float) -> Floats:
-    """Points (n, 3) of a ring on the artery near those given, with no more of their waves than leave it without hooks.
-
-    Where arteries meet, and where a branch runs along the sac, neighbouring flanks may end on different walls.
-    """
+    """Return a ring of points (n, 3) on the artery, smoothed only as much as is needed to remove its hooks."""
     ring = artery.onto(feet_mm)
     for more in WAVES:
         if _sharpest_rad(ring, 0.5 * low_mm) < HOOK_RAD:
@@ -238,14 +283,14 @@ def _settled(artery: Artery, feet_mm: Floats, low_mm: float, n_waves: float) -> 
 
 
 def _nearly(artery: Artery, points_mm: Floats) -> Floats:
-    """Move points (n, 3) close to the artery's wall onto it; those further off go a smaller part of the way."""
+    """Return points (n, 3) moved onto the artery's wall; points farther off are moved only part of the way."""
     moved = artery.onto(points_mm) - points_mm
     size = np.linalg.norm(moved, axis=1, keepdims=True)
     return np.asarray(points_mm + moved / (1.0 + (size / LOOSE_MM) ** 4))
 
 
 def _sharpest_rad(ring_mm: Floats, length_mm: float) -> float:
-    """Largest turn of a closed curve (n, 3) from one piece of a given length to the next."""
+    """Return the largest angle, in rad, between successive chords of `length_mm` on a closed curve (n, 3)."""
     closed = np.concatenate([ring_mm, ring_mm[:1]])
     n = max(12, round(4.0 * float(curves.arc_length(closed)[-1]) / length_mm))
     even = curves.resample_evenly(closed, n + 1)[:-1]
@@ -256,7 +301,7 @@ def _sharpest_rad(ring_mm: Floats, length_mm: float) -> float:
 
 
 def _rise(flank: Flank, starts_mm: Floats, low_mm: float) -> Floats:
-    """Points (levels, n, 3) up the flank from its rim: each the nearest one on the next line of equal height."""
+    """Return points (levels, n, 3) up the flank from its rim, each the nearest one on the next contour line."""
     high_mm = min(BAND * low_mm, low_mm + BAND_OF_HEIGHT * (float(flank.height_mm.max()) - low_mm))
     points = [starts_mm]
     for height_mm in np.linspace(low_mm, high_mm, N_LEVELS)[1:]:
@@ -266,14 +311,15 @@ def _rise(flank: Flank, starts_mm: Floats, low_mm: float) -> Floats:
 
 
 def _parabolas(points_mm: Floats) -> Floats:
-    """Coefficients (n, 3, 3) of 1, t, t^2 of lines of points (levels, n, 3), t their length, by least squares."""
+    """Return least-squares coefficients (n, 3, 3) of 1, t, t^2 of lines (levels, n, 3), with t the arc length."""
     steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=2)
     length = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)]).T
     return np.asarray(np.linalg.pinv(length[..., None] ** np.arange(3)) @ points_mm.transpose(1, 0, 2))
 
 
 def _convex(bend: Floats) -> Floats:
-    """Parabolas (n, 3, 3) around a ring, straightened where they are hollow: a sac is convex, its flare is not sac."""
+    """Return parabolas (n, 3, 3) around a ring with concave ones straightened."""
+    # A sac is convex. A concave flank is the flare of its mouth, and would lead the extrapolation astray.
     along = np.roll(bend[:, 0], -1, axis=0) - np.roll(bend[:, 0], 1, axis=0)
     outward = np.cross(along, bend[:, 1])
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
@@ -284,10 +330,8 @@ def _convex(bend: Floats) -> Floats:
 
 
 def _length_to_neck(bend: Floats, reach_mm: float, artery: Artery, lumen: Surface) -> Floats:
-    """Length (n,) of the continuation of parabolas (n, 3, 3) down to where they enter the artery.
-
-    One that misses it ends at its lowest point in the lumen.
-    """
+    """Return the length (n,) over which parabolas (n, 3, 3) continue down to the artery, in mm."""
+    # A parabola that misses the artery ends at its lowest point inside the lumen.
     t = np.linspace(0.0, reach_mm, N_STEPS + 1)
     points = np.einsum("td,nde->nte", (-t[:, None]) ** np.arange(3), bend).reshape(-1, 3)
     height = artery.height_mm(points).reshape(len(bend), -1)
@@ -302,5 +346,5 @@ def _length_to_neck(bend: Floats, reach_mm: float, artery: Artery, lumen: Surfac
 
 
 def _between(values: Floats, where: Floats) -> Floats:
-    """Values (k, d) at fractional places (k,) on a ring of values (n, d)."""
+    """Return values (k, d) interpolated at fractional positions (k,) on a ring of values (n, d)."""
     return curves.interpolate(np.arange(len(values) + 1.0), np.concatenate([values, values[:1]]), where)

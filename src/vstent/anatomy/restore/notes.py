@@ -1,4 +1,4 @@
-"""Notes on an anatomy: one sentence on every finding and assumption, and on everything that may look like an error."""
+"""Notes on an anatomy: one sentence for each finding, each assumption and each possible error."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -14,19 +14,27 @@ from vstent.kernels import curves
 from vstent.units import counted, place
 
 FUSIFORM: Final = 1.5
-"""An artery wider by this factor than at both its ends is reported as fusiform."""
+"""An artery wider than both its ends by this factor is reported as fusiform."""
 END_MM: Final = 2.0
-"""Length over which the width of an end is measured, in mm."""
+"""Length in mm over which the width of an end is measured."""
 NEAR_SAC_MM: Final = 4.0
-"""Distance between an opening and the wall of a sac below which it is reported, in mm."""
+"""An opening closer than this to the wall of a sac, in mm, is reported."""
 STENOSED: Final = 0.7
-"""Ratio of the width beside a neck to the widths beyond and across it, below which a stenosis is reported."""
+"""A stenosis is reported where the width beside a neck is below this fraction of the widths on both sides of it."""
 STENOSED_REACH: Final = 2.0
 """Largest distance of a reported stenosis from the neck, in diameters."""
 
 
 def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
-    """Sentences on the sacs cut off from the bulges found, and on the parent artery, along the centerline `path`."""
+    """Return notes on the parent artery and its sacs.
+
+    Parameters
+    ----------
+    vessel : vessel with centerlines.
+    path : index of the parent artery's centerline.
+    bulges : bulges that were found.
+    aneurysms : sacs that were cut off.
+    """
     line, sacs = vessel.centerlines[path], [bulge for bulge in bulges if is_in_one(bulge.points_mm, aneurysms)]
     return (
         *_found(vessel, path, aneurysms, len(bulges)),
@@ -39,7 +47,13 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
 
 
 def candidates_told(aneurysms: Sequence[Aneurysm], candidates: Sequence[Candidate]) -> tuple[str, ...]:
-    """Return a sentence on bulges that were not taken for aneurysms, and how to choose one."""
+    """Return a note on bulges that are not used as aneurysms, with how to choose one.
+
+    Parameters
+    ----------
+    aneurysms : sacs that are used.
+    candidates : all bulges with their class.
+    """
     others = [one.described for one in candidates if not one.is_aneurysm]
     if not others:
         return ()
@@ -48,7 +62,12 @@ def candidates_told(aneurysms: Sequence[Aneurysm], candidates: Sequence[Candidat
 
 
 def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
-    """A sentence on a bulge that is a sac only for whoever asks for it."""
+    """Return a note on a bulge that is used as a sac only on request.
+
+    Parameters
+    ----------
+    bulge : flat bulge; None where there is none.
+    """
     if bulge is None:
         return ()
     return (
@@ -58,7 +77,7 @@ def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
 
 
 def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges: int) -> tuple[str, ...]:
-    """Sentences on where the parent artery runs and how many sacs hang on it."""
+    """Return notes on the course of the parent artery and the number of sacs."""
     end = vessel.far_ends[path]
     notes = [f"The parent artery runs from the inlet to {end.role} (diameter {end.diameter_mm:.1f} mm)."]
     if not aneurysms:
@@ -70,7 +89,7 @@ def _found(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...], n_bulges:
 
 
 def _before_another(vessel: Vessel, path: int, bulges: list[Bulge]) -> tuple[str, ...]:
-    """A sentence where the highest bulge hangs on the artery from another inlet, before the parent artery."""
+    """Return a note where the highest bulge is on the artery from another inlet, upstream of the parent artery."""
     if not bulges or reach_of(vessel.centerlines[path], bulges[0]) <= PASSING:
         return ()
     return tuple(
@@ -82,7 +101,7 @@ def _before_another(vessel: Vessel, path: int, bulges: list[Bulge]) -> tuple[str
 
 
 def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
-    """A sentence where the artery along a centerline widens all round, off its sacs."""
+    """Return a note where the artery along a centerline is wider on all sides, away from its sacs."""
     radius = np.where(is_off_sacs(line, bulges), line.inscribed_radius_mm, 0.0)
     at_end = np.minimum(line.abscissa_mm, line.length_mm - line.abscissa_mm) < END_MM
     is_first = line.abscissa_mm < 0.5 * line.length_mm
@@ -98,10 +117,11 @@ def _fusiform(line: Centerline, bulges: list[Bulge]) -> tuple[str, ...]:
 
 
 def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
-    """Sentences where the artery along a centerline narrows beside a neck, and is wide again beyond and across it.
-
-    The width of the artery under a neck is estimated from its width beside it, which a stenosis makes too small.
-    """
+    """Return notes where the artery narrows beside a neck and is wide again on both sides of the stenosis."""
+    # The width of the artery under a neck is estimated from the width beside it. A stenosis makes that estimate too
+    # small.
+    # The width of the artery under a neck is estimated from the width beside it. A stenosis makes that estimate too
+    # small.
     abscissa, radius = line.abscissa_mm, line.inscribed_radius_mm
     at_neck = curves.project(line.points_mm, aneurysm.neck_mm)[0]
     gap_mm = np.maximum(at_neck.min() - abscissa, abscissa - at_neck.max())
@@ -127,7 +147,7 @@ def _stenosed(line: Centerline, aneurysm: Aneurysm) -> tuple[str, ...]:
 
 
 def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
-    """Sentences on the openings that lie on a sac or beside one: holes in it, or branches cut off at their mouth."""
+    """Return notes on openings on a sac or near one: holes in it, or branches cut off at their mouth."""
     notes = []
     for opening in vessel.far_ends:
         gap_mm = min((float(bulge.distances_mm(opening.center_mm[None])[0]) for bulge in bulges), default=np.inf)
@@ -141,18 +161,19 @@ def _near_sacs(vessel: Vessel, bulges: list[Bulge]) -> tuple[str, ...]:
 
 
 def _from_sacs(vessel: Vessel, path: int, aneurysms: tuple[Aneurysm, ...]) -> tuple[str, ...]:
-    """Return sentences on branches that arise from a sac: their blood flows through it with any device."""
+    """Return notes on branches that arise from a sac: their blood flows through it with any device."""
     branches = [one for k, one in enumerate(zip(vessel.far_ends, vessel.centerlines, strict=True)) if k != path]
     return tuple(_through_sac(opening) for opening, line in branches if any(_leaves(line, one) for one in aneurysms))
 
 
 def _through_sac(opening: Opening) -> str:
+    """Return a note on an opening whose blood flows through a sac."""
     way, beside = ("opens into", ", and is not part of the neck inflow") if opening.is_inlet else ("leaves from", "")
     return f"{opening.role}, {opening.described}, {way} a sac: its blood flows through the sac with any device{beside}."
 
 
 def _leaves(line: Centerline, aneurysm: Aneurysm) -> bool:
-    """Tell whether a centerline comes out of a sac by another way than its neck: farther from it than it is wide."""
+    """Return whether a centerline leaves a sac other than through its neck."""
     inside = np.flatnonzero(aneurysm.sac.signed_distance(line.points_mm) < 0)
     last = inside[-1:]
     return bool((aneurysm.neck.closest(line.points_mm[last])[1] > line.inscribed_radius_mm[last]).any())

@@ -1,4 +1,4 @@
-"""The centerline that the parent artery follows: past the sac to an outlet, at every fork the wider way on."""
+"""Choose the centerline of the parent artery: past the sac to an outlet, along the wider branch at every fork."""
 
 from functools import reduce
 from typing import Final
@@ -13,23 +13,32 @@ from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats
 
 REACH_MM: Final = 10.0
-"""At a fork, the parent artery goes on where the vessel is wider over this length."""
+"""Length beyond a fork, in mm, over which the widths of two branches are compared."""
 IN_SAC: Final = 1.2
-"""A sphere reaches into a sac whose wall is within this many of its radii."""
+"""An inscribed sphere reaches into a sac if the sac's wall is within this many of its radii."""
 BACK_RAD: Final = np.radians(100.0)
-"""A way that turns by more than this at a fork turns back: where two arteries join, it is the other one..."""
+"""A path that turns by more than this angle, in rad, at a fork turns back: it runs into the other of two arteries that
+join there."""
 BACK: Final = 0.8
-"""... which is no wider than the one that both feed (Murray 1926), or hardly: it counts as this much of its width."""
+"""Factor on the width of a path that turns back: both joining arteries feed the third, and are at most about as wide as
+it (Murray 1926)."""
 SHARED: Final = 2.0
-"""Two lines are one up to this many radii before they part."""
+"""Two centerlines share their course up to this many radii before the point where they part."""
 PASSING: Final = 2.0
-"""A centerline passes a bulge that begins within this many parent radii of it (a bulge's wall begins at 1.5)."""
+"""A centerline passes a bulge whose foot is within this many parent radii; the wall of a bulge begins at 1.5."""
 
 
 def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -> int:
-    """Number of the centerline that the parent artery follows: past the sac to an outlet, at every fork the wider way.
+    """Return the index of the centerline that the parent artery follows.
 
-    To another inlet it leads only where `outlet_mm` (3,) is there.
+    It passes the sac and ends at an outlet, taking the wider branch at every fork. It ends at another inlet only if
+    `outlet_mm` is nearest to that.
+
+    Parameters
+    ----------
+    vessel : vessel with centerlines.
+    bulges : bulges of the wall; the first is the sac to pass.
+    outlet_mm : (3,) point in mm near the opening at the end of the parent artery; None to choose by width.
     """
     lines = vessel.centerlines
     if outlet_mm is not None:
@@ -44,7 +53,17 @@ def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -
 
 
 def is_off_sacs(line: Centerline, bulges: list[Bulge]) -> Bools:
-    """Tell the points (n,) of a centerline whose inscribed spheres reach into none of the sacs: they make them wide."""
+    """Return whether each point of a centerline has an inscribed sphere that no bulge widens.
+
+    Parameters
+    ----------
+    line : centerline of n points.
+    bulges : bulges that may be sacs.
+
+    Returns
+    -------
+    is_off : (n,) whether the sphere reaches into no bulge.
+    """
     off = np.ones(len(line.points_mm), dtype=bool)
     for bulge in bulges:
         off &= bulge.distances_mm(line.points_mm) > IN_SAC * line.inscribed_radius_mm
@@ -52,38 +71,39 @@ def is_off_sacs(line: Centerline, bulges: list[Bulge]) -> Bools:
 
 
 def reach_of(line: Centerline, bulge: Bulge) -> float:
-    """Return the least distance between a centerline and a bulge's foot, in parent radii; the wall itself is at 1."""
+    """Return the smallest distance from a centerline to a bulge's foot, in parent radii.
+
+    Parameters
+    ----------
+    line : centerline of an artery; its wall is at a distance of 1.
+    bulge : bulge that may be a sac.
+    """
     radius = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
     return float((cKDTree(bulge.foot_mm).query(line.points_mm)[0] / radius).min())
 
 
 def _is_wider(one: Centerline, other: Centerline, one_is_off: Bools, other_is_off: Bools) -> bool:
-    """Tell whether the first of two centerlines is the wider over `REACH_MM` beyond their fork."""
+    """Return whether the first of two centerlines is wider over `REACH_MM` beyond their fork."""
     return _width_beyond_fork(one, other, one_is_off) >= _width_beyond_fork(other, one, other_is_off)
 
 
 def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> float:
-    """Median radius of a centerline over `REACH_MM` beyond its fork from another, less where it turns back there.
-
-    0 where it parts in the sac alone.
-    """
+    """Return the median radius of a centerline over `REACH_MM` beyond its fork; 0 where it parts in the sac only."""
     distance = curves.project(other.points_mm, line.points_mm)[1]
     apart = np.flatnonzero((distance > line.inscribed_radius_mm) & is_off)
     if not len(apart):
         return 0.0
     fork_mm = line.abscissa_mm[apart[0]]
     beyond = (line.abscissa_mm >= fork_mm) & (line.abscissa_mm <= fork_mm + REACH_MM)
-    # A way that is mostly in the sac is a branch of the sac: the sac's own width is none of its.
+    # A path that is mostly in the sac leads to a branch of the sac. The width of the sac is not that of the branch.
     own = beyond & is_off if (beyond & is_off).sum() < 0.5 * beyond.sum() else beyond
     share = BACK if _turns_back(line, float(fork_mm)) else 1.0
     return share * float(np.median(line.inscribed_radius_mm[own]))
 
 
 def _turns_back(line: Centerline, fork_mm: float) -> bool:
-    """Tell whether a centerline that parts from another at an abscissa turns back: over `REACH_MM` on both sides of it.
-
-    Lines part where the one leaves the other's sphere, some way behind the fork.
-    """
+    """Return whether a centerline turns back, over `REACH_MM` on both sides of where it parts from another."""
+    # Centerlines part where one leaves the inscribed sphere of the other, some distance beyond the fork.
     shared_mm = fork_mm - SHARED * float(np.interp(fork_mm, line.abscissa_mm, line.inscribed_radius_mm))
     places_mm = np.array([shared_mm - REACH_MM, shared_mm, fork_mm, fork_mm + REACH_MM])
     before, _, beyond = np.diff(line.at(np.clip(places_mm, 0.0, line.length_mm)), axis=0)

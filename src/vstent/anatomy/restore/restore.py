@@ -1,10 +1,9 @@
-"""Restore the parent artery: find the sac, and close its neck and the side branches' ostia.
+"""Restore the parent artery: find the sac, and close its neck and the ostia of the side branches.
 
-The paper (Zhong et al. 2016) shrinks the sac by hand ("aneurysm scaling"). Here it is found: the wall that stands out
-of the tubes around all centerlines is a sac where it stands out by more than the artery's own radius. The parent
-artery is then a tube around its own axis (`axis`), its wall the patient's own except across necks and ostia, where it
-is closed by the smoothest surface through the wall around them (`landing`). What of the lumen lies outside that tube
-and holds the sac's dome is the sac (`sac`).
+Zhong et al. 2016 shrink the sac by hand ("aneurysm scaling"). Here it is found automatically: a sac is wall that rises
+above the tubes around all centerlines by more than the artery's own radius. The parent artery is a tube around its own
+axis (`axis`). Its wall is the patient's own, except across necks and ostia, where the smoothest surface through the
+surrounding wall closes it (`landing`). The sac is the lumen outside that tube that contains the dome (`sac`).
 """
 
 from collections.abc import Sequence
@@ -28,30 +27,36 @@ from vstent.kernels.arrays import Floats
 from vstent.units import place
 
 ON_FOOT: Final = 1.5
-"""A foot, which rises to half a radius above the nearest artery, is an artery's own up to this many of its radii."""
+"""Points of a bulge's foot up to this many artery radii above the artery are on that artery. A foot rises to half a
+radius above the nearest artery."""
 MOST_FLAT: Final = 3
-"""No more flat bulges than this are looked into: one on a branch takes as long as restoring the artery does."""
+"""Number of flat bulges that are examined at most: one on a branch takes as long as restoring the artery."""
 
 
 def restore(
     vessel: Vessel, *, at_mm: Floats | None = None, outlet_mm: Floats | None = None, neck_mm: Floats | None = None
 ) -> Anatomy:
-    """Return the anatomy of a traced vessel: parent artery, landing surface, sacs.
+    """Restore the parent artery of a traced vessel and cut off its sacs.
 
     Parameters
     ----------
-    vessel : a vessel with centerlines.
-    at_mm : (3,) a point near the sac wanted; all sacs otherwise.
-    outlet_mm : (3,) a point near the opening that the parent artery leads to; the widest way on to an outlet otherwise.
-    neck_mm : (k, 3) a neck drawn by hand, a closed curve near the wall: what it parts from the inlet is a sac, and
-        the only one; necks are found otherwise.
+    vessel : vessel with centerlines.
+    at_mm : (3,) point near the requested sac in mm; all sacs where not given.
+    outlet_mm : (3,) point in mm near the opening at the end of the parent artery; the widest path to an outlet where
+        not given.
+    neck_mm : (k, 3) closed curve near the wall in mm: a neck drawn by hand. The part that it separates from the inlet
+        is the only sac. Necks are found automatically where not given.
+
+    Returns
+    -------
+    anatomy : parent artery, landing surface, sacs and candidates.
 
     Raises
     ------
     InputError
-        When nothing stands out of the artery near `at_mm`, or `neck_mm` does not part a sac from the artery.
+        When there is no bulge near `at_mm`, or `neck_mm` does not separate a sac from the artery.
     VesselError
-        When the vessel has no centerlines, or its wall is no artery's along them.
+        When the vessel has no centerlines, or no tube fits the wall along them.
     """
     if not vessel.centerlines:
         raise VesselError("the vessel has no centerlines: trace it before restoring its parent artery")
@@ -89,7 +94,7 @@ def restore(
 def _closed(
     vessel: Vessel, bulges: Sequence[Bulge], outlet_mm: Floats | None, drawn: Drawn | None = None
 ) -> tuple[int, Landing, list[Aneurysm]]:
-    """Return the number of the parent artery's centerline, its landing surface, and the sacs cut off from it."""
+    """Return the index of the parent artery's centerline, its landing surface, and the sacs cut off from it."""
     path = parent_path(vessel, list(bulges), outlet_mm)
     landing = _landing(vessel, path, bulges, drawn.artery if drawn else None)
     side_lines = _all_but(path, vessel.centerlines)
@@ -99,32 +104,30 @@ def _closed(
 
 
 def _classified(vessel: Vessel, landing: Landing, sac: Aneurysm) -> Candidate:
-    """Return the class of a sac beside the parent artery's diameter at its neck."""
+    """Return the class of a sac, from its shape and the parent artery's diameter at its neck."""
     middle_mm = 0.5 * (sac.proximal_abscissa_mm + sac.distal_abscissa_mm)
     return classified(vessel, sac, 2 * float(np.interp(middle_mm, landing.axis.abscissa_mm, landing.section_radius_mm)))
 
 
 def _but(bulges: Sequence[Bulge], sacs: Sequence[Aneurysm]) -> list[Bulge]:
-    """Return the bulges that are in none of the sacs; all but the first where that leaves them all."""
+    """Return the bulges that are in none of the sacs; all but the first where no bulge is in a sac."""
     left = [bulge for bulge in bulges if not is_in_one(bulge.points_mm, sacs)]
     return left if len(left) < len(bulges) else list(bulges[1:])
 
 
 def _landing(vessel: Vessel, path: int, bulges: Sequence[Bulge], own: Surface | None = None) -> Landing:
-    """The landing surface along a centerline, with the necks of bulges closed; `own`: see `close_landing`."""
+    """Return the landing surface along a centerline, with the necks of bulges closed; `own`: see `close_landing`."""
     line = vessel.centerlines[path]
     mouths = [Mouth(_foot_on(line, bulge), bulge.inward) for bulge in bulges]
     return close_landing(vessel.lumen, fit_axis(vessel.lumen, line, mouths), own)
 
 
 def _flat_sac(vessel: Vessel, outlet_mm: Floats | None, path: int, landing: Landing) -> Bulge | None:
-    """The highest bulge too flat to be taken for a sac of which one is cut off where it is asked for: a blister.
-
-    It hardly bears on the fit of the artery, so that the landing surface along a path holds for all bulges on it.
-    """
+    """Return the first flat bulge (a blister) that can be cut off as a sac on request; None without one."""
+    # Flat bulges hardly affect the fit of the artery, so one landing surface serves all bulges on a path.
     flat = flat_bulges(vessel.lumen, tubes_of(vessel.centerlines))[:MOST_FLAT]
     landings = {path: landing}
-    # Forks and bends bulge as high as a blister does: they turn out to be the artery once it is restored.
+    # Forks and bends bulge as much as a blister. After restoring the artery they are part of it.
     for bulge in flat:
         way = parent_path(vessel, [bulge], outlet_mm)
         if way not in landings:
@@ -135,24 +138,23 @@ def _flat_sac(vessel: Vessel, outlet_mm: Floats | None, path: int, landing: Land
 
 
 def _all_but(path: int, lines: Sequence[Centerline]) -> list[Centerline]:
+    """Return the centerlines without the one at index `path`."""
     return [line for k, line in enumerate(lines) if k != path]
 
 
 def _sacs(vessel: Vessel, landing: Landing, side_lines: list[Centerline], bulges: list[Bulge]) -> list[Aneurysm]:
-    """The sacs of those bulges that hang on the parent artery and are not flat."""
+    """Return the sacs of those bulges that are on the parent artery and not flat."""
     found: list[Aneurysm] = []
     for bulge in bulges:
         sac = cut_sac(vessel, landing, side_lines, bulge)
-        # Bulges apart above the tubes may be one sac above the landing surface, which lies lower.
+        # Bulges that are separate above the tubes may be one sac above the landing surface, which is lower.
         found += [] if sac is None or is_in_one(sac.sac.vertices_mm, found) else [sac]
     return found
 
 
 def _foot_on(line: Centerline, bulge: Bulge) -> Floats:
-    """Points (k, 3) of a bulge's foot that stand on the artery along a centerline; all where none does.
-
-    Where a branch leaves from the sac beside its neck, the foot goes around the branch's mouth too.
-    """
+    """Return the points (k, 3) of a bulge's foot that are on the artery along a centerline; all where none is."""
+    # Where a branch arises from the sac beside its neck, the foot runs around the mouth of the branch too.
     tubes = tubes_of([line])
     height, sphere = tubes.height_mm(bulge.foot_mm)
     on_artery = bulge.foot_mm[height < ON_FOOT * tubes.radius_mm[sphere]]

@@ -1,4 +1,4 @@
-"""The sac: the lumen outside the landing surface that holds a bulge's dome, and the neck that closes it."""
+"""Cut off the sac, the lumen outside the landing surface that contains a bulge's dome, and find its neck."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -19,40 +19,54 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.regions import region
 
 ON_ARTERY_MM: Final = 0.5
-"""A flank whose rim comes nearer than this to the height where it begins stands on the parent artery."""
+"""A flank is attached to the parent artery if its rim comes this close to the height where it begins, in mm."""
 FLAT: Final = 0.2
-"""Less volume than this fraction of neck area to the power 3/2 is an uneven wall (a half sphere has 0.38)."""
+"""A sac is rejected as uneven wall if its volume is below this fraction of (neck area)^(3/2); a half sphere has
+0.38."""
 ROUND: Final = 0.6
-"""A shape with more than 1 / 0.6 times the surface of the sphere of its volume is a scan's debris: sacs, lobed ones
-too, have 0.7 to 0.85."""
+"""A shape is rejected as debris of the scan if its `_roundness` is below this. Sacs, including lobed ones, have 0.7 to
+0.85."""
 PASSING: Final = 2.5
-"""A branch passes under a sac that begins within this many of its radii..."""
+"""A branch passes under a sac that begins within this many of the branch's radii."""
 NEAR_MM: Final = 12.0
-"""... and is restored as the parent artery is where the sac begins within this distance..."""
+"""Length of branch and of parent artery on each side of the fork, in mm, that is used to restore a branch under a
+sac."""
 TURNED_BACK: Final = -0.5
-"""A way that turns by more than 120 degrees is none for a wall to follow."""
+"""Smallest cosine of the angle between branch and parent artery that a wall can follow: a turn of 120 degrees."""
 EQUAL: Final = 0.6
-"""A branch thinner than this many times the parent artery leaves its wall as it is: a tube stands for it."""
+"""A branch thinner than this fraction of the parent artery does not shape its wall; a tube represents it."""
 COURSE_STEP_MM: Final = 0.1
-"""Spacing of the points of such a way."""
+"""Spacing of the points of a path from a branch into the parent artery, in mm."""
 OWN_WALL: Final = 0.25
-"""... and beyond the last section outside the parent artery of which less than this fraction is the patient's own."""
+"""A restored branch ends at the first section outside the parent artery with less than this fraction of original
+wall."""
 FEWEST_SECTIONS: Final = 8
-"""A shorter piece is no artery."""
+"""Fewest sections of a restored branch; a shorter piece is not used."""
 SETTLING: Final = 6.0
-"""The neck's border on the wall settles within this many times the height where the flank begins."""
+"""The border of the neck is optimized within this many times the height where the flank begins."""
 N_RINGS: Final = 12
-"""Rings of the neck's triangles."""
+"""Number of rings of triangles in the neck."""
 N_SKIRT: Final = 4
-"""Strips of triangles between the flank and the neck."""
+"""Number of strips of triangles between flank and neck."""
 ON_SAC_MM: Final = 0.05
-"""What lies for the most part no further outside a sac than this is a part of it."""
+"""Points whose median distance outside a sac is below this, in mm, belong to that sac."""
 
 
 def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], bulge: Bulge) -> Aneurysm | None:
-    """Cut the sac of a bulge off the lumen; None where it does not hang on the parent artery, or is flat.
+    """Cut the sac of a bulge off the lumen.
 
-    Side branches that leave from the sac or beside it are cut off along their own tubes.
+    Side branches that arise from the sac or beside it are cut off along their own tubes.
+
+    Parameters
+    ----------
+    vessel : vessel with centerlines.
+    landing : landing surface of the parent artery.
+    side_lines : centerlines other than that of the parent artery.
+    bulge : part of the wall that may be a sac.
+
+    Returns
+    -------
+    aneurysm : sac and neck; None where the bulge is not on the parent artery, or is too flat or too uneven for a sac.
     """
     lumen = vessel.lumen
     artery = _artery(vessel, landing, side_lines, bulge)
@@ -67,7 +81,7 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
         return None
     found = _cut_off(vessel, artery, flank, other_loops, low_mm)
     for k, loop in enumerate(other_loops):
-        # A sac that touches its artery opens into it at two places, and the touch has the longer flare at times.
+        # A sac that touches its artery a second time has two openings, and the false one may have the longer rim.
         if np.median(landing.surface.closest(flank.vertices_mm[loop])[1]) < low_mm + ON_ARTERY_MM:
             mouths = [flank.rim, *other_loops[:k], *other_loops[k + 1 :]]
             other = _cut_off(vessel, artery, flank._replace(rim=loop), mouths, low_mm)
@@ -77,25 +91,39 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
 
 
 def _cut_off(vessel: Vessel, artery: Artery, flank: Flank, other_loops: list[Ints], low_mm: float) -> Aneurysm:
-    """The sac above a flank's rim, continued down to the artery."""
+    """Return the sac above a flank's rim, continued down to the artery."""
     flank = unblurred(flank, vessel.blur_mm) if vessel.blur_mm else flank
     rings = skirt(flank.levelled(low_mm), artery, vessel.closed, n_rings=N_SKIRT)
     return _aneurysm(artery, flank, other_loops, rings)
 
 
 def _low_mm(vessel: Vessel, landing: Landing, bulge: Bulge) -> float:
-    """Height above the artery from which on a bulge's flank is believed."""
+    """Return the height above the artery, in mm, above which a bulge's flank is free of blur."""
     most_mm = FLANK * float(np.median(landing.section_radius_mm[landing.nearest_sections(bulge.foot_mm)]))
     return believed_from_mm(vessel.lumen, bulge.foot_mm, most_mm, vessel.blur_mm)
 
 
 def is_in_one(points_mm: Floats, aneurysms: Sequence[Aneurysm]) -> bool:
-    """Tell whether most of the points (n, 3) of a sac or bulge lie in or on one of the sacs."""
+    """Return whether most points of a sac or bulge lie in or on one of the aneurysms.
+
+    Parameters
+    ----------
+    points_mm : (n, 3) points in mm.
+    aneurysms : sacs that are already cut off.
+    """
     return any(np.median(one.sac.signed_distance(points_mm)) < ON_SAC_MM for one in aneurysms)
 
 
 def drawn_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], drawn: Drawn) -> Aneurysm:
-    """Close the sac behind a neck that was drawn; side branches that leave from it are cut off along their tubes."""
+    """Cut off the sac at a neck drawn by hand; side branches that arise from it are cut off along their tubes.
+
+    Parameters
+    ----------
+    vessel : vessel with centerlines.
+    landing : landing surface of the parent artery.
+    side_lines : centerlines other than that of the parent artery.
+    drawn : wall cut along the drawn neck.
+    """
     artery = _artery(vessel, landing, side_lines, drawn.bulge)
     normals = Surface(drawn.vertices_mm, drawn.faces).vertex_normals
     in_branch_mm = _low_mm(vessel, landing, drawn.bulge) - artery.above_branches_mm(drawn.vertices_mm, normals)
@@ -109,7 +137,7 @@ def drawn_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline]
 
 
 def _aneurysm(artery: Artery, flank: Flank, other_loops: list[Ints], rings: Floats) -> Aneurysm:
-    """The sac of a flank, the mouths of its branches, and its continuation, rings (n, k, 3), down to the neck."""
+    """Return the aneurysm of a flank, its branch mouths, and its continuation, rings (n, k, 3), down to the neck."""
     neck = _neck(artery, rings[-1])
     sac = _closed_sac(flank, other_loops, rings, neck)
     abscissa = curves.project(artery.landings[0].points_mm, rings[-1])[0]
@@ -117,10 +145,8 @@ def _aneurysm(artery: Artery, flank: Flank, other_loops: list[Ints], rings: Floa
 
 
 def _is_island(lumen: Surface, is_low: Bools) -> Bools:
-    """Tell the vertices (n,) of low wall from which no low wall leads to an opening.
-
-    There the sac itself touches an artery that it does not hang on.
-    """
+    """Return whether each vertex (n,) is low wall without a connection to an opening over low wall."""
+    # There the sac touches an artery from which it does not arise.
     edges = triangles.directed_edges(lumen.faces)
     edges = edges[is_low[edges].all(axis=1)]
     label = triangles.joined(edges, len(is_low))
@@ -129,14 +155,14 @@ def _is_island(lumen: Surface, is_low: Bools) -> Bools:
 
 
 def _roundness(sac: Surface) -> float:
-    """Surface of the sphere of the same volume over the sac's own (Wadell 1935, J. Geol. 43:250)."""
+    """Return the sphericity: area of the sphere of equal volume over the sac's (Wadell 1935, J. Geol. 43:250)."""
     return float(np.cbrt(36 * np.pi * max(sac.volume_mm3, 0.0) ** 2)) / sac.area_mm2
 
 
 def _flank(
     lumen: Surface, height_mm: Floats, low_mm: float, dome_mm: Floats, landing: Landing
 ) -> tuple[Flank | None, list[Ints]]:
-    """The sac's wall above a height, and its edges apart from the rim; None where it does not stand on the artery."""
+    """Return the sac's wall above a height and its edges other than the rim; None where it is not on the artery."""
     is_touching = _is_island(lumen, height_mm < low_mm)
     height_mm = np.where(is_touching, 2.0 * low_mm, height_mm)
     level = _level(lumen, height_mm, low_mm)
@@ -147,17 +173,15 @@ def _flank(
     near = [landing.surface.closest(vertices[loop])[1].min() < low_mm + ON_ARTERY_MM for loop in loops]
     if not any(near):
         return None, []
-    # The longest edge at the artery is the rim; others are the mouths of branches that leave from the sac.
+    # The longest edge at the artery is the rim. Other edges are mouths of branches that arise from the sac.
     rim = near.index(True)
     return Flank(vertices, faces, height_mm, loops[rim]), [*loops[:rim], *loops[rim + 1 :]]
 
 
 def _level(lumen: Surface, height_mm: Floats, low_mm: float) -> Floats:
-    """Level (n,), negative on the wall above a height, with a border that is short where the height hardly decides.
-
-    It is shifted by the square of `low_mm` times its curvature at most, and a spike narrower than `low_mm` goes where
-    the height hardly exceeds it.
-    """
+    """Return a level (n,), negative on the wall above a height, with a short border where the height is flat."""
+    # The border moves by at most low_mm squared times its curvature. Spikes narrower than low_mm vanish where the
+    # height hardly exceeds it.
     excess = height_mm - low_mm
     member = np.flatnonzero(_near_border(lumen, excess, SETTLING * low_mm))
     level = -excess
@@ -174,7 +198,7 @@ def _level(lumen: Surface, height_mm: Floats, low_mm: float) -> Floats:
 
 
 def _near_border(lumen: Surface, excess: Floats, reach_mm: float) -> Bools:
-    """Tell the vertices (n,) that lie within `reach_mm` of where the excess (n,) changes sign."""
+    """Return whether each vertex (n,) is within `reach_mm` of where the excess (n,) changes sign."""
     is_above = excess[lumen.faces] > 0
     crossed = is_above.any(axis=1) & ~is_above.all(axis=1)
     border = lumen.vertices_mm[np.unique(lumen.faces[crossed])]
@@ -184,7 +208,7 @@ def _near_border(lumen: Surface, excess: Floats, reach_mm: float) -> Bools:
 
 
 def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge: Bulge) -> Artery:
-    """The arteries around a sac: the parent, the branches that pass under it too, and those elsewhere or from it."""
+    """Return the arteries around a sac: the parent artery, branches that pass under the sac, and all other branches."""
     landings, proper = [landing], []
     foot = cKDTree(bulge.foot_mm)
     for line in lines:
@@ -207,16 +231,14 @@ def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge
 
 
 def _runs(member: Bools) -> list[slice]:
-    """Stretches of two members (n,) or more in a row."""
+    """Return the slices of consecutive members (n,), each with at least two."""
     change = np.flatnonzero(np.diff(np.concatenate([[False], member, [False]]).astype(int)))
     return [slice(first, last) for first, last in change.reshape(-1, 2) if last - first > 1]
 
 
 def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) -> Landing | None:
-    """The landing surface from a branch into the parent artery under a sac, as far as the branch is none of the sac's.
-
-    The wall between two branches, where a sac at their fork sits, is that of the way from one into the other.
-    """
+    """Return the landing surface from a branch into the parent artery, up to where it becomes the sac's wall."""
+    # A sac at a fork sits on the wall between two branches, which is the wall of the path from one into the other.
     course = _into_parent(landing, line, bulge)
     if course is None:
         return None
@@ -231,7 +253,7 @@ def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) ->
 
 
 def _into_parent(landing: Landing, line: Centerline, bulge: Bulge) -> Centerline | None:
-    """The way from a branch into the parent artery: to where the sac is, unless that turns back; None for none."""
+    """Return the path from a branch into the parent artery, towards the sac unless that turns back; else None."""
     depth = landing.solid.signed_distance(line.points_mm)
     inside = np.flatnonzero(depth < -0.5 * line.inscribed_radius_mm)
     if not len(inside):
@@ -258,18 +280,17 @@ def _into_parent(landing: Landing, line: Centerline, bulge: Bulge) -> Centerline
 
 
 def _evenly(points_mm: Floats, radius_mm: Floats) -> Centerline:
-    """A centerline through points (n, 3) with radii (n,), its own points evenly spaced."""
+    """Return a centerline with evenly spaced points through points (n, 3) with radii (n,)."""
     even = curves.resample(points_mm, COURSE_STEP_MM)
     share = np.linspace(0.0, curves.arc_length(points_mm)[-1], len(even))
     return Centerline(even, np.interp(share, curves.arc_length(points_mm), radius_mm))
 
 
 def _neck(artery: Artery, rim_mm: Floats) -> Surface:
-    """The arteries' wall inside a closed curve (k, 3) on it: rings from the curve to its middle.
-
-    The outermost ring is the curve itself, so that the sac closes without a gap; where it lies off the landing surface
-    the rings do as a membrane would. The curve runs with the sac's wall, so the faces along it look into the sac.
-    """
+    """Return the arteries' wall inside a closed curve (k, 3), meshed in rings from the curve to its middle."""
+    # The outermost ring is the curve itself, so that the sac closes without a gap. Where the curve is off the landing
+    # surface, the rings follow it as a membrane would. The curve has the direction of the sac's rim, so the normals of
+    # these faces point into the sac.
     landing = artery.landings[0]
     grid = landing.grid_of(rim_mm)
     grid[:, 1] = np.unwrap(grid[:, 1], period=landing.n_rays)
@@ -277,7 +298,7 @@ def _neck(artery: Artery, rim_mm: Floats) -> Surface:
     lift = np.fft.rfft(rim_mm - landing.at_grid(grid), axis=0)
     wave = np.arange(len(lift))[:, None]
     share = np.linspace(1.0, 0.0, N_RINGS + 1)
-    # A harmonic function on a disc: waves around its rim decay inwards with the power of their number.
+    # The amplitude of wave number m of a harmonic function on a disc falls inwards as the radius to the power m.
     rings = [
         landing.at_grid(middle + f * (grid - middle)) + np.fft.irfft(f**wave * lift, n=len(grid), axis=0) for f in share
     ]
@@ -295,10 +316,11 @@ def _neck(artery: Artery, rim_mm: Floats) -> Surface:
 
 
 def _closed_sac(flank: Flank, other_loops: list[Ints], rings: Floats, neck: Surface) -> Surface:
-    """The sac's wall, its branches' mouths, its continuation to the artery and its neck as one closed surface."""
+    """Return the closed surface of a sac: its wall, the caps of its branches, its continuation and its neck."""
     points, wall = triangles.cap(flank.vertices_mm, flank.faces, other_loops)
     n_below, k = len(rings) - 1, len(flank.rim)
-    # The skirt's first ring is the rim, the neck's first ring is the skirt's last: those vertices are shared.
+    # The first ring of the skirt is the rim, and its last ring is the first ring of the neck: these vertices are
+    # shared.
     number = np.concatenate([flank.rim, len(points) + np.arange(n_below * k)]).reshape(-1, k)
     strips = [_strip(number[i], number[i + 1]) for i in range(n_below)]
     first = len(points) + n_below * k
@@ -308,6 +330,6 @@ def _closed_sac(flank: Flank, other_loops: list[Ints], rings: Floats, neck: Surf
 
 
 def _strip(upper: Ints, lower: Ints) -> Ints:
-    """Triangles between two rings of vertices (k,), seen from outside; the rings run with the wall above them."""
+    """Return outward triangles between two rings of vertices (k,) that run in the direction of the wall above them."""
     ahead_up, ahead_low = np.roll(upper, -1), np.roll(lower, -1)
     return np.concatenate([np.stack([ahead_up, upper, lower], 1), np.stack([ahead_up, lower, ahead_low], 1)])

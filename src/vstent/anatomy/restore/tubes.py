@@ -1,4 +1,4 @@
-"""Tubes: the vessel as it would be around its centerlines alone, without any sac."""
+"""Tubes around centerlines: the vessel as it would be without any sac."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,32 +12,42 @@ from vstent.geometry.vessel import Centerline
 from vstent.kernels.arrays import Floats, Ints, freeze
 
 N_CLASSES: Final = 16
-"""Classes of spheres of about the same radius."""
+"""Number of groups of spheres with similar radius."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tubes:
-    """A union of spheres along centerlines."""
+    """Union of spheres along centerlines."""
 
     centers_mm: Floats
     """(n, 3) centerline points."""
     radius_mm: Floats
-    """(n,) inscribed radius, no more than the parent artery's there."""
+    """(n,) inscribed radius, limited by the radius of the parent artery there."""
 
     def __post_init__(self) -> None:
         freeze(self, "centers_mm", np.float64, (-1, 3))
         freeze(self, "radius_mm", np.float64, (len(self.centers_mm),))
 
     def height_mm(self, points_mm: Floats) -> tuple[Floats, Ints]:
-        """Return the distance (n,) of points (n, 3) to the tubes' wall, negative inside, and each one's sphere (n,)."""
+        """Return the height of points above the wall of the tubes.
+
+        Parameters
+        ----------
+        points_mm : (n, 3) points in mm.
+
+        Returns
+        -------
+        height : (n,) distance to the wall of the tubes in mm, negative inside; inf without tubes.
+        sphere : (n,) index of the sphere with the nearest wall.
+        """
         if not len(self.centers_mm):
             return np.full(len(points_mm), np.inf), np.zeros(len(points_mm), dtype=np.int32)
         distance, nearest = cKDTree(self.centers_mm).query(points_mm)
         sphere = np.array(nearest, dtype=np.int32)
         own_mm = self.radius_mm[sphere]
         height = np.asarray(distance - own_mm)
-        # Sorting spheres by radius into a few classes makes the nearest wall a nearest-centre query per class, and only
-        # a sphere wider than the one about the nearest centre can have a nearer wall.
+        # Within a group of spheres of similar radius, the nearest wall is that of the sphere with the nearest center.
+        # Across groups, only a sphere wider than the one at the nearest center can have a nearer wall.
         for members in np.array_split(np.argsort(-self.radius_mm), min(N_CLASSES, len(self.radius_mm))):
             widest = float(self.radius_mm[members[0]])
             open_ = np.flatnonzero(own_mm < widest)
@@ -55,7 +65,7 @@ class Tubes:
 
 
 def tubes_of(centerlines: Sequence[Centerline]) -> Tubes:
-    """Tubes around centerlines with the radius of the parent artery."""
+    """Return the tubes around centerlines, with the radius of the parent artery."""
     if not centerlines:
         return Tubes(np.zeros((0, 3)), np.zeros(0))
     radius = [
