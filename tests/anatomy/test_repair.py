@@ -178,7 +178,10 @@ def test_the_piece_at_a_point_is_kept_however_small_but_for_debris():
     debris = with_faces(both, CUBE_FACES + len(both.vertices_mm), 0.1 * CUBE + [24.0, 0, 3.0])
     surface, notes = repair(debris, at_mm=np.array([23.9, 0, 3.0]))
     np.testing.assert_allclose(surface.vertices_mm, other.vertices_mm, atol=1e-9)
-    assert f"2 loose pieces removed (20.0% of the area kept), the largest of them {SOUND.area_mm2:.1f} mm2 about" in notes[0]
+    assert (
+        f"2 loose pieces removed (20.0% of the area kept), the largest of them {SOUND.area_mm2:.1f} mm2 about"
+        in notes[0]
+    )
 
 
 def test_two_cubes_that_kiss_along_an_edge_part():

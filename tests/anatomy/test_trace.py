@@ -197,7 +197,9 @@ def test_a_thin_branch_with_a_coarse_cap_is_opened() -> None:
 
 
 def test_a_sphere_has_no_way_in() -> None:
-    with pytest.raises(VesselError, match=r"near .* has \d openings.*may be bone: choose a point in the artery \(--at\)"):
+    with pytest.raises(
+        VesselError, match=r"near .* has \d openings.*may be bone: choose a point in the artery \(--at\)"
+    ):
         open_ends(Vessel(sphere(3.0)))
 
 
@@ -229,7 +231,9 @@ def test_an_outlet_nearly_as_wide_as_the_inlet_is_told_once_with_both_places(
     vessel = trace(untraced)
     told = [note for note in vessel.notes if "because it is the widest opening" in note]
     assert len(told) == is_told
-    assert not any("because it is the widest opening" in note for note in trace(untraced, inlet_mm=vessel.inlet.center_mm).notes)
+    assert not any(
+        "because it is the widest opening" in note for note in trace(untraced, inlet_mm=vessel.inlet.center_mm).notes
+    )
     for note in told:
         places = [[float(x) for x in place.split(")")[0].split(",")] for place in note.split("(")[1:]]
         np.testing.assert_allclose(places, [vessel.inlet.center_mm, vessel.outlets[0].center_mm], atol=0.05)

@@ -479,7 +479,9 @@ def test_what_leaves_the_artery_wherever_it_is_moved_to_is_refused_after_some_tr
 @pytest.mark.parametrize(("off_mm", "told"), [(0.001, "0.1"), (0.09, "0.1"), (0.11, "0.2"), (3.0, "3.0")])
 def test_what_is_missing_is_rounded_up_and_moving_by_it_and_a_little_is_enough(off_mm, told):
     for rows_mm, sense in ((np.array([10.0, 32 + off_mm]), -1), (np.array([-off_mm, 10.0]), 1)):
-        with pytest.raises(LandingError, match=f"extends {told} mm beyond .* at least {told} mm (dis|proxim)ally") as refused:
+        with pytest.raises(
+            LandingError, match=f"extends {told} mm beyond .* at least {told} mm (dis|proxim)ally"
+        ) as refused:
             check_inside(SILK, SILK_SIZE, rows_mm, 32.0)
         check_inside(SILK, SILK_SIZE, rows_mm + refused.value.move_mm, 32.0)
         assert refused.value.move_mm == pytest.approx(sense * (off_mm + SPARE_MM))
@@ -508,7 +510,9 @@ def test_in_a_short_artery_a_narrower_size_is_proposed_before_none():
 
 
 def test_no_size_fits_a_stump():
-    with pytest.raises(LandingError, match=r"No size of Silk up to 4\.5 mm in diameter fits: the shortest would be 1\d\."):
+    with pytest.raises(
+        LandingError, match=r"No size of Silk up to 4\.5 mm in diameter fits: the shortest would be 1\d\."
+    ):
         propose_size(SILK, tube(line(10), 1.9))
 
 
@@ -516,7 +520,9 @@ def test_a_size_too_wide_for_the_artery_is_not_said_to_be_too_long_for_it():
     wide = device.Size(4.0, 8.0, 4.2)
     design = replace(SILK, sizes=(device.Size(3.0, 25.0, 3.2), device.Size(3.5, 25.0, 3.7), wide))
     anatomy = with_neck(tube(line(20), 1.45), 8.0, 12.0)
-    with pytest.raises(LandingError, match=r"up to 3\.5 mm in diameter fits: the shortest would be [2-4]\d\.\d mm long"):
+    with pytest.raises(
+        LandingError, match=r"up to 3\.5 mm in diameter fits: the shortest would be [2-4]\d\.\d mm long"
+    ):
         propose_size(design, anatomy)
     assert deploy(design, anatomy, size=wide).stent.deployed_length_mm < 20
 
@@ -542,7 +548,9 @@ def test_a_device_that_misses_the_neck_or_hardly_passes_it_says_by_how_much(cent
 def test_a_device_too_short_for_the_neck_asks_for_a_longer_one_where_that_helps():
     wide_neck = with_neck(tube(line(60), 1.9), 20.0, 36.0)
     advice = deploy(SILK, wide_neck, size=SILK_SIZE).advice
-    assert re.search(r"only 1\.0 mm beyond the \w+ end of the neck \(choose a longer size\); 100% of it is apposed", advice)
+    assert re.search(
+        r"only 1\.0 mm beyond the \w+ end of the neck \(choose a longer size\); 100% of it is apposed", advice
+    )
     at_the_end = with_neck(tube(line(60), 1.9), 0.0, 5.0)
     assert ", 0.5 mm short of the proximal end of the neck; 100%" in deploy(SILK, at_the_end, size=SILK_SIZE).advice
 
@@ -565,7 +573,9 @@ def test_of_a_device_that_is_as_it_should_be_no_more_is_said(anatomy):
 
 def test_of_a_device_wholly_over_restored_wall_nothing_is_said_of_gaps():
     restored = replace(straight(), is_restored=np.ones(len(straight().landing_surface.vertices_mm), dtype=bool))
-    assert deploy(SILK, restored, size=SILK_SIZE).advice.endswith("(deployed length 18.0 mm). All of it is over restored wall.")
+    assert deploy(SILK, restored, size=SILK_SIZE).advice.endswith(
+        "(deployed length 18.0 mm). All of it is over restored wall."
+    )
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ import numpy as np
 from vstent.deployment import sizing, wires
 from vstent.deployment.advice import Gaps, advise
 from vstent.deployment.braid import ConstantWire
+from vstent.deployment.evenly_spaced import Zhong2016
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, laid_inside, run
 from vstent.deployment.wall import landing_wall
-from vstent.deployment.zhong2016 import Zhong2016
 from vstent.devices.design import Design, Size
 from vstent.devices.formulas import compacted
 from vstent.devices.stent import Deployment, Landing, Stent
