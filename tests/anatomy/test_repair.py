@@ -157,8 +157,8 @@ def test_loose_piece_is_dropped_and_its_size_told():
     surface, notes = repair(with_faces(SOUND, other.faces + len(SOUND.vertices_mm), other.vertices_mm))
     np.testing.assert_array_equal(surface.faces, SOUND.faces)
     assert notes == (
-        f"1 loose piece removed (80.0% of the area kept), the largest of them {other.area_mm2:.1f} mm2 about (20.0, 9.0, "
-        "3.8) mm; choose another piece by a point near it (--at).",
+        f"1 loose piece removed (80.0% of the area kept), the largest of them {other.area_mm2:.1f} mm2 about "
+        "(20.0, 9.0, 3.8) mm; choose another piece by a point near it (--at).",
     )
 
 

@@ -242,9 +242,7 @@ def test_a_vessel_beside_a_far_larger_bone_is_found_at_a_point():
 def test_a_point_far_from_any_vessel_is_refused(two_vessels):
     image, in_thin = two_vessels
     for away in ([0, 0, 40.0], [500.0, 0, 0]):
-        with pytest.raises(
-            VesselError, match=r"no lumen within 5 mm .* than threshold \d+\. Check the point, .* LPS mm"
-        ):
+        with pytest.raises(VesselError, match=r"no lumen within 5 mm .* than threshold \d+\. Check the point, .* LPS"):
             segment(image, at_mm=in_thin + np.array(away))
 
 
@@ -265,9 +263,7 @@ def test_a_threshold_above_everything_is_refused(demo):
 def test_a_threshold_below_everything_is_refused(demo, below):
     _, image, _ = demo
     low, high = image.voxels.min(), image.voxels.max()
-    with pytest.raises(
-        VesselError, match=rf"No voxel is below threshold .* \(intensities range from {low} to {high}\)"
-    ):
+    with pytest.raises(VesselError, match=rf"No voxel is below threshold .* range from {low} to {high}\)"):
         segment(image, threshold=low - below)
 
 

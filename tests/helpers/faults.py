@@ -640,9 +640,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(OPTION, "inflow below zero", run("--flow-rate", "-3"), INPUT, "not above zero"),
     Fault(OPTION, "point of two numbers", run("--at", "1,2"), INPUT, "2 numbers, not 3"),
     Fault(OPTION, "an inlet given twice", run("--inlet", "0,0,0", "--inlet", "0,1,0"), INPUT, "the same opening"),
-    Fault(
-        OPTION, "inlets wherever there is an opening", run(*inlets_all_over()), INPUT, "inlets and none is an outlet"
-    ),
+    Fault(OPTION, "inlets wherever there is an opening", run(*inlets_all_over()), INPUT, "none is an outlet"),
     Fault(OPTION, "device that does not exist", run("--device", "slik"), INPUT, "Did you mean silk"),
     Fault(OPTION, "size that is not made", run("--diameter", "17"), INPUT, "is not made in"),
     Fault(OPTION, "device beyond the artery", run("--center", "900"), INPUT, "is not on the parent artery"),

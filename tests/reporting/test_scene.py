@@ -91,9 +91,7 @@ def test_scales_of_the_flow_are_as_wide_as_what_is_about_the_sac_before():
 
 def test_pictures_of_the_flow_say_what_is_done_with_what_is_above_their_scale():
     words = {picture.id: picture.caption for picture in pictures(report_case.scene())}
-    assert all(
-        "What is above the scale is drawn in its last colour." in words[name] for name in ("streamlines", "shear")
-    )
+    assert all("Values above the scale have its last color." in words[name] for name in ("streamlines", "shear"))
 
 
 @pytest.mark.parametrize(("value", "expected"), [(0.97, 1), (1.0, 1), (1.2, 1.5), (0.041, 0.05), (7.1, 8), (83, 100)])

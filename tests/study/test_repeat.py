@@ -135,11 +135,11 @@ def test_settings_come_back_from_json_to_the_last_bit(tmp_path):
     [
         (
             11.0,
-            "1 of 2 metrics differ, stents.silk.b_mm most (relative difference 0.091, more than the 0.001 that another",
+            "1 of 2 metrics differ, stents.silk.b_mm most (relative difference 0.091, more than the 0.001",
         ),
         (
             10.005,
-            "1 of 2 metrics differ, stents.silk.b_mm most (relative difference 0.0005, within the 0.001 that another",
+            "1 of 2 metrics differ, stents.silk.b_mm most (relative difference 0.0005, within the 0.001",
         ),
         (10.0 + 1e-12, "The metrics agree except for rounding."),
         (10.0, "The metrics are identical to the last bit."),

@@ -1,4 +1,4 @@
-"""The embedded engine against OpenFOAM, bare, on the demo and on a real carotid; `docs/validation/openfoam.rst` keeps the table."""
+"""The embedded engine against OpenFOAM, bare, on the demo and on a real carotid (`docs/validation/openfoam.rst`)."""
 
 import os
 import resource
