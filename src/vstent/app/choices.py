@@ -1,4 +1,4 @@
-"""The user's choices: as the page and the REST interface state them, and as settings of a study."""
+"""The user's choices as the page and the REST interface state them, and their conversion to settings of a study."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -12,11 +12,15 @@ if (
     from vstent.study.types import Placing, Settings
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
+"""A coordinate or position in mm."""
 Length = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
+"""A length in mm."""
 Count = Annotated[int, Field(gt=0, le=100_000)]
+"""A number of voxels."""
 NECK_HANDLES: Final = 12
 """Number of evenly spaced handles on a neck."""
 Point = tuple[Coordinate, Coordinate, Coordinate]
+"""A point in LPS mm."""
 
 
 class Strict(BaseModel):
@@ -83,6 +87,7 @@ class Choices(Strict):
     @field_validator("devices")
     @classmethod
     def _each_once(cls, devices: tuple[DeviceChoice, ...]) -> tuple[DeviceChoice, ...]:
+        """Return the devices; ValueError is raised where one is chosen twice."""
         if len({device.name for device in devices}) < len(devices):
             raise ValueError("a device can be chosen only once")
         return devices
