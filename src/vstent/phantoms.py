@@ -218,7 +218,14 @@ def tube_implicit_mm(tube: Centerline, points_mm: Floats, *, begins_inside: bool
 
 
 def tube(*, length_mm: float = 20.0, radius_mm: float = 2.0, end_radius_mm: float | None = None) -> Phantom:
-    """Return a straight tube along z; its radius changes linearly where `end_radius_mm` is given."""
+    """Return a straight tube along z.
+
+    Parameters
+    ----------
+    length_mm : its length.
+    radius_mm : its radius, at the inlet if it is tapered.
+    end_radius_mm : radius at the outlet of a linearly tapered tube; None: not tapered.
+    """
     z = np.linspace(0.0, length_mm, int(length_mm / AXIS_STEP_MM) + 1)
     points = np.stack([np.zeros_like(z), np.zeros_like(z), z], axis=-1)
     end = radius_mm if end_radius_mm is None else end_radius_mm
@@ -226,14 +233,26 @@ def tube(*, length_mm: float = 20.0, radius_mm: float = 2.0, end_radius_mm: floa
 
 
 def torus_arc(*, bend_radius_mm: float = 8.0, angle_rad: float = np.pi, radius_mm: float = 2.0) -> Phantom:
-    """Return part of a torus around the y axis: an artery of constant curvature."""
+    """Return part of a torus around the y axis: an artery of constant curvature.
+
+    Parameters
+    ----------
+    bend_radius_mm : radius of the axis.
+    angle_rad : angle of the bend.
+    radius_mm : radius of the artery.
+    """
     angle = np.linspace(0.0, angle_rad, int(bend_radius_mm * angle_rad / AXIS_STEP_MM) + 1)
     points = bend_radius_mm * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=-1)
     return Phantom("torus arc", Centerline(points, np.full(len(angle), radius_mm)))
 
 
 def siphon(*, inlet_radius_mm: float = 2.1, outlet_radius_mm: float = 1.8) -> Phantom:
-    """Return a curved internal carotid artery: up, forward, back over itself and up again (a C-shaped siphon)."""
+    """Return a curved internal carotid artery: up, forward, back over itself and up again (a C-shaped siphon).
+
+    Parameters
+    ----------
+    inlet_radius_mm, outlet_radius_mm : radii at the ends; the radius changes linearly along the axis.
+    """
     knots = [
         (0.0, 5.0, 0.0), (0.0, 5.0, 4.0), (0.0, 4.6, 8.0), (0.2, 1.5, 11.6), (0.8, -3.2, 12.6), (1.4, -7.2, 14.0),
         (1.8, -8.6, 17.6), (1.6, -6.0, 20.8), (0.8, -1.8, 22.0), (0.0, 1.2, 24.4), (-0.2, 1.8, 28.0), (-0.2, 1.8, 32.0),
@@ -243,7 +262,14 @@ def siphon(*, inlet_radius_mm: float = 2.1, outlet_radius_mm: float = 1.8) -> Ph
 
 
 def bifurcation(*, radius_mm: float = 1.75, daughter_radius_mm: float = 1.5, half_angle_rad: float = 0.9) -> Phantom:
-    """Return a bifurcation in the x-z plane: an artery along z with two daughters of bend radius 5 mm."""
+    """Return a bifurcation in the x-z plane: an artery along z with two daughters of bend radius 5 mm.
+
+    Parameters
+    ----------
+    radius_mm : radius of the parent artery.
+    daughter_radius_mm : radius of both daughters.
+    half_angle_rad : angle between each daughter and the z axis.
+    """
     trunk_mm, bend_mm, leg_mm = 10.0, 5.0 * half_angle_rad, 9.0
     abscissa = np.linspace(0.0, trunk_mm + bend_mm + leg_mm, int((trunk_mm + bend_mm + leg_mm) / AXIS_STEP_MM) + 1)
     turned = np.clip((abscissa - trunk_mm) / bend_mm, 0.0, 1.0)
@@ -352,7 +378,18 @@ def spline(knots_mm: Floats, *, vertical_ends: bool = False) -> Floats:
 
 
 def outer_side(axis: Centerline, i: int) -> Floats:
-    """Return the unit vector (3,) away from the center of curvature at axis point `i`; any normal if straight."""
+    """Return the direction away from the center of curvature of an axis.
+
+    Parameters
+    ----------
+    axis : the axis.
+    i : index of the point.
+
+    Returns
+    -------
+    Floats
+        (3,) unit vector; any vector perpendicular to a straight axis.
+    """
     span = max(1, min(25, i, len(axis.points_mm) - 1 - i))
     bend = axis.points_mm[i - span] - 2 * axis.points_mm[i] + axis.points_mm[i + span]
     length = float(np.linalg.norm(bend))

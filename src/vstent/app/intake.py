@@ -34,6 +34,7 @@ _TOO_MUCH: Final = (
     f"The archive holds more than {UNPACKED_LIMIT >> 30} GB or {MOST_FILES} files, which is too much. Drop a "
     "smaller one."
 )
+"""Message for an archive that is too large."""
 
 
 def checked_name(name: str) -> str:

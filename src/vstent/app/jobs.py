@@ -118,7 +118,7 @@ class Job:
         self._thread.join(5.0)
 
     def abandon(self) -> None:
-        """Stop because the server ends; the stored state says that the job is to be resumed."""
+        """Stop because the server ends; the stored state still names the job, so that it is resumed."""
         self.case = _Deaf(self.case)  # type: ignore[assignment]
         self._kill()
 

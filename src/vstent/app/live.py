@@ -94,12 +94,12 @@ class Live:
 
     @property
     def anatomy(self) -> Anatomy:
-        """The last anatomy found.
+        """Last anatomy found.
 
         Raises
         ------
         ReadError
-            No anatomy was found yet.
+            There is no anatomy yet.
         """
         key = self.case.state.anatomy
         path = self.case.folder / CACHE / f"anatomy-{key}.npz"
@@ -131,7 +131,13 @@ class Live:
         return self.remembered(key, find)
 
     def sketch(self, choice: DeviceChoice, landing: Landing | None) -> Sketch:
-        """Return the expected position of a device; without a given or chosen position, the proposed one."""
+        """Return the expected position of a device.
+
+        Parameters
+        ----------
+        choice : the device.
+        landing : its position; None: the chosen position, or the proposed one where none is chosen.
+        """
         with LOCK:
             wall = self.bed(choice)
             if landing is None and choice.center_mm is not None:
@@ -213,7 +219,13 @@ class Live:
             return message([wires], scales_of([wires], self.anatomy), **_place(found, found.stent))
 
     def deployment_message(self, choice: DeviceChoice, colour: Colour) -> bytes:
-        """Return a deployed device with its expansion and its metrics."""
+        """Return a deployed device with its expansion and its metrics, as a message for the page.
+
+        Parameters
+        ----------
+        choice : the device.
+        colour : quantity that colors the wires.
+        """
         with LOCK:
             deployment = self.deployment(choice)
             stent, gap_mm = deployment.stent, deployment.wall_gap_mm

@@ -63,7 +63,13 @@ def positive(text: str) -> float:
 
 
 def within(low: float, high: float, remark: str) -> Callable[[str], float]:
-    """Return a reader of numbers within a range; `remark` names the unit and a conversion into it."""
+    """Return a function that reads a number and rejects it outside a range.
+
+    Parameters
+    ----------
+    low, high : ends of the range.
+    remark : unit and an example of a conversion into it, for the error message.
+    """
 
     def read(text: str) -> float:
         value = number(text)

@@ -72,7 +72,13 @@ def run_cohort(tasks: Sequence[Task], out: Path, crew: AbstractCrew, progress: P
 
 
 def collect(cases: Sequence[Case], out: Path) -> list[Row]:
-    """Return the rows that exist, in the order of cases and devices."""
+    """Return the rows that exist, in the order of cases and devices.
+
+    Parameters
+    ----------
+    cases : cases of the cohort.
+    out : output folder of the cohort.
+    """
     rows = [read_row(_folder(case, out), device, key) for case in cases for device, key in case.keys.items()]
     return [row for row in rows if row is not None]
 

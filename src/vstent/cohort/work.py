@@ -126,7 +126,13 @@ def _failure(task: Task, do: Callable[[Progress], object]) -> Row:
 
 
 def flat_metrics(metrics: Mapping[str, Any], device: str) -> Row:
-    """Return all metrics of a study that concern one device, under dotted keys."""
+    """Return all metrics of a study that concern one device, under dotted keys.
+
+    Parameters
+    ----------
+    metrics : metrics of the study.
+    device : name of the device.
+    """
     parts = {"vessel": metrics["vessel"], "bare": metrics.get("bare", {})} | dict(metrics["stents"][device])
     return _flat(parts, "")
 
@@ -140,14 +146,28 @@ def _flat(values: Mapping[str, Any], before: str) -> Row:
 
 
 def write_row(task: Task, device: str, row: Row) -> None:
-    """Write the row of a device with the key of everything it depends on."""
+    """Write the row of a device with the key of everything it depends on.
+
+    Parameters
+    ----------
+    task : task of the case.
+    device : name of the device.
+    row : values by column name.
+    """
     named = {"case": task.case.name, "device": device} | row
     kept = {"key": task.keys[device], "row": named, "settings": asdict(task.case.settings)}
     write_json(row_path(task.folder, device), kept)
 
 
 def read_row(folder: Path, device: str, key: str) -> Row | None:
-    """Return the row of a device; None where it is missing, damaged, or has another key."""
+    """Return the row of a device; None where it is missing, damaged, or has another key.
+
+    Parameters
+    ----------
+    folder : folder of the case.
+    device : name of the device.
+    key : key of everything that the row depends on.
+    """
     try:
         kept = json.loads(row_path(folder, device).read_text(encoding="utf-8"))
         return dict(kept["row"]) if kept["key"] == key else None

@@ -35,6 +35,7 @@ class _Slice:
     dataset: Any
     """Header of the file, without pixels until they are needed."""
     path: Path
+    """The file."""
     frame: int | None
     """Index of the frame of a multi-frame file; None for a single-frame file."""
     position_mm: Floats

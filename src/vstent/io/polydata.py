@@ -34,7 +34,13 @@ def cells_of(cells: Ints) -> Any:
 
 
 def ragged_cells(connectivity: Ints, starts: Ints) -> Any:
-    """Return cells as vtkCellArray; cell c has the points connectivity[starts[c]:starts[c + 1]]."""
+    """Return cells with different numbers of points as vtkCellArray.
+
+    Parameters
+    ----------
+    connectivity : point numbers of all cells, one cell after another.
+    starts : (m + 1,) index of the first point number of every cell, and the length of `connectivity`.
+    """
     from vtkmodules.util.numpy_support import numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonDataModel import vtkCellArray
 

@@ -53,9 +53,15 @@ def read_columns(path: Path, count: int) -> Floats:
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of named values as CSV, with one column per name in the order of first use; missing values are empty.
+    """Write rows of named values as CSV.
 
-    Floats have seven digits; booleans are ``true`` and ``false``.
+    There is one column per name in the order of first use. Missing values are empty, floats have seven digits, and
+    booleans are ``true`` and ``false``.
+
+    Parameters
+    ----------
+    path : the file.
+    rows : values by column name.
     """
     names = columns_of(rows)
     text = io.StringIO()
@@ -71,7 +77,18 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Write rows of named values as Parquet; return False and write nothing where pyarrow is not installed."""
+    """Write rows of named values as Parquet.
+
+    Parameters
+    ----------
+    path : the file.
+    rows : values by column name.
+
+    Returns
+    -------
+    bool
+        False where pyarrow is not installed; nothing is written then.
+    """
     try:
         from pyarrow import parquet, table
     except ImportError:

@@ -67,7 +67,13 @@ def write_lines(
 
 
 def write_centerlines(path: Path, centerlines: Sequence[Centerline]) -> None:
-    """Write centerlines as VTP under the array names of VMTK."""
+    """Write centerlines as VTP with the array names of VMTK.
+
+    Parameters
+    ----------
+    path : the file.
+    centerlines : points in mm, inscribed radii and frames.
+    """
     lengths = [len(line.points_mm) for line in centerlines]
     frames = np.concatenate([line.frames for line in centerlines])
     write_lines(

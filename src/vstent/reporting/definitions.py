@@ -17,6 +17,7 @@ class Definition(NamedTuple):
 _DHAR: Final = "Dhar et al. 2008, Neurosurgery 63:185"
 _RAGHAVAN: Final = "Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355"
 _PICCINELLI: Final = "Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141"
+"""Publications that define metrics."""
 
 DEFINITIONS: Final[dict[str, Definition]] = {
     # the artery and the sac

@@ -19,6 +19,7 @@ BACKGROUND = (0.965, 0.973, 0.978)
 """Background color: red, green and blue, 0 to 1."""
 _INK = "#16262e"
 _QUIET = "#54666f"
+"""Colors of the lettering."""
 _LIGHT = np.array([-0.35, 0.50, 0.79])
 """Direction to the light in view axes (right, up, toward the eye), not normalized."""
 _SUPERSAMPLING = 2
@@ -125,7 +126,15 @@ def _is_translucent(layer: MeshLayer | LineLayer) -> bool:
 
 
 def span_mm(view: View, size_px: tuple[int, int]) -> float:
-    """Return the length in mm that the width of a picture shows; the sphere of the view fits with a small margin."""
+    """Return the length in mm that the width of a picture shows.
+
+    The sphere of the view fits into the picture with a small margin.
+
+    Parameters
+    ----------
+    view : the view.
+    size_px : width and height of the picture in pixels.
+    """
     return 2.15 * view.radius_mm * max(1.0, size_px[0] / size_px[1])
 
 

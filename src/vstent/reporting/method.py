@@ -31,6 +31,7 @@ RINGS: Final = 28
 _SPHERE: Final = (0.36, 0.55, 0.72)
 _STEEL: Final = (0.58, 0.63, 0.68)
 _INK: Final = (0.10, 0.17, 0.20)
+"""Colors of spheres, contours and lines: red, green and blue, 0 to 1."""
 
 
 def method_pictures(case: "CaseResult", scene: Scene) -> list[Picture]:

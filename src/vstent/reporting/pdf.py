@@ -20,6 +20,7 @@ LEFT, RIGHT, TOP, FOOT = 0.75, 0.75, 0.85, 0.80
 WIDTH: Final = PAGE_IN[0] - LEFT - RIGHT
 """Width of the text in inches."""
 _INK, _QUIET, _ACCENT, _LINE, _WARN = "#16262e", "#54666f", "#0b6473", "#d7dfe3", "#8a4b08"
+"""Colors of text, secondary text, headings, rules and the statement at the foot."""
 _CHARACTER: Final = 0.53
 """Mean width of a character as a fraction of the font size, for line breaks."""
 BADGE: Final = "Research use only. Not a medical device."

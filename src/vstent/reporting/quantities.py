@@ -157,7 +157,13 @@ def split_unit(key: str) -> tuple[str, str]:
 
 
 def format_value(key: str, value: Any) -> str:
-    """Return a value with the unit of its key: ``0.412 mL/s``; several values are separated by commas."""
+    """Return a value with the unit of its key: ``0.412 mL/s``.
+
+    Parameters
+    ----------
+    key : key of the metric, which ends in its unit.
+    value : number, text, boolean or None; several values in a list are separated by commas.
+    """
     if isinstance(value, (list, tuple)):
         return ", ".join(format_value(key, one) for one in value) or "–"
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
@@ -183,7 +189,12 @@ def format_number(value: float) -> str:
 
 
 def format_change(before: Any, after: Any) -> str:
-    """Return a relative change in percent: ``−35 %``; a dash where it is undefined."""
+    """Return a relative change in percent, such as ``−35 %``; a dash where it is undefined.
+
+    Parameters
+    ----------
+    before, after : values without and with a device.
+    """
     numbers = all(isinstance(value, (int, float)) and math.isfinite(value) for value in (before, after))
     if not numbers or before == 0:
         return "–"
@@ -193,7 +204,13 @@ def format_change(before: Any, after: Any) -> str:
 
 
 def flatten(metrics: Any, path: tuple[str, ...] = ()) -> list[Quantity]:
-    """Return every value of nested metrics with its path, in order; lists of plain values are one value."""
+    """Return every value of nested metrics with its path, in order.
+
+    Parameters
+    ----------
+    metrics : nested mappings and lists; a list of plain values counts as one value.
+    path : keys that lead to `metrics`.
+    """
     if isinstance(metrics, dict):
         return [quantity for key, value in metrics.items() for quantity in flatten(value, (*path, str(key)))]
     if isinstance(metrics, (list, tuple)) and any(isinstance(value, dict) for value in metrics):

@@ -170,10 +170,12 @@ def device_title(deployment: Deployment) -> str:
 
 
 _PLAIN: dict[str, Any] = {"scale": "", "values": np.zeros(0)}
+"""Fields of a layer without values."""
 _WALL = (0.62, 0.68, 0.73)
 _SAC = (0.80, 0.42, 0.36)
 _INK = (0.10, 0.17, 0.20)
 _STEEL = (0.33, 0.38, 0.43)
+"""Colors of wall, sac, lines and devices: red, green and blue, 0 to 1."""
 
 
 def anatomy_layers(anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
@@ -211,7 +213,14 @@ def curves_layer(name: str, curves: list[Floats], radius_mm: float, colour: tupl
 
 
 def device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
-    """Return the contour of a device with its expansion over time, and its wires, for the pane `name`."""
+    """Return the contour of a device with its expansion over time, and its wires.
+
+    Parameters
+    ----------
+    name : pane that shows them.
+    deployment : the deployment.
+    anatomy : vessel, parent artery and sacs.
+    """
     frames_mm, gaps_mm = thin_frames(deployment, anatomy.landing_surface, n_frames=24)
     stent = deployment.stent
     points, starts, _ = thin_lines(stent.wire_points_mm, stent.wire_starts, np.zeros(0), 60_000)
@@ -233,7 +242,13 @@ def device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[M
 
 
 def coverage_layer(name: str, stent: Stent) -> MeshLayer:
-    """Return the contour of a device colored by the local metal coverage in percent, for the pane `name`."""
+    """Return the contour of a device colored by the local metal coverage in percent.
+
+    Parameters
+    ----------
+    name : pane that shows it.
+    stent : the deployed device.
+    """
     values = 100 * node_coverage(stent).ravel()
     return MeshLayer(id="coverage", pane=name, colour=_STEEL, scale="coverage", values=values, surface=stent.contour)
 
@@ -260,7 +275,14 @@ def node_coverage(stent: Stent) -> Floats:
 
 
 def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
-    """Return the wall colored by its shear stress, and the streamlines, for the pane `name`."""
+    """Return the wall colored by its shear stress, and the streamlines.
+
+    Parameters
+    ----------
+    name : pane that shows them.
+    field : the flow.
+    anatomy : vessel, parent artery and sacs.
+    """
     wall, origin = thin_surface(field.wall, 40_000)
     shear = MeshLayer(
         id="shear",
@@ -307,7 +329,12 @@ _OF_FLOW = ("speed", "shear")
 def scales_of(layers: Sequence[MeshLayer | LineLayer], anatomy: Anatomy) -> tuple[Scale, ...]:
     """Return the color scales in use, each wide enough for all layers that use it.
 
-    The range of a flow scale is set by the values near the sac without a device, which is the first layer.
+    The range of a flow scale is set by the values near the sac without a device.
+
+    Parameters
+    ----------
+    layers : all layers; the first one with a flow scale belongs to the flow without a device.
+    anatomy : vessel, parent artery and sacs.
     """
     scales = []
     for name, (title, unit, colour_map, least) in _SCALES.items():
@@ -344,7 +371,13 @@ def _colours(name: str) -> Floats:
 
 
 def views_of(anatomy: Anatomy, deployments: dict[str, Deployment]) -> tuple[View, ...]:
-    """Return the views of a case, the profile of the first sac first."""
+    """Return the views of a case, the profile of the first sac first.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployments by device name; the profile view encloses them.
+    """
     points = [deployment.stent.nodes_mm.reshape(-1, 3) for deployment in deployments.values()]
     points += [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
     treated = np.concatenate(points or [anatomy.axis.points_mm])

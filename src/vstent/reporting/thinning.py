@@ -60,7 +60,18 @@ def thin_lines(points: Floats, starts: Ints, values: Floats, n_points: int) -> t
 
 
 def some_frames(deployment: Deployment, n_frames: int) -> Ints:
-    """Return indices of at most `n_frames` contours of an expansion: the first, the last, and some between."""
+    """Return the indices of evenly spaced contours of an expansion, including the first and the last.
+
+    Parameters
+    ----------
+    deployment : the deployment with its history.
+    n_frames : largest number of contours.
+
+    Returns
+    -------
+    Ints
+        (f,) indices into the history.
+    """
     last = len(deployment.history_mm) - 1
     return np.unique(np.linspace(0, last, min(n_frames, last + 1)).astype(int))
 

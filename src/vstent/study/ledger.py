@@ -84,7 +84,14 @@ class Ledger:
         return result
 
     def hold(self, name: str, key: str, result: Any) -> None:
-        """Keep a result in memory until `settle` is called, because a later input may still prove unusable."""
+        """Keep a result in memory until `settle` is called, because a later input may still prove unusable.
+
+        Parameters
+        ----------
+        name : name of the result.
+        key : key of everything that it depends on.
+        result : a data class of vstent.
+        """
         self._held.append((name, key, result, self._seconds_since(name)))
 
     def is_held(self, name: str) -> bool:
@@ -98,7 +105,14 @@ class Ledger:
         self._held.clear()
 
     def keep(self, name: str, key: str, result: Any) -> None:
-        """Store a result under a key; older results of the same name are deleted."""
+        """Store a result under a key; older results of the same name are deleted.
+
+        Parameters
+        ----------
+        name : name of the result.
+        key : key of everything that it depends on.
+        result : a data class of vstent.
+        """
         self._write(name, key, result, self._seconds_since(name))
 
     def _seconds_since(self, name: str) -> dict[str, float]:
@@ -153,13 +167,25 @@ def hash_of(path: Path) -> str:
 
 
 def anatomy_key(source: str, settings: Settings) -> str:
-    """Return the key of the anatomy of an input; it does not depend on devices and flow."""
+    """Return the key of the anatomy of an input; it does not depend on devices and flow.
+
+    Parameters
+    ----------
+    source : SHA-256 of the input.
+    settings : settings of the study.
+    """
     geometry = replace(settings, devices=(), diameter_mm=None, length_mm=None, center_mm=None, flow=None, placings={})
     return key_of(source, replace(geometry, uncertainty=None, without_flow=()))
 
 
 def vessel_key(source: str, settings: Settings) -> str:
-    """Return the key of the vessel of an input; it does not depend on trimming and restoration."""
+    """Return the key of the vessel of an input; it does not depend on trimming and restoration.
+
+    Parameters
+    ----------
+    source : SHA-256 of the input.
+    settings : settings of the study.
+    """
     given = settings.units, settings.spacing_mm, settings.shape, settings.threshold, settings.at_mm, settings.inlet_mm
     later = [value for value in (settings.frame, settings.acquisition) if value is not None]
     return key_of(source, "vessel", given, *later)

@@ -110,7 +110,18 @@ def write_anatomy(out: Path, anatomy: Anatomy) -> None:
 
 
 def write_stent(folder: Path, deployment: Deployment) -> str:
-    """Write contour, wires and struts of a device, and return a sentence with their numbers."""
+    """Write contour, wires and struts of a device.
+
+    Parameters
+    ----------
+    folder : the folder to write.
+    deployment : the deployment.
+
+    Returns
+    -------
+    str
+        A sentence with the numbers of wires and triangles.
+    """
     stent = deployment.stent
     folder.mkdir(parents=True, exist_ok=True)
     writers.write_surface(folder / "contour.vtp", stent.contour, {"wall_gap_mm": deployment.wall_gap_mm.ravel()})
@@ -143,7 +154,12 @@ def write_field(folder: Path, field: FlowField) -> None:
 def write_ranking(out: Path, ranking: Ranking) -> None:
     """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``.
 
-    Rows of other devices are kept if they were ranked by the same criteria.
+    Stored rows of other devices are kept if they have the same criteria.
+
+    Parameters
+    ----------
+    out : the case folder.
+    ranking : the ranking.
     """
     criteria = [item.model_dump(exclude_none=True) for item in ranking.criteria.items]
     rows = _ranked([*ranking.rows(), *_former_rows(out / "ranking.json", ranking, criteria)])

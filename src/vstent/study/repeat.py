@@ -143,6 +143,10 @@ def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]
 def agreement(first: Path, second: Path) -> str:
     """Return a sentence on how well the metrics of two case folders agree.
 
+    Parameters
+    ----------
+    first, second : case folders.
+
     Raises
     ------
     ReadError

@@ -42,8 +42,9 @@ from vstent.study.types import Placing, Point, Settings
 from vstent.units import counted
 
 SLOWEST_M_S: Final = 0.01
+"""Smallest plausible mean speed at an inlet, in m/s; below it the inflow is taken to be in another unit."""
 FASTEST_M_S: Final = 2.0
-"""Range of plausible mean speeds at an inlet, in m/s; outside it the inflow is taken to be in another unit."""
+"""Largest plausible mean speed at an inlet, in m/s; above it the inflow is taken to be in another unit."""
 
 NEAR_MM: Final = 3.0
 """Largest distance from the vessel wall, in mm, at which another interpretation of a point is proposed."""
@@ -205,13 +206,26 @@ def deploy_all(
 
 
 def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
-    """Deploy a device in the given size and position; missing values are proposed."""
+    """Deploy a device in the given size and position; missing values are proposed.
+
+    Parameters
+    ----------
+    design : the device.
+    anatomy : vessel, parent artery and sacs.
+    placing : given size and position.
+    """
     landing = None if placing.center_mm is None else Landing(placing.center_mm)
     return deploy(design, anatomy, size=size_of(design, anatomy, placing), landing=landing)
 
 
 def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
     """Return the given size of a device; where diameter or length is missing, the best of the matching sizes.
+
+    Parameters
+    ----------
+    design : the device.
+    anatomy : vessel, parent artery and sacs.
+    placing : given size and position.
 
     Raises
     ------
@@ -227,7 +241,18 @@ def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
 
 
 def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
-    """Raise InputError for a mean inflow that no artery has, because it was probably given in another unit."""
+    """Refuse a mean inflow that no artery has, because it is probably in another unit.
+
+    Parameters
+    ----------
+    anatomy : vessel with its inlets.
+    flow : settings of the flow; None: no flow is computed.
+
+    Raises
+    ------
+    InputError
+        The mean speed at an inlet is implausible.
+    """
     if flow is None or flow.inflow_mL_s is None:
         return
     case = FlowCase(anatomy.vessel, settings=flow)
@@ -313,13 +338,29 @@ def compute_flows(
 
 
 def flow_key(source: str, settings: Settings, name: str, design: Design | None) -> str:
-    """Return the key of the flow called `name`: ``bare``, or that of a device of this design."""
+    """Return the key of one flow.
+
+    Parameters
+    ----------
+    source : SHA-256 of the input.
+    settings : settings of the study.
+    name : ``bare``, or the name of the device.
+    design : the device; None: no device.
+    """
     placed = (design, settings.placing(name)) if design else ()
     return key_of(anatomy_key(source, settings), settings.flow, name, *placed)
 
 
 def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Sensitivity:
-    """Compute the flow without a device on three grids, with three time steps and in three positions on the grid."""
+    """Compute the flow without a device on three grids, with three time steps and in three positions on the grid.
+
+    Parameters
+    ----------
+    out : the case folder.
+    anatomy : vessel, parent artery and sacs.
+    settings : settings of the study; the grid spacing is that of the finest grid.
+    ledger : record of the study.
+    """
     flow = settings.flow or FlowSettings()
     _plan(anatomy, {}, flow, ledger)
     with ledger.stage("convergence") as tell:
@@ -347,7 +388,21 @@ def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings,
 def vary_all(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
 ) -> dict[str, dict[str, Any]]:
-    """Return the uncertainty metrics of every deployment by device name; empty without an uncertainty study."""
+    """Vary the uncertain inputs of every deployment.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployments by device name.
+    settings : settings of the study.
+    ledger : record of the study.
+    source : SHA-256 of the input.
+
+    Returns
+    -------
+    dict
+        Uncertainty metrics by device name; empty without an uncertainty study.
+    """
     if settings.uncertainty is None:
         return {}
     flow = settings.flow if settings.uncertainty.flow_samples else None
@@ -376,7 +431,19 @@ def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
 def measure_all(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]
 ) -> dict[str, Any]:
-    """Return the metrics of the vessel, every deployment and every flow, with ratios to the flow without a device."""
+    """Return the metrics of the vessel, every deployment and every flow, with ratios to the flow without a device.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployments by device name.
+    fields : flows by name, ``bare`` first.
+
+    Returns
+    -------
+    dict
+        Nested metrics; the end of each key is its unit.
+    """
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
     shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
     flow = {name: indices(field, *shapes) for name, field in fields.items()}
