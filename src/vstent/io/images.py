@@ -92,7 +92,7 @@ def files_of(path: Path) -> list[Path]:
         return [path]
     if dicom.is_dicom(path):
         return dicom.series_of(path)
-    return [path, *(file for file in _voxel_files(path) if os.path.isfile(file))]  # a name may be too long
+    return [path, *(file for file in _voxel_files(path) if os.path.isfile(file))]  # accepts too long names
 
 
 APART: Final = {

@@ -192,7 +192,7 @@ def vessel_key(source: str, settings: Settings) -> str:
 
 
 def key_of(*parts: Any) -> str:
-    """Return a short digest of everything that a result depends on, including the version of vstent."""
+    """Return a short digest of everything that a result depends on, the version of its computation included."""
     plain = [_plain(part) if is_dataclass(part) and not isinstance(part, type) else part for part in parts]
     return hashlib.sha256(json.dumps([version("vstent"), plain], sort_keys=True).encode()).hexdigest()[:16]
 
