@@ -1,6 +1,6 @@
-"""vstent: virtual stenting of intracranial aneurysms, from a scan to a deployed device and the blood flow.
+"""Virtual stenting of intracranial aneurysms, from a scan to a deployed device and the blood flow.
 
-The functions are loaded when they are first used: importing vstent costs nothing.
+Each function is imported on first use, so that ``import vstent`` is fast.
 """
 
 from importlib import import_module
@@ -44,11 +44,13 @@ _HOMES = {
     "run": "vstent.study.pipeline",
     "report": "vstent.reporting.page",
 }
+"""Module that defines each public function."""
 
 __all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
+    """Import a public function on first use."""
     if name not in _HOMES:
         raise AttributeError(f"module 'vstent' has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)

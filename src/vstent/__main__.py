@@ -1,4 +1,4 @@
-"""``python -m vstent`` is the command line."""
+"""Run the command line with ``python -m vstent``."""
 
 import sys
 

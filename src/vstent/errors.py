@@ -1,6 +1,6 @@
 """Exceptions of vstent.
 
-Their tree::
+Class hierarchy::
 
     VstentError
     ├── InputError              an input or option cannot be used (exit code 2 at the command line)
@@ -42,7 +42,13 @@ class DeviceError(InputError):
 
 
 class LandingError(InputError):
-    """A landing zone that does not fit the artery."""
+    """A landing zone that does not fit the artery.
+
+    Parameters
+    ----------
+    sentence : the message.
+    move_mm : distance along the artery by which to move the device, positive distally; 0 where that does not help.
+    """
 
     def __init__(self, sentence: str, move_mm: float = 0.0) -> None:
         super().__init__(sentence)

@@ -1,7 +1,7 @@
-"""Phantoms: analytic vessels whose truth is known, as surfaces and as synthetic 3DRA scans.
+"""Analytic vessels with known dimensions, as surfaces and as synthetic 3DRA scans.
 
-A phantom is the union of round tubes about given axes and, maybe, an ellipsoidal sac. It is described by an implicit
-function that is negative in the lumen, so that a surface, a scan and the true volumes all come from one definition.
+A phantom is the union of round tubes around given axes and, optionally, an ellipsoidal sac. An implicit function,
+negative in the lumen, defines the surface, the scan and the true volumes.
 """
 
 from dataclasses import dataclass, replace
@@ -22,14 +22,15 @@ from vstent.kernels.clipping import clip
 from vstent.kernels.isosurface import isosurface
 
 AXIS_STEP_MM: Final = 0.04
+"""Distance between the points of an axis, in mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sac:
-    """An ellipsoid of revolution: the analytic aneurysm."""
+    """An ellipsoid of revolution that represents an aneurysm."""
 
     center_mm: Floats
-    """(3,) centre."""
+    """(3,) center."""
     direction: Floats
     """(3,) unit vector along the height, away from the parent artery."""
     width_radius_mm: float
@@ -43,13 +44,25 @@ class Sac:
 
     @property
     def reach_mm(self) -> float:
-        """The larger semi-axis."""
+        """Larger semi-axis."""
         return max(self.width_radius_mm, self.height_radius_mm)
 
     def implicit_mm(self, points_mm: Floats) -> tuple[Floats, Floats]:
-        """Signed distance (n,) of (n, 3) points, negative inside, and its unit gradient (n, 3).
+        """Return the signed distance to the ellipsoid and its unit gradient.
 
-        Exact on a sphere, first order at an ellipsoid: k0 (k0 - 1) / k1 with k0 = |x / r| and k1 = |x / r^2|.
+        The distance is exact for a sphere and first-order accurate near the wall of an ellipsoid: k0 (k0 - 1) / k1 with
+        k0 = abs(x / r) and k1 = abs(x / r^2).
+
+        Parameters
+        ----------
+        points_mm : (n, 3) points.
+
+        Returns
+        -------
+        distance_mm : Floats
+            (n,) signed distance, negative inside.
+        gradient : Floats
+            (n, 3) unit gradient.
         """
         local = points_mm - self.center_mm
         along = (local @ self.direction)[:, None] * self.direction
@@ -64,14 +77,14 @@ class Sac:
 
 @dataclass(frozen=True, eq=False)
 class Phantom:
-    """A vessel with its truth."""
+    """A vessel with known dimensions."""
 
     name: str
-    """What it is."""
+    """Name of the phantom."""
     parent: Centerline
     """The parent artery: its true axis and radius, from inlet to outlet."""
     branches: tuple[Centerline, ...] = ()
-    """Other tubes; the first point of each lies on the parent's axis, the last is an outlet."""
+    """Other tubes; the first point of each is on the parent's axis, the last is an outlet."""
     sac: Sac | None = None
     """The aneurysm."""
     blebs: tuple[Sac, ...] = ()
@@ -88,9 +101,20 @@ class Phantom:
         return (self.parent, *self.branches)
 
     def implicit_mm(self, points_mm: Floats) -> tuple[Floats, Floats]:
-        """Signed distance (n,) to the wall of the union, negative in the lumen, and its unit gradient (n, 3).
+        """Return the signed distance to the wall of the union and its unit gradient.
 
-        Tubes are continued past their ends, but not past one that lies in the parent artery.
+        Tubes are extended straight beyond their ends, except at an end inside the parent artery.
+
+        Parameters
+        ----------
+        points_mm : (n, 3) points.
+
+        Returns
+        -------
+        distance_mm : Floats
+            (n,) signed distance, negative in the lumen.
+        gradient : Floats
+            (n, 3) unit gradient.
         """
         value, gradient = tube_implicit_mm(self.parent, points_mm)
         parts = [tube_implicit_mm(branch, points_mm, begins_inside=self._feeds(branch)) for branch in self.branches]
@@ -100,12 +124,12 @@ class Phantom:
         return value, gradient
 
     def _feeds(self, branch: Centerline) -> bool:
-        """Whether a branch begins in the parent artery."""
+        """Return whether a branch begins inside the parent artery."""
         return bool(tube_implicit_mm(self.parent, branch.points_mm[:1])[0][0] < 0)
 
     @cached_property
     def ends(self) -> tuple[tuple[Floats, Floats, float], ...]:
-        """Center (3,), outward unit normal (3,) and radius of every opening, the inlet first, then parent, branches."""
+        """Center (3,), outward unit normal (3,) and radius of every opening: the inlet, then the end of every tube."""
         inlet = (
             self.parent.points_mm[0],
             -curves.tangents(self.parent.points_mm[:3])[0],
@@ -118,17 +142,23 @@ class Phantom:
 
     @cached_property
     def sac_volume_mm3(self) -> float:
-        """True volume of the sac: the ellipsoids outside the parent artery (0 without a sac)."""
+        """True volume of the sac: the part of the ellipsoids outside the parent artery; 0 without a sac."""
         return self._sac_layers[0]
 
     @cached_property
     def neck_area_mm2(self) -> float:
-        """True area of the parent artery's wall that lies inside the ellipsoids (0 without a sac)."""
+        """True area of the parent artery's wall inside the ellipsoids; 0 without a sac."""
         return self._sac_layers[1]
 
     @property
     def neck_center_mm(self) -> Floats:
-        """(3,) point of the parent artery's wall under the middle of the sac."""
+        """(3,) point of the parent artery's wall under the center of the sac.
+
+        Raises
+        ------
+        ValueError
+            The phantom has no sac.
+        """
         if self.sac is None:
             raise ValueError(f"phantom {self.name} has no sac")
         abscissa = self.parent.nearest_abscissa_mm(self.sac.center_mm[None])
@@ -139,7 +169,7 @@ class Phantom:
 
     @cached_property
     def _sac_layers(self) -> tuple[float, float]:
-        """Volume outside the wall and area of the wall, both within the ellipsoids, on a grid of 1/80 of the sac."""
+        """Return sac volume and neck area, integrated on a grid with a spacing of 1/40 of the larger semi-axis."""
         if self.sac is None:
             return 0.0, 0.0
         step = self.sac.reach_mm / 40
@@ -155,9 +185,22 @@ class Phantom:
 
 
 def tube_implicit_mm(tube: Centerline, points_mm: Floats, *, begins_inside: bool = False) -> tuple[Floats, Floats]:
-    """Distance (n,) of points (n, 3) to a tube's axis less the radius at the foot, and the direction (n, 3) from it.
+    """Return the distance to the wall of a tube and the direction from its axis.
 
-    The ends are continued straight, the first not where it `begins_inside` of another tube.
+    The distance is that to the axis minus the radius at the nearest point of the axis. The ends are extended straight.
+
+    Parameters
+    ----------
+    tube : axis and radius.
+    points_mm : (n, 3) points.
+    begins_inside : whether the first end lies inside another tube and is not extended.
+
+    Returns
+    -------
+    distance_mm : Floats
+        (n,) distance, negative inside.
+    direction : Floats
+        (n, 3) unit vectors away from the axis.
     """
     points, radius = tube.points_mm, tube.inscribed_radius_mm
     reach = np.linspace(4.0, 0.0, 40, endpoint=False)[:, None] * radius.max()
@@ -175,7 +218,14 @@ def tube_implicit_mm(tube: Centerline, points_mm: Floats, *, begins_inside: bool
 
 
 def tube(*, length_mm: float = 20.0, radius_mm: float = 2.0, end_radius_mm: float | None = None) -> Phantom:
-    """Straight tube along z; tapered linearly where `end_radius_mm` is given."""
+    """Return a straight tube along z.
+
+    Parameters
+    ----------
+    length_mm : its length.
+    radius_mm : its radius, at the inlet if it is tapered.
+    end_radius_mm : radius at the outlet of a linearly tapered tube; None: not tapered.
+    """
     z = np.linspace(0.0, length_mm, int(length_mm / AXIS_STEP_MM) + 1)
     points = np.stack([np.zeros_like(z), np.zeros_like(z), z], axis=-1)
     end = radius_mm if end_radius_mm is None else end_radius_mm
@@ -183,14 +233,26 @@ def tube(*, length_mm: float = 20.0, radius_mm: float = 2.0, end_radius_mm: floa
 
 
 def torus_arc(*, bend_radius_mm: float = 8.0, angle_rad: float = np.pi, radius_mm: float = 2.0) -> Phantom:
-    """Part of a torus about y: an artery of constant curvature."""
+    """Return part of a torus around the y axis: an artery of constant curvature.
+
+    Parameters
+    ----------
+    bend_radius_mm : radius of the axis.
+    angle_rad : angle of the bend.
+    radius_mm : radius of the artery.
+    """
     angle = np.linspace(0.0, angle_rad, int(bend_radius_mm * angle_rad / AXIS_STEP_MM) + 1)
     points = bend_radius_mm * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=-1)
     return Phantom("torus arc", Centerline(points, np.full(len(angle), radius_mm)))
 
 
 def siphon(*, inlet_radius_mm: float = 2.1, outlet_radius_mm: float = 1.8) -> Phantom:
-    """Curved internal carotid artery: straight up, forward, back over itself and up again (a C-shaped siphon)."""
+    """Return a curved internal carotid artery: up, forward, back over itself and up again (a C-shaped siphon).
+
+    Parameters
+    ----------
+    inlet_radius_mm, outlet_radius_mm : radii at the ends; the radius changes linearly along the axis.
+    """
     knots = [
         (0.0, 5.0, 0.0), (0.0, 5.0, 4.0), (0.0, 4.6, 8.0), (0.2, 1.5, 11.6), (0.8, -3.2, 12.6), (1.4, -7.2, 14.0),
         (1.8, -8.6, 17.6), (1.6, -6.0, 20.8), (0.8, -1.8, 22.0), (0.0, 1.2, 24.4), (-0.2, 1.8, 28.0), (-0.2, 1.8, 32.0),
@@ -200,7 +262,14 @@ def siphon(*, inlet_radius_mm: float = 2.1, outlet_radius_mm: float = 1.8) -> Ph
 
 
 def bifurcation(*, radius_mm: float = 1.75, daughter_radius_mm: float = 1.5, half_angle_rad: float = 0.9) -> Phantom:
-    """Y in the x-z plane: an artery along z whose two daughters bend away from it (bend radius 5 mm)."""
+    """Return a bifurcation in the x-z plane: an artery along z with two daughters of bend radius 5 mm.
+
+    Parameters
+    ----------
+    radius_mm : radius of the parent artery.
+    daughter_radius_mm : radius of both daughters.
+    half_angle_rad : angle between each daughter and the z axis.
+    """
     trunk_mm, bend_mm, leg_mm = 10.0, 5.0 * half_angle_rad, 9.0
     abscissa = np.linspace(0.0, trunk_mm + bend_mm + leg_mm, int((trunk_mm + bend_mm + leg_mm) / AXIS_STEP_MM) + 1)
     turned = np.clip((abscissa - trunk_mm) / bend_mm, 0.0, 1.0)
@@ -209,7 +278,7 @@ def bifurcation(*, radius_mm: float = 1.75, daughter_radius_mm: float = 1.5, hal
     steps = 0.5 * (direction[1:] + direction[:-1]) * np.diff(abscissa)[:, None]
     right = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     radius = radius_mm + (daughter_radius_mm - radius_mm) * turned**2 * (3 - 2 * turned)
-    after = abscissa > trunk_mm - 4 * AXIS_STEP_MM  # the axis is continued backwards along its first steps
+    after = abscissa > trunk_mm - 4 * AXIS_STEP_MM  # a tube is extended backwards along its first points
     left = Centerline(right[after] * [-1.0, 1.0, 1.0], radius[after])
     return Phantom("bifurcation", Centerline(right, radius), (left,))
 
@@ -223,15 +292,16 @@ def with_sac(
     elongation: float = 1.0,
     direction: Floats | None = None,
 ) -> Phantom:
-    """Glue a sac to the wall of the parent artery.
+    """Return a phantom with a sac on the wall of the parent artery.
 
     Parameters
     ----------
-    abscissa_mm : where on the parent artery's axis.
+    phantom : the phantom without a sac.
+    abscissa_mm : position of the sac along the parent artery's axis.
     width_mm : diameter across the height.
-    neck_mm : length of the neck along the artery where that is straight (across it the neck is shorter).
+    neck_mm : length of the neck along a straight artery; across it the neck is shorter.
     elongation : height radius over width radius.
-    direction : (3,) from the axis towards the sac; the outer side of the bend where not given.
+    direction : (3,) direction from the axis to the sac; None: the outer side of the bend.
     """
     parent = phantom.parent
     i = int(np.abs(parent.abscissa_mm - abscissa_mm).argmin())
@@ -246,7 +316,19 @@ def with_sac(
 
 
 def with_bleb(phantom: Phantom, *, direction: Floats, radius_mm: float = 1.2) -> Phantom:
-    """Let a round daughter sac stand half out of the sac in a direction (3,) from its centre."""
+    """Return a phantom with a round daughter sac, half of which protrudes from the sac.
+
+    Parameters
+    ----------
+    phantom : a phantom with a sac.
+    direction : (3,) direction from the center of the sac.
+    radius_mm : radius of the daughter sac.
+
+    Raises
+    ------
+    ValueError
+        The phantom has no sac.
+    """
     if phantom.sac is None:
         raise ValueError(f"phantom {phantom.name} has no sac")
     unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
@@ -258,7 +340,16 @@ def with_bleb(phantom: Phantom, *, direction: Floats, radius_mm: float = 1.2) ->
 def with_branch(
     phantom: Phantom, *, abscissa_mm: float, direction: Floats, radius_mm: float = 0.65, length_mm: float = 12.0
 ) -> Phantom:
-    """Let a straight side branch leave the parent artery's axis in a direction (3,)."""
+    """Return a phantom with a straight side branch.
+
+    Parameters
+    ----------
+    phantom : the phantom.
+    abscissa_mm : position along the parent artery's axis where the branch begins.
+    direction : (3,) direction of the branch.
+    radius_mm : radius of the branch.
+    length_mm : length of the branch from the axis of the parent artery.
+    """
     start = phantom.parent.at(np.array([abscissa_mm]))[0]
     unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     points = start + np.linspace(0.0, length_mm, int(length_mm / AXIS_STEP_MM) + 1)[:, None] * unit
@@ -267,13 +358,19 @@ def with_branch(
 
 
 def demo_phantom() -> Phantom:
-    """Curved ICA, 4.2 to 3.6 mm wide, with an ophthalmic-like branch and a sidewall sac of 7 mm on the outer bend."""
+    """Return a curved ICA of 4.2 to 3.6 mm with a side branch and a sidewall sac of 7 mm on the outer bend."""
     healthy = with_branch(siphon(), abscissa_mm=19.0, direction=np.array([0.3, -1.0, -0.12]), length_mm=15.0)
     return replace(with_sac(healthy, abscissa_mm=27.0, neck_mm=5.5), name="demo")
 
 
 def spline(knots_mm: Floats, *, vertical_ends: bool = False) -> Floats:
-    """Smooth curve (n, 3) through knots (k, 3) in steps of `AXIS_STEP_MM`, ends along z if wanted."""
+    """Return a smooth curve (n, 3) through knots (k, 3), sampled every `AXIS_STEP_MM`.
+
+    Parameters
+    ----------
+    knots_mm : (k, 3) points on the curve.
+    vertical_ends : whether the curve begins and ends along z.
+    """
     chord = curves.arc_length(knots_mm)
     up = np.array([0.0, 0.0, 1.0])
     fine = CubicSpline(chord, knots_mm, bc_type=((1, up), (1, up)) if vertical_ends else "natural")
@@ -281,7 +378,18 @@ def spline(knots_mm: Floats, *, vertical_ends: bool = False) -> Floats:
 
 
 def outer_side(axis: Centerline, i: int) -> Floats:
-    """Give the unit vector (3,) away from the centre of curvature at axis point `i`; any perpendicular if straight."""
+    """Return the direction away from the center of curvature of an axis.
+
+    Parameters
+    ----------
+    axis : the axis.
+    i : index of the point.
+
+    Returns
+    -------
+    Floats
+        (3,) unit vector; any vector perpendicular to a straight axis.
+    """
     span = max(1, min(25, i, len(axis.points_mm) - 1 - i))
     bend = axis.points_mm[i - span] - 2 * axis.points_mm[i] + axis.points_mm[i + span]
     length = float(np.linalg.norm(bend))
@@ -294,12 +402,18 @@ def outer_side(axis: Centerline, i: int) -> Floats:
 
 
 def phantom_surface(phantom: Phantom, *, edge_mm: float = 0.25) -> Surface:
-    """Triangles on the exact wall, open and cut square at every end; edges of about `edge_mm`."""
+    """Return triangles on the exact wall, open and cut at a right angle at every end.
+
+    Parameters
+    ----------
+    phantom : the phantom.
+    edge_mm : approximate length of the edges.
+    """
     low, high = _box(phantom, margin_mm=4 * edge_mm)
     low, high = low - 3 * edge_mm, high + 3 * edge_mm
     ticks = [np.arange(a, b + edge_mm, edge_mm) for a, b in zip(low, high, strict=True)]
     field = _sample(phantom, ticks, band_mm=3 * edge_mm)
-    # grid values next to the wall are pushed away from it: no slivers; the vertices are put on the wall afterwards
+    # Values next to the wall are moved away from 0 to avoid slivers; the vertices are put on the wall afterwards.
     field = np.where(np.abs(field) < 0.2 * edge_mm, np.copysign(0.2 * edge_mm, field), field)
     index, faces = isosurface(-field.astype(np.float32), 0.0)
     surface = _relaxed(phantom, low + edge_mm * index, faces)
@@ -307,6 +421,7 @@ def phantom_surface(phantom: Phantom, *, edge_mm: float = 0.25) -> Surface:
 
 
 def _relaxed(phantom: Phantom, vertices: Floats, faces: Ints) -> Surface:
+    """Return a mesh with evenly distributed vertices on the wall."""
     vertices = _onto_wall(phantom, vertices)
     mean = smoothing.averaging(len(vertices), faces)
     for _ in range(5):
@@ -315,7 +430,7 @@ def _relaxed(phantom: Phantom, vertices: Floats, faces: Ints) -> Surface:
 
 
 def _onto_wall(phantom: Phantom, points: Floats, *, steps: int = 3) -> Floats:
-    """Step along the gradient to the zero of the implicit function."""
+    """Return points moved along the gradient to the zero of the implicit function."""
     for _ in range(steps):
         value, gradient = phantom.implicit_mm(points)
         points = points - value[:, None] * gradient
@@ -323,7 +438,7 @@ def _onto_wall(phantom: Phantom, points: Floats, *, steps: int = 3) -> Floats:
 
 
 def _beyond_ends(phantom: Phantom, points: Floats) -> Floats:
-    """Distance (n,) past the plane of the end in whose neighbourhood a point lies; elsewhere far below 0."""
+    """Return the distance (n,) of points beyond the plane of a nearby end; far below 0 away from all ends."""
     beyond = np.full(len(points), -1e6)
     for center, normal, radius in phantom.ends:
         local = points - center
@@ -335,7 +450,7 @@ def _beyond_ends(phantom: Phantom, points: Floats) -> Floats:
 
 
 def _cut_ends(phantom: Phantom, surface: Surface, edge_mm: float) -> Surface:
-    """Cut the mesh at the end planes: vertices near a plane are moved onto it, faces beyond it dropped or split."""
+    """Return the mesh cut at the end planes; vertices near a plane are moved onto it."""
     vertices, faces = np.array(surface.vertices_mm), surface.faces
     for center, normal, radius in phantom.ends:
         local = vertices - center
@@ -347,14 +462,14 @@ def _cut_ends(phantom: Phantom, surface: Surface, edge_mm: float) -> Surface:
     beyond[np.abs(beyond) < 1e-6] = 0.0
     vertices, faces = triangles.compact(*clip(vertices, faces, beyond))
     rim = np.unique(triangles.open_edges(faces))
-    vertices[rim] = _onto_wall(phantom, vertices[rim])  # about a round tube this moves within the plane
+    vertices[rim] = _onto_wall(phantom, vertices[rim])  # at the end of a round tube they stay in the plane
     return Surface(vertices, faces)
 
 
 def _sample(phantom: Phantom, ticks: list[Floats], band_mm: float) -> Floats:
-    """Implicit function on a grid (i, j, k), exact within `band_mm` of the wall and of the right sign elsewhere.
+    """Return the implicit function on a grid (i, j, k), exact within `band_mm` of the wall and elsewhere right in sign.
 
-    Blocks of 6 x 6 x 6 samples that the wall cannot reach keep the value at their middle.
+    Blocks of 6 x 6 x 6 samples that the wall cannot reach have the value at their center.
     """
     size = 6
     shape = np.array([len(t) for t in ticks])
@@ -368,11 +483,12 @@ def _sample(phantom: Phantom, ticks: list[Floats], band_mm: float) -> Floats:
 
 
 def _points(ticks: list[Floats]) -> Floats:
+    """Return all points (n, 3) of a grid from its coordinates along each axis."""
     return np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _box(phantom: Phantom, *, margin_mm: float) -> tuple[Floats, Floats]:
-    """Lower and upper corner (3,) around the whole phantom."""
+    """Return the lower and upper corner (3,) of a box around the phantom."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for t in phantom.tubes:
         reach = t.inscribed_radius_mm[:, None] + margin_mm
@@ -389,7 +505,7 @@ def _box(phantom: Phantom, *, margin_mm: float) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class Scanner:
-    """How a synthetic 3DRA scan is made."""
+    """Properties of a synthetic 3DRA scan."""
 
     voxel_mm: float = 0.28
     """Edge of the cubic voxels."""
@@ -398,19 +514,25 @@ class Scanner:
     noise: float = 0.04
     """Standard deviation of the noise, as a fraction of the contrast."""
     contrast: float = 2000.0
-    """Intensity of the lumen above the tissue."""
+    """Difference in intensity between lumen and tissue."""
     tissue: float = 100.0
     """Intensity of the tissue."""
     structure: float = 0.05
     """Standard deviation of slow variations of the tissue, as a fraction of the contrast."""
     margin_mm: float = 3.0
-    """Tissue around the vessel."""
+    """Width of the tissue around the vessel."""
 
 
 def scan(phantom: Phantom, rng: Generator, *, scanner: Scanner = Scanner()) -> Image:
-    """Take a synthetic 3DRA scan: partial volume, point spread, tissue and noise; the ends leave through the border.
+    """Return a synthetic 3DRA scan with partial volume, point spread, tissue and noise.
 
-    The voxels are int16 and the grid is aligned with LPS.
+    The voxels are int16, the grid is aligned with LPS, and the vessel ends leave through the border.
+
+    Parameters
+    ----------
+    phantom : the phantom.
+    rng : source of noise and tissue structure.
+    scanner : voxel size, blur, noise and intensities.
     """
     h = scanner.voxel_mm
     low, high = _field_of_view(phantom, scanner.margin_mm)
@@ -428,7 +550,7 @@ def scan(phantom: Phantom, rng: Generator, *, scanner: Scanner = Scanner()) -> I
 
 
 def _coverage(field: Floats, h: float) -> Floats:
-    """Fraction of every voxel that lies in the lumen, from the distance at its middle; in it the wall is flat."""
+    """Return the fraction of every voxel in the lumen, from the distance at its center and a locally flat wall."""
     gradient = np.moveaxis(np.asarray(np.gradient(field, h)), 0, -1)
     near = np.nonzero(np.abs(field) < 1.5 * h)
     normal = gradient[near] / np.maximum(np.linalg.norm(gradient[near], axis=-1, keepdims=True), 1e-9)
@@ -443,11 +565,12 @@ def _coverage(field: Floats, h: float) -> Floats:
 
 
 def _normalised(noise: Floats) -> Floats:
+    """Return noise scaled to a standard deviation of 1."""
     return noise / noise.std()
 
 
 def _field_of_view(phantom: Phantom, margin_mm: float) -> tuple[Floats, Floats]:
-    """Box around the phantom, cut at the ends along the axis that each end faces most."""
+    """Return the corners of a box around the phantom, cut at the ends along the axis closest to each end's normal."""
     low, high = _box(phantom, margin_mm=margin_mm)
     for center, normal, _ in phantom.ends:
         axis = int(np.argmax(np.abs(normal)))

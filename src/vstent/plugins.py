@@ -37,7 +37,13 @@ def plugins(group: Group) -> dict[str, EntryPoint]:
 
 
 def load(group: Group, name: str, *, built_in: str) -> Any:
-    """Load a plug-in by its name; `built_in` lists the built-in choices for the error message.
+    """Load a plug-in by its name.
+
+    Parameters
+    ----------
+    group : entry point group.
+    name : name of the entry point.
+    built_in : built-in choices that the error message lists.
 
     Raises
     ------

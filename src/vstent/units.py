@@ -14,10 +14,17 @@ MM_PER: Final = {"m": 1e3, "cm": 10.0, "mm": 1.0}
 
 
 def counted(n: int, one: str, many: str = "") -> str:
-    """Return a count with its unit word: ``1 hole``, ``2 holes``; `many` is the plural where it is not `one` + s."""
+    """Return a count with the word for what is counted: ``1 hole``, ``2 holes``.
+
+    Parameters
+    ----------
+    n : the count.
+    one : singular.
+    many : plural; empty: `one` + s.
+    """
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
 def place(point_mm: Iterable[float]) -> str:
-    """Return a point (3,) in words: ``(1.0, -2.5, 30.2) mm``."""
+    """Return a point (3,) as text: ``(1.0, -2.5, 30.2) mm``."""
     return f"({', '.join(f'{x:.1f}' for x in point_mm)}) mm"

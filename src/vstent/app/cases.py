@@ -28,6 +28,7 @@ UNDOS: Final = 100
 """Number of changes that can be undone."""
 
 Status = Literal["todo", "running", "done", "stale", "failed"]
+"""Status of a step; stale: finished with other choices than the present ones."""
 
 
 class Conflict(InputError):
@@ -44,7 +45,9 @@ class State(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     name: str
+    """Display name of the case."""
     revision: int = 0
+    """Number of changes so far, by which clients detect changes made elsewhere."""
     input: str = ""
     """Path of the scan or surface: inside the case folder, or elsewhere if it was given to the command."""
     source: str = ""
@@ -52,8 +55,11 @@ class State(BaseModel):
     former: dict[str, Any] = Field(default_factory=dict)
     """Settings of the study that the case was opened from (its `run.json`); empty for a case begun on the page."""
     choices: Choices = Choices()
+    """Present choices."""
     undo: tuple[Choices, ...] = ()
+    """Earlier choices, the latest last."""
     redo: tuple[Choices, ...] = ()
+    """Undone choices, the latest last."""
     done: dict[str, str] = Field(default_factory=dict)
     """Digest of everything that a finished step depended on, by step."""
     failed: dict[str, str] = Field(default_factory=dict)
@@ -125,13 +131,20 @@ def dependencies(state: State) -> dict[str, str]:
 
 
 def failures(state: State) -> dict[str, str]:
-    """Return the error messages of the steps that failed with the present choices, by step."""
+    """Return the error messages, by step, of the steps that failed with the present choices."""
     keys = set(dependencies(state).values())
     return {step: why for step, why in state.failed.items() if state.failed_with.get(step) in keys}
 
 
 def statuses(state: State, at_work: str, lost: Set[str]) -> dict[str, Status]:
-    """Return the status of every step, given the step of the running job and the steps whose results are missing."""
+    """Return the status of every step.
+
+    Parameters
+    ----------
+    state : state of the case.
+    at_work : step of the running job; empty: none.
+    lost : steps whose results are missing.
+    """
     keys, failed = dependencies(state), failures(state)
 
     def status(step: str) -> Status:
@@ -147,7 +160,14 @@ def statuses(state: State, at_work: str, lost: Set[str]) -> dict[str, Status]:
 
 
 class Case:
-    """A case folder that several browser tabs read and change, one change at a time."""
+    """A case folder that several browser tabs may read and change, one change at a time.
+
+    Parameters
+    ----------
+    case_id : name of the case in URLs.
+    folder : the case folder.
+    state : its stored state.
+    """
 
     def __init__(self, case_id: str, folder: Path, state: State) -> None:
         self.id, self.folder = case_id, folder
@@ -157,23 +177,34 @@ class Case:
 
     @property
     def state(self) -> State:
-        """Choices and results of the steps."""
+        """Present state: choices and results of the steps."""
         return self._state
 
     @property
     def input(self) -> Path:
-        """The scan or surface."""
+        """Path of the scan or surface.
+
+        Raises
+        ------
+        ReadError
+            There is no input yet.
+        """
         if not self._state.input:
             raise ReadError(f"{self._state.name} has no scan yet. Drop one on the page.")
         return self.folder / self._state.input
 
     def change(self, revision: int, choices: Choices) -> State:
-        """Replace the choices, unless the case was changed since `revision`.
+        """Replace the choices.
+
+        Parameters
+        ----------
+        revision : revision on which the change is based.
+        choices : all choices after the change.
 
         Raises
         ------
         Conflict
-            The case was changed since.
+            The case was changed since that revision.
         """
         with self._lock:
             self._check(revision)
@@ -184,12 +215,17 @@ class Case:
             return self.update(choices=choices, undo=undo, redo=(), revision=before.revision + 1)
 
     def step_back(self, revision: int, *, forward: bool = False) -> State:
-        """Undo the last change, or redo it.
+        """Undo the last change, or redo the last undone one.
+
+        Parameters
+        ----------
+        revision : revision that the client last read.
+        forward : redo instead of undo.
 
         Raises
         ------
         Conflict
-            The case was changed since `revision`, or there is nothing to undo.
+            The case was changed since that revision, or there is nothing to undo or redo.
         """
         with self._lock:
             self._check(revision)
@@ -211,17 +247,18 @@ class Case:
         return self._state
 
     def _check(self, revision: int) -> None:
+        """Raise Conflict where the case was changed since a revision."""
         if revision != self._state.revision:
             raise Conflict("This case was changed in another window. The page now shows that change; make yours again.")
 
     def tell(self) -> None:
-        """Notify all clients."""
+        """Notify all clients of a change."""
         for loop, event in tuple(self._listeners):
             with suppress(RuntimeError):  # the event loop of a closed client is closed
                 loop.call_soon_threadsafe(event.set)
 
     def listen(self) -> asyncio.Event:
-        """Return an event that is set at every change; call it in the client's event loop."""
+        """Return an event that is set at every change; to be called in the client's event loop."""
         event = asyncio.Event()
         self._listeners.add((asyncio.get_running_loop(), event))
         return event
@@ -232,7 +269,7 @@ class Case:
 
 
 def load(case_id: str, folder: Path) -> Case:
-    """Return the case of a folder.
+    """Return the case stored in a folder.
 
     Raises
     ------
@@ -255,7 +292,7 @@ def identifier(name: str) -> str:
 
 
 class Store:
-    """All cases of a workspace, and the one given to the command."""
+    """All cases of a workspace folder, and the case given on the command line."""
 
     def __init__(self, workspace: Path) -> None:
         self.workspace = workspace
@@ -286,7 +323,14 @@ class Store:
             return self._cases[case_id]
 
     def create(self, name: str, folder: Path | None = None, **known: Any) -> Case:
-        """Create a case, by default in a new folder of the workspace."""
+        """Create a case.
+
+        Parameters
+        ----------
+        name : display name.
+        folder : the case folder; None: a new folder in the workspace.
+        known : further fields of the state.
+        """
         with self._lock:
             case_id = free = identifier(name)
             count = 1
@@ -301,7 +345,7 @@ class Store:
         return case
 
     def of_input(self, path: Path) -> Case | None:
-        """Return the case that was begun with a file of this machine; None if there is none."""
+        """Return the case whose input is this file; None where there is none."""
         for case_id in self.ids():
             with suppress(ReadError):
                 case = self.get(case_id)
@@ -310,7 +354,7 @@ class Store:
         return None
 
     def adopt(self, folder: Path) -> Case:
-        """Add a case folder that is anywhere on this machine."""
+        """Add a case folder outside the workspace."""
         case = load(identifier(folder.resolve().name), folder.resolve())
         with self._lock:
             self._cases[case.id] = case

@@ -1,4 +1,4 @@
-"""The user's choices: as the page and the REST interface state them, and as settings of a study."""
+"""The user's choices as the page and the REST interface state them, and their conversion to settings of a study."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -12,11 +12,15 @@ if (
     from vstent.study.types import Placing, Settings
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
+"""A coordinate or position in mm."""
 Length = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
+"""A length in mm."""
 Count = Annotated[int, Field(gt=0, le=100_000)]
+"""A number of voxels."""
 NECK_HANDLES: Final = 12
 """Number of evenly spaced handles on a neck."""
 Point = tuple[Coordinate, Coordinate, Coordinate]
+"""A point in LPS mm."""
 
 
 class Strict(BaseModel):
@@ -29,19 +33,28 @@ class DeviceChoice(Strict):
     """A device with its size and the position of its middle; missing values are proposed."""
 
     name: str = Field(max_length=60)
+    """Name in the catalogue."""
     diameter_mm: Length | None = None
+    """Label diameter."""
     length_mm: Length | None = None
+    """Label length."""
     center_mm: Coordinate | None = None
+    """Position of the device's middle along the parent axis."""
 
 
 class FlowChoice(Strict):
     """How the blood flow is computed."""
 
     is_wanted: bool = True
+    """Whether a flow is computed."""
     cell_size_mm: Annotated[float, Field(ge=0.04, le=1.0)] | None = None
+    """Grid spacing."""
     inflow_mL_s: Annotated[float, Field(gt=0, le=50)] | None = None
+    """Mean inflow of all inlets."""
     is_pulsatile: bool = False
+    """Whether the inflow is pulsatile."""
     outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
+    """Boundary condition at the outlets."""
 
     def settings(self, former: "FlowSettings") -> "FlowSettings | None":
         """Return the flow settings of the study; settings that the page cannot change are taken from `former`."""
@@ -60,13 +73,19 @@ class Choices(Strict):
     """All choices of the user; missing values are proposed."""
 
     units: Literal["m", "cm", "mm"] | None = None
+    """Length unit of a surface file."""
     spacing_mm: tuple[Length, Length, Length] | None = None
+    """Voxel spacing of a raw volume."""
     shape: tuple[Count, Count, Count] | None = None
+    """Number of voxels of a raw volume."""
     threshold: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    """Intensity at the lumen wall of a scan."""
     at_mm: Point | None = None
+    """Point near the sac."""
     inlet_mm: Point | Annotated[tuple[Point, ...], Field(min_length=1, max_length=50)] | None = None
     """Point near the inlet, or near each inlet; the parent artery begins at the first."""
     outlet_mm: Point | None = None
+    """Point near the outlet of the parent artery."""
     neck_mm: Annotated[tuple[Point, ...], Field(min_length=3, max_length=1000)] | None = None
     """Neck drawn by hand: a closed curve near the wall."""
     upstream_mm: Length | None = None
@@ -76,13 +95,16 @@ class Choices(Strict):
     devices: tuple[DeviceChoice, ...] = Field(
         default=(DeviceChoice(name="silk"), DeviceChoice(name="enterprise")), max_length=3
     )
+    """Devices with their sizes and positions."""
     flow: FlowChoice = FlowChoice()
+    """Settings of the flow."""
     uncertainty_samples: Annotated[int, Field(ge=8, le=256)] | None = None
     """Number of deployments with uncertain inputs varied; None: none."""
 
     @field_validator("devices")
     @classmethod
     def _each_once(cls, devices: tuple[DeviceChoice, ...]) -> tuple[DeviceChoice, ...]:
+        """Return the devices; ValueError is raised where one is chosen twice."""
         if len({device.name for device in devices}) < len(devices):
             raise ValueError("a device can be chosen only once")
         return devices
@@ -117,7 +139,7 @@ class Choices(Strict):
 
 
 def pulse_of(former: "FlowSettings") -> "Waveform":
-    """Return the waveform that can be chosen: that of the former study, or the published one."""
+    """Return the waveform that can be chosen: that of the study the case was opened from, or the published one."""
     from vstent.flow.waveform import OLDER_ADULT_ICA
 
     return former.waveform or OLDER_ADULT_ICA

@@ -1,4 +1,4 @@
-"""Cuts: a flow on the plane that the sac is seen in."""
+"""Speed of the flow on the plane of the profile view."""
 
 from typing import Final
 
@@ -12,11 +12,18 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.reporting.scene import MeshLayer, views_of
 
 STEP_CELLS: Final = 0.6
-"""Distance between the points of a cut, in cells of the flow."""
+"""Distance between the points of a cut, as a fraction of the grid spacing."""
 
 
 def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
-    """Return the speed on the plane through the sac's middle, or the axis's, that the profile view looks at."""
+    """Return the speed on the plane of the profile view, through the center of the sac or, without a sac, of the axis.
+
+    Parameters
+    ----------
+    pane : name of the pane that shows the cut.
+    field : the flow.
+    anatomy : vessel, parent artery and sacs.
+    """
     right, up = views_of(anatomy, {})[0].axes[:2]
     sacs = anatomy.aneurysms
     middle = sacs[0].sac.vertices_mm.mean(axis=0) if sacs else anatomy.axis.points_mm.mean(axis=0)
@@ -31,6 +38,7 @@ def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
 
 
 def _is_blood(field: FlowField, points_mm: Floats) -> Bools:
+    """Return whether points (n, 3) lie in cells of the flow."""
     place = np.rint((points_mm - field.origin_mm) / field.cell_size_mm).astype(int)
     is_near = ((place >= 0) & (place < field.index.shape)).all(axis=1)
     found = np.zeros(len(points_mm), dtype=bool)
@@ -39,7 +47,7 @@ def _is_blood(field: FlowField, points_mm: Floats) -> Bools:
 
 
 def _where_blood_is(points_mm: Floats, is_blood: Bools) -> tuple[Surface, Ints]:
-    """Triangles of a grid of points (n, m, 3) between those in blood (n m,), and which points they use."""
+    """Return the triangles of a grid of points (n, m, 3) with all corners in blood, and the indices of their points."""
     n, m = points_mm.shape[:2]
     number = np.arange(n * m).reshape(n, m)
     a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]

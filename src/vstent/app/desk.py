@@ -1,4 +1,4 @@
-"""The open cases with their jobs: everything that the routes of the server call."""
+"""Open cases and their jobs: everything that the routes of the server call."""
 
 import json
 import tempfile
@@ -18,7 +18,13 @@ from vstent.io.files import existing
 
 
 class Desk:
-    """Cases, jobs, and immediate answers."""
+    """Cases, jobs and immediate answers.
+
+    Parameters
+    ----------
+    store : cases of the workspace.
+    opened : name of the case that the page opens first; empty: the list of cases.
+    """
 
     def __init__(self, store: Store, *, opened: str = "") -> None:
         self.store, self.opened = store, opened
@@ -33,7 +39,7 @@ class Desk:
     # -- cases ---------------------------------------------------------------------------------------------------------
 
     def open(self, path: Path) -> None:
-        """Open an input of the command: a case of the page, one of `vstent run`, or a scan or surface.
+        """Open an input of the command line: a case of the page, one of `vstent run`, or a scan or surface.
 
         Raises
         ------
@@ -64,7 +70,7 @@ class Desk:
         return found
 
     def view(self, case: Case) -> dict[str, Any]:
-        """Return everything that a client needs to know of a case."""
+        """Return the state of a case as clients read it."""
         state, job = case.state, self.jobs.of(case)
         is_at_work = job is not None and job.is_alive
         at_work = job.step if job is not None and is_at_work else ""
@@ -116,12 +122,14 @@ class Desk:
             self._scans.pop(case.id, None)
 
     def start(self, case: Case, kind: str) -> None:
-        """Start a job.
+        """Start a job of a kind: anatomy, rank or flow.
 
         Raises
         ------
         ReadError
-            There is no scan yet.
+            There is no scan or surface, or it was moved.
+        InputError
+            No device is chosen.
         """
         if not case.input.exists():
             raise ReadError(f"The scan of {case.state.name} has been moved from {case.input}. Put it back there.")
@@ -136,17 +144,17 @@ class Desk:
             self.start(case, case.state.job)
 
     def note_deployed(self, case: Case, device: DeviceChoice) -> None:
-        """Store that the chosen devices were shown deployed."""
+        """Mark the steps device and deploy as finished after the deployed device was sent to the page."""
         keys = dependencies(case.state)
         is_current = device in case.state.choices.devices and case.state.done.get("sac") == keys["sac"]
         chosen = {step: keys[step] for step in ("device", "deploy")}
         if is_current and any(case.state.done.get(step) != key for step, key in chosen.items()):
             case.update(done=case.state.done | chosen)
 
-    # -- what answers at once ------------------------------------------------------------------------------------------
+    # -- immediate answers ---------------------------------------------------------------------------------------------
 
     def live(self, case: Case) -> Any:
-        """Return the immediate answers of a case."""
+        """Return the object that answers immediately for a case."""
         from vstent.app.live import Live
 
         with self._lock:
@@ -175,7 +183,7 @@ class Desk:
             return self._scans[case.id][1]
 
     def surface(self, case: Case, threshold: float) -> bytes:
-        """Return the surface at a threshold."""
+        """Return the surface of the scan at a threshold, as a message for the page."""
         from vstent.app.live import LOCK
 
         scan = self.scan(case)
@@ -183,7 +191,15 @@ class Desk:
             return bytes(scan.surface(threshold))
 
     def neck(self, case: Case, curve_mm: Sequence[Point], handle: int | None, to_mm: Point | None) -> bytes:
-        """Return a neck, with one handle moved if its new position is given."""
+        """Return a neck as a message for the page.
+
+        Parameters
+        ----------
+        case : the case.
+        curve_mm : points of the neck in LPS mm.
+        handle : number of a handle to move; None: none.
+        to_mm : new position of the handle.
+        """
         import numpy as np
 
         whither = None if to_mm is None else np.array(to_mm, dtype=np.float64)
@@ -204,7 +220,7 @@ class Desk:
         return found
 
     def warm(self) -> None:
-        """Start the case given to the command, and load what the first click will need."""
+        """Start the case given on the command line, and load what the first request will need."""
         self.load()
         if self._to_begin is not None:
             case, path = self._to_begin
@@ -213,9 +229,9 @@ class Desk:
         devices()
 
     def load(self) -> None:
-        """Import everything that answers need, before the first request; a second caller waits.
+        """Import everything that answers need before the first request; a second caller waits.
 
-        Two threads that import a package and a module of it at the same time may get incomplete modules.
+        Two threads that import a package and one of its modules at the same time may get incomplete modules.
         """
         with self._loading:
             from vstent.app import live, scans, sheets  # noqa: F401
@@ -279,14 +295,14 @@ def devices() -> list[dict[str, Any]]:
 
 
 def landing(abscissa_mm: float | None, anchor: Literal["proximal", "center", "distal"]) -> Any:
-    """Return the landing of a device, or None where no position is given."""
+    """Return the landing of a device at a position along the parent axis; None where no position is given."""
     from vstent.devices.stent import Landing
 
     return None if abscissa_mm is None else Landing(abscissa_mm, anchor)
 
 
 def ranking(case: Case) -> dict[str, Any]:
-    """Return the ranking, and whether it belongs to the present choices."""
+    """Return the stored ranking, and whether it belongs to the present choices."""
     path = case.folder / RANKING
     if not path.is_file():
         return {"rows": [], "is_current": False}
@@ -297,7 +313,10 @@ def ranking(case: Case) -> dict[str, Any]:
 
 
 def pulse(case: Case | None) -> dict[str, Any]:
-    """Return the waveform that can be chosen (times, flow over mean flow): the published one, or the case's own."""
+    """Return times in s and flow over mean flow of the waveform that can be chosen.
+
+    It is the published waveform, or that of the study that the case was opened from.
+    """
     import numpy as np
 
     from vstent.flow.case import FlowSettings
@@ -317,13 +336,14 @@ def _titles(metrics: dict[str, Any], case: Case) -> dict[str, str]:
 
 
 def _is_surface(case: Case) -> bool:
+    """Return whether the input of a case is a surface."""
     from vstent.io.files import is_surface_file
 
     return is_surface_file(case.input)
 
 
 def _wants_grid(case: Case) -> bool:
-    """Return whether the number and spacing of the voxels are unknown."""
+    """Return whether number and spacing of the voxels must be given before the scan can be read."""
     from vstent.io.files import RAW_SUFFIXES, suffix
 
     choices = case.state.choices

@@ -13,12 +13,13 @@ if TYPE_CHECKING:  # imported when a folder is read, as in `vstent.app.choices`
 RUN: Final = "run.json"
 """File in which a study states its settings."""
 REPORT: Final = "report.html"
+"""File of the case folder with the report."""
 REMEMBERED: Final = 256
 """Number of `run.json` files whose content is kept in memory."""
 
 
 def kept_flows(folder: Path) -> dict[str, Path]:
-    """Return the files of the flows of the last finished study, ``bare`` first; none where one of them is missing.
+    """Return the files of all flows of the last finished study by name, ``bare`` first; empty where one is missing.
 
     A later study that was stopped may have replaced flows by those of other settings.
     """
@@ -45,14 +46,17 @@ def lost_steps(folder: Path, state: State) -> set[str]:
 
 @lru_cache(maxsize=REMEMBERED)
 def _flows_wanted(folder: Path, given: str) -> dict[str, Path]:
-    """Return the files of the flows that a case's state (JSON) requests."""
+    """Return the files of the flows that the state of a case (JSON) requests."""
     state = State.model_validate_json(given)
     return _paths(folder, state.source, state.settings())
 
 
 @lru_cache(maxsize=REMEMBERED)
 def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
-    """Return the files of the flows that a `run.json` states; none where this version cannot read it."""
+    """Return the files of the flows that a ``run.json`` states; empty where this version cannot read it.
+
+    The time of writing is a parameter so that a changed file is read again.
+    """
     from vstent.study.repeat import UNTOLD, told_in
 
     try:
@@ -63,7 +67,7 @@ def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
 
 
 def _paths(folder: Path, source: str, settings: "Settings") -> dict[str, Path]:
-    """Return the files in which a study keeps its flows."""
+    """Return the files in which a study stores its flows, by name."""
     from vstent.devices.catalogue import find_design
     from vstent.devices.design import BARE
     from vstent.study.folder import CACHE

@@ -1,8 +1,8 @@
-"""Files that come in through the door: their names, their sizes, what is packed in them, and no patient's record.
+"""Receive uploaded files: check names and sizes, unpack archives, and remove patient data.
 
-A file lies in the case's folder `input` as soon as it is whole. DICOM slices are written anew without the patient's
-record and under numbers for names, for names too can be a patient's; archives are unpacked under a limit, whatever
-paths are in them.
+A complete file is moved to the subfolder ``input`` of the case folder. DICOM slices are rewritten without patient data
+and numbered, because their names may be a patient's too. Archives are unpacked up to a size limit; the paths in them
+are not used.
 """
 
 import gzip
@@ -19,28 +19,31 @@ from vstent.io.dicom_strip import strip_dicom
 from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
 
 FOLDER: Final = "input"
-"""Where a case keeps what came in."""
+"""Subfolder of the case folder for uploaded files."""
 SERIES: Final = "series"
-"""Folder in it for DICOM slices."""
+"""Subfolder of it for DICOM slices."""
 UNPACKED_LIMIT: Final = 4 << 30
-"""Bytes that archives may unpack to, all together."""
+"""Largest unpacked size of an archive or compressed file, in bytes."""
 MOST_FILES: Final = 5000
-"""Files of a case, and entries of an archive."""
+"""Largest number of slices of a case, and of files in an archive."""
 LONGEST_NAME: Final = 120
+"""Largest number of characters of a file name."""
 _BLOCK: Final = 1 << 20
+"""Number of bytes read at a time."""
 _TOO_MUCH: Final = (
     f"The archive holds more than {UNPACKED_LIMIT >> 30} GB or {MOST_FILES} files, which is too much. Drop a "
     "smaller one."
 )
+"""Message for an archive that is too large."""
 
 
 def checked_name(name: str) -> str:
-    """Return the name of an upload if it is the plain name of a file that can be read here.
+    """Return the name of an upload if it is a plain name of a file that can be read.
 
     Raises
     ------
     ReadError
-        It is a path, hidden, too long, or of a kind that cannot be read.
+        The name is a path, hidden, too long, or of an unsupported kind.
     """
     is_plain = name and not any(mark in name for mark in ("/", "\\", "\0")) and not name.startswith(".")
     if not is_plain or len(name) > LONGEST_NAME or not name.isprintable():
@@ -54,12 +57,18 @@ def checked_name(name: str) -> str:
 
 
 def take(partial: Path, name: str, case_folder: Path) -> None:
-    """Put a file that has come in whole where it belongs; `partial` is gone afterwards.
+    """Move a complete upload into the case folder; `partial` is removed.
+
+    Parameters
+    ----------
+    partial : the uploaded file.
+    name : its name on the user's machine.
+    case_folder : the case folder.
 
     Raises
     ------
     ReadError
-        It is damaged, unpacks to too much, or there are too many.
+        The file is damaged, unpacks to too many bytes, or there are too many files.
     """
     folder = case_folder / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
@@ -76,19 +85,19 @@ def take(partial: Path, name: str, case_folder: Path) -> None:
 
 
 def found(case_folder: Path) -> str:
-    """Return what a study is to read, relative to the case folder.
+    """Return the path of the uploaded scan or surface, relative to the case folder.
 
     Raises
     ------
     ReadError
-        Nothing that can be read has come in, or more than one scan or surface.
+        There is no scan or surface, or more than one.
     """
-    from vstent.io.images import files_of  # not for the first page, which needs no reader
+    from vstent.io.images import files_of  # imported late so that the first page appears sooner
 
     folder = case_folder / FOLDER
     files = sorted(path for path in folder.glob("*") if path.is_file() and not path.name.startswith("."))
     known = [path for path in files if suffix(path) in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES)]
-    voxels = {file for path in known for file in files_of(path)[1:]}  # that lie apart from their header
+    voxels = {file for path in known for file in files_of(path)[1:]}  # voxel files with a separate header
     scans = [path for path in known if path not in voxels]
     if (folder / SERIES).is_dir():
         scans.append(folder / SERIES)
@@ -101,6 +110,7 @@ def found(case_folder: Path) -> str:
 
 
 def _take_slice(path: Path, folder: Path) -> None:
+    """Write a DICOM slice without patient data into the case."""
     series = folder / SERIES
     series.mkdir(exist_ok=True)
     count = sum(1 for _ in series.iterdir())
@@ -110,7 +120,7 @@ def _take_slice(path: Path, folder: Path) -> None:
 
 
 def _take_archive(path: Path, folder: Path) -> None:
-    """Unpack what can be read; the paths in the archive are not used."""
+    """Unpack the supported files of an archive; the paths in it are not used."""
     try:
         with zipfile.ZipFile(path) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
@@ -124,12 +134,12 @@ def _take_archive(path: Path, folder: Path) -> None:
 
 
 def _take_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, partial: Path, folder: Path, left: int) -> int:
-    """Unpack one entry and take it if it can be read; return how many bytes may still come."""
+    """Unpack one file of an archive and keep it if it is supported; return the number of bytes left of the limit."""
     try:
         with archive.open(entry) as packed, partial.open("wb") as out:
             for block in iter(lambda: packed.read(_BLOCK), b""):
                 left -= len(block)
-                if left < 0:  # sizes in an archive can lie
+                if left < 0:  # the sizes that an archive states may be wrong
                     raise ReadError(
                         f"The archive unpacks to more than {UNPACKED_LIMIT >> 30} GB, which is too much. Drop "
                         "a smaller one."
@@ -147,7 +157,7 @@ def _take_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, partial: Path,
 
 
 def _refuse_bomb(path: Path, name: str) -> None:
-    """See that a compressed file unpacks to no more than the limit."""
+    """Raise ReadError for a compressed file that unpacks to more than the limit."""
     if suffix(Path(name)).endswith(".gz") and _unpacked_size(_blocks(path)) > UNPACKED_LIMIT:
         raise ReadError(
             f"{name} unpacks to more than {UNPACKED_LIMIT >> 30} GB, which is too much. Drop a smaller one."
@@ -155,6 +165,7 @@ def _refuse_bomb(path: Path, name: str) -> None:
 
 
 def _blocks(path: Path) -> Iterable[bytes]:
+    """Yield the unpacked content of a gzip file in blocks."""
     try:
         with gzip.open(path) as stream:
             yield from iter(lambda: stream.read(_BLOCK), b"")
@@ -163,6 +174,7 @@ def _blocks(path: Path) -> Iterable[bytes]:
 
 
 def _unpacked_size(blocks: Iterable[bytes]) -> int:
+    """Return the total size of blocks; counting stops above the limit."""
     total = 0
     for block in blocks:
         total += len(block)

@@ -43,15 +43,23 @@ STAGES: Final = {
 SETTLING: Final = re.compile(r"([\d.]+)% from convergence, (?:.*?)(\d+) s left")
 """Form of the progress message of a flow (`vstent.study.ledger.Ledger.teller`)."""
 STOPPED: Final = "Stopped. Finished results are kept."
+"""Message of a step that the user stopped."""
 LAST_WORDS: Final = ".worker.log"
 """File of a case folder with the output of a job that ended unexpectedly."""
 POINTS_KEPT: Final = 600
+"""Number of residuals kept for the convergence plot."""
 RANKING: Final = "ranking.json"
 """File of a case folder with the ranking."""
 
 
 class Job:
-    """A process that works on a case."""
+    """A process that works on a case.
+
+    Parameters
+    ----------
+    case : the case.
+    kind : a key of `KINDS`.
+    """
 
     def __init__(self, case: Case, kind: str) -> None:
         self.case, self.kind = case, kind
@@ -67,7 +75,7 @@ class Job:
         with (case.folder / LAST_WORDS).open("w", encoding="utf-8") as last_words:
             self._process = subprocess.Popen(
                 command,
-                stdin=subprocess.PIPE,  # closes when the server ends for any reason, which ends the job too
+                stdin=subprocess.PIPE,  # it closes when the server ends for any reason, and the job ends then
                 stdout=subprocess.PIPE,
                 stderr=last_words,
                 text=True,
@@ -79,11 +87,11 @@ class Job:
 
     @property
     def step(self) -> str:
-        """Present step; empty when all are done."""
+        """Current step of the page; empty when all are finished."""
         if self._process.poll() is not None and not self._thread.is_alive():
             return ""
         step = STAGES.get(self.stage.partition(" ")[0], FIRST[self.kind])
-        is_past = self._has_anatomy and step not in KINDS[self.kind]  # the anatomy is only loaded again
+        is_past = self._has_anatomy and step not in KINDS[self.kind]  # the stored anatomy is being loaded
         return FIRST[self.kind] if is_past else step
 
     @property
@@ -92,7 +100,7 @@ class Job:
         return self._thread.is_alive()
 
     def told(self) -> dict[str, Any]:
-        """Return the progress."""
+        """Return the progress as clients read it."""
         return {
             "kind": self.kind,
             "stage": self.stage,
@@ -110,11 +118,12 @@ class Job:
         self._thread.join(5.0)
 
     def abandon(self) -> None:
-        """Stop because the server ends; the case stores that the job is to be resumed."""
+        """Stop because the server ends; the stored state still names the job, so that it is resumed."""
         self.case = _Deaf(self.case)  # type: ignore[assignment]
         self._kill()
 
     def _kill(self) -> None:
+        """Kill the process and its children."""
         with suppress(ProcessLookupError):
             if hasattr(os, "killpg"):
                 os.killpg(self._process.pid, signal.SIGKILL)
@@ -122,6 +131,7 @@ class Job:
                 self._process.kill()
 
     def _follow(self) -> None:
+        """Read the messages of the process until it ends."""
         assert self._process.stdout is not None
         assert self._process.stdin is not None
         failure = ""
@@ -149,13 +159,14 @@ class Job:
         self._close(failure)
 
     def _take_anatomy(self, key: str) -> None:
-        """Store the anatomy of the present choices, whichever job found it."""
+        """Store the key of the anatomy that the job found, and mark its steps as finished."""
         self._has_anatomy = True
         steps, keys, state = KINDS["anatomy"], dependencies(self._given), self.case.state
         failed = {step: why for step, why in state.failed.items() if step not in steps}
         self.case.update(anatomy=key, done=state.done | {step: keys[step] for step in steps}, failed=failed)
 
     def _take(self, stage: str, fraction: float, detail: str) -> None:
+        """Record a progress message and notify the clients."""
         if stage != self.stage:
             self.residual.clear()
         self.stage, self.fraction, self.detail = stage, fraction, detail
@@ -168,13 +179,14 @@ class Job:
         self.case.tell()
 
     def _pass(self) -> None:
-        """Mark the steps before the present one as done."""
+        """Mark the steps before the current one as finished."""
         steps, keys, done = KINDS[self.kind], dependencies(self._given), self.case.state.done
         passed = steps[: steps.index(self.step)] if self.step in steps else ()
         if any(done.get(step) != keys[step] for step in passed):
             self.case.update(done=done | {step: keys[step] for step in passed})
 
     def _close(self, failure: str) -> None:
+        """Store the outcome of the job."""
         state = self.case.state
         failed = {step: why for step, why in state.failed.items() if step not in KINDS[self.kind]}
         done, failed_with, keys = dict(state.done), dict(state.failed_with), dependencies(self._given)
@@ -187,7 +199,7 @@ class Job:
 
 
 class _Deaf:
-    """Stands in for a case that must not receive further messages."""
+    """Replaces a case that must not receive further messages."""
 
     def __init__(self, case: Case) -> None:
         self.state: State = case.state

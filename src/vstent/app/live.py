@@ -1,4 +1,4 @@
-"""Live: what a hand on the page asks is answered here, at once, from what the case has found so far."""
+"""Answer the page immediately, from the results that a case has so far."""
 
 import threading
 from collections.abc import Callable, Hashable
@@ -49,19 +49,21 @@ from vstent.study.folder import CACHE
 from vstent.study.stages import deploy_one, size_of
 
 Colour = Literal["wall_gap", "coverage", "diameter"]
+"""Quantity that colors the wires."""
 Anchor = Literal["proximal", "center", "distal"]
+"""Part of a device that a position refers to."""
 Found = TypeVar("Found")
 
 LOCK: Final = threading.RLock()
-"""One computation at a time: compiled loops with threads of their own do not share them."""
+"""Lock for one computation at a time, because parallel compiled loops must not run concurrently."""
 KEPT: Final = 40
-"""Results remembered per case."""
+"""Number of results cached per case."""
 SECTION_REACH_MM: Final = 9.0
-"""A section shows what is this near to the axis."""
+"""Distance from the axis within which a section shows surfaces, in mm."""
 BESIDE_MM: Final = 8.0
-"""The profile shows so much of the artery beside the neck."""
+"""Length of artery on each side of the neck that the profile view shows, in mm."""
 NEIGHBOURS: Final = 3
-"""Every so many points of a wire are coloured after the nearest node, those between like them."""
+"""Number of consecutive wire points that have the color of one node, the nearest to the first of them."""
 OPENING_COLOURS: Final = (
     (0.00, 0.45, 0.70),
     (0.90, 0.62, 0.00),
@@ -69,18 +71,18 @@ OPENING_COLOURS: Final = (
     (0.80, 0.47, 0.65),
     (0.34, 0.71, 0.91),
 )
-"""Okabe and Ito's colours, told apart by the colour-blind; the inlets have the first."""
+"""Okabe and Ito's colors, distinguishable with color vision deficiency; inlets have the first."""
 
 
 class Live:
-    """Data of one case, loaded and computed on demand, and cached."""
+    """Results of one case, loaded or computed on demand, and cached."""
 
     def __init__(self, case: Case) -> None:
         self.case = case
         self._memory: dict[Hashable, Any] = {}
 
     def remembered(self, key: Hashable, find: Callable[[], Found]) -> Found:
-        """Return what was found under a key before, or find it now."""
+        """Return the cached result of a key; where there is none, compute and cache it."""
         with LOCK:
             if key not in self._memory:
                 found = find()
@@ -92,12 +94,12 @@ class Live:
 
     @property
     def anatomy(self) -> Anatomy:
-        """The anatomy found last.
+        """Last anatomy found.
 
         Raises
         ------
         ReadError
-            None was found yet.
+            There is no anatomy yet.
         """
         key = self.case.state.anatomy
         path = self.case.folder / CACHE / f"anatomy-{key}.npz"
@@ -106,12 +108,12 @@ class Live:
         return self.remembered(("anatomy", key), lambda: load_data(path, Anatomy))
 
     def choice(self, name: str) -> DeviceChoice:
-        """Return what was chosen of a device.
+        """Return the choice of size and position for a device.
 
         Raises
         ------
         ReadError
-            It was not chosen.
+            The device is not chosen.
         """
         for device in self.case.state.choices.devices:
             if device.name == name:
@@ -119,7 +121,7 @@ class Live:
         raise ReadError(f"{name} is not among the chosen devices.")
 
     def bed(self, choice: DeviceChoice) -> Bed:
-        """Return the wall as a device finds it."""
+        """Return the artery prepared for a device of the chosen size."""
         key = ("bed", self.case.state.anatomy, choice.name, choice.diameter_mm, choice.length_mm)
 
         def find() -> Bed:
@@ -129,7 +131,13 @@ class Live:
         return self.remembered(key, find)
 
     def sketch(self, choice: DeviceChoice, landing: Landing | None) -> Sketch:
-        """Return where a device would lie; centred on the neck where nothing is said."""
+        """Return the expected position of a device.
+
+        Parameters
+        ----------
+        choice : the device.
+        landing : its position; None: the chosen position, or the proposed one where none is chosen.
+        """
         with LOCK:
             wall = self.bed(choice)
             if landing is None and choice.center_mm is not None:
@@ -145,11 +153,12 @@ class Live:
         return self.remembered(key, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice)))
 
     def _field(self, path: Path, moment: int | None) -> FlowField:
-        """A flow: its mean, or a moment of its last cycle."""
+        """Return a flow: its mean, or one moment of its last cycle."""
         field = self.remembered(("flow", path, path.stat().st_mtime_ns), lambda: load_data(path, FlowField))
         return field if moment is None or not field.phases else field.at_phase(field.phases[moment % len(field.phases)])
 
     def _flow_layers(self, name: str, path: Path, moment: int | None) -> list[MeshLayer | LineLayer]:
+        """Return the layers of a flow, with its cut."""
         key = ("flow layers", path, path.stat().st_mtime_ns, self.case.state.anatomy, moment)
 
         def find() -> list[MeshLayer | LineLayer]:
@@ -161,7 +170,7 @@ class Live:
     # -- messages for the page -----------------------------------------------------------------------------------------
 
     def anatomy_message(self) -> bytes:
-        """Return vessel, openings, sac, neck, parent artery and axis, with their numbers."""
+        """Return vessel, openings, sac, neck, parent artery and axis with their numbers, as a message for the page."""
         anatomy = self.anatomy
         openings = anatomy.vessel.openings
         layers = [*anatomy_layers(anatomy), *(_disc(k, opening) for k, opening in enumerate(openings))]
@@ -177,26 +186,46 @@ class Live:
         )
 
     def neck_message(self, curve_mm: Floats, handle: int | None, to_mm: Floats | None) -> bytes:
-        """Return a neck as it is, or with one handle pulled to a point of the wall, with its area."""
+        """Return a neck with its area, optionally with one handle moved to a point of the wall.
+
+        Parameters
+        ----------
+        curve_mm : (n, 3) points of the neck.
+        handle : number of the handle to move; None: none.
+        to_mm : (3,) new position of the handle.
+        """
         with LOCK:
             if handle is not None and to_mm is not None:
                 curve_mm = necks.pulled(self.anatomy, curve_mm, handle, to_mm)
             return message([necks.layer_of(curve_mm)], neck=necks.told(curve_mm))
 
     def anatomy_sheet(self) -> list[dict[str, Any]]:
-        """Return the anatomy's numbers."""
+        """Return the metrics of the anatomy."""
         measures = self.remembered(("morphology", self.case.state.anatomy), lambda: morphology(self.anatomy))
         return sheets.anatomy(measures)
 
     def sketch_message(self, choice: DeviceChoice, landing: Landing | None, colour: Colour) -> bytes:
-        """Return the wires of a device where it would lie."""
+        """Return the wires of a device at its expected position.
+
+        Parameters
+        ----------
+        choice : the device.
+        landing : its position; None: the chosen or proposed one.
+        colour : quantity that colors the wires.
+        """
         with LOCK:
             found = self.sketch(choice, landing)
             wires = _wires(choice.name, found.stent, found.gap_mm, colour, lambda: _formula_coverage(found.stent))
             return message([wires], scales_of([wires], self.anatomy), **_place(found, found.stent))
 
     def deployment_message(self, choice: DeviceChoice, colour: Colour) -> bytes:
-        """Return a deployed device with its expansion and its numbers."""
+        """Return a deployed device with its expansion and its metrics, as a message for the page.
+
+        Parameters
+        ----------
+        choice : the device.
+        colour : quantity that colors the wires.
+        """
         with LOCK:
             deployment = self.deployment(choice)
             stent, gap_mm = deployment.stent, deployment.wall_gap_mm
@@ -218,7 +247,17 @@ class Live:
             )
 
     def flow_message(self, moment: int | None) -> bytes:
-        """Return wall shear stress, streamlines and a cut of every flow, on one scale: the mean, or one moment."""
+        """Return wall shear stress, streamlines and a cut of every flow, on common color scales.
+
+        Parameters
+        ----------
+        moment : number of the moment in the last cycle; None: the mean.
+
+        Raises
+        ------
+        ReadError
+            Flows are missing.
+        """
         with LOCK:
             paths = kept_flows(self.case.folder)
             if not paths:
@@ -230,7 +269,13 @@ class Live:
             return message(layers, scales_of(of_scales, self.anatomy), **_moments(bare, moment), panes=list(paths))
 
     def section(self, name: str | None, abscissa_mm: float) -> dict[str, Any]:
-        """Return what a plane across the parent axis cuts: curves in the plane and diameters."""
+        """Return the section by a plane across the parent axis: curves in the plane, in mm, and diameters.
+
+        Parameters
+        ----------
+        name : device to include; None: none.
+        abscissa_mm : position of the plane along the parent axis.
+        """
         with LOCK:
             anatomy = self.anatomy
             across = self.remembered(("planes", self.case.state.anatomy), lambda: planes(anatomy.axis))
@@ -250,7 +295,7 @@ class Live:
 
 
 def _views(anatomy: Anatomy) -> list[View]:
-    """The report's directions, the profile as wide as where a device will lie, and the whole vessel from there."""
+    """Return the views: the profile around the neck, the whole vessel from the same side, and those of the report."""
     profile, *others = views_of(anatomy, {})
     axis, span = anatomy.axis, _neck_span(anatomy) or [0.0, anatomy.axis.length_mm]
     is_near = (axis.abscissa_mm > span[0] - BESIDE_MM) & (axis.abscissa_mm < span[1] + BESIDE_MM)
@@ -261,6 +306,7 @@ def _views(anatomy: Anatomy) -> list[View]:
 
 
 def _axis(anatomy: Anatomy) -> dict[str, list[float]]:
+    """Return points, abscissa and diameter of the parent axis in mm."""
     axis = anatomy.axis
     return {
         "points": np.round(axis.points_mm, 3).ravel().tolist(),
@@ -270,16 +316,17 @@ def _axis(anatomy: Anatomy) -> dict[str, list[float]]:
 
 
 def _peak(field: FlowField) -> int | None:
-    """The moment of the largest inflow; None for a steady flow."""
+    """Return the number of the moment of the largest inflow; None for a steady flow."""
     return max(range(len(field.phases)), key=lambda k: field.phases[k].inflow_mL_s) if field.phases else None
 
 
 def _moments(field: FlowField, moment: int | None) -> dict[str, Any]:
-    """Times of the moments there are, and the one shown."""
+    """Return the times of all moments in s, and the number of the one shown."""
     return {"times_s": [phase.time_s for phase in field.phases], "moment": moment if field.phases else None}
 
 
 def _said(opening: Opening) -> dict[str, Any]:
+    """Return role, center, area, diameter and color of an opening."""
     return {
         "role": opening.role,
         "center_mm": opening.center_mm.tolist(),
@@ -290,12 +337,13 @@ def _said(opening: Opening) -> dict[str, Any]:
 
 
 def _opening_colour(opening: Opening) -> tuple[float, float, float]:
+    """Return the color of an opening."""
     number = 0 if opening.is_inlet else int(opening.role.rpartition("_")[2])
     return OPENING_COLOURS[number] if number < len(OPENING_COLOURS) else (0.45, 0.50, 0.54)
 
 
 def _disc(number: int, opening: Opening) -> MeshLayer:
-    """A disc of the opening's area, a little outside of it."""
+    """Return a disc with the area of an opening, slightly outside it."""
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     first = np.cross(opening.normal, np.eye(3)[np.argmin(np.abs(opening.normal))])
     first /= np.linalg.norm(first)
@@ -311,13 +359,14 @@ def _disc(number: int, opening: Opening) -> MeshLayer:
 
 
 def _neck_span(anatomy: Anatomy) -> list[float]:
+    """Return the ends of the neck along the parent axis in mm; empty without a sac."""
     if not anatomy.aneurysms:
         return []
     return [anatomy.aneurysms[0].proximal_abscissa_mm, anatomy.aneurysms[0].distal_abscissa_mm]
 
 
 def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Callable[[], Floats]) -> LineLayer:
-    """Wires coloured after the nodes (rows, columns) beside them."""
+    """Return the wires of a device, colored by the values at the nearest nodes (rows, columns)."""
     of_node = gap_mm
     if colour == "coverage":
         of_node = 100 * coverage()
@@ -339,18 +388,18 @@ def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Ca
 
 
 def _formula_coverage(stent: Stent) -> Floats:
-    """Coverage (rows, columns) by the formula, from every row's diameter."""
+    """Return the metal coverage (rows, columns) by the formula, from the diameter of every row."""
     of_row = [coverage_fraction(stent.design, stent.size, float(d)) for d in stent.row_diameter_mm]
     return np.broadcast_to(np.array(of_row)[:, None], stent.nodes_mm.shape[:2])
 
 
 def _center_mm(stent: Stent) -> float:
-    """Where the middle row lies on the parent axis."""
+    """Return the position of the middle row along the parent axis."""
     return float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
 
 
 def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
-    """Where a device lies, with the band of its ends about where the sketch has them."""
+    """Return the position of a device, with bands of uncertainty around its ends."""
     ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
     sketched = (found.stent.proximal_abscissa_mm, found.stent.distal_abscissa_mm)
     bands = [
@@ -372,7 +421,7 @@ def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
 
 
 def _cut(surface: Surface, center: Floats, frame: Floats) -> list[float]:
-    """Segments of a section as numbers x1, y1, x2, y2 in the plane, those near the axis."""
+    """Return the section of a surface near the axis as segments x1, y1, x2, y2 in the plane."""
     near = np.linalg.norm(surface.corners_mm[:, 0] - center, axis=1) < SECTION_REACH_MM
     offset = surface.vertices_mm - center
     segments = clipping.section(offset, surface.faces[near], offset @ frame[0])
@@ -380,7 +429,7 @@ def _cut(surface: Surface, center: Floats, frame: Floats) -> list[float]:
 
 
 def _row(deployment: Deployment, at_mm: float, center: Floats, frame: Floats) -> dict[str, Any]:
-    """What the plane cuts of a device."""
+    """Return the section of a device, its diameters and its largest gap; empty where the plane misses it."""
     stent = deployment.stent
     if not stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm:
         return {}

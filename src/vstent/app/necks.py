@@ -1,4 +1,4 @@
-"""Necks drawn on the page: a closed curve with handles, of which one is pulled along the wall."""
+"""Necks drawn on the page: a closed curve with handles that are dragged along the wall."""
 
 from typing import Any, Final
 
@@ -11,14 +11,15 @@ from vstent.kernels.arrays import Floats
 from vstent.reporting.scene import LineLayer, curves_layer
 
 POINTS: Final = 96
-"""Points of a neck on the page."""
+"""Number of points of a neck on the page."""
 REACH: Final = 1.5
-"""A handle takes the curve along on both sides as far as this many handles away."""
+"""Distance from a dragged handle within which the curve moves too, in handle spacings."""
 _DRAWN: Final = (0.72, 0.20, 0.16)
+"""Color of a neck: red, green and blue, 0 to 1."""
 
 
 def curve_of(anatomy: Anatomy) -> Floats:
-    """Return the neck found, as evenly spaced points (n, 3); none where there is no sac."""
+    """Return the neck of the first sac as evenly spaced points (n, 3); empty without a sac."""
     if not anatomy.aneurysms:
         return np.zeros((0, 3))
     ring = anatomy.aneurysms[0].neck_mm
@@ -26,9 +27,21 @@ def curve_of(anatomy: Anatomy) -> Floats:
 
 
 def pulled(anatomy: Anatomy, curve_mm: Floats, handle: int, to_mm: Floats) -> Floats:
-    """Return a neck (n, 3) of which one handle was pulled to a point (3,) of the wall; its neighbours come along.
+    """Return a neck with one handle moved to a point of the wall; the points near it move too.
 
-    What is moved is drawn onto the wall as far as it is moved; the rest stays as it is, to the bit.
+    Moved points are projected on the wall in proportion to their movement. All other points stay exactly unchanged.
+
+    Parameters
+    ----------
+    anatomy : the anatomy with the wall.
+    curve_mm : (n, 3) points of the neck.
+    handle : number of the handle.
+    to_mm : (3,) new position of the handle.
+
+    Returns
+    -------
+    Floats
+        (n, 3) points of the new neck.
     """
     at = round(handle * len(curve_mm) / NECK_HANDLES)
     away = (np.arange(len(curve_mm)) - at + len(curve_mm) / 2) % len(curve_mm) - len(curve_mm) / 2
@@ -39,12 +52,12 @@ def pulled(anatomy: Anatomy, curve_mm: Floats, handle: int, to_mm: Floats) -> Fl
 
 
 def layer_of(curve_mm: Floats) -> LineLayer:
-    """Return a neck as a layer for the scene, in the place of the one that was found."""
+    """Return a neck (n, 3) as a layer that replaces the one in the scene."""
     return curves_layer("neck", [np.concatenate([curve_mm, curve_mm[:1]])], 0.08, _DRAWN)
 
 
 def told(curve_mm: Floats) -> dict[str, Any]:
-    """Return a neck's points and its size, as `vstent.measure` defines it."""
+    """Return points, area and perimeter of a neck, with the definitions of `vstent.morphology`."""
     return {
         "curve_mm": np.round(curve_mm, 3).tolist(),
         "area_mm2": float(np.linalg.norm(triangles.polygon_area_vector(curve_mm))) if len(curve_mm) else 0.0,

@@ -1,4 +1,4 @@
-"""Ranking: all sizes of the devices chosen, deployed and ranked, kept in the case folder for the page's table."""
+"""Deploy and rank all sizes of the chosen devices, and store the ranking for the page."""
 
 import os
 from typing import Any, Final
@@ -14,12 +14,18 @@ from vstent.study.stages import find_anatomy
 from vstent.study.types import Progress
 
 MOST_PROCESSES: Final = 4
+"""Largest number of parallel processes."""
 WORTH_A_PROCESS: Final = 12
-"""So many sizes take longer than another process takes to start."""
+"""Number of sizes whose deployment takes longer than starting another process."""
 
 
 def rank_sizes(case: Case, progress: Progress) -> None:
-    """Rank every size of the devices chosen and write it down.
+    """Rank every size of the chosen devices and store the ranking in the case folder.
+
+    Parameters
+    ----------
+    case : the case.
+    progress : called at every stage.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Reopening: a case folder that `vstent run` has written becomes a case of the page, with all that was found."""
+"""Open a case folder of `vstent run` as a case of the page, with all its results."""
 
 import json
 from dataclasses import asdict
@@ -20,23 +20,30 @@ GEOMETRY: Final = (
     *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
     *("neck_mm", "upstream_mm", "downstream_mm"),
 )
+"""Settings of the vessel that the page can change."""
 FLOW: Final = ("cell_size_mm", "inflow_mL_s", "outlets")
+"""Settings of the flow that the page can change."""
 
 
 def stem(path: Path) -> str:
-    """Return what a case of this file or folder is called."""
+    """Return the name of a case from its file or folder: the name without the suffix."""
     ending = suffix(path)
     return path.name[: -len(ending)] if ending and path.is_file() else path.name
 
 
 def reopened(store: Store, folder: Path) -> Case:
-    """Make a case of a study's folder.
+    """Create a case from the folder of a study.
+
+    Parameters
+    ----------
+    store : cases of the page.
+    folder : the case folder.
 
     Raises
     ------
     ReadError
-        The folder does not say how it was made, or not in a way that this version understands, or has a setting that
-        the page does not take.
+        The folder does not state its input and settings, is from another version, or has a setting that the page does
+        not support.
     """
     from vstent.study.folder import CACHE
     from vstent.study.provenance import INPUT
@@ -61,7 +68,7 @@ def reopened(store: Store, folder: Path) -> Case:
 
 
 def _choices(settings: "Settings", folder: Path) -> Choices:
-    """What of a study's settings can be chosen on the page; ReadError where a value cannot."""
+    """Return the settings of a study that the page can change; ReadError is raised for an unsupported value."""
     flow, varied = settings.flow, settings.uncertainty
     chosen = {name: getattr(settings, name) for name in GEOMETRY}
     chosen["devices"] = [{"name": name} | asdict(settings.placing(name)) for name in settings.devices]

@@ -1,4 +1,4 @@
-"""Scans: slices of a volume, and the surface that a threshold gives, for the first step of the page."""
+"""Slices of a scan and its surface at a threshold, for the first step of the page."""
 
 from functools import cached_property
 from typing import Any, Final
@@ -17,30 +17,32 @@ from vstent.reporting.scene import FRONTAL, MeshLayer, view_of
 from vstent.reporting.thinning import thin_surface
 
 COARSE: Final = 2.5e6
-"""Voxels in which the live surface is sought, at most."""
+"""Largest number of voxels from which the live surface is computed."""
 LIVE_FACES: Final = 40_000
+"""Number of triangles above which the live surface is decimated."""
 SPECK: Final = 0.01
-"""Pieces smaller than this part of the largest are not drawn."""
+"""Size of a piece, as a fraction of the triangles of the largest piece, below which it is not drawn."""
 
 
 class Scan:
-    """A volume, looked at."""
+    """A scan as the page shows it."""
 
     def __init__(self, image: Image) -> None:
         self.image = image
 
     @cached_property
     def _range(self) -> tuple[float, float]:
+        """Lowest shown and highest intensity: the 0.5 % quantile of a sample, and the maximum."""
         sample = self.image.voxels[::3, ::3, ::3]
         return float(np.percentile(sample, 0.5)), float(self.image.voxels.max())
 
     @cached_property
     def proposed_threshold(self) -> float:
-        """The threshold that a study would take."""
+        """Threshold that a study would use."""
         return propose(self.image)[0].threshold
 
     def told(self) -> dict[str, Any]:
-        """Return shape, spacing, range and the threshold proposed."""
+        """Return shape, spacing, affine, range and proposed threshold."""
         return {
             "shape": self.image.voxels.shape,
             "spacing_mm": self.image.spacing_mm.tolist(),
@@ -51,7 +53,12 @@ class Scan:
         }
 
     def slice(self, axis: int, index: int) -> bytes:
-        """Return one slice across a voxel axis: its values, quantised, columns fastest.
+        """Return the quantized values of one slice, as a message for the page; columns run fastest.
+
+        Parameters
+        ----------
+        axis : voxel axis across the slice: 0, 1 or 2.
+        index : voxel index along that axis.
 
         Raises
         ------
@@ -68,7 +75,7 @@ class Scan:
         return packer.framed({"width": plane.shape[0], "height": plane.shape[1], "values": values})
 
     def surface(self, threshold: float) -> bytes:
-        """Return the surface that a threshold gives, coarsened so that it follows a slider."""
+        """Return the surface at a threshold, coarse enough to follow a slider, as a message for the page."""
         stride = max(1, int(np.ceil((self.image.voxels.size / COARSE) ** (1 / 3))))
         field = self.image.voxels[::stride, ::stride, ::stride].astype(np.float32)
         index, faces = isosurface(field, threshold)
@@ -82,6 +89,7 @@ class Scan:
 
 
 def _without_specks(index: Floats, faces: Any) -> tuple[Floats, Any]:
+    """Return vertices and faces without small pieces."""
     label = topology.face_components(faces)
     count = np.bincount(label)
     return triangles.compact(index, faces[count[label] >= SPECK * count.max()])

@@ -1,4 +1,4 @@
-"""Who may ask: this machine's own browser, with the token, from the page itself."""
+"""Restrict access to the server: only this machine's browser, with the token, from the page itself."""
 
 import hmac
 from collections.abc import Iterable
@@ -14,16 +14,19 @@ POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""The page runs nothing but its own files and asks nobody but its own server."""
+"""Content security policy of the page: it runs only its own files and contacts only its own server."""
 REPORT_POLICY: Final = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""A report holds its scripts; its own policy allows only those very texts, this one keeps it apart from the page."""
+"""Content security policy of a report, which contains its scripts.
+
+The policy in the report allows only those exact scripts; this one isolates the report from the page.
+"""
 BODY_LIMIT: Final = 1 << 20
-"""Bytes of any request but an upload."""
+"""Largest size of a request other than an upload, in bytes."""
 UPLOAD_LIMIT: Final = 2 << 30
-"""Bytes of an upload."""
+"""Largest size of an upload, in bytes."""
 
 _HEADERS: Final = (
     (b"x-content-type-options", b"nosniff"),
@@ -31,17 +34,25 @@ _HEADERS: Final = (
     (b"cross-origin-resource-policy", b"same-origin"),
     (b"cache-control", b"no-store"),
 )
+"""Headers added to every response."""
 
 
 class TooLarge(HTTPException):
-    """A body exceeds what is allowed."""
+    """The body of a request is larger than allowed."""
 
     def __init__(self) -> None:
         super().__init__(413, "Too large.")
 
 
 class Guard:
-    """Lets a request through only from an own page with the token; sets the headers of every answer."""
+    """Accepts requests only from the page itself with the token, and sets the headers of every response.
+
+    Parameters
+    ----------
+    app : the application.
+    token : secret token.
+    hosts : accepted host names with port.
+    """
 
     def __init__(self, app: ASGIApp, *, token: str, hosts: Iterable[str]) -> None:
         self.app, self.token = app, token
@@ -49,7 +60,7 @@ class Guard:
         self.cookie = f"vstent-{next(iter(sorted(self.hosts))).rpartition(':')[2]}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or pass it on."""
+        """Refuse a request, or pass it to the application."""
         if scope["type"] == "lifespan":
             await self.app(scope, receive, send)
             return
@@ -64,10 +75,11 @@ class Guard:
         await (refusal or self.app)(scope, _counted(receive, limit), sender)
 
     def _refusal(self, scope: Scope, headers: dict[str, str]) -> Response | None:
+        """Return the response to a request that is not allowed; None where it is allowed."""
         if headers.get("host", "") not in self.hosts:
             return PlainTextResponse("This server answers only to its own address.", 403)
         own = {f"http://{host}" for host in self.hosts}
-        # A report is shown in a sandbox, whose origin is "null": it has nothing to ask for either.
+        # A report is shown in a sandbox with the origin "null"; it needs no requests, so they are refused too.
         if headers.get("origin", next(iter(own))) not in own or headers.get("sec-fetch-site") == "cross-site":
             return PlainTextResponse("Requests from other sites are refused.", 403)
         query = parse_qs(scope["query_string"].decode("latin-1"))
@@ -80,10 +92,12 @@ class Guard:
         return None
 
     def _is_right(self, given: str) -> bool:
+        """Return whether a token is right, in constant time."""
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
 
 def _token(headers: dict[str, str], cookie: str) -> str:
+    """Return the token of a request: a bearer token, or that of the cookie."""
     kind, _, value = headers.get("authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return value.strip()
@@ -95,16 +109,18 @@ def _token(headers: dict[str, str], cookie: str) -> str:
 
 
 def _is_upload(scope: Scope) -> bool:
+    """Return whether a request uploads a file."""
     return scope["method"] == "PUT" and scope["path"].endswith("/input")
 
 
 def _length(headers: dict[str, str]) -> int:
+    """Return the stated length of a request in bytes; 0 where it is not stated."""
     text = headers.get("content-length", "0")
     return int(text) if text.isdigit() else 0
 
 
 def _counted(receive: Receive, limit: int) -> Receive:
-    """Count what comes in: a request may not say how long it is."""
+    """Return a receiver that counts the bytes of a request, because its stated length may be missing."""
     so_far = 0
 
     async def counted() -> Message:
@@ -119,6 +135,8 @@ def _counted(receive: Receive, limit: int) -> Receive:
 
 
 def _with_headers(send: Send) -> Send:
+    """Return a sender that adds the headers."""
+
     async def sender(message: Message) -> None:
         if message["type"] == "http.response.start":
             present = {name.lower() for name, _ in message["headers"]}

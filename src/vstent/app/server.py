@@ -1,4 +1,4 @@
-"""The server: the files of the page and the REST interface, which is described at /api/docs."""
+"""Server: the files of the page and the REST interface, documented at /api/docs."""
 
 import asyncio
 import json
@@ -23,16 +23,20 @@ from vstent.app.security import REPORT_POLICY, Guard
 from vstent.errors import ReadError, VstentError
 
 MEDIA: Final = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css"}
+"""Media type of a file of the page by its suffix."""
 BINARY: Final = "application/octet-stream"
 """Media type of binary answers: a manifest and its arrays (`vstent.reporting.packing`)."""
 SHARED: Final = ("viewer.js", "viewer.css")
 """Files that the page shares with the report."""
 ASSETS: Final = ("index.html", "app.js", "app.css", "docs.html", "docs.js", *SHARED)
+"""Files of the page."""
 BEAT_S: Final = 15.0
 """Interval of keep-alive messages in a stream of events, in s."""
 
 Finite = Annotated[float, Query(allow_inf_nan=False)]
+"""A finite number in a query."""
 Revision = Annotated[int, Field(ge=0)]
+"""Revision of a case."""
 
 
 class NewCase(Strict):
@@ -77,7 +81,14 @@ class NeckWanted(Strict):
 
 
 def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
-    """Return the server: the interface behind its guard."""
+    """Return the server: the REST interface behind its guard.
+
+    Parameters
+    ----------
+    desk : cases and jobs.
+    token : secret token.
+    hosts : accepted host names with port.
+    """
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -106,23 +117,26 @@ def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
 
 
 def new_token() -> str:
-    """Return a random key."""
+    """Return a random token."""
     return secrets.token_urlsafe(24)
 
 
 def _said(_: Request, error: Exception) -> JSONResponse:
+    """Return an error as a JSON response."""
     return JSONResponse({"detail": str(error)}, desks.code_of(error))
 
 
 def asset(name: str) -> Response:
-    """Return one of the page's files."""
+    """Return a file of the page."""
     folder = "reporting" if name in SHARED else "app"
-    # The reporting package is not imported for this, because that takes longer than the first page may.
+    # Importing the reporting package here would delay the first page.
     text = files("vstent").joinpath(folder, "assets", name).read_bytes()
     return Response(text, media_type=MEDIA[Path(name).suffix])
 
 
 def _add_page(app: FastAPI) -> None:
+    """Add the routes of the page's files."""
+
     @app.get("/", include_in_schema=False)
     def page() -> Response:
         return asset("index.html")
@@ -139,6 +153,8 @@ def _add_page(app: FastAPI) -> None:
 
 
 def _add_cases(api: APIRouter, desk: Desk) -> None:
+    """Add the routes of cases and their choices."""
+
     @api.get("/api/catalogue", summary="Devices and their sizes")
     def catalogue() -> list[dict[str, Any]]:
         return desks.devices()
@@ -186,6 +202,7 @@ def _add_cases(api: APIRouter, desk: Desk) -> None:
 
 
 async def _stream(desk: Desk, case: Any) -> AsyncIterator[str]:
+    """Yield the state of a case whenever it changes, as server-sent events."""
     event = case.listen()
     try:
         while not desk.is_closing:
@@ -201,6 +218,8 @@ async def _stream(desk: Desk, case: Any) -> AsyncIterator[str]:
 
 
 def _add_input(api: APIRouter, desk: Desk) -> None:
+    """Add the routes of uploads and scans."""
+
     @api.put("/api/cases/{case_id}/input", summary="Upload a volume, a surface, a DICOM slice, or a ZIP of them")
     async def bring(case_id: str, request: Request, name: Annotated[str, Query(max_length=300)]) -> dict[str, Any]:
         found = await asyncio.to_thread(desk.store.get, case_id)
@@ -234,6 +253,8 @@ def _add_input(api: APIRouter, desk: Desk) -> None:
 
 
 def _add_jobs(api: APIRouter, desk: Desk) -> None:
+    """Add the routes of jobs and results."""
+
     @api.post("/api/cases/{case_id}/jobs/{kind}", status_code=202, summary="Start a long stage")
     def start(case_id: str, kind: Literal["anatomy", "rank", "flow"]) -> dict[str, Any]:
         found = desk.store.get(case_id)
@@ -264,6 +285,8 @@ def _add_jobs(api: APIRouter, desk: Desk) -> None:
 
 
 def _add_scenes(api: APIRouter, desk: Desk) -> None:
+    """Add the routes of 3-D scenes."""
+
     @api.get("/api/cases/{case_id}/anatomy", summary="Vessel, sac, neck and parent artery (binary)")
     def anatomy(case_id: str) -> Response:
         return Response(desk.live(desk.store.get(case_id)).anatomy_message(), media_type=BINARY)

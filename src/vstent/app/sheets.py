@@ -1,4 +1,4 @@
-"""Sheets: metrics as the page lists them, each with its unit and its definition."""
+"""Metrics as the page lists them, each with its unit and its definition."""
 
 from typing import Any, Final
 
@@ -7,6 +7,7 @@ from vstent.reporting.quantities import Quantity, compare, flatten, format_chang
 from vstent.reporting.uncertainty import uncertainty_of
 
 Sheet = dict[str, Any]
+"""Title, devices and rows of one table."""
 
 FIRST: Final = {
     "anatomy": (
@@ -30,22 +31,28 @@ FIRST: Final = {
         "jailed_branches_count",
     ),
 }
-"""What is shown before one asks for more."""
+"""Metrics shown before the user expands a table."""
 
 
 def anatomy(measures: dict[str, Any]) -> list[Sheet]:
-    """Return the sheet of the vessel."""
+    """Return the table of the vessel."""
     return [_plain("Anatomy", flatten(measures), FIRST["anatomy"])]
 
 
 def device(title: str, measures: dict[str, Any]) -> Sheet:
-    """Return the sheet of one deployed device."""
+    """Return the table of one deployed device."""
     numbers = {key: value for key, value in measures.items() if not isinstance(value, str)}
     return _plain(title, flatten(numbers), FIRST["device"])
 
 
 def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
-    """Return the sheet of the flow: before, and with every device after and change."""
+    """Return the table of the flow: without a device, and with each device and its relative change.
+
+    Parameters
+    ----------
+    metrics : metrics of the case.
+    titles : titles of the devices by name, in order.
+    """
     changes = compare(metrics)
     rows = []
     for change in changes:
@@ -60,7 +67,13 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
 
 
 def uncertainty(metrics: dict[str, Any], titles: dict[str, str]) -> list[dict[str, Any]]:
-    """Return the intervals of every device for which something was varied."""
+    """Return the uncertainty intervals of every device with an uncertainty study.
+
+    Parameters
+    ----------
+    metrics : metrics of the case.
+    titles : titles of the devices by name, in order.
+    """
     ordered = {"stents": {name: metrics["stents"][name] for name in titles}}
     return [
         {"title": varied.title, "words": varied.words, "rows": [row._asdict() for row in varied.rows]}
@@ -69,12 +82,14 @@ def uncertainty(metrics: dict[str, Any], titles: dict[str, str]) -> list[dict[st
 
 
 def _plain(title: str, quantities: list[Quantity], first: tuple[str, ...]) -> Sheet:
+    """Return a table of values, those named `first` on top."""
     rows = [_row(quantity, [quantity.text], is_first=quantity.key in first) for quantity in quantities]
     rows.sort(key=lambda row: first.index(row["key"]) if row["key"] in first else len(first))
     return {"title": title, "names": [], "devices": [], "rows": rows}
 
 
 def _row(quantity: Quantity, cells: list[str], *, is_first: bool) -> dict[str, Any]:
+    """Return one row of a table with name, meaning and source of the metric."""
     meaning = quantity.definition
     words = {"key": quantity.key, "name": quantity.name, "meaning": meaning.meaning, "source": meaning.source}
     return words | {"cells": cells, "is_first": is_first}

@@ -1,7 +1,7 @@
-"""Worker process: `python -m vstent.app.worker KIND FOLDER` runs one job and reports it, one JSON line per message.
+"""Worker process: ``python -m vstent.app.worker KIND FOLDER`` runs one job and reports it as lines of JSON.
 
-The first line of its standard input is the case's state when the job was started; later choices do not affect the job.
-The input closes when the server ends for any reason. The worker then ends with all its processes, so that the case
+The first line of its standard input is the state of the case when the job was started; later choices do not affect the
+job. The input closes when the server ends for any reason. The worker then ends with all its processes, so that the case
 folder is free when the server starts again.
 """
 
@@ -21,7 +21,7 @@ from vstent.study.pipeline import run
 
 
 def end_with_the_server() -> None:
-    """Wait until the server has ended, and end."""
+    """Wait until the server has ended, then end this process and its children."""
     sys.stdin.read()
     if hasattr(os, "killpg"):
         os.killpg(0, signal.SIGKILL)
@@ -48,6 +48,7 @@ def find_anatomy(case: Case) -> None:
 
 
 def _anatomy_key(case: Case) -> str:
+    """Return the key of the anatomy of a case."""
     return anatomy_key(hash_of(case.input), case.state.settings())
 
 
@@ -56,7 +57,7 @@ def compute(case: Case) -> None:
     from vstent.reporting.write import write_report
 
     if _anatomy_key(case) != case.state.anatomy:
-        find_anatomy(case)  # reported before the flow: a job that is stopped there has replaced the former anatomy
+        find_anatomy(case)  # reported before the flow, since it has replaced the stored anatomy by then
     result = run(case.input, case.folder, case.state.settings(), progress, replaces=True)
     progress("report", 0.0, "")
     write_report(result, case.folder, is_printed=True)
@@ -64,17 +65,24 @@ def compute(case: Case) -> None:
 
 
 def rank(case: Case) -> None:
-    """Deploy all sizes of the devices chosen and rank them."""
+    """Deploy and rank all sizes of the chosen devices."""
     from vstent.app.ranking import rank_sizes
 
     rank_sizes(case, progress)
 
 
 JOBS: Final[dict[str, Callable[[Case], None]]] = {"anatomy": find_anatomy, "rank": rank, "flow": compute}
+"""Function of each kind of job."""
 
 
 def main(kind: str, folder: Path) -> int:
-    """Do a job; return the exit code."""
+    """Run a job; return the exit code.
+
+    Parameters
+    ----------
+    kind : a key of `JOBS`.
+    folder : the case folder.
+    """
     given = State.model_validate_json(sys.stdin.readline())
     threading.Thread(target=end_with_the_server, daemon=True).start()
     try:

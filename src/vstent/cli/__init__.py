@@ -1,4 +1,4 @@
-"""The command line: arguments in, a study run, tables and messages out; one module for each command.
+"""Command line: arguments in, a study run, tables and messages out; one module per command.
 
 Open ``run.py`` first; ``options.py`` holds the options that several commands share.
 """
@@ -24,12 +24,22 @@ FAILED: Final = 1
 INTERRUPTED: Final = 130
 """Exit code after Ctrl-C."""
 HELPER: Final = (sys.executable, "-m", "vstent.cli.warm")
-"""Command that compiles the kernels that are needed last, while this process compiles those that it needs first."""
+"""Command of a second process that compiles the kernels needed last while this process compiles those needed first."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code (0 done, 1 failed, 2 bad input, 130 interrupted)."""
-    # The linear systems are small, so threads of the linear algebra would only wait for each other.
+    """Run the command line.
+
+    Parameters
+    ----------
+    argv : arguments; None: those of the process.
+
+    Returns
+    -------
+    int
+        Exit code: 0 done, 1 failed, 2 input cannot be used, 130 interrupted.
+    """
+    # The linear systems are too small for several threads of the linear algebra library.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with borne_interrupts():
         words, notices = renamed(sys.argv[1:] if argv is None else argv)
@@ -72,17 +82,19 @@ def _remedy(error: OSError) -> str:
 
 
 def _first_use() -> None:
+    """Print a notice that the kernels are being compiled."""
     said = "first use of this version: compiling its kernels, which takes about half a minute once."
     print(f"vstent: {said}", file=sys.stderr, flush=True)
 
 
 def _fail(sentence: str, code: int) -> int:
+    """Print an error message and return the exit code."""
     print(f"vstent: {sentence}", file=sys.stderr)
     return code
 
 
 class _Version(argparse.Action):
-    """Prints the version, which takes a while to look up and is therefore looked up on request only."""
+    """Prints the version; it is looked up on request only, because that is slow."""
 
     def __call__(self, parser: argparse.ArgumentParser, *given: object) -> None:
         """Print the version and exit."""
@@ -93,6 +105,7 @@ class _Version(argparse.Action):
 
 
 def _parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
     parser = argparse.ArgumentParser(
         prog="vstent",
         description="Virtual stenting of intracranial aneurysms.",

@@ -39,12 +39,14 @@ def add(commands: options.Commands) -> None:
 
 
 def _port(text: str) -> int:
+    """Return a port number read from text."""
     if not text.isdecimal() or int(text) > LAST_PORT:
         raise argparse.ArgumentTypeError(f"{text!r} is not a port: give 0 to {LAST_PORT}")
     return int(text)
 
 
 def _app(arguments: argparse.Namespace) -> int:
+    """Serve the page until it is interrupted; return the exit code."""
     from vstent.errors import InputError
 
     if importlib.util.find_spec("fastapi") is None or importlib.util.find_spec("uvicorn") is None:
@@ -78,7 +80,13 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def open_desk(given: Path | None, workspace: Path) -> "Desk":
-    """Return a desk, with the input or case folder opened on it if one is given."""
+    """Return a desk with its cases.
+
+    Parameters
+    ----------
+    given : scan, surface or case folder to open; None: nothing is opened.
+    workspace : folder of the cases.
+    """
     from vstent.app.cases import Store
     from vstent.app.desk import Desk
 

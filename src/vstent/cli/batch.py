@@ -38,6 +38,7 @@ def add(commands: options.Commands) -> None:
 
 
 def _batch(arguments: argparse.Namespace) -> int:
+    """Run the command; return the exit code."""
     from vstent.cli.console import Console, cohort_table
     from vstent.cohort.batch import collect, left_to_do, run_cohort, write_table
     from vstent.cohort.cases import device_rows, find_cases
@@ -63,6 +64,7 @@ def _batch(arguments: argparse.Namespace) -> int:
 
 
 def _crew(arguments: argparse.Namespace, foreseen: "Estimate") -> "AbstractCrew":
+    """Return the processes or the cluster that the options request."""
     from vstent.cohort.crews import DaskCluster, Processes, Slurm
 
     if arguments.scheduler:
@@ -73,6 +75,8 @@ def _crew(arguments: argparse.Namespace, foreseen: "Estimate") -> "AbstractCrew"
 
 
 def _teller(console: Any) -> Any:
+    """Return a function that prints a line for every finished case."""
+
     def tell(done: int, total: int, name: str, rows: Sequence[dict[str, Any]]) -> None:
         faults = [f" {row['device']}, {row['outcome']}: {row['sentence']}" for row in rows if row["outcome"] != "done"]
         console.say(f"{done}/{total} {name} {_seconds(rows)}{''.join(faults)}")
@@ -81,10 +85,12 @@ def _teller(console: Any) -> Any:
 
 
 def _seconds(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the run time of a case as text."""
     return ", ".join(sorted({f"{row['case_s']:.0f} s" for row in rows if "case_s" in row}))
 
 
 def _report(out: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write the report of the cohort."""
     from vstent.io.writers import write_text
     from vstent.reporting.cohort import cohort_report
 

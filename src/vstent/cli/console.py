@@ -37,7 +37,7 @@ QUIET_S: Final = 30.0
 
 
 class Console:
-    """Shows the progress of a study on standard error and its tables on standard output."""
+    """Prints the progress of a study to standard error and its tables to standard output."""
 
     def __init__(self) -> None:
         self._err = RichConsole(stderr=True, highlight=False)
@@ -48,14 +48,21 @@ class Console:
 
     @contextmanager
     def live(self) -> Iterator[None]:
-        """Show a spinner with the present stage on a terminal."""
+        """Show a spinner with the current stage on a terminal."""
         with self._err.status("starting") as status:
             self._status = status
             yield
             self._status = None
 
     def progress(self, stage: str, fraction: float, detail: str) -> None:
-        """Show the progress of a stage, from 0 (begins) to 1 (done)."""
+        """Show the progress of a stage.
+
+        Parameters
+        ----------
+        stage : name of the stage.
+        fraction : completed fraction, from 0 (starts) to 1 (done).
+        detail : result of a finished stage, or remaining time.
+        """
         now = time.monotonic()
         began = self._began.setdefault(stage, now)
         if fraction >= 1.0:
@@ -77,7 +84,7 @@ class Console:
 
 
 def comparison_table(metrics: Mapping[str, Any]) -> Table:
-    """Return the table of bare artery and devices: values with units and changes against bare."""
+    """Return the table of the main results: without a device, and with each device and its relative change."""
     stents = metrics["stents"]
     table = Table("", "bare", *stents)
     for title, key in DEVICE_ROWS:
@@ -119,7 +126,13 @@ RANKING_COLUMNS: Final = (
 
 
 def ranking_table(ranking: Ranking, shown: int) -> Table:
-    """Return the table of the best candidates, with the number of all in its caption."""
+    """Return the table of the best candidates of a ranking.
+
+    Parameters
+    ----------
+    ranking : the ranking.
+    shown : number of candidates to show.
+    """
     table = Table("", "device and size", "shift", "score", *(title for title, _, _ in RANKING_COLUMNS))
     for number, candidate in enumerate(ranking.candidates[:shown], start=1):
         values = [(candidate.measures.get(key), form) for _, key, form in RANKING_COLUMNS]
@@ -132,13 +145,19 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
 
 
 def ranking_reasons(ranking: Ranking, shown: int) -> str:
-    """Return a line with the reasons for the place of every candidate shown."""
+    """Return one line per candidate with the reasons for its rank.
+
+    Parameters
+    ----------
+    ranking : the ranking.
+    shown : number of candidates to show.
+    """
     best = enumerate(ranking.candidates[:shown], start=1)
     return "\n".join(f"{number}. {candidate.label}: {candidate.reason}" for number, candidate in best)
 
 
 def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the table of a cohort: a row for each device with medians over the finished cases."""
+    """Return the table of a cohort: one row per device with medians over the finished cases."""
     columns = [column for column in COHORT_COLUMNS if any(row.get(column[1]) is not None for row in rows)]
     table = Table("device", "done", "failed", "lost", *(title for title, _, _ in columns))
     for device in dict.fromkeys(row["device"] for row in rows):
@@ -154,7 +173,7 @@ def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
-    """Return the table of uncertainty intervals of each result of each device, with the causes of the spread."""
+    """Return the table of uncertainty intervals of all results, with the main causes."""
     from vstent.reporting.uncertainty import intervals
 
     table = Table("device", "result", "mean", "95 % interval from", "to", "main causes", title="uncertainty")
@@ -186,7 +205,7 @@ def morphology_table(measures: Mapping[str, Any]) -> Table:
 
 
 def flow_table(metrics: Mapping[str, Any]) -> Table:
-    """Return the table of every flow index: bare, and with each device with its change."""
+    """Return the table of all flow indices: without a device, and with each device and its relative change."""
     from vstent.reporting.quantities import flatten
 
     stents = metrics["stents"]
@@ -212,7 +231,7 @@ def convergence_table(found: Refinement) -> Table:
 
 
 def positions_table(found: Mapping[str, Scatter]) -> Table:
-    """Return the table of one flow in several orientations on the grid: every quantity, mean and half the range."""
+    """Return the table of one flow in several orientations on the grid: every quantity, its mean and half its range."""
     from vstent.reporting.quantities import flatten
 
     table = Table("orientation on the grid", *POSITIONS, "mean", "±")
@@ -235,7 +254,7 @@ def _spaced(text: str) -> str:
 
 
 def _change(key: str, bare: float, value: float | None) -> str:
-    """Return a value with its unit and its change against bare; empty where there is none."""
+    """Return a value with its unit and its relative change; empty where there is none."""
     from vstent.reporting.quantities import ERRORS
 
     has_change = value is not None and bare and key not in ERRORS
@@ -243,7 +262,7 @@ def _change(key: str, bare: float, value: float | None) -> str:
 
 
 def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:
-    """Return the table of found and true values."""
+    """Return the table of found and true values; rows hold title, found value, true value and unit."""
     table = Table("against the phantom's truth", "unit", "found", "true", "error")
     for title, found, true, unit in rows:
         error = f"{found / true - 1:+.1%}" if true else f"{found - true:+.3g}"
@@ -252,7 +271,7 @@ def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:
 
 
 def device_table(devices: Mapping[str, Design]) -> Table:
-    """Return the table of the catalogue: names, construction, sizes, and the grades of the numbers' sources."""
+    """Return the table of the catalogue: names, construction, sizes, and how well the numbers are sourced."""
     table = Table(
         "name", "device", "construction", "sizes (diameter x length, mm)", "numbers cited / derived / estimated"
     )

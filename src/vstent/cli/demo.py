@@ -1,4 +1,4 @@
-"""`vstent demo`: a whole study of a synthetic scan, compared with its known truth."""
+"""`vstent demo`: run a study of a synthetic scan and compare it with the known truth."""
 
 import argparse
 from pathlib import Path
@@ -26,6 +26,7 @@ def add(commands: options.Commands) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> int:
+    """Run the command; return the exit code."""
     from vstent.cli.console import Console, truth_table
     from vstent.study.demo import truth, write_scan
 

@@ -7,7 +7,7 @@ from vstent.cli import options
 
 
 def add(commands: options.Commands) -> None:
-    """Add the command and its own."""
+    """Add the command and its subcommand ``add``."""
     parser = options.add_command(commands, "devices", "List the devices of the catalogue, or add your own.", "devices")
     parser.set_defaults(command=_devices)
     adding = options.add_command(
@@ -23,6 +23,7 @@ def add(commands: options.Commands) -> None:
 
 
 def _devices(arguments: argparse.Namespace) -> int:
+    """Print the catalogue; return the exit code."""
     from vstent.cli.console import Console, device_table
     from vstent.devices.catalogue import catalogue
 
@@ -31,6 +32,7 @@ def _devices(arguments: argparse.Namespace) -> int:
 
 
 def _add(arguments: argparse.Namespace) -> int:
+    """Add the devices of a file to the catalogue and print them; return the exit code."""
     from vstent.cli.console import Console, device_table
     from vstent.devices.catalogue import add_devices
 

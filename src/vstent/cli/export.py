@@ -7,7 +7,7 @@ from vstent.cli import options
 
 
 def add(commands: options.Commands) -> None:
-    """Add the command and its own."""
+    """Add the command and its subcommands."""
     parser = options.add_command(
         commands, "export", "Write a case for other flow solvers.", "export openfoam case --out foam"
     )
@@ -43,18 +43,21 @@ def add(commands: options.Commands) -> None:
 
 
 def _add_input(parser: argparse.ArgumentParser) -> None:
+    """Add input, output folder and the options on the vessel."""
     parser.add_argument("input", type=Path, help="case folder of `vstent run`, scan or surface")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder")
     options.add_outlet(options.add_given(parser))
 
 
 def _layers(text: str) -> int:
+    """Return a number of prism layers read from text."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of layers: give 0 or more")
     return int(text)
 
 
 def _openfoam(arguments: argparse.Namespace) -> int:
+    """Run ``export openfoam``; return the exit code."""
     from vstent.cli.console import Console
     from vstent.study.exports import export_openfoam
     from vstent.study.types import Settings
@@ -72,6 +75,7 @@ def _openfoam(arguments: argparse.Namespace) -> int:
 
 
 def _patches(arguments: argparse.Namespace) -> int:
+    """Run ``export patches``; return the exit code."""
     from vstent.cli.console import Console
     from vstent.study.exports import export_patches
     from vstent.study.types import Settings

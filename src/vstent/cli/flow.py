@@ -36,6 +36,7 @@ def add(commands: options.Commands) -> None:
 
 
 def _flow(arguments: argparse.Namespace) -> int:
+    """Run the command; return the exit code."""
     from vstent.cli.console import Console
     from vstent.study.types import Settings
 
@@ -50,6 +51,7 @@ def _flow(arguments: argparse.Namespace) -> int:
 
 
 def _compute(path: Path, out: Path, settings: "Settings", console: "Console", replaces: bool) -> "list[Table]":
+    """Compute the flows and return their table."""
     from vstent.cli.console import flow_table
     from vstent.study.pipeline import run
 
@@ -59,6 +61,7 @@ def _compute(path: Path, out: Path, settings: "Settings", console: "Console", re
 
 
 def _converge(path: Path, out: Path, settings: "Settings", console: "Console", replaces: bool) -> "list[Table]":
+    """Compute the flow on several grids, time steps and orientations and return the tables."""
     from vstent.cli.console import convergence_table, positions_table
     from vstent.study.pipeline import refine_flow
 

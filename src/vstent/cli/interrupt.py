@@ -1,4 +1,4 @@
-"""Ctrl-C at the command line."""
+"""Handle Ctrl-C at the command line."""
 
 import signal
 import threading
@@ -8,18 +8,18 @@ from types import FrameType
 from typing import Final
 
 UNBEARING: Final = ("numba", "llvmlite", "vtkmodules", "importlib", "_frozen_importlib", "_frozen_importlib_external")
-"""Packages whose Python code is called by C code that an exception leaves in disorder, or crashes."""
+"""Packages whose Python code is called from C code that an exception would corrupt or crash."""
 BEARING: Final = "numba.cuda"
-"""What of them waits for a GPU most of the time, in Python."""
+"""Part of these packages that may be interrupted: it waits for a GPU most of the time, in Python."""
 AGAIN_S: Final = 0.05
-"""Time until an interrupt that could not be borne comes back."""
+"""Delay before a deferred Ctrl-C is raised again, in s."""
 
 
 @contextmanager
 def borne_interrupts() -> Iterator[None]:
-    """Have Ctrl-C raise KeyboardInterrupt only where that can be borne: not while a kernel or a module is loaded.
+    """Raise KeyboardInterrupt on Ctrl-C only where it is safe: not while a kernel is compiled or a module is loaded.
 
-    Where Ctrl-C is ignored or answered by another, and off the main thread, nothing is changed.
+    Nothing is changed off the main thread, or where Ctrl-C is ignored or has another handler.
     """
     is_main = threading.current_thread() is threading.main_thread()
     if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
@@ -33,6 +33,7 @@ def borne_interrupts() -> Iterator[None]:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, or defer it where it is not safe."""
     if not _is_borne(frame):
         again = threading.Timer(AGAIN_S, _again)
         again.daemon = True
@@ -42,7 +43,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _is_borne(frame: FrameType | None) -> bool:
-    """Tell whether neither a frame nor any that called it is of a package that does not bear exceptions."""
+    """Return whether no frame on the call stack belongs to a package that must not be interrupted."""
     while frame is not None:
         name = str(frame.f_globals.get("__name__"))
         if name.partition(".")[0] in UNBEARING and not name.startswith(BEARING):
@@ -52,7 +53,7 @@ def _is_borne(frame: FrameType | None) -> bool:
 
 
 def _again() -> None:
-    """Interrupt the main thread, wherever it waits, unless what was to be interrupted is over."""
+    """Interrupt the main thread again, unless this handler is no longer installed."""
     if signal.getsignal(signal.SIGINT) is not _interrupt:
         return
     main = threading.main_thread().ident

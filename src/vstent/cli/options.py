@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from vstent.plan.uncertainty import Ranges
 
 EPILOG: Final = "Lengths are in mm, coordinates are LPS. Research use only: not cleared for diagnosis or treatment."
+"""Last line of every help text."""
 RENAMED: Final = {
     "--cell-size": "--grid-spacing",
     "--close-up": "--refine-sac",
@@ -25,7 +26,7 @@ RENAMED: Final = {
     "--files": "--keep-files",
     "--crate": "--ro-crate",
 }
-"""Option names of version 0.1 and their present names. The old ones are accepted until version 0.3."""
+"""Option names of version 0.1 that are accepted until version 0.3, and their present names."""
 PUBLISHED: Final = "published"
 """Value of ``--pulsatile`` without a file: the published waveform."""
 LONGEST_CYCLE_S: Final = 3.0
@@ -38,7 +39,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def renamed(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a command line with the present names of options, and a notice for every old name in it."""
+    """Return a command line with present option names, and a notice for every old name in it."""
     words, notices = [], []
     for word in argv:
         name, equals, value = word.partition("=")
@@ -62,7 +63,13 @@ def positive(text: str) -> float:
 
 
 def within(low: float, high: float, remark: str) -> Callable[[str], float]:
-    """Return a reader of numbers within a range; `remark` names the unit and a conversion into it."""
+    """Return a function that reads a number and rejects it outside a range.
+
+    Parameters
+    ----------
+    low, high : ends of the range.
+    remark : unit and an example of a conversion into it, for the error message.
+    """
 
     def read(text: str) -> float:
         value = number(text)
@@ -74,7 +81,15 @@ def within(low: float, high: float, remark: str) -> Callable[[str], float]:
 
 
 def add_command(commands: Commands, name: str, text: str, example: str) -> argparse.ArgumentParser:
-    """Add a command with its summary and an example, the words after the command's name."""
+    """Add a command.
+
+    Parameters
+    ----------
+    commands : parser to which the command is added.
+    name : name of the command.
+    text : summary, one sentence.
+    example : arguments of an example, after ``vstent``.
+    """
     parser = commands.add_parser(
         name,
         help=text[0].lower() + text[1:].rstrip("."),
@@ -83,13 +98,13 @@ def add_command(commands: Commands, name: str, text: str, example: str) -> argpa
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    # A minus and a digit begin a number or a point, not an option; argparse knows single numbers only.
+    # A minus before a digit begins a number or a point; argparse recognizes single numbers only.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     return parser
 
 
 def add_geometry(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
-    """Add input, case folder and the options on the vessel; return the group of the latter."""
+    """Add input, case folder and the options on the vessel; return the group of these options."""
     parser.add_argument(
         "input",
         type=Path,
@@ -158,7 +173,7 @@ def add_outlet(given: "argparse._ArgumentGroup") -> None:
 
 
 def add_neck(given: "argparse._ArgumentGroup") -> None:
-    """Add a neck drawn by hand."""
+    """Add the option for a neck drawn by hand."""
     given.add_argument(
         "--neck",
         type=Path,
@@ -259,17 +274,19 @@ def add_jobs(group: "argparse._ArgumentGroup") -> None:
 
 
 def _cores() -> int:
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _jobs(text: str) -> int:
+    """Return a number of processes read from text."""
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of processes: give a whole number such as 2")
     return int(text)
 
 
 def numbers(text: str) -> list[float]:
-    """Return numbers separated by commas."""
+    """Return numbers separated by commas, read from text."""
     return _numbers(text, float)
 
 
@@ -308,6 +325,7 @@ RANGES: Final = {
 
 
 def _cause(text: str) -> tuple[str, float]:
+    """Return field and range of a cause of uncertainty read from text."""
     name, _, value = text.partition("=")
     try:
         return RANGES[name], float(value)
@@ -340,30 +358,35 @@ def _numbers(text: str, kind: type, count: int | None = None) -> list[float]:
 
 
 def _three(text: str, kind: type) -> tuple[float, float, float]:
+    """Return three numbers read from text."""
     first, second, third = _numbers(text, kind, 3)
     return first, second, third
 
 
 def _count(text: str) -> int:
+    """Return a whole number above zero read from text."""
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
     return int(text)
 
 
 def _point(text: str) -> tuple[float, float, float]:
+    """Return a point read from text."""
     return _three(text, float)
 
 
 def _shape(text: str) -> tuple[float, float, float]:
+    """Return the numbers of voxels read from text."""
     return _three(text, int)
 
 
 def _spacing(text: str) -> tuple[float, float, float]:
+    """Return three voxel edges read from text; one number stands for all three."""
     return _three(text if "," in text else ",".join([text] * 3), float)
 
 
 def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options on the vessel under the names of the settings."""
+    """Return the options on the vessel by the names of the settings, with points in LPS mm."""
     in_lps = _from_ras if arguments.frame == "ras" else _as_given
     inlets = tuple(map(in_lps, arguments.inlet)) if arguments.inlet else None
     at, outlet, neck = arguments.at, getattr(arguments, "outlet", None), _neck(getattr(arguments, "neck", None))
@@ -384,9 +407,11 @@ def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 Point: TypeAlias = tuple[float, float, float]
+"""Coordinates in mm."""
 
 
 def _as_given(point_mm: Point) -> Point:
+    """Return a point unchanged."""
     return point_mm
 
 
@@ -396,13 +421,14 @@ def _from_ras(point_mm: Point) -> Point:
 
 
 def _neck(path: Path | None) -> tuple[tuple[float, float, float], ...] | None:
+    """Return the points of a CSV file; None without a file."""
     from vstent.io.tables import read_columns
 
     return None if path is None else tuple((x, y, z) for x, y, z in read_columns(path, 3).tolist())
 
 
 def given_devices(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """Return the names of the devices, each once; by default the two of the paper."""
+    """Return the names of the devices, each once; by default silk and enterprise, the devices of the paper."""
     return tuple(dict.fromkeys(arguments.device or ("silk", "enterprise")))
 
 
@@ -438,6 +464,7 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
 
 
 def _blood(arguments: argparse.Namespace) -> "Blood":
+    """Return the blood properties that the options state."""
     from vstent.flow.case import HIGH_SHEAR_VISCOSITY_PA_S, Blood, CarreauYasuda
 
     if not arguments.shear_thinning:
@@ -446,6 +473,7 @@ def _blood(arguments: argparse.Namespace) -> "Blood":
 
 
 def _waveform(source: str | None) -> "Waveform | None":
+    """Return the inflow waveform; None for a steady flow."""
     from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
     from vstent.io.tables import read_columns
 

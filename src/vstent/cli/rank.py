@@ -34,6 +34,7 @@ def add(commands: options.Commands) -> None:
 
 
 def _rank(arguments: argparse.Namespace) -> int:
+    """Run the command; return the exit code."""
     from vstent.cli.console import Console, ranking_reasons, ranking_table
     from vstent.devices.catalogue import find_design
     from vstent.plan.criteria import default_criteria, read_criteria

@@ -17,6 +17,7 @@ def add(commands: options.Commands) -> None:
 
 
 def _restore(arguments: argparse.Namespace) -> int:
+    """Run the command; return the exit code."""
     from vstent.cli.console import Console, morphology_table
     from vstent.study.pipeline import restore_vessel
     from vstent.study.types import Settings

@@ -58,7 +58,13 @@ def add_pdf(parser: argparse.ArgumentParser) -> None:
 
 
 def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
-    """Return the settings of a study; `given` are further ones."""
+    """Return the settings of a study.
+
+    Parameters
+    ----------
+    arguments : parsed options.
+    given : further settings by name.
+    """
     from vstent.study.types import Settings
 
     flow = None if arguments.no_flow else options.given_flow(arguments)
@@ -67,7 +73,16 @@ def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
 
 
 def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool, replaces: bool) -> "CaseResult":
-    """Run a study, show its progress, write its reports and print its tables."""
+    """Run a study, show its progress, write its reports and print its tables.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    out : the case folder.
+    settings : settings of the study.
+    is_printed : whether the report is also written as PDF.
+    replaces : whether results of another input or of other settings are replaced.
+    """
     from vstent.cli.console import Console, comparison_table, uncertainty_table
     from vstent.study.pipeline import run
 
@@ -89,6 +104,7 @@ def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool, repl
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    """Run the command; return the exit code."""
     settings = given_study(
         arguments,
         **options.given_geometry(arguments),
@@ -103,7 +119,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _again(arguments: argparse.Namespace, given: "Settings") -> int:
-    """Repeat a run from its run.json; report what has changed since, and how well the results agree."""
+    """Repeat a run from its ``run.json`` and compare the results; return the exit code."""
     from vstent.cli.console import Console
     from vstent.errors import InputError
     from vstent.study.repeat import agreement, read_record
@@ -126,7 +142,7 @@ def _again(arguments: argparse.Namespace, given: "Settings") -> int:
 
 
 def _finish(arguments: argparse.Namespace, case: "CaseResult") -> int:
-    """Write the RO-Crate where asked; return the exit code: 1 where a device or a flow failed."""
+    """Write the RO-Crate if requested; return the exit code: 1 where a device or a flow failed."""
     from vstent.study.crate import write_crate
 
     if arguments.ro_crate:

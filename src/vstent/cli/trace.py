@@ -15,6 +15,7 @@ def add(commands: options.Commands) -> None:
 
 
 def _trace(arguments: argparse.Namespace) -> int:
+    """Run the command; return the exit code."""
     from vstent.cli.console import Console, opening_table
     from vstent.study.pipeline import trace_vessel
     from vstent.study.types import Settings

@@ -1,11 +1,11 @@
-"""Compile every kernel ahead of its first use: ``python -m vstent.cli.warm``, in the set-up."""
+"""Compile every kernel before its first use: ``python -m vstent.cli.warm``."""
 
 from vstent.flow.lattice.kernels.warm import flow
 from vstent.kernels.warm import warm as warm_shared
 
 
 def warm() -> None:
-    """Call every kernel once on next to nothing, the flow's first; numba keeps what it compiles."""
+    """Call every kernel once on a tiny input, those of the flow first, so that numba caches the compiled code."""
     flow()
     warm_shared()
 

@@ -1,4 +1,4 @@
-"""Many patients: a folder or table of cases in, one table with a row for each device of each case out.
+"""Run many patients: a folder or table of cases in, one table with a row per case and device out.
 
 Open ``batch.py`` first.
 """

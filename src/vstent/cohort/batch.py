@@ -1,8 +1,8 @@
-"""Cohort: many patients, many devices: one row each in one table, whatever happens to whom.
+"""Run a cohort: one table row per case and device, also where a case fails.
 
-Every row is written into its case's folder as soon as it is known, under a key of all that it depends on (the input's
-hash, the settings, this version). Whoever dies, the next run does what is missing and nothing else; the table is made
-from the rows.
+Each row is written into the folder of its case as soon as it is known, under a key of everything it depends on: the
+hash of the input, the settings and the version. A later run computes only the rows that are missing. The table is
+collected from the rows.
 """
 
 from collections.abc import Sequence
@@ -16,18 +16,25 @@ from vstent.cohort.work import LOST, Row, Task, read_row, write_row
 from vstent.io.tables import write_parquet, write_rows
 
 CASES: Final = "cases"
-"""Folder that holds a folder for every case."""
+"""Subfolder of the output folder that holds one folder per case."""
 
 
 class Progress(Protocol):
-    """Told when a case has ended."""
+    """Called when a case has ended."""
 
     def __call__(self, done: int, total: int, name: str, rows: Sequence[Row]) -> None:
-        """`done` of `total` cases have ended, the last is called `name` and has these rows."""
+        """Report that `done` of `total` cases have ended; the last one is called `name` and has these rows."""
 
 
 def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -> list[Task]:
-    """Return what is missing: the cases with the devices whose rows are not there, or were lost."""
+    """Return the work that is missing: cases with those devices whose row is missing or whose process died.
+
+    Parameters
+    ----------
+    cases : cases of the cohort.
+    out : output folder of the cohort.
+    keeps_files : whether all files of every study are kept.
+    """
     tasks = []
     for case in cases:
         folder, keys = _folder(case, out), case.keys
@@ -40,14 +47,21 @@ def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -
 
 
 def run_cohort(tasks: Sequence[Task], out: Path, crew: AbstractCrew, progress: Progress) -> None:
-    """Let a crew do the tasks; a case whose process died gets rows that say so.
+    """Run tasks in parallel; a case whose process died gets rows that state it.
+
+    Parameters
+    ----------
+    tasks : tasks from `left_to_do`.
+    out : output folder of the cohort.
+    crew : processes or cluster that runs the tasks.
+    progress : called when a case has ended.
 
     Raises
     ------
     InputError
-        When the crew cannot begin.
+        The processes or the cluster cannot be started.
     VstentError
-        When the crew itself is lost; what was finished is kept.
+        The connection to the cluster is lost; finished rows are kept.
     """
     for done, ended in enumerate(crew.do(tasks), start=1):
         task = tasks[ended.number]
@@ -58,17 +72,24 @@ def run_cohort(tasks: Sequence[Task], out: Path, crew: AbstractCrew, progress: P
 
 
 def collect(cases: Sequence[Case], out: Path) -> list[Row]:
-    """Return the rows that are there, in the order of cases and devices."""
+    """Return the rows that exist, in the order of cases and devices.
+
+    Parameters
+    ----------
+    cases : cases of the cohort.
+    out : output folder of the cohort.
+    """
     rows = [read_row(_folder(case, out), device, key) for case in cases for device, key in case.keys.items()]
     return [row for row in rows if row is not None]
 
 
 def write_table(out: Path, rows: Sequence[Row]) -> list[Path]:
-    """Write ``cohort.csv`` and, where pyarrow is installed, ``cohort.parquet``; return what was written."""
+    """Write ``cohort.csv`` and, where pyarrow is installed, ``cohort.parquet``; return the paths written."""
     write_rows(out / "cohort.csv", rows)
     is_written = write_parquet(out / "cohort.parquet", rows)
     return [out / "cohort.csv", *([out / "cohort.parquet"] if is_written else [])]
 
 
 def _folder(case: Case, out: Path) -> Path:
+    """Return the folder of a case in the output folder `out`."""
     return out / CASES / case.name

@@ -1,4 +1,4 @@
-"""Cases: what a folder or a CSV file says is to be done."""
+"""Read the cases of a cohort from a folder or a CSV file."""
 
 import csv
 from collections.abc import Callable, Sequence
@@ -23,15 +23,15 @@ class Case:
     """One patient of a cohort."""
 
     name: str
-    """Its name in the table, and that of its folder."""
+    """Name of the case in the table, and of its folder."""
     path: Path
     """Scan or surface."""
     settings: Settings
-    """What is given; its devices are those to do."""
+    """Settings of the study, with the devices to deploy."""
 
     @cached_property
     def keys(self) -> dict[str, str]:
-        """Key of every device's row: names everything that the row depends on."""
+        """Key of the row of every device; it covers everything that the row depends on."""
         source = hash_of(self.path)
         return {
             name: key_of(source, find_design(name), replace(self.settings, devices=(name,)))
@@ -44,18 +44,19 @@ def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:
 
     Parameters
     ----------
-    cohort : a folder, or a CSV file with titles. Its column ``input`` holds paths (relative ones from the file's
-        folder), ``case`` names (else the file's), ``devices`` names parted by blanks; the other columns are settings:
-        ``units``, ``threshold``, ``at``, ``inlet`` (a point, or several parted by semicolons), ``outlet``, ``spacing``,
-        ``shape``, ``diameter``, ``length``, ``center``. An empty cell takes what `settings` says.
-    settings : for every case.
+    cohort : a folder, or a CSV file with column titles. Column ``input`` holds paths relative to the folder of the
+        file, ``case`` holds names (default: the file name), ``devices`` holds names separated by spaces. The other
+        columns are settings: ``units``, ``threshold``, ``at``, ``inlet`` (one point, or several separated by
+        semicolons), ``outlet``, ``spacing``, ``shape``, ``diameter``, ``length``, ``center``. An empty cell takes the
+        value of `settings`.
+    settings : settings for every case.
 
     Raises
     ------
     ReadError
-        When there is no such folder or file, or no case in it.
+        The folder or file does not exist, or holds no case.
     InputError
-        When a row of the file is wrong or two cases have one name.
+        A row of the file cannot be used, or two cases have the same name.
     """
     refuse_missing(cohort)
     cases = _in_folder(cohort, settings) if cohort.is_dir() else _in_file(cohort, settings)
@@ -73,21 +74,25 @@ def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:
 
 
 def _in_folder(folder: Path, settings: Settings) -> list[Case]:
+    """Return a case for every scan or surface of a folder, in the order of their names."""
     shown = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     return [Case(_name(path), path, settings) for path in shown if _is_case(path)]
 
 
 def _is_case(path: Path) -> bool:
+    """Return whether a path is a scan or a surface."""
     if path.is_dir():
-        return any(file.is_file() for file in path.iterdir())  # a DICOM series has no names to go by
+        return any(file.is_file() for file in path.iterdir())  # files of a DICOM series need no suffix
     return suffix(path) in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES)
 
 
 def _name(path: Path) -> str:
+    """Return the name of a case: its file name without the suffix."""
     return path.name if path.is_dir() else path.name[: len(path.name) - len(suffix(path))] or path.name
 
 
 def _in_file(path: Path, settings: Settings) -> list[Case]:
+    """Return a case for every row of a CSV file."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
@@ -99,6 +104,7 @@ def _in_file(path: Path, settings: Settings) -> list[Case]:
 
 
 def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Case:
+    """Return the case of one row of a CSV file; `line` is its line number for messages."""
     given = {str(key).strip(): value.strip() for key, value in row.items() if isinstance(value, str) and value.strip()}
     where = f"line {line} of {file}"
     unknown = sorted(set(given) - {"case", "input", *COLUMNS})
@@ -123,30 +129,37 @@ def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Cas
 
 
 def _size(text: str) -> float:
+    """Return a finite number above zero read from text."""
     return _above_zero(finite(text))
 
 
 def _count(text: str) -> int:
+    """Return a whole number above zero read from text."""
     return _above_zero(int(text))
 
 
 def _above_zero(value: Number) -> Number:
+    """Return a value above zero; ValueError is raised for others."""
     if value <= 0:
         raise ValueError("it must be above zero")
     return value
 
 
 def _units(text: str) -> str:
+    """Return a length unit read from text."""
     if text not in MM_PER:
         raise ValueError(f"give one of {', '.join(MM_PER)}")
     return text
 
 
 def _words(text: str) -> list[str]:
+    """Return the words of a text separated by spaces, commas or semicolons."""
     return text.replace(",", " ").replace(";", " ").split()
 
 
 def _three(kind: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+    """Return a reader of three values of one kind."""
+
     def read(text: str) -> tuple[Any, ...]:
         values = tuple(kind(word) for word in _words(text))
         if len(values) != 3:
@@ -157,6 +170,7 @@ def _three(kind: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
 
 
 def _points(text: str) -> tuple[tuple[float, ...], ...]:
+    """Return points read from text, three numbers each."""
     values = [finite(word) for word in _words(text)]
     if len(values) % 3:
         raise ValueError("three numbers are needed for every point")
@@ -164,6 +178,7 @@ def _points(text: str) -> tuple[tuple[float, ...], ...]:
 
 
 def _devices(text: str) -> tuple[str, ...]:
+    """Return names of devices read from text, each once."""
     return tuple(dict.fromkeys(_words(text)))
 
 
@@ -180,9 +195,9 @@ COLUMNS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
     "length": ("length_mm", _size),
     "center": ("center_mm", finite),
 }
-"""Titles of a CSV file's columns: the setting each fills, and how it is read."""
+"""Columns of a CSV file: the setting that each sets, and the function that reads it."""
 
 
 def device_rows(cases: Sequence[Case]) -> int:
-    """Number of rows that the cohort's table will have."""
+    """Return the number of rows of the cohort's table."""
     return sum(len(case.settings.devices) for case in cases)

@@ -1,4 +1,4 @@
-"""Crews: who does the cases: processes of this machine, or the workers of a Dask cluster."""
+"""Run the cases of a cohort in processes of this machine, on a Dask cluster, or in a Slurm queue."""
 
 import multiprocessing
 import shutil
@@ -15,42 +15,42 @@ from vstent.cohort.work import Task, work
 from vstent.errors import InputError, VstentError
 
 ATTEMPTS: Final = 2
-"""A case whose process dies is tried so often."""
+"""Number of times a case is started where its process dies."""
 SPARE: Final = 2.0
-"""A job of a queue asks for so many times the memory foreseen: beyond it, it is killed."""
+"""Factor on the estimated memory that a Slurm job requests, because a job that exceeds its request is killed."""
 SCHEDULER_S: Final = 20.0
-"""A scheduler that does not answer for so long is lost."""
+"""Time to wait for a Dask scheduler to answer, in s."""
 
 
 class Ended(NamedTuple):
-    """A task that has come to an end."""
+    """A task that has ended."""
 
     number: int
-    """Which."""
+    """Index of the task."""
     fault: str
-    """Why its process died; empty where it did its work."""
+    """Reason why its process died; empty where it finished."""
 
 
 class AbstractCrew(ABC):
-    """Does tasks. Rows are written by whoever does them, so that they outlive the one who gave the order."""
+    """Runs tasks in parallel. Every task writes its own rows, so that they survive the main process."""
 
     @abstractmethod
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Yield every task when it has ended, in any order."""
+        """Run tasks; yield each one when it has ended, in any order."""
 
 
 @final
 @dataclass(frozen=True)
 class Processes(AbstractCrew):
-    """Processes of this machine, a fresh one for every case: what dies takes nothing with it."""
+    """Processes of this machine, a new one for every case, so that a crash affects one case only."""
 
     jobs: int
-    """How many at once."""
+    """Number of parallel processes."""
     work: Callable[[Task], None] = work
-    """What each does."""
+    """Function that each process calls."""
 
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Yield every task when its process has ended."""
+        """Run tasks; yield each one when its process has ended."""
         context = multiprocessing.get_context("spawn")
         waiting = [(number, 1) for number in reversed(range(len(tasks)))]
         running: list[tuple[BaseProcess, int, int]] = []
@@ -76,11 +76,13 @@ class Processes(AbstractCrew):
 
 
 def _uninterrupted(work: Callable[[Task], None], task: Task) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the first process's to answer, which ends this one
+    """Do a task with Ctrl-C ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C and ends this process
     work(task)
 
 
 def _fault(exitcode: int | None) -> str:
+    """Return the reason why a process died, from its exit code; empty where it finished."""
     if not exitcode:
         return ""
     how = f"was killed by signal {-exitcode}" if exitcode < 0 else f"ended with code {exitcode}"
@@ -92,22 +94,22 @@ def _fault(exitcode: int | None) -> str:
 @final
 @dataclass(frozen=True)
 class DaskCluster(AbstractCrew):
-    """Workers of a Dask cluster; they must see the same folders as this machine."""
+    """Workers of a Dask cluster; they must have access to the same folders as this machine."""
 
     address: str
-    """Of the scheduler, such as tcp://head:8786."""
+    """Address of the scheduler, such as ``tcp://head:8786``."""
     work: Callable[[Task], None] = work
-    """What each worker does."""
+    """Function that each worker calls."""
 
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Yield every task when its future has ended; a worker's death makes Dask give its task to another.
+        """Run tasks; yield each one when it has ended. Dask gives the task of a worker that died to another worker.
 
         Raises
         ------
         InputError
-            When Dask is missing or no scheduler answers.
+            Dask is not installed, or no scheduler answers.
         VstentError
-            When the scheduler is lost: what was finished is kept.
+            The connection to the scheduler is lost; finished rows are kept.
         """
         with _client(self.address) as client:
             futures = {client.submit(self.work, task, pure=False): number for number, task in enumerate(tasks)}
@@ -121,31 +123,31 @@ class DaskCluster(AbstractCrew):
 @final
 @dataclass(frozen=True)
 class Slurm(AbstractCrew):
-    """Jobs of a Slurm queue, each a Dask worker, started for this cohort and ended with it."""
+    """Jobs of a Slurm queue, each a Dask worker; they are started for this cohort and ended with it."""
 
     jobs: int
-    """How many at once."""
+    """Number of parallel jobs."""
     memory_MB: float
-    """What one case is foreseen to need."""
+    """Estimated memory of one case."""
 
     def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Yield every task when it has ended.
+        """Run tasks; yield each one when it has ended.
 
         Raises
         ------
         InputError
-            When dask-jobqueue or Slurm is missing.
+            dask-jobqueue is not installed, or Slurm is not available.
         """
-        if shutil.which("sbatch") is None:  # dask-jobqueue would try to send jobs for ever
+        if shutil.which("sbatch") is None:  # dask-jobqueue would try to submit jobs forever
             raise InputError(
                 "Slurm was not found (no `sbatch` on the PATH): run the command on a machine that submits jobs"
             )
         with self.cluster() as cluster:
-            cluster.adapt(minimum_jobs=self.jobs, maximum_jobs=self.jobs)  # a job that the queue ends is asked for anew
+            cluster.adapt(minimum_jobs=self.jobs, maximum_jobs=self.jobs)  # a job that the queue ends is replaced
             yield from DaskCluster(cluster.scheduler_address).do(tasks)
 
     def cluster(self) -> Any:
-        """Start the scheduler; queue, account and time limit come from dask-jobqueue's own configuration file."""
+        """Start the scheduler; dask-jobqueue's configuration file sets queue, account and time limit."""
         try:
             from dask_jobqueue import SLURMCluster
         except ImportError:
@@ -154,10 +156,12 @@ class Slurm(AbstractCrew):
 
 
 def _missing(package: str) -> InputError:
+    """Return the error for a package that is not installed."""
     return InputError(f"{package} is not installed: run pip install 'vstent[cluster]', or work without the cluster")
 
 
 def _client(address: str) -> Any:
+    """Return a client of the Dask scheduler at an address."""
     try:
         from distributed import Client
     except ImportError:
@@ -169,6 +173,7 @@ def _client(address: str) -> Any:
 
 
 def _see_alive(client: Any) -> None:
+    """Raise VstentError where the connection to the scheduler is lost."""
     if client.status not in ("running", "connecting"):
         raise VstentError(
             "the Dask scheduler was lost; finished cases are kept: start it again and give the same command"
@@ -176,6 +181,7 @@ def _see_alive(client: Any) -> None:
 
 
 def _future_fault(future: Any) -> str:
+    """Return the reason why a task failed; empty where it finished."""
     if future.status == "finished":
         return ""
     if future.status == "error":

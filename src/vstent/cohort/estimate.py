@@ -1,4 +1,4 @@
-"""Estimate: the time and memory that a cohort will take, told before it begins."""
+"""Estimate run time and memory of a cohort before it starts."""
 
 import os
 from collections.abc import Sequence
@@ -9,53 +9,63 @@ from vstent.cohort.cases import Case
 from vstent.io.files import is_surface_file, suffix
 
 START_CPU_S: Final = 3.0
-"""A process starts and loads its compiled kernels."""
+"""CPU time in s to start a process and load its compiled kernels."""
 START_MB: Final = 220.0
-"""What a process holds before it has read anything."""
+"""Memory in MB of a process before it reads its input."""
 STL_BYTES: Final = 50
-"""Of one triangle in a binary file; other surface files hold about as much a triangle."""
+"""Bytes per triangle of a binary STL file; other surface files have about as many."""
 CPU_S_PER_1000_TRIANGLES: Final = 0.25
-"""Repair, trace, restore: 38,000 triangles of AneuriskWeb's C0038 take 10 s, 25,000 of the demo's 2.5 s."""
+"""CPU time in s per 1000 triangles to repair, trace and restore.
+
+38,000 triangles of AneuriskWeb's C0038 take 10 s, 25,000 of the demo's 2.5 s.
+"""
 MB_PER_1000_TRIANGLES: Final = 5.0
-"""Beside them: 400 MB in all for the demo."""
+"""Memory in MB per 1000 triangles on top of `START_MB`; the demo uses 400 MB in all."""
 CPU_S_PER_MILLION_VOXELS: Final = 0.5
-"""Reading and segmenting, before the surface is worked on."""
+"""CPU time in s per million voxels to read and segment a scan."""
 MB_PER_MILLION_VOXELS: Final = 40.0
-"""Several copies of a scan, as 32-bit numbers."""
+"""Memory in MB per million voxels: several copies of a scan as 32-bit numbers."""
 SCAN_TRIANGLES: Final = 60_000
-"""Of a vessel tree out of a scan."""
+"""Typical number of triangles of the vessel tree segmented from a scan."""
 CPU_S_PER_DEVICE: Final = 1.0
-"""Deployed, measured, its wires made solid."""
+"""CPU time in s to deploy and measure a device and to build the solids of its wires."""
 FLOW_CELLS: Final = 200_000
-"""Measured on a trimmed vessel with a grid spacing of 0.17 mm."""
+"""Number of grid cells of a flow, measured on a trimmed vessel with a grid spacing of `COMMON_CELL_MM`."""
 CPU_S_PER_1000_CELLS: Final = 0.6
-"""Steady, from rest: the demo's flows take about 130 s of CPU each."""
+"""CPU time in s per 1000 grid cells of a steady flow computed from rest; the demo's flows take about 130 s each."""
 MB_PER_1000_CELLS: Final = 1.0
-"""Of a flow at work."""
+"""Memory in MB per 1000 grid cells during a flow computation."""
 COMMON_CELL_MM: Final = 0.17
+"""Grid spacing in mm to which `FLOW_CELLS` and `CPU_S_PER_1000_CELLS` refer."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is foreseen, roughly: within a factor of two on a machine of 2020's."""
+    """Estimated run time and memory, within a factor of two on a machine of the 2020s."""
 
     cpu_s: float
-    """Time of one core for all cases."""
+    """CPU time of all cases, in s."""
     memory_MB: float
-    """Largest memory of one case."""
+    """Memory of the largest case."""
     jobs: int
-    """Cases at once that the memory left on this machine bears."""
+    """Number of parallel cases for which the free memory of this machine suffices."""
 
     @property
     def sentence(self) -> str:
-        """The estimate in words."""
+        """The estimate as text."""
         hours = self.cpu_s / self.jobs / 3600
         time = f"{hours:.1f} h" if hours >= 1 else f"{max(1, round(60 * hours))} min"
         return f"about {time} with {self.jobs} parallel processes, up to {self.memory_MB:.0f} MB each"
 
 
 def estimate(cases: Sequence[Case], jobs: int) -> Estimate:
-    """Foresee time and memory of the cases left to do from the sizes of their files."""
+    """Return the estimated run time and memory of cases, from the sizes of their files.
+
+    Parameters
+    ----------
+    cases : cases to run.
+    jobs : number of parallel processes requested.
+    """
     costs = [_cost(case) for case in cases]
     memory_MB = max((memory for _, memory in costs), default=START_MB)
     free_MB = _free_memory_MB()
@@ -64,7 +74,7 @@ def estimate(cases: Sequence[Case], jobs: int) -> Estimate:
 
 
 def _cost(case: Case) -> tuple[float, float]:
-    """CPU seconds and MB of one case."""
+    """Return CPU time in s and memory in MB of one case."""
     n_bytes = _bytes(case)
     is_surface = is_surface_file(case.path)
     voxels = 0.0 if is_surface else n_bytes * (4 if suffix(case.path).endswith(".gz") else 1) / 2
@@ -82,12 +92,13 @@ def _cost(case: Case) -> tuple[float, float]:
 
 
 def _bytes(case: Case) -> int:
+    """Return the size of the files of a case in bytes."""
     files = case.path.rglob("*") if case.path.is_dir() else [case.path]
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _free_memory_MB() -> float | None:
-    """Memory that new processes may take; None where the system does not say."""
+    """Return the memory available to new processes in MB; None where the system does not report it."""
     try:
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e6
     except (AttributeError, ValueError, OSError):

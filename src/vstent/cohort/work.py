@@ -1,4 +1,4 @@
-"""Work: one case done, whatever comes: a row a device, written as soon as it is known."""
+"""Run one case of a cohort and write one row per device, also where the case fails."""
 
 import json
 import shutil
@@ -17,36 +17,38 @@ from vstent.study.pipeline import restore_vessel, run
 from vstent.study.types import Progress, Settings
 
 Row = dict[str, Any]
-"""One case with one device: names to values."""
+"""One case with one device: column name to value."""
 
 COST: Final = ("case_s", "case_cpu_s", "peak_memory_MB")
-"""Columns that no two runs agree on: they tell of the computer, not of the case."""
+"""Columns on run time and memory; they describe the computer, so they differ between runs."""
 DONE: Final = "done"
+"""Outcome of a device that was deployed and measured."""
 FAILED: Final = "failed"
-"""The input cannot be used, or a flow cannot be computed: doing it again changes nothing."""
+"""Outcome where the input cannot be used or a flow cannot be computed; a repetition would give the same."""
 LOST: Final = "lost"
-"""The process died: done again by the next run."""
+"""Outcome where the process died; the next run repeats the case."""
 MB: Final = 1e6
+"""Bytes in a megabyte."""
 _ALONE: Final = threading.Lock()
-"""Compiled kernels that run in parallel bear one caller in a process; a Dask worker may have several threads."""
+"""Lock for parallel kernels, which allow one caller per process; a Dask worker may have several threads."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is left to do of one case."""
+    """Remaining work of one case."""
 
     case: Case
     """The case; its devices are those whose rows are missing."""
     folder: Path
-    """Where its rows are written."""
+    """Folder in which its rows are written."""
     keys: Mapping[str, str]
     """Key of every missing row, by device."""
     keeps_files: bool = False
-    """Keep all that `vstent run` writes, in ``study`` beside the rows."""
+    """Whether all files of `vstent run` are kept, in subfolder ``study``."""
 
 
 class _Watch:
-    """Knows which stage is at work."""
+    """Remembers the current stage of a study."""
 
     stage = "read"
 
@@ -55,23 +57,23 @@ class _Watch:
 
 
 def row_path(folder: Path, device: str) -> Path:
-    """Where the row of a device lies in a case's folder."""
+    """Return the file of the row of a device in the folder of a case."""
     return folder / f"{device}.json"
 
 
 def work(task: Task) -> None:
-    """Do one case: run its study with every missing device and write the rows.
+    """Run one case: deploy every missing device and write the rows.
 
-    A device that does not fit, or an input that cannot be used, is a row too, with the stage and the sentence.
+    A device that does not fit, or an input that cannot be used, gives a row with its stage and error message.
     """
     import numba
 
     with _ALONE:
-        numba.set_num_threads(1)  # as many cases at once as there are cores
+        numba.set_num_threads(1)  # cases run in parallel, one per core
         began, cpu = time.perf_counter(), time.process_time()
         rows = _rows(task)
         done = tuple(device for device, row in rows.items() if row["outcome"] == DONE)
-        if task.keeps_files and done and len(rows) > 1:  # one study with all that can be done: nothing is computed anew
+        if task.keeps_files and done and len(rows) > 1:  # one study of all devices, read from stored results
             run(
                 task.case.path,
                 task.folder / "study",
@@ -88,7 +90,7 @@ def work(task: Task) -> None:
 
 
 def _rows(task: Task) -> dict[str, Row]:
-    """Return the rows of a case: the artery is restored once, then every device deployed; failures are rows too."""
+    """Return the rows of a case by device; the artery is restored once, and failures are rows too."""
     case, study = task.case, task.folder / "study"
     devices = case.settings.devices
     failed = _failure(task, lambda watch: restore_vessel(case.path, study, case.settings, watch, replaces=True))
@@ -110,7 +112,7 @@ def _rows(task: Task) -> dict[str, Row]:
 
 
 def _failure(task: Task, do: Callable[[Progress], object]) -> Row:
-    """Do something; return the row of its failure, empty where there was none."""
+    """Call a function and return the row of its failure; empty where it succeeds."""
     watch = _Watch()
     try:
         do(watch)
@@ -124,12 +126,19 @@ def _failure(task: Task, do: Callable[[Progress], object]) -> Row:
 
 
 def flat_metrics(metrics: Mapping[str, Any], device: str) -> Row:
-    """Every number of a study's metrics that concerns a device, under names parted by dots."""
+    """Return all metrics of a study that concern one device, under dotted keys.
+
+    Parameters
+    ----------
+    metrics : metrics of the study.
+    device : name of the device.
+    """
     parts = {"vessel": metrics["vessel"], "bare": metrics.get("bare", {})} | dict(metrics["stents"][device])
     return _flat(parts, "")
 
 
 def _flat(values: Mapping[str, Any], before: str) -> Row:
+    """Return nested values under dotted keys."""
     row: Row = {}
     for name, value in values.items():
         row |= _flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {f"{before}{name}": value}
@@ -137,14 +146,28 @@ def _flat(values: Mapping[str, Any], before: str) -> Row:
 
 
 def write_row(task: Task, device: str, row: Row) -> None:
-    """Write the row of a device, with the key of all that it depends on."""
+    """Write the row of a device with the key of everything it depends on.
+
+    Parameters
+    ----------
+    task : task of the case.
+    device : name of the device.
+    row : values by column name.
+    """
     named = {"case": task.case.name, "device": device} | row
     kept = {"key": task.keys[device], "row": named, "settings": asdict(task.case.settings)}
     write_json(row_path(task.folder, device), kept)
 
 
 def read_row(folder: Path, device: str, key: str) -> Row | None:
-    """Return the row of a device; None where it is missing, damaged, or of another input or version."""
+    """Return the row of a device; None where it is missing, damaged, or has another key.
+
+    Parameters
+    ----------
+    folder : folder of the case.
+    device : name of the device.
+    key : key of everything that the row depends on.
+    """
     try:
         kept = json.loads(row_path(folder, device).read_text(encoding="utf-8"))
         return dict(kept["row"]) if kept["key"] == key else None
@@ -153,7 +176,7 @@ def read_row(folder: Path, device: str, key: str) -> Row | None:
 
 
 def peak_memory_MB() -> float | None:
-    """Largest resident memory of this process so far; None where the system does not say."""
+    """Return the largest resident memory of this process so far; None where the system does not report it."""
     try:
         import resource
     except ImportError:  # Windows

@@ -1,4 +1,4 @@
-"""Files in and out: scans, surfaces and tables in, data classes out, and back. Open ``images.py`` first.
+"""Read scans, surfaces and tables into data classes, and write them. Open ``images.py`` first.
 
-Nothing else reads or writes files, and nothing else knows another frame than LPS millimetres.
+No other package reads or writes files, and none handles a frame other than LPS in mm.
 """

@@ -1,7 +1,7 @@
 """Save and load vstent's data classes, one compressed file each, so that a study can resume.
 
-An archive is a NumPy .npz file: the arrays, and under the name ``noun`` a JSON text that describes their structure. It
-holds no pickle: loading runs only the constructors of vstent's own data classes.
+An archive is a NumPy .npz file. It holds the arrays and, in the entry ``noun``, a JSON text that describes their
+structure. It contains no pickle: loading runs only the constructors of vstent's own data classes.
 """
 
 import dataclasses
@@ -21,7 +21,9 @@ from vstent.io.files import atomic, existing
 Saved = TypeVar("Saved")
 
 _ROOT: Final = "vstent."
+"""Prefix of the modules whose data classes may be loaded."""
 _KIND: Final = "is"
+"""Key of the JSON text that states the kind of a value."""
 _FORMER_HOMES: Final = {
     "vstent.device": "vstent.devices.design",
     "vstent.flow.types": "vstent.flow.case",
@@ -34,7 +36,7 @@ _FORMER_HOMES: Final = {
     "vstent.uncertainty": "vstent.plan.uncertainty",
     "vstent.vessel": "vstent.geometry.vessel",
 }
-"""Modules that archives of version 0.1 name -> modules that hold the same classes."""
+"""Modules named in archives of version 0.1, and the modules that define the same classes."""
 DAMAGE: Final = (
     OSError,
     ValueError,
@@ -55,10 +57,15 @@ MOST_BYTES: Final = 1 << 33
 
 
 def save_data(path: Path, value: Any) -> None:
-    """Write a frozen data class of vstent with everything it contains.
+    """Write a data class of vstent with everything it contains.
 
     Fields may be arrays, numbers, strings, booleans, None, tuples, lists, dictionaries with string keys, and data
     classes of vstent, nested to any depth.
+
+    Parameters
+    ----------
+    path : the file to write.
+    value : the data class.
 
     Raises
     ------
@@ -73,7 +80,12 @@ def save_data(path: Path, value: Any) -> None:
 
 
 def load_data(path: Path, kind: type[Saved]) -> Saved:
-    """Read a data class of the given type.
+    """Read a data class.
+
+    Parameters
+    ----------
+    path : a file written by `save_data`.
+    kind : expected type.
 
     Raises
     ------
@@ -103,6 +115,7 @@ def _refuse_bomb(archive: Any) -> None:
 
 
 def _packed(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
+    """Return a value as JSON types; its arrays are added to `arrays`."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, (bool, int, float, str)):
@@ -122,6 +135,7 @@ def _packed(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
 
 
 def _unpacked(value: Any, archive: Any) -> Any:
+    """Return the value that JSON types and arrays describe."""
     if not isinstance(value, dict):
         return value
     kind = value[_KIND]
@@ -137,6 +151,7 @@ def _unpacked(value: Any, archive: Any) -> Any:
 
 
 def _class_of(module: str, name: str) -> type:
+    """Return a data class of vstent by module and name; ValueError is raised for anything else."""
     if not module.startswith(_ROOT):
         raise ValueError(f"{module}.{name} is not a data class of vstent")
     home = _FORMER_HOMES.get(module, module)

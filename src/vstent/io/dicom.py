@@ -1,4 +1,4 @@
-"""DICOM series -> Image."""
+"""Read a DICOM series as an `Image`."""
 
 import logging
 import struct
@@ -33,15 +33,21 @@ class _Slice:
     """One plane of voxels: a file, or one frame of a multi-frame file."""
 
     dataset: Any
+    """Header of the file, without pixels until they are needed."""
     path: Path
+    """The file."""
     frame: int | None
+    """Index of the frame of a multi-frame file; None for a single-frame file."""
     position_mm: Floats
+    """(3,) center of the first voxel, LPS mm."""
     orientation: Floats
-    """(2, 3) unit directions of growing column and of growing row number."""
+    """(2, 3) unit directions of increasing column and of increasing row number."""
     pixel_mm: Floats
     """(2,) distance between columns and between rows, in mm."""
     slope: float
+    """Factor from stored to rescaled values."""
     intercept: float
+    """Offset added after the factor."""
     padding: tuple[int, int] | None
     """Smallest and largest stored value that mark pixels outside the field of view; None where not stated."""
 
@@ -67,14 +73,19 @@ def is_dicom(path: Path) -> bool:
 def read_dicom(path: Path, *, acquisition: int | None = None) -> Image:
     """Read the largest series of a folder, or the series that one file belongs to.
 
-    Slices are ordered by their positions, never by names or numbers. Exact copies of a slice are dropped. Where a
-    series holds several acquisitions of the same slices, as mask and fill runs, one of them is read: the one given,
-    else the one with the brightest vessels. MONOCHROME1 images are inverted.
+    Slices are ordered by position, never by name or number. Exact copies of a slice are dropped. Where a series holds
+    several acquisitions of the same slices, such as mask and fill runs, one is read: the requested one, else the one
+    with the brightest vessels. MONOCHROME1 images are inverted.
 
     Parameters
     ----------
     path : a folder, or one file of a series; a multi-frame file is read alone.
-    acquisition : which acquisition of a series that holds several, counted from 1.
+    acquisition : number of the acquisition in a series that holds several, counted from 1.
+
+    Returns
+    -------
+    Image
+        Voxels (i, j, k) and the affine from voxel to LPS mm.
 
     Raises
     ------
@@ -111,7 +122,7 @@ def series_of(path: Path) -> list[Path]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Suppress pydicom's warnings about small faults; errors are still raised."""
+    """Suppress pydicom's warnings about minor faults; errors are still raised."""
     logger = logging.getLogger("pydicom")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -150,7 +161,7 @@ def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
 
 
 def _headers(path: Path) -> Iterator[tuple[Path, Any]]:
-    """Yield files with their headers: all below a folder, or the file given and its neighbors.
+    """Yield files with their headers: all below a folder, or the given file and its neighbors.
 
     A multi-frame file is a volume of its own. A neighbor that cannot be read may belong to another series; where it
     belongs to this one, its slice is reported as missing later.
@@ -179,6 +190,7 @@ def _candidates(folder: Path) -> list[Path]:
 
 
 def _siblings(path: Path) -> list[Path]:
+    """Return the other DICOM files in the folder of a file."""
     return sorted(p for p in path.parent.iterdir() if p != path and is_dicom(p))
 
 
@@ -192,7 +204,7 @@ def _header(file: Path) -> Any:
         is_image = "Image Storage" in dataset.file_meta.MediaStorageSOPClassUID.name
         if not is_image and "Rows" not in dataset:
             return None
-        _ = dataset.SeriesInstanceUID, _n_voxels(dataset)  # values are decoded, and faults met, on first use
+        _ = dataset.SeriesInstanceUID, _n_voxels(dataset)  # faults are raised when values are first used
         return dataset
     except damage():
         raise ReadError(
@@ -209,7 +221,7 @@ def _refuse_bomb(file: Path) -> None:
     if meta.get("TransferSyntaxUID") != DeflatedExplicitVRLittleEndian:
         return
     with file.open("rb") as stream:
-        stream.seek(144 + meta.FileMetaInformationGroupLength)  # preamble, magic and this element go before
+        stream.seek(144 + meta.FileMetaInformationGroupLength)  # 144: preamble, magic and this element
         unpacker, length = zlib.decompressobj(-zlib.MAX_WBITS), 0
         while length <= MOST_UNPACKED and (packed := unpacker.unconsumed_tail or stream.read(1 << 16)):
             length += len(unpacker.decompress(packed, 1 << 22))
@@ -218,6 +230,7 @@ def _refuse_bomb(file: Path) -> None:
 
 
 def _n_voxels(dataset: Any) -> int:
+    """Return the number of voxels of a file."""
     return int(dataset.Rows) * int(dataset.Columns) * int(getattr(dataset, "NumberOfFrames", 1) or 1)
 
 
@@ -232,6 +245,7 @@ def _planes(file: Path, dataset: Any) -> list[_Slice]:
 
 
 def _frames(file: Path, dataset: Any) -> list[_Slice]:
+    """Return the slices of one file; ReadError is raised for a series of projections."""
     if "PerFrameFunctionalGroupsSequence" not in dataset:
         if int(getattr(dataset, "NumberOfFrames", 1) or 1) > 1:
             raise ReadError(f"{file.name} is a series of projections, not a volume. Export the 3-D reconstruction.")
@@ -252,6 +266,7 @@ _GROUP: Final = {
 
 
 def _value(places: list[Any], keyword: str) -> Any:
+    """Return an attribute from the first place that states it; None where none does."""
     for place in places:
         group = getattr(place, _GROUP[keyword], None)
         value = getattr(group[0] if group else place, keyword, None)
@@ -261,6 +276,7 @@ def _value(places: list[Any], keyword: str) -> Any:
 
 
 def _plane(file: Path, dataset: Any, frame: int | None, places: list[Any]) -> _Slice:
+    """Return one slice with its position, orientation, spacing and scaling."""
     name = file.name if frame is None else f"{file.name} frame {frame + 1}"
     position, orientation = _value(places, "ImagePositionPatient"), _value(places, "ImageOrientationPatient")
     pixel = _value(places, "PixelSpacing")
@@ -284,6 +300,7 @@ def _plane(file: Path, dataset: Any, frame: int | None, places: list[Any]) -> _S
 
 
 def _padding(dataset: Any) -> tuple[int, int] | None:
+    """Return the range of stored values outside the field of view; None where it is not stated."""
     value = getattr(dataset, "PixelPaddingValue", None)
     if value is None:
         return None
@@ -303,13 +320,13 @@ ACQUISITION_KEYS: Final = {
     "ContentTime": "content time",
     "ImageType": "image type",
 }
-"""Attributes that may tell acquisitions of one series apart, in the order in which they are tried, with their names."""
+"""Attributes that may distinguish the acquisitions of a series, in the order in which they are tried: display names."""
 SAME_PLACE_MM: Final = 1e-3
-"""Slices that are nearer to each other than this have the same position."""
+"""Resolution in mm at which slice positions are compared."""
 BRIGHT_QUANTILE: Final = 0.999
-"""Quantile of a slice's values that stands for the brightness of its vessels."""
+"""Quantile of the values of a slice that measures the brightness of its vessels."""
 SLICES_LOOKED_AT: Final = 5
-"""Number of slices of an acquisition whose brightness is compared."""
+"""Number of slices of an acquisition whose brightness is averaged."""
 
 
 def _places(planes: list[_Slice]) -> list[tuple[int, ...]]:
@@ -339,10 +356,9 @@ def _one_acquisition(planes: list[_Slice], wanted: int | None) -> tuple[list[_Sl
 
 
 def _acquisitions(planes: list[_Slice]) -> tuple[str, list[tuple[str, list[_Slice]]]]:
-    """Return the attribute that tells acquisitions apart and the slices by its values; no groups where there is one.
+    """Return the attribute that distinguishes acquisitions and the slices by its values; no groups where there is one.
 
-    It is the first attribute whose values divide slices of the same position: every group has each position
-    once.
+    It is the first attribute that divides slices of the same position so that every group has each position once.
     """
     if len(set(_places(planes))) == len(planes):
         return "", []
@@ -357,12 +373,14 @@ def _acquisitions(planes: list[_Slice]) -> tuple[str, list[tuple[str, list[_Slic
 
 
 def _text(value: Any) -> str:
+    """Return the value of an attribute as text."""
     if value is None:
         return "none"
     return str(value) if isinstance(value, str) or not hasattr(value, "__iter__") else "/".join(map(str, value))
 
 
 def _sortable(name: str) -> tuple[float, str]:
+    """Return a key that sorts numbers before other texts."""
     try:
         return float(name), name
     except ValueError:
@@ -370,7 +388,7 @@ def _sortable(name: str) -> tuple[float, str]:
 
 
 def _brightness(planes: list[_Slice]) -> float:
-    """Return the brightness of the vessels in slices about the middle of an acquisition."""
+    """Return the brightness of the vessels in the middle slices of an acquisition."""
     normal = np.cross(*planes[0].orientation)
     order = np.argsort([plane.position_mm @ normal for plane in planes])
     middle = np.unique(np.linspace(0.25, 0.75, SLICES_LOOKED_AT) * (len(planes) - 1)).round().astype(int)
@@ -378,7 +396,7 @@ def _brightness(planes: list[_Slice]) -> float:
 
 
 def _without_copies(planes: list[_Slice]) -> tuple[list[_Slice], tuple[str, ...]]:
-    """Return slices without exact copies (same position, same pixels), and a note where there were any."""
+    """Return slices without exact copies (same position, same pixels), and a note where there are any."""
     kept: dict[tuple[int, ...], _Slice] = {}
     others: list[_Slice] = []
     dropped = 0
@@ -446,6 +464,7 @@ def _refuse_odd(slices: list[_Slice]) -> None:
 
 
 def _refuse_gaps(slices: list[_Slice], height: Floats) -> None:
+    """Raise ReadError where slices are missing, at the same position, or unevenly spaced."""
     steps = np.diff(height)
     usual = float(np.median(steps))
     for i, step in enumerate(steps):
@@ -468,6 +487,7 @@ def _refuse_gaps(slices: list[_Slice], height: Floats) -> None:
 
 
 def _refuse_offsets(slices: list[_Slice], offset_mm: Floats, step_mm: float) -> None:
+    """Raise ReadError where a slice is off the line of the others."""
     distance = np.linalg.norm(offset_mm, axis=1)
     worst = int(distance.argmax())
     if distance[worst] > max(SPACING_TOLERANCE * step_mm, 1e-3):
@@ -480,7 +500,7 @@ def _refuse_offsets(slices: list[_Slice], offset_mm: Floats, step_mm: float) -> 
 
 
 def _pixels(plane: _Slice) -> NDArray[Any]:
-    """Return the rescaled values (rows, columns) of one slice, bright for high."""
+    """Return the rescaled values (rows, columns) of one slice; high values are bright."""
     pixels = _decoded(plane)
     if pixels.shape != plane.size:
         raise ReadError(
@@ -498,9 +518,9 @@ def _pixels(plane: _Slice) -> NDArray[Any]:
 
 
 def _without_padding(stored: NDArray[Any], padding: tuple[int, int], *, is_inverted: bool) -> NDArray[Any]:
-    """Return stored values (rows, columns) with the darkest of the others, or 0, outside the field of view.
+    """Return stored values (rows, columns) with pixels outside the field of view set to the darkest value inside, or 0.
 
-    The value that marks the outside may be brighter than any contrast (DICOM PS3.3, C.7.5.1.1.2).
+    The padding value may be brighter than any contrast (DICOM PS3.3, C.7.5.1.1.2).
     """
     is_padding = (stored >= padding[0]) & (stored <= padding[1])
     rest = stored[~is_padding]
@@ -510,11 +530,12 @@ def _without_padding(stored: NDArray[Any], padding: tuple[int, int], *, is_inver
 
 
 def _is_inverted(plane: _Slice) -> bool:
+    """Return whether low values of a slice are bright (MONOCHROME1)."""
     return str(getattr(plane.dataset, "PhotometricInterpretation", "")).strip() == "MONOCHROME1"
 
 
 def _inverted(stored: NDArray[Any], dataset: Any) -> NDArray[Any]:
-    """Return the stored values of a MONOCHROME1 image (low is bright) turned upside down within their bits."""
+    """Return the stored values of a MONOCHROME1 image inverted within their number of bits."""
     if stored.dtype.kind == "f":
         return -stored
     is_signed, bits = int(getattr(dataset, "PixelRepresentation", 0)), int(dataset.BitsStored)
@@ -523,6 +544,7 @@ def _inverted(stored: NDArray[Any], dataset: Any) -> NDArray[Any]:
 
 
 def _decoded(plane: _Slice) -> NDArray[Any]:
+    """Return the stored values (rows, columns) of one slice."""
     try:
         if "PixelData" not in plane.dataset:
             _load_pixels(plane)

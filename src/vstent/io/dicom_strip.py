@@ -1,4 +1,4 @@
-"""Remove patient data from DICOM files: the elements needed to read the voxels are kept, all others dropped."""
+"""Remove patient data from DICOM files: only the elements needed to read the voxels are kept."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -19,11 +19,16 @@ KEPT: Final = frozenset(
 )
 """Elements needed to read a volume; none identifies the patient."""
 RENAMED: Final = ("SeriesInstanceUID", "SOPInstanceUID")
-"""Identifiers of series and image: kept as digests."""
+"""Identifiers of series and image; they are replaced by digests."""
 
 
 def strip_dicom(path: Path, out: Path) -> None:
-    """Write a copy of a DICOM file with only the elements that its voxels need.
+    """Write a copy of a DICOM file with only the elements needed to read its voxels.
+
+    Parameters
+    ----------
+    path : the file.
+    out : the copy to write.
 
     Raises
     ------
@@ -47,6 +52,7 @@ def strip_dicom(path: Path, out: Path) -> None:
 
 
 def _kept(given: Any) -> Any:
+    """Return the elements of a data set that are kept, also in sequences."""
     from pydicom.dataset import Dataset
     from pydicom.sequence import Sequence
 
@@ -61,6 +67,7 @@ def _kept(given: Any) -> Any:
 
 
 def _meta(given: Any, kept: Any) -> Any:
+    """Return the file meta information of a stripped file."""
     from pydicom.dataset import FileMetaDataset
     from pydicom.uid import ImplicitVRLittleEndian
 

@@ -1,4 +1,4 @@
-"""Write an `Image` as a DICOM series: the input of ``vstent demo``."""
+"""Write an `Image` as a DICOM series, the input of ``vstent demo``."""
 
 import hashlib
 import shutil
@@ -18,9 +18,15 @@ MOMENT: Final = ("20000101", "120000")
 
 
 def write_dicom(image: Image, folder: Path, *, description: str = "3DRA of a phantom, research only") -> None:
-    """Write a scan as an anonymous series of single-frame files, one for each k.
+    """Write a scan as an anonymous series of single-frame files, one per k.
 
-    The same image gives the same bytes. The folder is complete or does not exist; an older one is replaced.
+    Equal images give equal bytes. The folder is complete or does not exist; an existing one is replaced.
+
+    Parameters
+    ----------
+    image : the scan.
+    folder : the folder to write.
+    description : description of study and series.
 
     Raises
     ------
@@ -52,6 +58,7 @@ def write_dicom(image: Image, folder: Path, *, description: str = "3DRA of a pha
 
 
 def _int16(voxels: NDArray[Any]) -> NDArray[np.int16]:
+    """Return voxels rounded to 16-bit integers; ValueError is raised where they do not fit."""
     rounded = np.round(voxels) if voxels.dtype.kind == "f" else voxels
     if not np.isfinite(rounded).all() or rounded.min() < -32768 or rounded.max() > 32767:
         raise ValueError("a DICOM series of 16 bits holds values from -32768 to 32767 only")
@@ -66,7 +73,7 @@ def _decimal(value: float) -> str:
 
 
 def _dataset(digest: str, k: int, description: str) -> Any:
-    """Return one slice's identity: patient, study, series, instance."""
+    """Return the header of slice `k` without geometry and pixels."""
     from pydicom.dataset import Dataset, FileMetaDataset
     from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 
@@ -96,7 +103,7 @@ def _dataset(digest: str, k: int, description: str) -> Any:
 
 
 def _put_pixels(plane: Any, pixels: NDArray[np.int16]) -> None:
-    """Store values (rows, columns) as they are: slope 1, intercept 0."""
+    """Store values (rows, columns) unscaled: slope 1, intercept 0."""
     plane.SamplesPerPixel, plane.PhotometricInterpretation = 1, "MONOCHROME2"
     plane.Rows, plane.Columns = pixels.shape
     plane.BitsAllocated, plane.BitsStored, plane.HighBit, plane.PixelRepresentation = 16, 16, 15, 1

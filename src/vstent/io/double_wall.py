@@ -1,4 +1,4 @@
-"""Hollow models: surfaces that hold the inner and the outer wall of an artery."""
+"""Detect hollow models: surfaces that contain the inner and the outer wall of an artery."""
 
 from typing import Final
 
@@ -16,13 +16,13 @@ an inner and an outer wall."""
 LEAST_AREA: Final = 0.3
 """Smallest ratio of the areas of an inner and an outer wall."""
 LEAST_COVERED: Final = 0.9
-"""Fraction of the inner wall's vertices that must have the outer wall at a similar distance."""
+"""Smallest fraction of the inner wall's vertices in the bounding box of the outer wall, widened by the thickness."""
 MOST_UNEVEN: Final = 4.0
-"""Largest ratio of the thickest to the thinnest place of a wall, the thinnest and thickest 5 % left out."""
+"""Largest ratio of the thickest to the thinnest part of a wall, without the thinnest and thickest 5 %."""
 THICKEST: Final = 0.35
 """Largest thickness of a wall, as a fraction of the hydraulic diameter 4 V / A of the inner wall."""
 SAMPLES: Final = 2000
-"""Vertices at which the thickness is measured."""
+"""Approximate number of vertices at which the thickness is measured."""
 
 
 def inner_wall(surface: Surface) -> Surface | None:
@@ -30,6 +30,10 @@ def inner_wall(surface: Surface) -> Surface | None:
 
     The faces are divided at sharp edges. A hollow model has two large parts, one inside the other at a nearly constant
     distance; the inner one has the smaller area.
+
+    Parameters
+    ----------
+    surface : the surface, in any unit.
     """
     kept, same = topology.first_equals(surface.vertices_mm)
     welded = same[surface.faces].astype(np.int32)
@@ -47,7 +51,7 @@ def inner_wall(surface: Surface) -> Surface | None:
 
 
 def _smooth_parts(points_mm: Floats, faces: Ints) -> Ints:
-    """Return the part (m,) that every face belongs to, parts being divided by sharp and by open edges."""
+    """Return the number (m,) of the part that every face belongs to; sharp and open edges separate parts."""
     corners = points_mm[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
@@ -56,7 +60,7 @@ def _smooth_parts(points_mm: Floats, faces: Ints) -> Ints:
     face = np.repeat(np.arange(len(faces)), 3)[order]
     is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
     first, second = face[:-1][is_same], face[1:][is_same]
-    # A hollow model's two walls may be wound alike or not: only the line of the normals counts.
+    # The two walls may have equal or opposite orientation, so the sign of the normals is ignored.
     is_smooth: Bools = np.abs(np.einsum("ij,ij->i", normal[first], normal[second])) > SHARP_COSINE
     links = coo_array((np.ones(is_smooth.sum()), (first[is_smooth], second[is_smooth])), shape=(len(faces),) * 2)
     return np.asarray(connected_components(links, directed=False)[1])

@@ -1,4 +1,4 @@
-"""Paths: file kinds by name, and writing that never leaves a half-written file."""
+"""File kinds by suffix, and writing that leaves no half-written files."""
 
 import os
 import secrets
@@ -11,23 +11,26 @@ from typing import Final
 from vstent.errors import ReadError
 
 SURFACE_SUFFIXES: Final = (".stl", ".vtp", ".vtk", ".vtu", ".vtm", ".obj", ".ply")
-"""Names of surface files."""
+"""Suffixes of surface files."""
 NIFTI_SUFFIXES: Final = (".nii", ".nii.gz")
+"""Suffixes of NIfTI files."""
 RAW_SUFFIXES: Final = (".raw", ".raw.gz")
-"""Voxels without a header: their number and spacing must be given."""
+"""Suffixes of voxels without a header; their number and spacing must be given."""
 IMAGE_SUFFIXES: Final = (*NIFTI_SUFFIXES, ".nrrd", ".nhdr", ".mha", ".mhd", ".vti", *RAW_SUFFIXES, ".dcm")
+"""Suffixes of scans."""
 PARTIAL: Final = ".partial-"
-"""Begin of the name of a file that is being written; the process number follows."""
+"""Prefix of the name of a file that is being written; the process number follows."""
 _ONE_AT_A_TIME: Final = threading.RLock()
+"""Lock of `silenced`."""
 
 
 def is_surface_file(path: Path) -> bool:
-    """Return whether the name is that of a surface file."""
+    """Return whether a path has the suffix of a surface file."""
     return suffix(path) in SURFACE_SUFFIXES
 
 
 def suffix(path: Path) -> str:
-    """Return the file's suffix in lower case; ``.gz`` includes the suffix before it."""
+    """Return the suffix of a path in lower case; ``.gz`` includes the suffix before it."""
     suffixes = [s.lower() for s in Path(path).suffixes]
     return "".join(suffixes[-2:]) if suffixes[-1:] == [".gz"] else "".join(suffixes[-1:])
 
@@ -38,7 +41,7 @@ def existing(path: Path) -> Path:
     Raises
     ------
     ReadError
-        When there is nothing at that path.
+        The path does not exist.
     """
     path = Path(path)
     if not path.exists():
@@ -62,7 +65,7 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> None:
-    """Remove files that killed processes left half-written in a folder and two levels below it."""
+    """Remove half-written files of killed processes from a folder and two levels below it."""
     for depth in ("", "*/", "*/*/"):
         for partial in folder.glob(f"{depth}{PARTIAL}*"):
             if partial.is_file() and not _is_running(partial.name[len(PARTIAL) :].partition("-")[0]):
@@ -70,6 +73,7 @@ def sweep(folder: Path) -> None:
 
 
 def _is_running(process: str) -> bool:
+    """Return whether the process with this number is running."""
     if not process.isdigit():
         return False
     try:
@@ -85,7 +89,7 @@ def _is_running(process: str) -> bool:
 def silenced() -> Iterator[None]:
     """Discard what C and C++ libraries write to standard error; vstent reports its own errors.
 
-    Standard error belongs to the process, so one thread at a time may discard it.
+    Standard error belongs to the whole process, so only one thread at a time may discard it.
     """
     with _ONE_AT_A_TIME:
         saved = os.dup(2)

@@ -22,7 +22,7 @@ from vstent.io.rectangular import rectangular
 from vstent.io.vtk_child import read_vti
 
 VOXEL_MM: Final = (0.01, 5.0)
-"""Smallest and largest plausible voxel edge of a scan of the head."""
+"""Smallest and largest plausible voxel edge of a scan of the head, in mm."""
 LONGEST_LINE: Final = 1000
 """Largest number of characters in a line of a header."""
 
@@ -41,15 +41,16 @@ def read_image(
     ----------
     path : DICOM folder or file, NIfTI, NRRD, MHA, MHD, VTI or raw (also .gz).
     spacing_mm : voxel edges along i, j, k, or one number for cubes. Required for raw voxels and for headers without
-        spacing; replaces the header's spacing where given.
+        spacing; it replaces the spacing in the header.
     shape : number of voxels along i, j, k of raw voxels; i runs fastest.
-    dtype : type of raw voxels; by default derived from the file size, and reported in a note.
-    acquisition : which acquisition of a DICOM series that holds several, counted from 1; by default the one with the
+    dtype : type of raw voxels; None: derived from the file size and reported in a note.
+    acquisition : number of the acquisition in a DICOM series that holds several, counted from 1; None: the one with the
         brightest vessels.
 
     Returns
     -------
-    image : voxels (i, j, k) and the affine from voxel to LPS mm.
+    image : Image
+        Voxels (i, j, k) and the affine from voxel to LPS mm.
 
     Raises
     ------
@@ -78,7 +79,7 @@ def read_image(
     if spacing_mm is not None:
         image = _respaced(image, _three(spacing_mm, "spacing"))
     image = _plausible(image, path)
-    return image if is_series else rectangular(image)  # a tilted DICOM series is exact as it is
+    return image if is_series else rectangular(image)  # the affine of a tilted DICOM series is exact
 
 
 def files_of(path: Path) -> list[Path]:
@@ -91,14 +92,14 @@ def files_of(path: Path) -> list[Path]:
         return [path]
     if dicom.is_dicom(path):
         return dicom.series_of(path)
-    return [path, *(file for file in _voxel_files(path) if os.path.isfile(file))]  # a name may be too long
+    return [path, *(file for file in _voxel_files(path) if os.path.isfile(file))]  # accepts too long names
 
 
 APART: Final = {
     **dict.fromkeys((".mha", ".mhd"), re.compile(rb"^[ \t]*elementdatafile[ \t]*=([^\0\r\n]{1,1000})", re.I | re.M)),
     **dict.fromkeys((".nrrd", ".nhdr"), re.compile(rb"^data ?file:([^\0\r\n]{1,1000})", re.I | re.M)),
 }
-"""Header line that names the voxel file: a name, a pattern, or ``LIST`` followed by one file a line."""
+"""Pattern of the header line that names the voxel file: a name, a file pattern, or ``LIST`` and one file per line."""
 
 
 def _voxel_files(path: Path) -> list[Path]:
@@ -121,6 +122,7 @@ def _voxel_files(path: Path) -> list[Path]:
 
 
 def _three(values: Sequence[float], what: str) -> NDArray[np.float64]:
+    """Return one or three positive numbers as three; UnitError is raised for others."""
     given = np.atleast_1d(np.asarray(values, dtype=np.float64))
     if len(given) not in (1, 3) or not (np.isfinite(given) & (given > 0)).all():
         raise UnitError(
@@ -131,6 +133,7 @@ def _three(values: Sequence[float], what: str) -> NDArray[np.float64]:
 
 
 def _respaced(image: Image, spacing_mm: NDArray[np.float64]) -> Image:
+    """Return an image with another voxel spacing."""
     affine = np.array(image.affine_mm)
     affine[:3, :3] *= spacing_mm / image.spacing_mm
     return Image(
@@ -142,6 +145,7 @@ def _respaced(image: Image, spacing_mm: NDArray[np.float64]) -> Image:
 
 
 def _plausible(image: Image, path: Path) -> Image:
+    """Return an image; an error is raised where its spacing, size, values or byte order are implausible."""
     low, high = VOXEL_MM
     if not ((image.spacing_mm >= low) & (image.spacing_mm <= high)).all():
         size = " x ".join(f"{v:.4g}" for v in image.spacing_mm)
@@ -164,6 +168,7 @@ def _plausible(image: Image, path: Path) -> Image:
 
 
 def _read_itk(path: Path, kind: str, *, has_spacing: bool) -> Image:
+    """Return the image in a file that ITK reads."""
     import SimpleITK
 
     if kind in (".mha", ".mhd"):
@@ -195,7 +200,7 @@ def _read_itk(path: Path, kind: str, *, has_spacing: bool) -> Image:
 
 
 def _refuse_odd_meta(path: Path) -> None:
-    """Raise ReadError for a MetaImage header with contradicting counts: ITK crashes on those."""
+    """Raise ReadError for a MetaImage header with contradicting counts, because ITK crashes on those."""
     with path.open("rb") as file:
         head = file.read(65536).partition(b"ElementDataFile")[0]
     pairs = [line.partition(b"=") for line in head.splitlines()]
@@ -208,7 +213,7 @@ def _refuse_odd_meta(path: Path) -> None:
 
 
 def _refuse_untrue(path: Path, kind: str, reader: Any) -> None:
-    """Raise ReadError where a header states more than the file holds: ITK would fill the rest with zeros."""
+    """Raise ReadError where a header states more than the file holds, because ITK would fill the rest with zeros."""
     import SimpleITK
 
     size = reader.GetSize()
@@ -244,7 +249,7 @@ def _states_spacing(path: Path, kind: str) -> bool:
 
 
 def _may_be_spacing(line: bytes) -> bool:
-    """Return whether a header line holds numbers and no negative edge: ITK drops the sign."""
+    """Return whether a header line holds numbers and no negative edge, whose sign ITK would drop."""
     key, _, values = line.lower().replace(b"=", b":").partition(b":")
     is_edges = b"directions" not in key
     return b"nan" not in values and not (is_edges and any(word.startswith(b"-") for word in values.split()))
@@ -256,6 +261,7 @@ def _may_be_spacing(line: bytes) -> bool:
 def _read_raw(
     path: Path, spacing_mm: Sequence[float] | None, shape: Sequence[int] | None, dtype: DTypeLike | None
 ) -> Image:
+    """Return the image in a file of raw voxels."""
     if spacing_mm is None:
         raise UnitError(f"{path.name} has no header that states the voxel spacing; give --spacing in mm.")
     if shape is None or len(shape) != 3 or min(shape) < 1:
@@ -275,15 +281,15 @@ def _read_raw(
 
 
 SWAPPED_ROUGHNESS: Final = 2.0
-"""Ratio of the roughness as stored to the roughness with swapped bytes, above which the byte order is wrong."""
+"""Ratio of the roughness as stored to the roughness with swapped bytes above which the byte order is wrong."""
 SMOOTH: Final = 0.1
-"""Largest roughness of a scan in the right byte order, noise included."""
+"""Largest roughness of a scan in the right byte order, including noise."""
 LARGEST_VOXEL: Final = 8
 """Bytes of the largest voxel type."""
 
 
 def _bytes(path: Path, most: int) -> bytes:
-    """Return the unpacked content of a file, at most one byte more than `most`."""
+    """Return the unpacked content of a file, but at most `most` + 1 bytes."""
     try:
         with gzip.open(path) if suffix(path) == ".raw.gz" else path.open("rb") as file:
             return file.read(min(most, MOST_BYTES) + 1)
@@ -292,7 +298,7 @@ def _bytes(path: Path, most: int) -> bytes:
 
 
 def _guessed_dtype(data: bytes, n: int, path: Path) -> tuple[np.dtype[Any], tuple[str, ...]]:
-    """Return the voxel type by the bytes per voxel, in the byte order with the smoother rows, and a note on it."""
+    """Return the voxel type that matches the file size, in the byte order with smoother rows, and a note on it."""
     candidates = {1: ("u1",), 2: ("<i2", ">i2"), 4: ("<f4", ">f4", "<i4", ">i4")}.get(len(data) // n if n else 0, ())
     if not candidates or len(data) % n:
         raise ReadError(
@@ -304,11 +310,12 @@ def _guessed_dtype(data: bytes, n: int, path: Path) -> tuple[np.dtype[Any], tupl
 
 
 def _order(kind: str) -> str:
+    """Return the byte order of a voxel type as text."""
     return {"<": "little-endian", ">": "big-endian"}.get(kind[0], "one byte each")
 
 
 def _roughness(values: NDArray[Any]) -> float:
-    """Return the mean step between neighbors over the range; infinite for values that no scanner produces."""
+    """Return the mean step between neighbors divided by the range; infinite for values that no scanner produces."""
     sample = values[: 1 << 20].astype(np.float64) if values.dtype.itemsize > 1 else values[:2]
     if not np.isfinite(sample).all() or np.abs(sample).max(initial=0) > 1e9:
         return np.inf

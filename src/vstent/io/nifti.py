@@ -1,4 +1,4 @@
-"""NIfTI-1 and NIfTI-2 files -> Image, read with nibabel."""
+"""Read NIfTI-1 and NIfTI-2 files as an `Image`, with nibabel."""
 
 import gzip
 import math
@@ -16,7 +16,7 @@ from vstent.io.files import suffix
 from vstent.kernels.arrays import Floats
 
 HEADER_BYTES: Final = {348: "NIfTI-1", 540: "NIfTI-2"}
-"""Size of the header, which is also its first number, and the version that has it."""
+"""Size of the header in bytes, which is also its first number, and the version with that size."""
 MOST_BYTES: Final = 1 << 32
 """Largest scan that is read, in bytes; a scan of the head is smaller."""
 MOST_PACKED: Final = 1032
@@ -24,13 +24,14 @@ MOST_PACKED: Final = 1032
 MM_PER_UNIT: Final = {"meter": 1e3, "mm": 1.0, "micron": 1e-3, "unknown": 1.0}
 """Length units of a NIfTI header in mm."""
 RAS_TO_LPS: Final = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Matrix that converts RAS coordinates to LPS."""
 
 
 def read_nifti(path: Path, *, has_spacing: bool) -> Image:
     """Read one volume from a NIfTI-1 or NIfTI-2 file.
 
     Scaled integers (``scl_slope``, ``scl_inter``) are returned as scaled values. The frame is the sform where its code
-    is set, else the qform; a file with neither gets its voxel axes as LPS axes.
+    is set, else the qform. Where neither is set, the voxel axes are taken as LPS axes.
 
     Parameters
     ----------
@@ -39,7 +40,8 @@ def read_nifti(path: Path, *, has_spacing: bool) -> Image:
 
     Returns
     -------
-    image : voxels (i, j, k) and the affine from voxel to LPS mm.
+    image : Image
+        Voxels (i, j, k) and the affine from voxel to LPS mm.
 
     Raises
     ------
@@ -60,6 +62,7 @@ def read_nifti(path: Path, *, has_spacing: bool) -> Image:
 
 @contextmanager
 def _opened(path: Path) -> Any:
+    """Open a file, unpacked where it is compressed."""
     with gzip.open(path) if suffix(path) == ".nii.gz" else path.open("rb") as file:
         yield file
 
@@ -122,7 +125,7 @@ def _kind(header: Any, path: Path) -> np.dtype[Any]:
 
 
 def _begin(header: Any, path: Path) -> int:
-    """Return the byte at which the voxels begin."""
+    """Return the position of the first voxel in bytes."""
     begin = float(header["vox_offset"])
     if not int(header["sizeof_hdr"]) <= begin <= MOST_BYTES:
         raise ReadError(f"{path.name} is damaged: its voxels would begin at byte {begin:g}. Copy or export it again.")
@@ -161,12 +164,13 @@ def _stored(header: Any, shape: tuple[int, int, int], path: Path) -> NDArray[Any
 
 
 def _skip(file: IO[bytes], n_bytes: int) -> None:
+    """Read and discard bytes."""
     while n_bytes > 0 and (part := file.read(min(n_bytes, 1 << 22))):
         n_bytes -= len(part)
 
 
 def _scaled(stored: NDArray[Any], header: Any) -> NDArray[Any]:
-    """Return the values that the stored voxels stand for; a slope of zero or not a number means none (NIfTI-1.1)."""
+    """Return the rescaled voxels; a slope that is zero or not finite means no scaling (NIfTI-1.1)."""
     slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
     intercept = intercept if np.isfinite(intercept) else 0.0
     if slope == 0.0 or not np.isfinite(slope) or (slope == 1.0 and intercept == 0.0):

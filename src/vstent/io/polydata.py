@@ -9,7 +9,7 @@ from vstent.kernels.arrays import Floats, Ints
 
 
 def polydata_of(vertices_mm: Floats, faces: Ints) -> Any:
-    """Return triangles as vtkPolyData."""
+    """Return a surface of vertices (n, 3) and triangles (m, 3) as vtkPolyData."""
     from vtkmodules.vtkCommonDataModel import vtkPolyData
 
     data = vtkPolyData()
@@ -34,7 +34,13 @@ def cells_of(cells: Ints) -> Any:
 
 
 def ragged_cells(connectivity: Ints, starts: Ints) -> Any:
-    """Return cells as vtkCellArray; cell c has the points connectivity[starts[c]:starts[c + 1]]."""
+    """Return cells with different numbers of points as vtkCellArray.
+
+    Parameters
+    ----------
+    connectivity : point numbers of all cells, one cell after another.
+    starts : (m + 1,) index of the first point number of every cell, and the length of `connectivity`.
+    """
     from vtkmodules.util.numpy_support import numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonDataModel import vtkCellArray
 
@@ -49,8 +55,8 @@ def ragged_cells(connectivity: Ints, starts: Ints) -> Any:
 def triangles_of(data: Any) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Return the polygons of vtkPolyData as vertices (n, 3) and triangles (m, 3).
 
-    Lines, vertices and polygons with invalid point numbers are left out. VTK's own filters do not check a reader's
-    output and crash on damaged files, so the arrays are checked here.
+    Lines, vertices and polygons with invalid point numbers are left out. VTK's own filters do not check the output of
+    its readers and crash on damaged files, so the arrays are checked here.
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -62,7 +68,7 @@ def triangles_of(data: Any) -> tuple[NDArray[Any], NDArray[np.int64]]:
 
 
 def _cells(cells: Any) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return point numbers of all cells, the start of each and its length; nothing where they are inconsistent."""
+    """Return point numbers of all cells, the start of each cell and its length; empty where they are inconsistent."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     connectivity = vtk_to_numpy(cells.GetConnectivityArray()).astype(np.int64)
@@ -92,7 +98,7 @@ def _polygons(cells: Any, vertices_mm: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def _strips(cells: Any) -> NDArray[np.int64]:
-    """Return the triangles (m, 3) of triangle strips: every second one is turned."""
+    """Return the triangles (m, 3) of triangle strips; every second one is reversed."""
     connectivity, starts, count = _cells(cells)
     inner = np.maximum(count - 2, 0)
     step = np.arange(inner.sum()) - np.repeat(np.cumsum(inner) - inner, inner)

@@ -1,4 +1,4 @@
-"""Images whose axes are not perpendicular: a small shear is taken out of the frame, a large one is resampled."""
+"""Make image axes perpendicular: a small shear is removed from the frame, a large one by resampling."""
 
 from typing import Final
 
@@ -9,7 +9,7 @@ from vstent.geometry.image import Image
 from vstent.kernels.arrays import Floats
 
 NEGLIGIBLE_MM: Final = 0.01
-"""Displacement below which a shear is rounding of the header and is not reported."""
+"""Displacement in mm below which a shear is a rounding error of the header and is not reported."""
 SMALL_VOXELS: Final = 0.5
 """Largest displacement, in voxel edges, for which the nearest rectangular frame replaces a sheared one."""
 
@@ -17,9 +17,9 @@ SMALL_VOXELS: Final = 0.5
 def rectangular(image: Image) -> Image:
     """Return an image with perpendicular axes.
 
-    A shear that moves no voxel by more than half a voxel edge is removed from the frame: the nearest rectangular frame
-    about the center of the volume is used (polar decomposition). A larger one, as from a tilted gantry, is removed by
-    resampling the voxels on a rectangular grid with the same first axis. A note reports either.
+    A shear that moves no voxel by more than half a voxel edge is removed from the frame: it is replaced by the nearest
+    rectangular frame around the center of the volume (polar decomposition). A larger one, as from a tilted gantry, is
+    removed by resampling the voxels on a rectangular grid with the same first axis. A note reports either.
     """
     edges = np.array(image.affine_mm[:3, :3])
     spacing_mm = np.linalg.norm(edges, axis=0)
@@ -34,20 +34,20 @@ def rectangular(image: Image) -> Image:
 
 
 def _nearest_rotation(directions: Floats) -> Floats:
-    """Return the orthonormal matrix (3, 3) that is nearest to a matrix of unit columns, mirrored where that is."""
+    """Return the orthonormal matrix (3, 3) nearest to a matrix of unit columns, with the same handedness."""
     left, _, right = np.linalg.svd(directions)
     return np.asarray(left @ right)
 
 
 def _largest_displacement_mm(change_mm: Floats, shape: tuple[int, ...]) -> float:
-    """Return how far a change of the voxel edges (3, 3) moves the farthest corner, the center being held."""
+    """Return the displacement of the farthest corner where the voxel edges (3, 3) change and the center is fixed."""
     half = 0.5 * (np.array(shape, dtype=np.float64) - 1)
     corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1) * half[:, None]
     return float(np.linalg.norm(change_mm @ corners, axis=0).max())
 
 
 def _worst_angle_deg(directions: Floats) -> float:
-    """Return by how many degrees two axes are off the right angle, the worst pair."""
+    """Return the largest deviation of two axes from a right angle, in degrees."""
     cosine = np.abs(np.triu(directions.T @ directions, k=1)).max()
     return float(np.degrees(np.arcsin(min(cosine, 1.0))))
 
@@ -62,6 +62,7 @@ def _centered(edges: Floats, image: Image) -> Floats:
 
 
 def _turned(image: Image, edges: Floats, angle_deg: float, moved_mm: float) -> Image:
+    """Return an image with a rectangular frame and a note on it."""
     note = (
         f"The image axes are not perpendicular (off by {angle_deg:.1f} degrees): the nearest rectangular frame is "
         f"used, which moves voxels by at most {moved_mm:.2f} mm."
@@ -70,7 +71,7 @@ def _turned(image: Image, edges: Floats, angle_deg: float, moved_mm: float) -> I
 
 
 def _resampled(image: Image, angle_deg: float) -> Image:
-    """Return the image on a rectangular grid that spans the sheared volume; voxels outside it get the least value."""
+    """Return the image on a rectangular grid that spans the sheared volume; voxels outside it get the lowest value."""
     from scipy.ndimage import affine_transform
 
     rotation, upper = np.linalg.qr(image.affine_mm[:3, :3])
@@ -79,7 +80,7 @@ def _resampled(image: Image, angle_deg: float) -> Image:
     edges = rotation * sign * spacing_mm
     last = np.array(image.voxels.shape) - 1
     corners = np.array(np.meshgrid(*[[0, n] for n in last], indexing="ij")).reshape(3, -1)
-    places = np.linalg.solve(edges, image.affine_mm[:3, :3] @ corners)  # of the corners on the new grid
+    places = np.linalg.solve(edges, image.affine_mm[:3, :3] @ corners)  # corners in voxels of the new grid
     low = np.floor(np.round(places.min(axis=1), 6))
     shape = tuple((np.ceil(np.round(places.max(axis=1), 6)) - low).astype(int) + 1)
     to_old = np.linalg.solve(image.affine_mm[:3, :3], edges)

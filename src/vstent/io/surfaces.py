@@ -21,13 +21,16 @@ Frame = Literal["lps", "ras"]
 """Patient frame of coordinates: x to the left and y to the back (LPS, DICOM), or x to the right and y to the front."""
 
 VESSEL_DIAMETER_MM: Final = (0.8, 14.0)
-"""Smallest and largest hydraulic diameter 4 V / A of intracranial vessel trees with sacs; decides the unit."""
+"""Smallest and largest hydraulic diameter 4 V / A of intracranial vessel trees with sacs, in mm; decides the unit."""
 GIANT_DIAMETER_MM: Final = 25.0
-"""Hydraulic diameter of an artery of 4 mm with a giant sac of 36 mm: that of a sphere is 2/3 of its diameter."""
+"""Largest hydraulic diameter 4 V / A with a giant sac, in mm: an artery of 4 mm with a sac of 36 mm.
+
+The hydraulic diameter of a sphere is 2/3 of its diameter.
+"""
 TYPICAL_DIAMETER_MM: Final = 3.5
-"""Typical hydraulic diameter; of two possible units the one that comes nearer is chosen."""
+"""Typical hydraulic diameter in mm; of several possible units the one closest to it is chosen."""
 VESSEL_SIZE_MM: Final = (5.0, 400.0)
-"""Smallest and largest diagonal of the bounding box of such a tree."""
+"""Smallest and largest diagonal of the bounding box of a vessel tree, in mm."""
 
 
 def read_surface(
@@ -35,19 +38,21 @@ def read_surface(
 ) -> tuple[Surface, tuple[str, ...]]:
     """Read the wall of a vessel from an STL, VTP, VTU, VTM, VTK, OBJ or PLY file.
 
-    Of a hollow model (inner and outer wall) the inner wall is returned.
+    The inner wall of a hollow model (inner and outer wall) is returned.
 
     Parameters
     ----------
-    path : the file; polygons of more than three corners are triangulated, of a grid the outer faces are taken.
-    units : unit of its coordinates; by default derived from the vessel's size, and reported in a note.
-    frame : frame of its coordinates; by default the one that the file states (``SPACE=RAS`` in a header, comment or
-        field data), else LPS.
+    path : the file; polygons with more than three corners are triangulated, and the outer faces of a grid are used.
+    units : unit of its coordinates; None: derived from the size of the vessel and reported in a note.
+    frame : frame of its coordinates; None: the one that the file states (``SPACE=RAS`` in a header, comment or field
+        data), else LPS.
 
     Returns
     -------
-    surface : the mesh in LPS mm as it is in the file, faults included (see `vstent.repair`).
-    notes : one sentence for every assumption.
+    surface : Surface
+        The mesh in LPS mm as it is in the file, including its faults (see `vstent.repair`).
+    notes : tuple of str
+        One sentence for every assumption.
 
     Raises
     ------
@@ -77,11 +82,11 @@ def read_surface(
 
 
 RAS_TO_LPS: Final = np.array([-1.0, -1.0, 1.0])
-"""Factors that turn RAS coordinates into LPS ones, and back."""
+"""Factors that convert RAS coordinates to LPS, and back."""
 
 
 def _in_lps(surface: Surface, given: Frame | None, stated: str) -> tuple[Surface, tuple[str, ...]]:
-    """Return a surface in LPS and a note where the file states RAS; the frame given overrules the one stated."""
+    """Return a surface in LPS, and a note where the file states RAS; a given frame overrides the stated one."""
     if given not in (None, *get_args(Frame)):
         raise UnitError(f"Frame {given} is not known: give lps or ras.")
     if (given or stated.lower()) != "ras":
@@ -91,7 +96,7 @@ def _in_lps(surface: Surface, given: Frame | None, stated: str) -> tuple[Surface
 
 
 def _read(path: Path) -> tuple[Surface, str]:
-    """Return the surface in the unit and frame of the file, and the frame that the file states or nothing."""
+    """Return the surface in the unit and frame of the file, and the frame that the file states; empty where none."""
     kind = suffix(path)
     if kind not in SURFACE_SUFFIXES:
         raise ReadError(
@@ -111,13 +116,13 @@ def _read(path: Path) -> tuple[Surface, str]:
 
 
 SPACE: Final = re.compile(rb"SPACE\s*[=:]\s*(RAS|LPS)", re.IGNORECASE)
-"""How 3D Slicer states the frame in a header or comment."""
+"""Pattern by which 3D Slicer states the frame in a header or comment."""
 _HEAD_ENDS: Final = {".stl": b"facet", ".ply": b"end_header", ".obj": b"\nv ", ".vtk": b"DATASET"}
-"""Where the part of a file that may state its frame ends."""
+"""First text after the header of a file, by its suffix."""
 
 
 def _stated_frame(path: Path, kind: str) -> str:
-    """Return the frame that a header or comment states: ``RAS``, ``LPS`` or nothing."""
+    """Return the frame that a header or comment states: ``RAS``, ``LPS`` or empty."""
     with path.open("rb") as file:
         head = file.read(4096)
     if kind == ".stl" and not _is_ascii_stl(head):
@@ -127,13 +132,13 @@ def _stated_frame(path: Path, kind: str) -> str:
 
 
 TAIL_BYTES: Final = 4096
-"""Bytes at the end of an STL text file that hold its last line."""
+"""Number of bytes at the end of an STL text file that contain its last line."""
 _BEGINS: Final = {**dict.fromkeys((".vtp", ".vtu", ".vtm"), (b"<",)), ".vtk": (b"# vtk",), ".ply": (b"ply",)}
 """First bytes of a file by its suffix."""
 
 
 def _refuse_mislabelled(path: Path, kind: str) -> None:
-    """Raise ReadError where the first bytes are those of another format: VTK's readers may hang or crash on those."""
+    """Raise ReadError where the first bytes are those of another format, on which VTK's readers may hang or crash."""
     with path.open("rb") as file:
         head = file.read(512)
     wrong = kind in _BEGINS and not head.lstrip(b"\xef\xbb\xbf \r\n\t").lower().startswith(_BEGINS[kind])
@@ -149,15 +154,17 @@ def _refuse_mislabelled(path: Path, kind: str) -> None:
 
 
 def _is_ascii_stl(head: bytes) -> bool:
+    """Return whether a file starts like an STL text file."""
     return head.lstrip().lower().startswith(b"solid") and (b"facet" in head.lower() or len(head) == 512)
 
 
 def _is_binary_stl(path: Path, head: bytes) -> bool:
+    """Return whether a file is long enough for the triangles that its binary STL header states."""
     return len(head) >= 84 and path.stat().st_size >= 84 + 50 * _n_stl(head)
 
 
 def _is_torn_text(path: Path) -> bool:
-    """Return whether an STL text file lacks its end: VTK reads some truncated text files as if they were binary."""
+    """Return whether an STL text file is truncated; VTK reads some of these as if they were binary."""
     with path.open("rb") as file:
         head = file.read(512)
         file.seek(-min(TAIL_BYTES, path.stat().st_size), os.SEEK_END)
@@ -171,6 +178,7 @@ def _n_stl(head: bytes) -> int:
 
 
 def _checked(surface: Surface, path: Path) -> Surface:
+    """Return a surface; ReadError is raised where it has too few triangles, invalid vertices or no area."""
     if len(surface.faces) < 4:
         raise ReadError(
             f"{path.name} holds {len(surface.faces)} triangles, too few for a vessel. Give the wall of the vessel."
@@ -186,12 +194,13 @@ def _checked(surface: Surface, path: Path) -> Surface:
 
 
 def _diagonal(surface: Surface) -> float:
+    """Return the diagonal of the bounding box."""
     used = surface.vertices_mm[np.unique(surface.faces)]
     return float(np.linalg.norm(np.ptp(used, axis=0)))
 
 
 def hydraulic_diameter(surface: Surface) -> float:
-    """Return the hydraulic diameter 4 V / A of the capped surface in its own unit."""
+    """Return the hydraulic diameter 4 V / A of the capped surface, in the unit of the surface."""
     kept, same = topology.first_equals(surface.vertices_mm)
     welded = same[surface.faces].astype(np.int32)
     faces, _ = topology.oriented(welded[topology.sound_faces(welded)])
@@ -201,10 +210,12 @@ def hydraulic_diameter(surface: Surface) -> float:
 
 
 def _fits(size_mm: float, diameter_mm: float, widest_mm: float) -> bool:
+    """Return whether extent and hydraulic diameter are those of an intracranial vessel."""
     return VESSEL_DIAMETER_MM[0] <= diameter_mm <= widest_mm and VESSEL_SIZE_MM[0] <= size_mm <= VESSEL_SIZE_MM[1]
 
 
 def _guessed(size: float, diameter: float, path: Path) -> str:
+    """Return the unit in which the size is most like that of an intracranial vessel."""
     usual, giant = (
         [unit for unit, mm in MM_PER.items() if _fits(size * mm, diameter * mm, widest_mm)]
         for widest_mm in (VESSEL_DIAMETER_MM[1], GIANT_DIAMETER_MM)
@@ -219,6 +230,7 @@ def _guessed(size: float, diameter: float, path: Path) -> str:
 
 
 def _accepted(unit: str, size: float, diameter: float, path: Path) -> str:
+    """Return a given unit; UnitError is raised where the size is implausible."""
     if not _fits(size * MM_PER[unit], diameter * MM_PER[unit], GIANT_DIAMETER_MM):
         raise UnitError(
             f"{path.name} in {unit} would be {size * MM_PER[unit]:.4g} mm long with a hydraulic diameter of "

@@ -16,7 +16,17 @@ from vstent.kernels.arrays import Floats
 
 
 def read_columns(path: Path, count: int) -> Floats:
-    """Read a CSV file with `count` columns of numbers as an array (n, count); lines above the first number are titles.
+    """Read a CSV file of numbers as an array; lines above the first number are titles.
+
+    Parameters
+    ----------
+    path : the file; columns are separated by commas, semicolons or tabs.
+    count : number of columns.
+
+    Returns
+    -------
+    Floats
+        (n, count) numbers.
 
     Raises
     ------
@@ -43,9 +53,15 @@ def read_columns(path: Path, count: int) -> Floats:
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of named values as CSV: one column for each name in the order of first use; missing values are empty.
+    """Write rows of named values as CSV.
 
-    Floats have seven digits; booleans are ``true`` and ``false``.
+    There is one column per name in the order of first use. Missing values are empty, floats have seven digits, and
+    booleans are ``true`` and ``false``.
+
+    Parameters
+    ----------
+    path : the file.
+    rows : values by column name.
     """
     names = columns_of(rows)
     text = io.StringIO()
@@ -61,7 +77,18 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Write rows of named values as Parquet; return False and write nothing where pyarrow is not installed."""
+    """Write rows of named values as Parquet.
+
+    Parameters
+    ----------
+    path : the file.
+    rows : values by column name.
+
+    Returns
+    -------
+    bool
+        False where pyarrow is not installed; nothing is written then.
+    """
     try:
         from pyarrow import parquet, table
     except ImportError:
@@ -72,6 +99,7 @@ def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> bool:
 
 
 def _plain(value: Any) -> Any:
+    """Return a value as it is written to a CSV file."""
     if isinstance(value, bool | np.bool_):
         return "true" if value else "false"
     return f"{value:.{SIGNIFICANT_DIGITS}g}" if isinstance(value, float) else value

@@ -1,4 +1,4 @@
-"""Write 3MF files: a surface in mm for printers and CAD, XML in a zip file (3MF Core Specification 1.3)."""
+"""Write a surface in mm as a 3MF file for printers and CAD: XML in a zip file (3MF Core Specification 1.3)."""
 
 from pathlib import Path
 from typing import Final
@@ -8,6 +8,7 @@ from vstent.geometry.surface import Surface
 from vstent.io.files import atomic
 
 NAMESPACE: Final = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+"""XML namespace of the 3MF core specification."""
 _TYPES: Final = """<?xml version="1.0" encoding="UTF-8"?>
 <Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">
 <Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>
@@ -33,7 +34,7 @@ _MODEL: Final = """<?xml version="1.0" encoding="UTF-8"?>
 </model>
 """
 _LONG_AGO: Final = (1980, 1, 1, 0, 0, 0)
-"""Date of every part: the same surface gives the same file."""
+"""Date of every file in the archive, so that equal surfaces give equal files."""
 
 
 def write_3mf(path: Path, surface: Surface) -> None:

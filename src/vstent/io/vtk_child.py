@@ -1,7 +1,7 @@
-"""VTK's readers, run in a child process.
+"""Run VTK's readers in a child process.
 
 VTK is fast and reads every dialect, but a damaged file can crash it or make it allocate all memory. The child reads the
-file and returns bare arrays. Where the child dies, the parent reports the file as damaged.
+file and returns arrays. Where the child dies, the parent reports the file as damaged.
 """
 
 import errno
@@ -24,41 +24,48 @@ from vstent.io.polydata import triangles_of
 from vstent.kernels.arrays import Floats, Ints
 
 SECONDS: Final = 8.0
-"""Processor time that a child may take, in s; a busy machine must not make a sound file look damaged."""
+"""CPU time that a child may use, in s; long enough that a sound file is read on a busy machine too."""
 SECONDS_PER_BYTE: Final = 1e-6
-"""Further processor time for each byte of the file, in s."""
+"""Additional CPU time per byte of the file, in s."""
 PATIENCE: Final = 1.0 if sys.platform == "win32" else 10.0
-"""Wall time allowed for each second of processor time; Windows limits wall time only."""
+"""Wall time allowed per second of CPU time; Windows limits wall time only."""
 MEMORY_BYTES: Final = 2_000_000_000
 """Memory that a child may allocate, in bytes."""
 MEMORY_PER_BYTE: Final = 40
-"""Further memory for each byte of the file, in bytes."""
+"""Additional memory per byte of the file, in bytes."""
 DISK_FULL: Final = 28
 """Exit code of a child that could not write its arrays."""
 LEAST_USED: Final = 0.9
-"""Smallest fraction of the points of a complete OBJ file that belong to triangles; points come before triangles, so a
-truncated file has fewer."""
+"""Smallest fraction of the points of a complete OBJ file that belong to triangles.
+
+Points come before triangles, so a truncated file has a smaller fraction.
+"""
 
 
 def read_apart(path: Path) -> tuple[Floats, Ints, str] | None:
     """Read a surface file in a child process.
 
+    Parameters
+    ----------
+    path : the file.
+
     Returns
     -------
-    vertices : (n, 3) coordinates, triangles : (m, 3) vertex numbers, and the frame that the file's field data state
-    (``RAS``, ``LPS`` or nothing); None where the child died or took too long.
+    tuple or None
+        Vertices (n, 3), triangles (m, 3) as vertex numbers, and the frame that the field data state (``RAS``, ``LPS``
+        or empty). None where the child died or took too long.
     """
     found = _from_child(path)
     return None if found is None else (found["vertices"], found["faces"], str(found["space"]))
 
 
 def read_vti(path: Path) -> Image:
-    """Read a VTK image (``.vti``), its axes taken as LPS.
+    """Read a VTK image (``.vti``); its axes are taken as LPS.
 
     Raises
     ------
     ReadError
-        The file is damaged or holds no single values at its points.
+        The file is damaged, or has no point data with one value per voxel.
     """
     found = _from_child(path)
     if found is None:
@@ -103,11 +110,12 @@ def _environment() -> dict[str, str]:
 
 
 def _seconds(size: int) -> float:
+    """Return the CPU time in s allowed for a file of `size` bytes."""
     return SECONDS + SECONDS_PER_BYTE * size
 
 
 def _limit(size: int) -> None:
-    """Limit the memory and the processor time of this process."""
+    """Limit memory and CPU time of this process for a file of `size` bytes."""
     with suppress(ImportError):  # Windows has no such limits
         import resource
 
@@ -135,7 +143,7 @@ def _reader(kind: str) -> Any:
 
 
 def _faults() -> list[str]:
-    """Return a list that collects VTK's complaints: after an error VTK returns incomplete data, zeros included."""
+    """Return a list that collects VTK's error messages; after an error VTK returns incomplete data."""
     from vtkmodules.util.misc import calldata_type
     from vtkmodules.vtkCommonCore import VTK_STRING, vtkOutputWindow
 
@@ -153,7 +161,7 @@ def _faults() -> list[str]:
 
 
 def _announced(path: Path) -> int:
-    """Return how many polygons the header of a PLY file states; VTK accepts fewer."""
+    """Return the number of polygons that the header of a PLY file states; VTK accepts files with fewer."""
     if suffix(path) != ".ply":
         return 0
     with path.open("rb") as file:
@@ -163,7 +171,7 @@ def _announced(path: Path) -> int:
 
 
 def _polygons(data: Any) -> Any:
-    """Return polygons as they are, the outer faces of a grid, the joined surfaces of blocks; None for anything else."""
+    """Return polygons, the outer faces of a grid, or the joined surfaces of blocks; None for anything else."""
     if data is None or data.IsA("vtkPolyData"):
         return data
     if data.IsA("vtkMultiBlockDataSet"):
@@ -179,12 +187,13 @@ def _polygons(data: Any) -> Any:
 
 
 def _blocks(data: Any) -> list[Any]:
-    """Return the data sets of a multi-block data set, those of blocks in blocks included."""
+    """Return all data sets of a multi-block data set, also those of nested blocks."""
     children = [data.GetBlock(number) for number in range(data.GetNumberOfBlocks())]
     return [one for child in children if child is not None for one in (_blocks(child) if _is_multi(child) else [child])]
 
 
 def _is_multi(data: Any) -> bool:
+    """Return whether a data set is a multi-block data set."""
     return bool(data.IsA("vtkMultiBlockDataSet"))
 
 
@@ -226,7 +235,7 @@ def _voxels(data: Any) -> dict[str, NDArray[Any]] | None:
 
 
 def _triangles(data: Any, path: Path) -> dict[str, NDArray[Any]] | None:
-    """Return vertices, triangles and stated frame; None where there are no polygons, or not all of them."""
+    """Return vertices, triangles and stated frame; None where polygons are missing."""
     polygons = _polygons(data)
     if polygons is None:
         return None
@@ -243,7 +252,18 @@ def _triangles(data: Any, path: Path) -> dict[str, NDArray[Any]] | None:
 
 
 def main(path: Path, result: Path) -> int:
-    """Read a file and save its arrays; return 1 where there is nothing to save."""
+    """Read a file and save its arrays.
+
+    Parameters
+    ----------
+    path : the file.
+    result : the .npz file to write.
+
+    Returns
+    -------
+    int
+        Exit code: 0 done, 1 where there is nothing to save, `DISK_FULL` where it could not be saved.
+    """
     _limit(path.stat().st_size)
     reader = _reader(suffix(path))
     reader.SetFileName(str(path))

@@ -23,13 +23,21 @@ Arrays = Mapping[str, NDArray[Any]]
 NOTHING: Final[Arrays] = {}
 """No arrays."""
 SIGNIFICANT_DIGITS: Final = 7
-"""Digits of numbers in JSON and CSV files."""
+"""Significant digits of numbers in JSON and CSV files."""
 SPACE: Final = "LPS"
-"""Frame of every file written, stated as 3D Slicer does: ``SPACE=LPS``."""
+"""Frame of every file written, stated as in 3D Slicer: ``SPACE=LPS``."""
 
 
 def write_surface(path: Path, surface: Surface, point_data: Arrays = NOTHING, cell_data: Arrays = NOTHING) -> None:
-    """Write a surface in mm as VTP, with arrays (n, ...) on its vertices and (m, ...) on its faces."""
+    """Write a surface in mm as VTP.
+
+    Parameters
+    ----------
+    path : the file.
+    surface : the surface.
+    point_data : arrays (n, ...) on its vertices.
+    cell_data : arrays (m, ...) on its faces.
+    """
     data = polydata_of(surface.vertices_mm, surface.faces)
     _attach(data.GetPointData(), point_data, len(surface.vertices_mm))
     _attach(data.GetCellData(), cell_data, len(surface.faces))
@@ -59,7 +67,13 @@ def write_lines(
 
 
 def write_centerlines(path: Path, centerlines: Sequence[Centerline]) -> None:
-    """Write centerlines as VTP under the array names of VMTK."""
+    """Write centerlines as VTP with the array names of VMTK.
+
+    Parameters
+    ----------
+    path : the file.
+    centerlines : points in mm, inscribed radii and frames.
+    """
     lengths = [len(line.points_mm) for line in centerlines]
     frames = np.concatenate([line.frames for line in centerlines])
     write_lines(
@@ -79,7 +93,7 @@ def write_centerlines(path: Path, centerlines: Sequence[Centerline]) -> None:
 def write_cells(
     path: Path, centers_mm: Floats, size_mm: float, cell_data: Arrays, point_data: Arrays = NOTHING
 ) -> None:
-    """Write the used cells of a regular grid as VTU: hexahedra that share their corners.
+    """Write the used cells of a regular grid as VTU: hexahedra with shared corners.
 
     Parameters
     ----------
@@ -105,7 +119,20 @@ _CORNERS: Final = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1
 
 
 def grid_corners(centers_mm: Floats, size_mm: float) -> tuple[Floats, Ints]:
-    """Return the corners (p, 3) of grid cells with centers (c, 3), each once, and the corners (c, 8) of every cell."""
+    """Return the corners of grid cells, each once, and the corners of every cell.
+
+    Parameters
+    ----------
+    centers_mm : (c, 3) centers of the cells.
+    size_mm : grid spacing.
+
+    Returns
+    -------
+    corners_mm : Floats
+        (p, 3) corners.
+    cells : Ints
+        (c, 8) numbers of the corners of every cell, in VTK's order of a hexahedron.
+    """
     origin = np.min(centers_mm, axis=0, initial=np.inf) if len(centers_mm) else np.zeros(3)
     index = np.round((centers_mm - origin) / size_mm).astype(np.int64)
     n = index.max(axis=0, initial=0) + 2
@@ -116,6 +143,7 @@ def grid_corners(centers_mm: Floats, size_mm: float) -> tuple[Floats, Ints]:
 
 
 def _attach(attributes: Any, arrays: Arrays, length: int) -> None:
+    """Add arrays of `length` rows to the attributes of a VTK data set."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
 
     for name, values in arrays.items():
@@ -130,6 +158,7 @@ def _attach(attributes: Any, arrays: Arrays, length: int) -> None:
 
 
 def _write_xml(path: Path, data: Any) -> None:
+    """Write a VTK data set as VTP or VTU, with its frame."""
     from vtkmodules.vtkCommonCore import vtkStringArray
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
@@ -152,6 +181,7 @@ def _write_xml(path: Path, data: Any) -> None:
 
 
 _STL_FACE: Final = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+"""Layout of a triangle in a binary STL file."""
 
 
 def write_stl(path: Path, surface: Surface) -> None:
@@ -164,7 +194,13 @@ def write_stl(path: Path, surface: Surface) -> None:
 
 
 def write_json(path: Path, content: Any, *, is_exact: bool = False) -> None:
-    """Write numbers, strings, lists, mappings and arrays as JSON: sorted keys, floats of seven digits or exact.
+    """Write numbers, strings, lists, mappings and arrays as JSON with sorted keys.
+
+    Parameters
+    ----------
+    path : the file.
+    content : what is written.
+    is_exact : whether floats are written without rounding; otherwise they have seven digits.
 
     Raises
     ------
@@ -176,6 +212,7 @@ def write_json(path: Path, content: Any, *, is_exact: bool = False) -> None:
 
 
 def _plain(value: Any, where: str, is_exact: bool) -> Any:
+    """Return a value as JSON types; `where` is its place for error messages."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item, f"{where}.{key}", is_exact) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,1 +1,1 @@
-"""Reports: a finished case or cohort in, HTML and PDF out. Open ``page.py`` first."""
+"""Build HTML and PDF reports of a finished case or cohort. Open ``page.py`` first."""

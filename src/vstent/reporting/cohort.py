@@ -1,4 +1,4 @@
-"""The report of a cohort: how many came through, how their numbers are distributed, and who stands apart."""
+"""Report of a cohort: counts of finished and failed cases, distributions of their metrics, and outliers."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,6 +11,7 @@ from vstent.reporting.page import asset
 from vstent.reporting.quantities import Quantity, format_value
 
 Row = Mapping[str, Any]
+"""One case with one device: column name to value."""
 
 HEADLINES: Final = (
     "vessel.sac_volume_mm3",
@@ -30,47 +31,62 @@ HEADLINES: Final = (
     "case_s",
     "peak_memory_MB",
 )
-"""Columns that are drawn, and in which outliers are sought."""
+"""Keys of the table columns that are drawn and searched for outliers; the end of each key is its unit."""
 OUTLYING: Final = 3.5
-"""A value stands apart from this modified z-score on (Iglewicz and Hoaglin 1993, How to Detect and Handle Outliers)."""
+"""Absolute modified z-score above which a value is an outlier.
+
+Iglewicz and Hoaglin 1993, How to Detect and Handle Outliers.
+"""
 NORMAL: Final = 0.6745
-"""Median absolute deviation of a normal distribution of standard deviation 1."""
+"""Median absolute deviation of a normal distribution with standard deviation 1."""
 WIDTH, HEIGHT, EDGE = 640, 34, 8
-"""Of a strip, and what is left free at its ends."""
+"""Width and height of a strip plot, and the margin at its ends, in SVG user units."""
 
 
 class Distribution(NamedTuple):
-    """One number of one device over all cases."""
+    """Distribution of one metric of one device over all cases."""
 
     device: str
-    """The device."""
+    """Name of the device."""
     n_cases: int
-    """Cases that have it."""
+    """Number of cases that have the metric."""
     quantiles: tuple[str, ...]
-    """Least, lower quartile, median, upper quartile, greatest, with the unit."""
+    """Minimum, lower quartile, median, upper quartile and maximum as text with unit."""
     strip: str
-    """A point per case, as SVG."""
+    """Strip plot as SVG: one point per case."""
 
 
 class Outlier(NamedTuple):
-    """One value that stands apart."""
+    """One value far from the median of its device."""
 
     case: str
+    """Name of the case."""
     device: str
+    """Name of the device."""
     name: str
+    """Name of the metric."""
     value: str
+    """Value as text with unit."""
     median: str
+    """Median over the cases as text with unit."""
     score: float
-    """Modified z-score."""
+    """Modified z-score, signed."""
 
 
 def cohort_report(name: str, rows: Sequence[Row]) -> str:
-    """Return the report of a cohort as the text of one HTML file, which asks nothing of a network.
+    """Return the report of a cohort as the text of one HTML file.
+
+    The file is self-contained: it loads nothing from a network.
 
     Parameters
     ----------
-    name : the cohort's.
-    rows : one a case and device: ``case``, ``device``, ``outcome``, ``stage``, ``sentence``, numbers.
+    name : name of the cohort.
+    rows : one row per case and device, with ``case``, ``device``, ``outcome``, ``stage``, ``sentence`` and metrics.
+
+    Returns
+    -------
+    str
+        HTML.
     """
     from jinja2 import Environment, PackageLoader
 
@@ -94,12 +110,30 @@ def cohort_report(name: str, rows: Sequence[Row]) -> str:
 
 
 def _counts(rows: Sequence[Row], device: str) -> tuple[int, int, int]:
+    """Return the numbers of finished, failed and lost cases of a device."""
     outcomes = [row["outcome"] for row in rows if row["device"] == device]
     return outcomes.count("done"), outcomes.count("failed"), outcomes.count("lost")
 
 
 def modified_z_scores(values: Sequence[float]) -> list[float]:
-    """Distance of every value from the median, in median absolute deviations, scaled like a standard deviation."""
+    """Return the modified z-score of every value.
+
+    It is the distance from the median divided by the median absolute deviation, scaled to the standard deviation of
+    a normal distribution.
+
+    Parameters
+    ----------
+    values : (n,) values of one metric.
+
+    Returns
+    -------
+    list of float
+        (n,) signed scores; all 0 where the median absolute deviation is 0.
+
+    References
+    ----------
+    Iglewicz and Hoaglin 1993, How to Detect and Handle Outliers.
+    """
     if not len(values):
         return []
     array = np.asarray(values, dtype=np.float64)
@@ -109,7 +143,14 @@ def modified_z_scores(values: Sequence[float]) -> list[float]:
 
 
 def outliers(rows: Sequence[Row], device: str, key: str) -> list[Outlier]:
-    """Values of one column of one device that stand apart, the farthest first."""
+    """Return the outliers of one metric of one device, the farthest from the median first.
+
+    Parameters
+    ----------
+    rows : rows of the cohort table.
+    device : name of the device.
+    key : column of the metric.
+    """
     found = _values(rows, device, key)
     scores = modified_z_scores([value for _, value in found])
     median = format_value(_leaf(key), float(np.median([value for _, value in found]))) if found else ""
@@ -122,7 +163,14 @@ def outliers(rows: Sequence[Row], device: str, key: str) -> list[Outlier]:
 
 
 def distribution(rows: Sequence[Row], device: str, key: str) -> Distribution:
-    """How one column of one device is distributed."""
+    """Return the distribution of one metric of one device.
+
+    Parameters
+    ----------
+    rows : rows of the cohort table, of all devices; they set the range of the strip plot.
+    device : name of the device.
+    key : column of the metric.
+    """
     found = _values(rows, device, key)
     values = [value for _, value in found]
     quantiles = np.quantile(values, (0.0, 0.25, 0.5, 0.75, 1.0))
@@ -136,7 +184,7 @@ def distribution(rows: Sequence[Row], device: str, key: str) -> Distribution:
 
 
 def _strip(found: Sequence[tuple[str, float]], key: str, span: tuple[float, float]) -> str:
-    """Every case a point on a line from the least to the greatest value of all devices; a box over the quartiles."""
+    """Return an SVG strip plot: a point per case on the range `span` of all devices, and a box over the quartiles."""
     low, high = span
     per_unit = (WIDTH - 2 * EDGE) / (high - low) if high > low else 0.0
     at = [EDGE + (value - low) * per_unit for _, value in found]
@@ -156,16 +204,20 @@ def _strip(found: Sequence[tuple[str, float]], key: str, span: tuple[float, floa
 
 
 def _values(rows: Sequence[Row], device: str, key: str) -> list[tuple[str, float]]:
+    """Return case name and value of one metric of one device, where the value is a finite number."""
     return [(str(row["case"]), float(row[key])) for row in rows if row["device"] == device and _is_number(row.get(key))]
 
 
 def _is_number(value: Any) -> bool:
+    """Return whether a value is a finite number; booleans are not numbers."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _leaf(key: str) -> str:
+    """Return the last part of a dotted key."""
     return key.rsplit(".", 1)[-1]
 
 
 def _name(key: str) -> str:
+    """Return the display name of a metric."""
     return Quantity((_leaf(key),), 0.0).name

@@ -1,22 +1,23 @@
-"""What each number of the metrics means, and who defined it."""
+"""Name, meaning and source of every metric in the report."""
 
 from typing import Final, NamedTuple
 
 
 class Definition(NamedTuple):
-    """The words for one metric."""
+    """Display name, meaning and source of one metric."""
 
     name: str
-    """Name for people."""
+    """Display name."""
     meaning: str
-    """One sentence."""
+    """Meaning, in one sentence."""
     source: str = ""
-    """Publication; empty where the meaning says all."""
+    """Publication that defines the metric; empty where the meaning suffices."""
 
 
 _DHAR: Final = "Dhar et al. 2008, Neurosurgery 63:185"
 _RAGHAVAN: Final = "Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355"
 _PICCINELLI: Final = "Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141"
+"""Publications that define metrics."""
 
 DEFINITIONS: Final[dict[str, Definition]] = {
     # the artery and the sac
@@ -212,12 +213,13 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "checks. Of a pulse: change between its last two cycles.",
     ),
 }
+"""Definition of every metric by its key; the end of a key is its unit."""
 
 OF_PULSE: Final = (
     "In pulsatile flow every number is the mean over the last cycle, unless its name says largest; wall shear "
     "stress is the time average of its magnitude (TAWSS)."
 )
-"""What holds for all numbers of the flow."""
+"""Note on all flow metrics of a pulsatile flow."""
 
 HEADLINES: Final = (
     "neck_inflow_mL_s",
@@ -226,4 +228,4 @@ HEADLINES: Final = (
     "mean_sac_wss_Pa",
     "low_shear_area_fraction",
 )
-"""The numbers for the first screen, the most telling first."""
+"""Keys of the flow metrics on the first screen of the report, the most important first."""

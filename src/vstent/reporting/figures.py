@@ -1,4 +1,4 @@
-"""Pictures of a scene without a graphics library: a depth buffer for the paint, matplotlib for the lettering."""
+"""Render pictures of a scene without a graphics library: a depth buffer for the geometry, matplotlib for the labels."""
 
 import io
 from dataclasses import dataclass
@@ -16,41 +16,50 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BACKGROUND = (0.965, 0.973, 0.978)
+"""Background color: red, green and blue, 0 to 1."""
 _INK = "#16262e"
 _QUIET = "#54666f"
+"""Colors of the lettering."""
 _LIGHT = np.array([-0.35, 0.50, 0.79])
+"""Direction to the light in view axes (right, up, toward the eye), not normalized."""
 _SUPERSAMPLING = 2
+"""Rendered pixels per picture pixel along each axis, averaged to smooth the edges."""
 ABOVE = "Values above the scale have its last color."
+"""Caption sentence on values above a color scale."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A finished picture with its words."""
+    """A rendered picture with its title and caption."""
 
     id: str
-    """What it shows: anatomy, contour, coverage, wires, streamlines, shear."""
+    """Name of what it shows: anatomy, contour, coverage, wires, streamlines, shear."""
     title: str
-    """One line above it."""
+    """Title, one line."""
     caption: str
-    """What to see, and what the colours mean."""
+    """Caption: what the picture shows and what its colors mean."""
     png: bytes
-    """The picture."""
+    """The picture as PNG."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One panel of a picture: what is drawn, and from where."""
+    """One panel of a picture: layers and the view from which they are drawn."""
 
     title: str
-    """Above the panel."""
+    """Title above the panel."""
     layers: tuple[MeshLayer | LineLayer, ...]
-    """What is drawn."""
+    """Layers to draw."""
     view: View
-    """From where."""
+    """View from which they are drawn."""
 
 
 def pictures(scene: Scene) -> list[Picture]:
-    """Return the pictures of a scene: anatomy always, contour and wires per device, flow where it was computed."""
+    """Return the pictures of a scene.
+
+    The anatomy is always shown; contour, coverage and wires where there is a device; streamlines and wall shear stress
+    where a flow was computed.
+    """
     found = [_anatomy(scene)]
     if len(scene.panes) > 1:
         found += [_contour(scene), _coverage(scene), _wires(scene)]
@@ -63,7 +72,7 @@ def pictures(scene: Scene) -> list[Picture]:
 
 
 def overview(scene: Scene) -> bytes:
-    """Return one wide PNG for a front page: wires across the neck, and the flow before and after where there is one."""
+    """Return one wide PNG that sums up a case: wires across the neck, and streamlines where a flow was computed."""
     layers = ("lumen", "wires", "neck", "streamlines")
     shots = [Shot(title, scene.pick(layers, pane), scene.view("profile")) for pane, title in scene.panes]
     scales = {scale.id for scale in scene.scales}
@@ -71,10 +80,22 @@ def overview(scene: Scene) -> bytes:
 
 
 def draw(layers: tuple[MeshLayer | LineLayer, ...], scene: Scene, view: View, size_px: tuple[int, int]) -> Floats:
-    """Paint layers seen from `view` into an image (h, w, 3), 0 to 1, of `size_px` (width, height).
+    """Render layers seen from a view.
 
-    Opaque triangles and lines hide what is farther; translucent layers are blended over them, denser where they are
-    seen at a grazing angle, so that a tube shows its outline and what it holds.
+    Opaque triangles and lines hide what is farther away. Translucent layers are blended over them and are denser at
+    grazing angles, so that a tube shows both its outline and its contents.
+
+    Parameters
+    ----------
+    layers : meshes and lines to draw.
+    scene : scene that holds their color scales.
+    view : direction, center and radius of the view.
+    size_px : width and height of the image in pixels.
+
+    Returns
+    -------
+    Floats
+        (height, width, 3) red, green and blue, 0 to 1.
     """
     width, height = (n * _SUPERSAMPLING for n in size_px)
     pixel = span_mm(view, size_px) / width
@@ -100,21 +121,31 @@ def draw(layers: tuple[MeshLayer | LineLayer, ...], scene: Scene, view: View, si
 
 
 def _is_translucent(layer: MeshLayer | LineLayer) -> bool:
+    """Return whether a layer is a mesh with an opacity below 1."""
     return isinstance(layer, MeshLayer) and layer.opacity < 1.0
 
 
 def span_mm(view: View, size_px: tuple[int, int]) -> float:
-    """Return what the width of a picture spans, so that the view's sphere fits with a little room."""
+    """Return the length in mm that the width of a picture shows.
+
+    The sphere of the view fits into the picture with a small margin.
+
+    Parameters
+    ----------
+    view : the view.
+    size_px : width and height of the picture in pixels.
+    """
     return 2.15 * view.radius_mm * max(1.0, size_px[0] / size_px[1])
 
 
 def _to_screen(points_mm: Floats, view: View, pixel: float, size: tuple[int, int]) -> Floats:
+    """Return points (n, 3) as column and row in pixels and depth in mm; `pixel` is the size of a pixel in mm."""
     seen = (points_mm - view.center_mm) @ view.axes.T
     return np.stack([0.5 * size[0] + seen[:, 0] / pixel, 0.5 * size[1] - seen[:, 1] / pixel, -seen[:, 2]], axis=1)
 
 
 def _colours(layer: MeshLayer | LineLayer, scene: Scene, depth_mm: Floats) -> Floats:
-    """Colours (n, 3) of a layer's vertices or points at depths (n,) behind the middle of the picture."""
+    """Return colors (n, 3) of the points of a layer; wires are paler with their depth (n,) in mm behind the center."""
     if layer.scale:
         return scene.scale(layer.scale).paint(layer.values)
     colours = np.tile(np.array(layer.colour), (len(depth_mm), 1))
@@ -125,16 +156,18 @@ def _colours(layer: MeshLayer | LineLayer, scene: Scene, depth_mm: Floats) -> Fl
 
 
 def _brightness(normals: Floats, ambient: float) -> Floats:
-    """Light (n,) on both sides of a surface with unit normals (n, 3) in the view's axes."""
+    """Return the brightness (n,) of a surface lit on both sides, from unit normals (n, 3) in view axes."""
     facing = normals * np.where(normals[:, 2:] < 0, -1.0, 1.0)
     return ambient + (1.0 - ambient) * np.maximum(facing @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0)
 
 
 def _alphas(opacity: float, normals: Floats) -> Floats:
+    """Return the opacity (n,) of vertices: higher where the surface is seen at a grazing angle."""
     return opacity + (1.0 - opacity) * 0.75 * (1.0 - np.abs(normals[:, 2])) ** 3
 
 
 def _anatomy(scene: Scene) -> Picture:
+    """Return the picture of vessel, parent artery, sac and neck from three sides."""
     ids = ("lumen", "landing", "sac", "neck")
     titles = {"profile": "In profile", "frontal": "Frontal", "lateral": "From the left"}
     shots = [Shot(title, scene.pick(ids, BARE), scene.view(view)) for view, title in titles.items()]
@@ -143,6 +176,7 @@ def _anatomy(scene: Scene) -> Picture:
 
 
 def _contour(scene: Scene) -> Picture:
+    """Return the picture of the deployed contours, colored by their gap to the wall."""
     ids = ("lumen", "contour", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
     caption = "The deployed contour in the lumen, colored by its gap to the wall of the parent artery."
@@ -150,6 +184,7 @@ def _contour(scene: Scene) -> Picture:
 
 
 def _coverage(scene: Scene) -> Picture:
+    """Return the picture of the metal coverage of each device."""
     ids = ("lumen", "coverage", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
     caption = (
@@ -160,6 +195,7 @@ def _coverage(scene: Scene) -> Picture:
 
 
 def _wires(scene: Scene) -> Picture:
+    """Return the picture of the wires in profile and seen from the sac."""
     looks = {"profile": ("in profile", ("lumen", "wires", "neck")), "neck": ("seen from the sac", ("wires", "neck"))}
     shots = [
         Shot(f"{title}: {looks[view.id][0]}", scene.pick(looks[view.id][1], pane), view)
@@ -174,6 +210,7 @@ def _wires(scene: Scene) -> Picture:
 
 
 def _streamlines(scene: Scene) -> Picture:
+    """Return the picture of the streamlines without and with each device."""
     ids = ("lumen", "streamlines", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes]
     caption = f"Streamlines through artery and sac, colored by speed on one scale. {ABOVE}"
@@ -181,13 +218,21 @@ def _streamlines(scene: Scene) -> Picture:
 
 
 def _shear(scene: Scene) -> Picture:
+    """Return the picture of the wall shear stress without and with each device."""
     shots = [Shot(title, scene.pick(("shear", "neck"), pane), scene.view("profile")) for pane, title in scene.panes]
     caption = f"Wall shear stress on the lumen, on one scale. {ABOVE}"
     return Picture("shear", "Wall shear stress before and after", caption, sheet(scene, shots, "shear"))
 
 
 def sheet(scene: Scene, shots: list[Shot], scale: str) -> bytes:
-    """Lay panels side by side, two to a row where there are four, with one colour bar and a length bar: a PNG."""
+    """Return a PNG of panels side by side, each with a length bar, over one common color bar.
+
+    Parameters
+    ----------
+    scene : scene that holds the color scales.
+    shots : panels; four are laid out in two rows, others in rows of at most three.
+    scale : name of the scale of the color bar; empty: no color bar.
+    """
     from matplotlib.figure import Figure
 
     columns = 2 if len(shots) == 4 else min(len(shots), 3)
@@ -210,6 +255,7 @@ def sheet(scene: Scene, shots: list[Shot], scale: str) -> bytes:
 
 
 def _length_bar(axes: "Axes", width_mm: float, size_px: tuple[int, int]) -> None:
+    """Draw a bar of a round length in mm into a panel."""
     width, height = size_px
     length_mm = next((step for step in (20.0, 10.0, 5.0, 2.0, 1.0) if step < 0.3 * width_mm), 0.5)
     start, y = 0.04 * width, 0.95 * height
@@ -219,6 +265,7 @@ def _length_bar(axes: "Axes", width_mm: float, size_px: tuple[int, int]) -> None
 
 
 def _colour_bar(figure: "Figure", scene: Scene, name: str, inches: tuple[float, float]) -> None:
+    """Draw the color bar of a scale below the panels."""
     scale = scene.scale(name)
     axes = figure.add_axes((0.30, 0.34 / inches[1], 0.40, 0.12 / inches[1]))
     axes.imshow(scale.colours[None], aspect="auto", extent=(scale.low, scale.high, 0.0, 1.0))
@@ -230,6 +277,7 @@ def _colour_bar(figure: "Figure", scene: Scene, name: str, inches: tuple[float, 
 
 
 def _png(figure: "Figure") -> bytes:
+    """Return a figure as PNG without metadata on the software, so that equal figures give equal bytes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     stream = io.BytesIO()

@@ -1,7 +1,7 @@
-"""Pictures of the way to a device in place, as Zhong et al. 2016 show it.
+"""Pictures of the steps to a deployed device, in the order of Zhong et al. 2016.
 
-The sac shrunk, the spheres along the axis, the first contour, its expansion, the wires in the parent artery and in the
-patient's own.
+They show the parent artery with the sac removed, the maximum inscribed spheres along its axis, the initial contour,
+its expansion, and the wires in the parent artery and in the patient's own artery.
 """
 
 from dataclasses import replace
@@ -23,18 +23,25 @@ if TYPE_CHECKING:
     from vstent.study.types import CaseResult
 
 SPHERE_STEP: Final = 0.9
-"""Distance between spheres that are drawn, in their radii."""
+"""Distance between drawn spheres as a fraction of their radius."""
 FRAMES: Final = 4
-"""Moments of an expansion."""
+"""Number of contours drawn of an expansion."""
 RINGS: Final = 28
-"""Rows of the first contour that are drawn as lines."""
+"""Largest number of rows of the initial contour that are drawn as lines."""
 _SPHERE: Final = (0.36, 0.55, 0.72)
 _STEEL: Final = (0.58, 0.63, 0.68)
 _INK: Final = (0.10, 0.17, 0.20)
+"""Colors of spheres, contours and lines: red, green and blue, 0 to 1."""
 
 
 def method_pictures(case: "CaseResult", scene: Scene) -> list[Picture]:
-    """Return the pictures of a case's way from the patient's artery to the device in place, in that order."""
+    """Return the pictures of the steps from the patient's artery to the deployed devices, in that order.
+
+    Parameters
+    ----------
+    case : the finished case.
+    scene : its scene.
+    """
     found = [_restoration(scene), _spheres(case.anatomy, scene)]
     if case.deployments:
         found.append(_first_contours(case, scene))
@@ -44,6 +51,7 @@ def method_pictures(case: "CaseResult", scene: Scene) -> list[Picture]:
 
 
 def _restoration(scene: Scene) -> Picture:
+    """Return the picture of the removal of the sac."""
     profile = scene.view("profile")
     lumen, landing = scene.pick(("lumen",), BARE), scene.pick(("landing",), BARE)
     cut = scene.pick(("lumen", "sac", "neck"), BARE)
@@ -60,6 +68,7 @@ def _restoration(scene: Scene) -> Picture:
 
 
 def _spheres(anatomy: Anatomy, scene: Scene) -> Picture:
+    """Return the picture of the axis and its maximum inscribed spheres."""
     spheres = _bead_layer(anatomy)
     shots = [
         Shot("In profile", (*scene.pick(("lumen", "axis"), BARE), spheres), scene.view("profile")),
@@ -73,6 +82,7 @@ def _spheres(anatomy: Anatomy, scene: Scene) -> Picture:
 
 
 def _bead_layer(anatomy: Anatomy) -> MeshLayer:
+    """Return the maximum inscribed spheres along the axis as one translucent layer."""
     axis = anatomy.axis
     at_mm = [0.0]
     while at_mm[-1] < axis.length_mm:
@@ -88,6 +98,7 @@ def _bead_layer(anatomy: Anatomy) -> MeshLayer:
 
 
 def _unit_sphere(rows: int = 17, columns: int = 32) -> tuple[Floats, Ints]:
+    """Return points (n, 3) and triangles (m, 3) of a sphere of radius 1, open at the poles."""
     polar, turn = np.meshgrid(
         np.linspace(0.01, np.pi - 0.01, rows), np.linspace(0, 2 * np.pi, columns, endpoint=False), indexing="ij"
     )
@@ -96,6 +107,7 @@ def _unit_sphere(rows: int = 17, columns: int = 32) -> tuple[Floats, Ints]:
 
 
 def _first_contours(case: "CaseResult", scene: Scene) -> Picture:
+    """Return the picture of the contour of each device before the first iteration."""
     shots = []
     for name, title in scene.panes[1:]:
         layers = (*scene.pick(("axis",), BARE), *_contour_layers(case.deployments[name].history_mm[0]))
@@ -108,7 +120,7 @@ def _first_contours(case: "CaseResult", scene: Scene) -> Picture:
 
 
 def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
-    """A contour (rows, columns, 3) as a surface with some of its rows as lines."""
+    """Return a contour (rows, columns, 3) as a surface and some of its rows as lines."""
     rows, columns = nodes_mm.shape[:2]
     surface = Surface(nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
     some = np.unique(np.linspace(0, rows - 1, min(rows, RINGS)).astype(int))
@@ -117,6 +129,7 @@ def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
 
 
 def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene) -> Picture:
+    """Return the picture of the expansion of one device, colored by the gap to the wall."""
     frames_mm, gaps_mm = thin_frames(deployment, anatomy.landing_surface, FRAMES)
     contour = next(layer for layer in scene.pick(("contour",), name) if isinstance(layer, MeshLayer))
     reached = np.concatenate([[0.0], deployment.terminated_fraction])
@@ -130,7 +143,7 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
             else "initial contour"
         )
         shots.append(Shot(words[:1].upper() + words[1:], (*_glass(scene), layer), scene.view("profile")))
-    # The scale of the deployed device is too narrow for the way there.
+    # Earlier contours have larger gaps than the deployed device, so its scale would be too narrow.
     gap = scene.scale("wall_gap")
     wide = replace(gap, high=round_up(max(gap.high, float(np.percentile(gaps_mm[0], 98)))))
     shown = replace(scene, scales=tuple(wide if scale is gap else scale for scale in scene.scales))
@@ -143,6 +156,7 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
 
 
 def _fitted(scene: Scene) -> Picture:
+    """Return the picture of the wires in the parent artery and in the patient's own artery."""
     profile = scene.view("profile")
     shots = [
         shot
@@ -157,10 +171,11 @@ def _fitted(scene: Scene) -> Picture:
 
 
 def _glass(scene: Scene) -> tuple[MeshLayer | LineLayer, ...]:
-    """The parent artery, seen through."""
+    """Return the layers of the parent artery, translucent."""
     layers = (layer for layer in scene.pick(("landing",), BARE) if isinstance(layer, MeshLayer))
     return tuple(replace(layer, opacity=0.18) for layer in layers)
 
 
 def _opaque(layers: tuple[MeshLayer | LineLayer, ...]) -> tuple[MeshLayer | LineLayer, ...]:
+    """Return layers with their meshes made opaque."""
     return tuple(replace(layer, opacity=1.0) if isinstance(layer, MeshLayer) else layer for layer in layers)

@@ -1,9 +1,10 @@
-"""A scene as a small manifest and one block of bytes, for the viewer.
+"""Pack a scene for the viewer: a small JSON manifest and one block of bytes.
 
-Every array is an integer block ``{offset, length, type}`` in the bytes, little-endian, at a multiple of 4. A quantised
-array carries ``low`` and ``step``, one per component besides: number = low + step * integer. Contours over time are one
-block of all their frames. In the report the bytes are zlib-compressed and written in base64; over HTTP they follow the
-manifest (`framed`): the length of its JSON in four bytes, the JSON padded with spaces to a multiple of 4, the bytes.
+Every array is an integer block ``{offset, length, type}`` in the bytes, little-endian, at a multiple of 4. A quantized
+array also has ``low`` and ``step``, one per component: number = low + step * integer. Contours over time are one block
+of all frames. In the report the bytes are compressed with zlib and encoded in base64. Over HTTP they follow the
+manifest (`Packer.framed`): the length of its JSON in four bytes, the JSON padded with spaces to a multiple of 4, and
+the bytes.
 """
 
 import base64
@@ -18,17 +19,18 @@ from vstent.kernels.arrays import Floats
 from vstent.reporting.scene import LineLayer, MeshLayer, Scale, Scene, View
 
 _LEVELS = 65_535
+"""Largest quantized integer; it fits in two bytes."""
 
 
 class Packer:
-    """Collects arrays into one run of bytes."""
+    """Collects arrays in one block of bytes."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
         self._length = 0
 
     def add(self, integers: Any) -> dict[str, Any]:
-        """Append unsigned integers of 1, 2 or 4 bytes; return their block."""
+        """Append unsigned integers of 1, 2 or 4 bytes and return the description of their block."""
         array = np.ascontiguousarray(integers)
         data = array.astype(array.dtype.newbyteorder("<")).tobytes()
         block = {"offset": self._length, "length": array.size, "type": f"u{8 * array.itemsize}"}
@@ -38,12 +40,12 @@ class Packer:
         return block
 
     def add_indices(self, indices: Any) -> dict[str, Any]:
-        """Append indices with as few bytes as they need."""
+        """Append indices as 2-byte integers, or as 4-byte integers where they are larger; return their block."""
         wide = np.max(indices, initial=0) > _LEVELS
         return self.add(np.asarray(indices).ravel().astype(np.uint32 if wide else np.uint16))
 
     def add_numbers(self, numbers: Floats) -> dict[str, Any]:
-        """Append numbers (..., d) quantised to 65,536 levels between the bounds of each component."""
+        """Append numbers (..., d) with each component quantized to 65,536 levels in its range; return their block."""
         columns = np.nan_to_num(numbers).reshape(-1, numbers.shape[-1])
         low, high = columns.min(axis=0, initial=np.inf), columns.max(axis=0, initial=-np.inf)
         if not len(columns):
@@ -53,11 +55,11 @@ class Packer:
         return {**self.add(levels.astype(np.uint16)), "low": low.tolist(), "step": step.tolist()}
 
     def text(self) -> str:
-        """Return everything compressed, as base64."""
+        """Return all blocks compressed with zlib, as base64."""
         return base64.b64encode(zlib.compress(b"".join(self._parts), 9)).decode("ascii")
 
     def framed(self, manifest: Mapping[str, Any]) -> bytes:
-        """Return a manifest and everything as one message."""
+        """Return a manifest and all blocks as one message."""
         words = json.dumps(manifest, separators=(",", ":"), allow_nan=False).encode()
         words += b" " * (-len(words) % 4)
         return len(words).to_bytes(4, "little") + words + b"".join(self._parts)
@@ -66,7 +68,15 @@ class Packer:
 def message(
     layers: Iterable[MeshLayer | LineLayer], scales: Iterable[Scale] = (), views: Iterable[View] = (), **more: Any
 ) -> bytes:
-    """Return layers, scales and views as one message for the page; `more` stands in its manifest beside them."""
+    """Return layers, scales and views as one message for the page.
+
+    Parameters
+    ----------
+    layers : meshes and lines.
+    scales : color scales that the layers use.
+    views : directions that the page offers.
+    more : further entries of the manifest.
+    """
     packer = Packer()
     manifest = {
         "scales": [_scale(scale, packer) for scale in scales],
@@ -77,7 +87,13 @@ def message(
 
 
 def pack(scene: Scene, notes: dict[str, str]) -> tuple[dict[str, Any], str]:
-    """Return the manifest of a scene and its bytes in base64; `notes` are a line of words per pane."""
+    """Return the manifest of a scene and its bytes in base64.
+
+    Parameters
+    ----------
+    scene : the scene.
+    notes : one line of text per pane, by the name of the pane.
+    """
     packer = Packer()
     manifest = {
         "version": 1,
@@ -91,17 +107,20 @@ def pack(scene: Scene, notes: dict[str, str]) -> tuple[dict[str, Any], str]:
 
 
 def _scale(scale: Scale, packer: Packer) -> dict[str, Any]:
+    """Return the manifest entry of a color scale."""
     colours = packer.add(np.rint(255 * scale.colours).astype(np.uint8))
     words = {"id": scale.id, "title": scale.title, "unit": scale.unit}
     return {**words, "low": scale.low, "high": scale.high, "colours": colours}
 
 
 def _view(view: View) -> dict[str, Any]:
+    """Return the manifest entry of a view."""
     axes, center = view.axes.ravel().tolist(), view.center_mm.tolist()
     return {"id": view.id, "axes": axes, "center": center, "radius": view.radius_mm}
 
 
 def _layer(layer: MeshLayer | LineLayer, packer: Packer) -> dict[str, Any]:
+    """Return the manifest entry of a layer; its arrays are added to `packer`."""
     packed: dict[str, Any] = {"id": layer.id, "pane": layer.pane, "colour": layer.colour, "scale": layer.scale}
     if isinstance(layer, LineLayer):
         packed |= {"kind": "lines", "opacity": 1.0, "points": packer.add_numbers(layer.points_mm)}

@@ -1,4 +1,4 @@
-"""The page itself: what goes where."""
+"""Collect the contents of the report of a case and lay them out as one HTML file."""
 
 import base64
 import hashlib
@@ -36,59 +36,63 @@ if TYPE_CHECKING:
     from vstent.study.types import CaseResult
 
 WEBP_QUALITY: Final = 90
+"""Quality of the pictures in the HTML report, 0 to 100, as defined by Pillow's WebP writer."""
 OF_CONTOUR: Final = (
     "The contour is the active contour of Zhong et al. 2016 with a rigid wall: forces between artery and "
     "device are not computed."
 )
+"""Limit of the deployment that every report states."""
 OF_USE: Final = "Research use only. Not cleared for diagnosis or treatment."
+"""Statement on the intended use in every report."""
 AT_OUTLETS: Final = {
     "zero_pressure": "the pressure at the outlets is assumed, not measured in the patient",
     "murray": "the flow is split among the outlets by their diameter cubed, not measured in the patient",
 }
-"""Setting of the outlets -> what it leaves out."""
+"""Limit that a report states, by the outlet setting of the flow."""
 AT_INLETS: Final = "The flow through each inlet is assumed, not measured in the patient."
+"""Limit that a report states where the vessel has several inlets."""
 OF_DEVICE: Final = {
     LATTICE: "In the flow a device is a porous screen computed from its wires.",
     OPENFOAM: "In the flow a device is its meshed wires over the neck and over branches.",
 }
-"""Engine -> what it makes of a device."""
+"""How a device is represented in the flow, by the name of the engine."""
 
 
 def report(case: "CaseResult") -> str:
     """Return the report of a case as the text of one HTML file.
 
-    The file asks nothing of a network (its content security policy forbids it), carries no field of a patient's record,
-    and stays below 10 MB: surfaces are thinned and quantised.
+    The file loads nothing from a network (its content security policy forbids it) and contains no field of a patient's
+    record. It stays below 10 MB because surfaces are decimated and quantized.
     """
     return as_html(contents_of(case))
 
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """All that a report holds, however it is laid out."""
+    """Contents of a report, independent of its layout."""
 
     name: str
-    """Of the case."""
+    """Name of the case."""
     metrics: dict[str, Any]
-    """Every number."""
+    """All metrics; the end of each key is its unit."""
     scene: Scene
-    """What there is to look at."""
+    """Layers, color scales and views."""
     pictures: tuple[Picture, ...]
-    """In the order of the report."""
+    """Pictures in the order of the report."""
     changes: list[Change]
-    """Numbers before and after."""
+    """Flow metrics without and with each device."""
     stents: list[dict[str, Any]]
-    """Every device: title, words, advice, quantities, facts."""
+    """One entry per device: title, words, advice, quantities, facts."""
     openings: list[tuple[str, str, str, str]]
-    """Role, diameter, area and center of every end of the vessel."""
+    """Role, diameter, area and center of every opening of the vessel, as text."""
     is_pulse: bool
-    """Whether the flow is one."""
+    """Whether the flow is pulsatile."""
     notes: tuple[str, ...]
-    """What was found, guessed or repaired."""
+    """Findings, assumptions and repairs, one sentence each."""
     limits: tuple[str, ...]
-    """What is left out."""
+    """Limits of the results, one sentence each."""
     provenance: list[tuple[str, list[tuple[str, str]]]]
-    """Groups of lines: how this was made."""
+    """Versions, input and settings: groups of (name, value) lines by title."""
 
     @property
     def devices(self) -> tuple[tuple[str, str], ...]:
@@ -97,30 +101,33 @@ class Contents:
 
     @property
     def headlines(self) -> list[Change]:
-        """The rows for the first screen: the known headlines, or the first eight where none was measured."""
+        """Flow metrics for the first screen: the known headlines, or the first eight where none of them exists."""
         chosen = [row for key in HEADLINES for row in self.changes if row.before.key == key]
         return chosen or self.changes[:8]
 
     @property
     def vessel(self) -> list[Quantity]:
-        """The anatomy's numbers."""
+        """Metrics of the vessel."""
         return flatten(self.metrics.get("vessel", {}), ("vessel",))
 
     @property
     def uncertainty(self) -> list[Varied]:
-        """Intervals by device; empty where nothing was varied."""
+        """Uncertainty intervals by device; empty where there is no uncertainty study."""
         return uncertainty_of(self.metrics, dict(self.devices))
 
     @property
     def definitions(self) -> list[tuple[Definition, str]]:
-        """What every number means, and its unit, by name; ratios and outlets under what they are of."""
+        """Definition and unit of every metric, sorted by name.
+
+        Ratios and metrics of single openings are listed under the metric that they derive from.
+        """
         keys = {base_of(q.key)[0] for q in flatten(self.metrics)}
         found = [(DEFINITIONS[key], unit_of(key)) for key in keys if key in DEFINITIONS]
         return sorted(found, key=lambda pair: pair[0].name.casefold())
 
 
 def contents_of(case: "CaseResult") -> Contents:
-    """Return what the report of a case holds; its pictures are painted here."""
+    """Return the contents of the report of a case, with all pictures rendered."""
     scene, metrics = scene_of(case), case.metrics
     before, *after = pictures(scene)
     return Contents(
@@ -139,7 +146,7 @@ def contents_of(case: "CaseResult") -> Contents:
 
 
 def limits_of(case: "CaseResult") -> tuple[str, ...]:
-    """Return what a result leaves out, a sentence each: of a flow, where there is one, by its own settings."""
+    """Return the limits of a result, one sentence each; those of the flow depend on its settings."""
     flow = case.provenance.get("settings", {}).get("flow")
     if flow is None:
         return OF_CONTOUR, OF_USE
@@ -148,6 +155,7 @@ def limits_of(case: "CaseResult") -> tuple[str, ...]:
 
 
 def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
+    """Return the limits of a flow with these settings, one sentence each."""
     thins = flow["blood"]["thinning"] is not None
     blood = "Blood is shear-thinning, with parameters from the literature" if thins else "Blood is Newtonian"
     told = [f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
@@ -155,7 +163,7 @@ def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
 
 
 def as_html(told: Contents) -> str:
-    """Lay a report out as one HTML file."""
+    """Return a report laid out as one HTML file."""
     from jinja2 import Environment, PackageLoader
 
     manifest, scene_bytes = pack(told.scene, _pane_notes(told.headlines))
@@ -190,20 +198,22 @@ def as_html(told: Contents) -> str:
 
 
 def asset(name: str) -> str:
-    """Return the text of a file that pages are made of."""
+    """Return the text of a file in the package's ``assets`` folder."""
     return files("vstent.reporting").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _script(name: str) -> str:
+    """Return a JavaScript file with closing script tags escaped, so that it can be embedded in HTML."""
     return asset(name).replace("</script", "<\\/script")
 
 
 def _hash(script: str) -> str:
-    """Return the script's source expression for a content security policy: only this very text may run."""
+    """Return the source expression of a script for a content security policy, so that only this exact text may run."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
 
 
 def _sections(told: Contents) -> list[tuple[str, str]]:
+    """Return id and title of every section of the report."""
     titles = {"summary": "Summary", "scene": "3-D view", "pictures": "Pictures", "anatomy": "Anatomy"}
     if told.stents:
         titles["devices"] = "Devices"
@@ -216,12 +226,13 @@ def _sections(told: Contents) -> list[tuple[str, str]]:
 
 
 def _picture(picture: Picture) -> dict[str, str]:
+    """Return id, title, caption and base64-encoded WebP of a picture."""
     words = {"id": picture.id, "title": picture.title, "caption": picture.caption}
     return {**words, "base64": base64.b64encode(_webp(picture.png)).decode("ascii")}
 
 
 def _webp(png: bytes) -> bytes:
-    """Write a picture as WebP: a fifth of the bytes, and no difference to the eye."""
+    """Return a PNG converted to WebP: about a fifth of the bytes without a visible difference."""
     from PIL import Image
 
     stream = io.BytesIO()
@@ -230,7 +241,7 @@ def _webp(png: bytes) -> bytes:
 
 
 def _pane_notes(headlines: list[Change]) -> dict[str, str]:
-    """One line per pane: the first headline, and by how much it changed."""
+    """Return one line per pane: the first headline and its change."""
     for row in headlines[:1]:
         notes = {BARE: f"{row.before.name} {row.before.text}"}
         for name, after in row.after.items():
@@ -240,6 +251,7 @@ def _pane_notes(headlines: list[Change]) -> dict[str, str]:
 
 
 def _stent(name: str, deployment: Deployment, metrics: dict[str, Any]) -> dict[str, Any]:
+    """Return title, words, advice, quantities and facts of one device."""
     stent = deployment.stent
     measured = metrics.get("stents", {}).get(name, {})
     values = flatten(measured.get("deployment", {}), ("stents", name, "deployment"))
@@ -258,7 +270,7 @@ def _stent(name: str, deployment: Deployment, metrics: dict[str, Any]) -> dict[s
 
 
 def _flow_only(metrics: dict[str, Any], rows: list[Change], titles: dict[str, str]) -> list[tuple[str, list[Quantity]]]:
-    """Flow results without a partner on the other side, and ratios, by pane."""
+    """Return flow metrics that exist on one side only, and ratios, by pane."""
     paired = {row.before.path for row in rows}
     found = [("Before", [q for q in flatten(metrics.get("bare", {}), ("bare", "")) if q.path[2:] not in paired])]
     for name, stent in metrics.get("stents", {}).items():
@@ -269,7 +281,7 @@ def _flow_only(metrics: dict[str, Any], rows: list[Change], titles: dict[str, st
 
 
 def _other(metrics: dict[str, Any]) -> list[Quantity]:
-    """Whatever the metrics hold besides the parts that have a place of their own."""
+    """Return the metrics that no other section shows."""
     top = {key: value for key, value in metrics.items() if key not in ("vessel", "bare", "stents")}
     stents = {
         name: {key: value for key, value in stent.items() if key not in ("deployment", "flow", "ratios", "uncertainty")}
@@ -279,6 +291,7 @@ def _other(metrics: dict[str, Any]) -> list[Quantity]:
 
 
 def _provenance(provenance: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return the provenance as groups of (name, value) lines by title."""
     parts = {key: value for key, value in provenance.items() if isinstance(value, (dict, list, tuple))}
     single = {key: value for key, value in provenance.items() if key not in parts}
     groups = [(key.replace("_", " ").capitalize(), _lines(value)) for key, value in parts.items()]
@@ -286,11 +299,12 @@ def _provenance(provenance: dict[str, Any]) -> list[tuple[str, list[tuple[str, s
 
 
 def _lines(values: Any) -> list[tuple[str, str]]:
+    """Return nested values as (name, value) lines."""
     return [(" · ".join(q.path).replace("_", " "), _plain(q.value)) for q in flatten(values)]
 
 
 def _plain(value: Any) -> str:
-    """Write a setting as text; of a path only its last part, since folders can carry a patient's name."""
+    """Return a setting as text; of a path only its last part, because folders may be named after a patient."""
     if isinstance(value, PurePath) or (isinstance(value, str) and value.startswith("/")):
         return PurePath(value).name
     if isinstance(value, float):

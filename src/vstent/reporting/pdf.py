@@ -1,4 +1,4 @@
-"""The report on paper: A4 pages with text that can be searched, the pictures, and every number with its definition."""
+"""Report as PDF: A4 pages with searchable text, the pictures, and every metric with its definition."""
 
 import io
 import textwrap
@@ -14,23 +14,26 @@ if TYPE_CHECKING:
     from vstent.study.types import CaseResult
 
 PAGE_IN: Final = (8.27, 11.69)
-"""A4."""
+"""Width and height of an A4 page in inches."""
 LEFT, RIGHT, TOP, FOOT = 0.75, 0.75, 0.85, 0.80
 """Margins in inches."""
 WIDTH: Final = PAGE_IN[0] - LEFT - RIGHT
+"""Width of the text in inches."""
 _INK, _QUIET, _ACCENT, _LINE, _WARN = "#16262e", "#54666f", "#0b6473", "#d7dfe3", "#8a4b08"
+"""Colors of text, secondary text, headings, rules and the statement at the foot."""
 _CHARACTER: Final = 0.53
-"""Mean width of a character over its height."""
+"""Mean width of a character as a fraction of the font size, for line breaks."""
 BADGE: Final = "Research use only. Not a medical device."
+"""Statement at the foot of every page."""
 
 
 def report_pdf(case: "CaseResult") -> bytes:
-    """Return the report of a case as a PDF; like the page it carries no field of a patient's record."""
+    """Return the report of a case as PDF; it contains no field of a patient's record."""
     return as_pdf(contents_of(case))
 
 
 def as_pdf(told: Contents) -> bytes:
-    """Lay a report out on A4 pages."""
+    """Return a report laid out on A4 pages, as PDF."""
     from matplotlib import rc_context
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
@@ -64,7 +67,7 @@ class _Paper:
         self._turn()
 
     def _turn(self) -> None:
-        """Begin a page."""
+        """Begin a new page with its footer."""
         from matplotlib.figure import Figure
 
         self._close()
@@ -76,40 +79,42 @@ class _Paper:
         self._put(PAGE_IN[0] - RIGHT, 0.45, str(self._number), 7.5, color=_QUIET, ha="right")
 
     def _close(self) -> None:
+        """Write the current page to the document."""
         if self._figure is not None:
             self._pages.savefig(self._figure)
 
     def done(self) -> bytes:
-        """Return all pages."""
+        """Return all pages as PDF."""
         self._close()
         self._pages.close()
         return self._stream.getvalue()
 
     def _put(self, x: float, y: float, words: str, size: float, **more: Any) -> None:
+        """Write text at a position in inches from the lower left corner; `size` is in points."""
         more.setdefault("color", _INK)
         self._figure.text(x / PAGE_IN[0], y / PAGE_IN[1], words, fontsize=size, parse_math=False, **more)
 
     def room(self, inches: float) -> None:
-        """Turn the page unless so much room is left on it."""
+        """Begin a new page unless this many inches are left on the current one."""
         if self._y - inches < FOOT:
             self._turn()
 
     def title(self, words: str) -> None:
-        """Put the report's title."""
+        """Write the title of the report."""
         self._put(LEFT, self._y, "vstent", 10, color=_ACCENT, weight="bold")
         self._y -= 0.36
         self._put(LEFT, self._y, words, 18, weight="bold")
         self._y -= 0.20
 
     def heading(self, words: str) -> None:
-        """Put a heading, not at a page's end."""
+        """Write a heading; it starts a new page where the current one has no space for text below it."""
         self.room(1.2)
         self._y -= 0.38
         self._put(LEFT, self._y, words, 12.5, weight="bold", color=_ACCENT)
         self._y -= 0.16
 
     def text(self, words: str, size: float = 8.5, *, color: str = _INK, indent: float = 0.0) -> None:
-        """Put a paragraph."""
+        """Write a paragraph; `size` is in points, `indent` in inches."""
         step = 1.45 * size / 72
         for line in _wrapped(words, WIDTH - indent, size):
             self.room(step)
@@ -118,13 +123,21 @@ class _Paper:
         self._y -= 0.05
 
     def table(self, rows: Iterable[Sequence[str]], widths: Sequence[float], *, head: Sequence[str] = ()) -> None:
-        """Put rows of cells, as wide as the page by `widths`: the first column flush left, the others flush right."""
+        """Write a table: the first column is aligned left, the others right.
+
+        Parameters
+        ----------
+        rows : cells of every row.
+        widths : width of every column as a fraction of the text width.
+        head : column titles; empty: none.
+        """
         if head:
             self._row(head, widths, _QUIET, "bold")
         for row in rows:
             self._row(row, widths, _INK, "normal")
 
     def _row(self, cells: Sequence[str], widths: Sequence[float], color: str, weight: str) -> None:
+        """Write one row of a table, with a line above it."""
         size, step = 8.0, 0.155
         bold = 1.1 if weight == "bold" else 1.0
         lines = [_wrapped(cell, WIDTH * w - 0.12, size * bold) for cell, w in zip(cells, widths, strict=True)]
@@ -138,6 +151,7 @@ class _Paper:
         self._y -= step * max(map(len, lines)) + 0.05
 
     def _rule(self) -> None:
+        """Draw a horizontal line across the text."""
         from matplotlib.lines import Line2D
 
         ends = [LEFT / PAGE_IN[0], 1 - RIGHT / PAGE_IN[0]]
@@ -145,7 +159,7 @@ class _Paper:
         self._figure.add_artist(Line2D(ends, height, color=_LINE, linewidth=0.5))
 
     def picture(self, picture: "Picture") -> None:
-        """Put a picture with its words; as high as half a page at most."""
+        """Write a picture with title and caption, at most half a page high."""
         from matplotlib.image import imread
 
         image = imread(io.BytesIO(picture.png))
@@ -157,27 +171,30 @@ class _Paper:
         left = (LEFT + (WIDTH - width) / 2) / PAGE_IN[0]
         self._y -= height
         axes = self._figure.add_axes((left, self._y / PAGE_IN[1], width / PAGE_IN[0], height / PAGE_IN[1]))
-        axes.imshow(image, interpolation="none")  # kept as it is
+        axes.imshow(image, interpolation="none")  # no resampling
         axes.set_axis_off()
         self.text(picture.caption, 8, color=_QUIET)
 
 
 def _wrapped(words: str, width_in: float, size: float) -> list[str]:
-    """Lines of words that are as wide as `width_in` at most."""
+    """Return text broken into lines of at most `width_in` inches; `size` is the font size in points."""
     count = max(6, int(width_in * 72 / (_CHARACTER * size)))
     return textwrap.wrap(words, count, break_long_words=True, break_on_hyphens=False) or [""]
 
 
 def _rows(quantities: Iterable[Quantity], skip: int) -> list[tuple[str, str]]:
+    """Return name and value of quantities; the first `skip` keys of their paths are left out of the names."""
     return [(_named(quantity, skip), quantity.text) for quantity in quantities]
 
 
 def _named(quantity: Quantity, skip: int) -> str:
+    """Return the name of a quantity after the keys that lead to it, without the first `skip` of them."""
     place = " · ".join(quantity.place[skip:]).replace("_", " ")
     return f"{place}: {quantity.name}" if place else quantity.name
 
 
 def _summary(paper: _Paper, told: Contents) -> None:
+    """Write the title and the headline metrics."""
     paper.title(told.name)
     paper.text("Virtual stenting report. Blood flow without and with each device; change is with / without − 1.")
     if told.headlines:
@@ -190,6 +207,7 @@ def _summary(paper: _Paper, told: Contents) -> None:
 
 
 def _changes(paper: _Paper, told: Contents, rows: list[Change]) -> None:
+    """Write a table of metrics without and with each device."""
     n = max(1, len(told.devices))
     first = 0.40 if n < 3 else 0.31
     rest = (1 - first) / (1 + 1.5 * n)
@@ -205,6 +223,7 @@ def _changes(paper: _Paper, told: Contents, rows: list[Change]) -> None:
 
 
 def _devices(paper: _Paper, told: Contents) -> None:
+    """Write the section of every device."""
     for stent in told.stents:
         paper.heading(stent["title"])
         paper.text(stent["words"])
@@ -215,12 +234,14 @@ def _devices(paper: _Paper, told: Contents) -> None:
 
 
 def _flow(paper: _Paper, told: Contents) -> None:
+    """Write the section on blood flow where there is one."""
     if told.changes:
         paper.heading("Blood flow")
         _changes(paper, told, told.changes)
 
 
 def _uncertainty(paper: _Paper, told: Contents) -> None:
+    """Write the uncertainty intervals of every device."""
     for varied in told.uncertainty:
         paper.heading(f"Uncertainty: {varied.title}")
         paper.text(varied.words)
@@ -232,6 +253,7 @@ def _uncertainty(paper: _Paper, told: Contents) -> None:
 
 
 def _words(paper: _Paper, told: Contents) -> None:
+    """Write notes, limits, definitions and provenance."""
     paper.heading("Notes and limits")
     for note in (*told.notes, *told.limits):
         paper.text(f"• {note}")

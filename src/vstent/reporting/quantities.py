@@ -1,4 +1,4 @@
-"""Numbers for people: a metric's key becomes a name, a unit, a definition and a formatted value."""
+"""Display name, unit, definition and formatted value of a metric, derived from its key."""
 
 import math
 import re
@@ -45,74 +45,93 @@ UNITS: dict[str, tuple[str, float]] = {
     "MB": ("MB", 1.0),
     "s": ("s", 1.0),
 }
-"""End of a key -> unit for people, and the factor to it (degrees, percent and µJ: here only)."""
+"""Suffix of a key: its display unit and the factor that converts to it.
+
+Angles, fractions and energies are converted to degrees, percent and µJ for display only.
+"""
 
 
 NOTHING = 1e-9
-"""What is smaller is what rounding leaves of zero."""
+"""Magnitude below which a value is shown as 0, because only rounding errors are that small."""
 RATIO = "_ratio"
-"""End of the key of a quantity after over before."""
+"""Suffix of the key of a ratio: value with the device over value without it."""
 OPENING = re.compile(r"(inlet|outlet)_(\d+)_(\w+)")
-"""Key of a quantity of one of several inlets or outlets."""
+"""Pattern of the key of a metric of one of several inlets or outlets."""
 ERRORS = ("unsettled_fraction",)
-"""How far numbers are to be relied on: that one changes says nothing of a device."""
+"""Suffixes of keys that state the reliability of a result; their change with a device means nothing."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One number of the metrics."""
+    """One metric with its path in the nested metrics."""
 
     path: tuple[str, ...]
     """Keys from the top of the metrics."""
     value: Any
-    """What was measured."""
+    """Measured value."""
 
     @property
     def key(self) -> str:
-        """The last key that ends in a unit (``outlets_mL_s.outlet_1``: the first), else the last that is a name."""
+        """Last key that ends in a unit, else the last key that is not a number.
+
+        In ``outlets_mL_s.outlet_1`` it is ``outlets_mL_s``.
+        """
         names = [part for part in reversed(self.path) if not part.isdigit()]
         return next((part for part in names if split_unit(part)[1]), names[0] if names else "")
 
     @property
     def definition(self) -> Definition:
-        """Name, meaning and source: of a ratio, or of one of several openings, those of what that is of."""
+        """Name, meaning and source.
+
+        A ratio or a metric of one of several openings has the definition of the metric it derives from.
+        """
         key, more = base_of(self.key)
         known = DEFINITIONS.get(key) or Definition(_spell(split_unit(key)[0]), "", "")
         return known._replace(name=known.name + more)
 
     @property
     def name(self) -> str:
-        """Name for people, with what follows the key: ``Outlet flow, outlet 1``."""
+        """Display name, followed by the keys below the defining one: ``Outlet flow, outlet 1``."""
         index = len(self.path) - self.path[::-1].index(self.key) if self.key in self.path else len(self.path)
         return ", ".join([self.definition.name, *(part.replace("_", " ") for part in self.path[index:])])
 
     @property
     def place(self) -> tuple[str, ...]:
-        """The keys above the name."""
+        """Keys above the defining one."""
         return self.path[: self.path.index(self.key)] if self.key in self.path else ()
 
     @property
     def unit(self) -> str:
-        """Unit for people; empty for a pure number."""
+        """Display unit; empty for a pure number."""
         return unit_of(self.key)
 
     @property
     def text(self) -> str:
-        """The value with its unit."""
+        """Value with its unit."""
         return format_value(self.key, self.value)
 
 
 class Change(NamedTuple):
-    """One quantity before and after."""
+    """One quantity without and with each device."""
 
     before: Quantity
-    """Without a device."""
+    """Value without a device."""
     after: dict[str, Quantity]
-    """With each device, by its name."""
+    """Value with each device, by the name of the device."""
 
 
 def base_of(key: str) -> tuple[str, str]:
-    """Return the key that a key's definition stands under, and what it adds to that name."""
+    """Return the key that defines a metric, and the text to append to its name.
+
+    Parameters
+    ----------
+    key : key of a metric, of a ratio, or of one of several openings.
+
+    Returns
+    -------
+    tuple of str
+        Key in `DEFINITIONS` (or the key itself), and a suffix such as ``, after / before``.
+    """
     if key in DEFINITIONS:
         return key, ""
     if key.endswith(RATIO):
@@ -123,12 +142,12 @@ def base_of(key: str) -> tuple[str, str]:
 
 
 def unit_of(key: str) -> str:
-    """Return the unit for people that a key ends in; empty for a pure number."""
+    """Return the display unit of a key; empty for a pure number."""
     return UNITS.get(split_unit(key)[1], ("", 1.0))[0]
 
 
 def split_unit(key: str) -> tuple[str, str]:
-    """Split a key into its words and the unit it ends in (empty where it ends in none)."""
+    """Return a key without its unit, and the unit; the unit is empty where the key ends in none."""
     for unit in UNITS:
         if key == unit:
             return "", unit
@@ -138,7 +157,13 @@ def split_unit(key: str) -> tuple[str, str]:
 
 
 def format_value(key: str, value: Any) -> str:
-    """Return a value with the unit of its key: ``0.412 mL/s``; several values are separated by commas."""
+    """Return a value with the unit of its key: ``0.412 mL/s``.
+
+    Parameters
+    ----------
+    key : key of the metric, which ends in its unit.
+    value : number, text, boolean or None; several values in a list are separated by commas.
+    """
     if isinstance(value, (list, tuple)):
         return ", ".join(format_value(key, one) for one in value) or "–"
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
@@ -154,7 +179,7 @@ def format_value(key: str, value: Any) -> str:
 
 
 def format_number(value: float) -> str:
-    """Return a number with three significant digits, and no fewer than all before the point: 0.0412, 3.14, 1520."""
+    """Return a number with three significant digits, and with all digits before the point: 0.0412, 3.14, 1520."""
     if abs(value) < NOTHING:
         return "0"
     magnitude = math.floor(math.log10(abs(value)))
@@ -164,7 +189,12 @@ def format_number(value: float) -> str:
 
 
 def format_change(before: Any, after: Any) -> str:
-    """Return by how much a number changed, in percent: ``−35 %``; a dash where that means nothing."""
+    """Return a relative change in percent, such as ``−35 %``; a dash where it is undefined.
+
+    Parameters
+    ----------
+    before, after : values without and with a device.
+    """
     numbers = all(isinstance(value, (int, float)) and math.isfinite(value) for value in (before, after))
     if not numbers or before == 0:
         return "–"
@@ -174,7 +204,13 @@ def format_change(before: Any, after: Any) -> str:
 
 
 def flatten(metrics: Any, path: tuple[str, ...] = ()) -> list[Quantity]:
-    """Return every value of nested metrics with its path, in order; lists of plain values stay whole."""
+    """Return every value of nested metrics with its path, in order.
+
+    Parameters
+    ----------
+    metrics : nested mappings and lists; a list of plain values counts as one value.
+    path : keys that lead to `metrics`.
+    """
     if isinstance(metrics, dict):
         return [quantity for key, value in metrics.items() for quantity in flatten(value, (*path, str(key)))]
     if isinstance(metrics, (list, tuple)) and any(isinstance(value, dict) for value in metrics):
@@ -183,7 +219,10 @@ def flatten(metrics: Any, path: tuple[str, ...] = ()) -> list[Quantity]:
 
 
 def opening_rows(openings: Iterable[Opening]) -> list[tuple[str, str, str, str]]:
-    """Return role, diameter, area and center (LPS) of every opening: by its role the numbers of the flow go."""
+    """Return role, diameter, area and center (LPS) of every opening as text.
+
+    Flow metrics refer to an opening by its role.
+    """
     return [
         (
             opening.role.replace("_", " "),
@@ -196,7 +235,10 @@ def opening_rows(openings: Iterable[Opening]) -> list[tuple[str, str, str, str]]
 
 
 def compare(metrics: dict[str, Any]) -> list[Change]:
-    """Return the numbers that were measured before (``bare``) and after (``stents.NAME.flow``), in order; no errors."""
+    """Return the flow metrics without (``bare``) and with each device (``stents.NAME.flow``), in order.
+
+    Metrics that state the reliability of a result are left out.
+    """
     after = {name: dict(_flow(stent)) for name, stent in metrics.get("stents", {}).items()}
     rows = []
     for quantity in flatten(metrics.get("bare", {})):
@@ -207,14 +249,17 @@ def compare(metrics: dict[str, Any]) -> list[Change]:
 
 
 def _is_compared(quantity: Quantity) -> bool:
+    """Return whether a quantity is a number whose change with a device is meaningful."""
     is_number = isinstance(quantity.value, (int, float)) and not isinstance(quantity.value, bool)
     return is_number and quantity.key not in ERRORS
 
 
 def _flow(stent: dict[str, Any]) -> list[tuple[tuple[str, ...], Quantity]]:
+    """Return path and quantity of every flow metric of a device."""
     return [(quantity.path, quantity) for quantity in flatten(stent.get("flow", {}))]
 
 
 def _spell(words: str) -> str:
+    """Return the words of a key as a display name."""
     text = re.sub(r"^n ", "Number of ", words.replace("_", " ").strip())
     return text[:1].upper() + text[1:]

@@ -1,4 +1,4 @@
-"""A case as things to look at: layers with colours, scales and views, for the viewer and for the pictures alike."""
+"""Scene of a case: layers with colors, color scales and views, shared by the viewer and the pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,99 +18,99 @@ from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.reporting.thinning import thin_frames, thin_lines, thin_surface
 
 N_INLET, N_NECK = 70, 60
-"""Streamlines through the inlets and through the neck."""
+"""Number of streamlines through the inlets and through the neck."""
 BESIDE_SAC_MM = 1.0
-"""What is this near to the sac says how wide the scales of the flow are."""
+"""Distance from the sac, in mm, within which values set the range of the flow's color scales."""
 
 if TYPE_CHECKING:
     from vstent.study.types import CaseResult
 
 FRONTAL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""From the front: the patient's left is to the right, the head is up."""
+"""Axes (3, 3) of the frontal view, rows in LPS: the patient's left is on the right, the head is up."""
 LATERAL = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-"""From the left."""
+"""Axes (3, 3) of the view from the patient's left, rows in LPS."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """A colour scale that every pane shares."""
+    """A color scale shared by all panes."""
 
     id: str
     """Name by which layers refer to it."""
     title: str
-    """The quantity, for people."""
+    """Display name of the quantity."""
     unit: str
     """Unit of `low` and `high`."""
     low: float
-    """Value of the first colour."""
+    """Value of the first color."""
     high: float
-    """Value of the last colour; what is above is drawn in it."""
+    """Value of the last color; values above have this color too."""
     colours: Floats
-    """(256, 3) red, green and blue, 0 to 1; even in lightness and legible to the colour-blind."""
+    """(256, 3) red, green and blue, 0 to 1; perceptually uniform and readable with color vision deficiency."""
 
     def __post_init__(self) -> None:
         freeze(self, "colours", np.float64, (256, 3))
 
     def paint(self, values: Floats) -> Floats:
-        """Return the colours (n, 3) of values (n,)."""
+        """Return the colors (n, 3) of values (n,); NaN has the first color."""
         place = (np.nan_to_num(values, nan=self.low) - self.low) / max(self.high - self.low, 1e-300)
         return self.colours[np.rint(255 * np.clip(place, 0.0, 1.0)).astype(int)]
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """What every layer has."""
+    """Properties common to all layers."""
 
     id: str
-    """What it is: lumen, landing, sac, neck, axis, contour, coverage, wires, streamlines, shear."""
+    """Name of what it shows: lumen, landing, sac, neck, axis, contour, coverage, wires, streamlines, shear."""
     pane: str
-    """The pane that shows it; empty: every pane."""
+    """Name of the pane that shows it; empty: all panes."""
     colour: tuple[float, float, float]
-    """Red, green and blue, 0 to 1, where it has no values."""
+    """Red, green and blue, 0 to 1, used where the layer has no scale."""
     scale: str
-    """Name of the scale that colours the values; empty: `colour`."""
+    """Name of the color scale of the values; empty: `colour` is used."""
     values: Floats
-    """(n,) a value per vertex or point; empty without a scale."""
+    """(n,) value per vertex or point; empty without a scale."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshLayer(Layer):
-    """Triangles."""
+    """A layer of triangles."""
 
     surface: Surface
     """The triangles."""
     opacity: float = 1.0
-    """1 hides what is behind; below, seen through, denser at the silhouette."""
+    """1: opaque; below 1: translucent, denser at the silhouette."""
     frames_mm: Floats | None = None
-    """(f, n, 3) the vertices over time, the last one is `surface`; None: it does not move."""
+    """(f, n, 3) vertices over time, the last frame equal to `surface`; None: static."""
     frame_values: Floats | None = None
-    """(f, n) the values over time."""
+    """(f, n) values over time; None: static."""
 
 
 @dataclass(frozen=True, eq=False)
 class LineLayer(Layer):
-    """Round lines: wires, streamlines, curves."""
+    """A layer of round lines: wires, streamlines, curves."""
 
     points_mm: Floats
-    """(p, 3) points, one polyline after another."""
+    """(p, 3) points of all polylines, one after another."""
     starts: Ints
-    """(w + 1,) first point of every polyline, and p at the end."""
+    """(w + 1,) index of the first point of every polyline, and p at the end."""
     radius_mm: Floats
     """(w,) radius of every polyline."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A direction to look from."""
+    """A direction of view."""
 
     id: str
     """Name: profile, neck, frontal, lateral."""
     axes: Floats
-    """(3, 3) unit rows in LPS: to the right on the screen, up, and towards the eye."""
+    """(3, 3) unit rows in LPS: right on the screen, up, and toward the eye."""
     center_mm: Floats
-    """(3,) what is in the middle."""
+    """(3,) point at the center of the picture."""
     radius_mm: float
-    """Radius of the sphere about the middle that should fill the picture."""
+    """Radius of the sphere around the center that should fill the picture."""
 
     def __post_init__(self) -> None:
         freeze(self, "axes", np.float64, (3, 3))
@@ -119,21 +119,21 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything there is to look at."""
+    """Layers, color scales and views of a case."""
 
     panes: tuple[tuple[str, str], ...]
-    """(name, title): bare first, then every device."""
+    """(name, title) of every pane: ``bare`` first, then the devices."""
     layers: tuple[MeshLayer | LineLayer, ...]
-    """What is drawn."""
+    """All layers."""
     scales: tuple[Scale, ...]
-    """The colour scales in use."""
+    """Color scales in use."""
     views: tuple[View, ...]
-    """The directions offered, the best first."""
+    """Views offered, the best first."""
     fade_mm: float
-    """Wires this far behind the middle of a picture are pale: the near side of a device stands out."""
+    """Depth behind the center of a picture at which wires are pale, so that the near side of a device stands out."""
 
     def scale(self, name: str) -> Scale:
-        """Return the scale called `name`."""
+        """Return the color scale called `name`."""
         return next(scale for scale in self.scales if scale.id == name)
 
     def view(self, name: str) -> View:
@@ -141,12 +141,12 @@ class Scene:
         return next(view for view in self.views if view.id == name)
 
     def pick(self, ids: tuple[str, ...], pane: str) -> tuple[MeshLayer | LineLayer, ...]:
-        """Return the layers of these ids that `pane` shows."""
+        """Return the layers with these ids that `pane` shows."""
         return tuple(layer for layer in self.layers if layer.id in ids and layer.pane in ("", pane))
 
 
 def scene_of(case: "CaseResult") -> Scene:
-    """Return the scene of a case, thinned to what a screen can show."""
+    """Return the scene of a case, decimated to the resolution of a screen."""
     anatomy: Anatomy = case.anatomy
     devices = tuple((name, device_title(deployment)) for name, deployment in case.deployments.items())
     layers: list[MeshLayer | LineLayer] = anatomy_layers(anatomy)
@@ -164,20 +164,22 @@ def scene_of(case: "CaseResult") -> Scene:
 
 
 def device_title(deployment: Deployment) -> str:
-    """Return what a device is called, with its size: ``Silk 4.0 × 20 mm``."""
+    """Return the name of a device with its size: ``Silk 4.0 × 20 mm``."""
     size = deployment.stent.size
     return f"{deployment.stent.design.name} {size.diameter_mm:g} × {size.length_mm:g} mm"
 
 
 _PLAIN: dict[str, Any] = {"scale": "", "values": np.zeros(0)}
+"""Fields of a layer without values."""
 _WALL = (0.62, 0.68, 0.73)
 _SAC = (0.80, 0.42, 0.36)
 _INK = (0.10, 0.17, 0.20)
 _STEEL = (0.33, 0.38, 0.43)
+"""Colors of wall, sac, lines and devices: red, green and blue, 0 to 1."""
 
 
 def anatomy_layers(anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
-    """Return lumen, landing surface, axes, sacs and necks."""
+    """Return the layers of lumen, landing surface, centerlines, axis, sacs and necks."""
     lumen, _ = thin_surface(anatomy.vessel.lumen, 40_000)
     landing, _ = thin_surface(anatomy.landing_surface, 24_000)
     layers: list[MeshLayer | LineLayer] = [
@@ -195,7 +197,15 @@ def anatomy_layers(anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
 
 
 def curves_layer(name: str, curves: list[Floats], radius_mm: float, colour: tuple[float, float, float]) -> LineLayer:
-    """Return plain curves (n, 3) as one layer of every pane."""
+    """Return curves as one layer without values, shown in every pane.
+
+    Parameters
+    ----------
+    name : id of the layer.
+    curves : (n, 3) points of every curve in mm.
+    radius_mm : radius of the drawn lines.
+    colour : red, green and blue, 0 to 1.
+    """
     starts = np.concatenate([[0], np.cumsum([len(curve) for curve in curves])]).astype(np.int32)
     points = np.concatenate([np.zeros((0, 3)), *curves])
     radii = np.full(len(curves), radius_mm)
@@ -203,7 +213,14 @@ def curves_layer(name: str, curves: list[Floats], radius_mm: float, colour: tupl
 
 
 def device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
-    """Return the contour with its expansion, and the wires, for the pane `name`."""
+    """Return the contour of a device with its expansion over time, and its wires.
+
+    Parameters
+    ----------
+    name : pane that shows them.
+    deployment : the deployment.
+    anatomy : vessel, parent artery and sacs.
+    """
     frames_mm, gaps_mm = thin_frames(deployment, anatomy.landing_surface, n_frames=24)
     stent = deployment.stent
     points, starts, _ = thin_lines(stent.wire_points_mm, stent.wire_starts, np.zeros(0), 60_000)
@@ -225,13 +242,31 @@ def device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[M
 
 
 def coverage_layer(name: str, stent: Stent) -> MeshLayer:
-    """Return the contour coloured by how much metal is about, for the pane `name`."""
+    """Return the contour of a device colored by the local metal coverage in percent.
+
+    Parameters
+    ----------
+    name : pane that shows it.
+    stent : the deployed device.
+    """
     values = 100 * node_coverage(stent).ravel()
     return MeshLayer(id="coverage", pane=name, colour=_STEEL, scale="coverage", values=values, surface=stent.contour)
 
 
 def node_coverage(stent: Stent) -> Floats:
-    """Coverage (rows, columns) as measured on the wires in the quads around every node, smoothed over a few cells."""
+    """Return the metal coverage at every node of a device.
+
+    Coverage is measured on the wires in each quad of the contour and averaged over 7 x 7 quads.
+
+    Parameters
+    ----------
+    stent : the deployed device.
+
+    Returns
+    -------
+    Floats
+        (rows, columns) fraction of the surface covered by metal, 0 to 1.
+    """
     from scipy.ndimage import uniform_filter
 
     quads = coverage_fractions(stent)
@@ -240,7 +275,14 @@ def node_coverage(stent: Stent) -> Floats:
 
 
 def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
-    """Return the wall coloured by its shear stress, and streamlines, for the pane `name`."""
+    """Return the wall colored by its shear stress, and the streamlines.
+
+    Parameters
+    ----------
+    name : pane that shows them.
+    field : the flow.
+    anatomy : vessel, parent artery and sacs.
+    """
     wall, origin = thin_surface(field.wall, 40_000)
     shear = MeshLayer(
         id="shear",
@@ -266,7 +308,7 @@ def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer
 
 
 def _seeds_mm(field: FlowField, anatomy: Anatomy) -> Floats:
-    """Points (s, 3) on the inlets' sections and on the neck."""
+    """Return seed points (s, 3) of streamlines on the inlets and on the neck of the first sac."""
     seeds = [inlet_seeds_mm(field, anatomy.vessel, N_INLET)]
     seeds += [neck_seeds_mm(field, sac.neck, N_NECK) for sac in anatomy.aneurysms[:1]]
     return np.concatenate(seeds)
@@ -279,14 +321,20 @@ _SCALES = {
     "coverage": ("Metal coverage", "%", "viridis", 40.0),
     "diameter": ("Deployed diameter", "mm", "viridis", 1.0),
 }
-"""Name -> title, unit, colour map and the smallest range worth a scale."""
+"""Name of a scale: title, unit, color map, and the smallest upper end of the scale."""
 _OF_FLOW = ("speed", "shear")
+"""Names of the color scales of the flow."""
 
 
 def scales_of(layers: Sequence[MeshLayer | LineLayer], anatomy: Anatomy) -> tuple[Scale, ...]:
-    """Return the scales that the layers use, each wide enough for all of them.
+    """Return the color scales in use, each wide enough for all layers that use it.
 
-    Those of the flow are as wide as what it has about the sac without a device, which is its first layer.
+    The range of a flow scale is set by the values near the sac without a device.
+
+    Parameters
+    ----------
+    layers : all layers; the first one with a flow scale belongs to the flow without a device.
+    anatomy : vessel, parent artery and sacs.
     """
     scales = []
     for name, (title, unit, colour_map, least) in _SCALES.items():
@@ -300,7 +348,7 @@ def scales_of(layers: Sequence[MeshLayer | LineLayer], anatomy: Anatomy) -> tupl
 
 
 def _about_the_sac(layer: MeshLayer | LineLayer, anatomy: Anatomy) -> Floats:
-    """Values (k,) of a layer's points near the wall of the first sac; none without one."""
+    """Return the values (k,) of a layer near the wall of the first sac; empty without a sac."""
     if not anatomy.aneurysms:
         return np.zeros(0)
     points_mm = layer.points_mm if isinstance(layer, LineLayer) else layer.surface.vertices_mm
@@ -315,14 +363,21 @@ def round_up(value: float) -> float:
 
 
 def _colours(name: str) -> Floats:
+    """Return 256 colors (256, 3) of a matplotlib color map."""
     import matplotlib
 
-    # The lightest tenth of a map is lost on a light background.
+    # The lightest colors of a map would not show on the light background.
     return matplotlib.colormaps[name](np.linspace(0.0, 0.93, 256))[:, :3]
 
 
 def views_of(anatomy: Anatomy, deployments: dict[str, Deployment]) -> tuple[View, ...]:
-    """Return the directions to look from, the profile of the largest sac first."""
+    """Return the views of a case, the profile of the first sac first.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployments by device name; the profile view encloses them.
+    """
     points = [deployment.stent.nodes_mm.reshape(-1, 3) for deployment in deployments.values()]
     points += [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
     treated = np.concatenate(points or [anatomy.axis.points_mm])
@@ -339,7 +394,15 @@ def views_of(anatomy: Anatomy, deployments: dict[str, Deployment]) -> tuple[View
 
 
 def view_of(name: str, axes: Floats, points_mm: Floats, room: float = 1.0) -> View:
-    """Frame points (n, 3) as they show from there, with some room."""
+    """Return a view whose sphere encloses points as seen along its axes.
+
+    Parameters
+    ----------
+    name : id of the view.
+    axes : (3, 3) unit rows in LPS: right, up, toward the eye.
+    points_mm : (n, 3) points to enclose.
+    room : factor on the radius of the sphere.
+    """
     seen = points_mm @ axes.T
     middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
     radius_mm = room * float(np.linalg.norm((seen - middle)[:, :2], axis=1).max())
@@ -347,7 +410,7 @@ def view_of(name: str, axes: Floats, points_mm: Floats, room: float = 1.0) -> Vi
 
 
 def _profile(anatomy: Anatomy) -> Floats:
-    """Rows right, up, toward: the artery at the neck runs to the right, the sac stands up."""
+    """Return rows right, up and toward the eye (3, 3): the artery at the neck runs to the right, the sac points up."""
     axis = anatomy.axis
     if not anatomy.aneurysms:
         plane = np.linalg.svd(axis.points_mm - axis.points_mm.mean(axis=0))[2]
@@ -363,7 +426,7 @@ def _profile(anatomy: Anatomy) -> Floats:
 
 
 def _hidden(points_mm: Floats, view: View) -> int:
-    """Count the points (n, 3) that stand between the eye and what the view is of."""
+    """Return the number of points (n, 3) between the eye and the sphere of a view."""
     offset = (points_mm - view.center_mm) @ view.axes.T
     aside_mm = np.linalg.norm(offset[:, :2], axis=1)
     return int(np.count_nonzero((aside_mm < view.radius_mm) & (offset[:, 2] > view.radius_mm)))

@@ -1,4 +1,4 @@
-"""Making things light enough for a page: fewer triangles, points and frames, same look."""
+"""Reduce triangles, points and frames so that a scene is small enough for a page."""
 
 import itertools
 
@@ -11,12 +11,25 @@ from vstent.kernels.arrays import Floats, Ints
 
 
 def thin_surface(surface: Surface, n_faces: int) -> tuple[Surface, Ints]:
-    """Return a surface of about `n_faces` faces at most, and the nearest old vertex (n,) of every new one."""
+    """Return a surface decimated to about `n_faces` faces.
+
+    Parameters
+    ----------
+    surface : the surface.
+    n_faces : number of faces above which it is decimated.
+
+    Returns
+    -------
+    surface : Surface
+        The decimated surface, or the given one where it is small enough.
+    origin : Ints
+        (n,) nearest vertex of the given surface for every new vertex.
+    """
     if len(surface.faces) <= n_faces:
         return surface, np.arange(len(surface.vertices_mm), dtype=np.int32)
     import fast_simplification
 
-    # The library writes to neither array but refuses read-only ones.
+    # The library does not change the arrays, but it rejects read-only ones.
     vertices, faces = fast_simplification.simplify(
         surface.vertices_mm.copy(), surface.faces.copy(), target_count=n_faces
     )
@@ -25,9 +38,19 @@ def thin_surface(surface: Surface, n_faces: int) -> tuple[Surface, Ints]:
 
 
 def thin_lines(points: Floats, starts: Ints, values: Floats, n_points: int) -> tuple[Floats, Ints, Floats]:
-    """Keep every k-th point of polylines and their last ones, so that about `n_points` (p, 3) stay.
+    """Return polylines reduced to about `n_points` points: every k-th point and the last of each line.
 
-    `values` (p,), or (0,), is thinned along.
+    Parameters
+    ----------
+    points : (p, 3) points of all polylines, one after another.
+    starts : (w + 1,) index of the first point of every polyline, and p at the end.
+    values : (p,) value per point, or (0,).
+    n_points : number of points to keep, approximately.
+
+    Returns
+    -------
+    points, starts, values
+        The reduced arrays.
     """
     step = max(1, -(-len(points) // n_points))
     kept = [np.append(np.arange(a, b - 1, step), b - 1) for a, b in itertools.pairwise(starts)]
@@ -37,15 +60,40 @@ def thin_lines(points: Floats, starts: Ints, values: Floats, n_points: int) -> t
 
 
 def some_frames(deployment: Deployment, n_frames: int) -> Ints:
-    """Return which contours of the history (f,) stand for all of it: the first, the last, and some between."""
+    """Return the indices of evenly spaced contours of an expansion, including the first and the last.
+
+    Parameters
+    ----------
+    deployment : the deployment with its history.
+    n_frames : largest number of contours.
+
+    Returns
+    -------
+    Ints
+        (f,) indices into the history.
+    """
     last = len(deployment.history_mm) - 1
     return np.unique(np.linspace(0, last, min(n_frames, last + 1)).astype(int))
 
 
 def thin_frames(deployment: Deployment, landing_surface: Surface, n_frames: int) -> tuple[Floats, Floats]:
-    """Return contours (f, nodes, 3) over the expansion and their wall gaps (f, nodes), the deployed one last.
+    """Return contours over the expansion of a device, and their gaps to the wall.
 
-    The gap of an earlier contour is its distance to the wall less what the deployed node keeps inside the device.
+    The gap of an earlier contour is its distance to the wall, reduced by the part of that distance that belongs to the
+    device at the deployed node.
+
+    Parameters
+    ----------
+    deployment : the deployment with its history.
+    landing_surface : wall of the parent artery that the device expands against.
+    n_frames : largest number of contours.
+
+    Returns
+    -------
+    frames_mm : Floats
+        (f, nodes, 3) contours, the deployed one last.
+    gaps_mm : Floats
+        (f, nodes) gaps to the wall.
     """
     nodes = deployment.stent.nodes_mm.reshape(-1, 3)
     gaps = deployment.wall_gap_mm.ravel()

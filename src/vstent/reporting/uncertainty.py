@@ -1,4 +1,4 @@
-"""Uncertainty in words: a row a result, with its interval and what makes its spread."""
+"""Uncertainty of results as table rows: mean, 95 % interval, and the share of each cause in the variance."""
 
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
@@ -12,35 +12,43 @@ CAUSES: Final = {
     "inflow": "inflow",
     "rest": "interplay",
 }
-"""Names of the causes for people."""
+"""Display names of the causes of uncertainty."""
 
 
 class Interval(NamedTuple):
-    """One result."""
+    """Uncertainty of one result, as text."""
 
     name: str
+    """Display name of the result."""
     mean: str
+    """Mean, with unit."""
     low: str
+    """Lower end of the 95 % interval, with unit."""
     high: str
+    """Upper end of the 95 % interval, with unit."""
     shares: list[tuple[str, float]]
-    """Causes and their shares, the largest first."""
+    """Causes and their shares in the variance, the largest first."""
 
 
 class Varied(NamedTuple):
-    """All results of a device."""
+    """Uncertainty of all results of one device."""
 
     title: str
+    """Title of the device."""
     words: str
+    """Number of deployments and the ranges that were varied, as text."""
     rows: list[Interval]
+    """Uncertainty of every result."""
 
 
 def intervals(stent: Mapping[str, Any]) -> list[Interval]:
-    """Return the rows of a device's metrics; none where nothing was varied."""
+    """Return the uncertainty of every result in the metrics of a device; empty without an uncertainty study."""
     varied = stent.get("uncertainty", {})
     return [_interval(key, ends, varied["shares"][key]) for key, ends in varied.get("intervals", {}).items()]
 
 
 def _interval(key: str, ends: Mapping[str, float], shares: Mapping[str, float]) -> Interval:
+    """Return the uncertainty of one result as text."""
     parts = [(CAUSES[cause.removesuffix("_fraction")], share) for cause, share in shares.items()]
     parts.sort(key=lambda part: -part[1])
     mean, low, high = (format_value(key, ends[end]) for end in ("mean", "low", "high"))
@@ -48,7 +56,13 @@ def _interval(key: str, ends: Mapping[str, float], shares: Mapping[str, float]) 
 
 
 def uncertainty_of(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Varied]:
-    """Return what was varied of every device; empty where nothing was."""
+    """Return the uncertainty of all devices; empty without an uncertainty study.
+
+    Parameters
+    ----------
+    metrics : metrics of the case.
+    titles : titles of the devices by name.
+    """
     found = []
     for name, stent in metrics.get("stents", {}).items():
         if "uncertainty" in stent:
@@ -57,6 +71,7 @@ def uncertainty_of(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> lis
 
 
 def _words(varied: Mapping[str, Any]) -> str:
+    """Return the number of deployments and the ranges that were varied, as text."""
     ranges = varied["ranges"]
     told = [
         f"{CAUSES[key.rsplit('_', 1)[0]]} ±{format_value(key, value)}" for key, value in ranges.items() if value > 0

@@ -1,4 +1,4 @@
-"""The reports of a case and of a cohort: one HTML file each with every number, no network; of a case a PDF too."""
+"""Write the report of a case as HTML, and optionally as PDF."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,14 @@ if TYPE_CHECKING:
 
 
 def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False) -> None:
-    """Write ``report.html`` into the case folder `out`, and ``report.pdf`` beside it where it is to be printed."""
+    """Write ``report.html`` into a case folder, and optionally ``report.pdf``.
+
+    Parameters
+    ----------
+    case : the finished case.
+    out : its case folder.
+    is_printed : whether to write the PDF too.
+    """
     told = contents_of(case)
     write_text(out / "report.html", as_html(told))
     if is_printed:

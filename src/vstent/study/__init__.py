@@ -1,4 +1,4 @@
-"""One patient: an input file and `Settings` in, a case folder with every result out; a rerun resumes.
+"""Study of one patient: an input file and `Settings` in, a case folder with all results out; a rerun resumes.
 
 Open ``pipeline.py`` first; ``stages.py`` holds the stages in their order.
 """

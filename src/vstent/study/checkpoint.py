@@ -1,4 +1,4 @@
-"""Checkpoint: a flow under way, kept in the case's cache until it is done."""
+"""Store the state of an unfinished flow computation in the cache of a case folder."""
 
 from pathlib import Path
 
@@ -10,16 +10,22 @@ from vstent.io.files import atomic
 
 
 class FlowCheckpoint:
-    """One file for each run of a flow (the guesses and the answer), replaced whole.
+    """Saved states of the runs of one flow computation, one file per run.
 
-    The ledger drops them when it keeps the flow itself, for their names begin as its own.
+    The ledger deletes these files when it stores the finished flow, because their names begin with the flow's name.
+
+    Parameters
+    ----------
+    folder : cache folder of the case.
+    flow : name of the flow in the ledger.
+    key : key of everything that the flow depends on.
     """
 
     def __init__(self, folder: Path, flow: str, key: str) -> None:
         self._folder, self._flow, self._key = folder, flow, key
 
     def load(self, run: str) -> Saved | None:
-        """Return what was saved of a run last; None where nothing was, or it is damaged."""
+        """Return the last saved state of a run; None where there is none, or it is damaged."""
         try:
             with self._path(run).open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
@@ -27,9 +33,10 @@ class FlowCheckpoint:
             return None
 
     def save(self, run: str, saved: Saved) -> None:
-        """Keep the state of a run instead of the one before."""
+        """Store the state of a run; it replaces the one before."""
         with atomic(self._path(run)) as partial, partial.open("wb") as file:
             np.savez(file, **saved)  # type: ignore[arg-type]
 
     def _path(self, run: str) -> Path:
+        """Return the file of a run."""
         return self._folder / f"{self._flow}-{self._key}-{run}.running.npz"

@@ -1,6 +1,8 @@
-"""Crate: a case folder as an RO-Crate: what each file is, and what made it.
+"""Describe a case folder as an RO-Crate: what each file contains, and which program made it from which input.
 
-Version 1.1, https://w3id.org/ro/crate/1.1 (Soiland-Reyes et al. 2022, Data Science 5:97).
+References
+----------
+RO-Crate 1.1, https://w3id.org/ro/crate/1.1 (Soiland-Reyes et al. 2022, Data Science 5:97).
 """
 
 import hashlib
@@ -12,8 +14,9 @@ from vstent.errors import ReadError
 from vstent.io.writers import write_json
 
 NAME: Final = "ro-crate-metadata.json"
+"""File name of the description."""
 LICENSE: Final = "https://spdx.org/licenses/BSD-3-Clause"
-"""Of the program."""
+"""License of vstent."""
 FORMATS: Final = {
     ".json": "application/json",
     ".csv": "text/csv",
@@ -25,6 +28,7 @@ FORMATS: Final = {
     ".png": "image/png",
     ".pdf": "application/pdf",
 }
+"""Media type of a file by its suffix."""
 ABOUT: Final = {
     "metrics.json": "All results as numbers, with the unit in each key",
     "run.json": "Versions, input with SHA-256, settings: enough to repeat the run",
@@ -44,21 +48,22 @@ ABOUT: Final = {
     "field.vtu": "Velocity and pressure",
     "wall.vtp": "Wall shear stress",
 }
+"""Description of a file by its name."""
 
 
 def write_crate(folder: Path, provenance: Mapping[str, Any], when: str) -> None:
-    """Describe every file of a finished case folder in ``ro-crate-metadata.json``; hidden ones are left out.
+    """Describe every file of a finished case folder in ``ro-crate-metadata.json``; hidden files are left out.
 
     Parameters
     ----------
     folder : the case folder.
-    provenance : what its ``run.json`` says.
-    when : the day, ISO 8601.
+    provenance : content of its ``run.json``.
+    when : date of the run, ISO 8601.
 
     Raises
     ------
     ReadError
-        There is no finished case in the folder.
+        The folder holds no finished case.
     """
     if not (folder / "metrics.json").exists():
         raise ReadError(f"{folder} holds no finished case. Run it first.")
@@ -74,10 +79,12 @@ def write_crate(folder: Path, provenance: Mapping[str, Any], when: str) -> None:
 
 
 def _is_shown(path: Path) -> bool:
+    """Return whether a file is described: it is neither hidden nor the description itself."""
     return path.name != NAME and not any(part.startswith(".") for part in path.parts)
 
 
 def _file(folder: Path, path: Path) -> dict[str, Any]:
+    """Return the entry of a file, with its size and SHA-256."""
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256")
     return {
@@ -91,6 +98,7 @@ def _file(folder: Path, path: Path) -> dict[str, Any]:
 
 
 def _crate(folder: Path, files: list[dict[str, Any]], when: str) -> list[dict[str, Any]]:
+    """Return the entries of the description itself and of the case folder."""
     return [
         {
             "@id": NAME,
@@ -112,7 +120,7 @@ def _crate(folder: Path, files: list[dict[str, Any]], when: str) -> list[dict[st
 
 
 def _making(provenance: Mapping[str, Any], files: list[dict[str, Any]], when: str) -> list[dict[str, Any]]:
-    """Which program made the files, from what."""
+    """Return the entries of program, input and run."""
     given = provenance["input"]
     return [
         {

@@ -1,4 +1,4 @@
-"""The demo: a synthetic 3DRA scan with a known truth, and how far the study's result is from it."""
+"""Demo: a synthetic 3DRA scan of a phantom, and a comparison of the study's results with the known truth."""
 
 from pathlib import Path
 from typing import Final
@@ -10,15 +10,16 @@ from vstent.kernels import curves
 from vstent.phantoms import Phantom, demo_phantom, scan
 from vstent.study.types import CaseResult
 
-SEED: Final = 20161  # of the scan's noise: any other does as well
+SEED: Final = 20161  # seed of the scan's noise; the value is arbitrary
 END_DIAMETERS: Final = 1.0
-"""Radii are compared from this many diameters inside the ends on."""
+"""Length at each end of the artery that the comparison of radii leaves out, in diameters."""
 
 Row = tuple[str, float, float, str]
+"""Title, found value, true value and unit."""
 
 
 def write_scan(folder: Path) -> Path:
-    """Write the demo's scan as a DICOM series, unless it is there, and return its folder."""
+    """Write the demo's scan as a DICOM series unless the folder exists, and return the folder."""
     if not folder.is_dir():
         image = scan(demo_phantom(), np.random.default_rng(SEED))
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -27,7 +28,17 @@ def write_scan(folder: Path) -> Path:
 
 
 def truth(case: CaseResult) -> list[Row]:
-    """Compare a study of the demo's scan with the phantom: rows of title, found, true, unit."""
+    """Compare a study of the demo's scan with the phantom.
+
+    Parameters
+    ----------
+    case : study of the scan that `write_scan` writes.
+
+    Returns
+    -------
+    list of Row
+        Title, found value, true value and unit.
+    """
     phantom = demo_phantom()
     found_mm, true_mm = _radii_mm(case, phantom)
     rows = [("Artery radius, mean along the axis", float(found_mm.mean()), float(true_mm.mean()), "mm")]
@@ -43,7 +54,7 @@ def truth(case: CaseResult) -> list[Row]:
 
 
 def _radii_mm(case: CaseResult, phantom: Phantom) -> tuple[np.ndarray, np.ndarray]:
-    """Radius of the landing surface and of the phantom's artery at the same places, ends left out."""
+    """Return the radius of the landing surface and of the phantom at the same points, without the ends."""
     axis, parent = case.anatomy.axis, phantom.parent
     margin = 2 * END_DIAMETERS * float(axis.inscribed_radius_mm.mean())
     inner = (axis.abscissa_mm > margin) & (axis.abscissa_mm < axis.length_mm - margin)

@@ -45,8 +45,15 @@ def export_openfoam(
     path : a case folder of `run`, or a scan or surface.
     out : the folder to write.
     settings : settings of the study; the wires of its first device, if any, are meshed.
-    foam : fields of `FoamSetup`; by default the flavor of the installed OpenFOAM.
+    foam : fields of `FoamSetup` to set; the default flavor is that of the installed OpenFOAM.
     progress : called at every stage.
+
+    Returns
+    -------
+    case : FlowCase
+        The flow problem.
+    written : FoamCase
+        The files of the OpenFOAM case.
 
     Raises
     ------
@@ -103,6 +110,7 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: Progress
 
 
 def _middle(corners_mm: np.ndarray) -> dict[str, Any]:
+    """Return the area-weighted center and the mean unit normal of triangles (m, 3, 3)."""
     area_mm2 = 0.5 * np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     size_mm2 = np.linalg.norm(area_mm2, axis=1)
     total = area_mm2.sum(axis=0)
@@ -137,7 +145,7 @@ def _stent(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> 
 
 
 def _told(path: Path, settings: Settings) -> Settings:
-    """Return the settings of the run of a case folder; those given where there is none."""
+    """Return the settings of the run of a case folder; the given ones where there is no run."""
     run = path / RUN
     if not run.exists():
         return settings
@@ -150,6 +158,7 @@ def _told(path: Path, settings: Settings) -> Settings:
 
 
 def _flavour_here() -> Flavour:
+    """Return the flavor of the installed OpenFOAM; ``com`` where none is installed."""
     try:
         return program.find().flavour
     except FlowError:

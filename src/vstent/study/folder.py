@@ -1,4 +1,4 @@
-"""The case folder: one process at a time works in it, and it is never left half-made."""
+"""Reserve a case folder for one process, and leave no half-written files in it."""
 
 import os
 import platform
@@ -12,16 +12,22 @@ from vstent.errors import FolderError
 from vstent.io.files import sweep
 
 CACHE: Final = ".vstent"
-"""Folder inside the case folder that holds finished stages, and the lock."""
+"""Subfolder of the case folder with finished stages and the lock."""
 
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
 Study = Callable[Concatenate[Path, Path, Given], Found]
-"""Takes an input and a case folder, and more."""
+"""Function of an input, a case folder and further arguments."""
 
 
 def claiming(study: Study[Given, Found]) -> Study[Given, Found]:
-    """Let a study have its case folder (the second argument) for itself while it runs."""
+    """Decorate a study so that it reserves its case folder (the second argument) while it runs.
+
+    Raises
+    ------
+    FolderError
+        Another process uses the folder, or it cannot be written; see `claimed`.
+    """
 
     @wraps(study)
     def alone(path: Path, out: Path, /, *args: Given.args, **given: Given.kwargs) -> Found:
@@ -33,14 +39,19 @@ def claiming(study: Study[Given, Found]) -> Study[Given, Found]:
 
 @contextmanager
 def claimed(out: Path) -> Iterator[None]:
-    """Keep other processes out of a case folder; folders that were made for it go again if they stay empty.
+    """Reserve a case folder for this process.
 
-    What a process that was killed has left half-written there is taken away.
+    Files that a killed process left half-written there are removed. Folders created here are removed at the end if they
+    are empty.
+
+    Parameters
+    ----------
+    out : the case folder; it is created if it does not exist.
 
     Raises
     ------
     FolderError
-        Another process works there, or the folder cannot be written to.
+        Another process uses the folder, or it cannot be written.
     """
     cache = out / CACHE
     made = [folder for folder in (cache, out, *out.parents) if not folder.exists()]
@@ -60,14 +71,14 @@ def claimed(out: Path) -> Iterator[None]:
 
 
 def _drop(folders: list[Path]) -> None:
-    """Remove folders, innermost first, as far as they are empty."""
+    """Remove folders, the innermost first, until one is not empty."""
     with suppress(OSError):
         for folder in folders:
             folder.rmdir()
 
 
 def _locked(path: Path) -> IO[str]:
-    """Lock a file until it is closed or the process dies, however it dies."""
+    """Return a file that is locked until it is closed or the process ends for any reason."""
     while True:
         file = path.open("a+", encoding="utf-8")
         try:
@@ -76,7 +87,7 @@ def _locked(path: Path) -> IO[str]:
         except BaseException:
             file.close()
             raise
-        if is_there:  # and not taken away by a process that ended just now
+        if is_there:  # a process that ends removes the file, perhaps between opening and locking
             file.truncate(0)
             file.write(f"process {os.getpid()} on {platform.node()}")
             file.flush()
@@ -85,9 +96,10 @@ def _locked(path: Path) -> IO[str]:
 
 
 def _lock(file: IO[str], path: Path) -> None:
+    """Lock a file; raise FolderError where another process holds the lock."""
     try:
         import fcntl
-    except ImportError:  # Windows: two processes are not kept apart there
+    except ImportError:  # Windows has no such locks, so two processes may use the folder at once
         return
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

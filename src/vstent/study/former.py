@@ -1,6 +1,6 @@
-"""What a case folder holds from former runs: settings are merged where they agree, and refused where they do not.
+"""Compare a run with the earlier runs of its case folder: merge settings that agree, refuse those that do not.
 
-Results that were computed are kept: a run with another device adds it. A change of the input or of a setting that would
+Computed results are kept: a run with another device adds it. A change of the input or of a setting that would
 invalidate results is refused, unless the user asks to replace them.
 """
 
@@ -18,7 +18,7 @@ from vstent.study.repeat import UNTOLD, former_source, settings_of
 from vstent.study.types import Placing, Settings
 
 BEGUN: Final = "settings.json"
-"""File in the cache folder with the settings of the run begun last, finished or not."""
+"""File in the cache folder with the settings of the last run that was started, finished or not."""
 _OF_DEVICES: Final = (
     "devices",
     "diameter_mm",
@@ -29,11 +29,11 @@ _OF_DEVICES: Final = (
     "without_flow",
     "uncertainty",
 )
-"""Fields of the settings that do not change the anatomy."""
+"""Settings that do not change the anatomy."""
 
 
 def former_settings(out: Path) -> Settings | None:
-    """Return the settings of the former run of a case folder; None where there was none, or they cannot be read."""
+    """Return the settings of the last run of a case folder; None where there is none, or they cannot be read."""
     for path in (out / CACHE / BEGUN, out / RUN):
         with suppress(*UNTOLD):
             told = json.loads(path.read_text(encoding="utf-8"))
@@ -42,15 +42,21 @@ def former_settings(out: Path) -> Settings | None:
 
 
 def note_begun(out: Path, settings: Settings) -> None:
-    """Write the settings of a run that begins to write into a case folder."""
+    """Store the settings of a run that starts to write into a case folder."""
     write_json(out / CACHE / BEGUN, {"settings": asdict(settings)}, is_exact=True)
 
 
 def merged(out: Path, source: str, settings: Settings) -> Settings:
-    """Return the settings of a run together with what the case folder holds of former runs.
+    """Return the settings of a run merged with those of the earlier runs of the case folder.
 
-    Former devices stay, first, with their sizes, places and flows; new ones are added. Where a run asks for no flow,
-    new devices get none and former flows stay.
+    Earlier devices come first and keep their sizes, positions and flows; new ones are added. Where a run requests no
+    flow, new devices get none and existing flows are kept.
+
+    Parameters
+    ----------
+    out : the case folder.
+    source : SHA-256 of the input.
+    settings : settings of the new run.
 
     Raises
     ------
@@ -89,13 +95,20 @@ def merged(out: Path, source: str, settings: Settings) -> Settings:
 
 
 def refuse_other_input(out: Path, source: str) -> None:
-    """Raise InputError where a case folder holds results of another input than that of the hash `source`."""
+    """Raise InputError where a case folder holds results of an input with another SHA-256 than `source`."""
     if former_source(out) not in (source, None):
         raise InputError(f"{out} holds the results of another input. Give another --out, or --replace to replace them.")
 
 
 def refuse_other_anatomy(out: Path, settings: Settings, former: Settings | None = None) -> None:
-    """Raise InputError where a case folder holds results of an anatomy that was found with other settings."""
+    """Raise InputError where a case folder holds results of an anatomy found with other settings.
+
+    Parameters
+    ----------
+    out : the case folder.
+    settings : settings of the new run.
+    former : settings of the earlier run; None: they are read from the folder.
+    """
     former = former or former_settings(out)
     if former is None:
         return
@@ -111,12 +124,12 @@ def refuse_other_anatomy(out: Path, settings: Settings, former: Settings | None 
 
 
 def _named(key: str) -> str:
-    """Return what a setting is called: its field without the unit."""
+    """Return the name of a setting without its unit."""
     return key.removesuffix("_mm").replace("_", " ")
 
 
 def _same(out: Path, what: str, former: Any, given: Any) -> Any:
-    """Return a setting that either run states; raise InputError where both do and differ."""
+    """Return a setting that at least one of two runs states; raise InputError where both do and differ."""
     if former is not None and given is not None and former != given and asdict(former) != asdict(given):
         raise InputError(f"{out} holds results with other {what}. Give another --out, or --replace to replace them.")
     return given if former is None else former

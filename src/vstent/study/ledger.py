@@ -1,4 +1,4 @@
-"""The ledger of a study: finished stages, their times, and the keys under which their results are stored."""
+"""Record of a study: the run time of every stage, and the stored results under keys of everything they depend on."""
 
 import hashlib
 import json
@@ -25,7 +25,13 @@ ANATOMY: Final = "anatomy"
 
 
 class Ledger:
-    """Times the stages, reports them, and stores results under keys of everything that they depend on."""
+    """Measures the time of the stages, reports their progress, and stores and retrieves their results.
+
+    Parameters
+    ----------
+    folder : cache folder of the case.
+    progress : called at every stage.
+    """
 
     def __init__(self, folder: Path, progress: Progress) -> None:
         self.folder, self.progress = folder, progress
@@ -35,7 +41,10 @@ class Ledger:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Callable[[str], None]]:
-        """Announce a stage, time it, and report its result (the yielded function takes the sentence)."""
+        """Report the start of a stage, measure its time, and report its result.
+
+        The yielded function takes a sentence on the result.
+        """
         found: list[str] = []
         self.progress(name, 0.0, "")
         began = time.perf_counter()
@@ -44,7 +53,7 @@ class Ledger:
         self.progress(name, 1.0, " ".join(found))
 
     def teller(self, name: str) -> Callable[[FlowProgress], None]:
-        """Return a function that reports the progress of a flow."""
+        """Return a function that reports the progress of a flow under a stage name."""
 
         def tell(progress: FlowProgress) -> None:
             fraction = min(progress.fraction, 0.99)
@@ -54,7 +63,14 @@ class Ledger:
         return tell
 
     def recall(self, name: str, key: str, kind: type[Kept]) -> Kept | None:
-        """Return the result stored under a key, with the seconds it took; None where it is missing or damaged."""
+        """Return the result stored under a key, and add its run time; None where it is missing or damaged.
+
+        Parameters
+        ----------
+        name : name of the result.
+        key : key of everything that it depends on.
+        kind : data class of the result.
+        """
         path = self.folder / f"{name}-{key}.npz"
         self._before[name] = set(self.seconds)
         if not path.exists():
@@ -69,28 +85,43 @@ class Ledger:
         return result
 
     def hold(self, name: str, key: str, result: Any) -> None:
-        """Hold a result until `settle` is called, because a later input may still be unusable."""
+        """Keep a result in memory until `settle` is called, because a later input may still prove unusable.
+
+        Parameters
+        ----------
+        name : name of the result.
+        key : key of everything that it depends on.
+        result : a data class of vstent.
+        """
         self._held.append((name, key, result, self._seconds_since(name)))
 
     def is_held(self, name: str) -> bool:
-        """Return whether a result of this name is held and not stored yet."""
+        """Return whether a result of this name is in memory and not stored yet."""
         return any(held == name for held, *_ in self._held)
 
     def settle(self) -> None:
-        """Store all held results: from here on files are written."""
+        """Store all results kept in memory; from here on files are written."""
         for held in self._held:
             self._write(*held)
         self._held.clear()
 
     def keep(self, name: str, key: str, result: Any) -> None:
-        """Store a result under a key; an older one of the same name is dropped."""
+        """Store a result under a key; older results of the same name are deleted.
+
+        Parameters
+        ----------
+        name : name of the result.
+        key : key of everything that it depends on.
+        result : a data class of vstent.
+        """
         self._write(name, key, result, self._seconds_since(name))
 
     def _seconds_since(self, name: str) -> dict[str, float]:
-        """Return the seconds of every stage since a result was looked up."""
+        """Return the run time in s of every stage since a result was looked up."""
         return {stage: took for stage, took in self.seconds.items() if stage not in self._before.get(name, ())}
 
     def _write(self, name: str, key: str, result: Any, seconds: dict[str, float]) -> None:
+        """Store a result with the run times of its stages; older results of the same name are deleted."""
         path = self.folder / f"{name}-{key}.npz"
         self.folder.mkdir(parents=True, exist_ok=True)
         told = path.with_suffix(".json")
@@ -102,7 +133,7 @@ class Ledger:
 
 
 def _seconds_of(path: Path) -> dict[str, float]:
-    """Return the seconds of the stages of a stored result; none where they are not stated."""
+    """Return the run times in s of the stages of a stored result; empty where they are not stated."""
     with suppress(OSError, ValueError):
         return dict(json.loads(path.with_suffix(".json").read_text(encoding="utf-8")))
     return {}
@@ -115,9 +146,15 @@ def refuse_missing(path: Path) -> None:
 
 
 def hash_of(path: Path) -> str:
-    """Return the SHA-256 of a file, or of all files of a folder with their names, in the order of the names.
+    """Return the SHA-256 of an input.
 
-    For a scan of several files, one of which is given, it is that of all contents one after the other.
+    For a folder it covers the names and contents of all files, in the order of their paths. For one file of a scan that
+    has several, it covers the contents of all of them.
+
+    Raises
+    ------
+    ReadError
+        The input does not exist.
     """
     refuse_missing(path)
     digest = hashlib.sha256()
@@ -131,13 +168,25 @@ def hash_of(path: Path) -> str:
 
 
 def anatomy_key(source: str, settings: Settings) -> str:
-    """Return the key of the anatomy of an input, which devices and flow do not change."""
+    """Return the key of the anatomy of an input; it does not depend on devices and flow.
+
+    Parameters
+    ----------
+    source : SHA-256 of the input.
+    settings : settings of the study.
+    """
     geometry = replace(settings, devices=(), diameter_mm=None, length_mm=None, center_mm=None, flow=None, placings={})
     return key_of(source, replace(geometry, uncertainty=None, without_flow=()))
 
 
 def vessel_key(source: str, settings: Settings) -> str:
-    """Return the key of the vessel of an input, which trimming and restoring do not change."""
+    """Return the key of the vessel of an input; it does not depend on trimming and restoration.
+
+    Parameters
+    ----------
+    source : SHA-256 of the input.
+    settings : settings of the study.
+    """
     given = settings.units, settings.spacing_mm, settings.shape, settings.threshold, settings.at_mm, settings.inlet_mm
     later = [value for value in (settings.frame, settings.acquisition) if value is not None]
     return key_of(source, "vessel", given, *later)
@@ -150,7 +199,7 @@ def key_of(*parts: Any) -> str:
 
 
 _LATER: Final = {"without_flow": (), "acquisition": None, "frame": None}
-"""Settings added after version 0.1, with their defaults: with these, keys are those of 0.1."""
+"""Settings that version 0.1 does not have, with defaults for which the keys equal those of version 0.1."""
 
 
 def _plain(part: Any) -> dict[str, Any]:

@@ -24,21 +24,24 @@ from vstent.study.crate import NAME as CRATE
 from vstent.study.provenance import METRICS, RUN
 
 STENT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
+"""Files of one device."""
 FIELD: Final = ("field.vtu", "wall.vtp")
+"""Files of one flow."""
 SACS: Final = ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp")
+"""Files of sacs and necks, as patterns."""
 OF_STUDY: Final = (
     *(METRICS, RUN, "report.html", "report.pdf", CRATE),
     *(f"stents/*/{name}" for name in STENT),
     *(f"flow/*/{name}" for name in FIELD),
 )
-"""Files of devices, flows and reports."""
+"""Files of devices, flows and reports, as patterns."""
 OF_ANATOMY: Final = ("morphology.json", "convergence.json")
 """Files that describe an anatomy alone."""
 RESULTS: Final = (
     *("vessel.vtp", "centerlines.vtp", "openings.json", "landing_surface.vtp", *SACS),
     *("ranking.csv", "ranking.json", *OF_ANATOMY, *OF_STUDY),
 )
-"""All files of a case folder except the cache and OpenFOAM's folders."""
+"""All files of a case folder except the cache and OpenFOAM's folders, as patterns."""
 
 
 def take_away_results(out: Path) -> None:
@@ -47,17 +50,23 @@ def take_away_results(out: Path) -> None:
 
 
 def take_away_study(out: Path, kept: Collection[Path]) -> None:
-    """Remove the results of a study with other settings, except OpenFOAM's folders in `kept`, which are resumed."""
+    """Remove the results of a study with other settings.
+
+    Parameters
+    ----------
+    out : the case folder.
+    kept : OpenFOAM folders that stay, because their computation can be resumed.
+    """
     _take_away(out, OF_STUDY, [key for key in out.glob(f"flow/*/*/{KEY}") if key.parent not in kept])
 
 
 def take_away_measures(out: Path) -> None:
-    """Remove the results that describe another anatomy alone."""
+    """Remove the results that describe a replaced anatomy alone."""
     _take_away(out, OF_ANATOMY, list(out.glob(f"flow/convergence/**/{KEY}")))
 
 
 def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None:
-    """Remove files, OpenFOAM's folders by their `keys`, and folders that are then empty."""
+    """Remove files by pattern, OpenFOAM's folders by their key files, and folders that are then empty."""
     for file in [file for pattern in patterns for file in out.glob(pattern)]:
         file.unlink()
     for key in keys:
@@ -68,7 +77,14 @@ def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None
 
 
 def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
-    """Write the wall, the centerlines (and further axes) and the openings."""
+    """Write the wall, the centerlines (and further axes) and the openings.
+
+    Parameters
+    ----------
+    out : the case folder.
+    vessel : the vessel.
+    axes : further lines for ``centerlines.vtp``.
+    """
     out.mkdir(parents=True, exist_ok=True)
     writers.write_surface(out / "vessel.vtp", vessel.lumen)
     writers.write_centerlines(out / "centerlines.vtp", (*vessel.centerlines, *axes))
@@ -89,12 +105,23 @@ def write_anatomy(out: Path, anatomy: Anatomy) -> None:
         writers.write_lines(out / neck, closed, np.array([0, len(closed)], dtype=np.int32))
         written |= {sac, neck}
     for pattern in SACS:
-        for stale in {file.name for file in out.glob(pattern)} - written:  # of other settings
+        for stale in {file.name for file in out.glob(pattern)} - written:  # left by other settings
             (out / stale).unlink()
 
 
 def write_stent(folder: Path, deployment: Deployment) -> str:
-    """Write contour, wires and struts, and return a sentence with their numbers."""
+    """Write contour, wires and struts of a device.
+
+    Parameters
+    ----------
+    folder : the folder to write.
+    deployment : the deployment.
+
+    Returns
+    -------
+    str
+        A sentence with the numbers of wires and triangles.
+    """
     stent = deployment.stent
     folder.mkdir(parents=True, exist_ok=True)
     writers.write_surface(folder / "contour.vtp", stent.contour, {"wall_gap_mm": deployment.wall_gap_mm.ravel()})
@@ -108,7 +135,7 @@ def write_stent(folder: Path, deployment: Deployment) -> str:
 
 
 def write_field(folder: Path, field: FlowField) -> None:
-    """Write the flow on the grid and on the wall."""
+    """Write a flow: velocity and pressure on the grid, wall shear stress and pressure on the wall."""
     folder.mkdir(parents=True, exist_ok=True)
     of_cell = {"velocity_m_s": field.velocity_m_s, "pressure_Pa": field.pressure_Pa}
     if field.swing:
@@ -127,7 +154,12 @@ def write_field(folder: Path, field: FlowField) -> None:
 def write_ranking(out: Path, ranking: Ranking) -> None:
     """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``.
 
-    Rows of other devices that a former ranking by the same criteria has are kept.
+    Stored rows of other devices are kept if they have the same criteria.
+
+    Parameters
+    ----------
+    out : the case folder.
+    ranking : the ranking.
     """
     criteria = [item.model_dump(exclude_none=True) for item in ranking.criteria.items]
     new = ranking.rows()
@@ -140,7 +172,7 @@ def write_ranking(out: Path, ranking: Ranking) -> None:
 
 
 def _ranked(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows of a ranking in order: suitable ones by their score, then the rest, numbered anew."""
+    """Return the rows of a ranking in order: suitable ones by their score, then the rest, numbered anew."""
     size = ("device", "label_diameter_mm", "label_length_mm")
 
     def place(row: dict[str, Any]) -> tuple[Any, ...]:
@@ -150,7 +182,7 @@ def _ranked(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _former_rows(path: Path, ranking: Ranking, criteria: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of a former ranking by the same criteria whose devices the new one does not have."""
+    """Return the rows of an earlier ranking by the same criteria for devices that the new ranking does not include."""
     try:
         former = json.loads(path.read_text(encoding="utf-8"))
         if former["criteria"] != json.loads(json.dumps(criteria)):

@@ -1,8 +1,8 @@
-"""Study: one patient, from a file to the flow before and after, with its files, its provenance and its resume.
+"""Run a study of one patient: from a file to the flow before and after, with files, provenance and resumption.
 
-The stages follow each other as in design.md section 1. Geometry is computed first and nothing is written until every
-device is deployed, so that a wrong input leaves nothing behind. From then on each finished stage lies in the folder
-under a key that names everything it depends on; running the same study again reads it back instead of computing it.
+The geometry is computed first, and nothing is written until every device is deployed, so that an unusable input leaves
+no files. After that each finished stage is stored in the folder under a key of everything it depends on. A rerun of the
+same study reads it instead of computing it.
 """
 
 from dataclasses import asdict
@@ -46,16 +46,21 @@ from vstent.study.types import CaseResult, Progress, Settings
 def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False) -> CaseResult:
     """Run one study and write its folder; a study that was stopped there resumes.
 
-    Results that the folder holds of the same input and settings stay, and devices are added to those. A device that
-    does not fit, or whose flow cannot be computed, is reported in `CaseResult.failures`; the others are computed.
+    Results of the same input and settings in the folder are kept, and new devices are added to them. A device that does
+    not fit, or whose flow cannot be computed, is reported in `CaseResult.failures`; the others are computed.
 
     Parameters
     ----------
     path : a scan or a surface.
     out : the case folder.
-    settings : what is given; the rest is proposed.
+    settings : settings of the study; missing values are proposed.
     progress : called at every stage.
     replaces : whether results of another input or of other settings are replaced.
+
+    Returns
+    -------
+    CaseResult
+        Anatomy, deployments, flows, metrics and provenance.
 
     Raises
     ------
@@ -81,7 +86,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
     note_begun(out, settings)
     if has_former:
         take_away_study(out, engine_folders(out, settings).values())
-    (out / CRATE).unlink(missing_ok=True)  # it describes files that are written anew
+    (out / CRATE).unlink(missing_ok=True)  # it describes files that this run replaces
     write_anatomy(out, anatomy)
     for name, deployment in deployments.items():
         with ledger.stage(f"struts {name}") as tell:
@@ -106,19 +111,22 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
 
 @claiming
 def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False) -> Vessel:
-    """Find the vessel, its openings and its centerlines, untrimmed; write them into the folder `out`.
+    """Find the vessel, its openings and its centerlines, untrimmed, and write them.
 
     Parameters
     ----------
     path : a scan or a surface.
-    out : the folder.
-    settings : what is given; the rest is proposed.
-    progress : told of every stage.
+    out : the folder to write.
+    settings : settings of the study; missing values are proposed.
+    progress : called at every stage.
+    replaces : whether results of another input or of other settings are replaced.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        An input or option cannot be used; nothing has been written.
+    FolderError
+        Another process uses the folder, or it cannot be written.
     """
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
@@ -133,21 +141,31 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress, 
 def restore_vessel(
     path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False
 ) -> tuple[Anatomy, dict[str, Any]]:
-    """Shrink the sac: find the parent artery and measure it; write it into the folder `out`.
+    """Remove the sac, restore the parent artery, measure both, and write them.
 
-    A study begun in the same folder goes on from what is found here, and the other way round.
+    A study in the same folder reuses the result, and the other way round.
 
     Parameters
     ----------
     path : a scan or a surface.
     out : the case folder.
-    settings : what is given; the rest is proposed.
-    progress : told of every stage.
+    settings : settings of the study; missing values are proposed.
+    progress : called at every stage.
+    replaces : whether results of another input or of other settings are replaced.
+
+    Returns
+    -------
+    anatomy : Anatomy
+        Vessel, parent artery and sacs.
+    measures : dict
+        Morphology; the end of each key is its unit.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        An input or option cannot be used; nothing has been written.
+    FolderError
+        Another process uses the folder, or it cannot be written.
     """
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
@@ -164,21 +182,24 @@ def restore_vessel(
 def refine_flow(
     path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False
 ) -> Sensitivity:
-    """Compute the flow without a device on three grids, time steps and positions; write ``convergence.json``.
+    """Compute the flow without a device on three grids, time steps and grid positions; write ``convergence.json``.
 
     Parameters
     ----------
     path : a scan or a surface.
     out : the case folder.
-    settings : what is given; the cell size, given or proposed, is the finest.
-    progress : told of every stage.
+    settings : settings of the study; its grid spacing, given or proposed, is the finest.
+    progress : called at every stage.
+    replaces : whether results of another input or of other settings are replaced.
 
     Raises
     ------
     InputError
-        Something given cannot be used; nothing has been written.
+        An input or option cannot be used; nothing has been written.
     FlowError
         A flow could not be computed.
+    FolderError
+        Another process uses the folder, or it cannot be written.
     """
     ledger = Ledger(out / CACHE, progress)
     source = hash_of(path)
@@ -194,14 +215,14 @@ def refine_flow(
 
 
 def _refuse_loss(out: Path, source: str, settings: Settings, replaces: bool) -> None:
-    """Raise FolderError where a folder holds results of another input or anatomy, unless they are to be replaced."""
+    """Raise InputError where a folder holds results of another input or anatomy, unless they are to be replaced."""
     if not replaces:
         refuse_other_input(out, source)
         refuse_other_anatomy(out, settings)
 
 
 def _settle(path: Path, out: Path, source: str, ledger: Ledger) -> None:
-    """Keep what is held: the folder is this input's from here on; results of another one, or its anatomy, go."""
+    """Store the results held in memory, and remove results of another input or of a replaced anatomy."""
     former = former_source(out)
     if former not in (source, None):
         take_away_results(out)

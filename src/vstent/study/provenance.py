@@ -1,4 +1,4 @@
-"""Provenance: everything that it takes to repeat a run."""
+"""Provenance: everything needed to repeat a run."""
 
 import platform
 from collections.abc import Iterable
@@ -13,14 +13,29 @@ from vstent.study.ledger import key_of
 from vstent.study.types import Settings
 
 PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
+"""Packages whose versions are recorded."""
 INPUT: Final = "input.json"
-"""File in the case folder that says where the input lies: not for handing on, for its path may name the patient."""
+"""File in the cache folder with the path of the input; not for sharing, because the path may name the patient."""
 METRICS: Final = "metrics.json"
+"""File of the case folder with all metrics."""
 RUN: Final = "run.json"
+"""File of the case folder with the provenance of the run."""
 
 
 def provenance(path: Path, source: str, settings: Settings) -> dict[str, Any]:
-    """Return versions, machine, devices, input with its hash `source`, and settings: all that a result depends on."""
+    """Return everything that a result depends on.
+
+    Parameters
+    ----------
+    path : the input.
+    source : its SHA-256.
+    settings : settings of the study.
+
+    Returns
+    -------
+    dict
+        Versions, machine, devices, input with its hash, and settings.
+    """
     return {
         "versions": versions(),
         "machine": machine(settings),
@@ -32,16 +47,16 @@ def provenance(path: Path, source: str, settings: Settings) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of everything that computes."""
+    """Return the versions of Python and of the packages that compute."""
     return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
 
 
 def machine(settings: Settings) -> dict[str, str]:
-    """Return what of the machine can change the last bits of a number."""
+    """Return the properties of the machine that can change the last digits of a result."""
     uses_gpu = settings.flow is not None and settings.flow.device_gpu
     return {"system": platform.system(), "processor": platform.machine()} | ({"gpu": gpu_name()} if uses_gpu else {})
 
 
 def devices_of(names: Iterable[str]) -> dict[str, str]:
-    """Return a fingerprint of every device's numbers: a catalogue can change."""
+    """Return a digest of the catalogue data of every device, because a catalogue can change."""
     return {name: key_of(find_design(name)) for name in names}

@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
 MISSING: Final = "absent"
+"""Text for a value that a record does not state."""
 SECONDS: Final = "seconds"
-"""Key of the seconds of every stage."""
+"""Key of the run times of the stages, in s."""
 UNTOLD: Final = (OSError, ValueError, KeyError, TypeError)
 """Exceptions that reading a missing, damaged or foreign file raises."""
 TOLERANCE: Final = 1e-3
@@ -32,32 +33,32 @@ ROUNDING: Final = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A run as stated by its `run.json`."""
+    """A run as stated by its ``run.json``."""
 
     folder: Path
-    """The case folder."""
+    """Its case folder."""
     input: Path
-    """Scan or surface, checked to be the same file."""
+    """Scan or surface; its hash equals the recorded one."""
     settings: Settings
-    """All settings, exactly."""
+    """All settings, without rounding."""
     differences: tuple[str, ...]
-    """What has changed since (versions, machine, devices), one sentence each."""
+    """Differences from the present versions, machine and devices, one sentence each."""
 
 
 def read_record(path: Path, moved_to: Path | None = None) -> Record:
-    """Read a `run.json` and find its input.
+    """Read a ``run.json`` and find its input.
 
     Parameters
     ----------
     path : the file, in its case folder.
-    moved_to : present path of the input; None: its former path.
+    moved_to : present path of the input; None: the recorded path.
 
     Raises
     ------
     ReadError
         The file does not exist or is from another version, or the input is missing.
     InputError
-        The input is another one.
+        The input is not the recorded one.
     """
     try:
         told, settings = told_in(existing(path))
@@ -74,6 +75,7 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
 
 
 def _input(folder: Path) -> Path:
+    """Return the recorded path of the input of a case folder."""
     try:
         return Path(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"])
     except UNTOLD:
@@ -92,7 +94,7 @@ def former_source(folder: Path) -> str | None:
 
 
 def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
-    """Return whether a case folder was begun by a run with another provenance than `told`, or by an unfinished one."""
+    """Return whether a folder holds results of an unfinished run, or of one with another provenance than `told`."""
     with suppress(*UNTOLD):
         former = json.loads((folder / RUN).read_text(encoding="utf-8"))
         return {key: former[key] for key in former if key != SECONDS} != json.loads(json.dumps(told))
@@ -100,13 +102,19 @@ def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
 
 
 def told_in(run: Path) -> tuple[dict[str, Any], Settings]:
-    """Return the content of a `run.json` and its settings; one of `UNTOLD` is raised where it cannot be read."""
+    """Return the content of a ``run.json`` and its settings; one of `UNTOLD` is raised where it cannot be read."""
     told = json.loads(run.read_text(encoding="utf-8"))
     return told, settings_of(told["settings"])
 
 
 def settings_of(told: Mapping[str, Any]) -> Settings:
-    """Return the settings stated by a `run.json`; ValueError is raised where this version does not know one."""
+    """Return the settings stated by a ``run.json``.
+
+    Raises
+    ------
+    ValueError
+        This version does not know a setting or its value.
+    """
     unknown = sorted(set(told) - {field.name for field in fields(Settings)})
     if unknown:
         raise ValueError(f"unknown settings: {unknown}")
@@ -115,12 +123,14 @@ def settings_of(told: Mapping[str, Any]) -> Settings:
 
 @cache
 def _adapter() -> "TypeAdapter[Settings]":
+    """Return pydantic's reader of settings."""
     from pydantic import TypeAdapter  # its ValidationError is a ValueError
 
     return TypeAdapter(Settings)
 
 
 def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]:
+    """Return the differences between a recorded run and the present versions, machine and devices."""
     now = {"versions": versions(), "machine": machine(settings), "devices": devices_of(settings.devices)}
     return tuple(
         f"{name.replace('_', ' ')} ({part}): {told.get(part, {}).get(name, MISSING)} before, {value} now"
@@ -132,6 +142,10 @@ def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]
 
 def agreement(first: Path, second: Path) -> str:
     """Return a sentence on how well the metrics of two case folders agree.
+
+    Parameters
+    ----------
+    first, second : case folders.
 
     Raises
     ------
@@ -160,6 +174,7 @@ def agreement(first: Path, second: Path) -> str:
 
 
 def _relative(one: Any, other: Any) -> float:
+    """Return the relative difference of two values; 1 for different texts, 0 where only rounding differs."""
     if one == other:
         return 0.0
     if isinstance(one, str) or isinstance(other, str):
@@ -169,6 +184,7 @@ def _relative(one: Any, other: Any) -> float:
 
 
 def _numbers(values: Mapping[str, Any], before: str = "") -> list[tuple[str, Any]]:
+    """Return all values of nested metrics with dotted names."""
     found = []
     for name, value in values.items():
         found += _numbers(value, f"{before}{name}.") if isinstance(value, Mapping) else [(f"{before}{name}", value)]

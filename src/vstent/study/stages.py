@@ -1,4 +1,4 @@
-"""Stages of a study: each timed and told of by the ledger."""
+"""Stages of a study; the ledger measures and reports each of them."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -42,23 +42,31 @@ from vstent.study.types import Placing, Point, Settings
 from vstent.units import counted
 
 SLOWEST_M_S: Final = 0.01
+"""Smallest plausible mean speed at an inlet, in m/s; below it the inflow is taken to be in another unit."""
 FASTEST_M_S: Final = 2.0
-"""Mean speeds at the inlet beyond which no artery of the brain's blood flows."""
+"""Largest plausible mean speed at an inlet, in m/s; above it the inflow is taken to be in another unit."""
 
 NEAR_MM: Final = 3.0
-"""Largest distance from the wall of a vessel at which another reading of a point is proposed."""
+"""Largest distance from the vessel wall, in mm, at which another interpretation of a point is proposed."""
 
 
 def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) -> Anatomy:
-    """Read, segment, repair, trace, trim and restore; a result kept for this `source` (hash) is returned as it is.
+    """Read, segment, repair, trace, trim and restore; a result stored for this input is returned without computation.
 
-    The ledger holds the result until its `settle` keeps it.
+    The ledger keeps the result in memory until its `settle` stores it.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    source : SHA-256 of the input.
+    settings : settings of the study.
+    ledger : record of the study.
 
     Raises
     ------
     InputError
-        An input or option cannot be used. Where the point `at_mm` finds nothing, the message proposes the same point
-        in another frame or as a voxel index, if that finds a vessel.
+        An input or option cannot be used. Where no vessel is found at the point `at_mm`, the message proposes the same
+        point in another frame or as a voxel index, if there is a vessel.
     """
     key = anatomy_key(source, settings)
     kept = ledger.recall(ANATOMY, key, Anatomy)
@@ -76,7 +84,7 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
 
 
 def other_reading(path: Path, settings: Settings) -> str:
-    """Return a question that proposes another reading of the point `at_mm`, which finds a vessel; else nothing."""
+    """Return a question that proposes another interpretation of the point `at_mm`; empty where none finds a vessel."""
     for words, point_mm in _readings(path, settings):
         with suppress(VstentError):
             vessel = trace(_vessel(path, replace(settings, at_mm=point_mm)))
@@ -87,7 +95,7 @@ def other_reading(path: Path, settings: Settings) -> str:
 
 
 def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
-    """Yield other readings of the point `at_mm`, in LPS mm, with their names."""
+    """Yield other interpretations of the point `at_mm`, as a description and a point in LPS mm."""
     x, y, z = settings.at_mm or (0.0, 0.0, 0.0)
     yield "the point given is RAS", (-x, -y, z)
     if not (path.is_file() and is_surface_file(path)):
@@ -100,12 +108,13 @@ def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
 
 
 def _find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger, key: str) -> Anatomy:
+    """Return the anatomy of an input, computed."""
     whole = find_vessel(path, source, settings, ledger)
     neck_mm = None if settings.neck_mm is None else np.array(settings.neck_mm, dtype=np.float64)
     at_mm = _array(settings.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
     outlet_mm = _array(settings.outlet_mm)
     if outlet_mm is not None:
-        opening_at(whole, outlet_mm)  # before ends are cut off: the outlet meant may be one of them
+        opening_at(whole, outlet_mm)  # checked before trimming, which may cut this outlet off
     with ledger.stage("trim") as tell:
         traced = trim(whole, at_mm=at_mm, upstream_mm=settings.upstream_mm, downstream_mm=settings.downstream_mm)
         tell(" ".join(traced.notes[len(whole.notes) :]))
@@ -117,7 +126,17 @@ def _find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger, k
 
 
 def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> Vessel:
-    """Read, segment, repair and trace; what was kept of this `source` (hash) is taken, what is found is held."""
+    """Read, segment, repair and trace; a result stored for this input is returned without computation.
+
+    The ledger keeps the result in memory until its `settle` stores it.
+
+    Parameters
+    ----------
+    path : a scan or a surface.
+    source : SHA-256 of the input.
+    settings : settings of the study.
+    ledger : record of the study.
+    """
     key = vessel_key(source, settings)
     kept = ledger.recall("vessel", key, Vessel)
     if kept is not None:
@@ -135,6 +154,7 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
 
 
 def _vessel(path: Path, settings: Settings) -> Vessel:
+    """Return the repaired vessel of an input, without openings and centerlines."""
     if path.is_file() and is_surface_file(path):
         surface, notes = read_surface(path, units=settings.units, frame=settings.frame)
         vessel = Vessel(surface, notes=notes)
@@ -149,12 +169,26 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
 def deploy_all(
     designs: Mapping[str, Design], anatomy: Anatomy, settings: Settings, ledger: Ledger
 ) -> tuple[dict[str, Deployment], dict[str, str]]:
-    """Deploy every device, each in the given or the proposed size; return the deployments and the failures by name.
+    """Deploy every device in the given or the proposed size.
+
+    Parameters
+    ----------
+    designs : designs by device name.
+    anatomy : vessel, parent artery and sacs.
+    settings : settings of the study.
+    ledger : record of the study.
+
+    Returns
+    -------
+    deployments : dict
+        Deployments by device name.
+    failures : dict
+        Reasons by the name of each device that was not deployed.
 
     Raises
     ------
-    InputError
-        No device can be deployed: the reason of the first.
+    DeviceError, LandingError
+        No device can be deployed; the reason is that of the last one.
     """
     deployments: dict[str, Deployment] = {}
     failures: dict[str, str] = {}
@@ -172,20 +206,33 @@ def deploy_all(
 
 
 def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
-    """Deploy a device in the size and at the place that are given, or proposed where they are not."""
+    """Deploy a device in the given size and position; missing values are proposed.
+
+    Parameters
+    ----------
+    design : the device.
+    anatomy : vessel, parent artery and sacs.
+    placing : given size and position.
+    """
     landing = None if placing.center_mm is None else Landing(placing.center_mm)
     return deploy(design, anatomy, size=size_of(design, anatomy, placing), landing=landing)
 
 
 def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
-    """Return the size given; where of it a diameter or a length is not given, what is proposed of those that match.
+    """Return the given size of a device; where diameter or length is missing, the best of the matching sizes.
+
+    Parameters
+    ----------
+    design : the device.
+    anatomy : vessel, parent artery and sacs.
+    placing : given size and position.
 
     Raises
     ------
     DeviceError
-        When the device is not made in that size.
+        The device is not made in that size.
     LandingError
-        When none of those that match fits the artery.
+        No matching size fits the artery.
     """
     sizes = find_sizes(design, diameter_mm=placing.diameter_mm, length_mm=placing.length_mm)
     if placing.diameter_mm is not None and placing.length_mm is not None:
@@ -194,7 +241,18 @@ def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
 
 
 def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
-    """Refuse a mean inflow with which no blood flows: another unit was meant."""
+    """Refuse a mean inflow that no artery has, because it is probably in another unit.
+
+    Parameters
+    ----------
+    anatomy : vessel with its inlets.
+    flow : settings of the flow; None: no flow is computed.
+
+    Raises
+    ------
+    InputError
+        The mean speed at an inlet is implausible.
+    """
     if flow is None or flow.inflow_mL_s is None:
         return
     case = FlowCase(anatomy.vessel, settings=flow)
@@ -208,7 +266,7 @@ def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
 
 
 def engine_folders(out: Path, settings: Settings) -> dict[str, Path]:
-    """Return where an engine keeps files of its own of every flow, by name; none where no flow is computed."""
+    """Return the folder of the engine's own files for every flow, by name; empty where no flow is computed."""
     if settings.flow is None:
         return {}
     return {name: out / "flow" / name / settings.flow.engine for name in (BARE, *settings.devices)}
@@ -222,9 +280,28 @@ def compute_flows(
     ledger: Ledger,
     source: str,
 ) -> tuple[dict[str, FlowField], dict[str, str]]:
-    """Compute the flow without and with each device; each is kept as soon as it is done.
+    """Compute the flow without and with each device; each is stored as soon as it is finished.
 
-    Returns the flows by name, and a sentence on every device whose flow could not be computed.
+    Parameters
+    ----------
+    out : the case folder.
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployments by device name.
+    settings : settings of the study.
+    ledger : record of the study.
+    source : SHA-256 of the input.
+
+    Returns
+    -------
+    fields : dict
+        Flows by name, ``bare`` first.
+    failures : dict
+        Reasons by the name of each device whose flow could not be computed.
+
+    Raises
+    ------
+    FlowError
+        The flow without a device could not be computed.
     """
     if settings.flow is None:
         return {}, {}
@@ -261,13 +338,29 @@ def compute_flows(
 
 
 def flow_key(source: str, settings: Settings, name: str, design: Design | None) -> str:
-    """Return the key of one flow of an input: ``bare``, or with a device of this design."""
+    """Return the key of one flow.
+
+    Parameters
+    ----------
+    source : SHA-256 of the input.
+    settings : settings of the study.
+    name : ``bare``, or the name of the device.
+    design : the device; None: no device.
+    """
     placed = (design, settings.placing(name)) if design else ()
     return key_of(anatomy_key(source, settings), settings.flow, name, *placed)
 
 
 def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Sensitivity:
-    """Compute the flow without a device on three grids, with three time steps and in three positions on the grid."""
+    """Compute the flow without a device on three grids, with three time steps and in three positions on the grid.
+
+    Parameters
+    ----------
+    out : the case folder.
+    anatomy : vessel, parent artery and sacs.
+    settings : settings of the study; the grid spacing is that of the finest grid.
+    ledger : record of the study.
+    """
     flow = settings.flow or FlowSettings()
     _plan(anatomy, {}, flow, ledger)
     with ledger.stage("convergence") as tell:
@@ -284,7 +377,7 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
 
 
 def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings, ledger: Ledger) -> None:
-    """Say what the flow will cost, and where a device's costs more; refuse one that does not fit in the memory."""
+    """Report run time and memory of the flows; an error is raised where one does not fit in the memory."""
     with ledger.stage("plan flow") as tell:
         bare = flow_case(anatomy, None, settings)
         said = foretell_cost(bare)
@@ -295,7 +388,21 @@ def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings,
 def vary_all(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
 ) -> dict[str, dict[str, Any]]:
-    """Vary the uncertain inputs of every deployment; return the metrics of each, none where this is off."""
+    """Vary the uncertain inputs of every deployment.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployments by device name.
+    settings : settings of the study.
+    ledger : record of the study.
+    source : SHA-256 of the input.
+
+    Returns
+    -------
+    dict
+        Uncertainty metrics by device name; empty without an uncertainty study.
+    """
     if settings.uncertainty is None:
         return {}
     flow = settings.flow if settings.uncertainty.flow_samples else None
@@ -317,13 +424,26 @@ def vary_all(
 
 
 def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
+    """Report that `done` of `total` deployments of a stage are finished."""
     ledger.progress(stage, 0.99 * done / total, f"{done} of {total}")
 
 
 def measure_all(
     anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]
 ) -> dict[str, Any]:
-    """Measure the vessel, every deployment and every flow, and compare the latter with the bare one."""
+    """Return the metrics of the vessel, every deployment and every flow, with ratios to the flow without a device.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployments by device name.
+    fields : flows by name, ``bare`` first.
+
+    Returns
+    -------
+    dict
+        Nested metrics; the end of each key is its unit.
+    """
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
     shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
     flow = {name: indices(field, *shapes) for name, field in fields.items()}
@@ -340,4 +460,5 @@ def measure_all(
 
 
 def _array(points_mm: Point | tuple[Point, ...] | None) -> Floats | None:
+    """Return points as an array (3,) or (n, 3); None where none is given."""
     return None if points_mm is None else np.array(points_mm, dtype=np.float64)

@@ -9,6 +9,7 @@ from vstent.geometry.vessel import Anatomy
 from vstent.plan.uncertainty import Ranges
 
 Point = tuple[float, float, float]
+"""Three lengths in mm: a point or voxel edges."""
 
 
 @dataclass(frozen=True)
