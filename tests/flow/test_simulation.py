@@ -104,7 +104,7 @@ def test_a_flow_that_does_not_settle_is_the_mean_of_its_last_checks() -> None:
     field = engine.result(state, Outcome(False, (0.5,), 1.0, 1.0))
     np.testing.assert_allclose(field.velocity_m_s, np.mean(seen[-9:], axis=0), atol=1e-6)
     assert np.abs(seen[-1] - field.velocity_m_s).max() > 0.001
-    assert "has not settled in" in field.advice
+    assert "has not converged in" in field.advice
     assert field.unsettled_fraction == pytest.approx(np.nanmax(swings(np.array(state.history), 9)))
 
 
@@ -119,7 +119,7 @@ def test_a_flow_that_has_settled_is_its_last_check() -> None:
         assert engine.terminate(state) == pytest.approx(3 * excess)
     field = engine.result(state, Outcome(True, (1e-3,), 1.0, 1.0))
     np.testing.assert_allclose(field.velocity_m_s, seen[-1], atol=1e-6)
-    assert "has settled" in field.advice
+    assert "has converged" in field.advice
     assert field.unsettled_fraction == 0.0
 
 
@@ -144,7 +144,7 @@ def test_a_flow_that_swings_is_its_mean_once_that_is_known() -> None:
     np.testing.assert_allclose(field.velocity_m_s, factor * still.velocity_m_s, atol=1e-6)
     assert factor == pytest.approx(1.0, abs=SURE * mean.standard_error)
     assert field.unsettled_fraction == pytest.approx(SURE * mean.standard_error)
-    assert "The flow goes on moving about its mean: these are means over its last" in field.advice
+    assert "The flow is unsteady. The results are averages over the last" in field.advice
 
 
 def test_what_goes_to_and_fro_is_told_by_its_size_and_not_by_its_mean() -> None:

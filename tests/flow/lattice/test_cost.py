@@ -55,9 +55,9 @@ def test_the_time_foretold_is_of_a_measured_rate():
 
 def test_what_does_not_fit_is_refused_with_the_cell_size_that_does():
     case, free_bytes = case_of(cell_size_mm=0.02), 1e9
-    with pytest.raises(FlowError, match="set a cell size of") as refusal:
+    with pytest.raises(FlowError, match="use a grid spacing of") as refusal:
         refuse_too_large(case, free_bytes)
-    fitting_mm = float(str(refusal.value).split("cell size of ")[1].split(" mm")[0])
+    fitting_mm = float(str(refusal.value).split("use a grid spacing of ")[1].split(" mm")[0])
     assert 0.02 < fitting_mm < 0.1
     refuse_too_large(case_of(cell_size_mm=1.05 * fitting_mm), free_bytes)
     with pytest.raises(FlowError):
@@ -69,14 +69,14 @@ def test_more_cells_than_can_be_numbered_are_refused_whatever_the_memory():
     assert 19 * 1.05 * MOST_CELLS < 2**31
     case = case_of(cell_size_mm=0.007)
     assert estimate(case).cells > MOST_CELLS
-    with pytest.raises(FlowError, match=r"more than the 100 million .* set a cell size of 0\.01\d? mm"):
+    with pytest.raises(FlowError, match=r"more than the 100 million .* use a grid spacing of 0\.01\d? mm"):
         refuse_too_large(case, free_bytes=1e15)
 
 
 def test_too_long_a_time_step_is_named_with_the_last_good_state():
     with pytest.raises(FlowError, match="diverged") as error:
         simulate_case(case_of(cell_size_mm=0.4, lattice_speed=25.0, max_steps=4000))
-    assert "halve the lattice speed" in str(error.value)
+    assert "use half the lattice speed" in str(error.value)
 
 
 def test_a_narrow_place_inside_is_computed_with_a_shorter_time_step(monkeypatch):

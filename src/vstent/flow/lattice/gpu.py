@@ -11,6 +11,8 @@ PACKAGE: Final = "numba_cuda"
 """Compiles kernels for a GPU; an extra."""
 ELSE: Final = "or compute on the processor (without --gpu)"
 """What can be done in any case."""
+DRIVER: Final = "CUDA"
+"""Word in the errors of CUDA's driver, which errors of the compiler lack."""
 
 
 def require_gpu() -> None:
@@ -60,6 +62,11 @@ def told() -> Iterator[None]:
         yield
     except Exception as error:  # each of them raises its own
         words = next(iter(str(error).splitlines()), type(error).__name__)
+        if DRIVER not in f"{type(error).__name__} {error}".upper():
+            raise FlowError(
+                f"numba-cuda failed to compile the flow for the GPU ({words}): its version does not match numpy's or "
+                f"numba's, so run pip install 'vstent[gpu]' again, {ELSE}"
+            ) from error
         raise FlowError(f"the GPU failed to compute the flow ({words}): check nvidia-smi, {ELSE}") from error
 
 
