@@ -206,7 +206,7 @@ class _Grid:
         return ((i * self._shape[1] + j) * self._shape[2] + k).astype(np.int32)
 
     def _address(self, cells: Ints) -> None:
-        """Cut the rows where they come back in, so that every row's neighbours are contiguous."""
+        """Set the addresses of segments; rows end at the periodic border, so that their neighbours are contiguous."""
         last = self._shape[2] - 1
         follows = (np.diff(cells, axis=0) == (0, 0, 1)).all(axis=1)
         follows &= (cells[1:, 2] != 1) & (cells[1:, 2] != last)
