@@ -72,7 +72,7 @@ def region(vertices: Floats, faces: Ints, gain: Floats, is_fixed: Bools, reach: 
     start = gain > 0
     inside = start
     for _ in range(N_STEPS):
-        # An implicit step leaves a slope of 1 / (2 reach) across the border: this much moves it by reach^2 gain.
+        # After an implicit step the slope across the border is 1 / (2 reach); this term moves it by reach^2 gain.
         smooth = solver.solve(area * inside) + 0.5 * reach * gain
         now = np.where(is_fixed, start, smooth > 0.5)
         if (now == inside).all():

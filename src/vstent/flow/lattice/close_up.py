@@ -35,13 +35,14 @@ UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 3.0, 1.0
 """Extent of the refined region from the sac towards the inlet and the outlets, in mean diameters 4 V / A of the vessel.
 The flow into the sac forms upstream: with one diameter the demo's neck inflow is 9 % too low, with two 2.4 %."""
 STRETCH = 4 / 3
-"""Ratio of the time step of a steady flow in the refined region to that in a whole vessel, where it would be too long
-(a fork lost 0.3 % of its blood). The flow through the ends of the region is imposed. The means of C0038's sac and neck,
-bare and with Silk and Enterprise, change by at most 0.4 % with shorter steps, the demo's by 0.5 %. In a pulse the ratio
-is 1: with longer steps C0038 diverged at 0.2 mm."""
+"""Ratio of the time step of a steady flow in the refined region to that in a whole vessel. Longer steps are possible
+because the flow rates at the ends of the region are imposed; in a whole vessel they would lose flow (0.3 % in a
+bifurcation). With shorter steps the means of C0038's sac and neck, bare and with Silk and Enterprise, change by at most
+0.4 %, the demo's by 0.5 %. In a pulse the ratio is 1: with longer steps C0038 diverged at 0.2 mm."""
 SHARE_WITHIN = 1 / 6
-"""Largest fraction of a steady flow's time steps that the refined region may take: it starts from the coarser flow, and
-of an unsteady flow, which needs the most steps, only the last checks are averaged (`settling.LATEST`)."""
+"""Maximum fraction of a steady flow's time steps that the refined region may take. It is small because the region
+starts from the coarser flow. An unsteady flow needs the most steps, but only its last checks are averaged
+(`settling.LATEST`)."""
 SHARE_AROUND = 1 / 2
 """Maximum fraction of a steady flow's time steps that the coarser flow may take; the sac is computed again
 afterwards."""

@@ -143,7 +143,7 @@ def sheet_speed(flow: CellFlow, force: Floats) -> float:
 
 
 def _blood(wires: Wires) -> Bools:
-    """Return the cells (i, j, k) outside the wires, without gaps that are one cell wide.
+    """Return the cells (i, j, k) outside the wires, without gaps of a single cell between wires.
 
     Populations in such a gap bounce between its walls and accumulate the momentum of the body force.
     """

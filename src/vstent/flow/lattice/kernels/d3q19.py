@@ -61,8 +61,10 @@ ENTRY: Final = 7
 """Number of values per screen cell (see `resist`): unit normal (3) and resistance (4)."""
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _ROOT_THREE: Final = float(np.sqrt(3.0))
+"""Inverse speed of sound of the lattice."""
 _U = np.uint64
 _WIDE = SEGMENT + COUNT
+"""Length of a work array for one segment and a vector beyond it."""
 _KINDS: Final = 3
 """Number of stages of a step. Stage 0: cells collide. Stage 1: links return what the cells of their band and of the
 adjacent bands have sent. Stage 2: septa exchange populations that the links of their band and the next have read."""

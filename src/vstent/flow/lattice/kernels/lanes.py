@@ -32,10 +32,13 @@ class Lanes(types.Type):
 
 
 LANES: Final = Lanes()
+"""The type's only instance."""
 
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):
+    """Memory layout of Lanes: an LLVM vector."""
+
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _VECTOR)
 
@@ -87,6 +90,8 @@ for _operation, _instruction in (
 
 @intrinsic
 def _larger(_: Any, a: Any, b: Any) -> Any:
+    """Return the larger of two Lanes, element by element."""
+
     def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         x, y = (_widened(builder, *one) for one in zip(signature.args, arguments, strict=True))
         return builder.select(builder.fcmp_ordered(">", x, y), x, y)
@@ -96,6 +101,8 @@ def _larger(_: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def _root(_: Any, a: Any) -> Any:
+    """Return the square root of Lanes, element by element."""
+
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
         return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{COUNT}f32"), arguments)
@@ -110,6 +117,8 @@ def larger(a: Any, b: Any) -> Any:
 
 @overload(larger)
 def _larger_chosen(a: Any, b: Any) -> Any:
+    """Return the implementation of `larger` for Lanes or for numbers."""
+
     def of_lanes(a: Any, b: Any) -> Any:
         return _larger(a, b)
 
@@ -126,6 +135,8 @@ def root(a: Any) -> Any:
 
 @overload(root)
 def _root_chosen(a: Any) -> Any:
+    """Return the implementation of `root` for Lanes or for a number."""
+
     def of_lanes(a: Any) -> Any:
         return _root(a)
 
