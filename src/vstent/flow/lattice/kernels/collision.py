@@ -214,7 +214,7 @@ def stress_size(f: Any) -> Any:
 def thinned(size: Any, time: Any, law: Any) -> Any:
     """Return the relaxation time of shear-thinning blood from its `stress_size`.
 
-    The shear rate is 1.5 / time times the departure of the second moments from equilibrium. It depends on the
+    The strain rate is 1.5 / time times the departure of the second moments from equilibrium. It depends on the
     relaxation time itself, which is found by three fixed-point iterations from the viscosity at rest. Numbers must be
     scalars, not Lanes.
 
@@ -272,7 +272,7 @@ def of_thin_sheet(across: Any, spread: Any, through: Any, blood: Any) -> tuple[A
     - A force F on a cell changes its velocity by an additional (1/4 - L) F / stir along a grid axis, and by
       `squared_reach` times that in other directions. L is the product of (relaxation time - 1/2) of the stress and of
       the odd part. The term stems from the second difference of the force. With L far below 1/4 the drag of a dense
-      braid would be twice too high.
+      braid would be twice its true value.
 
     Parameters
     ----------
