@@ -131,7 +131,7 @@ export class SectionChart {
   }
 }
 
-/** How much a flow has left to settle, check by check, on a logarithmic scale. */
+/** Convergence error of a flow at every check, on a logarithmic scale. */
 export function residualChart(points, tolerance = 0.01) {
   const [width, height, left, bottom, top] = [360, 150, 44, 22, 22];
   const x = (f) => left + (width - left - 8) * f;
@@ -141,7 +141,7 @@ export function residualChart(points, tolerance = 0.01) {
     svg("line", { x1: left, x2: width - 8, y1: y(v), y2: y(v), class: v === tolerance ? "goal" : "grid" }),
     text(left - 6, y(v) + 4, `${100 * v} %`, { class: "tick end" }),
   ]);
-  parts.push(text(4, 13, "Left to settle", { class: "axis-title" }), text(width - 8, 13, "goal 1 %", { class: "axis-title end" }));
+  parts.push(text(4, 13, "Convergence error", { class: "axis-title" }), text(width - 8, 13, "goal 1 %", { class: "axis-title end" }));
   parts.push(text(x(0), height - 6, "start", { class: "tick" }), text(x(1), height - 6, "done", { class: "tick end" }));
   if (points.length) {
     parts.push(svg("path", { d: path(points.map(([f, v]) => [x(f), y(v)])), class: "line device" }));
@@ -161,7 +161,7 @@ export function pulseChart({ time_s, factor }, isPulsatile, times, moment, chose
     svg("line", { x1: left, x2: width - 8, y1: y(v), y2: y(v), class: v ? "goal" : "grid" }),
     text(left - 6, y(v) + 4, String(v), { class: "tick end" }),
   ]);
-  const shown = moment !== undefined && times.length ? `shown: ${times[moment].toFixed(2)} s` : times.length ? "shown: the cycle's mean" : isPulsatile ? "the pulse" : "steady, at the mean";
+  const shown = moment !== undefined && times.length ? `shown: ${times[moment].toFixed(2)} s` : times.length ? "shown: the cycle's mean" : isPulsatile ? "pulsatile" : "steady, at the mean";
   parts.push(text(0, 12, "Inflow / mean", { class: "axis-title" }), text(width - 8, 13, shown, { class: "axis-title end" }));
   for (const t of ticks(0, time_s.at(-1), 4)) parts.push(text(x(t), height - 8, `${t} s`, { class: "tick middle" }));
   parts.push(svg("path", { d: path(time_s.map((t, i) => [x(t), y(factor[i])])), class: isPulsatile ? "line device" : "line artery" }));

@@ -436,7 +436,7 @@ class Page {
     const words = make("div", { className: "work-words" }, [make("b", {}, [job.stage ? this.spoken(job.stage) : "Starting"]), make("span", {}, [job.detail || "…"])]);
     const stop = make("button", { type: "button", onClick: () => drop(`${this.path}/jobs`).catch((problem) => this.complain(problem)) }, ["Cancel"]);
     const done = job.finished.map(({ stage }) => this.spoken(stage));
-    const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "It goes on when this tab is closed."]);
+    const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "The work continues when this tab is closed."]);
     this.work.replaceChildren(words, make("div", { className: "bar", role: "progressbar", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
   }
 
@@ -449,7 +449,7 @@ class Page {
     const parts = [];
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
-      const stale = this.view.steps.flow !== "done" ? [make("p", { className: "note stale" }, ["Of an earlier choice: run the step Flow again."])] : [];
+      const stale = this.view.steps.flow !== "done" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
       parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole, (name) => this.deviceTitle(name)));
     }
     if (["device", "deploy"].includes(this.step)) {
@@ -458,8 +458,8 @@ class Page {
     }
     if (this.step === "report") for (const varied of this.sheets?.uncertainty || []) parts.push(...sureSheet(varied));
     if (this.sheets?.anatomy?.length && !(flow && ["flow", "report"].includes(this.step))) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));
-    if (!parts.length) parts.push(make("h2", {}, ["Numbers"]), make("p", { className: "hint" }, ["They appear here as the steps are done, each with its unit and definition."]));
-    else parts.push(make("p", { className: "hint" }, ["Rest the pointer on a name for its definition."]));
+    if (!parts.length) parts.push(make("h2", {}, ["Numbers"]), make("p", { className: "hint" }, ["Metrics appear here when a step is finished, each with its unit and definition."]));
+    else parts.push(make("p", { className: "hint" }, ["Hold the pointer over a name to see its definition."]));
     this.numbers.replaceChildren(...parts);
   }
 
@@ -555,7 +555,7 @@ class Page {
 
   setSeed(point) {
     this.choose({ at_mm: point.map((x) => Number(x.toFixed(2))) });
-    this.tell("Seed set: find the vessel again to use it.");
+    this.tell("Point set. Find the vessel again to use it.");
   }
 
   async start(kind) {
@@ -607,7 +607,7 @@ const deviceWith = (name, changes) => ({ devices }) => ({
 });
 const SPOKEN = {
   scan: "Scan", vessel: "Vessel", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes",
-  deploy: "Deploying", struts: "Struts of", plan: "Cost of the flow", flow: "Flow,", vary: "How sure:", measure: "Numbers", report: "Report",
+  deploy: "Deploying", struts: "Wires of", plan: "Run time of the flow", flow: "Flow,", vary: "Uncertainty of", measure: "Metrics", report: "Report",
 };
 
 /** From where each step looks at first. */

@@ -45,17 +45,17 @@ function span(low, high) {
   return unit && high.endsWith(unit) ? `${digits} – ${high}` : `${low} – ${high}`;
 }
 
-/** How sure the results of a device are: the mean, what 95 % lie between, and what makes the spread. */
+/** Uncertainty of the results of a device: mean, 95 % interval and main causes. */
 export function sureSheet({ title, words, rows }) {
   const cause = (shares) => shares.filter(([, share]) => share >= 0.05).map(([name, share]) => `${name} ${Math.round(100 * share)} %`).join(", ");
   const cards = rows.map((row) =>
     make("div", { className: "card" }, [
       make("span", { className: "term" }, [row.name]),
-      make("div", { className: "card-cells" }, [cell("Mean", "", row.mean, ""), cell("95 % lie between", "", span(row.low, row.high), "")]),
+      make("div", { className: "card-cells" }, [cell("Mean", "", row.mean, ""), cell("95 % interval", "", span(row.low, row.high), "")]),
       make("p", { className: "hint" }, [cause(row.shares)]),
     ]),
   );
-  return [make("h2", { className: "sure" }, [`How sure: ${title}`]), make("p", { className: "hint" }, [words]), make("div", { className: "cards" }, cards)];
+  return [make("h2", { className: "sure" }, [`Uncertainty: ${title}`]), make("p", { className: "hint" }, [words]), make("div", { className: "cards" }, cards)];
 }
 
 /** Where a device lies, in words with their bands. */

@@ -16,7 +16,7 @@ function failure(page) {
 }
 
 function staleness(page) {
-  const words = page.step === "image" ? "The vessel that was found is of an earlier choice." : "Something before this step has changed. What you see is from before the change.";
+  const words = page.step === "image" ? "You have changed a setting since this vessel was found." : "You have changed an earlier step. What you see was computed before the change.";
   return page.view.steps[page.step] === "stale" ? [make("p", { className: "note stale" }, [words])] : [];
 }
 
@@ -67,7 +67,7 @@ function notes(page, count) {
   const all = page.anatomy?.notes || [];
   if (!all.length) return [];
   const list = (some) => make("ul", { className: "notes" }, some.map((note) => make("li", {}, [note])));
-  const details = make("details", {}, [make("summary", {}, ["What was found, guessed or repaired"]), list(all)]);
+  const details = make("details", {}, [make("summary", {}, ["Notes: found, assumed or repaired"]), list(all)]);
   return [count ? list(all.slice(0, count)) : details];
 }
 
@@ -98,11 +98,11 @@ function again(page) {
 
 export const panels = {
   image(page) {
-    const parts = [...title("Image", page.view.is_scan ? "The lumen is what is brighter than the threshold." : "This case began with a surface: there is no scan to look at.")];
+    const parts = [...title("Image", page.view.is_scan ? "Voxels brighter than the threshold are the lumen." : "This case began with a surface, so there is no scan to show.")];
     if (page.view.wants_grid || page.view.choices.spacing_mm) parts.push(...grid(page));
     if (page.view.is_scan && page.scan) parts.push(...threshold(page));
     if (!page.view.is_scan) {
-      parts.push(select("units", "Length unit", page.view.choices.units ?? "", [["", "guessed"], ["mm", "mm"], ["cm", "cm"], ["m", "m"]], (unit) => page.choose({ units: unit || null })));
+      parts.push(select("units", "Length unit", page.view.choices.units ?? "", [["", "derived from the size"], ["mm", "mm"], ["cm", "cm"], ["m", "m"]], (unit) => page.choose({ units: unit || null })));
     }
     parts.push(...point(page, "at_mm", "Seed"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
     if (page.view.steps.image === "done") parts.push(next(page, "vessel", "Vessel →"));
@@ -140,7 +140,7 @@ export const panels = {
 
   deploy(page) {
     const { choices } = page.view;
-    const parts = [...title("Deploy", "Drag either end along the artery. The length follows from the wires, which cannot stretch."), ...earlier(page)];
+    const parts = [...title("Deploy", "Drag either end along the artery. The deployed length follows, because the wires cannot stretch."), ...earlier(page)];
     if (!page.device) return [...parts, make("p", { className: "note" }, ["Choose a device first."]), next(page, "device", "← Device")];
     const tabs = choices.devices.map(({ name }) => {
       const button = make("button", { type: "button", ariaPressed: String(name === page.device) }, [page.deviceTitle(name)]);
@@ -165,7 +165,7 @@ export const panels = {
     const parts = [...title("Blood flow", "The flow without a device, then with each. All pictures share one camera and one scale.")];
     parts.push(
       number(page, "inflow", "Mean inflow", "mL/s", flow.inflow_mL_s, (value) => page.chooseFlow({ inflow_mL_s: value }), { min: 0 }),
-      number(page, "cell", "Grid cell", "mm", flow.cell_size_mm, (value) => page.chooseFlow({ cell_size_mm: value }), { min: 0.04, step: 0.01 }),
+      number(page, "cell", "Grid spacing", "mm", flow.cell_size_mm, (value) => page.chooseFlow({ cell_size_mm: value }), { min: 0.04, step: 0.01 }),
       select("pulse", "Inlet", flow.is_pulsatile ? "1" : "", [["", "steady, at the mean"], ["1", "pulse of the carotid"]], (value) => page.chooseFlow({ is_pulsatile: Boolean(value) })),
       select("outlets", "Outlets", flow.outlets, [["zero_pressure", "zero pressure"], ["murray", "split by r³ (Murray)"]], (value) => page.chooseFlow({ outlets: value })),
     );
@@ -177,24 +177,24 @@ export const panels = {
   },
 
   report(page) {
-    const parts = [...title("Report", "One file with the case in 3-D, pictures, every number with its definition, and how it was made. It needs no network.")];
+    const parts = [...title("Report", "One file with a 3-D view, pictures, every metric with its definition, and the method. It needs no network.")];
     const { choices, has_flow, has_pdf, has_report, job, steps } = page.view;
     const link = (file, words, isMain) => make("a", { className: `button wide ${isMain ? "primary" : ""}`, href: `${page.path}/files/${file}`, target: "_blank", rel: "noopener" }, [words]);
     parts.push(...staleness(page), ...failure(page));
     if (has_report) parts.push(link("report.html", "Open the report", true));
     if (has_pdf) parts.push(link("report.pdf", "Report to print (PDF)"));
-    if (has_report) parts.push(link("metrics.json", "Numbers (JSON)"), link("run.json", "How it was made (JSON)"));
+    if (has_report) parts.push(link("metrics.json", "Metrics (JSON)"), link("run.json", "Settings and versions (JSON)"));
     if (has_flow) {
-      const options = [["", "not asked"], ...[16, 32, 64].map((n) => [String(n), `${n} deployments`])];
+      const options = [["", "off"], ...[16, 32, 64].map((n) => [String(n), `${n} deployments`])];
       const asked = (count) => page.choose({ uncertainty_samples: count ? Number(count) : null });
-      parts.push(select("sure", "How sure", choices.uncertainty_samples ?? "", options, asked));
-      parts.push(make("p", { className: "hint" }, ["Deploys every device again and again with threshold, landing and width of the device varied: an interval for each result, and what makes it."]));
+      parts.push(select("sure", "Uncertainty", choices.uncertainty_samples ?? "", options, asked));
+      parts.push(make("p", { className: "hint" }, ["Deploys every device many times with varied threshold, landing and device diameter. The report then shows a 95 % interval for each result and its main causes."]));
       if (steps.report !== "done" && steps.flow === "done" && !job) parts.push(main(page, "Write the report again", () => page.start("flow")));
     }
     if (steps.flow !== "done") {
       parts.push(make("p", { className: "note" }, ["The report is written when the flow has been computed."]), next(page, "flow", "← Flow"));
     }
-    parts.push(make("p", { className: "hint" }, [`The case lies in ${page.view.folder}.`]));
+    parts.push(make("p", { className: "hint" }, [`The files are in ${page.view.folder}.`]));
     return parts;
   },
 };
@@ -361,7 +361,7 @@ function expansion(page) {
 }
 
 function modes(page) {
-  const options = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall stress"]].map(([id, words]) => {
+  const options = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall shear stress"]].map(([id, words]) => {
     const button = make("button", { type: "button", ariaPressed: String((page.memory.mode || "streamlines") === id) }, [words]);
     button.addEventListener("click", () => {
       page.memory.mode = id;

@@ -21,9 +21,9 @@ export function rankingTable(page) {
 function table(page, { rows, names, is_current }) {
   if (!rows.length) return [make("p", { className: "hint" }, ["The sizes are being deployed …"])];
   const suits = rows.filter((row) => row.is_suitable).length;
-  const words = `${rows.length} sizes deployed, ${suits} suit. Click one to choose it.`;
+  const words = `${rows.length} sizes deployed, ${suits} suitable. Click one to choose it.`;
   const head = make("div", { className: "ranking-head" }, [
-    make("b", {}, ["Sizes, the best first"]),
+    make("b", {}, ["Sizes, best first"]),
     make("span", {}, [words]),
     ...(is_current ? [] : [make("span", { className: "note stale" }, ["of an earlier choice: rank again"])]),
   ]);

@@ -39,18 +39,18 @@ export function startPage(open, complain) {
   });
   const list = make("div", { className: "recent" });
   get("/api/cases").then(({ cases }) => list.replaceChildren(...recent(cases, open)));
-  const privacy = "Files stay on this machine. Of DICOM files only what the voxels need is kept: no name, no date, no number of a patient.";
+  const privacy = "Files stay on this machine. Of DICOM files only the image is kept, without name, date and number of the patient.";
   return make("main", { className: "start" }, [zone, make("p", { className: "hint" }, [privacy]), list]);
 }
 
 function recent(cases, open) {
   if (!cases.length) return [];
   return [
-    make("h2", {}, ["Go on with a case"]),
+    make("h2", {}, ["Open an earlier case"]),
     ...cases.slice(0, 12).map(({ id, name, done }) =>
       make("button", { type: "button", className: "recent-case", onClick: () => open(id) }, [
         make("b", {}, [name]),
-        make("span", {}, [done.length ? `${done.length} of 7 steps done` : "just begun"]),
+        make("span", {}, [done.length ? `${done.length} of 7 steps done` : "no step done"]),
       ]),
     ),
   ];
@@ -77,12 +77,12 @@ async function dropped(transfer) {
 }
 
 async function upload(files, said) {
-  if (!files.length) throw new Error("There is no file in what was dropped.");
-  said.textContent = "Bringing it in …";
+  if (!files.length) throw new Error("What you dropped contains no file.");
+  said.textContent = "Reading …";
   const name = files.length > 1 ? "scan" : files[0].name.replace(/(\.[A-Za-z]+)+$/, "") || "case";
   const { id } = await post("/api/cases", { name });
   for (const [i, file] of files.entries()) {
-    said.textContent = files.length > 1 ? `Bringing in file ${i + 1} of ${files.length} …` : `Bringing in ${file.name} …`;
+    said.textContent = files.length > 1 ? `Reading file ${i + 1} of ${files.length} …` : `Reading ${file.name} …`;
     await put(`/api/cases/${id}/input?name=${encodeURIComponent(file.name)}`, file);
   }
   await post(`/api/cases/${id}/input/done`);

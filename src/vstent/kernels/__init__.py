@@ -1,6 +1,6 @@
-"""Compiled loops that several packages share: arrays in, arrays out. Open ``triangles.py`` or ``curves.py`` first.
+"""Compiled loops that several packages share; arguments and results are arrays.
 
-What numba compiles is kept between runs; ``cache.py`` sees to it.
+Open ``triangles.py`` or ``curves.py`` first. ``cache.py`` manages the compiled code that numba keeps between runs.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Read-only arrays, the fields of the data classes."""
+"""Read-only arrays for the fields of the data classes."""
 
 from typing import Any
 
@@ -11,19 +11,23 @@ Bools = NDArray[np.bool_]
 
 
 def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) -> NDArray[Any]:
-    """Return `values` as a read-only contiguous array of its own.
+    """Return `values` as a new read-only contiguous array.
 
     Parameters
     ----------
     values : array_like
-    dtype : the kind of number that the field holds.
-    shape : expected shape; -1 stands for any length.
-    name : field name, for the error.
+        Values.
+    dtype : dtype
+        Type of the array.
+    shape : tuple of int
+        Expected shape; -1 stands for any length.
+    name : str
+        Field name for the error message.
 
     Raises
     ------
     ValueError
-        When the shape is another one.
+        When the shape differs.
     """
     array = np.array(values, dtype=dtype, order="C", copy=True)
     if array.ndim != len(shape) or any(want not in (-1, have) for want, have in zip(shape, array.shape, strict=True)):
@@ -33,5 +37,5 @@ def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) 
 
 
 def freeze(noun: object, name: str, dtype: DTypeLike, shape: tuple[int, ...]) -> None:
-    """Replace the field `name` of a frozen dataclass by a read-only copy (call it in ``__post_init__``)."""
+    """Replace the field `name` of a frozen dataclass by a read-only copy; call it in ``__post_init__``."""
     object.__setattr__(noun, name, read_only(getattr(noun, name), dtype, shape, name))

@@ -1,27 +1,28 @@
-"""Where compiled kernels are kept between runs, and when they are compiled anew."""
+"""Location of numba's compiled kernels, and their removal when the sources have changed."""
 
 import os
 import tempfile
 from hashlib import sha1, sha256
 from pathlib import Path
 
-# A thread that waits looks for its turn about as long as waking it takes (some 50 microseconds), and then sleeps. To
-# look on costs a factor of ten on a machine that is busy otherwise; to sleep at once, a tenth on one that is not.
+# A waiting thread polls about as long as waking it takes (50 microseconds) and then sleeps. Polling for longer is ten
+# times slower on a machine that is busy with other work; sleeping at once is 10 % slower on an idle one.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ |= {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "1000"}
 
 STAMP = "vstent.sources"
-"""File beside the kernels kept compiled that says of which sources they are."""
+"""Name of the file beside the compiled kernels that holds the hash of their sources."""
 
 
 def _user_cache() -> Path:
+    """Return the user's cache folder."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
 def choose_folder() -> None:
-    """Let what is compiled be kept where neither the package nor the user's own cache can be written.
+    """Let numba keep compiled kernels in a temporary folder where no other place is writable.
 
-    Numba keeps it beside the source or else in the user's cache, and refuses to work where it can do neither.
+    Numba uses the folder of the source or the user's cache, and fails where it can write to neither.
     """
     if not hasattr(os, "getuid"):
         return
@@ -31,7 +32,7 @@ def choose_folder() -> None:
 
 
 def _kept_in(sources: Path) -> Path:
-    """Where numba keeps what it compiles from a folder."""
+    """Return the folder where numba keeps what it compiles from a source folder."""
     name = f"{sources.name}_{sha1(str(sources).encode(), usedforsecurity=False).hexdigest()}"
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(given) / name
@@ -39,10 +40,17 @@ def _kept_in(sources: Path) -> Path:
 
 
 def forget_outdated(sources: Path, *also: Path) -> None:
-    """Take away what was compiled from other sources than those of a folder, and of further ones it calls.
+    """Remove compiled kernels whose sources have changed.
 
-    Numba looks at a kernel's own file alone, not at those of the functions that are compiled into it: after an upgrade
-    that changes only these it would go on with the former ones.
+    Numba checks only a kernel's own file, not those of the functions compiled into it. After an upgrade that changes
+    only these, it would use outdated code.
+
+    Parameters
+    ----------
+    sources : Path
+        Folder of the kernels.
+    also : Path
+        Further folders with functions that they call.
     """
     place = _kept_in(sources)
     files = [file for folder in (sources, *also) for file in sorted(folder.glob("*.py"))]
@@ -53,5 +61,5 @@ def forget_outdated(sources: Path, *also: Path) -> None:
             for index in place.glob("*.nbi"):
                 index.unlink(missing_ok=True)
             (place / STAMP).write_text(digest)
-    except OSError:  # it cannot be written, so nobody compiles into it either
+    except OSError:  # the folder is not writable, so that nothing is compiled into it
         return

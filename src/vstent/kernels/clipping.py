@@ -1,4 +1,4 @@
-"""Cutting a triangle mesh along the zero of a value at its vertices."""
+"""Cut a triangle mesh along the zero of a value at its vertices."""
 
 import numpy as np
 
@@ -6,9 +6,16 @@ from vstent.kernels.arrays import Floats, Ints
 
 
 def clip(vertices: Floats, faces: Ints, value: Floats) -> tuple[Floats, Ints]:
-    """Keep the part of a mesh where `value` (n,), linear on every face, is at most 0.
+    """Return the part of a mesh where a value is at most 0.
 
-    Vertices of the cut are shared by the faces beside it; vertices that no face uses any more stay in the list.
+    Faces share the vertices of the cut. Vertices that no face uses any more stay in the list.
+
+    Parameters
+    ----------
+    vertices, faces : (n, 3), (m, 3)
+        The mesh.
+    value : (n,)
+        Value at every vertex, linear on every face.
     """
     positive = value[faces] > 0
     count = positive.sum(axis=1)
@@ -32,14 +39,14 @@ def clip(vertices: Floats, faces: Ints, value: Floats) -> tuple[Floats, Ints]:
 
 
 def _rotated(faces: Ints, start: Ints) -> Ints:
-    """Rotate every face so that its corner number `start` comes first."""
+    """Return every face rotated so that its corner number `start` comes first."""
     return faces[np.arange(len(faces))[:, None], (start[:, None] + np.arange(3)) % 3]
 
 
 def _crossings(vertices: Floats, edges: Ints, value: Floats) -> tuple[Floats, Ints]:
-    """Vertices with one more for each edge whose ends differ in sign, and that vertex for every edge (k,).
+    """Return vertices with one more per edge whose ends differ in sign, and its number for every edge (k,).
 
-    An edge that ends on the zero has its end for an answer.
+    For an edge with an end at zero, the number is that of this end.
     """
     low, high = edges.min(axis=1), edges.max(axis=1)
     on_zero = (value[low] == 0) | (value[high] == 0)
@@ -53,7 +60,7 @@ def _crossings(vertices: Floats, edges: Ints, value: Floats) -> tuple[Floats, In
 
 
 def section(vertices: Floats, faces: Ints, value: Floats) -> Floats:
-    """Segments (s, 2, 3) along which a mesh meets the zero of `value` (n,), linear on every face."""
+    """Return the segments (s, 2, 3) along which a mesh meets the zero of `value` (n,), linear on every face."""
     is_positive = value[faces] > 0
     count = is_positive.sum(axis=1)
     lone = np.concatenate(

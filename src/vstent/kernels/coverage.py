@@ -1,4 +1,4 @@
-"""Coverage: which part of a grid of quads lies under wires."""
+"""Metal coverage: the fraction of each cell of a quadrilateral grid that lies under wires."""
 
 from typing import Any
 
@@ -9,20 +9,25 @@ from vstent.kernels.arrays import Floats
 
 
 def covered_fractions(nodes: Floats, starts: Floats, ends: Floats, radius: Floats, samples: int) -> Floats:
-    """Part (rows - 1, columns) of every quad of a contour that wires hide.
+    """Return the fraction (rows - 1, columns) of every grid cell that is covered by wires.
+
+    Sample points of a low-discrepancy sequence are tested against nearby wire segments, all projected onto the plane of
+    the cell. The sequence has a different offset in every cell, so that a regular wire pattern cannot fall between the
+    points.
 
     Parameters
     ----------
-    nodes : (rows, columns, 3) grid, columns periodic.
-    starts, ends : (m, 3) segments of wire axes, shorter than the grid's spacing.
-    radius : (m,) half-widths of the wires.
-    samples : points tried per quad and direction.
-
-    Points of a low-discrepancy lattice, shifted anew in every quad so that no pattern of wires can hide between them,
-    are tested against the segments nearby, all projected onto the quad's plane.
+    nodes : (rows, columns, 3)
+        Grid; columns are periodic.
+    starts, ends : (m, 3)
+        Ends of the wire segments, which must be shorter than the grid spacing.
+    radius : (m,)
+        Half-widths of the wires.
+    samples : int
+        Number of sample points per cell and direction.
     """
     rows, columns = nodes.shape[:2]
-    nodes = np.array(nodes, order="C")  # a copy: what may not be written would be compiled anew
+    nodes = np.array(nodes, order="C")  # a writable copy: numba compiles separate code for read-only arrays
     home = homes(nodes, 0.5 * (starts + ends))
     order = np.argsort(home, kind="stable")
     first = np.searchsorted(home[order], np.arange(rows * columns + 1)).astype(np.int32)
@@ -38,9 +43,16 @@ def covered_fractions(nodes: Floats, starts: Floats, ends: Floats, radius: Float
 
 @njit(cache=True)
 def homes(nodes: Any, points: Any) -> Any:
-    """Nearest node (n,) of a grid (rows, columns, 3), its number, to points (n, 3) that follow on each other.
+    """Return the number (n,) of the grid node nearest to each of consecutive points.
 
-    It is sought downhill from that of the point before, and among all where the next point is too far for that.
+    Each search starts from the node of the previous point; if the points are too far apart, all nodes are tried.
+
+    Parameters
+    ----------
+    nodes : (rows, columns, 3)
+        Grid; columns are periodic.
+    points : (n, 3)
+        Points, consecutive ones close together.
     """
     columns = nodes.shape[1]
     home = np.zeros(len(points), dtype=np.int32)
@@ -59,6 +71,7 @@ def homes(nodes: Any, points: Any) -> Any:
 
 @njit(cache=True)
 def _away2(nodes: Any, point: Any, row: int, column: int) -> float:
+    """Return the squared distance of a point from a node."""
     total = 0.0
     for k in range(3):
         total += (nodes[row, column, k] - point[k]) ** 2
@@ -67,6 +80,7 @@ def _away2(nodes: Any, point: Any, row: int, column: int) -> float:
 
 @njit(cache=True)
 def _nearest(nodes: Any, point: Any) -> tuple[int, int]:
+    """Return row and column of the node nearest to a point, by trying all nodes."""
     best, at = np.inf, (0, 0)
     for row in range(nodes.shape[0]):
         for column in range(nodes.shape[1]):
@@ -78,7 +92,7 @@ def _nearest(nodes: Any, point: Any) -> tuple[int, int]:
 
 @njit(cache=True)
 def _downhill(nodes: Any, point: Any, row: int, column: int) -> tuple[int, int]:
-    """Go to the nearest of the nodes around as long as one is nearer."""
+    """Return row and column of the nearest node, found by moving to nearer neighbours until there is none."""
     rows, columns = nodes.shape[0], nodes.shape[1]
     best = _away2(nodes, point, row, column)
     while True:
@@ -95,7 +109,7 @@ def _downhill(nodes: Any, point: Any, row: int, column: int) -> tuple[int, int]:
 
 @njit(cache=True)
 def _gather(first: Any, row: int, column: int, rows: int, columns: int, found: Any) -> int:
-    """Put the segments at home within one node of a quad into `found`; return how many."""
+    """Write the segments whose home is within one node of a cell into `found` and return their number."""
     n = 0
     for i in range(max(0, row - 1), min(rows, row + 3)):
         for step in range(-1, 3):
@@ -108,7 +122,7 @@ def _gather(first: Any, row: int, column: int, rows: int, columns: int, found: A
 
 @njit(cache=True)
 def _plane(corners: Any, frame: Any) -> float:
-    """Write the middle of a quad (4, 3) and two unit vectors in its plane (3, 3); return its half-diagonal."""
+    """Write the centre and two in-plane unit vectors of a cell into `frame` (3, 3); return its half-diagonal."""
     for k in range(3):
         frame[0, k] = 0.25 * (corners[0, k] + corners[1, k] + corners[2, k] + corners[3, k])
         frame[1, k], frame[2, k] = corners[3, k] - corners[0, k], corners[2, k] - corners[1, k]
@@ -128,7 +142,7 @@ def _plane(corners: Any, frame: Any) -> float:
 
 @njit(cache=True)
 def _scale(vector: Any) -> None:
-    """Give a vector (3,) the length 1."""
+    """Normalise a vector (3,) in place."""
     length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     for k in range(3):
         vector[k] /= length
@@ -136,7 +150,7 @@ def _scale(vector: Any) -> None:
 
 @njit(cache=True)
 def _flatten(frame: Any, reach: float, starts: Any, ends: Any, radius: Any, near: Any, flat: Any) -> int:
-    """Write the nearby segments that reach the quad, seen square to it: start, vector, 1 / length^2, radius^2."""
+    """Write nearby segments projected onto the cell's plane into `flat`: start, vector, 1 / length^2, radius^2."""
     n = 0
     for i in range(len(near)):
         k = near[i]
@@ -157,6 +171,7 @@ def _flatten(frame: Any, reach: float, starts: Any, ends: Any, radius: Any, near
 
 @njit(cache=True)
 def _is_under(x: float, y: float, flat: Any) -> bool:
+    """Return whether the point x, y lies under one of the projected segments."""
     for i in range(len(flat)):
         px, py, bx, by = x - flat[i, 0], y - flat[i, 1], flat[i, 2], flat[i, 3]
         t = min(max((px * bx + py * by) * flat[i, 4], 0.0), 1.0)
@@ -168,6 +183,7 @@ def _is_under(x: float, y: float, flat: Any) -> bool:
 
 @njit(cache=True)
 def _share_under(quad: int, corners: Any, frame: Any, flat: Any, samples: int) -> float:
+    """Return the fraction of a cell's sample points that lie under wires."""
     hits = 0
     at = np.zeros((4, 2))
     for corner in range(4):
@@ -176,7 +192,7 @@ def _share_under(quad: int, corners: Any, frame: Any, flat: Any, samples: int) -
             at[corner, 0] += off * frame[1, k]
             at[corner, 1] += off * frame[2, k]
     for sample in range(samples * samples):
-        # R2 sequence (Roberts 2018), its start moved from quad to quad by the same kind of numbers.
+        # R2 sequence (Roberts 2018), with an offset per cell from a sequence of the same kind.
         u = (0.5 + 0.7548776662466927 * sample + 0.5698402909980532 * quad) % 1.0
         v = (0.5 + 0.5698402909980532 * sample + 0.3247179572447460 * quad) % 1.0
         a, b, c, d = (1 - u) * (1 - v), (1 - u) * v, u * (1 - v), u * v
@@ -190,6 +206,7 @@ def _share_under(quad: int, corners: Any, frame: Any, flat: Any, samples: int) -
 def _row_fractions(
     row: int, nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int, result: Any
 ) -> None:
+    """Write the covered fractions of one row of cells into `result`."""
     rows, columns = nodes.shape[0], nodes.shape[1]
     near, flat = np.zeros(4096, dtype=np.int32), np.zeros((4096, 6))
     corners, frame = np.zeros((4, 3)), np.zeros((3, 3))
@@ -205,6 +222,7 @@ def _row_fractions(
 
 @njit(cache=True)
 def _fractions(nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int) -> Any:
+    """Return the covered fractions (rows - 1, columns) of all cells."""
     result = np.zeros((nodes.shape[0] - 1, nodes.shape[1]))
     for row in range(len(result)):
         _row_fractions(row, nodes, starts, ends, radius, first, samples, result)

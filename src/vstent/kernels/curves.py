@@ -1,4 +1,4 @@
-"""Polylines: arc length, frames, interpolation, projection."""
+"""Polylines: arc length, frames, curvature, interpolation, projection and smoothing."""
 
 from typing import Any
 
@@ -14,21 +14,23 @@ from vstent.kernels.arrays import Floats
 
 
 def lengths(vectors: Floats) -> Floats:
-    """Lengths (...) of vectors (..., d): several times as fast as numpy's norm where d is small."""
+    """Return the lengths (...) of vectors (..., d); several times as fast as numpy's norm where d is small."""
     return np.asarray(np.sqrt(np.einsum("...k,...k->...", vectors, vectors)))
 
 
 def closed_lengths(rows: Floats) -> Floats:
-    """Lengths (n,) of closed rows (n, m, d) as smooth curves: chords, and 8/3 of the squared height over each.
+    """Return the lengths (n,) of smooth closed curves through rows of points (n, m, d).
 
-    Four points in a row show the height: what they bend square to the chord, however they are spaced.
+    Each arc is its chord plus 8/3 of the squared height above it, divided by the chord. The height follows from four
+    consecutive points: their bending perpendicular to the chord, at any spacing.
     """
-    # Numba compiles a kernel anew for arrays that may not be written.
+    # A writable copy, because numba compiles separate code for read-only arrays.
     return np.asarray(_closed_lengths(np.array(rows, dtype=np.float64, order="C")))
 
 
 @njit(cache=True, nogil=True)
 def _closed_lengths(rows: Any) -> Any:
+    """Return the lengths (n,) of closed rows."""
     n, m, d = rows.shape
     length = np.zeros(n)
     for i in range(n):
@@ -49,45 +51,48 @@ def _closed_lengths(rows: Any) -> Any:
 
 
 def arc_length(points: Floats) -> Floats:
-    """Cumulative length (n,) of a polyline (n, 3), starting at 0."""
+    """Return the cumulative length (n,) of a polyline (n, 3), starting at 0."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def interpolate(abscissa: Floats, values: Floats, wanted: Floats) -> Floats:
-    """Values (k, d) at arc lengths `wanted` (k,), linear between samples (n,), (n, d)."""
+    """Return values (k, d) at arc lengths `wanted` (k,), linear between samples at `abscissa` (n,), (n, d)."""
     return np.stack([np.interp(wanted, abscissa, column) for column in values.T], axis=-1)
 
 
 def resample(points: Floats, step: float) -> Floats:
-    """Points (k, 3) at equal arc lengths of about `step` along a polyline (n, 3), ends kept."""
+    """Return points (k, 3) at equal arc lengths of about `step` along a polyline (n, 3); the ends are kept."""
     return resample_evenly(points, max(2, round(arc_length(points)[-1] / step) + 1))
 
 
 def resample_evenly(points: Floats, n: int) -> Floats:
-    """`n` points (n, 3) at equal arc lengths along a polyline (k, 3), ends kept."""
+    """Return `n` points (n, 3) at equal arc lengths along a polyline (k, 3); the ends are kept."""
     abscissa = arc_length(points)
     return interpolate(abscissa, points, np.linspace(0.0, abscissa[-1], n))
 
 
 def tangents(points: Floats) -> Floats:
-    """Unit tangents (n, 3) of a polyline, central differences over arc length."""
+    """Return the unit tangents (n, 3) of a polyline, from central differences over arc length."""
     derivative = np.gradient(points, arc_length(points), axis=0)
     return derivative / np.linalg.norm(derivative, axis=1, keepdims=True)
 
 
 def parallel_frames(points: Floats) -> Floats:
-    """Rotation-minimising frames (n, 3, 3) of a polyline: rows tangent, normal, binormal (right-handed).
+    """Return rotation-minimising frames (n, 3, 3) of a polyline: rows tangent, normal, binormal (right-handed).
 
-    Double reflection (Wang, Juettler, Zheng and Liu 2008, ACM Trans. Graph. 27(1):2, table I).
+    References
+    ----------
+    Wang, Juettler, Zheng and Liu 2008, ACM Trans. Graph. 27(1):2, table I: double reflection.
     """
     tangent = tangents(points)
-    points = np.array(points, dtype=np.float64)  # numba compiles a kernel anew for arrays that may not be written
+    points = np.array(points, dtype=np.float64)  # a writable copy: numba compiles separate code for read-only arrays
     return np.asarray(_transported(points, tangent, any_perpendicular(tangent[0])))
 
 
 @njit(cache=True)
 def _transported(points: Any, tangent: Any, first: Any) -> Any:
+    """Return the frames (n, 3, 3) that transport the normal `first` along the curve."""
     n = len(points)
     frames = np.zeros((n, 3, 3))
     normal, step, turn = first.copy(), np.zeros(3), np.zeros(3)
@@ -123,10 +128,14 @@ def _transported(points: Any, tangent: Any, first: Any) -> Any:
 
 
 def curvature_and_torsion(points: Floats, reach: float) -> tuple[Floats, Floats]:
-    """Curvature |a x b| / |a|^3 and torsion (a x b) . c / |a x b|^2, both (n,), of evenly spaced points (n, 3).
+    """Return curvature |a x b| / |a|^3 and torsion (a x b) . c / |a x b|^2, both (n,), of evenly spaced points (n, 3).
 
-    a, b and c are the first three derivatives of the quartic of least squares through the points within `reach` along
-    the curve (Savitzky and Golay 1964, Anal. Chem. 36:1627). The torsion of a straight piece is 0 here: it has none.
+    a, b and c are the first three derivatives of a quartic least-squares fit through the points within `reach` along
+    the curve. The torsion of a straight piece, where it is undefined, is set to 0.
+
+    References
+    ----------
+    Savitzky and Golay 1964, Anal. Chem. 36:1627.
     """
     step = float(arc_length(points)[-1]) / (len(points) - 1)
     window = min(2 * max(3, round(reach / step)) + 1, len(points) - 1 + len(points) % 2)
@@ -139,21 +148,22 @@ def curvature_and_torsion(points: Floats, reach: float) -> tuple[Floats, Floats]
 
 
 def any_perpendicular(direction: Floats) -> Floats:
-    """Some unit vector (3,) perpendicular to a unit vector (3,)."""
+    """Return a unit vector (3,) perpendicular to a unit vector (3,)."""
     helper = np.eye(3)[np.argmin(np.abs(direction))]
     normal = np.cross(direction, helper)
     return normal / np.linalg.norm(normal)
 
 
 def running_percentile(values: Floats, percentile: float, size: int) -> Floats:
-    """Percentile (n,) of values (n,) within a window of so many, three at least, about each of them."""
+    """Return the percentile (n,) of values (n,) in a window of `size` samples, at least three, around each."""
     return np.asarray(percentile_filter(values, percentile, size=max(3, size), mode="nearest"))
 
 
 def project(polyline: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Foot of each of (k, 3) points on a polyline (n, 3): arc length (k,) and distance (k,).
+    """Return arc length (k,) and distance (k,) of the foot of points (k, 3) on a polyline (n, 3).
 
-    The two segments beside the nearest vertex are tried; the polyline must be sampled finer than it is far away.
+    Only the two segments next to the nearest vertex are tried, so that the polyline must be finer than its distance
+    from the points.
     """
     abscissa = arc_length(polyline)
     nearest = cKDTree(polyline).query(points)[1]
@@ -171,14 +181,24 @@ def project(polyline: Floats, points: Floats) -> tuple[Floats, Floats]:
 
 
 def lowpass(values: Floats, n_waves: float) -> Floats:
-    """Values (n, ...) around a ring, without waves of which more than `n_waves` fit into it."""
+    """Return values (n, ...) around a ring without waves of which more than `n_waves` fit into it."""
     wave = np.arange(len(values) // 2 + 1)
     gain = 1.0 / (1.0 + (wave / n_waves) ** 4)
     return np.fft.irfft(np.fft.rfft(values, axis=0) * gain.reshape(-1, *[1] * (values.ndim - 1)), n=len(values), axis=0)
 
 
 def roughness(n: int, order: int, strength: Floats | float = 1.0) -> csc_matrix:
-    """Matrix (n, n) of the sum of squared differences of `order` along n samples, each times its strength (n,)."""
+    """Return the matrix (n, n) of the weighted sum of squared differences along n samples.
+
+    Parameters
+    ----------
+    n : int
+        Number of samples.
+    order : int
+        Order of the differences.
+    strength : float or (n,)
+        Weight of the differences, possibly for every sample.
+    """
     difference = csc_matrix(eye(n))
     for k in range(order):
         difference = csc_matrix(diags([-1.0, 1.0], [0, 1], shape=(n - k - 1, n - k)) @ difference)
@@ -187,10 +207,22 @@ def roughness(n: int, order: int, strength: Floats | float = 1.0) -> csc_matrix:
 
 
 def smooth(values: Floats, weight: Floats, strength: Floats | float, order: int = 2) -> Floats:
-    """Whittaker smoothing of samples (n,) or (n, d) with weights (n,).
+    """Smooth samples with the Whittaker method: minimise sum w |x - v|^2 + strength |difference of `order` of x|^2.
 
-    Minimises sum w |x - v|^2 + strength |difference of `order` of x|^2 (Eilers 2003, Anal. Chem. 75:3631, eq. 5);
-    `strength` may be given for every sample (n,).
+    Parameters
+    ----------
+    values : (n,) or (n, d)
+        Samples v.
+    weight : (n,)
+        Weights w.
+    strength : float or (n,)
+        Weight of the differences, possibly for every sample.
+    order : int
+        Order of the differences.
+
+    References
+    ----------
+    Eilers 2003, Anal. Chem. 75:3631, eq. 5.
     """
     n = len(values)
     if n <= order:

@@ -1,4 +1,4 @@
-"""The nineteen directions from a grid cell to itself and to its neighbours (D3Q19)."""
+"""The nineteen directions of D3Q19: from a grid cell to itself and to its neighbours."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""First use: tell that kernels are being compiled, where none are kept from before, and have help with it."""
+"""First use of compiled kernels: report that kernels are being compiled, and compile them in a second process."""
 
 import subprocess
 import threading
@@ -10,10 +10,15 @@ from numba.core import event
 
 @contextmanager
 def telling(tell: Callable[[], None], *, helper: Sequence[str] = ()) -> Iterator[None]:
-    """Have `tell` called once, when a kernel is about to be compiled for want of a kept one.
+    """Call `tell` once when a kernel has to be compiled because numba's cache does not hold it.
 
-    `helper` is the command of a second process that then compiles others, as far as it gets before this ends: numba
-    takes from its cache what is there by the time that it is needed, and threads of one process cannot compile at once.
+    Parameters
+    ----------
+    tell : callable
+        Called at the first compilation.
+    helper : sequence of str
+        Command of a second process that compiles further kernels until this block ends. Threads of one process cannot
+        compile at the same time, but this process uses whatever the helper has put in numba's cache by then.
     """
     once = _Once(tell, tuple(helper))
     try:
@@ -24,9 +29,17 @@ def telling(tell: Callable[[], None], *, helper: Sequence[str] = ()) -> Iterator
 
 
 def kept(call: Callable[[], None], command: Sequence[str]) -> None:
-    """See that the kernels which `call` runs are those of numba's cache: what it lacks another process compiles.
+    """Make sure that the kernels which `call` runs are loaded from numba's cache.
 
-    `command` is that process. Where its work cannot be kept, this process compiles at the next call.
+    If one is missing, another process compiles it. Where the cache cannot be written, this process compiles at the next
+    call.
+
+    Parameters
+    ----------
+    call : callable
+        Runs the kernels.
+    command : sequence of str
+        Command of a process that compiles them.
     """
     try:
         with event.install_listener("numba:compile", _Refusal()):
@@ -36,36 +49,36 @@ def kept(call: Callable[[], None], command: Sequence[str]) -> None:
 
 
 class _Unkept(Exception):
-    """Numba is about to compile."""
+    """A kernel is missing from numba's cache and would be compiled."""
 
 
 class _Refusal(event.Listener):
-    """Keeps this thread from compiling."""
+    """Prevents compilation in this thread."""
 
     def __init__(self) -> None:
-        """Remember the thread."""
+        """Store the present thread."""
         self._thread = threading.get_ident()
 
     def on_start(self, event: event.Event) -> None:
-        """Refuse."""
+        """Raise `_Unkept` in this thread."""
         if threading.get_ident() == self._thread:
             raise _Unkept
 
     def on_end(self, event: event.Event) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
 
 class _Once(event.Listener):
-    """Reports the first compilation."""
+    """Reports the first compilation and starts the helper process."""
 
     def __init__(self, tell: Callable[[], None], command: tuple[str, ...]) -> None:
-        """Keep whom to tell, and what to start."""
+        """Store the callback and the command."""
         self._tell: Callable[[], None] | None = tell
         self._command = command
         self._helper: subprocess.Popen[bytes] | None = None
 
     def on_start(self, event: event.Event) -> None:
-        """Tell, the first time."""
+        """Call the callback and start the helper, the first time."""
         tell, self._tell = self._tell, None
         if tell is None:
             return
@@ -75,10 +88,10 @@ class _Once(event.Listener):
             self._helper = subprocess.Popen(self._command, stdin=silent, stdout=silent, stderr=silent)
 
     def on_end(self, event: event.Event) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
     def stop(self) -> None:
-        """End the helper, wherever it is: what it has compiled is kept."""
+        """Stop the helper; the kernels that it has finished stay in the cache."""
         if self._helper is not None:
             self._helper.terminate()
             self._helper.wait()

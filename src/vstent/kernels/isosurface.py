@@ -7,10 +7,28 @@ from vstent.kernels.arrays import Floats, Ints
 
 
 def isosurface(field: NDArray[np.float32], level: float) -> tuple[Floats, Ints]:
-    """Triangles where a field (i, j, k) crosses `level`: vertices (n, 3) in index units and faces (m, 3).
+    """Return the triangles where a field crosses a level.
 
-    Faces are counter-clockwise seen from the low side; the surface is open where it meets the border of the grid.
-    Flying edges (Schroeder, Maynard and Geveci 2015, IEEE LDAV) with linear interpolation along the grid's edges.
+    Vertices lie on grid edges and are found by linear interpolation. The surface is open where it meets the border of
+    the grid.
+
+    Parameters
+    ----------
+    field : (i, j, k) float32
+        Field.
+    level : float
+        Level.
+
+    Returns
+    -------
+    vertices : (n, 3)
+        Vertices in index units.
+    faces : (m, 3)
+        Triangles, counter-clockwise seen from the low side.
+
+    References
+    ----------
+    Schroeder, Maynard and Geveci 2015, IEEE LDAV: flying edges.
     """
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkCommonDataModel import vtkImageData

@@ -1,7 +1,7 @@
-"""Medial graph of a closed surface: Voronoi vertices inside it, and shortest paths along it.
+"""Medial graph of a closed surface: inscribed spheres from a Voronoi diagram, and shortest paths between them.
 
-The vertices of the Voronoi diagram of a dense surface sample that lie inside the surface are, to sampling accuracy,
-centres of maximum inscribed spheres (Antiga et al. 2003, IEEE Trans. Med. Imaging 22:674).
+The vertices of the Voronoi diagram of a dense surface sample that lie inside the surface are, within the accuracy of
+the sampling, centres of maximum inscribed spheres (Antiga et al. 2003, IEEE Trans. Med. Imaging 22:674).
 """
 
 from typing import Any, Final, NamedTuple
@@ -16,25 +16,25 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.tree import Tree, sees_inside
 
 SHORTER: Final = 0.93
-"""Steps towards the widest sphere of a section become shorter by this factor..."""
+"""Factor by which the steps towards the widest sphere of a section shrink."""
 N_STEPS: Final = 128
-"""... so many times: the last is a ten-thousandth of the first."""
+"""Number of these steps; the last is a ten-thousandth of the first."""
 
 
 class Medial(NamedTuple):
-    """The medial graph as bare arrays."""
+    """The medial graph as arrays."""
 
     points: Floats
     """(n, 3) centres of inscribed spheres."""
     radius: Floats
-    """(n,) their radii."""
+    """(n,) radii of the spheres."""
     edges: Ints
     """(e, 2) pairs of spheres whose Delaunay tetrahedra share a face."""
 
 
 def voronoi(samples: Floats) -> tuple[Medial, Ints]:
-    """All Voronoi vertices of surface samples (n, 3), and the four samples (t, 4) that each is equally far from."""
-    # Exactly cospherical lattice points (marching cubes) make flat tetrahedra; a hair of jitter parts them.
+    """Return the Voronoi vertices of surface samples (n, 3), and the four samples (t, 4) equidistant from each."""
+    # Exactly cospherical points on a lattice (marching cubes) form flat tetrahedra; a small jitter avoids this.
     scale = float(np.ptp(samples, axis=0).max())
     jitter = np.random.default_rng(0).normal(0.0, 1e-7 * scale, samples.shape)
     points = samples + jitter
@@ -48,6 +48,7 @@ def voronoi(samples: Floats) -> tuple[Medial, Ints]:
 
 
 def _circumspheres(corners: Floats) -> tuple[Floats, Floats]:
+    """Return centres and radii of the circumspheres of tetrahedra; the radius of a flat one is inf."""
     a = corners[:, 0]
     edges = corners[:, 1:] - a[:, None]
     right = 0.5 * np.einsum("ijk,ijk->ij", edges, edges)
@@ -60,16 +61,25 @@ def _circumspheres(corners: Floats) -> tuple[Floats, Floats]:
 
 
 def keep(medial: Medial, kept: Bools) -> Medial:
-    """The part of the graph on the vertices where the mask `kept` (n,) is true."""
+    """Return the part of the graph on the vertices where the mask `kept` (n,) is true."""
     number = np.cumsum(kept) - 1
     edges = medial.edges[kept[medial.edges].all(axis=1)]
     return Medial(medial.points[kept], medial.radius[kept], number[edges].astype(np.int32))
 
 
 def with_terminals(medial: Medial, terminals: Floats, reach: Floats) -> Medial:
-    """Append terminals (t, 3), joined to all spheres whose centres lie within its reach (t,).
+    """Return the graph with terminals appended, each joined to all spheres whose centres lie within its reach.
 
-    Where there is none it is joined to the nearest, if that is within ten times the reach.
+    Without such a sphere a terminal is joined to the nearest one, if it is within ten times the reach.
+
+    Parameters
+    ----------
+    medial : Medial
+        The graph.
+    terminals : (t, 3)
+        Points to append.
+    reach : (t,)
+        Distance within which each is joined.
     """
     n = len(medial.points)
     tree = cKDTree(medial.points)
@@ -87,7 +97,15 @@ def with_terminals(medial: Medial, terminals: Floats, reach: Floats) -> Medial:
 
 
 def cost_graph(medial: Medial, radius_cap: Floats) -> csr_matrix:
-    """Symmetric graph whose edges cost length / radius, the radius capped (n,): the travel time of Antiga 2003."""
+    """Return the symmetric graph whose edges have the cost length / radius (the travel time of Antiga et al. 2003).
+
+    Parameters
+    ----------
+    medial : Medial
+        The graph.
+    radius_cap : (n,)
+        Upper limit of the radii.
+    """
     radius = np.maximum(np.minimum(medial.radius, radius_cap), 1e-6)
     a, b = medial.edges.T
     length = np.linalg.norm(medial.points[a] - medial.points[b], axis=1)
@@ -97,7 +115,15 @@ def cost_graph(medial: Medial, radius_cap: Floats) -> csr_matrix:
 
 
 def path_to(before: Ints, end: int) -> Ints:
-    """Vertices from the start of a shortest-path tree to `end`."""
+    """Return the vertices from the root of a shortest-path tree to `end`.
+
+    Parameters
+    ----------
+    before : (n,) int
+        Predecessor of every vertex, negative at the root.
+    end : int
+        Last vertex.
+    """
     path = [end]
     while before[path[-1]] >= 0:
         path.append(int(before[path[-1]]))
@@ -105,11 +131,20 @@ def path_to(before: Ints, end: int) -> Ints:
 
 
 def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Medial:
-    """The medial graph inside a surface, from samples (n, 3) of its wall with outward normals (n, 3).
+    """Return the medial graph inside a surface.
 
-    The wall alone is sampled, not its caps: towards an opening the spheres keep the vessel's radius. A sphere is inside
-    when it lies behind the wall at all four samples that it touches. Where the wall alone says little, near the
-    openings centred at `ends` (k, 3) and for the widest spheres, the closed surface decides.
+    Only the wall is sampled, not its caps, so that the spheres keep the vessel's radius towards an opening. A sphere is
+    inside when its centre lies behind the wall at all four samples that it touches. This test is unreliable near the
+    openings and for the widest spheres; there the closed surface decides.
+
+    Parameters
+    ----------
+    samples, normals : (n, 3)
+        Points of the wall and outward normals.
+    closed : Tree
+        The closed surface.
+    ends : (k, 3)
+        Centres of the openings.
     """
     every, touched = voronoi(samples)
     extent = float(np.ptp(samples, axis=0).max())
@@ -126,14 +161,14 @@ def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Med
 
 
 def within(medial: Medial, closed: Tree) -> Medial:
-    """The connected part of most spheres whose centres lie inside a closed surface."""
-    askew = np.array([0.756, 0.539, 0.371])  # a ray along no axis grazes no row of triangles
+    """Return the largest connected part of the graph among the spheres whose centres lie inside a closed surface."""
+    askew = np.array([0.756, 0.539, 0.371])  # an oblique ray does not graze rows of triangles along an axis
     inside = sees_inside(closed, medial.points, np.broadcast_to(askew, medial.points.shape))
     return _largest(keep(medial, inside))
 
 
 def _largest(medial: Medial) -> Medial:
-    """The connected part of most spheres: sampling leaves a few spheres by themselves."""
+    """Return the connected part with most spheres; sampling leaves a few isolated ones."""
     n = len(medial.points)
     if not n:
         return medial
@@ -144,10 +179,21 @@ def _largest(medial: Medial) -> Medial:
 
 
 def arms(medial: Medial, roots: Ints, least_cost: float, least_radius: float) -> list[Ints]:
-    """Paths from the tree of `roots` (without any: the widest sphere) to the tips further from it than `least_cost`.
+    """Return paths from a tree to distant tips of the graph, the most distant first.
 
-    The cost length / radius counts radii travelled. The farthest tip comes first; its path joins the tree before the
-    next is sought. Spheres no wider than `least_radius` are passed on the way between roots, but make no arm.
+    The tree consists of the paths between `roots`, or of the widest sphere. Each path is added to the tree before the
+    next tip is searched.
+
+    Parameters
+    ----------
+    medial : Medial
+        The graph.
+    roots : (r,) int
+        Vertices of the tree; may be empty.
+    least_cost : float
+        Minimum cost length / radius of a path, that is, its length in radii.
+    least_radius : float
+        Spheres up to this radius may lie between roots but do not form an arm.
     """
     graph = cost_graph(medial, np.full(len(medial.radius), np.inf))
     if len(roots):
@@ -167,7 +213,7 @@ def arms(medial: Medial, roots: Ints, least_cost: float, least_radius: float) ->
 
 
 def _farthest(graph: csr_matrix, roots: Ints, least_cost: float) -> Ints:
-    """Path from the nearest of `roots` to the vertex farthest from them; empty when that is nearer than asked."""
+    """Return the path from `roots` to the most distant vertex, empty when its cost is less than `least_cost`."""
     cost, before, _ = dijkstra(graph, directed=False, indices=roots, return_predecessors=True, min_only=True)
     cost[~np.isfinite(cost)] = -1.0
     tip = int(np.argmax(cost))
@@ -175,7 +221,7 @@ def _farthest(graph: csr_matrix, roots: Ints, least_cost: float) -> Ints:
 
 
 def shortest_paths(graph: csr_matrix, start: int) -> tuple[Floats, Ints]:
-    """Cost (n,) from vertex `start` to every vertex (inf where unreachable), and each one's predecessor (n,)."""
+    """Return the cost (n,) from vertex `start` to every vertex, inf where unreachable, and the predecessors (n,)."""
     cost, before, _ = dijkstra(
         graph, directed=False, indices=np.array([start]), return_predecessors=True, min_only=True
     )
@@ -184,11 +230,25 @@ def shortest_paths(graph: csr_matrix, start: int) -> tuple[Floats, Ints]:
 
 @njit(cache=True)
 def widest_in_section(distance: Any, slope: Any, gain: float, first_step: Any) -> Any:
-    """Shifts (n, 2) within sections for which the least distance to k planes, less `gain` times the shift, is largest.
+    """Return the shifts (n, 2) within sections that maximise the distance to the nearest of k planes.
 
-    The planes' distances are (n, k), and fall by their slopes (n, k, 2) with a shift. Each step goes straight away from
-    the nearest plane, the first one (n,) far (the subgradient method, Shor 1985, Minimization Methods, 2.4). Where
-    nothing lies ahead the shift comes to fourteen first steps.
+    A penalty of `gain` times the shift is subtracted. Each step moves straight away from the nearest plane (subgradient
+    method). Without planes ahead, the total shift is fourteen first steps.
+
+    Parameters
+    ----------
+    distance : (n, k)
+        Distances from the planes.
+    slope : (n, k, 2)
+        Decrease of the distances with the shift.
+    gain : float
+        Weight of the penalty.
+    first_step : (n,)
+        Length of the first step.
+
+    References
+    ----------
+    Shor 1985, Minimization Methods, sec. 2.4.
     """
     n, k = distance.shape
     shift = np.zeros((n, 2))

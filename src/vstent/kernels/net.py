@@ -1,15 +1,15 @@
-"""Net: crossings that slide on a grid of nodes until pieces of wire between them are as long as they were made.
+"""A net of wire crossings that slide on a grid until the wire pieces between them have their manufactured length.
 
-Crossings x (c, 2), moves along and around in mm, are those of least
+The moves x (c, 2) of the crossings, along and around in mm, minimise
 
-    sum over pieces of (length - length as made)^2
-    +  sum over crossings of (resistance times how far they move otherwise than their row)^2
-    +  sum over neighbours in a row of (crowding times how much nearer together or further apart they come)^2
+    sum over pieces of (length - manufactured length)^2
+    +  sum over crossings of (resistance times their move relative to their row)^2
+    +  sum over neighbours in a row of (crowding times the change of their distance)^2
     +  sum over neighbours on a wire of (stiffness times the second difference of their moves)^2
 
-with the mean of one row held where it is. Steps of Levenberg and Marquardt (their inertia falls with every one); each
-solves its normal equations by conjugate gradients, preconditioned by the diagonal and by one coarse problem: whole rows
-moved, tilted, turned and bunched.
+while the mean of one row stays in place. The steps are those of Levenberg and Marquardt, with a damping that decreases
+with every successful step. Their normal equations are solved by conjugate gradients, preconditioned by the diagonal and
+by a coarse problem in which whole rows move, tilt, turn and bunch.
 """
 
 from typing import Any, Final, NamedTuple
@@ -20,75 +20,77 @@ from numba import njit
 from vstent.kernels.arrays import Floats, Ints
 
 _WAVES: Final = 6
-"""Moves of a row in the coarse problem: 1, cos, sin along and around."""
+"""Number of moves of a row in the coarse problem: 1, cos, sin, along and around."""
 _BAND: Final = 2 * _WAVES
-"""Width of its matrix: a row and the next."""
+"""Bandwidth of its matrix: a row and the next."""
 
 
 INERTIA: Final = 0.001
-"""Weight, squared, of a crossing's move otherwise than its row in the first step.
+"""Initial damping: squared weight of a crossing's move relative to its row.
 
-With thirty times as much, a small artery's descent ended at thrice the cost: its first steps gained too little.
-"""
+With a damping thirty times as high, the minimisation in a small artery ended at three times the cost, because its first
+steps gained too little."""
 CALMING: Final = 3.0
-"""It falls by this factor with every step that helps, and rises by its square when one does not."""
+"""Factor by which the damping decreases after a successful step; it increases by the square after a failed one."""
 STUCK: Final = 10.0
-"""With more inertia than this nothing moves any more."""
+"""Damping above which the minimisation ends, because nothing moves any more."""
 ROUNDS: Final = 200
-"""Of conjugate gradients, at most."""
+"""Maximum number of conjugate-gradient iterations."""
 
 
 class Net(NamedTuple):
-    """Crossings, and pieces of wire from each row of them to the next."""
+    """Crossings, and the pieces of wire from each row of crossings to the next."""
 
     chart: Floats
-    """(rows, columns, 9) the grid they slide on: nodes, derivatives per mm along and around."""
+    """(rows, columns, 9) grid on which they slide: nodes, and derivatives per mm along and around."""
     row: Ints
-    """(c,) row of the grid on which every crossing lies before it slides."""
+    """(c,) grid row of every crossing before it slides."""
     column: Ints
-    """(c,) and its column."""
+    """(c,) grid column of every crossing before it slides."""
     line: Ints
-    """(c,) row of crossings, rising, that every crossing belongs to; this and what follows uint32, for speed."""
+    """(c,) row of crossings to which each belongs, ascending. This and the following index arrays are uint32, for
+    speed."""
     beside: Ints
     """(c,) next crossing in the same row."""
     ends: Ints
-    """(2, p) crossings at the two ends of every piece, in rows one after the other."""
+    """(2, p) crossings at both ends of every piece, sorted by row."""
     spacing: Floats
-    """(2,) mm per row and per column of the grid."""
+    """(2,) grid spacing along and around, in mm."""
     bulge: Floats
-    """(l,) mm2: wires follow the wall, so much more than its chord's is the squared length of a piece behind a row."""
+    """(l,) mm2: squared length of a piece after each row minus that of its chord, because wires follow the curved
+    wall."""
     bends: Ints
-    """(3, b) every three crossings that follow on each other on a wire."""
+    """(3, b) all triples of consecutive crossings on a wire."""
 
 
 class Weights(NamedTuple):
-    """What the crossings heed."""
+    """Weights of the terms that are minimised."""
 
     length: float
-    """Length of a piece as made."""
+    """Manufactured length of a piece."""
     resistance: float
-    """Weight of a crossing that moves otherwise than its row against a piece that stretches by as much."""
+    """Weight of a crossing's move relative to its row, compared with an equal elongation of a piece."""
     crowding: float
-    """Weight of neighbours in a row that come nearer together."""
+    """Weight of the change of distance between neighbours in a row."""
     stiffness: float
-    """Weight of wires that bend otherwise."""
+    """Weight of the change of a wire's bending."""
     held: int
-    """The row of crossings that stays where it is in the mean."""
+    """Row of crossings whose mean position is kept."""
 
 
 class Descent(NamedTuple):
-    """When the crossings have gone far enough."""
+    """Stopping criteria of the minimisation."""
 
     steps: int
-    """Steps at most."""
+    """Maximum number of steps."""
     gain: float
-    """Less gained by a step, relative, ends them."""
+    """Relative decrease of the cost in one step below which the minimisation ends."""
     tolerance: float
-    """Of every least-squares problem, relative."""
+    """Relative tolerance of each least-squares problem."""
 
 
 def slide(net: Net, weights: Weights, descent: Descent) -> Floats:
-    """Moves (c, 2) of the crossings, along and around, mm."""
+    """Return the moves (c, 2) of the crossings, along and around, in mm."""
     angle = 2 * np.pi * net.column / net.chart.shape[1]
     waves = np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
     return _slide(net, weights, waves, descent)
@@ -96,7 +98,7 @@ def slide(net: Net, weights: Weights, descent: Descent) -> Floats:
 
 @njit(cache=True, nogil=True)
 def _put(net: Any, x: Any, places: Any) -> None:
-    """Write the chart's values (c, 9) where the crossings are; beyond its rows it goes on in straight lines."""
+    """Write the chart's values (c, 9) at the crossings; beyond the first and last row it is extrapolated linearly."""
     chart = net.chart
     rows, columns = chart.shape[0], chart.shape[1]
     for c in range(len(net.row)):
@@ -112,7 +114,7 @@ def _put(net: Any, x: Any, places: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def _cost(net: Any, weights: Any, places: Any, x: Any, excess: Any) -> float:
-    """Write by how much every piece (p,) is too long; return what the crossings minimise."""
+    """Write the excess length (p,) of every piece and return the cost."""
     total = 0.0
     for p in range(net.ends.shape[1]):
         a, b = net.ends[0, p], net.ends[1, p]
@@ -135,7 +137,7 @@ def _cost(net: Any, weights: Any, places: Any, x: Any, excess: Any) -> float:
 
 @njit(cache=True, nogil=True)
 def _row_means(line: Any, x: Any) -> tuple[Any, Any]:
-    """Mean move along (l,) of every row of crossings, and how many they are."""
+    """Return the mean move along (l,) of every row of crossings, and the number of crossings in it."""
     mean, count = np.zeros(int(line[-1]) + 1), np.zeros(int(line[-1]) + 1)
     for c in range(len(line)):
         mean[line[c]] += x[c, 0]
@@ -147,7 +149,7 @@ def _row_means(line: Any, x: Any) -> tuple[Any, Any]:
 
 @njit(cache=True, nogil=True)
 def _slopes(places: Any, ends: Any, slopes: Any) -> None:
-    """Write the derivative (p, 4) of every piece's length by its first end's two moves and its last end's."""
+    """Write the derivatives (p, 4) of every piece's length with respect to the moves of its first and last end."""
     for p in range(ends.shape[1]):
         a, b = ends[0, p], ends[1, p]
         d0, d1, d2 = places[b, 0] - places[a, 0], places[b, 1] - places[a, 1], places[b, 2] - places[a, 2]
@@ -160,7 +162,7 @@ def _slopes(places: Any, ends: Any, slopes: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def _multiply(net: Any, weights: Any, inertia: float, slopes: Any, x: Any, result: Any) -> None:
-    """Write the normal matrix times x (c, 2)."""
+    """Write the product of the normal matrix and x (c, 2)."""
     line, beside, ends, bends = net.line, net.beside, net.ends, net.bends
     mean, _ = _row_means(line, x)
     damp, crowd, stiff = weights.resistance**2, weights.crowding**2, weights.stiffness**2
@@ -191,13 +193,14 @@ def _multiply(net: Any, weights: Any, inertia: float, slopes: Any, x: Any, resul
 
 @njit(cache=True, nogil=True)
 def _diagonal(net: Any, weights: Any, inertia: float, slopes: Any) -> Any:
-    """Inverse of the normal matrix's diagonal (c, 2)."""
+    """Return the inverse of the normal matrix's diagonal (c, 2)."""
     inverse = np.zeros((len(net.line), 2))
     for p in range(len(slopes)):
         for k in range(2):
             inverse[net.ends[0, p], k] += slopes[p, k] ** 2
             inverse[net.ends[1, p], k] += slopes[p, 2 + k] ** 2
-    rest = weights.resistance**2 + inertia + 12 * weights.stiffness**2  # on two wires (1, -2, 1) comes thrice
+    # Each crossing is on two wires and in three triples (1, -2, 1) of each: 2 (1 + 4 + 1) = 12.
+    rest = weights.resistance**2 + inertia + 12 * weights.stiffness**2
     for c in range(len(inverse)):
         for k in range(2):
             inverse[c, k] = 1 / (inverse[c, k] + rest + 2 * k * weights.crowding**2)
@@ -206,9 +209,9 @@ def _diagonal(net: Any, weights: Any, inertia: float, slopes: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _stretching(net: Any, slopes: Any, waves: Any) -> Any:
-    """Add up pieces' part of the normal matrix on moves of whole rows: (l, BAND, BAND), lower, of a row and the next.
+    """Return the pieces' part of the normal matrix on moves of whole rows: (l, BAND, BAND), lower, a row and the next.
 
-    Inertia changes nothing here.
+    It does not depend on the damping.
     """
     line = net.line
     blocks = np.zeros((int(line[-1]) + 1, _BAND, _BAND))
@@ -227,7 +230,7 @@ def _stretching(net: Any, slopes: Any, waves: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _coarse(net: Any, weights: Any, inertia: float, stretching: Any, waves: Any) -> Any:
-    """Banded Cholesky factor (n, BAND), lower form, of the normal matrix on moves of whole rows."""
+    """Return the banded Cholesky factor (n, BAND), lower form, of the normal matrix on moves of whole rows."""
     line, damp, crowd = net.line, weights.resistance**2, weights.crowding**2
     blocks = stretching.copy()
     for c in range(len(line)):
@@ -250,7 +253,7 @@ def _coarse(net: Any, weights: Any, inertia: float, stretching: Any, waves: Any)
 
 @njit(cache=True, nogil=True)
 def _cholesky(band: Any) -> Any:
-    """Factor in place a symmetric matrix whose entry (i, i - k) is band[i, k]; the diagonal becomes its inverse."""
+    """Factorise a symmetric band matrix in place: entry (i, i - k) is band[i, k]; the diagonal becomes its inverse."""
     n, width = band.shape
     for i in range(n):
         for k in range(min(i, width - 1), -1, -1):
@@ -264,7 +267,7 @@ def _cholesky(band: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _solve(factor: Any, right: Any) -> None:
-    """Solve in place with a factor of `_cholesky`."""
+    """Solve in place with a factor from `_cholesky`."""
     n, width = factor.shape
     for i in range(n):
         for k in range(1, min(i, width - 1) + 1):
@@ -278,7 +281,7 @@ def _solve(factor: Any, right: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def _precondition(inverse: Any, factor: Any, line: Any, waves: Any, residual: Any, result: Any) -> None:
-    """Write the preconditioner times the residual (c, 2)."""
+    """Write the product of the preconditioner and the residual (c, 2)."""
     rows = np.zeros((len(factor) // _WAVES, 2, 3))
     for c in range(len(line)):
         for k in range(2):
@@ -294,6 +297,7 @@ def _precondition(inverse: Any, factor: Any, line: Any, waves: Any, residual: An
 
 @njit(cache=True, nogil=True)
 def _dot(a: Any, b: Any) -> float:
+    """Return the scalar product of two arrays (c, 2)."""
     total = 0.0
     for c in range(len(a)):
         total += a[c, 0] * b[c, 0] + a[c, 1] * b[c, 1]
@@ -302,7 +306,7 @@ def _dot(a: Any, b: Any) -> float:
 
 @njit(cache=True, nogil=True)
 def _downhill(net: Any, weights: Any, slopes: Any, x: Any, excess: Any) -> Any:
-    """Half the negative gradient (c, 2) of what the crossings minimise."""
+    """Return half the negative gradient (c, 2) of the cost."""
     result = np.zeros((len(net.line), 2))
     _multiply(net, weights, 0.0, slopes[:0], x, result)
     for c in range(len(result)):
@@ -316,7 +320,7 @@ def _downhill(net: Any, weights: Any, slopes: Any, x: Any, excess: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _step(net: Any, weights: Any, inertia: float, coarse: Any, slopes: Any, residual: Any, tolerance: float) -> Any:
-    """Moves (c, 2) of a step downhill, by conjugate gradients; `coarse` is (factor, waves) of the coarse problem."""
+    """Return the moves (c, 2) of one step, by conjugate gradients; `coarse` is (factor, waves) of the coarse part."""
     n, (factor, waves) = len(net.line), coarse
     inverse = _diagonal(net, weights, inertia, slopes)
     move, way, ready, image = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2))
@@ -341,6 +345,7 @@ def _step(net: Any, weights: Any, inertia: float, coarse: Any, slopes: Any, resi
 
 @njit(cache=True, nogil=True)
 def _slide(net: Any, weights: Any, waves: Any, descent: Any) -> Any:
+    """Return the moves (c, 2) that minimise the cost."""
     n, pieces = len(net.row), net.ends.shape[1]
     x, inertia = np.zeros((n, 2)), INERTIA
     places, excess, slopes = np.zeros((n, 9)), np.zeros(pieces), np.zeros((pieces, 4))

@@ -1,7 +1,8 @@
-"""Painting triangles and wires into a picture with a depth buffer: no graphics library, no display.
+"""Rendering of triangles and wires into an image with a depth buffer, without a graphics library or a display.
 
-Screen coordinates: x to the right and y down, in pixels, and depth away from the eye, in mm (orthographic). A pixel's
-centre is at integer + 0.5. `depth` (h, w) holds the nearest depth painted so far, `image` (h, w, 3) its colour.
+Screen coordinates are x to the right and y down, in pixels, and depth away from the eye, in mm (orthographic). The
+centre of a pixel is at integer + 0.5. `depth` (h, w) holds the smallest depth painted so far, `image` (h, w, 3) its
+colour.
 """
 
 import math
@@ -14,7 +15,19 @@ from vstent.kernels.arrays import Floats, Ints
 
 @njit(cache=True)
 def paint_triangles(screen: Floats, colours: Floats, faces: Ints, depth: Floats, image: Floats) -> None:
-    """Paint opaque triangles (m, 3) over vertices (n, 3) coloured (n, 3); the nearer one wins."""
+    """Paint opaque triangles; the nearer one is visible.
+
+    Parameters
+    ----------
+    screen : (n, 3)
+        Vertices in screen coordinates.
+    colours : (n, 3)
+        Colour of every vertex.
+    faces : (m, 3) int
+        Triangles.
+    depth, image
+        Changed in place.
+    """
     height, width = depth.shape
     for f in range(len(faces)):
         i, j, k = _turned(screen, faces[f, 0], faces[f, 1], faces[f, 2])
@@ -43,9 +56,22 @@ def paint_triangles(screen: Floats, colours: Floats, faces: Ints, depth: Floats,
 def paint_wires(
     screen: Floats, starts: Ints, radius: Floats, pixel: float, colours: Floats, depth: Floats, image: Floats
 ) -> None:
-    """Paint round wires: polylines `starts` (w + 1,) over points (p, 3) coloured (p, 3), `radius` (w,) in pixels.
+    """Paint round wires.
 
-    `pixel` is the size of a pixel in mm: it turns the bulge of a wire towards the eye into depth.
+    Parameters
+    ----------
+    screen : (p, 3)
+        Points of the wires in screen coordinates.
+    starts : (w + 1,) int
+        First point of every wire.
+    radius : (w,)
+        Radius in pixels.
+    pixel : float
+        Size of a pixel in mm. It converts the bulge of a wire towards the eye to depth.
+    colours : (p, 3)
+        Colour of every point.
+    depth, image
+        Changed in place.
     """
     height, width = depth.shape
     for wire in range(len(radius)):
@@ -75,10 +101,22 @@ def paint_wires(
 def veil_triangles(
     screen: Floats, colours: Floats, alphas: Floats, faces: Ints, depth: Floats, sums: Floats, clear: Floats
 ) -> None:
-    """Collect translucent triangles in front of what is painted, in any order.
+    """Accumulate translucent triangles in front of the opaque ones, in any order.
 
-    `sums` (h, w, 4) gathers alpha times colour, and alpha; `clear` (h, w) is multiplied by 1 - alpha. Weighted blended
-    order-independent transparency (McGuire and Bavoil 2013, JCGT 2(2), eq. 6 with equal weights).
+    Parameters
+    ----------
+    screen, colours, faces, depth
+        As in `paint_triangles`; `depth` does not change.
+    alphas : (n,)
+        Opacity of every vertex.
+    sums : (h, w, 4)
+        Alpha times colour, and alpha, are added here.
+    clear : (h, w)
+        Multiplied by 1 - alpha.
+
+    References
+    ----------
+    McGuire and Bavoil 2013, JCGT 2(2), eq. 6 with equal weights: weighted blended order-independent transparency.
     """
     height, width = depth.shape
     for f in range(len(faces)):
@@ -109,18 +147,19 @@ def veil_triangles(
 
 @njit(cache=True, inline="always")
 def _edge(p: Floats, q: Floats, x: float, y: float) -> float:
+    """Return twice the signed area of the triangle p, q and the point x, y."""
     return (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0])
 
 
 @njit(cache=True, inline="always")
 def _holds(edge: float, p: Floats, q: Floats) -> bool:
-    """Inside of an edge; a point on an edge belongs to one of the two triangles that share it (the top-left rule)."""
+    """Return whether a point is inside an edge; on an edge it belongs to one of the two triangles (top-left rule)."""
     return edge > 0.0 or (edge == 0.0 and (q[1] < p[1] or (q[1] == p[1] and q[0] > p[0])))
 
 
 @njit(cache=True, inline="always")
 def _turned(screen: Floats, i: int, j: int, k: int) -> tuple[int, int, int]:
-    """Corners so ordered that the area is positive."""
+    """Return the corners in the order that makes the area positive."""
     if _edge(screen[i], screen[j], screen[k, 0], screen[k, 1]) < 0.0:
         return i, k, j
     return i, j, k
@@ -128,6 +167,7 @@ def _turned(screen: Floats, i: int, j: int, k: int) -> tuple[int, int, int]:
 
 @njit(cache=True, inline="always")
 def _box(p: Floats, q: Floats, r: Floats, margin: float, width: int, height: int) -> tuple[int, int, int, int]:
+    """Return the pixel ranges x0, x1, y0, y1 of a triangle's bounding box with a margin, limited to the image."""
     x0 = math.floor(min(p[0], q[0], r[0]) - margin)
     x1 = math.ceil(max(p[0], q[0], r[0]) + margin)
     y0 = math.floor(min(p[1], q[1], r[1]) - margin)
@@ -137,7 +177,22 @@ def _box(p: Floats, q: Floats, r: Floats, margin: float, width: int, height: int
 
 @njit(cache=True)
 def resolve(image: Floats, sums: Floats, clear: Floats, supersampling: int) -> Floats:
-    """Blend the veils over the opaque picture and average blocks of pixels: (h / s, w / s, 3)."""
+    """Blend the translucent layers over the opaque image and average blocks of pixels.
+
+    Parameters
+    ----------
+    image : (h, w, 3)
+        Opaque image.
+    sums, clear : (h, w, 4), (h, w)
+        Translucent layers from `veil_triangles`.
+    supersampling : int
+        Edge s of the blocks.
+
+    Returns
+    -------
+    (h / s, w / s, 3)
+        Colours.
+    """
     height, width = clear.shape
     result = np.zeros((height // supersampling, width // supersampling, 3))
     share = 1.0 / supersampling**2

@@ -1,4 +1,4 @@
-"""Regions of a triangle mesh with a short border."""
+"""Regions of a triangle mesh that balance a gain per area against the length of their border."""
 
 from typing import Final
 
@@ -10,15 +10,24 @@ from vstent.kernels import triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 N_STEPS: Final = 40
-"""Largest number of steps; a border has converged when none of its vertices changes sides."""
+"""Maximum number of steps. A border has converged when none of its vertices changes sides."""
 FLATTEST: Final = 0.05
-"""Cotangents below this count as this: weights stay positive on obtuse triangles."""
+"""Lower limit of the cotangents, so that the weights of obtuse triangles stay positive."""
 
 
 def stiffness(vertices: Floats, faces: Ints) -> csc_matrix:
-    """Matrix (n, n) of the Dirichlet energy of functions linear on triangles.
+    """Return the matrix (n, n) of the Dirichlet energy of piecewise linear functions on a mesh.
 
-    Cotangent weights (Pinkall and Polthier 1993, Experiment. Math. 2:15).
+    Parameters
+    ----------
+    vertices : (n, 3)
+        Vertices.
+    faces : (m, 3) int
+        Triangles.
+
+    References
+    ----------
+    Pinkall and Polthier 1993, Experiment. Math. 2:15: cotangent weights.
     """
     n = len(vertices)
     total = csc_matrix((n, n))
@@ -33,29 +42,37 @@ def stiffness(vertices: Floats, faces: Ints) -> csc_matrix:
 
 
 def areas_around(vertices: Floats, faces: Ints) -> Floats:
-    """A third of the areas (n,) of the triangles around every vertex."""
+    """Return a third of the total area (n,) of the triangles at every vertex."""
     share = np.repeat(triangles.areas(vertices[faces]) / 3, 3)
     return np.bincount(faces.ravel(), share, minlength=len(vertices)).astype(np.float64)
 
 
 def region(vertices: Floats, faces: Ints, gain: Floats, is_fixed: Bools, reach: float) -> Floats:
-    """Level (n,), negative inside, of the region for which gain minus length of the border is greatest nearby.
+    """Return a level (n,), negative inside, of the region with the locally largest gain minus border length.
+
+    Diffusion and threshold alternate, with the gain as a force on the border.
 
     Parameters
     ----------
-    vertices, faces : (n, 3), (m, 3) the mesh.
-    gain : (n,) gain per area, in 1 / length; the region begins where it is positive.
-    is_fixed : (n,) vertices that stay as they begin.
-    reach : length over which the border moves in a step, longer than the mesh's edges.
+    vertices, faces : (n, 3), (m, 3)
+        The mesh.
+    gain : (n,)
+        Gain per area, in 1 / length. The initial region is where it is positive.
+    is_fixed : (n,) bool
+        Vertices that keep their initial side.
+    reach : float
+        Length over which the border moves in a step; longer than the mesh's edges.
 
-    Diffusion and threshold in turn (Merriman, Bence and Osher 1994, J. Comput. Phys. 112:334), the gain as a force.
+    References
+    ----------
+    Merriman, Bence and Osher 1994, J. Comput. Phys. 112:334: diffusion and threshold.
     """
     area = np.maximum(areas_around(vertices, faces), 1e-12)
     solver = splu(csc_matrix(diags(area) + reach**2 * stiffness(vertices, faces)))
     start = gain > 0
     inside = start
     for _ in range(N_STEPS):
-        # An implicit step leaves a slope of 1 / (2 reach) across the border: this much moves it by reach^2 gain.
+        # After an implicit step the slope across the border is 1 / (2 reach); this term moves it by reach^2 gain.
         smooth = solver.solve(area * inside) + 0.5 * reach * gain
         now = np.where(is_fixed, start, smooth > 0.5)
         if (now == inside).all():

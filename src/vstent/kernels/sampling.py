@@ -1,7 +1,7 @@
-"""Reading a field on sparse grid cells: between the cells, along streamlines, at the wall.
+"""Interpolation of a field on sparse grid cells, streamlines, and gradients at the wall.
 
-Fields are (n, d) on cells; `index` (i, j, k) holds the cell's number at every grid point, -1 outside. Points are in
-grid units: cell centres at integers.
+Fields are (n, d) arrays over cells. `index` (i, j, k) holds the cell number at every grid point, -1 outside. Points are
+in grid units, with cell centres at integers.
 """
 
 from typing import Any
@@ -12,6 +12,7 @@ from numba import njit, prange
 
 @njit(cache=True, inline="always")
 def _cell_at(index: Any, i: int, j: int, k: int) -> int:
+    """Return the cell number at a grid point, -1 outside."""
     if 0 <= i < index.shape[0] and 0 <= j < index.shape[1] and 0 <= k < index.shape[2]:
         return index[i, j, k]
     return -1
@@ -19,7 +20,19 @@ def _cell_at(index: Any, i: int, j: int, k: int) -> int:
 
 @njit(cache=True)
 def stencil(index: Any, x: float, y: float, z: float, cells: Any, weights: Any) -> float:
-    """Fill the eight cells (-1: outside) round a point and their trilinear weights; return the weight inside."""
+    """Write the eight cells around a point and their trilinear weights; return the sum of the weights inside.
+
+    Parameters
+    ----------
+    index : (i, j, k) int
+        Cell numbers.
+    x, y, z : float
+        Point.
+    cells : (8,) int
+        Set to the cell numbers, -1 outside.
+    weights : (8,)
+        Set to the weights.
+    """
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     a, b, c = x - i, y - j, z - k
     inside = 0.0
@@ -34,7 +47,7 @@ def stencil(index: Any, x: float, y: float, z: float, cells: Any, weights: Any) 
 
 @njit(cache=True)
 def stencils(index: Any, points: Any) -> tuple[Any, Any]:
-    """Eight cells (m, 8), -1 outside, and trilinear weights (m, 8) of points (m, 3)."""
+    """Return the eight cells (m, 8) around points (m, 3), -1 outside, and their trilinear weights (m, 8)."""
     cells = np.zeros((len(points), 8), np.int32)
     weights = np.zeros((len(points), 8))
     for m in range(len(points)):
@@ -44,9 +57,18 @@ def stencils(index: Any, points: Any) -> tuple[Any, Any]:
 
 @njit(cache=True, parallel=True)
 def interpolate(index: Any, values: Any, points: Any, is_zero_outside: bool) -> Any:
-    """Trilinear values (m, d) at points (m, 3).
+    """Return trilinearly interpolated values (m, d); zero where no cell is near.
 
-    Outside cells count as zero (a no-slip velocity) or are left out of the mean (a pressure). Zero where no cell is.
+    Parameters
+    ----------
+    index : (i, j, k) int
+        Cell numbers.
+    values : (n, d)
+        Field.
+    points : (m, 3)
+        Points.
+    is_zero_outside : bool
+        True: cells outside count as zero, as for a velocity with no slip. False: they are left out, as for a pressure.
     """
     result = np.zeros((len(points), values.shape[1]))
     for m in prange(len(points)):
@@ -65,7 +87,7 @@ def interpolate(index: Any, values: Any, points: Any, is_zero_outside: bool) -> 
 
 @njit(cache=True)
 def _cubic_weights(t: float, weights: Any) -> None:
-    """Fill the weights (4) of Lagrange's cubic through values at -1, 0, 1 and 2, at t."""
+    """Write the weights (4) of cubic Lagrange interpolation at t between values at -1, 0, 1 and 2."""
     weights[0] = -t * (t - 1.0) * (t - 2.0) / 6.0
     weights[1] = (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0
     weights[2] = -(t + 1.0) * t * (t - 2.0) / 2.0
@@ -74,7 +96,7 @@ def _cubic_weights(t: float, weights: Any) -> None:
 
 @njit(cache=True, parallel=True)
 def interpolate_cubic(index: Any, values: Any, points: Any) -> Any:
-    """Tricubic values (m, d) at points (m, 3), of the 64 cells around each; outside cells count as zero."""
+    """Return tricubic values (m, d) at points (m, 3) from the 64 cells around each; cells outside count as zero."""
     result = np.zeros((len(points), values.shape[1]))
     for m in prange(len(points)):
         weights = np.zeros((3, 4))
@@ -93,7 +115,7 @@ def interpolate_cubic(index: Any, values: Any, points: Any) -> Any:
 
 @njit(cache=True)
 def _speed_at(index: Any, velocity: Any, p: Any, v: Any, cells: Any, weights: Any) -> float:
-    """Velocity v at p; its magnitude, or -1 outside."""
+    """Write the velocity at p into v; return its magnitude, or -1 outside."""
     v[:] = 0.0
     if stencil(index, p[0], p[1], p[2], cells, weights) <= 0.3:
         return -1.0
@@ -106,11 +128,7 @@ def _speed_at(index: Any, velocity: Any, p: Any, v: Any, cells: Any, weights: An
 
 @njit(cache=True)
 def _trace(index: Any, velocity: Any, seed: Any, step: float, slowest: float, path: Any) -> int:
-    """Follow the flow from a seed by steps of length `step` (negative: against it); the number of points written.
-
-    Classical Runge-Kutta of fourth order in arc length, so that slow blood does not take more points than fast. Ends
-    outside, below the speed `slowest`, or when `path` (m, 4) of points and speeds is full.
-    """
+    """Write a streamline from a seed into `path` (m, 4), as points and speeds, and return the number of points."""
     cells, weights = np.zeros(8, np.int32), np.zeros(8)
     k, total, p, q = np.zeros(3), np.zeros(3), seed.copy(), np.zeros(3)
     for m in range(len(path)):
@@ -132,7 +150,33 @@ def _trace(index: Any, velocity: Any, seed: Any, step: float, slowest: float, pa
 
 @njit(cache=True, parallel=True)
 def trace_all(index: Any, velocity: Any, seeds: Any, step: float, slowest: float, most: int) -> tuple[Any, Any]:
-    """Paths (s, most, 4) of points and speeds from seeds (s, 3), and how many points each has (s,); see `_trace`."""
+    """Return streamlines from seeds, integrated with the classical fourth-order Runge-Kutta method.
+
+    The integration runs over arc length, so that slow blood needs no more points than fast blood. A streamline ends
+    outside the cells, below the speed `slowest`, or after `most` points.
+
+    Parameters
+    ----------
+    index : (i, j, k) int
+        Cell numbers.
+    velocity : (n, 3)
+        Velocity field.
+    seeds : (s, 3)
+        First points.
+    step : float
+        Step length in cells; negative: upstream.
+    slowest : float
+        Speed at which a streamline ends.
+    most : int
+        Maximum number of points.
+
+    Returns
+    -------
+    path : (s, most, 4)
+        Points and speeds.
+    count : (s,)
+        Number of points of each streamline.
+    """
     path = np.zeros((len(seeds), most, 4))
     count = np.zeros(len(seeds), np.int32)
     for s in prange(len(seeds)):
@@ -142,7 +186,7 @@ def trace_all(index: Any, velocity: Any, seeds: Any, step: float, slowest: float
 
 @njit(cache=True)
 def _solve(matrix: Any, right: Any) -> None:
-    """Solve a small symmetric positive system in place, several right sides; a vanishing pivot drops its unknown."""
+    """Solve a small symmetric positive system in place for several right sides; a vanishing pivot drops its unknown."""
     n = len(matrix)
     floor = 1e-9 * matrix[0, 0]
     for i in range(n):
@@ -163,12 +207,32 @@ def _solve(matrix: Any, right: Any) -> None:
 
 @njit(cache=True, parallel=True)
 def fit_wall(index: Any, distance: Any, velocity: Any, pressure: Any, points: Any, normals: Any, reach: int) -> Any:
-    """Wall-normal gradient of the velocity and the pressure at wall points, (m, 4).
+    """Return the wall-normal velocity gradient (3) and the pressure at wall points, (m, 4).
 
-    Weighted least squares over the cells within `reach` cells of each point (m, 3) with inward normal (m, 3):
-    velocity = d (a + b d + c s + e t + g d^2), which is zero at the wall, cubic away from it and linear along it, exact
-    for Poiseuille flow in a straight tube; the cubic term is what a pulse bends near the wall. pressure = a + b d + c s
-    + e t. d: distance of the cell from the wall, in cells.
+    Both are weighted least-squares fits over the cells within `reach` of a point, with d the distance of the cell from
+    the wall and s, t tangential coordinates, all in cells:
+
+    velocity = d (a + b d + c s + e t + g d^2), zero at the wall, cubic away from it and linear along it. It is exact
+    for Poiseuille flow in a straight tube; the cubic term represents the curvature near the wall in a pulse.
+
+    pressure = a + b d + c s + e t.
+
+    Parameters
+    ----------
+    index : (i, j, k) int
+        Cell numbers.
+    distance : (n,)
+        Distance of every cell from the wall, in cells.
+    velocity : (n, 3)
+        Velocity field.
+    pressure : (n,)
+        Pressure field.
+    points : (m, 3)
+        Wall points.
+    normals : (m, 3)
+        Inward unit normals.
+    reach : int
+        Radius of the fit, in cells.
     """
     result = np.zeros((len(points), 4))
     for m in prange(len(points)):

@@ -1,4 +1,4 @@
-"""Moving the vertices of a mesh towards their neighbours' mean."""
+"""Smoothing of triangle meshes by averaging over neighbouring vertices, and mean curvature."""
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -8,9 +8,16 @@ from vstent.kernels.arrays import Floats, Ints
 
 
 def averaging(n_vertices: int, faces: Ints) -> csr_array:
-    """Sparse (n, n) matrix that takes each vertex to the mean of its neighbours.
+    """Return the sparse (n, n) matrix that averages a value over the neighbours of each vertex.
 
-    A vertex on an open edge has only its neighbours along that edge, so that openings do not creep inwards.
+    A vertex on an open edge has only its neighbours along that edge, so that openings do not shrink.
+
+    Parameters
+    ----------
+    n_vertices : int
+        Number of vertices.
+    faces : (m, 3) int
+        Triangles.
     """
     edges = np.sort(triangles.directed_edges(faces), axis=1).astype(np.int64)
     code, count = np.unique(edges[:, 0] * n_vertices + edges[:, 1], return_counts=True)
@@ -26,10 +33,25 @@ def averaging(n_vertices: int, faces: Ints) -> csr_array:
 
 
 def taubin(vertices: Floats, faces: Ints, *, iterations: int, pass_band: float) -> Floats:
-    """Smooth vertices (n, 3) without shrinking (Taubin 1995, ICCV, lambda | mu).
+    """Smooth a mesh without shrinking it.
 
-    `pass_band` is his k_PB: waves with a Laplacian eigenvalue (0..2) below it are kept. The gain 1 at k_PB and at 0 is
-    (1 - lambda k)(1 - mu k) with 1/mu = k_PB - 1/lambda.
+    A step with factor lambda and one with factor mu alternate. The gain (1 - lambda k)(1 - mu k) is 1 at k = 0 and at k
+    = k_PB, with 1 / mu = k_PB - 1 / lambda.
+
+    Parameters
+    ----------
+    vertices : (n, 3)
+        Vertices.
+    faces : (m, 3) int
+        Triangles.
+    iterations : int
+        Number of pairs of steps.
+    pass_band : float
+        k_PB: components with a Laplacian eigenvalue (0 to 2) below it are kept.
+
+    References
+    ----------
+    Taubin 1995, ICCV: the lambda | mu algorithm.
     """
     mean = averaging(len(vertices), faces)
     shrink = 0.6
@@ -41,9 +63,18 @@ def taubin(vertices: Floats, faces: Ints, *, iterations: int, pass_band: float) 
 
 
 def mean_curvature(vertices: Floats, faces: Ints, *, rounds: int) -> Floats:
-    """Mean curvature (n,), 1 / (2 R) on a cylinder seen from outside: half the divergence of the vertex normals.
+    """Return the mean curvature (n,) at the vertices; 1 / (2 R) on a cylinder seen from outside.
 
-    On every face the normals are interpolated linearly; the curvature is averaged with the neighbours' `rounds` times.
+    It is half the divergence of the vertex normals, which are interpolated linearly on every face.
+
+    Parameters
+    ----------
+    vertices : (n, 3)
+        Vertices.
+    faces : (m, 3) int
+        Triangles.
+    rounds : int
+        Number of times that the curvature is averaged over neighbouring vertices.
     """
     corners, n = vertices[faces], len(vertices)
     normal, double_area = triangles.normals(corners), np.maximum(2 * triangles.areas(corners), 1e-12)

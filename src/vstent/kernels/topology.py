@@ -1,4 +1,4 @@
-"""How triangles hang together: welding, orientation, components, and cutting apart what no surface can do."""
+"""Connectivity of triangle meshes: welding, orientation, components, and separation of non-manifold parts."""
 
 from typing import NamedTuple
 
@@ -15,22 +15,22 @@ Labels = NDArray[np.int64]
 
 
 class Edges(NamedTuple):
-    """The edges of a mesh, sorted; the uses of one edge stand together."""
+    """The edges of a mesh, sorted. A *use* is a side of a face; the uses of one edge are consecutive."""
 
     face: Labels
     """(3 m,) face of every use."""
     side: Labels
-    """(3 m,) which side of that face: from its corner `side` to the next."""
+    """(3 m,) side of that face: from its corner `side` to the next."""
     is_upward: Bools
-    """(3 m,) whether the face runs it from the lower vertex to the higher."""
+    """(3 m,) whether the side goes from the lower vertex number to the higher."""
     starts: Labels
     """(e,) first use of every edge."""
     n_uses: Labels
-    """(e,) number of uses: 1 open, 2 sound, more not manifold."""
+    """(e,) number of uses: 1 at an open edge, 2 at a regular one, more at a non-manifold one."""
 
 
 def edges_of(faces: Ints) -> Edges:
-    """Sort the uses of all edges of faces (m, 3)."""
+    """Return the sorted edges of faces (m, 3)."""
     directed = triangles.directed_edges(faces).astype(np.int64)
     low, high = directed.min(axis=1), directed.max(axis=1)
     code = low * (high.max(initial=0) + 1) + high
@@ -45,8 +45,8 @@ def edges_of(faces: Ints) -> Edges:
 
 
 def weld(vertices: Floats, faces: Ints, tolerance: float) -> tuple[Floats, Ints]:
-    """Make one vertex of all that are closer than `tolerance` (transitively); the first of them stays."""
-    kept, same = first_equals(vertices)  # of a million points at one place, every pair would be near
+    """Merge vertices that are closer than `tolerance`, transitively; the first of each group is kept."""
+    kept, same = first_equals(vertices)  # otherwise every pair of many equal points would be listed as near
     pairs = cKDTree(vertices[kept]).query_pairs(tolerance, output_type="ndarray")
     label = _components(len(kept), pairs[:, 0], pairs[:, 1])
     _, first = np.unique(label, return_index=True)
@@ -54,7 +54,7 @@ def weld(vertices: Floats, faces: Ints, tolerance: float) -> tuple[Floats, Ints]
 
 
 def first_equals(vertices: Floats) -> tuple[Ints, Ints]:
-    """Return the first (k,) of each set of equal vertices, in order, and for every vertex (n,) its place there."""
+    """Return the first (k,) of each set of equal vertices, in order, and for every vertex (n,) its position there."""
     rows = np.ascontiguousarray(vertices + 0.0, dtype=np.float64).view("V24").ravel()
     _, first, same = np.unique(rows, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -64,13 +64,13 @@ def first_equals(vertices: Floats) -> tuple[Ints, Ints]:
 
 
 def _components(n: int, a: NDArray[np.integer], b: NDArray[np.integer]) -> Labels:
-    """Component (n,) of every node of the graph with edges a - b."""
+    """Return the component (n,) of every node of the graph with edges a - b."""
     graph = coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def sound_faces(faces: Ints) -> Bools:
-    """Tell for each face (m,) that it has three different vertices and is the first with these three."""
+    """Return for each face (m,) whether it has three different vertices and no earlier face has the same three."""
     ordered = np.sort(faces, axis=1).astype(np.int64)
     distinct = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
     n = ordered.max(initial=0) + 1
@@ -83,30 +83,31 @@ def sound_faces(faces: Ints) -> Bools:
 
 
 def face_components(faces: Ints) -> Labels:
-    """Component (m,) of every face; faces hang together where they share an edge."""
+    """Return the component (m,) of every face; faces are connected by shared edges."""
     edges = edges_of(faces)
     return _components(len(faces), edges.face, edges.face[np.repeat(edges.starts, edges.n_uses)])
 
 
 def patches(faces: Ints) -> Labels:
-    """Patch (m,) of every face; the borders of patches are open edges and edges of more than two faces."""
+    """Return the patch (m,) of every face; patches are bounded by open edges and edges of more than two faces."""
     f, g, _ = _neighbours(faces)
     return _components(len(faces), f, g)
 
 
 def _neighbours(faces: Ints) -> tuple[Labels, Labels, Bools]:
-    """Pairs of faces (e,), (e,) across the edges of exactly two faces, and whether their orientations clash (e,)."""
+    """Return pairs of faces (e,), (e,) across the edges of exactly two faces, and whether orientations clash (e,)."""
     edges = edges_of(faces)
     first = edges.starts[edges.n_uses == 2]
     return edges.face[first], edges.face[first + 1], edges.is_upward[first] == edges.is_upward[first + 1]
 
 
 def oriented(faces: Ints) -> tuple[Ints, Bools]:
-    """Turn faces so that neighbours across sound edges agree: the faces (m, 3) and which were turned (m,).
+    """Return faces turned so that neighbours across regular edges agree, and which were turned (m,).
 
-    The majority of every patch stays as it is. Each face and its reverse are two nodes of a graph, linked to the
-    neighbour that agrees; the two sheets of that graph are the two orientations. A patch with one sheet only (a
-    Moebius strip) has none: there each face follows the majority of its neighbours, and some go on clashing.
+    The majority of every patch is kept. Each face and its reverse are two nodes of a graph, joined to the neighbour
+    with the same orientation. The two components of that graph are the two orientations. A patch with one component
+    only (a Moebius strip) has no orientation. There each face follows the majority of its neighbours, and some still
+    clash.
     """
     m = len(faces)
     f, g, is_clash = _neighbours(faces)
@@ -122,7 +123,7 @@ def oriented(faces: Ints) -> tuple[Ints, Bools]:
 
 
 def _settled(turned: Bools, f: Labels, g: Labels, is_clash: Bools) -> Bools:
-    """Turn faces that clash with most of their neighbours until there are none; of two neighbours one at a time."""
+    """Return which faces are turned after turning those that clash with most of their neighbours, until none does."""
     m = len(turned)
     degree = np.bincount(f, minlength=m) + np.bincount(g, minlength=m)
     while True:
@@ -137,7 +138,7 @@ def _settled(turned: Bools, f: Labels, g: Labels, is_clash: Bools) -> Bools:
 
 
 def clashing(faces: Ints) -> Bools:
-    """Tell for each face (m,) whether its orientation clashes with that of a neighbour."""
+    """Return for each face (m,) whether its orientation clashes with that of a neighbour."""
     f, g, is_clash = _neighbours(faces)
     result = np.zeros(len(faces), dtype=bool)
     result[f[is_clash]] = result[g[is_clash]] = True
@@ -145,7 +146,7 @@ def clashing(faces: Ints) -> Bools:
 
 
 def overused(faces: Ints) -> Bools:
-    """Tell for each face (m,) whether it shares an edge with two others or more."""
+    """Return for each face (m,) whether it shares an edge with two or more others."""
     edges = edges_of(faces)
     result = np.zeros(len(faces), dtype=bool)
     result[edges.face[np.repeat(edges.n_uses > 2, edges.n_uses)]] = True
@@ -153,10 +154,10 @@ def overused(faces: Ints) -> Bools:
 
 
 def inner_sheets(vertices: Floats, faces: Ints) -> Bools:
-    """Tell for each face (m,) whether it belongs to a sheet that hangs inside the surface.
+    """Return for each face (m,) whether it belongs to a sheet inside the surface, such as a fin or a membrane.
 
-    Where an odd number of patches meets along an edge, one of them is a fin or a membrane across the lumen. It is the
-    one of least area: a membrane is smaller than the wall that bulges over the same border.
+    Where an odd number of patches meets at an edge, one of them is inside. It is the one with the smallest area,
+    because a membrane is smaller than the wall that bulges over the same border.
     """
     edges, patch = edges_of(faces), patches(faces)
     area = np.bincount(patch, triangles.areas(vertices[faces]))
@@ -170,10 +171,10 @@ def inner_sheets(vertices: Floats, faces: Ints) -> Bools:
 
 
 def unzipped(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    """Give every fan of faces round a vertex a vertex of its own, so that the mesh is a manifold with boundary.
+    """Split vertices so that every fan of faces around a vertex has its own, and the mesh is a manifold with boundary.
 
-    Faces stay joined across edges that exactly two of them share. At an edge of more, the faces that bound the same
-    wedge of the inside stay joined and every other face is cut off. Faces must be oriented.
+    Faces stay joined across edges that exactly two of them share. At an edge of more faces, those that bound the same
+    wedge of the inside stay joined and all others are separated. Faces must be oriented.
     """
     m = len(faces)
     edges = edges_of(faces)
@@ -184,13 +185,13 @@ def unzipped(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
         a.append(pairs[:, 0])
         b.append(pairs[:, 1])
     use, other = np.concatenate(a), np.concatenate(b)
-    # corners are numbered corner * m + face; an agreeing neighbour runs the edge the other way round
+    # corners are numbered corner * m + face; a neighbour of equal orientation has the edge in opposite direction
     tail, head = edges.side * m + edges.face, (edges.side + 1) % 3 * m + edges.face
     agree = edges.is_upward[use] != edges.is_upward[other]
     use, other = use[agree], other[agree]
     label = _components(3 * m, np.concatenate([tail[use], head[use]]), np.concatenate([head[other], tail[other]]))
     _, where = np.unique(label, return_index=True)
-    number = faces.T.ravel()[where].astype(np.int64)  # the first fan of a vertex keeps its number, others are appended
+    number = faces.T.ravel()[where].astype(np.int64)  # the first fan keeps the vertex number, others are appended
     order = np.argsort(number, kind="stable")
     is_more = np.concatenate([[False], np.diff(number[order]) == 0])[: len(order)]
     more = order[is_more]
@@ -200,9 +201,9 @@ def unzipped(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
 
 
 def _wedges(vertices: Floats, faces: Ints, edges: Edges, uses: Labels) -> Labels:
-    """Pairs (k, 2) of uses of one edge that bound the same wedge of the inside.
+    """Return pairs (k, 2) of uses of one edge that bound the same wedge of the inside.
 
-    Going round the edge, the inside is entered through one face and left through the next one of opposite direction.
+    Around the edge, the inside begins at one face and ends at the next one of opposite direction.
     """
     face, side = edges.face[uses], edges.side[uses]
     up = edges.is_upward[uses]
@@ -215,18 +216,27 @@ def _wedges(vertices: Floats, faces: Ints, edges: Edges, uses: Labels) -> Labels
     angle = np.arctan2(apex @ np.cross(along, e1), apex @ e1)
     order = np.argsort(angle, kind="stable")
     following = np.roll(order, -1)
-    # seen along the edge, angles grow counter-clockwise; the outward normal of an upward face looks to larger angles,
-    # so the inside begins at a downward face and ends at the next upward one
+    # seen along the edge, angles increase counter-clockwise; the outward normal of an upward face points to larger
+    # angles, so that the inside begins at a downward face and ends at the next upward one
     is_wedge = ~up[order] & up[following]
     return np.stack([uses[order[is_wedge]], uses[following[is_wedge]]], axis=1)
 
 
 def least_area(polygon: Floats, is_taken: Bools) -> Ints | None:
-    """Triangles (n - 2, 3) of least total area over a closed polygon (n, 3), oriented as it runs.
+    """Return the triangulation (n - 2, 3) of a closed polygon with the smallest area; None if there is none.
 
-    Pairs of vertices that `is_taken` (n, n) get no chord; None where no triangulation is left.
+    The triangles have the direction of the polygon. The search is a dynamic programme over its chords.
 
-    Dynamic programming over its chords (Barequet and Sharir 1995, Comput. Aided Geom. Des. 12:207, section 3.2).
+    Parameters
+    ----------
+    polygon : (n, 3)
+        Closed polygon.
+    is_taken : (n, n) bool
+        Pairs of vertices between which no chord is allowed.
+
+    References
+    ----------
+    Barequet and Sharir 1995, Comput. Aided Geom. Des. 12:207, sec. 3.2.
     """
     n = len(polygon)
     cost, apex = np.zeros((n, n)), np.zeros((n, n), dtype=np.int32)

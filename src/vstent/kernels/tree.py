@@ -1,7 +1,8 @@
-"""Axis-aligned bounding-box tree over triangles: closest point, sign, crossing, first hit.
+"""Bounding-box tree over triangles: closest point, signed distance, crossings and first hit of a ray.
 
-Triangles are halved at the median along the longer side of their box down to leaves of `LEAF`; the leaves are the last
-level of a complete binary tree stored as a heap (children of node i: 2 i + 1 and 2 i + 2), so it holds no pointers.
+The triangles of a node are halved at the median along the longest side of their box, down to leaves of `LEAF`. The
+leaves are the last level of a complete binary tree stored as a heap without pointers: the children of node i are 2 i +
+1 and 2 i + 2.
 """
 
 from typing import Any, Final, NamedTuple
@@ -13,36 +14,39 @@ from vstent.kernels import triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 LEAF: Final = 1
-"""Triangles of a leaf. Boxes cost less than triangles: with 4 a closest point takes a quarter longer."""
+"""Number of triangles per leaf. Testing a box is cheaper than testing a triangle: with 4 a closest point takes a
+quarter longer."""
 _STACK: Final = 64
+"""Size of the stack of nodes to visit."""
 
 
 class Tree(NamedTuple):
-    """The tree as bare arrays."""
+    """The tree as arrays."""
 
     corners: Floats
     """(m, 3, 3) triangles in tree order."""
     face: Ints
-    """(m,) face number in the surface for every triangle in tree order."""
+    """(m,) face number in the surface of every triangle in tree order."""
     low: Floats
     """(nodes, 3) lower corner of every node's box."""
     high: Floats
     """(nodes, 3) upper corner of every node's box."""
     pseudonormal: Floats
-    """(m, 7, 3) normals of the face, its edges 01, 12, 20 and its corners 0, 1, 2."""
+    """(m, 7, 3) normals of each triangle's face, edges 01, 12, 20 and corners 0, 1, 2."""
 
 
 class Curved(NamedTuple):
-    """The tree over triangles that bulge: the smooth wall through their corners."""
+    """A tree over curved triangles: the smooth wall through the corners."""
 
     flat: Tree
-    """The tree over the flat triangles, with boxes that hold the bulges."""
+    """Tree over the flat triangles, whose boxes contain the curved ones."""
     rise: Floats
-    """(m, 3) of the edges 01, 12, 20 in tree order (n_b - n_a) (b - a): an edge bulges by t (1 - t) / 2 of it."""
+    """(m, 3) rise (n_b - n_a) (b - a) of the edges 01, 12, 20 in tree order. An edge bulges by t (1 - t) / 2 times its
+    rise."""
 
 
 def build(vertices: Floats, faces: Ints) -> Tree:
-    """Build the tree over triangles (m, 3) of vertices (n, 3)."""
+    """Return the tree over triangles (m, 3) of vertices (n, 3)."""
     corners = vertices[faces]
     order = _median_order(corners.mean(axis=1))
     corners = np.ascontiguousarray(corners[order])
@@ -53,10 +57,17 @@ def build(vertices: Floats, faces: Ints) -> Tree:
 
 
 def curved(tree: Tree, normals: Floats) -> Curved:
-    """Curve the faces of a tree by unit normals (m, 3, 3) at their corners.
+    """Return the tree with its triangles curved by normals at their corners.
 
-    Along an edge from a to b the quadratic with these normals at its ends rises t (1 - t) / 2 of (n_b - n_a) (b - a)
-    above it; over a triangle those of its edges add up.
+    Along an edge the quadratic with the normals of its ends rises by t (1 - t) / 2 times (n_b - n_a) (b - a). Inside a
+    triangle the contributions of the edges are added.
+
+    Parameters
+    ----------
+    tree : Tree
+        Tree over flat triangles.
+    normals : (m, 3, 3)
+        Unit normals at the corners of every face, in the order of the surface.
     """
     rise = triangles.edge_rises(tree.corners, normals[tree.face])
     low, high = _boxes(tree.corners, (len(tree.low) + 1) // 2, np.abs(rise).sum(axis=1) / 8)
@@ -65,7 +76,7 @@ def curved(tree: Tree, normals: Floats) -> Curved:
 
 @njit(cache=True)
 def _median_order(points: Any) -> Any:
-    """Order (m,) in which every node's triangles are one half of its parent's, split along the longer side."""
+    """Return the order (m,) in which each node's triangles are halved along the longest side."""
     n = len(points)
     order = np.arange(n).astype(np.int32)
     block = LEAF
@@ -82,6 +93,7 @@ def _median_order(points: Any) -> Any:
 
 @njit(cache=True)
 def _longest_side(points: Any, order: Any, start: int, end: int) -> int:
+    """Return the axis along which the points of a node extend furthest."""
     best, longest = 0, -1.0
     for k in range(3):
         low, high = np.inf, -np.inf
@@ -94,7 +106,7 @@ def _longest_side(points: Any, order: Any, start: int, end: int) -> int:
 
 @njit(cache=True)
 def _part(key: Any, order: Any, first: int, last: int, middle: int) -> None:
-    """Put the triangles of lesser key before `middle`, the others from it on (Hoare 1961, Algorithm 65: FIND)."""
+    """Reorder so that triangles of smaller key come before `middle` (Hoare 1961, Algorithm 65: FIND)."""
     while first < last:
         pivot = key[order[(first + last) // 2]]
         i, j = first, last
@@ -115,9 +127,9 @@ def _part(key: Any, order: Any, first: int, last: int, middle: int) -> None:
 
 @njit(cache=True)
 def _boxes(corners: Any, n_leaves: int, margin: Any) -> tuple[Any, Any]:
-    """Lower and upper corner (nodes, 3) of every node's box; without triangles it lies at infinity.
+    """Return the lower and upper corner (nodes, 3) of each node's box, with a margin (m,) around the triangles.
 
-    The boxes hold the triangles with a margin (m,) around each.
+    Boxes of nodes without triangles are at infinity.
     """
     low = np.full((2 * n_leaves - 1, 3), np.inf)
     high = np.full((2 * n_leaves - 1, 3), -np.inf)
@@ -133,13 +145,18 @@ def _boxes(corners: Any, n_leaves: int, margin: Any) -> tuple[Any, Any]:
             high[(node - 1) // 2, k] = max(high[(node - 1) // 2, k], high[node, k])
     for node in range(2 * n_leaves - 1):
         for k in range(3):
-            if low[node, k] == np.inf:  # a box from inf to -inf would be entered by every ray
+            if low[node, k] == np.inf:  # every ray would enter a box from inf to -inf
                 high[node, k] = np.inf
     return low, high
 
 
 def _pseudonormals(vertices: Floats, faces: Ints) -> Floats:
-    """Angle-weighted pseudonormals (Baerentzen and Aanaes 2005): their sign test is exact on closed surfaces."""
+    """Return angle-weighted pseudonormals (m, 7, 3), whose sign test is exact on closed surfaces.
+
+    References
+    ----------
+    Baerentzen and Aanaes 2005, IEEE TVCG 11(3).
+    """
     corners = vertices[faces]
     result = np.zeros((len(faces), 7, 3))
     result[:, 0] = triangles.normals(corners)
@@ -150,9 +167,9 @@ def _pseudonormals(vertices: Floats, faces: Ints) -> Floats:
 
 @njit(cache=True)
 def _add_edge_normals(faces: Any, n_vertices: int, result: Any) -> None:
-    """Write the sum of the normals of all faces at an edge into `result` (m, 7, 3), places 1 to 3.
+    """Write the sum of the normals of all faces at each edge into `result` (m, 7, 3), places 1 to 3.
 
-    The edges of a vertex to higher ones are kept in a list of its own, so that only a few are compared.
+    The edges from each vertex to higher ones are listed per vertex, so that only a few are compared.
     """
     m = len(faces)
     begin = np.zeros(n_vertices + 1, dtype=np.int64)
@@ -179,25 +196,25 @@ def _add_edge_normals(faces: Any, n_vertices: int, result: Any) -> None:
 
 
 def _plain(points: Floats) -> Floats:
-    """Points as one kind of array: numba compiles a kernel anew for arrays that may not be written."""
+    """Return points as a writable array: numba compiles separate code for read-only arrays."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     return points if points.flags.writeable else points.copy()
 
 
 def closest_points(tree: Tree, points: Floats) -> tuple[Floats, Floats, Ints]:
-    """Closest point (n, 3), distance (n,) and face (n,) for points (n, 3)."""
+    """Return the closest point (n, 3) of the surface, its distance (n,) and its face (n,) for points (n, 3)."""
     points = _plain(points)
     closest, distance, triangle, _ = _closest_all(tree.corners, tree.low, tree.high, points)
     return closest, distance, tree.face[triangle]
 
 
 def inscribed_radii(wall: Curved, points: Floats) -> Floats:
-    """Distance (n,) of points (n, 3) inside a wall to where it bulges to over its triangles."""
+    """Return the distance (n,) of points (n, 3) inside a wall to its curved triangles."""
     return _inscribed_all(wall.flat.corners, wall.rise, wall.flat.low, wall.flat.high, _plain(points))
 
 
 def signed_distances(tree: Tree, points: Floats) -> Floats:
-    """Distance (n,) of points (n, 3) to a closed surface, negative inside."""
+    """Return the distance (n,) of points (n, 3) to a closed surface, negative inside."""
     points = _plain(points)
     closest, distance, triangle, feature = _closest_all(tree.corners, tree.low, tree.high, points)
     normal = tree.pseudonormal[triangle, feature]
@@ -205,15 +222,20 @@ def signed_distances(tree: Tree, points: Floats) -> Floats:
 
 
 def segments_cross(tree: Tree, starts: Floats, ends: Floats) -> Bools:
-    """Tell for each segment, from starts (n, 3) to ends (n, 3), whether it meets a triangle."""
+    """Return for each segment, from starts (n, 3) to ends (n, 3), whether it meets a triangle."""
     starts = _plain(starts)
     return _first_hit_all(tree.corners, tree.low, tree.high, starts, ends - starts, 1.0)[0] <= 1.0
 
 
 def first_hits(tree: Tree, origins: Floats, directions: Floats) -> tuple[Floats, Ints]:
-    """Distance (n,) from origins (n, 3) along unit directions (n, 3) to the first triangle, and its face (n,).
+    """Return the distance (n,) to the first triangle along rays, inf where there is none, and its face (n,).
 
-    The distance is inf where there is none.
+    Parameters
+    ----------
+    tree : Tree
+        Tree over the triangles.
+    origins, directions : (n, 3)
+        Origins and unit directions of the rays.
     """
     origins, directions = _plain(origins), _plain(directions)
     distance, triangle = _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)
@@ -221,9 +243,10 @@ def first_hits(tree: Tree, origins: Floats, directions: Floats) -> tuple[Floats,
 
 
 def sees_inside(tree: Tree, origins: Floats, directions: Floats) -> Bools:
-    """Tell whether rays from origins (n, 3) along directions (n, 3) meet a closed surface from within.
+    """Return whether rays from origins (n, 3) along directions (n, 3) hit a closed surface from within.
 
-    Any ray of a point inside does. Where walls are all about as near, this is much faster than the nearest of them.
+    This is true for every ray of a point inside. Where all walls are about equally near, it is much faster than a
+    search for the closest point.
     """
     origins, directions = _plain(origins), _plain(directions)
     hit, triangle = _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)
@@ -232,6 +255,7 @@ def sees_inside(tree: Tree, origins: Floats, directions: Floats) -> Bools:
 
 @njit(cache=True)
 def _box_distance2(point: Any, low: Any, high: Any) -> float:
+    """Return the squared distance of a point from a box."""
     total = 0.0
     for k in range(3):
         gap = max(low[k] - point[k], 0.0, point[k] - high[k])
@@ -241,12 +265,13 @@ def _box_distance2(point: Any, low: Any, high: Any) -> float:
 
 @njit(cache=True)
 def _dot(a0: float, a1: float, a2: float, b0: float, b1: float, b2: float) -> float:
+    """Return the scalar product of two vectors given by components."""
     return a0 * b0 + a1 * b1 + a2 * b2
 
 
 @njit(cache=True)
 def _closest_on_longest_edge(t: Any, p: Any, ab_ab: float, ac_ac: float) -> tuple[float, float, int]:
-    """As `closest_on_triangle`, of a triangle whose corners lie on one line."""
+    """Return the result of `closest_on_triangle` for a triangle whose corners lie on one line."""
     bc_bc = 0.0
     for k in range(3):
         bc_bc += (t[2, k] - t[1, k]) ** 2
@@ -263,9 +288,20 @@ def _closest_on_longest_edge(t: Any, p: Any, ab_ab: float, ac_ac: float) -> tupl
 
 @njit(cache=True)
 def closest_on_triangle(p: Any, t: Any) -> tuple[float, float, int]:
-    """Barycentric weights (v, w) of the closest point a + v ab + w ac, and the feature it lies on.
+    """Return barycentric weights (v, w) of the closest point a + v ab + w ac, and the feature on which it lies.
 
-    Features: 0 face, 1 2 3 edges ab bc ca, 4 5 6 corners a b c (Ericson 2005, Real-Time Collision Detection, 5.1.5).
+    Features are 0 for the face, 1, 2, 3 for the edges ab, bc, ca, and 4, 5, 6 for the corners a, b, c.
+
+    Parameters
+    ----------
+    p : (3,)
+        Point.
+    t : (3, 3)
+        Corners a, b, c.
+
+    References
+    ----------
+    Ericson 2005, Real-Time Collision Detection, sec. 5.1.5.
     """
     ab0, ab1, ab2 = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     ac0, ac1, ac2 = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
@@ -280,7 +316,7 @@ def closest_on_triangle(p: Any, t: Any) -> tuple[float, float, int]:
     if d3 >= 0.0 and d4 <= d3:
         return 1.0, 0.0, 5
     vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0 and d1 > d3:  # d1 = d3: a and b are one point, the other edges decide
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0 and d1 > d3:  # d1 = d3: a and b coincide, the other edges decide
         return d1 / (d1 - d3), 0.0, 1
     cp0, cp1, cp2 = p[0] - t[2, 0], p[1] - t[2, 1], p[2] - t[2, 2]
     d5 = _dot(ab0, ab1, ab2, cp0, cp1, cp2)
@@ -296,13 +332,14 @@ def closest_on_triangle(p: Any, t: Any) -> tuple[float, float, int]:
         return 1.0 - w, w, 2
     total = va + vb + vc
     ab_ab, ac_ac = _dot(ab0, ab1, ab2, ab0, ab1, ab2), _dot(ac0, ac1, ac2, ac0, ac1, ac2)
-    if total <= 1e-13 * max(ab_ab, ac_ac) ** 2:  # no area but rounding: the longest edge is all of it
+    if total <= 1e-13 * max(ab_ab, ac_ac) ** 2:  # the area is zero within rounding: use the longest edge
         return _closest_on_longest_edge(t, p, ab_ab, ac_ac)
     return vb / total, vc / total, 0
 
 
 @njit(cache=True)
 def _closest_one(corners: Any, low: Any, high: Any, p: Any, best: Any) -> tuple[float, int, int]:
+    """Write the closest point into `best`; return its squared distance, triangle and feature."""
     first_leaf = low.shape[0] // 2
     stack = np.zeros(_STACK, dtype=np.int32)
     bound = np.zeros(_STACK)
@@ -341,6 +378,7 @@ def _closest_one(corners: Any, low: Any, high: Any, p: Any, best: Any) -> tuple[
 
 @njit(cache=True, parallel=True)
 def _closest_all(corners: Any, low: Any, high: Any, points: Any) -> tuple[Any, Any, Any, Any]:
+    """Return closest point, distance, triangle and feature for every point."""
     n = points.shape[0]
     closest = np.zeros((n, 3))
     distance = np.zeros(n)
@@ -354,6 +392,7 @@ def _closest_all(corners: Any, low: Any, high: Any, points: Any) -> tuple[Any, A
 
 @njit(cache=True)
 def _inscribed_one(corners: Any, rise: Any, low: Any, high: Any, p: Any) -> float:
+    """Return the distance of a point from the curved triangles."""
     first_leaf = low.shape[0] // 2
     stack = np.zeros(_STACK, dtype=np.int32)
     bound = np.zeros(_STACK)
@@ -390,6 +429,7 @@ def _inscribed_one(corners: Any, rise: Any, low: Any, high: Any, p: Any) -> floa
 
 @njit(cache=True, parallel=True)
 def _inscribed_all(corners: Any, rise: Any, low: Any, high: Any, points: Any) -> Any:
+    """Return the distance (n,) of every point from the curved triangles, at least 0."""
     radius = np.zeros(points.shape[0])
     for i in prange(points.shape[0]):
         radius[i] = max(_inscribed_one(corners, rise, low, high, points[i]), 0.0)
@@ -398,7 +438,7 @@ def _inscribed_all(corners: Any, rise: Any, low: Any, high: Any, points: Any) ->
 
 @njit(cache=True)
 def _entry(origin: Any, inverse: Any, low: Any, high: Any, node: int) -> float:
-    """Distance at which a ray enters a node's box, 0 from inside, inf where it misses."""
+    """Return the distance at which a ray enters a node's box, 0 from inside, inf where it misses."""
     near, far = 0.0, np.inf
     for k in range(3):
         t0 = (low[node, k] - origin[k]) * inverse[k]
@@ -414,7 +454,12 @@ def _entry(origin: Any, inverse: Any, low: Any, high: Any, node: int) -> float:
 
 @njit(cache=True)
 def ray_meets_triangle(o: Any, d: Any, t: Any) -> float:
-    """Parameter of the hit of the ray o + s d on a triangle, inf where it misses (Moeller and Trumbore 1997)."""
+    """Return the parameter s at which the ray o + s d hits a triangle (3, 3), inf where it misses.
+
+    References
+    ----------
+    Moeller and Trumbore 1997.
+    """
     e0, e1, e2 = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     f0, f1, f2 = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
     h0, h1, h2 = d[1] * f2 - d[2] * f1, d[2] * f0 - d[0] * f2, d[0] * f1 - d[1] * f0
@@ -425,7 +470,7 @@ def ray_meets_triangle(o: Any, d: Any, t: Any) -> float:
     u = (s0 * h0 + s1 * h1 + s2 * h2) / det
     q0, q1, q2 = s1 * e2 - s2 * e1, s2 * e0 - s0 * e2, s0 * e1 - s1 * e0
     v = (d[0] * q0 + d[1] * q1 + d[2] * q2) / det
-    # The slack closes the seams between neighbours: a ray through a shared edge must not slip out.
+    # The tolerance closes the seams between triangles: a ray through a shared edge must hit one of them.
     if u < -1e-12 or v < -1e-12 or u + v > 1.0 + 1e-12:
         return np.inf
     s = (f0 * q0 + f1 * q1 + f2 * q2) / det
@@ -434,6 +479,7 @@ def ray_meets_triangle(o: Any, d: Any, t: Any) -> float:
 
 @njit(cache=True)
 def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: Any, limit: float) -> tuple[float, int]:
+    """Return the parameter of a ray's first hit, inf where there is none, and the triangle."""
     first_leaf = low.shape[0] // 2
     inverse = np.zeros(3)
     for k in range(3):
@@ -444,7 +490,7 @@ def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: An
     while size > 0:
         size -= 1
         node = stack[size]
-        # A hit right at a box's face must not be lost to rounding: the boxes count as a hair nearer.
+        # A hit at the face of a box must not be lost by rounding: boxes count as slightly nearer.
         if entry[size] > min(best, limit) * (1.0 + 1e-12) + 1e-12:
             continue
         if node >= first_leaf:
@@ -470,6 +516,7 @@ def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: An
 
 @njit(cache=True, parallel=True)
 def _first_hit_all(corners: Any, low: Any, high: Any, origins: Any, directions: Any, limit: float) -> tuple[Any, Any]:
+    """Return the parameter of every ray's first hit, inf where there is none, and the triangle."""
     n = origins.shape[0]
     hit = np.full(n, np.inf)
     triangle = np.zeros(n, dtype=np.int32)

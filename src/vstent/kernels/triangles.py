@@ -1,4 +1,7 @@
-"""Triangle soups and meshes on bare arrays: areas, normals, volume, loops, caps."""
+"""Triangle meshes as arrays: areas, normals, volume, boundary loops, caps, cuts and connected components.
+
+Triangles are arrays of corners (m, 3, 3), or vertices (n, 3) and faces (m, 3).
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,22 +15,24 @@ from vstent.kernels.arrays import Floats, Ints
 
 
 def areas(corners: Floats) -> Floats:
-    """Areas (m,) of triangles (m, 3, 3)."""
+    """Return the areas (m,) of triangles (m, 3, 3)."""
     return 0.5 * np.linalg.norm(_crosses(corners), axis=1)
 
 
 def normals(corners: Floats) -> Floats:
-    """Unit normals (m, 3) of triangles (m, 3, 3); zero where degenerate."""
+    """Return the unit normals (m, 3) of triangles (m, 3, 3); zero for degenerate ones."""
     cross = _crosses(corners)
     return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
 
 
 def _crosses(corners: Floats) -> Floats:
+    """Return the cross product (m, 3) of two edges of each triangle."""
     return _cross_all(np.ascontiguousarray(corners, dtype=np.float64))
 
 
 @njit(cache=True)
 def _cross_all(corners: Any) -> Any:
+    """Return the cross product (m, 3) of two edges of each triangle."""
     cross = np.zeros((len(corners), 3))
     for f in range(len(corners)):
         a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
@@ -38,13 +43,18 @@ def _cross_all(corners: Any) -> Any:
 
 
 def volume(corners: Floats) -> float:
-    """Enclosed volume of a closed surface of triangles (m, 3, 3), by the divergence theorem about its centroid."""
+    """Return the volume enclosed by a closed surface of triangles (m, 3, 3), by the divergence theorem."""
     local = corners - corners.reshape(-1, 3).mean(axis=0)
     return float(np.einsum("ij,ij->", local[:, 0], np.cross(local[:, 1], local[:, 2])) / 6)
 
 
 def vertex_normals(vertices: Floats, faces: Ints) -> Floats:
-    """Angle-weighted unit normals (n, 3) (Baerentzen and Aanaes 2005, IEEE TVCG 11(3), eq. 5)."""
+    """Return unit normals (n, 3) at the vertices, weighted by the angles of the triangles.
+
+    References
+    ----------
+    Baerentzen and Aanaes 2005, IEEE TVCG 11(3), eq. 5.
+    """
     corners = np.ascontiguousarray(vertices[faces], dtype=np.float64)
     total = _angle_weighted(corners, np.ascontiguousarray(faces), normals(corners), len(vertices))
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
@@ -52,6 +62,7 @@ def vertex_normals(vertices: Floats, faces: Ints) -> Floats:
 
 @njit(cache=True)
 def _angle_weighted(corners: Any, faces: Any, normal: Any, n_vertices: int) -> Any:
+    """Return the sum (n, 3) of face normals at each vertex, weighted by angle."""
     total = np.zeros((n_vertices, 3))
     for f in range(len(faces)):
         for k in range(3):
@@ -66,9 +77,13 @@ def _angle_weighted(corners: Any, faces: Any, normal: Any, n_vertices: int) -> A
 
 
 def smooth_normals(vertices: Floats, faces: Ints) -> Floats:
-    """Unit normals (n, 3) of the smooth surface that a mesh samples (Max 1999, J. Graph. Tools 4(2):1, eq. 2).
+    """Return unit normals (n, 3) of the smooth surface that a mesh samples.
 
-    Exact where the vertices lie on a sphere, and a third-order surface is met better than by angle weights.
+    They are exact for vertices on a sphere, and more accurate on a third-order surface than angle-weighted normals.
+
+    References
+    ----------
+    Max 1999, J. Graph. Tools 4(2):1, eq. 2.
     """
     total = _max_weighted(np.ascontiguousarray(vertices[faces], dtype=np.float64), faces, len(vertices))
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
@@ -76,6 +91,7 @@ def smooth_normals(vertices: Floats, faces: Ints) -> Floats:
 
 @njit(cache=True)
 def _max_weighted(corners: Any, faces: Any, n_vertices: int) -> Any:
+    """Return the sum (n, 3) of face normals at each vertex with the weights of Max 1999."""
     total = np.zeros((n_vertices, 3))
     for f in range(len(faces)):
         for k in range(3):
@@ -92,7 +108,7 @@ def _max_weighted(corners: Any, faces: Any, n_vertices: int) -> Any:
 
 
 def barycentric(corners: Floats, points: Floats) -> Floats:
-    """Weights (n, 3) of the corners (n, 3, 3) of one triangle for each of (n, 3) points in it."""
+    """Return barycentric weights (n, 3) of points (n, 3), each in its own triangle (n, 3, 3)."""
     first, second, offset = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
     aa, ab, bb, ra, rb = (
         np.einsum("ij,ij->i", u, v)
@@ -104,12 +120,12 @@ def barycentric(corners: Floats, points: Floats) -> Floats:
 
 
 def directed_edges(faces: Ints) -> Ints:
-    """All directed edges (3 m, 2), in the order (01 of all faces, 12 of all, 20 of all)."""
+    """Return all directed edges (3 m, 2): 01 of all faces, then 12 of all, then 20 of all."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def open_edges(faces: Ints) -> Ints:
-    """Directed edges (k, 2) that belong to one face only."""
+    """Return the directed edges (k, 2) that belong to a single face."""
     edges = directed_edges(faces)
     low, high = np.sort(edges, axis=1).astype(np.int64).T
     _, inverse, count = np.unique(low * (high.max(initial=0) + 1) + high, return_inverse=True, return_counts=True)
@@ -117,10 +133,10 @@ def open_edges(faces: Ints) -> Ints:
 
 
 def boundary_loops(vertices: Floats, faces: Ints) -> tuple[Ints, ...]:
-    """Closed loops of vertex indices along the open edges, longest perimeter first.
+    """Return the closed loops of vertex numbers along open edges, longest perimeter first.
 
-    Each loop runs with the faces beside it (so the hole's cap runs against it). Loops that touch in a vertex are
-    taken apart where they touch.
+    Each loop has the direction of the faces next to it, opposite to that of a cap. Loops that touch at a vertex are
+    separated there.
     """
     following: dict[int, list[int]] = {}
     for a, b in open_edges(faces).tolist():
@@ -133,6 +149,7 @@ def boundary_loops(vertices: Floats, faces: Ints) -> tuple[Ints, ...]:
 
 
 def _walk(following: dict[int, list[int]]) -> list[list[int]]:
+    """Return the loops on one walk along open edges, which are removed from `following`."""
     path = [next(iter(following))]
     closed: list[list[int]] = []
     while path and path[-1] in following:
@@ -150,18 +167,18 @@ def _walk(following: dict[int, list[int]]) -> list[list[int]]:
 
 
 def perimeter(points: Floats) -> float:
-    """Length of the closed polygon through (n, 3) points."""
+    """Return the length of the closed polygon through points (n, 3)."""
     return float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
 
 
 def polygon_area_vector(points: Floats) -> Floats:
-    """Vector area (3,) of the closed polygon through (n, 3) points (Newell): its length is the area if flat."""
+    """Return the area vector (3,) of a closed polygon (n, 3), by Newell's method; its length is the area if flat."""
     local = points - points.mean(axis=0)
     return 0.5 * np.cross(local, np.roll(local, -1, axis=0)).sum(axis=0)
 
 
 def polygon_centroid(points: Floats) -> Floats:
-    """Area centroid (3,) of a nearly flat closed polygon (n, 3)."""
+    """Return the area centroid (3,) of a nearly flat closed polygon (n, 3)."""
     mean = points.mean(axis=0)
     local = points - mean
     unit = polygon_area_vector(points)
@@ -174,7 +191,7 @@ def polygon_centroid(points: Floats) -> Floats:
 
 
 def cap(vertices: Floats, faces: Ints, loops: Sequence[Ints]) -> tuple[Floats, Ints]:
-    """Close `loops` with fans about their centroids: vertices and faces of the closed mesh."""
+    """Return vertices and faces of a mesh whose `loops` are closed by fans around their centroids."""
     new_vertices, new_faces = [vertices], [faces]
     for k, loop in enumerate(loops):
         center = len(vertices) + k
@@ -184,15 +201,29 @@ def cap(vertices: Floats, faces: Ints, loops: Sequence[Ints]) -> tuple[Floats, I
 
 
 def compact(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    """Drop the vertices that no face uses."""
+    """Return vertices and faces without the vertices that no face uses."""
     used, inverse = np.unique(faces, return_inverse=True)
     return vertices[used], inverse.reshape(faces.shape).astype(np.int32)
 
 
 def clip(vertices: Floats, faces: Ints, level: Floats) -> tuple[Floats, Ints, Floats]:
-    """Keep the part of a mesh where `level` (n,) per vertex is negative, cutting faces along level 0 (linear on edges).
+    """Return the part of a mesh where `level` is negative; faces are cut along level 0.
 
-    Returns vertices (k, 3), faces (j, 3) and the level at the new vertices (k,); neighbours share the cut vertices.
+    Parameters
+    ----------
+    vertices, faces : (n, 3), (m, 3)
+        The mesh.
+    level : (n,)
+        Value at every vertex, linear along edges.
+
+    Returns
+    -------
+    vertices : (k, 3)
+        Vertices; faces next to each other share those of the cut.
+    faces : (j, 3)
+        Faces.
+    level : (k,)
+        Level at these vertices.
     """
     level = np.where(np.abs(level) < 1e-12, 1e-12, level)
     inside = level < 0
@@ -225,18 +256,18 @@ def clip(vertices: Floats, faces: Ints, level: Floats) -> tuple[Floats, Ints, Fl
 
 
 def components(faces: Ints, n_vertices: int) -> Ints:
-    """Connected-component number (m,) of every face, through shared vertices."""
+    """Return the number (m,) of each face's connected component; faces are connected by shared vertices."""
     return joined(directed_edges(faces), n_vertices)[faces[:, 0]]
 
 
 def joined(pairs: Ints, n: int) -> Ints:
-    """Connected-component number (n,) of every one of n things of which pairs (k, 2) hang together."""
+    """Return the number (n,) of each item's connected component, given connected pairs (k, 2) of n items."""
     graph = coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)[1].astype(np.int32)
 
 
 def face_neighbours(faces: Ints) -> Ints:
-    """Pairs (k, 2) of faces that share an edge (an edge of more than two faces pairs them in a chain)."""
+    """Return pairs (k, 2) of faces that share an edge; more than two faces at an edge are paired in a chain."""
     edges = np.sort(directed_edges(faces), axis=1).astype(np.int64)
     key = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
     order = np.argsort(key, kind="stable")
@@ -246,10 +277,18 @@ def face_neighbours(faces: Ints) -> Ints:
 
 
 def sample(vertices: Floats, faces: Ints, most: int = 30_000, coarsest: float = 0.4) -> tuple[Floats, Floats]:
-    """Evenly spread points (k, 3) of a surface and its normals (k, 3) there.
+    """Return evenly spaced points (k, 3) on a surface and its normals (k, 3) there.
 
-    The spacing is `coarsest`, or less where that makes fewer than `most` points, or more where it makes more. Every
-    point is a vertex or lies on a face; one is kept per cube of the spacing.
+    Every point is a vertex or lies on a face; one is kept per cube of the spacing.
+
+    Parameters
+    ----------
+    vertices, faces : (n, 3), (m, 3)
+        The surface.
+    most : int
+        Approximate maximum number of points; it limits how small the spacing is.
+    coarsest : float
+        Spacing wanted; limited to between one and two times the spacing at which there are `most` points.
     """
     corners = vertices[faces]
     even = float(np.sqrt(areas(corners).sum() / most))
@@ -271,28 +310,29 @@ def sample(vertices: Floats, faces: Ints, most: int = 30_000, coarsest: float = 
 
 
 def part_at(vertices: Floats, faces: Ints, point: Floats) -> tuple[Floats, Ints]:
-    """Vertices and faces of the connected part whose faces come nearest to `point` (3,)."""
+    """Return vertices and faces of the connected part with the face nearest to `point` (3,)."""
     return compact(vertices, faces_at(vertices, faces, point))
 
 
 def faces_at(vertices: Floats, faces: Ints, point: Floats) -> Ints:
-    """Faces (k, 3) of the connected part whose faces come nearest to `point` (3,)."""
+    """Return the faces (k, 3) of the connected part with the face nearest to `point` (3,)."""
     nearest = np.argmin(np.linalg.norm(vertices[faces].mean(axis=1) - point, axis=1))
     label = components(faces, len(vertices))
     return faces[label == label[nearest]]
 
 
 def largest_part(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    """Vertices and faces of the connected part of largest area."""
+    """Return vertices and faces of the connected part with the largest area."""
     label = components(faces, len(vertices))
     area = np.bincount(label, areas(vertices[faces]))
     return compact(vertices, faces[label == np.argmax(area)])
 
 
 def edge_rises(corners: Floats, normals: Floats) -> Floats:
-    """Rise (m, 3) of the edges 01, 12, 20 of triangles (m, 3, 3) with unit normals at their corners.
+    """Return the rise (m, 3) of the edges 01, 12, 20 of triangles (m, 3, 3) with unit normals at their corners.
 
-    From a to b it is (n_b - n_a) (b - a); the edge of the smooth surface bulges by t (1 - t) / 2 of it.
+    From a to b it is (n_b - n_a) (b - a). At fraction t the edge of the smooth surface bulges by t (1 - t) / 2 times
+    the rise.
     """
     ahead = [1, 2, 0]
     return np.ascontiguousarray(np.einsum("fkd,fkd->fk", normals[:, ahead] - normals, corners[:, ahead] - corners))

@@ -1,4 +1,4 @@
-"""Which grid cells lie inside a closed triangle mesh, and where each one stands in a list."""
+"""Grid cells inside a closed triangle mesh, and their numbers."""
 
 from typing import Any
 
@@ -10,10 +10,10 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 
 
 def fill(corners: Floats, shape: tuple[int, int, int]) -> Bools:
-    """Tell for every point of the integer grid `shape` whether it is inside closed triangles (m, 3, 3).
+    """Return for every point of the integer grid `shape` whether it is inside closed triangles (m, 3, 3).
 
-    The winding number along grid lines, found along each of the three axes; two of three decide, so that a crack or a
-    doubled face of a dirty mesh does not draw a line of wrong cells through the vessel.
+    The winding number is found along grid lines of all three axes, and the majority decides. A crack or a doubled face
+    of a faulty mesh therefore does not leave a line of wrong cells.
     """
     votes = np.zeros(shape, dtype=np.int8)
     for axis in range(3):
@@ -26,7 +26,7 @@ def fill(corners: Floats, shape: tuple[int, int, int]) -> Bools:
 
 @njit(cache=True)
 def _is_left(ax: float, ay: float, bx: float, by: float, px: float, py: float) -> bool:
-    """Tell whether p lies left of a -> b; exactly the opposite for b -> a, so no line slips between two faces."""
+    """Return whether p lies left of a -> b; exactly the opposite for b -> a, so that no line passes between faces."""
     if (bx, by) < (ax, ay):
         return not ((ax - bx) * (py - by) - (ay - by) * (px - bx) > 0.0)
     return (bx - ax) * (py - ay) - (by - ay) * (px - ax) > 0.0
@@ -34,7 +34,7 @@ def _is_left(ax: float, ay: float, bx: float, by: float, px: float, py: float) -
 
 @njit(cache=True)
 def _mark_crossings(corners: Any, change: Any) -> None:
-    """Add +1 where a grid line along axis 0 enters the mesh, -1 where it leaves, at the first grid point behind."""
+    """Add +1 where a grid line along axis 0 enters the mesh and -1 where it leaves, at the next grid point."""
     n0, n1, n2 = change.shape
     for m in range(len(corners)):
         t = corners[m]
@@ -57,7 +57,10 @@ def _mark_crossings(corners: Any, change: Any) -> None:
 
 
 def dilate(mask: Bools, offsets: NDArray[Any]) -> Bools:
-    """Every cell of `mask` and its neighbours at the integer `offsets` (k, 3); the mask must not touch its border."""
+    """Return all cells of `mask` and their neighbours at the integer `offsets` (k, 3).
+
+    The mask must not touch the border of its grid.
+    """
     result = mask.copy()
     for offset in offsets:
         result |= np.roll(mask, tuple(int(o) for o in offset), axis=(0, 1, 2))
@@ -65,7 +68,7 @@ def dilate(mask: Bools, offsets: NDArray[Any]) -> Bools:
 
 
 def index_of(cells: Ints) -> Ints:
-    """Number of the cell at every grid point (i, j, k), -1 outside, from coordinates (n, 3)."""
+    """Return the number of the cell at every grid point (i, j, k), -1 outside, from cell coordinates (n, 3)."""
     index = np.full(cells.max(axis=0) + 2, -1, dtype=np.int32)
     index[tuple(cells.T)] = np.arange(len(cells), dtype=np.int32)
     return index

@@ -1,4 +1,4 @@
-"""Compile the shared kernels ahead of their first use, in the set-up: all that take time to compile."""
+"""Compile the shared kernels that take time to compile, ahead of their first use."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from vstent.kernels import coverage, curves, medial, net, raster, sampling, tree
 
 
 def warm() -> None:
-    """Call every kernel once on next to nothing, numba keeps what it compiles."""
+    """Call every kernel once with very small arrays; numba keeps the compiled code."""
     row, column = np.meshgrid(np.arange(3.0), np.arange(4.0), indexing="ij")
     nodes = np.stack([np.cos(np.pi / 2 * column), np.sin(np.pi / 2 * column), row], axis=-1)
     _sample()
@@ -20,7 +20,7 @@ def warm() -> None:
 
 
 def _search() -> None:
-    """Ask a triangle what an artery is asked; a surface's faces may not be written."""
+    """Call the searches on a triangle; the faces of a surface are read-only arrays."""
     vertices, faces = np.eye(3), np.array([[0, 1, 2]], dtype=np.int32)
     faces.setflags(write=False)
     tiny = tree.build(vertices, faces)
@@ -30,7 +30,7 @@ def _search() -> None:
 
 
 def _paint() -> None:
-    """Paint a triangle and a wire, as the pictures of a report are."""
+    """Paint a triangle and a wire with the kernels that draw a report's pictures."""
     screen, faces = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]), np.array([[0, 1, 2]], dtype=np.int32)
     faces.setflags(write=False)
     depth, image, sums = np.full((2, 2), np.inf), np.zeros((2, 2, 3)), np.zeros((2, 2, 4))
@@ -41,6 +41,7 @@ def _paint() -> None:
 
 
 def _slide(nodes_mm: np.ndarray) -> None:
+    """Slide the crossings of a tiny net once."""
     line, column = np.array([0, 0, 1, 1, 2, 2]), np.array([0, 2, 1, 3, 0, 2])
     ends = np.array([[0, 1, 2, 3], [2, 3, 5, 4]])
     around_mm = 0.5 * (np.roll(nodes_mm, -1, axis=1) - np.roll(nodes_mm, 1, axis=1))
@@ -52,7 +53,7 @@ def _slide(nodes_mm: np.ndarray) -> None:
 
 
 def _sample() -> None:
-    """Read a field on a grid of one cell."""
+    """Interpolate a field on a grid of one cell."""
     index, numbers, points = np.zeros((2, 2, 2), np.int32), np.zeros(1), np.zeros((0, 3))
     sampling.interpolate_cubic(index, np.zeros((1, 3)), points)
     sampling.fit_wall(index, numbers, np.zeros((1, 3)), numbers, points, points, 1)

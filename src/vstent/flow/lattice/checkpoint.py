@@ -1,4 +1,4 @@
-"""A lattice-Boltzmann run as arrays, and going on from them as if it had never stopped."""
+"""Save a lattice-Boltzmann run as arrays, and resume it with the same result as without an interruption."""
 
 from collections import deque
 from collections.abc import Collection, Iterator
@@ -15,7 +15,7 @@ from vstent.flow.lattice.stepping import build, take_pace
 
 
 def pack(state: State) -> Saved:
-    """All of a run that its case and grid do not say."""
+    """Return the arrays of a run that cannot be rebuilt from its case and grid."""
     if state.device is not None:
         state.device.fetch(state)
     return {
@@ -36,7 +36,7 @@ def pack(state: State) -> Saved:
 
 
 def _columns(name: str, snapshots: Collection[Snapshot], cells: int) -> Saved:
-    """Snapshots as arrays of this name."""
+    """Return snapshots as arrays whose keys start with `name`."""
     count = len(snapshots)
     return {
         f"{name} step_s": np.array([one.scales.step_s for one in snapshots]),
@@ -49,7 +49,7 @@ def _columns(name: str, snapshots: Collection[Snapshot], cells: int) -> Saved:
 
 
 def _snapshots(name: str, saved: Saved, scales: Scales) -> Iterator[Snapshot]:
-    """The snapshots saved by this name."""
+    """Yield the snapshots that were saved under `name`."""
     columns = (saved[f"{name} {what}"] for what in ("step_s", "velocity", "density", "outflow", "checks"))
     speeds = iter(saved[f"{name} speed"])
     for step_s, velocity, density, outflow, checks in zip(*columns, strict=True):
@@ -58,7 +58,19 @@ def _snapshots(name: str, saved: Saved, scales: Scales) -> Iterator[Snapshot]:
 
 
 def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp | None) -> State:
-    """Build the run of a case anew and put it where it was."""
+    """Rebuild a run from its case and the saved arrays.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case.
+    cell_size_mm : float
+        Grid spacing.
+    saved : dict of arrays
+        Result of `pack`.
+    close_up : CloseUp or None
+        Refined region and the flow around it.
+    """
     check_s, kept = float(saved["check_s"]), int(saved["kept"])
     state = build(case, cell_size_mm, check_s, saved["pace"], close_up=close_up, start=None, kept=kept)
     state.history = list(saved["history"])

@@ -1,9 +1,10 @@
-"""The close-up: fine cells in the sac and about its neck alone, in a flow computed on wider cells all over.
+"""Refined region: a finer grid in and near the sac, inside a flow computed on a coarser grid in the whole vessel.
 
-What a device does to an aneurysm it does at the neck; the artery before it needs no finer cells than its own profile
-asks for. So the whole vessel is computed on wide cells, and the sac with a stretch of artery on fine ones, which take
-their flow and pressure from the wide ones where they end (one-way nesting; Davies 1976, Q. J. R. Meteorol. Soc. 102,
-405). What enters and leaves is exact: through every cut passes what the openings beyond it take or give.
+A stent changes the flow at the neck, whereas the artery upstream needs no finer grid than its velocity profile. The
+whole vessel is therefore computed on a coarser grid first. The sac and a piece of the artery are then computed on the
+fine grid, with velocity and pressure of the coarser flow at the cuts where the region ends (one-way nesting; Davies
+1976, Q. J. R. Meteorol. Soc. 102, 405). The flow rate through every cut is exact: it equals that of the openings beyond
+it.
 """
 
 from collections.abc import Sequence
@@ -34,53 +35,60 @@ UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 3.0, 1.0
 """Extent of the refined region from the sac towards the inlet and the outlets, in mean diameters 4 V / A of the vessel.
 The flow into the sac forms upstream: with one diameter the demo's neck inflow is 9 % too low, with two 2.4 %."""
 STRETCH = 4 / 3
-"""Ratio of the time step of a steady flow in the refined region to that in a whole vessel, where it would be too long
-(a fork lost 0.3 % of its blood). The flow through the ends of the region is imposed. The means of C0038's sac and neck,
-bare and with Silk and Enterprise, change by at most 0.4 % with shorter steps, the demo's by 0.5 %. In a pulse the ratio
-is 1: with longer steps C0038 diverged at 0.2 mm."""
+"""Ratio of the time step of a steady flow in the refined region to that in a whole vessel. Longer steps are possible
+because the flow rates at the ends of the region are imposed; in a whole vessel they would lose flow (0.3 % in a
+bifurcation). With shorter steps the means of C0038's sac and neck, bare and with Silk and Enterprise, change by at most
+0.4 %, the demo's by 0.5 %. In a pulse the ratio is 1: with longer steps C0038 diverged at 0.2 mm."""
 SHARE_WITHIN = 1 / 6
-"""Largest fraction of a steady flow's time steps that the refined region may take: it starts from the coarser flow, and
-of an unsteady flow, which needs the most steps, only the last checks are averaged (`settling.LATEST`)."""
+"""Maximum fraction of a steady flow's time steps that the refined region may take. It is small because the region
+starts from the coarser flow. An unsteady flow needs the most steps, but only its last checks are averaged
+(`settling.LATEST`)."""
 SHARE_AROUND = 1 / 2
-"""Part of them that what surrounds it makes at most: the sac is computed anew."""
+"""Maximum fraction of a steady flow's time steps that the coarser flow may take; the sac is computed again
+afterwards."""
 RIM_CELLS = 4
-"""Wide cells at the rim of the close-up where the wall's stress is still taken from the wide ones."""
+"""Width in coarse cells of the rim of the refined region where the wall shear stress is taken from the coarser flow."""
 
 
 @dataclass(frozen=True, eq=False)
 class CloseUp:
-    """A part of the vessel to be computed on finer cells, in the flow that surrounds it."""
+    """A part of the vessel to be computed on a finer grid, and the flow around it.
+
+    The rest of the vessel falls into *parts*: connected pieces, each joined to the region at a cut.
+    """
 
     outer: FlowField
-    """The flow all over, on wide cells."""
+    """Flow in the whole vessel on the coarser grid."""
     depth_mm: Floats
-    """(n,) way through the blood from each of its cells out of the close-up."""
+    """(n,) distance, through the blood, from each coarse cell to the outside of the region."""
     part: Ints
-    """(n,) part of the vessel beyond, by the cut that leads there; -1 within the close-up."""
+    """(n,) part of the vessel in which each coarse cell lies; -1 within the region."""
     part_of_opening: Ints
-    """(k,) the part that ends at each opening; -1 where that is within."""
+    """(k,) part in which each opening lies; -1 within the region."""
 
     @cached_property
     def inflow_mL_s(self) -> Floats:
-        """(p,) flow from each part into the close-up."""
+        """Return the flow rate (p,) from each part into the region."""
         through_mL_s = np.r_[self.outer.inlets_mL_s, -self.outer.outlets_mL_s]
         leads_out = self.part_of_opening >= 0
         return np.bincount(self.part_of_opening[leads_out], through_mL_s[leads_out]).astype(np.float64)
 
     def at_phase(self, phase: Phase) -> "CloseUp":
-        """The same in the flow at a moment of the cycle."""
+        """Return the same region with the surrounding flow at one phase of the cycle."""
         return replace(self, outer=self.outer.at_phase(phase))
 
     @cached_property
     def _tree_beyond(self) -> tuple[cKDTree, Ints]:
+        """Return a search tree over the coarse cells outside the region, and the part (n,) of each."""
         beyond = np.flatnonzero(self.part >= 0)
         return cKDTree(self.outer.centers_mm[beyond]), self.part[beyond]
 
     @cached_property
     def _sharpened_m_s(self) -> Floats:
-        """Velocity (n, 3) of the outer cells, linear between which the velocity is right in the mean.
+        """Return the velocity (n, 3) of the coarse cells, corrected so that linear interpolation has no mean error.
 
-        Linear interpolation is short by h^2 t (1 - t) / 2 of the second derivative, a twelfth of h^2 in the mean.
+        The error of linear interpolation is h^2 t (1 - t) / 2 times the second derivative, on average h^2 / 12 times
+        it.
         """
         outer = self.outer
         speed, curve = outer.velocity_m_s, np.zeros((len(outer.cells), 3))
@@ -91,12 +99,22 @@ class CloseUp:
         return np.asarray(speed - curve / 12)
 
     def part_at(self, points_mm: Floats) -> Ints:
-        """Part (m,) of the vessel beyond that points (m, 3) lie in."""
+        """Return the part (m,) of the vessel in which points (m, 3) outside the region lie."""
         tree, part = self._tree_beyond
         return np.asarray(part[tree.query(points_mm)[1]])
 
     def velocity_m_s(self, points_mm: Floats, surface: Surface) -> Floats:
-        """Velocity (m, 3) of the outer flow at points (m, 3): beside the wall, its ratio to the wall's distance."""
+        """Return the velocity (m, 3) of the surrounding flow at points (m, 3).
+
+        Next to the wall the ratio of velocity to wall distance is interpolated instead of the velocity.
+
+        Parameters
+        ----------
+        points_mm : (m, 3)
+            Points.
+        surface : Surface
+            Wall of the vessel, with the extensions of its openings.
+        """
         outer = self.outer
         cells, weights = lattice_sampling.stencils(outer.index, (points_mm - outer.origin_mm) / outer.cell_size_mm)
         share = np.where(cells >= 0, weights, 0.0)
@@ -112,12 +130,12 @@ class CloseUp:
 
 
 def require_sac(case: FlowCase) -> Surface:
-    """Return the sac that a close-up is of.
+    """Return the sac of a case, around which the grid is refined.
 
     Raises
     ------
     FlowError
-        When there is none.
+        When the vessel has no sac.
     """
     if case.sac is None:
         raise FlowError(
@@ -127,12 +145,19 @@ def require_sac(case: FlowCase) -> Surface:
 
 
 def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
-    """Choose the close-up of a case's sac in a flow on wide cells, and find what flows into it from where.
+    """Choose the refined region of a case and determine the flow rate through each of its cuts.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case.
+    outer : FlowField
+        Flow in the whole vessel on the coarser grid.
 
     Raises
     ------
     FlowError
-        When the case has no sac.
+        When the vessel has no sac.
     """
     surface, _, sections = domains.extend(case.vessel)
     graph = _neighbours(outer, surface)
@@ -151,12 +176,12 @@ def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
 
 
 def volume_mm3(case: FlowCase) -> float:
-    """Foretell the volume of a case's close-up: its sac, and a stretch of mean artery; some 15 % too much.
+    """Estimate the volume of a case's refined region, the sac and a piece of the artery; it is about 15 % too high.
 
     Raises
     ------
     FlowError
-        When the case has no sac.
+        When the vessel has no sac.
     """
     sac, diameter_mm = require_sac(case), domains.mean_diameter_mm(case.vessel)
     neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
@@ -165,15 +190,12 @@ def volume_mm3(case: FlowCase) -> float:
 
 
 def _cells_at_ends(outer: FlowField, sections: Sequence[Floats]) -> Ints:
-    """Cell (k,) at the end of every opening's extension, of which these are the polygons."""
+    """Return the coarse cell (k,) at the end of every opening's extension, given its end polygon."""
     return np.asarray(cKDTree(outer.centers_mm).query([section.mean(axis=0) for section in sections])[1])
 
 
 def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints) -> Ints:
-    """Parts (n,) that cells beyond fall into, -1 for those within.
-
-    A recess that leads to none of the `ends` (k,) is no part beyond.
-    """
+    """Return the part (n,) of each cell beyond the region, -1 within; a recess that leads to no end is not a part."""
     beyond = np.flatnonzero(is_beyond)
     part = np.full(len(is_beyond), -1, dtype=np.int32)
     part[beyond] = connected_components(graph[beyond][:, beyond], directed=False)[1]
@@ -182,10 +204,10 @@ def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints) -> Ints:
 
 
 def _neighbours(field: FlowField, surface: Surface) -> csr_matrix:
-    """Way between neighbouring cells that no wall of the blood's surface parts, mm."""
+    """Return the distances, mm, between neighbouring cells that are not separated by the wall."""
     neighbour = domains.neighbours(field.index, field.cells)
     is_open = neighbour >= 0
-    is_open[:, 0::2] = False  # every pair once
+    is_open[:, 0::2] = False  # count every pair once
     is_open[domains.septa(surface, neighbour, field.cells, field.origin_mm, field.cell_size_mm)] = False
     cell, direction = np.nonzero(is_open)
     length_mm = field.cell_size_mm * np.linalg.norm(VELOCITIES, axis=1)[direction]
@@ -194,9 +216,19 @@ def _neighbours(field: FlowField, surface: Surface) -> csr_matrix:
 
 
 def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:
-    """Put the blood of a close-up on a grid; links that lead beyond it have the patch of their part.
+    """Return the fine grid of a refined region.
 
-    The patch of part p is p + 1 more than the last opening's.
+    Links that leave the region through a cut have the patch number of their part: part p has the last opening's patch
+    number plus p + 1.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case.
+    cell_size_mm : float
+        Fine grid spacing.
+    chosen : CloseUp
+        The refined region.
     """
     grid = domains.build(case.vessel, cell_size_mm, _window(chosen, cell_size_mm))
     leads_beyond = grid.link_patch == BEYOND
@@ -208,7 +240,7 @@ def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:
 
 
 def _window(chosen: CloseUp, cell_size_mm: float) -> Window:
-    """Fine cells where a wide one lies within the close-up, or beside one but in no blood, as at the wall."""
+    """Return the fine grid points in coarse cells within the region, or next to one at the wall."""
     outer = chosen.outer
     inner = outer.cells[chosen.part < 0]
     low = inner.min(axis=0) - 2
@@ -225,19 +257,19 @@ def _window(chosen: CloseUp, cell_size_mm: float) -> Window:
 
 
 class _Patchwork(NamedTuple):
-    """How a close-up and the wide cells round about it become one field."""
+    """Combination of the refined region and the coarser flow around it into one field."""
 
     outer: FlowField
-    """The flow in the wide cells."""
+    """Flow on the coarser grid."""
     around_mm: Floats
-    """(k, 3) middles of the cells of the close-up's size that the wide ones outside it hold."""
+    """(k, 3) centres of the fine cells into which the coarse cells outside the region are divided."""
     order: Ints
-    """(n,) numbers of the close-up's cells, and after them of those, in the order of the field's."""
+    """(n,) order of the combined field's cells: the region's cells, then those outside, by number."""
     is_fine: Bools
-    """(v,) whether a vertex of the wall has the close-up's cells all about it."""
+    """(v,) whether a wall vertex has fine cells all around."""
 
     def at_moment(self, fine: Phase | FlowField, wide: FlowField) -> tuple[Floats, Floats, Floats]:
-        """Velocity (n, 3) and pressure (n,) in all cells and stress (v, 3) on the wall, at a moment."""
+        """Return velocity (n, 3), pressure (n,) and wall shear stress (v, 3) of the combined field at one moment."""
         around = sampling.values_at(wide, self.around_mm)
         within = fine.velocity_m_s, fine.pressure_Pa
         velocity_m_s, pressure_Pa = (np.concatenate(pair)[self.order] for pair in zip(within, around, strict=True))
@@ -245,12 +277,12 @@ class _Patchwork(NamedTuple):
         return velocity_m_s, pressure_Pa, stress_Pa
 
     def swing(self, fine: Swing) -> Swing:
-        """That of the close-up, and elsewhere what the wide cells have."""
+        """Return the mean magnitudes of an unsteady flow, from the region and elsewhere from the coarser flow."""
         speed_m_s = np.concatenate([fine.speed_m_s, sampling.speed_at(self.outer, self.around_mm)])[self.order]
         return Swing(speed_m_s, np.where(self.is_fine, fine.shear_Pa, self.outer.shear_Pa))
 
     def phases(self, inner: FlowField) -> tuple[Phase, ...]:
-        """Those of a pulse, with the openings' flows of the wide cells."""
+        """Return the phases of a pulse, with the flow rates of the openings from the coarser flow."""
         return tuple(
             Phase(fine.time_s, wide.inlets_mL_s, wide.outlets_mL_s, *self.at_moment(fine, self.outer.at_phase(wide)))
             for fine, wide in zip(inner.phases, self.outer.phases, strict=True)
@@ -258,7 +290,15 @@ class _Patchwork(NamedTuple):
 
 
 def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
-    """The flow of the close-up, and round about it that of the wide cells, all on cells of the close-up's size."""
+    """Return one field on the fine grid: the refined region, and the interpolated coarser flow around it.
+
+    Parameters
+    ----------
+    chosen : CloseUp
+        The refined region and the flow around it.
+    inner : FlowField
+        Flow in the region.
+    """
     outer = chosen.outer
     beyond = outer.cells[chosen.part >= 0]
     children = (WIDTH * beyond[:, None] + np.indices((WIDTH,) * 3).reshape(3, -1).T).reshape(-1, 3)
@@ -293,7 +333,7 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
 
 
 def _is_well_within(chosen: CloseUp, wall: Surface) -> Bools:
-    """Tell which vertices (v,) of the wall have fine cells all about them."""
+    """Return whether each vertex (v,) of the wall has fine cells all around."""
     outer = chosen.outer
     behind_mm = wall.vertices_mm - 0.5 * outer.cell_size_mm * wall.vertex_normals
     nearest = cKDTree(outer.centers_mm).query(behind_mm)[1]

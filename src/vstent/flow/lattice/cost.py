@@ -1,4 +1,4 @@
-"""What a flow will cost, told before it is spent; what does not fit in the memory is refused."""
+"""Estimated grid size, memory and run time of a flow; a flow that does not fit in memory is refused."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,49 +19,52 @@ from vstent.flow.lattice.pace import pace
 from vstent.flow.memory import free_memory_bytes
 
 BYTES_PER_CELL = 750
-"""Peak memory per blood cell (measured on 0.3 to 0.8 million cells: 300 to build and step; 280 for the last checks and
-the means of all; the rest is what other flows of the same study keep)."""
+"""Peak memory per cell of blood, in bytes. Measured on 0.3 to 0.8 million cells: 300 for the time steps, 280 for the
+last checks and the block means; the rest is for other flows of the same study."""
 BYTES_PER_CELL_OF_RESULT = 130
-"""Memory per cell that is only filled in from the wide ones around a close-up (measured on 0.5 million cells)."""
+"""Memory in bytes per cell outside a refined region, whose values are interpolated from the coarser grid (measured on
+0.5 million cells)."""
 BYTES_PER_PHASE_AND_CELL = 32
-"""Memory for every kept phase of a cycle and its cell, computed or only filled in."""
+"""Memory in bytes per stored phase of a cycle and cell, computed or interpolated."""
 BYTES_PER_GRID_POINT = 6
-"""Memory per point of the box around the vessel (3 measured)."""
+"""Memory in bytes per grid point of the box around the vessel (measured: 3)."""
 MOST_CELLS = 1e8
-"""Cells of blood whose 19 populations still have numbers of 32 bits, with those beside the wall (2^31 / 19 places)."""
+"""Maximum number of cells whose 19 populations can be addressed with 32 bits, cells beside the wall included (2^31 / 19
+storage places)."""
 GPU_BYTES_PER_CELL = 320
-"""Memory of a GPU per blood cell (sums of its arrays: 302 on 31,000 cells of the demo, 214 on 169,000)."""
+"""GPU memory in bytes per cell of blood (sum of the arrays: 302 on 31,000 cells of the demo, 214 on 169,000)."""
 BYTES_AT_LEAST = 4.5e8
-"""Memory of the program itself, its compiled kernels and one surface."""
+"""Memory in bytes of the program itself, its compiled kernels and one surface."""
 WHOLE_OVER_BLOCK = 3.5
-"""Ratio of the run time of a flow to that of its steps in a block of blood that fits the cache. The rest is walls,
-openings, checks, the first guess and memory. Measured: demo with Silk at 0.14 mm, 123 million updates per second
-against 440 in the block; 3.4 for C0038 at 0.2 mm, 4.8 for a small bifurcation."""
+"""Ratio of the run time of a flow to that of its time steps in a block of blood that fits the cache. The rest is walls,
+openings, checks, the initial flow and memory access. Measured: demo with Silk at 0.14 mm, 123 million updates per
+second against 440 in the block; 3.4 for C0038 at 0.2 mm, 4.8 for a small bifurcation."""
 BLOCK_ROWS = 4095
-"""Rows of the block that the rate is measured on, an odd number (see `setup.address`)."""
+"""Number of rows of the block used to measure the speed; odd, so that populations are not whole pages apart (see
+`setup.PAGE`)."""
 BLOCK_BAND = 15
-"""Rows of each of its bands."""
+"""Number of rows in each of its bands."""
 MARGIN = 1.05
-"""The cell size that is said to fit leaves this much room."""
+"""Factor by which the suggested grid spacing is increased until the flow fits."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What one flow will take."""
+    """Estimated cost of one flow."""
 
     cell_size_mm: float
-    """Edge of a cell."""
+    """Grid spacing."""
     cells: int
-    """Cells of blood to be computed, extensions included."""
+    """Number of cells of blood computed, extensions of the openings included."""
     memory_bytes: int
     """Peak memory."""
     steps: int
-    """Most time steps."""
+    """Maximum number of time steps."""
     seconds: float
-    """Most time, at the measured rate."""
+    """Maximum run time at the measured speed."""
 
     def __str__(self) -> str:
-        """One sentence."""
+        """Return the estimate as one sentence."""
         return (
             f"Grid spacing {self.cell_size_mm:.3g} mm ({self.cells:,.0f} cells), memory "
             f"{self.memory_bytes / 1e9:.2g} GB, run time at most {self.seconds / 60:.2g} min per flow "
@@ -70,7 +73,7 @@ class Cost:
 
 
 def estimate(case: FlowCase) -> Cost:
-    """Estimate what a flow takes, from the vessel's volume and a rate measured here and now."""
+    """Estimate the cost of a flow from the vessel's volume and the speed measured on this machine."""
     cell_size_mm = default_cell_size_mm(case)
     cells, memory_bytes = _size(case, cell_size_mm)
     steps = _steps(case, cell_size_mm, close_up.SHARE_WITHIN if case.settings.close_up else 1)
@@ -82,12 +85,21 @@ def estimate(case: FlowCase) -> Cost:
 
 
 def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes: float | None = None) -> None:
-    """Refuse a flow that does not fit in the free memory, or in the GPU's where it is to run on one, or in 32 bits.
+    """Check that a flow fits in the free memory, in the GPU's memory if it runs there, and in 32-bit addresses.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case.
+    free_bytes : float or None
+        Free memory; None: measure it.
+    gpu_bytes : float or None
+        Free memory of the GPU; None: measure it.
 
     Raises
     ------
     FlowError
-        Naming the cell size that would fit.
+        When it does not fit; the message names the grid spacing that would.
     """
     free_bytes = free_memory_bytes() if free_bytes is None else free_bytes
     cell_size_mm = default_cell_size_mm(case)
@@ -104,7 +116,7 @@ def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes:
 
 
 def _refuse(case: FlowCase, needed_bytes: Callable[[float], float], free_bytes: float, of: str) -> None:
-    """Refuse a flow that needs more than is free, by the cell size, of some memory."""
+    """Raise a `FlowError` when the case needs more bytes than are free in the memory named `of`."""
     cell_size_mm = default_cell_size_mm(case)
     if needed_bytes(cell_size_mm) <= free_bytes:
         return
@@ -116,7 +128,7 @@ def _refuse(case: FlowCase, needed_bytes: Callable[[float], float], free_bytes: 
 
 
 def _fitting_mm(case: FlowCase, needed: Callable[[float], float], most: float) -> float:
-    """Cell size from the case's own on at which so much at most is needed."""
+    """Return the smallest grid spacing tried, from the case's own upwards, at which at most `most` is needed."""
     own_mm = fitting_mm = default_cell_size_mm(case)
     while needed(fitting_mm) > most and fitting_mm < 1e3 * own_mm:
         fitting_mm *= MARGIN
@@ -124,7 +136,7 @@ def _fitting_mm(case: FlowCase, needed: Callable[[float], float], most: float) -
 
 
 def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
-    """Cells and bytes."""
+    """Return the number of cells computed and the peak memory in bytes."""
     vessel = case.vessel
     volume_mm3 = extended_volume_mm3(vessel)
     widest = max(opening.diameter_mm for opening in vessel.openings)
@@ -141,12 +153,12 @@ def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
 
 
 def _wide_cells(case: FlowCase, cell_size_mm: float) -> float:
-    """Cells of the flow around a close-up."""
+    """Return the number of cells of the coarser flow around a refined region."""
     return abs(case.vessel.closed.volume_mm3) / (close_up.WIDTH * cell_size_mm) ** 3
 
 
 def _steps(case: FlowCase, cell_size_mm: float, share: float) -> int:
-    """Most time steps of a pulse, or of a steady flow that makes this share of those allowed."""
+    """Return the maximum number of time steps; a steady flow makes the given share of those allowed."""
     settings = case.settings
     if settings.waveform is None:
         return int(share * settings.max_steps)
@@ -154,12 +166,13 @@ def _steps(case: FlowCase, cell_size_mm: float, share: float) -> int:
 
 
 def block_rate(*, on_gpu: bool = False) -> float:
-    """Cell updates per second in a block of blood without walls, measured once on what it will be computed with."""
+    """Return the cell updates per second in a block of blood without walls, measured once on the CPU or the GPU."""
     return _measured_rate(on_gpu)
 
 
 @cache
 def _measured_rate(on_gpu: bool) -> float:
+    """Return the measured cell updates per second."""
     keep_flow()
     length = np.full(BLOCK_ROWS, 64, np.int32)
     stride = int(length.sum())

@@ -1,8 +1,8 @@
-"""Flow through a periodic cell of resolved wires: what the screen's law is calibrated on.
+"""Flow through a periodic cell of resolved wires, on which the resistance law of the screen model is calibrated.
 
-The cell repeats in all three directions. Its wires are straight cylinders, solid grid cells with the exact place of
-their wall on every link; a body force drives the blood through them, as a pressure gradient would. What the wires take
-of it is known without looking at their surface: in steady flow it is the gradient times the cell's volume.
+The cell repeats in all three directions. Its wires are straight cylinders of solid grid cells, with the exact position
+of their surface on every link. A body force drives the blood like a pressure gradient. In steady flow the total drag on
+the wires equals the body force times the volume of the cell, so that no integration over their surface is needed.
 """
 
 from dataclasses import dataclass
@@ -15,57 +15,70 @@ from vstent.kernels import directions
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 RELAXATION_STEPS = 1.0
-"""Relaxation time of the stress."""
+"""Relaxation time of the stress, in time steps."""
 ODD_RATE = 1 / (0.5 + 3 / 16 / (RELAXATION_STEPS - 0.5))
-"""So that walls half-way between cells lie exactly there (Ginzburg and d'Humieres 2003, Phys. Rev. E 68, 066614)."""
+"""Relaxation rate of the odd populations at which half-way bounce-back places the wall exactly half-way between cells
+(Ginzburg and d'Humieres 2003, Phys. Rev. E 68, 066614)."""
 VISCOSITY = (RELAXATION_STEPS - 0.5) / 3
-"""Kinematic viscosity in squared cells per step."""
+"""Kinematic viscosity in squared cells per time step."""
 DEFER_PAIRS, DEFER_PART = 4, 0.3
-"""Step pairs between updates of the quadratic reflection, and the part of the way that each goes."""
+"""Number of step pairs between updates of the quadratic wall correction, and the under-relaxation factor of each
+update."""
 CHECK_PAIRS = 50
-"""Step pairs between checks of convergence."""
+"""Number of step pairs between checks of convergence."""
 SETTLED = 3e-4
-"""Change of the mean velocity between looks at which it has."""
+"""Relative change of the mean velocity between checks below which the flow has converged."""
 MAX_CHECKS = 600
-"""Most looks."""
+"""Maximum number of checks."""
 
 
 @dataclass(frozen=True)
 class Wires:
-    """Straight cylinders in a periodic box, lengths in cells."""
+    """Straight cylinders in a periodic box; lengths in cells."""
 
     shape: tuple[int, int, int]
-    """Cells of the box."""
+    """Size of the box."""
     points: tuple[tuple[float, float, float], ...]
-    """(w, 3) a point of every axis."""
+    """(w, 3) a point on the axis of every wire."""
     directions: tuple[tuple[float, float, float], ...]
-    """(w, 3) unit vector along every axis; a wire leaves the box where its neighbour's image comes in."""
+    """(w, 3) unit vector along every axis. Periodic images must join: a wire leaves the box where another one's image
+    enters."""
     radius: float
-    """Radius."""
+    """Radius of all wires."""
 
 
 @dataclass(frozen=True, eq=False)
 class CellFlow:
-    """Steady flow through a cell, in lattice units."""
+    """Steady flow through a periodic cell, in lattice units."""
 
     velocity: Floats
-    """(i, j, k, 3), zero inside the wires."""
+    """(i, j, k, 3) velocity, zero inside the wires."""
     force: Floats
-    """(3,) what the wires take of a pressure gradient as large as the body force: it presses on them as well."""
+    """(3,) total drag on the wires under a pressure gradient equal to the body force. It is counted over the whole box,
+    because a pressure gradient acts on the wires, too."""
     is_blood: Bools
-    """(i, j, k)."""
+    """(i, j, k) whether the cell is blood."""
 
     @property
     def superficial_velocity(self) -> Floats:
-        """(3,) mean over blood and wires."""
+        """Return the mean velocity (3,) over blood and wires."""
         return self.velocity.mean(axis=(0, 1, 2))
 
 
 def crossing_wires(across: int, along: int, height: int, diameter: float, apart: float = 1.0) -> Wires:
-    """Two families of wires on the diagonals of a box of along x across x height cells.
+    """Return two families of wires along the diagonals of a box.
 
-    Their angle to the first axis is atan(across / along), their spacing along * across / hypot(along, across). Their
-    axes lie so many diameters `apart`: one family on the other, or, with 0, both in one plane. Woven wires do either.
+    Their angle to the first axis is atan(across / along). Their spacing is along * across / hypot(along, across).
+
+    Parameters
+    ----------
+    across, along, height : int
+        Size of the box in cells: along x across x height.
+    diameter : float
+        Wire diameter in cells.
+    apart : float
+        Distance between the planes of the two families in diameters: 1, one on the other; 0, both in one plane. Woven
+        wires occur in both arrangements.
     """
     length = float(np.hypot(along, across))
     up, down = (along / length, across / length, 0.0), (along / length, -across / length, 0.0)
@@ -75,17 +88,24 @@ def crossing_wires(across: int, along: int, height: int, diameter: float, apart:
 
 
 def row_of_wires(spacing: int, height: int, diameter: float) -> Wires:
-    """One family along the first axis, `spacing` apart along the second, rows `height` apart along the third."""
+    """Return one family of wires along the first axis, `spacing` cells apart; rows are `height` cells apart."""
     return Wires((4, spacing, height), ((0.0, 0.5 * spacing, 0.5 * height),), ((1.0, 0.0, 0.0),), 0.5 * diameter)
 
 
 def flow_through(wires: Wires, force: Floats) -> CellFlow:
-    """Steady flow under a body force (3,) per cell volume, mass of a cell and step; with inertia.
+    """Compute the steady flow, with inertia, under a body force.
+
+    Parameters
+    ----------
+    wires : Wires
+        Wires and box.
+    force : (3,)
+        Body force per cell volume, in lattice units.
 
     Raises
     ------
     ValueError
-        When it does not settle.
+        When the flow does not converge.
     """
     is_blood = _blood(wires)
     grid = _Grid(wires, is_blood)
@@ -102,11 +122,19 @@ def flow_through(wires: Wires, force: Floats) -> CellFlow:
 
 
 def sheet_speed(flow: CellFlow, force: Floats) -> float:
-    """Speed along the first axis in a thin sheet that takes as much of blood passing at an angle as the wires do.
+    """Return the tangential speed at a thin sheet that has the same tangential drag as the wires.
 
-    Between sheets a height h apart, which blood crosses at speed w, a body force F makes it faster: steady advection
-    and diffusion, w u' = F + nu u'', have u = u_0 + (F / w) (z - h (e^(w z / nu) - 1) / (e^(w h / nu) - 1)). The mean
-    of it gives u_0, negative where the wires hold up more than a sheet could.
+    Sheets are a height h apart and blood crosses them at speed w, while a body force F accelerates it along the sheets.
+    Steady advection and diffusion, w u' = F + nu u'', give u = u_0 + (F / w) (z - h (e^(w z / nu) - 1) / (e^(w h / nu)
+    - 1)). The mean of u yields the speed u_0 at the sheet. It is negative where the wires have more drag than a sheet
+    could have.
+
+    Parameters
+    ----------
+    flow : CellFlow
+        Steady flow through the wires.
+    force : (3,)
+        Body force that drives it.
     """
     height = flow.velocity.shape[2]
     mean, _, through = flow.superficial_velocity
@@ -115,9 +143,9 @@ def sheet_speed(flow: CellFlow, force: Floats) -> float:
 
 
 def _blood(wires: Wires) -> Bools:
-    """Cells (i, j, k) outside the wires, without the gaps of a single cell between two of them.
+    """Return the cells (i, j, k) outside the wires, without gaps of a single cell between wires.
 
-    Blood in such a gap, thrown from wall to wall, would keep what the force gives it.
+    Populations in such a gap bounce between its walls and accumulate the momentum of the body force.
     """
     blood = _signed_distance(wires, np.argwhere(np.ones(wires.shape, bool))).reshape(wires.shape) > 0
     while True:
@@ -130,14 +158,14 @@ def _blood(wires: Wires) -> Bools:
 
 
 def _images(wires: Wires) -> tuple[Floats, Floats]:
-    """Points and directions of every wire that can touch the box: those of the boxes around."""
+    """Return points and directions of all wires that can touch the box, periodic images included."""
     shifts = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * wires.shape
     points = (np.array(wires.points)[:, None] + shifts).reshape(-1, 3)
     return points, np.repeat(np.array(wires.directions), len(shifts), axis=0)
 
 
 def _signed_distance(wires: Wires, at: Ints) -> Floats:
-    """Distance (n,) of points (n, 3) from the nearest wire's wall, negative inside."""
+    """Return the distance (n,) of points (n, 3) from the surface of the nearest wire, negative inside."""
     nearest = np.full(len(at), np.inf)
     for point, direction in zip(*_images(wires), strict=True):
         offset = at - point
@@ -147,7 +175,7 @@ def _signed_distance(wires: Wires, at: Ints) -> Floats:
 
 
 def _fractions(wires: Wires, cells: Ints, steps: Ints) -> Floats:
-    """Where each link (n,) from a cell (n, 3) along a step (n, 3) meets a wire first, as a fraction of it."""
+    """Return the fraction (n,) of each link, from a cell (n, 3) along a step (n, 3), at which it first meets a wire."""
     first = np.ones(len(cells))
     for point, direction in zip(*_images(wires), strict=True):
         offset = cells - point
@@ -173,11 +201,12 @@ class _Grid:
         self._link(wires, cells)
 
     def _number(self, cells: Ints) -> Ints:
+        """Return the storage place of cells (n, 3), wrapped periodically."""
         i, j, k = np.moveaxis(cells % np.array(self._shape), -1, 0)
         return ((i * self._shape[1] + j) * self._shape[2] + k).astype(np.int32)
 
     def _address(self, cells: Ints) -> None:
-        """Cut the rows where they come back in, so that every row's neighbours are contiguous."""
+        """Set the addresses of segments; rows end at the periodic border, so that their neighbours are contiguous."""
         last = self._shape[2] - 1
         follows = (np.diff(cells, axis=0) == (0, 0, 1)).all(axis=1)
         follows &= (cells[1:, 2] != 1) & (cells[1:, 2] != last)
@@ -190,6 +219,7 @@ class _Grid:
         self._populations = d3q19.addresses(self._place[first], behind, self._stride)
 
     def _link(self, wires: Wires, cells: Ints) -> None:
+        """Set the links from blood to wires and their bounce-back weights."""
         blood = self._is_blood.ravel()
         ahead = np.stack([blood[self._number(cells + c)] for c in directions.VELOCITIES], axis=1)
         cell, q = np.nonzero(~ahead)
@@ -211,14 +241,14 @@ class _Grid:
         self._source = np.zeros(len(q), np.float32)
 
     def advance(self, force: Floats) -> None:
-        """Make `CHECK_PAIRS` step pairs, the force given as a kick between them."""
+        """Make `CHECK_PAIRS` step pairs; the force acts as an impulse before each pair."""
         segments = len(self._length)
         limit = np.full(segments, np.inf, np.float32)
         relaxation = np.float32(RELAXATION_STEPS), np.zeros(4, np.float32), limit, np.float32(ODD_RATE)
         cells = self._populations, self._length, relaxation, d3q19.no_screen(segments)
         back = self._path, self._weight, self._source, *d3q19.NO_LINKS[3:]
         bands = d3q19.undivided(segments, len(self._source))
-        lost = np.empty_like(self._source)  # made up for nowhere here
+        lost = np.empty_like(self._source)  # not used: the lost mass is not replaced here
         for pair in range(CHECK_PAIRS):
             self._kick(2.0 * force)
             d3q19.update(self._f, cells, back, *bands)
@@ -226,12 +256,13 @@ class _Grid:
                 d3q19.defer(self._f, self._links, self._correction, self._source, lost, np.float32(DEFER_PART))
 
     def _kick(self, impulse: Floats) -> None:
+        """Add an impulse (3,) to the populations of every blood cell."""
         kick = 3 * d3q19.WEIGHTS * (directions.VELOCITIES @ impulse)
         populations = self._f[: 19 * self._stride].reshape(19, -1)
         populations += (kick[:, None] * self._is_blood.ravel()).astype(np.float32)
 
     def velocity(self, force: Floats) -> Floats:
-        """Velocity (i, j, k, 3) in the middle between two kicks."""
+        """Return the velocity (i, j, k, 3), with half of the next impulse added."""
         result = np.zeros((self._stride, 3))
         result[self._place] = d3q19.moments(self._f, self._stride, self._place)[:, 1:] + force
         return result.reshape(*self._shape, 3)

@@ -1,4 +1,7 @@
-"""What the embedded engine imposes where its grid ends: at the openings, and where a close-up is cut off."""
+"""Boundary conditions of the embedded engine at the openings and at the cuts that bound a refined region.
+
+A *cut* is a cross-section of the vessel where the refined region ends and takes its flow from the coarser grid.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,34 +19,48 @@ from vstent.kernels import directions
 from vstent.kernels.arrays import Floats, Ints
 
 SOUND_MEMORY = 0.002
-"""Rate per step pair at which an inlet forgets the pressure that it takes for the mean, in steady flow. In pulsatile
-flow it takes every new pressure for the mean at once (1): the flow is the waveform's, whatever answers it."""
+"""Rate per pair of time steps at which an inlet updates its mean pressure in steady flow. In pulsatile flow the rate is
+1: the mean follows every pressure change, so that the imposed waveform is kept exactly."""
 
 
 STILL = 0.05
-"""Part of its mean flow below which an entry takes the velocity of the mean, for what little passes has no profile."""
+"""Fraction of the mean inflow below which a cut imposes the velocity profile of the mean flow. The instantaneous
+profile is ill-defined when the flow is that small."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """The ends of a grid, by their patch."""
+    """Boundary conditions at the ends of a grid: openings and cuts."""
 
     case: FlowCase
-    """What is computed."""
+    """The flow case."""
     domain: Domain
     """The grid."""
     scales: Scales
-    """Its units."""
+    """Lattice units."""
     close_up: CloseUp | None
-    """What surrounds it, if anything does."""
+    """Refined region and the flow around it; None: the grid covers the whole vessel."""
 
     def imposed(self, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats, Floats, Floats]:
-        """What is imposed at ends of these patches (k,), each with its links.
+        """Return the boundary conditions at the ends of the grid.
+
+        Parameters
+        ----------
+        patches : (k,) int
+            Patch number of every end.
+        links : sequence of k arrays
+            Links of every end.
 
         Returns
         -------
-        Rows (k, 9) of `d3q19.drive`, what is wanted (k,) at mean flow, what is besides (m, k) at the moments of the
-        flow outside, and shapes (m, l, 2) at these.
+        openings : (k, 9)
+            Rows for `d3q19.drive`.
+        wanted : (k,)
+            Speed to impose at mean flow, in lattice units.
+        course : (m, k)
+            Speed or density to add to it at m moments of the cycle of the surrounding flow.
+        shape : (m, l, 2)
+            Profile coefficients of all links at these moments (see `d3q19.drive`).
         """
         usual, shape = self._at(self.close_up, patches, links)
         wanted = usual[:, 1].copy()
@@ -56,17 +73,19 @@ class Ends:
         return usual, wanted, course, np.stack([shape for _, shape in moments])
 
     def _at(self, now: CloseUp | None, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats]:
-        """Rows (k, 9) of `d3q19.drive`, and what is sent back through all links, (l, 2), at a moment."""
+        """Return rows (k, 9) for `d3q19.drive` and profile coefficients (l, 2) of all links at one moment."""
         ends = [self._end(now, int(patch), of_end) for patch, of_end in zip(patches, links, strict=True)]
         return np.stack([row for row, _ in ends]), np.concatenate([shape for _, shape in ends])
 
     def _end(self, now: CloseUp | None, patch: int, links: Ints) -> tuple[Floats, Floats]:
+        """Return the row (9,) and profile coefficients (l, 2) of one end, which is an opening or a cut."""
         part = patch - 1 - len(self.case.vessel.openings)
         if now is None or part < 0:
             return self._opening(patch - 1, links)
         return self._entry(now, part, links) if self._outside.inflow_mL_s[part] > 0 else self._exit(now, part, links)
 
     def _opening(self, k: int, links: Ints) -> tuple[Floats, Floats]:
+        """Return the row (9,) and profile coefficients (l, 2) of opening `k`."""
         opening = self.case.vessel.openings[k]
         flow_mL_s = np.concatenate([self.case.inlets_mL_s, self.case.held_mL_s])[k]
         kind = d3q19.INFLOW if opening.is_inlet else d3q19.PRESSURE if np.isnan(flow_mL_s) else d3q19.OUTFLOW
@@ -76,21 +95,24 @@ class Ends:
         return row, self._developed(k, links, area) if opening.is_inlet else np.zeros((len(links), 2))
 
     def _developed(self, k: int, links: Ints, area: float) -> Floats:
-        """What links of inlet k send back, (l, 2): developed flow."""
+        """Return the profile coefficients (l, 2) of the links of inlet `k` for fully developed flow."""
         normal = self.case.vessel.openings[k].normal
         places_mm = np.concatenate([self._along(links, part)[2] for part in (0.0, 0.5, 1.0)])
         speed = developed_profile(self.domain.sections[k], normal, places_mm)
         return _sent(self.domain.link_direction[links], normal, area, *(-speed.reshape(3, -1, 1) * normal))
 
     def _rate(self, kind: float) -> float:
-        """Rate at which an end changes what it remembers."""
+        """Return the rate per step pair at which an end of this kind updates its remembered density."""
         if kind == d3q19.INFLOW:
             return SOUND_MEMORY if self.case.settings.waveform is None else 1.0
-        # Critically damped: the blood that the pressure moves is a column about as long as the grid.
+        # Critical damping for a column of blood about as long as the grid.
         return 0.25 / float(np.ptp(self.domain.cells, axis=0).max())
 
     def _entry(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
-        """A cut through which blood enters, at the velocity of the flow outside, made up to what passes there."""
+        """Return the row and profile coefficients of a cut with inflow.
+
+        The velocity profile is that of the surrounding flow, scaled to the flow rate through this cut.
+        """
         normal, area = self._section(links)
         shown = now if now.inflow_mL_s[part] > STILL * self._outside.inflow_mL_s[part] else self._outside
         mean = shown.inflow_mL_s[part] / self.scales.flow_mL_s / area
@@ -100,15 +122,17 @@ class Ends:
         return row, _sent(self.domain.link_direction[links], normal, area, *profile)
 
     def _exit(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
-        """A cut through which blood leaves, at the pressure of the flow outside.
+        """Return the row and profile coefficients of a cut with outflow.
 
-        As a whole that is raised until what leaves is what passes there; where most leaves, the rest does.
+        The density follows the pressure of the surrounding flow. A uniform offset adjusts it so that the flow rate
+        through the cut is that of the surrounding flow. The cut with the largest outflow keeps its pressure and takes
+        the remaining flow.
         """
         normal, area = self._section(links)
         _, _, at_mm = self._along(links, 0.5)
         density = sampling.values_at(now.outer, at_mm)[1] / self.scales.pressure_Pa
         inward = np.maximum(0.0, -self._velocity(now, links, 0.5) @ normal)
-        density += 1.5 * inward**2  # what `d3q19.outlet_source` takes off again
+        density += 1.5 * inward**2  # `d3q19.outlet_source` subtracts this term again
         kind = d3q19.PRESSURE if self._takes_the_rest(part) else d3q19.OUTFLOW
         speed = -now.inflow_mL_s[part] / self.scales.flow_mL_s / area
         row = np.array([kind, speed if kind == d3q19.OUTFLOW else 0.0, 0.0, self._rate(kind), *normal, area, 0.0])
@@ -116,11 +140,12 @@ class Ends:
 
     @property
     def _outside(self) -> CloseUp:
+        """Return the refined region and its surrounding flow, where there is one."""
         assert self.close_up is not None
         return self.close_up
 
     def _takes_the_rest(self, part: int) -> bool:
-        """Tell whether no more leaves anywhere else, at a cut or an outlet."""
+        """Return whether no other cut or outlet of this grid has a larger outflow."""
         outside = self._outside
         first = len(self.case.vessel.inlets) + 1
         within = [k for k in range(len(self.case.vessel.outlets)) if (self.domain.link_patch == first + k).any()]
@@ -128,19 +153,19 @@ class Ends:
         return bool(-outside.inflow_mL_s[part] >= most_mL_s * (1 - 1e-9))
 
     def _along(self, links: Ints, part: float = 0.0) -> tuple[Ints, Ints, Floats]:
-        """Direction (l,) and lattice velocity (l, 3) of links, and the point (l, 3) on each that part of its way."""
+        """Return direction (l,) and velocity (l, 3) of links, and the point (l, 3), mm, at fraction `part` of each."""
         q = self.domain.link_direction[links]
         c = directions.VELOCITIES[q]
         cell = self.domain.cells[self.domain.link_cell[links]]
         return q, c, self.domain.origin_mm + (cell + part * c) * self.domain.cell_size_mm
 
     def _velocity(self, now: CloseUp, links: Ints, part: float) -> Floats:
-        """Velocity (l, 3) of the flow outside, in lattice units, that part of the way along links."""
+        """Return the velocity (l, 3) of the surrounding flow at fraction `part` of each link, in lattice units."""
         at_mm = self._along(links, part)[2]
         return now.velocity_m_s(at_mm, self.domain.surface) / self.scales.speed_m_s
 
     def _section(self, links: Ints) -> tuple[Floats, float]:
-        """Outward normal (3,) of a cut and its area in cells: the sum of the cells' faces in it."""
+        """Return the outward normal (3,) of a cut and its area in cell faces."""
         q, c, _ = self._along(links)
         faces = c[q <= d3q19.AXIAL].sum(axis=0)
         area = float(np.linalg.norm(faces))
@@ -148,17 +173,22 @@ class Ends:
 
 
 def _sent(direction: Ints, normal: Floats, area: float, inner: Floats, at: Floats, outer: Floats) -> Floats:
-    """What links of an entry send back, (l, 2): for its mean speed, and besides for that squared.
+    """Return the source coefficients (l, 2) of an inflow: linear and quadratic in its mean speed.
 
-    Links at the rim meet the wall instead of the entry: what they would send is made up for near the rim, for a
-    profile scaled up as a whole would be too fast on the axis, and keep so for tens of diameters.
+    Links at the rim of the opening end at the wall instead of the opening, and their share of the flow would be
+    missing. It is added to the links near the rim. Scaling the whole profile instead would make the velocity on the
+    axis too high, and this error persists for tens of diameters downstream.
 
     Parameters
     ----------
-    direction : (l,) of each link.
-    normal : (3,) outwards.
-    area : of the entry, in faces of cells.
-    inner, at, outer : (l, 3) velocity where each link begins, half-way, and where it ends, over the mean speed.
+    direction : (l,) int
+        Lattice direction of each link.
+    normal : (3,)
+        Outward normal.
+    area : float
+        Area of the opening in cell faces.
+    inner, at, outer : (l, 3)
+        Velocity at the start, the middle and the end of each link, divided by the mean speed.
     """
     c, weight = directions.VELOCITIES[direction], d3q19.WEIGHTS[direction]
     sent = -6 * weight * (c * at).sum(axis=1)
@@ -170,9 +200,9 @@ def _sent(direction: Ints, normal: Floats, area: float, inner: Floats, at: Float
 
 
 def _pushed(direction: Ints, inner: Floats, outer: Floats) -> Floats:
-    """What the odd rate would push across a profile of velocities (l, 3) where each link begins and ends.
+    """Return the momentum (l,) that a velocity profile (l, 3) gains from the relaxation rate of the odd populations.
 
-    Sent back through the links, it is taken out: it would push blood towards the axis.
+    The inflow sends it back through the links with opposite sign. Otherwise it would push blood towards the axis.
     """
     c, weight = directions.VELOCITIES[direction], d3q19.WEIGHTS[direction]
 

@@ -1,4 +1,4 @@
-"""The embedded engine for steady flow: sparse lattice-Boltzmann, D3Q19, single precision, interpolated walls."""
+"""The embedded engine for steady inflow: sparse D3Q19 lattice-Boltzmann, single precision, interpolated walls."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
@@ -23,20 +23,22 @@ from vstent.flow.stopping import SURE, swings
 from vstent.units import M_PER_MM
 
 CHECK_DIAMETERS = 0.5
-"""Flow time between checks, in inlet diameters over mean inlet speed."""
+"""Flow time between checks, in units of inlet diameter divided by mean inlet speed."""
 LEAST_CHECKS = 24
-"""Fewest checks within the limit of time steps: fewer cannot show convergence."""
+"""Minimum number of checks within the limit of time steps; convergence cannot be judged with fewer."""
 
 INFLOW_WEIGHT: Final = 3
-"""What the flow through an inlet has left to go, which is known, counts so many times as much as what is foretold."""
+"""Weight of the relative error of the inflow among the convergence criteria. It is larger than 1 because this error is
+measured, whereas the others are estimated."""
 SLOWER: Final = 0.5
-"""A run that diverged is tried again with a time step so much shorter."""
+"""Ratio by which the time step is reduced after a run has diverged."""
 
 
 class AbstractLattice(AbstractEngine[State]):
-    """Sparse D3Q19 in single precision with shifted populations, two relaxation times and interpolated walls.
+    """Common part of the lattice engines: sparse D3Q19, single precision, two relaxation times, interpolated walls.
 
-    It writes no file. A coarse run costs a sixteenth per second of flow, and so sound and vortices are led out cheaply.
+    It writes no files. On a grid with twice the spacing a second of flow takes a sixteenth of the run time, so that
+    sound and start-up vortices decay there first.
     """
 
     coarsening: ClassVar[float | None] = 2.0
@@ -45,18 +47,27 @@ class AbstractLattice(AbstractEngine[State]):
     runs_on_gpu: ClassVar[bool] = True
 
     def cost(self, case: FlowCase) -> str:
-        """Say how many cells and steps, how much memory and time."""
+        """Return a sentence with the grid spacing, the memory and the run time of a case.
+
+        Raises
+        ------
+        FlowError
+            When the GPU is requested but not usable, or the case does not fit in memory.
+        """
         if case.settings.device_gpu:
             require_gpu()
         refuse_too_large(case)
         return str(estimate(case))
 
     def calmer(self, case: FlowCase) -> FlowCase:
-        """Return the case with a shorter time step: a narrow place inside may hold faster blood than the openings."""
+        """Return the case with a shorter time step, for a second attempt after a run has diverged.
+
+        A narrow place in the vessel may hold faster blood than the openings suggest.
+        """
         return replace(case, settings=replace(case.settings, lattice_speed=SLOWER * case.settings.lattice_speed))
 
     def close_up(self, case: FlowCase) -> CloseUp | None:
-        """Return what of the vessel is computed; None: all of it."""
+        """Return the refined region of a case; None: the grid covers the whole vessel."""
         return None if self.outer is None else close_ups.close_up(case, self.outer)
 
     def save(self, state: State) -> Saved:
@@ -64,25 +75,25 @@ class AbstractLattice(AbstractEngine[State]):
         return pack(state)
 
     def resume(self, case: FlowCase, saved: Saved) -> State:
-        """Build the run anew and put it where it was."""
+        """Rebuild a run from its case and the saved arrays."""
         return unpack(case, self.cell_size_mm, saved, self.close_up(case))
 
     def step(self, state: State) -> State:
-        """Advance towards the next check."""
+        """Advance the run towards its next check."""
         step(state)
         return state
 
     def trouble(self, state: State) -> str:
-        """Say why the run diverged."""
+        """Return a sentence that says why the run diverged."""
         return trouble(state)
 
 
 @dataclass(frozen=True)
 class LatticeBoltzmann(AbstractLattice):
-    """The sparse D3Q19 engine at constant inflow."""
+    """The sparse D3Q19 engine with constant inflow."""
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
-        """Choose the time step so that the fastest blood moves `lattice_speed` cells a step; in a close-up, more."""
+        """Set up a run whose fastest blood moves `lattice_speed` cells a step (times `STRETCH` in a refined region)."""
         close_up = self.close_up(case)
         stretch = 1 if close_up is None else close_ups.STRETCH
         step_s = stretch * longest_step_s(case, self.cell_size_mm, peak_speed_m_s(case, start, close_up))
@@ -91,14 +102,17 @@ class LatticeBoltzmann(AbstractLattice):
         return build(case, self.cell_size_mm, steps * step_s, pace, close_up=close_up, start=start, kept=kept)
 
     def step(self, state: State) -> State:
-        """Advance towards the next check; there, add it to the means of the run."""
+        """Advance the run towards its next check and, at a check, update the block means."""
         super().step(state)
         if is_at_check(state):
             state.blocks = with_check(state.blocks, state.snapshots[-1])
         return state
 
     def terminate(self, state: State) -> float | None:
-        """Fraction that the monitored quantities have left to go, or the standard error of their means, if less."""
+        """Return the distance from convergence or the error of the time averages, whichever is smaller.
+
+        None between checks; nan when the run has diverged.
+        """
         if not is_at_check(state):
             return None
         if state.snapshots[-1].is_lost:
@@ -106,7 +120,7 @@ class LatticeBoltzmann(AbstractLattice):
         return min(_left(state), _mean(state).left)
 
     def max_checks(self, state: State) -> int:
-        """Checks within the limit of time steps."""
+        """Return the maximum number of checks within the limit of time steps."""
         steps = state.case.settings.max_steps * (1 if self.outer is None else close_ups.SHARE_WITHIN)
         return max(4, int(steps // state.steps_per_check))
 
@@ -121,17 +135,19 @@ class LatticeBoltzmann(AbstractLattice):
 
 
 def _steps_per_check(case: FlowCase, step_s: float) -> int:
+    """Return the even number of time steps between checks."""
     steps = CHECK_DIAMETERS * case.vessel.inlet.diameter_mm * M_PER_MM / float(case.inlet_speeds_m_s[0]) / step_s
     return 2 * max(1, round(0.5 * min(steps, case.settings.max_steps / LEAST_CHECKS)))
 
 
 def _left(state: State) -> float:
+    """Return the estimated relative distance of the run from convergence."""
     fields = [one.velocity[state.probe.cells] for one in state.snapshots]
     return max(left_to_settle(np.array(state.history), fields), INFLOW_WEIGHT * _inflow_error(state))
 
 
 def _inflow_error(state: State) -> float:
-    """How far what enters anywhere is from what is to, over all that is to: while sound is under way, openings give."""
+    """Return the relative error of the inflow, which is not zero while sound waves leave through the openings."""
     openings = state.links.openings
     enters = openings[:, 0] == d3q19.INFLOW
     wanted = (state.links.wanted * openings[:, 7])[enters]
@@ -139,6 +155,7 @@ def _inflow_error(state: State) -> float:
 
 
 def _mean(state: State) -> Mean:
+    """Return the best time average of the run so far."""
     return mean_of(state.blocks, np.array(state.history), state.probe.cells)
 
 

@@ -1,4 +1,4 @@
-"""Whether a flow can be computed on a GPU: where it is asked for, never required."""
+"""Availability of a GPU for the flow computation; a GPU is used only on request."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,9 +8,9 @@ from typing import Final
 from vstent.errors import FlowError
 
 PACKAGE: Final = "numba_cuda"
-"""Compiles kernels for a GPU; an extra."""
+"""Module that compiles kernels for a GPU; installed by the extra ``gpu``."""
 ELSE: Final = "or compute on the processor (without --gpu)"
-"""What can be done in any case."""
+"""End of the error messages: the alternative that always works."""
 DRIVER: Final = "CUDA"
 """Word in the errors of CUDA's driver, which errors of the compiler lack."""
 
@@ -21,7 +21,7 @@ def require_gpu() -> None:
     Raises
     ------
     FlowError
-        Naming what is missing, and how to get it.
+        When there is none; the message says what is missing and how to install it.
     """
     import numba
 
@@ -36,7 +36,7 @@ def require_gpu() -> None:
         if cuda.is_available():
             return
         complaint = cuda.cuda_error()
-    except (ImportError, OSError, RuntimeError):  # a library of CUDA's that cannot be loaded
+    except (ImportError, OSError, RuntimeError):  # a CUDA library could not be loaded
         complaint = None
     if complaint is None:
         raise FlowError(
@@ -51,16 +51,16 @@ def require_gpu() -> None:
 
 @contextmanager
 def told() -> Iterator[None]:
-    """Make a sentence of what a GPU, its driver or its compiler refuse.
+    """Convert errors of the GPU, its driver or its compiler to a `FlowError`.
 
     Raises
     ------
     FlowError
-        With their own first words.
+        With the first line of the original error.
     """
     try:
         yield
-    except Exception as error:  # each of them raises its own
+    except Exception as error:  # driver, compiler and numba each have their own exception classes
         words = next(iter(str(error).splitlines()), type(error).__name__)
         if DRIVER not in f"{type(error).__name__} {error}".upper():
             raise FlowError(
@@ -71,7 +71,7 @@ def told() -> Iterator[None]:
 
 
 def gpu_name() -> str:
-    """Name of the GPU that flows are computed on; "none" where there is none."""
+    """Return the name of the GPU that computes flows, or "none"."""
     try:
         require_gpu()
     except FlowError:
@@ -83,7 +83,7 @@ def gpu_name() -> str:
 
 
 def free_gpu_bytes() -> float:
-    """Memory of the GPU that can be had."""
+    """Return the free memory of the GPU in bytes."""
     from numba import cuda
 
     return float(cuda.current_context().get_memory_info()[0])

@@ -1,4 +1,4 @@
-"""A lattice-Boltzmann run on a GPU: its arrays stay there between checks, and nothing is asked of it in between."""
+"""A lattice-Boltzmann run on a GPU: its arrays stay there between checks, without transfers in between."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -16,19 +16,20 @@ from vstent.flow.lattice.scales import ODD_RATE
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, State
 from vstent.kernels.arrays import Floats, Ints
 
-# The openings are few, and a block each: numba's advice to give a GPU more to do at once is for other kernels.
+# Each opening is one block and there are few, so that numba's warning about low occupancy does not apply.
 numba.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
 
 PART: Final = np.float32(DEFER_PART)
+"""Under-relaxation factor of the deferred updates, in single precision."""
 UPDATES_TIMED: Final = 8
-"""Updates of which the fastest tells the rate; the first compiles."""
+"""Number of updates timed, of which the fastest counts; the first includes compilation."""
 
 
 class Device:
-    """The arrays of a run on the GPU, and what is done with them there."""
+    """The arrays of a run on the GPU and its kernels."""
 
     def __init__(self, state: State) -> None:
-        """Copy everything that the time steps need to the GPU, as it stands."""
+        """Copy all arrays that the time steps need to the GPU."""
         a, links, screen, scales = state.addressing, state.links, state.screen, state.scales
         self._populations, self._openings = put(state.populations), put(links.openings)
         self._source, self._refill = put(links.source), put(state.refill.refill)
@@ -58,7 +59,7 @@ class Device:
         )
 
     def advance(self, wanted: Floats, moments: Floats, first_pair: int) -> None:
-        """Make pairs of steps with what `stepping.imposed` returns; the first is that pair since a check."""
+        """Make one pair of time steps per row of `wanted` (see `state.OnDevice`)."""
         imposed = put(wanted), put(moments)
         for pair in range(len(wanted)):
             self._drive(*imposed, pair)
@@ -70,13 +71,13 @@ class Device:
         cuda.synchronize()
 
     def read(self) -> tuple[NDArray[np.float32], Floats]:
-        """Density deviation and momentum (n, 4) of every cell, and the flow out (k,) through every opening."""
+        """Return density deviation and momentum (n, 4) of every cell, and the flow rate (k,) out of every end."""
         for kernel in self._read:
             kernel()
         return self._moments.copy_to_host(), self._outflow.copy_to_host()
 
     def fetch(self, state: State) -> None:
-        """Put what the time steps have changed back into the state."""
+        """Copy the arrays that the time steps change back to `state`."""
         for here, there in (
             (self._populations, state.populations),
             (self._openings, state.links.openings),
@@ -93,7 +94,13 @@ def seconds_of_update(
     relaxation: Sequence[Any],
     screen: Sequence[NDArray[Any]],
 ) -> float:
-    """Time of an update of every cell, the best of some, with what `lattice.update` takes."""
+    """Return the run time of an update of all cells, the best of several.
+
+    Parameters
+    ----------
+    f, address, length, relaxation, screen
+        Arguments of `d3q19.update`.
+    """
     time, law, limit, odd_rate = relaxation
     segments = (*_cells_of(length), time, put(law), put(limit), odd_rate)
     launch = partial(_launch, kernels.update, int(length.sum()), put(f), put(address), *segments, *map(put, screen))
@@ -108,13 +115,13 @@ def seconds_of_update(
 
 
 def _cells_of(length: Ints) -> tuple[Any, Any]:
-    """Segment of every cell, and first cell of every segment, on the GPU, of segments of so many cells (s,)."""
+    """Return, on the GPU, the segment of every cell and the first cell of every segment, from segment lengths (s,)."""
     segment = np.repeat(np.arange(len(length), dtype=np.int32), length)
     return put(segment), put((np.cumsum(length) - length).astype(np.int32))
 
 
 def _settling(state: State, f: Any, source: Any, refill: Any) -> tuple[partial[None], ...]:
-    """What is done every few pairs: the deferred correction of the walls, and the balance of what they lose."""
+    """Return the kernels that run every few step pairs: the deferred wall correction and the mass balance."""
     links, walls = state.links, state.refill
     of_wall = slice(int(links.start[-1]), None)
     address = links.address[of_wall]
@@ -125,12 +132,12 @@ def _settling(state: State, f: Any, source: Any, refill: Any) -> tuple[partial[N
 
 
 def put(array: NDArray[Any]) -> Any:
-    """Copy an array to the GPU; instead of an empty one, for which there is no place there, a zero nobody asks for."""
+    """Copy an array to the GPU; an empty one, which cannot be stored there, becomes a zero that is never read."""
     whole = array if array.size else np.zeros([max(n, 1) for n in array.shape], array.dtype)
     return cuda.to_device(np.ascontiguousarray(whole))
 
 
 def _launch(kernel: Any, threads: int, *arguments: Any) -> None:
-    """Run a kernel by at least so many threads."""
+    """Run a kernel with at least `threads` threads."""
     if threads:
         kernel[-(-threads // THREADS), THREADS](*arguments)

@@ -1,8 +1,8 @@
-"""How long the time steps of a lattice-Boltzmann run may be: the fastest blood moves so many cells in each.
+"""Time step of a lattice-Boltzmann run: the fastest blood moves at most `lattice_speed` cells per step.
 
-In a pulse they are as long as they may be in every phase of the cycle: of the published pulse of the internal carotid
-artery half as many as the peak's would be all over, or more where the lattice's sound is slow. Populations are carried
-over by `collision.rescaled`.
+In a pulse the time step is chosen for each phase of the cycle. With the published pulse of the internal carotid artery
+this halves the number of steps compared with the time step of the peak throughout; the saving is smaller where the
+lattice's speed of sound limits the step. `collision.rescaled` converts the populations when the time step changes.
 """
 
 from typing import Final
@@ -18,26 +18,35 @@ from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
 FASTER: Final = 1.1
-"""The fastest blood over the fastest on the wider cells that it is foretold from."""
+"""Assumed ratio of the peak speed to the peak speed on the coarser grid from which it is estimated."""
 FEW: Final = 1e-3
-"""Part of the blood that may be faster than what time steps go by, as in one narrow branch: its Mach number harms no
-other."""
+"""Fraction of the blood that may exceed the speed that sets the time step, for example in one narrow branch. Its higher
+Mach number does not affect the flow elsewhere."""
 HASTE: Final = 2.0
-"""How many times as fast that may be at most. In C0038 steps half as long change the sac's mean speed by 0.3 per
-cent at the peak of systole and by 2 a phase later, when its vortices differ, and the speed that all but a thousandth of
-the blood keep below by 0.3 at most."""
+"""Maximum ratio of the overall peak speed to the speed that sets the time step. In C0038 half the time step changes the
+mean speed in the sac by 0.3 % at peak systole and by 2 % one phase later, when its vortices differ. It changes the
+speed below which all but a thousandth of the blood stays by at most 0.3 %."""
 LONGEST: Final = 3.0
-"""A pulse's longest time step over its shortest."""
+"""Maximum ratio of the longest to the shortest time step of a pulse."""
 STORED: Final = 0.005
-"""Part of the flow that a phase with longer steps may store for a moment."""
+"""Maximum fraction of the flow that may be stored by compressibility during a phase with longer time steps."""
 MOMENTS: Final = 25
-"""Moments of each phase at which the waveform is looked at."""
+"""Number of moments per phase at which the waveform is evaluated."""
 
 
 def peak_speed_m_s(case: FlowCase, start: FlowField | None, close_up: CloseUp | None = None) -> float:
-    """Estimate the speed that all but a `FEW` of the blood keep below, and these below `HASTE` times that.
+    """Estimate the speed that sets the time step: all but a fraction `FEW` of the blood stays below it.
 
-    At mean flow, or at the moment that `start` is of; in a close-up, where it begins.
+    The overall peak speed is at most `HASTE` times as high.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case.
+    start : FlowField or None
+        A flow on a coarser grid, at the mean or at one moment; None: estimate from the openings' flow rates.
+    close_up : CloseUp or None
+        Refined region: only the blood within it counts.
     """
     if start is not None:
         within = slice(None) if close_up is None else close_up.part < 0
@@ -48,20 +57,32 @@ def peak_speed_m_s(case: FlowCase, start: FlowField | None, close_up: CloseUp | 
 
 
 def longest_step_s(case: FlowCase, cell_size_mm: float, peak_m_s: float) -> float:
-    """Time in which the fastest blood moves as far as it may in a time step."""
+    """Return the time step, s, in which blood at `peak_m_s` moves `lattice_speed` cells."""
     return case.settings.lattice_speed * cell_size_mm * M_PER_MM / peak_m_s
 
 
 def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up: CloseUp | None = None) -> Ints:
-    """Time steps (PHASES,) of every phase of a pulse, even: its fastest blood moves `lattice_speed` cells at most.
+    """Return the number of time steps (PHASES,) in every phase of a pulse; all are even.
 
-    Sound is the slower the longer the steps, and blood is stored while it is on its way: steps longer than the
-    shortest have to keep that below `STORED`.
+    The fastest blood of each phase moves at most `lattice_speed` cells per step. A longer time step also lowers the
+    lattice's speed of sound, so that more flow is stored by compressibility. Where a step is longer than the shortest,
+    it is limited so that this part stays below `STORED`.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case.
+    cell_size_mm : float
+        Grid spacing.
+    start : FlowField or None
+        A flow on a coarser grid, if possible with its phases.
+    close_up : CloseUp or None
+        Refined region.
 
     Raises
     ------
     FlowError
-        When the case has no pulse.
+        When the case has no waveform.
     """
     pulse = _Pulse(pulse_of(case))
     peak_m_s = pulse.peaks_m_s(case, start, close_up)
@@ -74,7 +95,7 @@ def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up:
 
 
 class _Pulse:
-    """A waveform at moments of every phase."""
+    """A waveform sampled at `MOMENTS` moments of every phase."""
 
     def __init__(self, waveform: Waveform) -> None:
         self.phase_s = waveform.period_s / PHASES
@@ -83,10 +104,11 @@ class _Pulse:
         self._curvature_per_s2 = np.abs(waveform.curvature_per_s2(time_s))
 
     def peaks_m_s(self, case: FlowCase, start: FlowField | None, close_up: CloseUp | None) -> Floats:
-        """The fastest blood (PHASES,) in every phase.
+        """Return the peak speed (PHASES,) in every phase.
 
-        A whole cycle tells that itself at every phase's two ends. Otherwise blood is as much faster than in the mean as
-        the flow is, or was in the phase before: it goes on while the flow falls.
+        With a whole cycle in `start`, the speed at both ends of each phase is used. Otherwise the peak speed is scaled
+        with the flow rate, or with that of the phase before if that is higher, because inertia keeps blood moving while
+        the flow rate falls.
         """
         within, at_end = self._factor.max(axis=1), self._factor[:, -1]
         if start is None or len(start.phases) < PHASES:
@@ -96,10 +118,10 @@ class _Pulse:
         return np.maximum(ends_m_s, np.roll(ends_m_s, 1)) * within / np.maximum(at_ends, 0.5 * within)
 
     def sound_s(self) -> Floats:
-        """Longest time (PHASES,) that sound may take through the vessel in every phase.
+        """Return the maximum time (PHASES,), s, that sound may take through the vessel in every phase.
 
-        Blood that gives way by rho p / c^2 to the pressure rho L q' / A that speeds it up stores T^2 q'' / 2 on a way
-        that takes sound a time of T.
+        The pressure rho L q' / A accelerates the blood and compresses it by rho p / c^2. If sound takes a time T along
+        the vessel, the stored flow is T^2 q'' / 2.
         """
         most_per_s2 = np.maximum(self._curvature_per_s2.max(axis=1), 1e-9)
         return np.asarray(np.sqrt(2 * STORED * self._factor.mean(axis=1) / most_per_s2))

@@ -1,4 +1,4 @@
-"""The embedded engine for pulsatile flow: the same steps, the inflow following a waveform until cycles repeat."""
+"""The embedded engine for pulsatile inflow: the inflow follows a waveform until two cycles agree."""
 
 from dataclasses import dataclass, replace
 
@@ -16,26 +16,29 @@ from vstent.flow.lattice.stepping import build, is_at_check
 
 @dataclass(frozen=True)
 class PulsatileLatticeBoltzmann(AbstractLattice):
-    """The sparse D3Q19 engine with a waveform at the inlet."""
+    """The sparse D3Q19 engine with a flow waveform at the inlets."""
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
-        """Choose time steps that divide a phase and keep its fastest blood below `lattice_speed` cells a step."""
+        """Set up a run whose time steps divide each phase, with a peak speed below `lattice_speed` cells per step."""
         close_up, phase_s = self.close_up(case), pulse_of(case).period_s / PHASES
         steps = pace(case, self.cell_size_mm, start, close_up)
         return build(case, self.cell_size_mm, phase_s, steps, close_up=close_up, start=start, kept=PHASES)
 
     def terminate(self, state: State) -> float | None:
-        """Relative change of the monitored quantities from the last cycle but one to the last; inf within a cycle."""
+        """Return the relative difference of the monitored quantities between the last two cycles.
+
+        None between checks; inf within a cycle; nan when the run has diverged.
+        """
         if not is_at_check(state):
             return None
         return float("nan") if state.snapshots[-1].is_lost else cycle_change(np.array(state.history))
 
     def max_checks(self, state: State) -> int:
-        """Phases of all cycles allowed."""
+        """Return the number of phases in the maximum number of cycles."""
         return PHASES * state.case.settings.max_cycles
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
-        """Return the mean of the last cycle, with its phases."""
+        """Return the mean flow of the last cycle, with its phases."""
         phases = []
         for k, snapshot in enumerate(state.snapshots):
             flow = read(state, [snapshot])
@@ -44,7 +47,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
             phases.append(Phase(time_s, flow.inlets_mL_s, flow.outlets_mL_s, *moment))
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])
         advice = cycles_advice(changes, len(state.history) // PHASES, is_converged=outcome.is_converged)
-        # The stress of the mean flow is the mean stress only where blood does not thin.
+        # For shear-thinning blood the wall shear stress of the mean flow differs from the mean wall shear stress.
         mean_Pa = np.asarray(np.mean([phase.wall_shear_stress_Pa for phase in phases], axis=0, dtype=np.float64))
         flow = replace(read(state, list(state.snapshots)), wall_shear_stress_Pa=mean_Pa)
         return field_of(state, flow, outcome, outcome.residual[-1], advice, tuple(phases))

@@ -1,4 +1,4 @@
-"""What a lattice-Boltzmann run has come to, in SI units: its last checks or their mean, and the stress on the wall."""
+"""Result of a lattice-Boltzmann run in SI units: the last check or a time average, with the wall shear stress."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -21,25 +21,25 @@ class Reading:
     """A flow in SI units."""
 
     velocity_m_s: Floats
-    """(n, 3)."""
+    """(n, 3) velocity of every cell."""
     pressure_Pa: Floats
-    """(n,)."""
+    """(n,) pressure of every cell."""
     wall_shear_stress_Pa: Floats
-    """(v, 3)."""
+    """(v, 3) wall shear stress at every vertex of the lumen."""
     wall_pressure_Pa: Floats
-    """(v,)."""
+    """(v,) pressure at every vertex of the lumen."""
     inlets_mL_s: Floats
-    """(i,) in through every inlet; nan where a close-up does not reach it."""
+    """(i,) flow rate into every inlet; nan where a refined region does not reach it."""
     outlets_mL_s: Floats
-    """(k,) out through every outlet; nan likewise, 0 where no cell of all reaches it."""
+    """(k,) flow rate out of every outlet; nan likewise, 0 where no cell of the grid reaches it."""
     swing: Swing | None = None
-    """What it is the mean of, where a steady flow moves."""
+    """Mean speed and mean wall shear magnitude of an unsteady flow; None for a steady one."""
     neck_inflow_mL_s: float | None = None
-    """Its mean there."""
+    """Time average of the neck inflow of an unsteady flow; None for a steady one."""
 
 
 def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
-    """Return the mean of some snapshots in SI units, with the stress on the wall."""
+    """Return the mean of snapshots in SI units, with the wall shear stress."""
     domain = state.domain
     velocity_m_s = _mean(snapshots, (one.velocity_m_s for one in snapshots))
     pressure_Pa = _mean(snapshots, (one.pressure_Pa for one in snapshots))
@@ -55,7 +55,10 @@ def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
 
 
 def read_moving(state: State, snapshots: Sequence[Snapshot]) -> Reading:
-    """Return the mean of the last snapshots of a flow that moves, with what a mean does not tell."""
+    """Return the mean of the snapshots of an unsteady flow, with the time averages of speed, shear and neck inflow.
+
+    These cannot be computed from the mean velocity field.
+    """
     flow, case = read(state, snapshots), state.case
     speed_m_s = _mean(snapshots, (one.speed_m_s for one in snapshots))
     shear_Pa = mean_shear_Pa(state.domain, flow.velocity_m_s, speed_m_s, lumen=case.vessel.lumen, blood=case.blood)
@@ -65,7 +68,7 @@ def read_moving(state: State, snapshots: Sequence[Snapshot]) -> Reading:
 
 
 def _mean(snapshots: Sequence[Snapshot], values: Iterable[Floats | NDArray[np.float32]]) -> Floats:
-    """Mean of a value of each snapshot, each counting as many times as it has checks."""
+    """Return the mean of one value per snapshot, weighted by the number of checks of each."""
     share = np.array([one.checks for one in snapshots]) / sum(one.checks for one in snapshots)
     return np.asarray(sum(part * value for part, value in zip(share, values, strict=True)))
 
@@ -73,7 +76,23 @@ def _mean(snapshots: Sequence[Snapshot], values: Iterable[Floats | NDArray[np.fl
 def field_of(
     state: State, flow: Reading, outcome: Outcome, left: float, advice: str, phases: tuple[Phase, ...] = ()
 ) -> FlowField:
-    """Put a flow together with how it was reached, and what it has `left` to go."""
+    """Return the flow field of a run.
+
+    Parameters
+    ----------
+    state : State
+        The run.
+    flow : Reading
+        The flow in SI units.
+    outcome : Outcome
+        Convergence history and run time.
+    left : float
+        Expected remaining change, or uncertainty of the time averages, as a fraction.
+    advice : str
+        Sentence on convergence; sentences on the grid are appended.
+    phases : tuple of Phase
+        Phases of a pulsatile flow.
+    """
     domain, vessel = state.domain, state.case.vessel
     section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
@@ -106,7 +125,7 @@ def field_of(
 
 
 def _of_the_grid(state: State, flow: Reading, phases: tuple[Phase, ...]) -> str:
-    """Say where the cells are too wide for the vessel (in a close-up those around it are, if any) or for the flow."""
+    """Return sentences on where the grid is too coarse, for the vessel (not in a refined region) or for the flow."""
     narrow = ""
     if state.close_up is None:
         narrow = domains.too_narrow(state.case, state.domain.cell_size_mm)

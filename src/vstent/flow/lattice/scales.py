@@ -1,4 +1,4 @@
-"""Lattice units of the embedded engine, and the rate that its accuracy and stability were tuned to."""
+"""Lattice units of the embedded engine, and the relaxation rate to which its accuracy and stability were tuned."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,9 @@ from vstent.flow.case import Blood
 from vstent.units import M3_PER_ML
 
 ODD_RATE = 0.7
-"""Relaxation rate of the odd part: lower is more isotropic, higher is more stable and leaks less. Where blood is fast
-it is as much higher as is stable (`vstent.flow.lattice.kernels.collision`)."""
+"""Relaxation rate of the odd (antisymmetric) part of the populations. A lower rate is more isotropic; a higher rate is
+more stable and conserves mass better at the walls. In fast flow it is raised as far as stability requires
+(`vstent.flow.lattice.kernels.collision`)."""
 
 
 @dataclass(frozen=True)
@@ -18,35 +19,35 @@ class Scales:
     """Lattice units of one grid and time step."""
 
     cell_m: float
-    """Edge of a cell."""
+    """Grid spacing."""
     step_s: float
     """Time step."""
     blood: Blood
-    """The fluid."""
+    """Density and viscosity."""
 
     @property
     def speed_m_s(self) -> float:
-        """One cell per time step."""
+        """Return the speed of one cell per time step."""
         return self.cell_m / self.step_s
 
     @property
     def pressure_Pa(self) -> float:
-        """Pressure of unit density deviation: rho c^2 / 3."""
+        """Return the pressure of a unit density deviation: rho c^2 / 3."""
         return self.blood.density_kg_m3 * self.speed_m_s**2 / 3
 
     @property
     def flow_mL_s(self) -> float:
-        """One cell volume per time step."""
+        """Return the flow rate of one cell volume per time step."""
         return self.cell_m**3 / self.step_s / M3_PER_ML
 
     @property
     def viscosity(self) -> float:
-        """Kinematic viscosity, in squared cells per time step."""
+        """Return the kinematic viscosity in squared cells per time step."""
         return self.blood.kinematic_viscosity_m2_s * self.step_s / self.cell_m**2
 
     @property
     def thinning(self) -> NDArray[np.float32]:
-        """(4,) the blood's law in lattice units (see `lattice.update`)."""
+        """Return the Carreau-Yasuda law (4,) in lattice units (see `d3q19.update`); zeros for Newtonian blood."""
         law = self.blood.thinning
         if law is None:
             return np.zeros(4, np.float32)
@@ -55,5 +56,5 @@ class Scales:
 
     @property
     def relaxation_steps(self) -> float:
-        """Relaxation time of the stress, in time steps."""
+        """Return the relaxation time of the stress, in time steps."""
         return 3 * self.viscosity + 0.5

@@ -1,4 +1,4 @@
-"""A stent's screen on the lattice: shared among the grid cells beside it, in the lattice's own units."""
+"""The porous screen of a stent on the lattice: its resistance in the grid cells near it, in lattice units."""
 
 from dataclasses import dataclass, replace
 
@@ -18,42 +18,58 @@ from vstent.units import M_PER_MM
 
 @dataclass(frozen=True, eq=False)
 class ScreenEntries:
-    """A screen by segment (see `d3q19.update`)."""
+    """Resistance of a screen by segment of cells, in lattice units (see `d3q19.update`)."""
 
     start: Ints
-    """(s + 1,)."""
+    """(s + 1,) first entry of every segment."""
     place: Ints
-    """(e,) place within the segment."""
+    """(e,) position of the entry's cell within its segment."""
     entry: NDArray[np.float32]
-    """(e, `d3q19.ENTRY`)."""
+    """(e, `d3q19.ENTRY`) unit normal and resistance coefficients."""
     cell: Ints
-    """(e,) cell."""
+    """(e,) cell number of every entry."""
 
     def stretched(self, stretch: float) -> "ScreenEntries":
-        """The same for time steps that are so many times as long: all that goes with a speed is so much more."""
+        """Return the same screen for time steps `stretch` times as long.
+
+        Coefficients that multiply a velocity grow with the time step.
+        """
         return replace(self, entry=self.entry * np.array([1, 1, 1, stretch, stretch, 1, stretch], np.float32))
 
 
 @dataclass(frozen=True, eq=False)
 class GridResistance:
-    """A screen spread over the grid cells beside it."""
+    """Resistance of a screen distributed over the grid cells near it."""
 
     cell: Ints
-    """(e,) cells, ascending."""
+    """(e,) cell numbers, ascending."""
     normal: Floats
-    """(e, 3) the screen's unit normal there."""
+    """(e, 3) unit normal of the screen in the cell."""
     along_Pa_s_m2: Floats
-    """(e,) resistance along the normal per volume: pressure gradient per velocity."""
+    """(e,) resistance per volume along the normal: pressure gradient divided by velocity."""
     across_Pa_s_m2: Floats
-    """(e,) resistance across it."""
+    """(e,) resistance per volume tangential to the screen."""
     spread_Pa_s_m: Floats
-    """(e,) what of the screen's resistance across it acts twice, in layers of cells (see `of_thin_sheet`)."""
+    """(e,) part of the tangential resistance that acts twice because the screen is spread over layers of cells (see
+    `collision.of_thin_sheet`)."""
     inertial_per_m: Floats
-    """(e,) pressure gradient along the normal over rho |u| u_n."""
+    """(e,) inertial loss: pressure gradient along the normal divided by rho |u| u_n."""
 
 
 def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales) -> ScreenEntries:
-    """The case's screen in lattice units."""
+    """Return the screen of a case in lattice units.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case; without a screen the result is empty.
+    domain : Domain
+        The grid.
+    addressing : Addressing
+        Segments of cells.
+    scales : Scales
+        Lattice units.
+    """
     segments = len(addressing.length)
     if case.screen is None:
         return ScreenEntries(*d3q19.no_screen(segments), np.zeros(0, np.int32))
@@ -75,13 +91,22 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
 
 
 def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float) -> GridResistance:
-    """Share every sample's resistance among the eight cells around it, trilinearly; what falls outside is void.
+    """Distribute the resistance of a screen over grid cells.
 
-    So a cell at the rim resists as its neighbours do, where the screen goes on over the wall beyond the neck.
+    Every sample point of the screen is shared among the eight cells around it with trilinear weights. The share of
+    points outside the blood is dropped. A cell at the rim therefore resists as its neighbours do where the screen
+    extends over the wall beyond the neck.
 
     Parameters
     ----------
-    index : (i, j, k) cell number at every grid point, -1 outside.
+    screen : Screen
+        Sample points with normals, areas and resistances.
+    index : (i, j, k) int
+        Cell number at every grid point, -1 outside.
+    origin_mm : (3,)
+        Position of grid point 0, 0, 0.
+    cell_size_mm : float
+        Grid spacing.
     """
     at = (screen.points_mm - origin_mm) / cell_size_mm
     cells, weights = sampling.stencils(index, at)
@@ -94,7 +119,7 @@ def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float)
     def gathered(values: Floats) -> Floats:
         return np.bincount(place, per_volume * values[owner], len(found)).astype(np.float64)
 
-    # The normals of one sheet agree nearly; signs may differ where two sheets meet in a cell, but only n n^T counts.
+    # Normals of one sheet nearly agree. Where two sheets meet their signs may differ, but only n n^T enters.
     normal = np.stack([gathered(component) for component in screen.normals.T], axis=1)
     length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     factor = concentration(screen.wire_diameter_mm, screen.spacing_mm, cell_size_mm)
@@ -113,7 +138,7 @@ def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float)
 
 
 def _twice(at: Floats, normals: Floats) -> Floats:
-    """Sum (p,) over pairs of cells about points (p, 3) of their trilinear weights and their way along the normals."""
+    """Return the sum (p,), over pairs of cells near points (p, 3), of weight * weight * distance along the normal."""
     part = at - np.floor(at)
     corners = np.indices((2, 2, 2)).reshape(3, -1).T
     weight = np.where(corners == 1, part[:, None], 1 - part[:, None]).prod(axis=2)

@@ -1,4 +1,4 @@
-"""Whether a steady lattice-Boltzmann run may stop: it has converged, or its time averages are known well enough."""
+"""Stopping criterion of a steady lattice-Boltzmann run: convergence, or time averages of sufficient accuracy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,48 +12,75 @@ from vstent.flow.stopping import quantities_left, series_left, standard_error
 from vstent.kernels.arrays import Floats, Ints
 
 CHECKS_APART: Final = 3
-"""Number of checks between the fields whose difference estimates the distance of the velocity from convergence."""
+"""Number of checks between two velocity fields. Their difference serves to estimate the distance from convergence."""
 SHARE_OF_FIELD: Final = 0.5
-"""Largest ratio of the distance of means from convergence to that of the field (with Silk and Enterprise: 0.1-0.5)."""
+"""Weight of the velocity field's distance from convergence relative to that of the monitored quantities. With Silk and
+Enterprise the distance of the quantities is 0.1 to 0.5 of that of the field."""
 SHARE_OF_MEAN_FIELD: Final = 0.1
-"""The same ratio for the error of time averages, which is much larger for local values (C0038: 6 %)."""
+"""Weight of the statistical error of the local mean velocity relative to that of the monitored quantities. Local values
+have a much larger error (C0038: 6 %)."""
 BLOCKS: Final = 8
-"""Largest number of blocks of checks whose means are kept."""
+"""Maximum number of blocks of checks whose means are kept."""
 NO_MEAN: Final = 0.05
-"""Error of a mean above which the last checks are used instead."""
+"""Relative error above which a time average counts as unknown. The last `LATEST` checks are then averaged instead."""
 LATEST: Final = 8
-"""Number of the last checks that are averaged then."""
+"""Number of last checks that are averaged when no time average is known."""
 
 
 @dataclass(frozen=True)
 class Mean:
-    """The mean over the last checks of a run, and its error."""
+    """Time average over the last checks of a run, and its statistical error."""
 
     checks: int
-    """Number of checks."""
+    """Number of checks in the average."""
     blocks: int
-    """Number of blocks that they form."""
+    """Number of blocks that these checks form."""
     standard_error: float
-    """Largest relative standard error of the monitored quantities; inf where there are too few checks."""
+    """Largest relative standard error of the monitored quantities; inf with too few checks."""
     field_error: float
-    """Root-mean-square relative error of the local mean velocity in the sac."""
+    """Relative standard error of the local mean velocity in the sac, root mean square."""
 
     @property
     def left(self) -> float:
-        """Error that is compared with the tolerance."""
+        """Return the relative error to compare with the tolerance."""
         return max(self.standard_error, SHARE_OF_MEAN_FIELD * self.field_error)
 
 
 def left_to_settle(history: Floats, velocity: Sequence[NDArray[np.float32]]) -> float:
-    """Fraction that a history (checks, quantities) and the last fields (n, 3) have left to go; nan when not finite."""
+    """Return the estimated distance of a steady run from convergence.
+
+    Parameters
+    ----------
+    history : (checks, quantities) float
+        Monitored quantities at every check.
+    velocity : sequence of (n, 3) float32
+        Velocity fields at the last checks, oldest first.
+
+    Returns
+    -------
+    float
+        Expected remaining change as a fraction: the larger of that of the monitored quantities and `SHARE_OF_FIELD`
+        times that of the field. nan when the history is not finite, inf with too few checks.
+    """
     return max(quantities_left(history), SHARE_OF_FIELD * field_left(velocity))
 
 
 def field_left(velocity: Sequence[NDArray[np.float32]]) -> float:
-    """Fraction that a field has left to go, root mean square; `velocity` (n, 3) at every one of the last checks.
+    """Return the expected remaining change of a velocity field as a fraction of it, root mean square.
 
-    The mean speed behind a braid falls at once and then rises for half a second as the vortex finds its place: at the
-    turn nothing of the mean seems to be left, but 5 % is. A field's change does not pass through zero.
+    The field is used beside the monitored means because the change of a mean can pass through zero. Behind a braided
+    stent the mean speed in the sac drops quickly and then rises for half a second while the vortex moves to its final
+    position. At the turning point the mean seems converged although it will still change by 5 %.
+
+    Parameters
+    ----------
+    velocity : sequence of (n, 3) float32
+        Velocity fields at the last checks, oldest first.
+
+    Returns
+    -------
+    float
+        Fraction of the field; inf with fewer than 2 `CHECKS_APART` + 1 fields.
     """
     if len(velocity) < 2 * CHECKS_APART + 1:
         return float("inf")
@@ -63,9 +90,17 @@ def field_left(velocity: Sequence[NDArray[np.float32]]) -> float:
 
 
 def with_check(blocks: Sequence[Snapshot], now: Snapshot) -> tuple[Snapshot, ...]:
-    """Means over blocks of as many checks each, the last one growing, with one more check.
+    """Return the block means of a run with one more check added.
 
-    When there are too many, every two become one.
+    All blocks hold the same number of checks except the last, which is still being filled. When `BLOCKS` blocks are
+    full, each pair is merged into one.
+
+    Parameters
+    ----------
+    blocks : sequence of Snapshot
+        Means over blocks of checks, oldest first.
+    now : Snapshot
+        Flow at the new check.
     """
     if blocks and blocks[-1].checks < blocks[0].checks:
         return *blocks[:-1], blocks[-1].and_also(now)
@@ -75,11 +110,24 @@ def with_check(blocks: Sequence[Snapshot], now: Snapshot) -> tuple[Snapshot, ...
 
 
 def mean_of(blocks: Sequence[Snapshot], history: Floats, sac: Ints) -> Mean:
-    """Choose the last blocks of a run, half of its checks at least, whose mean is known best.
+    """Choose the last blocks of a run whose average has the smallest estimated error.
 
-    (White 1997, Simulation 69, 323: what comes before the steady state is left out so as to make the rest's standard
-    error least.) The velocity of the `sac` (n,), place by place, is asked for a tenth as much. Where no mean is known,
-    the last `LATEST` checks or some more: as little as may be of what came before.
+    At least half of all checks are averaged. The start of the run is left out so that the standard error of the
+    remainder is smallest. Where the error exceeds `NO_MEAN`, the last `LATEST` checks are averaged instead (rounded up
+    to whole blocks), so that little of the initial transient enters.
+
+    Parameters
+    ----------
+    blocks : sequence of Snapshot
+        Means over blocks of checks, oldest first.
+    history : (checks, quantities) float
+        Monitored quantities at every check.
+    sac : (n,) int
+        Cells of the sac, where the error of the local velocity is estimated.
+
+    References
+    ----------
+    White 1997, Simulation 69, 323: truncation that minimises the standard error.
     """
     lengths = np.cumsum([block.checks for block in blocks[::-1]])
     enough = range(int(np.searchsorted(lengths, 0.5 * lengths[-1])), len(blocks))
@@ -95,9 +143,10 @@ def mean_of(blocks: Sequence[Snapshot], history: Floats, sac: Ints) -> Mean:
 
 
 def field_error(blocks: Sequence[Snapshot], cells: Ints) -> float:
-    """Standard error of the mean velocity of cells (n,) over blocks, root mean square, from the means of both halves.
+    """Return the relative standard error of the mean velocity of `cells` (n,), root mean square.
 
-    As a fraction of it; inf of a single block.
+    It is estimated from the difference between the averages of the first and the second half of the blocks. inf with a
+    single block.
     """
     if len(blocks) < 2:
         return float("inf")

@@ -1,4 +1,4 @@
-"""What the lattice-Boltzmann engine needs before its first step: addresses, units, walls and openings."""
+"""Setup of a lattice-Boltzmann run: memory layout of the populations, walls, openings and viscosity limits."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -18,92 +18,93 @@ from vstent.kernels import directions, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 CELL_REYNOLDS_AT_END = 25.0
-"""Largest speed x cell / viscosity in the openings' extensions, whose ends are where fast blood becomes unstable first
-(30 to 50 were seen to fail): faster blood is made thicker there."""
+"""Grid Reynolds number (speed times grid spacing divided by viscosity) in the extensions of the openings above which
+the viscosity is raised. Fast flow becomes unstable there first: runs failed at values of 30 to 50."""
 CELL_REYNOLDS: Final = 75.0
 """Grid Reynolds number in the vessel above which the viscosity is raised. The systole of C0038 diverged with 100 at a
 grid spacing of 0.4 mm and with 150 at 0.2 mm."""
 CUT_CELLS = 6
-"""Cells at the cuts of a close-up that count as such an extension."""
+"""Depth in cells of the layer at the cuts of a refined region where the limit of the extensions applies."""
 CELL_REYNOLDS_IN_CUT: Final = 5.0
-"""The same in a cut's own cells: in the few between it and the wall what moves would grow (C0038 at systole: tenfold in
-60 steps)."""
+"""Grid Reynolds number in the cells next to a cut above which the viscosity is raised. Between the cut and the wall lie
+only a few cells, where disturbances would grow (C0038 at systole: tenfold in 60 steps)."""
 CELLS_IN_CUT: Final = 2
-"""How many cells deep those are."""
+"""Depth in cells of the layer next to a cut where `CELL_REYNOLDS_IN_CUT` applies."""
 PAGE, OFF_PAGE = 1024, 216
-"""Numbers in 4096 bytes, and by how many more than whole pages of them a cell's populations lie apart: a cache has the
-same few places for what is whole pages apart, and nineteen such runs at once would take a quarter longer."""
+"""Number of float32 values in a page of 4096 bytes, and offset of the stride from whole pages. Addresses that are whole
+pages apart share the same few places of a cache; nineteen populations stored so would make a run a quarter slower."""
 REFILL_BLOCK = 2
-"""Edge, in cells, of the blocks within which the walls' losses are made up."""
+"""Edge in cells of the blocks within which the mass lost at interpolated walls is redistributed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Addressing:
-    """Where populations lie (see `vstent.flow.lattice.kernels.d3q19`)."""
+    """Memory layout of the populations (see `vstent.flow.lattice.kernels.d3q19`)."""
 
     stride: int
-    """Storage places, and some more (see `OFF_PAGE`)."""
+    """Distance between two populations of a cell: the number of storage places plus padding (see `OFF_PAGE`)."""
     place: Ints
     """(n,) storage place of every cell."""
     length: Ints
-    """(s,) cells of every segment."""
+    """(s,) number of cells of every segment."""
     first_cell: Ints
     """(s,) first cell of every segment."""
     address: Ints
-    """(2, s, 19) where the populations of every segment begin, in an even step and in an odd one."""
+    """(2, s, 19) address of the first population of every segment and direction, in an even and in an odd step."""
     link_address: Ints
-    """(l, 6) see `d3q19.paths`."""
+    """(l, 6) addresses of the populations at every link (see `d3q19.paths`)."""
     link_has_one: NDArray[np.bool_]
-    """(l,) the cell behind the link's cell is blood, and no septum lies between."""
+    """(l,) whether the cell behind the link's cell is blood, with no septum between them."""
     link_has_two: NDArray[np.bool_]
-    """(l,) so it is with the two cells behind it."""
+    """(l,) whether the two cells behind the link's cell are blood, with no septum between them."""
     septa: Ints
-    """(2, t) see `d3q19.update`, by layer of their cell."""
+    """(2, t) addresses of populations exchanged at septa (see `d3q19.update`), sorted by layer of their cell."""
     septum_cell: Ints
-    """(t,) that cell."""
+    """(t,) cell of every septum."""
 
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """Coefficients of everything that is sent back, ends first, then the wall; sources change in place.
+    """Coefficients of all links that reflect populations: first those of the ends, then those of the wall.
 
-    The ends are the openings, and in a close-up the cuts beyond which the blood goes on.
+    The ends are the openings and, in a refined region, the cuts where the region ends. `source` and `openings` change
+    in place during a run.
     """
 
     patch: Ints
-    """(k,) patch of every end (see `Domain.link_patch`)."""
+    """(k,) patch number of every end (see `Domain.link_patch`)."""
 
     address: Ints
-    """(l, 6) see `d3q19.paths`."""
+    """(l, 6) addresses of the populations at every link (see `d3q19.paths`)."""
     path: Ints
-    """(2, l, 3) see `d3q19.update`, after an even step and after an odd one."""
+    """(2, l, 3) populations that a link reads and writes, after an even and after an odd step (see `d3q19.update`)."""
     weight: NDArray[np.float32]
-    """(l, 2) see `d3q19.update`."""
+    """(l, 2) weights of linearly interpolated bounce-back (see `d3q19.update`)."""
     correction: NDArray[np.float32]
-    """(l, 5) see `d3q19.defer`."""
+    """(l, 5) weights of the deferred correction to parabolic interpolation (see `d3q19.defer`)."""
     viscous: NDArray[np.float32]
-    """(l,) how much of `CURVE` viscosity takes off that."""
+    """(l,) multiple of `CURVE` that viscosity subtracts from `correction`."""
     source: NDArray[np.float32]
-    """(l,)."""
+    """(l,) source term of every link."""
     openings: Floats
-    """(k, 10) see `d3q19.drive`."""
+    """(k, 9) condition and state of every end (see `d3q19.drive`)."""
     start: Ints
-    """(k + 1,) first link of every opening, and of the wall."""
+    """(k + 1,) first link of every end, and of the wall."""
     by_layer: Ints
-    """(o,) the ends' links, by layer of their cell."""
+    """(o,) links of the ends, sorted by layer of their cell."""
     place: Ints
-    """(o,) storage place of every opening link."""
+    """(o,) storage place of the cell of every link of the ends."""
     direction: Ints
-    """(o,) lattice velocity of every opening link."""
+    """(o,) lattice direction of every link of the ends."""
     wanted: Floats
-    """(k,) speed wanted at every end at mean flow."""
+    """(k,) speed imposed at every end at mean flow, in lattice units."""
     course: Floats
-    """(m, k) what is wanted there besides, speed or density, at equal times of a cycle."""
+    """(m, k) speed or density to add to it, at m equally spaced times of a cycle."""
     shape: Floats
-    """(m, o, 2) see `d3q19.drive`, at the same times."""
+    """(m, o, 2) profile coefficients at the same times (see `d3q19.drive`)."""
 
     def stretched(self, stretch: float) -> "Links":
-        """The same for time steps that are so many times as long; what changes in place is shared."""
+        """Return the same links for time steps `stretch` times as long; arrays that change in place are shared."""
         is_inflow = np.repeat(self.openings[:, 0] == d3q19.INFLOW, np.diff(self.start))
         return replace(
             self,
@@ -116,20 +117,20 @@ class Links:
 
 @dataclass(frozen=True, eq=False)
 class Refill:
-    """What interpolated walls lose and get back (see `d3q19.balance`); `refill` changes in place."""
+    """Redistribution of the mass lost at interpolated walls (see `d3q19.balance`); `refill` changes in place."""
 
     place: Ints
     """(w,) storage place of every wall cell."""
     groups: tuple[Ints, Ints, Ints, Ints]
-    """See `d3q19.balance`; a group is the wall cells of a block of `REFILL_BLOCK` cells."""
+    """Links and wall cells of every group (see `d3q19.balance`); a group is a block of `REFILL_BLOCK` cells."""
     lost: NDArray[np.float32]
-    """(l,) see `d3q19.defer`."""
+    """(l,) mass lost at every wall link (see `d3q19.defer`)."""
     refill: NDArray[np.float32]
-    """(w,) added in every step."""
+    """(w,) mass added to every wall cell in every step."""
 
 
 def in_extensions(case: FlowCase, domain: Domain) -> Bools:
-    """Whether every cell (n,) lies in the extension of an opening."""
+    """Return for every cell (n,) whether it lies in the extension of an opening."""
     result = np.zeros(len(domain.cells), dtype=bool)
     for opening, section in zip(case.vessel.openings, domain.sections, strict=True):
         offset = domain.centers_mm - opening.center_mm
@@ -153,13 +154,22 @@ def thickest(case: FlowCase, domain: Domain) -> NDArray[np.float32]:
 
 
 def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
-    """Lay out the populations of a domain; no segment spans cells where `limit` (n,) differs (see `thickest`)."""
+    """Return the memory layout of the populations of a domain.
+
+    Parameters
+    ----------
+    domain : Domain
+        The grid.
+    limit : (n,) float32
+        Largest grid Reynolds number of every cell (see `thickest`). A segment contains only cells with equal values.
+    """
     cells = domain.cells
     inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
     inside[tuple(cells.T)] = True
     stored = voxels.dilate(inside, directions.VELOCITIES[1:])
     number = np.full(inside.shape, -1, dtype=np.int32)
-    # What a vector holds beyond its segment is written again as it was: of another layer, another thread may be there.
+    # A vector write rewrites values beyond its segment unchanged. The padding between layers keeps it from touching
+    # values that another thread may be changing.
     number[stored] = np.arange(stored.sum()) + lanes.COUNT * np.nonzero(stored)[0]
     count = int(number.max()) + lanes.COUNT
     stride = count + (OFF_PAGE - count) % PAGE
@@ -186,7 +196,7 @@ def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
 
 
 def _cut(first: Ints, length: Ints) -> tuple[Ints, Ints]:
-    """Cut segments longer than the buffer."""
+    """Return first cell and length of the segments after splitting those longer than `d3q19.SEGMENT`."""
     pieces = -(-length // d3q19.SEGMENT)
     owner = np.repeat(np.arange(len(first)), pieces)
     rank = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
@@ -197,7 +207,7 @@ def _cut(first: Ints, length: Ints) -> tuple[Ints, Ints]:
 def _link_addresses(
     domain: Domain, number: Ints, inside: NDArray[np.bool_], stride: int, septa: Ints
 ) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Addresses (l, 6) of `d3q19.paths`, and whether one and whether two blood cells lie behind the link's cell."""
+    """Return addresses (l, 6) for `d3q19.paths`, and whether at least one and two blood cells lie behind each link."""
     q = domain.link_direction
     p = d3q19.OPPOSITE[q]
     cell, c = domain.cells[domain.link_cell], directions.VELOCITIES[q]
@@ -218,7 +228,7 @@ def _link_addresses(
 
 
 def _septa(domain: Domain, number: Ints, stride: int) -> Ints:
-    """Addresses (2, t) of what cells send each other through septa."""
+    """Return the addresses (2, t) of the populations that cells on both sides of a septum would exchange."""
     q = domain.septum_direction
     cell = domain.cells[domain.septum_cell]
     here, ahead = (number[tuple(x.T)] for x in (cell, cell + directions.VELOCITIES[q]))
@@ -228,7 +238,21 @@ def _septa(domain: Domain, number: Ints, stride: int) -> Ints:
 def build_links(
     case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales, close_up: CloseUp | None
 ) -> Links:
-    """Interpolated reflection at the wall, imposed flow or pressure at the ends."""
+    """Return the links of the wall (interpolated bounce-back) and of the ends (imposed flow or pressure).
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case.
+    domain : Domain
+        The grid.
+    addressing : Addressing
+        Memory layout.
+    scales : Scales
+        Lattice units.
+    close_up : CloseUp or None
+        Refined region and the flow around it; None: the grid covers the whole vessel.
+    """
     order = _link_order(domain)
     patch = domain.link_patch[order]
     patches = np.unique(patch[patch > 0])
@@ -264,10 +288,7 @@ def build_links(
 
 
 def _link_order(domain: Domain) -> Ints:
-    """Ends first, in order, by cell within each; then the wall, by layer, and by direction within it.
-
-    So each address runs on, and what is done with a layer finds it in the processor's cache.
-    """
+    """Return the order of links that reads memory in sequence: ends by cell, then the wall by layer and direction."""
     is_wall = domain.link_patch == 0
     patch = np.where(is_wall, domain.link_patch.max() + 1, domain.link_patch)
     layer = domain.cells[domain.link_cell, 0]
@@ -275,7 +296,7 @@ def _link_order(domain: Domain) -> Ints:
 
 
 def build_bands(domain: Domain, addressing: Addressing, links: Links) -> Ints:
-    """Bands (b + 1, 5) of `d3q19.update`: the layers of cells across the first axis of the grid."""
+    """Return the bands (b + 1, 5) for `d3q19.update`: the layers of cells across the first axis of the grid."""
     of_ends, of_walls = np.split(domain.link_cell[_link_order(domain)], links.start[-1:])
     cells = addressing.first_cell, np.unique(of_walls), of_walls, of_ends[links.by_layer], addressing.septum_cell
     layer = domain.cells[:, 0]
@@ -286,7 +307,7 @@ def build_bands(domain: Domain, addressing: Addressing, links: Links) -> Ints:
 
 
 def build_refill(domain: Domain, addressing: Addressing) -> Refill:
-    """Group the wall cells into blocks."""
+    """Return the groups of wall cells within which the lost mass is redistributed, with nothing lost yet."""
     order = _link_order(domain)
     cell = domain.link_cell[order][domain.link_patch[order] == 0]
     wall_cell, of_link = np.unique(cell, return_inverse=True)
@@ -297,7 +318,7 @@ def build_refill(domain: Domain, addressing: Addressing) -> Refill:
 
 
 def _grouped(group: Ints) -> tuple[Ints, Ints]:
-    """Where each of the g groups begins (g + 1,) in the order (n,) of things by their group (n,), and that order."""
+    """Return the start (g + 1,) of each group and the order (n,) that sorts items by their group (n,)."""
     order = np.argsort(group, kind="stable")
     starts = np.searchsorted(group[order], np.arange(group.max(initial=-1) + 2))
     return starts.astype(np.int32), order.astype(np.int32)

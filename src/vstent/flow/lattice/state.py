@@ -1,4 +1,7 @@
-"""A lattice-Boltzmann run as data: its grid, storage, populations and history."""
+"""State of a lattice-Boltzmann run: grid, memory layout, populations and history.
+
+A *check* is a moment at which the monitored quantities are recorded and convergence is judged.
+"""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -21,53 +24,54 @@ from vstent.flow.lattice.setup import (
 from vstent.kernels.arrays import Floats, Ints
 
 DEFER_PAIRS = 8
-"""Step pairs between updates of what is deferred."""
+"""Number of step pairs between updates of the deferred wall correction and mass balance."""
 DEFER_PART = 0.15
-"""Part of the way that each update goes."""
+"""Under-relaxation factor of each of these updates."""
 TOO_FAST = 0.75
-"""Speed over the sound's from which a result is not to be trusted: at that speed a tube loses a tenth of its blood."""
+"""Mach number on the lattice above which a result counts as diverged: at that speed a tube loses a tenth of its
+flow."""
 NECK_INFLOW = 3
-"""Column of the monitored quantities that is the neck inflow, where there is a neck."""
+"""Column of the neck inflow among the monitored quantities, where there is a neck."""
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """Where the monitored quantities are read."""
+    """Places where the monitored quantities are evaluated."""
 
     cells: Ints
     """Cells of the sac, or of the whole lumen where there is no sac."""
     ostium_points: Floats
-    """(p, 3) points on the ostium, grid units."""
+    """(p, 3) points on the ostium, in grid units."""
     ostium_area_mm2: Floats
-    """(p, 3) area vectors there."""
+    """(p, 3) area vectors at these points."""
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The flow at a check, or its mean over some, in lattice units."""
+    """The flow at a check, or its mean over several checks, in lattice units."""
 
     scales: Scales
-    """These units."""
+    """Units of this snapshot."""
     velocity: NDArray[np.float32]
-    """(n, 3) of every cell."""
+    """(n, 3) velocity of every cell."""
     density: NDArray[np.float32]
-    """(n,) deviation of every cell."""
+    """(n,) deviation of the density from 1 in every cell."""
     outflow: Floats
-    """(k,) through every end."""
+    """(k,) flow rate out of every end."""
     checks: int = 1
-    """Checks that it is the mean of."""
+    """Number of checks in the mean."""
     mean_speed: NDArray[np.float32] | None = None
-    """(n,) mean speed of every cell over them; None of a single one."""
+    """(n,) mean speed of every cell over these checks; None for a single check."""
 
     @property
     def speed(self) -> NDArray[np.float32]:
-        """(n,) speed of every cell, or its mean over the checks."""
+        """Return the speed (n,) of every cell, or its mean over the checks."""
         if self.mean_speed is None:
             return np.asarray(np.linalg.norm(self.velocity, axis=1))
         return self.mean_speed
 
     def and_also(self, other: "Snapshot") -> "Snapshot":
-        """Return the mean of this and another, each counting as many times as it has checks; units are alike."""
+        """Return the mean of this and another snapshot in the same units, weighted by their number of checks."""
         share = np.float32(other.checks / (self.checks + other.checks))
         return Snapshot(
             self.scales,
@@ -80,101 +84,109 @@ class Snapshot:
 
     @property
     def velocity_m_s(self) -> NDArray[np.float32]:
-        """(n, 3) of every cell."""
+        """Return the velocity (n, 3) of every cell."""
         return self.velocity * np.float32(self.scales.speed_m_s)
 
     @property
     def speed_m_s(self) -> NDArray[np.float32]:
-        """(n,) of every cell, or its mean over the checks."""
+        """Return the speed (n,) of every cell, or its mean over the checks."""
         return self.speed * np.float32(self.scales.speed_m_s)
 
     @property
     def pressure_Pa(self) -> NDArray[np.float32]:
-        """(n,) of every cell."""
+        """Return the pressure (n,) of every cell."""
         return self.density * np.float32(self.scales.pressure_Pa)
 
     @property
     def outflow_mL_s(self) -> Floats:
-        """(k,) through every end."""
+        """Return the flow rate (k,) out of every end."""
         return self.outflow * self.scales.flow_mL_s
 
     @property
     def is_lost(self) -> bool:
-        """Whether the run has diverged, or its blood is so near the lattice's sound that it is no flow."""
-        return not np.abs(self.velocity).max() < TOO_FAST * d3q19.SOUND  # which nan is not either
+        """Return whether the run has diverged, or is too close to the lattice's speed of sound to be valid."""
+        return not np.abs(self.velocity).max() < TOO_FAST * d3q19.SOUND  # the comparison is false for nan, too
 
 
 class OnDevice(Protocol):
-    """The arrays of a run on a GPU, and what is done with them there."""
+    """A run whose arrays are on a GPU."""
 
     def advance(self, wanted: Floats, moments: Floats, first_pair: int) -> None:
-        """Make pairs of steps with what `stepping.imposed` returns; the first is that pair since a check."""
+        """Make one pair of time steps per row of `wanted`.
+
+        Parameters
+        ----------
+        wanted, moments : (pairs, k), (pairs, 3)
+            Boundary values from `stepping.imposed`.
+        first_pair : int
+            Number of the first pair, counted from the last check.
+        """
 
     def read(self) -> tuple[NDArray[np.float32], Floats]:
-        """Density deviation and momentum (n, 4) of every cell, and the flow out (k,) through every opening."""
+        """Return density deviation and momentum (n, 4) of every cell, and the flow rate (k,) out of every end."""
 
     def fetch(self, state: "State") -> None:
-        """Put what the time steps have changed back into the state."""
+        """Copy the arrays that the time steps change back to `state`."""
 
 
 @dataclass(eq=False)
 class State:
-    """A run under way; the populations and the links' sources change in place.
+    """A run in progress; the populations and the source terms of the links change in place.
 
-    On a GPU they change there: what is here is what they were when the run went there, or was last saved.
+    During a run on a GPU they change there. The arrays here are then those of the start or of the last save.
     """
 
     case: FlowCase
-    """What is computed."""
+    """The flow case."""
     close_up: CloseUp | None
-    """What of it is computed, and what surrounds that; None: all of it."""
+    """Refined region and the flow around it; None: the grid covers the whole vessel."""
     domain: domains.Domain
     """The grid."""
     addressing: Addressing
-    """The storage."""
+    """Memory layout of the populations."""
     scales: Scales
     """Lattice units; they change with the time step."""
     built: tuple[Links, ScreenEntries]
-    """What walls and openings send back, and the resistance of the stent by segment, for the first time steps."""
+    """Links and screen for the first time step length of the run."""
     links: Links
-    """The former for the present ones."""
+    """Links for the present time step length."""
     screen: ScreenEntries
-    """The latter for the present ones."""
+    """Screen for the present time step length."""
     probe: Probe
-    """Monitored quantities."""
+    """Places of the monitored quantities."""
     refill: Refill
-    """What the walls lose."""
+    """Redistribution of the mass lost at the walls."""
     bands: Ints
-    """(b + 1, 5) see `d3q19.update`."""
+    """(b + 1, 5) layers of cells (see `d3q19.update`)."""
     limit: NDArray[np.float32]
-    """(s,) largest cell Reynolds number in every segment."""
+    """(s,) largest grid Reynolds number of every segment, above which the viscosity is raised."""
     populations: NDArray[np.float32]
-    """(19 * stride + lanes.COUNT,) shifted populations."""
+    """(19 * stride + lanes.COUNT,) populations minus their rest weights."""
     pace: Ints
-    """(m,) time steps from each check to the next, even, in turn."""
+    """(m,) number of time steps from each check to the next; even; repeated cyclically."""
     check_s: float
     """Time between checks."""
     snapshots: deque[Snapshot]
     """The flow at the last checks."""
     blocks: tuple[Snapshot, ...] = ()
-    """Its means over all checks of a steady run, block by block."""
+    """Block means over all checks of a steady run."""
     steps: int = 0
-    """Time steps made."""
+    """Number of time steps made."""
     since_check: int = 0
-    """Those since the last check."""
+    """Number of time steps since the last check."""
     history: list[Floats] = field(default_factory=list)
     """Monitored quantities at every check."""
     loop_seconds: float = 0.0
-    """Time spent in the time steps."""
+    """Run time of the time steps."""
     device: "OnDevice | None" = None
-    """The run on a GPU, once it is there."""
+    """The run on a GPU, once it has been copied there."""
 
     @property
     def steps_per_check(self) -> int:
-        """Time steps from the last check to the next."""
+        """Return the number of time steps from the last check to the next."""
         return int(self.pace[len(self.history) % len(self.pace)])
 
     @property
     def time_s(self) -> float:
-        """Time since the run began."""
+        """Return the flow time since the start of the run."""
         return self.check_s * (len(self.history) + self.since_check / self.steps_per_check)

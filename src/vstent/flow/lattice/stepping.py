@@ -30,7 +30,7 @@ from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
 SLICE_UPDATES = 2e8
-"""Cell updates between looks at the clock: a few seconds of one core."""
+"""Number of cell updates between two looks at the clock: a few seconds on one core."""
 
 
 def build(
@@ -43,13 +43,24 @@ def build(
     start: FlowField | None,
     kept: int,
 ) -> State:
-    """Build grid, storage and coefficients, of a close-up or of the whole vessel, for the first steps.
+    """Set up a run: grid, memory layout, walls, openings, screen and initial flow.
 
     Parameters
     ----------
-    check_s, pace : time between checks, and (m,) the steps that it is made in, even, in turn.
-    start : a field on any grid to begin from; None: at rest.
-    kept : checks that are remembered.
+    case : FlowCase
+        The flow case.
+    cell_size_mm : float
+        Grid spacing.
+    check_s : float
+        Time between checks.
+    pace : (m,) int
+        Number of time steps from each check to the next; even; repeated cyclically.
+    close_up : CloseUp or None
+        Refined region and the flow around it; None: the grid covers the whole vessel.
+    start : FlowField or None
+        Initial flow, on any grid; None: at rest.
+    kept : int
+        Number of last checks that are kept.
     """
     if case.settings.device_gpu:
         require_gpu()
@@ -87,6 +98,7 @@ def build(
 
 
 def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
+    """Return the places of the monitored quantities: cells of the sac and points on the ostium."""
     cells = domains.cells_of_sac(case, domain)
     if case.ostium is None:
         return Probe(cells, np.zeros((0, 3)), np.zeros((0, 3)))
@@ -95,7 +107,7 @@ def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
 
 
 def _begin_from(state: State, start: FlowField) -> None:
-    """Begin from a flow; a pulse from the end of another's cycle, where there is one."""
+    """Set the initial flow; a pulse starts from the last phase of `start`, if it has phases."""
     pulses = state.case.settings.waveform is not None and start.phases
     moment = start.at_phase(start.phases[-1]) if pulses else start
     velocity, pressure = sampling.values_at(moment, state.domain.centers_mm)
@@ -113,7 +125,7 @@ def _begin_from(state: State, start: FlowField) -> None:
 
 
 def step(state: State) -> None:
-    """Make the time steps of a few seconds, no further than to the next check; there, read the monitored quantities."""
+    """Make time steps for a few seconds, at most up to the next check, and record the flow at a check."""
     began = perf_counter()
     advance(state, min(_slice_steps(state), state.steps_per_check - state.since_check))
     state.loop_seconds += perf_counter() - began
@@ -126,12 +138,12 @@ def step(state: State) -> None:
 
 
 def is_at_check(state: State) -> bool:
-    """Whether the last steps ended at a check."""
+    """Return whether the last time steps ended at a check."""
     return state.since_check == 0
 
 
 def _keep_pace(state: State) -> None:
-    """Go on, after a check, in time steps as long as they may be until the next; what moves, moves on as before."""
+    """Switch to the time step until the next check and rescale the populations so that the flow is the same."""
     last, following = (int(state.pace[(len(state.history) + k) % len(state.pace)]) for k in (-1, 0))
     if last == following:
         return
@@ -147,7 +159,7 @@ def _keep_pace(state: State) -> None:
 
 
 def take_pace(state: State) -> None:
-    """Set the coefficients to the time steps until the next check; populations and openings stay as they are."""
+    """Set links and screen for the time step until the next check; populations and openings do not change."""
     stretch = int(state.pace[0]) / state.steps_per_check
     state.scales = replace(state.scales, step_s=state.check_s / state.steps_per_check)
     links, screen = state.built
@@ -155,11 +167,12 @@ def take_pace(state: State) -> None:
 
 
 def _slice_steps(state: State) -> int:
+    """Return the even number of time steps between two looks at the clock."""
     return 2 * max(1, round(SLICE_UPDATES / len(state.domain.cells) / 2))
 
 
 def advance(state: State, steps: int) -> None:
-    """Make an even number of time steps, in pairs."""
+    """Make an even number of time steps."""
     wanted, moments = imposed(state, state.since_check + 1 + np.arange(0, steps, 2))
     first_pair = state.since_check // 2
     if state.case.settings.device_gpu:
@@ -172,9 +185,21 @@ def advance(state: State, steps: int) -> None:
 
 
 def imposed(state: State, steps: Floats | Ints) -> tuple[Floats, Floats]:
-    """What is wanted (t, k) at every end at steps (t,) since the last check, and their moments (t, 3).
+    """Return the boundary values at time steps (t,) since the last check.
 
-    See `d3q19.drive`.
+    Parameters
+    ----------
+    state : State
+        The run.
+    steps : (t,)
+        Time steps, counted from the last check.
+
+    Returns
+    -------
+    wanted : (t, k)
+        Speed or density imposed at every end.
+    moments : (t, 3)
+        The two moments of the cycle between which each step lies, and the fraction of the way (see `d3q19.drive`).
     """
     links = state.links
     count = len(links.course)
@@ -187,7 +212,7 @@ def imposed(state: State, steps: Floats | Ints) -> tuple[Floats, Floats]:
 
 
 def _device(state: State) -> OnDevice:
-    """Return the run on the GPU; the first time, put it there."""
+    """Return the run on the GPU; the first call copies it there."""
     from vstent.flow.lattice.on_gpu import Device
 
     if state.device is None:
@@ -196,7 +221,7 @@ def _device(state: State) -> OnDevice:
 
 
 def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int) -> None:
-    """Make pairs of steps with what `imposed` returns; the first is that pair since a check."""
+    """Make pairs of time steps on the CPU; `first_pair` is the number of the first since the last check."""
     f, links, refill = state.populations, state.links, state.refill
     a, screen = state.addressing, state.screen
     shares = d3q19.share(a.length, screen.start, state.bands, numba.get_num_threads())
@@ -215,7 +240,7 @@ def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int
 
 
 def _settle(state: State, part: float) -> None:
-    """Let what is deferred, the correction of the walls and the balance of what they lose, go so far of its way."""
+    """Update the deferred wall correction and the mass balance, with the under-relaxation factor `part`."""
     links, refill, share = state.links, state.refill, np.float32(part)
     wall = slice(links.start[-1], None)
     of_walls = links.address[wall], links.correction[wall], links.source[wall]
@@ -224,6 +249,7 @@ def _settle(state: State, part: float) -> None:
 
 
 def _snapshot(state: State) -> Snapshot:
+    """Return the present flow; in a screen the velocity includes half of its force."""
     moment, outflow = _read_here(state) if state.device is None else state.device.read()
     velocity = np.ascontiguousarray(moment[:, 1:])
     cells = state.screen.cell
@@ -234,7 +260,7 @@ def _snapshot(state: State) -> Snapshot:
 
 
 def _relaxation_times(state: State, cells: Ints) -> NDArray[np.float32]:
-    """Relaxation times (e,) of some cells, as they collide with."""
+    """Return the relaxation times (e,) of cells, which depend on the shear rate in shear-thinning blood."""
     time, law = np.float32(state.scales.relaxation_steps), state.scales.thinning
     if law[0] == 0:
         return np.full(len(cells), time)
@@ -245,7 +271,7 @@ def _relaxation_times(state: State, cells: Ints) -> NDArray[np.float32]:
 
 
 def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
-    """Density deviation and momentum (n, 4) of every cell, and the flow out (k,) through every opening."""
+    """Return density deviation and momentum (n, 4) of every cell, and the flow rate (k,) out of every end."""
     f, links = state.populations, state.links
     moment = d3q19.moments(f, state.addressing.stride, state.addressing.place).astype(np.float32)
     ends = range(len(links.start) - 1)
@@ -254,7 +280,7 @@ def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
 
 
 def _monitor(state: State, now: Snapshot) -> Floats:
-    """Mean speed of the sac, pressure and mean speed of the vessel, neck inflow: what convergence is judged by."""
+    """Return the monitored quantities: mean speed in the sac, inlet pressure, mean speed in the vessel, neck inflow."""
     velocity_m_s = now.velocity_m_s
     speed_m_s = np.linalg.norm(velocity_m_s, axis=1)
     first_inflow = state.links.patch[np.argmax(state.links.openings[:, 0] == d3q19.INFLOW)]

@@ -1,4 +1,4 @@
-"""Why a lattice-Boltzmann run diverged, from the last check at which all was well."""
+"""Likely cause of a diverged lattice-Boltzmann run, from its last valid check."""
 
 import numpy as np
 
@@ -8,11 +8,11 @@ from vstent.kernels.arrays import Floats
 from vstent.units import place
 
 FAST = 0.4
-"""Speed from which the sound is too near."""
+"""Speed in cells per time step above which the time step is reported as too long: it is close to the speed of sound."""
 
 
 def trouble(state: State) -> str:
-    """One sentence: what happened, the last good state, the likeliest cause and what to do about it."""
+    """Return one sentence: when the run diverged, where the flow was fastest, the likely cause and what to do."""
     good = [one for one in state.snapshots if not one.is_lost]
     when_ms = 1e3 * state.time_s
     if not good:
@@ -33,6 +33,7 @@ def trouble(state: State) -> str:
 
 
 def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
+    """Return the likely cause and what to do about it."""
     if speed[fastest] > FAST:
         return (
             f"the time step is too long ({speed[fastest]:.2g} cells per step): use half the lattice speed "
@@ -53,6 +54,6 @@ def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
 
 
 def _backflow(state: State, last: Snapshot, k: int) -> float:
-    """Fastest blood that enters through opening k, in cells a step."""
+    """Return the highest speed, in cells per step, of blood that enters through opening `k`."""
     cell = state.domain.link_cell[state.domain.link_patch == k + 1]
     return float(-(last.velocity[cell] @ state.case.vessel.openings[k].normal).min()) if len(cell) else 0.0

@@ -9,13 +9,25 @@ from vstent.flow.lattice.scales import ODD_RATE
 from vstent.kernels.arrays import Floats
 
 CURVE: Final = np.array([1.0, -2.0, 0.0, 1.0, 0.0], np.float32)
-"""The second difference along a link, of a, b, c, e and g (see `d3q19.defer`)."""
+"""Coefficients of the second difference along a link, for the populations a, b, c, e and g (see `d3q19.defer`)."""
 
 
 def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
-    """Linear interpolated reflection (Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids 13, 3452, eq. 5).
+    """Return the weights (l, 3) of linearly interpolated bounce-back for populations a, b and c (see `d3q19.paths`).
 
-    Half-way where it would need the cell behind and that is no blood.
+    A link whose wall is nearer than half-way needs the cell behind. Where that is not blood, half-way bounce-back is
+    used.
+
+    Parameters
+    ----------
+    fraction : (l,)
+        Position of the wall along each link, 0 to 1.
+    has_one : (l,) bool
+        Whether the cell behind the link's cell is blood.
+
+    References
+    ----------
+    Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids 13, 3452, eq. 5.
     """
     zero = np.zeros_like(fraction)
     near = np.stack([2 * fraction, 1 - 2 * fraction, zero], axis=1)
@@ -26,7 +38,17 @@ def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
 
 
 def quadratic_weights(fraction: Floats) -> Floats:
-    """Quadratic interpolated reflection (Lallemand and Luo 2003, J. Comput. Phys. 184, 406, eq. 10): (l, 5)."""
+    """Return the weights (l, 5) of quadratically interpolated bounce-back for a, b, c, e and g (see `d3q19.defer`).
+
+    Parameters
+    ----------
+    fraction : (l,)
+        Position of the wall along each link, 0 to 1.
+
+    References
+    ----------
+    Lallemand and Luo 2003, J. Comput. Phys. 184, 406, eq. 10.
+    """
     x, zero = fraction, np.zeros_like(fraction)
     near = np.stack([x * (1 + 2 * x), 1 - 4 * x**2, zero, -x * (1 - 2 * x), zero], axis=1)
     far = np.stack([1 / (x * (2 * x + 1)), zero, (2 * x - 1) / x, zero, (1 - 2 * x) / (1 + 2 * x)], axis=1)
@@ -34,15 +56,31 @@ def quadratic_weights(fraction: Floats) -> Floats:
 
 
 def parabolic_weights(fraction: Floats, relaxation_steps: float) -> tuple[Floats, Floats]:
-    """Reflection that is exact for a parabola along the link: (l, 5) weights of a, b, c, e and g (see `d3q19.defer`).
+    """Return the weights of bounce-back that is exact for a parabolic velocity along the link.
 
-    And how much of `CURVE` they would have more (l,) without viscosity.
+    Quadratic interpolation alone leaves a slip velocity of up to an eighth of the squared grid spacing times the flow's
+    curvature. The reason is that the populations carry, beside the velocity, second differences and the part that the
+    odd relaxation rate has not yet relaxed. The second difference a - 2 b + e compensates for both. Its viscous part is
+    a compromise between a plane channel and a tube; determining it from the populations would be wrong where the force
+    of a screen meets the wall.
 
-    Quadratic interpolation alone lets blood slip by up to an eighth of a squared cell times the flow's curvature: its
-    populations carry, beside the velocity, second differences and what the odd rate has still to relax (Ginzburg and
-    d'Humieres 2003, Phys. Rev. E 68, 066614, sec. III). Both are put back by the second difference, a - 2 b + e; how
-    much of it comes with the viscosity is taken between a plane channel and a tube, for read off the populations it
-    would be wrong where a screen's force meets the wall.
+    Parameters
+    ----------
+    fraction : (l,)
+        Position of the wall along each link, 0 to 1.
+    relaxation_steps : float
+        Relaxation time of the stress, in time steps.
+
+    Returns
+    -------
+    weights : (l, 5)
+        For the populations a, b, c, e and g (see `d3q19.defer`).
+    viscous : (l,)
+        Multiple of `CURVE` that the weights would contain in addition without viscosity.
+
+    References
+    ----------
+    Ginzburg and d'Humieres 2003, Phys. Rev. E 68, 066614, sec. III.
     """
     x, even, odd = fraction, relaxation_steps - 0.5, 1 / ODD_RATE - 0.5
     per = 1 / np.maximum(1, x * (2 * x + 1))

@@ -1,4 +1,4 @@
-"""Compiled loops of the lattice-Boltzmann engine: arrays in, arrays out. Open ``d3q19.py`` first."""
+"""Compiled loops of the lattice-Boltzmann engine; arguments and results are arrays. Open ``d3q19.py`` first."""
 
 from pathlib import Path
 

@@ -1,17 +1,21 @@
-"""What one collision does to the 19 populations of a cell: arithmetic alone, for one cell or for as many as Lanes hold.
+"""Collision of the 19 populations of one cell, or of as many cells as a vector register holds.
 
-Every number may be a float32 or `vstent.flow.lattice.kernels.lanes`. Populations are shifted by their rest weights
-and numbered as in `vstent.flow.lattice.kernels.d3q19`.
+Every number may be a float32 or `vstent.flow.lattice.kernels.lanes`. Populations are numbered as in
+`vstent.flow.lattice.kernels.d3q19`; their rest weights are subtracted.
 
-Regularised: of the even part only the stress survives (Latt and Chopard 2006, Math. Comput. Simul. 72:165, eq 12),
-without its trace, which only carries sound. The odd part has its own rate (Ginzburg, Verhaeghe and d'Humieres 2008,
-Commun. Comput. Phys. 3, 427), in fast blood a higher one (`_stable_rate`). Equilibrium of incompressible flow (He and
-Luo 1997, J. Stat. Phys. 88, 927, eq. 20): the steady state is free of divergence, whatever the lattice speed.
+The collision is regularised: of the even (symmetric) part only the stress is kept (Latt and Chopard 2006, Math. Comput.
+Simul. 72:165, eq. 12), without its trace, which only carries sound. The odd (antisymmetric) part has its own relaxation
+rate (Ginzburg, Verhaeghe and d'Humieres 2008, Commun. Comput. Phys. 3, 427), which is raised in fast flow
+(`_stable_rate`). The equilibrium is that of incompressible flow (He and Luo 1997, J. Stat. Phys. 88, 927, eq. 20): the
+steady state is free of divergence at any lattice speed.
 
-Two moments that nineteen velocities lack are made up for, and both bend a round jet along the grid's diagonals. The
-fourth moments are those that the second ones ask for, <xxyy> = density / 9 + (ux ux + uy uy) / 3 (Bauer and Ruede 2018,
-arXiv:1803.04937, sec. 3): the usual equilibrium of D3Q19 lacks uz uz / 6 there. And <xxyz> cannot be held at all: what
-advection makes of the stress by it, d/dz of a sixth of (uz n_xz + ...), is put into the third moments (`_third`).
+D3Q19 lacks two kinds of moments. Without them a round jet bends towards the diagonals of the grid. They are replaced as
+follows:
+
+- Fourth moments follow from the second ones, <xxyy> = density / 9 + (ux ux + uy uy) / 3 (Bauer and Ruede 2018,
+  arXiv:1803.04937, sec. 3). The usual equilibrium of D3Q19 lacks the term uz uz / 6 there.
+- The moment <xxyz> cannot be represented. Its effect on the advection of the stress, d/dz of a sixth of (uz n_xz +
+  ...), is added to the third moments (`_third`).
 """
 
 from typing import Any
@@ -32,7 +36,7 @@ _THREE_HALVES, _QUARTER, _EIGHTH, _TWELFTH, _TWENTY_FOURTH, _TINY = (
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def moments_of(f: Any) -> tuple[Any, Any, Any]:
-    """Density deviation, momentum (3) and momentum flux xx, yy, zz, xy, xz, yz of the populations."""
+    """Return density deviation, momentum (3) and momentum flux xx, yy, zz, xy, xz, yz of the populations."""
     s1, s2, s3 = f[1] + f[2], f[3] + f[4], f[5] + f[6]
     s4, s5, s6 = f[7] + f[8], f[9] + f[10], f[11] + f[12]
     s7, s8, s9 = f[13] + f[14], f[15] + f[16], f[17] + f[18]
@@ -47,7 +51,7 @@ def moments_of(f: Any) -> tuple[Any, Any, Any]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def departure(flux: Any, u: Any) -> tuple[Any, ...]:
-    """Stress (6): what the momentum flux has beyond u u, without its trace, which only carries sound."""
+    """Return the stress (6): momentum flux minus u u, without its trace, which only carries sound."""
     xx, yy, zz = flux[0] - u[0] * u[0], flux[1] - u[1] * u[1], flux[2] - u[2] * u[2]
     trace = (xx + yy + zz) * _THIRD
     return xx - trace, yy - trace, zz - trace, flux[3] - u[0] * u[1], flux[4] - u[0] * u[2], flux[5] - u[1] * u[2]
@@ -68,9 +72,9 @@ def _plus_square(n: Any, u: Any) -> tuple[Any, ...]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _third(u: Any, n: Any, part: Any) -> tuple[Any, ...]:
-    """Third moments xyy, xzz, xxy, yzz, xxz, yyz of velocity and stress, in the place of a moment <xxyz>.
+    """Return third moments xyy, xzz, xxy, yzz, xxz, yyz, times `part` / 4, that replace the missing moment <xxyz>.
 
-    A `part` of them, in quarters: what each adds to the odd half of four diagonal pairs.
+    Each is added to the odd half of four diagonal pairs of populations, hence the quarter.
     """
     part = _TWENTY_FOURTH * part
     x, y, z = part * u[0], part * u[1], part * u[2]
@@ -88,9 +92,16 @@ def _third(u: Any, n: Any, part: Any) -> tuple[Any, ...]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _even(density: Any, u: Any, flux: Any) -> tuple[Any, ...]:
-    """What the rest population and, in each of the nine pairs, half of both are to be (10): see `relaxed_pair`.
+    """Return the even parts (10) after collision: the rest population and half the sum of each of the nine pairs.
 
-    From the density deviation, the velocity (3) and the second moments wanted (6).
+    Parameters
+    ----------
+    density
+        Density deviation.
+    u
+        Velocity (3).
+    flux
+        Second moments after collision (6).
     """
     xx, yy, zz, xy, xz, yz = flux
     isotropic = density - _THREE_HALVES * (xx + yy + zz)
@@ -114,9 +125,14 @@ def _even(density: Any, u: Any, flux: Any) -> tuple[Any, ...]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _odd(momentum: Any, third: Any) -> tuple[Any, ...]:
-    """What is added to half the difference of each of the nine pairs: see `relaxed_pair`.
+    """Return what is added to half the difference of each of the nine pairs (see `relaxed_pair`).
 
-    From the momentum (3) added, and the third moments, in quarters (6).
+    Parameters
+    ----------
+    momentum
+        Momentum added (3).
+    third
+        Third moments, divided by four (6).
     """
     x, y, z = _TWELFTH * momentum[0], _TWELFTH * momentum[1], _TWELFTH * momentum[2]
     xyy, xzz, xxy, yzz, xxz, yyz = third
@@ -135,9 +151,16 @@ def _odd(momentum: Any, third: Any) -> tuple[Any, ...]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def relaxed_pair(a: Any, b: Any, even: Any, odd: Any, half_kept: Any) -> tuple[Any, Any]:
-    """Return collided populations in place of a and b, its opposite: already swapped.
+    """Return the collided populations of a pair, already swapped: the first belongs in the place of `a`.
 
-    `even` and `odd` are the pair's of what `collided` returns, `half_kept` what it returns besides.
+    Parameters
+    ----------
+    a, b
+        Populations of two opposite directions.
+    even, odd
+        Parts of this pair from `collided`.
+    half_kept
+        Third result of `collided`.
     """
     new = odd + half_kept * (a - b)
     return even - new, even + new
@@ -160,11 +183,11 @@ def relaxed(f: Any, even: Any, odd: Any, half_kept: Any) -> tuple[Any, ...]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _stable_rate(squared: Any, time: Any, odd_rate: Any) -> Any:
-    """Relaxation rate of the odd part: `odd_rate`, or as much higher as blood of this squared speed is stable with.
+    """Return the relaxation rate of the odd part: `odd_rate`, or a higher one where fast flow needs it for stability.
 
-    Waves on a uniform flow grow where its squared speed times (1 / rate - 1/2) passes some twice the viscosity: there
-    an eigenvalue of collision and streaming passes 1 (von Neumann's analysis, rates from 0.7 to 1.7; along the grid's
-    axes first). Up to three quarters of that are allowed, with which nothing grows up to a speed of 0.2.
+    Waves on a uniform flow grow when the squared speed times (1 / rate - 1/2) exceeds about twice the viscosity: an
+    eigenvalue of collision and streaming then exceeds 1 (von Neumann analysis with rates from 0.7 to 1.7, first along
+    the grid axes). Three quarters of this limit are allowed; nothing then grows up to a speed of 0.2.
     """
     slow = _ONE / odd_rate
     excess = larger((slow - _HALF) * squared - _HALF * (time - _HALF), _ZERO)
@@ -173,7 +196,7 @@ def _stable_rate(squared: Any, time: Any, odd_rate: Any) -> Any:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _kept_and_rate(u: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any]:
-    """Part of the stress kept, by the blood's relaxation time or at the largest cell Reynolds number, and odd rate."""
+    """Return the fraction of the stress that is kept, and the relaxation rate of the odd part."""
     squared = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + _TINY
     time = larger(time, _HALF + _THREE / limit * root(squared))
     return _ONE - _ONE / time, _stable_rate(squared, time, odd_rate)
@@ -181,7 +204,7 @@ def _kept_and_rate(u: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, A
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def stress_size(f: Any) -> Any:
-    """Norm of the stress that populations hold, times the root of two."""
+    """Return the norm of the stress in the populations, times the square root of 2."""
     _, u, flux = moments_of(f)
     xx, yy, zz, xy, xz, yz = departure(flux, u)
     return root(_TWO * (xx * xx + yy * yy + zz * zz + _TWO * (xy * xy + xz * xz + yz * yz)))
@@ -189,10 +212,24 @@ def stress_size(f: Any) -> Any:
 
 @njit(cache=True, forceinline=True, fastmath=True, error_model="numpy")
 def thinned(size: Any, time: Any, law: Any) -> Any:
-    """Relaxation time of blood that thins with the shear rate, from its `stress_size`; one number, never Lanes.
+    """Return the relaxation time of shear-thinning blood from its `stress_size`.
 
-    Strain rate = 1.5 / time of the second moments' departure from equilibrium (Boyd, Buick and Green 2006, J. Phys. A
-    39, 14241, eq. 9), which depends on the time sought: three rounds from blood at rest. `law` as in `lattice.update`.
+    The strain rate is 1.5 / time times the departure of the second moments from equilibrium. It depends on the
+    relaxation time itself, which is found by three fixed-point iterations from the viscosity at rest. Numbers must be
+    scalars, not Lanes.
+
+    Parameters
+    ----------
+    size
+        Result of `stress_size`.
+    time
+        Relaxation time at high shear rate.
+    law
+        Carreau-Yasuda law (4), as in `d3q19.update`.
+
+    References
+    ----------
+    Boyd, Buick and Green 2006, J. Phys. A 39, 14241, eq. 9.
     """
     found = time + law[0]
     for _ in range(3):
@@ -203,16 +240,20 @@ def thinned(size: Any, time: Any, law: Any) -> Any:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def rates(time: Any, odd_rate: Any) -> tuple[Any, Any]:
-    """Viscosity, and by how much the product of the two relaxation times, less a half each, falls short of 1/4."""
+    """Return the viscosity, and 1/4 minus the product of (relaxation time - 1/2) of the stress and of the odd part.
+
+    The second value is at least 0.
+    """
     even = time - _HALF
     return even * _THIRD, larger(_QUARTER - (_ONE / odd_rate - _HALF) * even, _ZERO)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def squared_reach(normal: Any) -> Any:
-    """How far along a unit normal the links reach that carry momentum across it, squared: 1 at most, 1/2 at least.
+    """Return the squared distance along a unit normal over which links carry momentum across it: 1/2 to 1.
 
-    The sum of w c_n^4 c_t^2 over that of w c_n^2 c_t^2, mean of both tangents t, over the velocities c of D3Q19.
+    It is the sum of w c_n^4 c_t^2 divided by that of w c_n^2 c_t^2, averaged over both tangents t, over the velocities
+    c of D3Q19.
     """
     x, y, z = normal[0] * normal[0], normal[1] * normal[1], normal[2] * normal[2]
     return _THREE - _EIGHT * (x * x + y * y + z * z) + _SIX * (x * x * x + y * y * y + z * z * z)
@@ -220,20 +261,37 @@ def squared_reach(normal: Any) -> Any:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def of_thin_sheet(across: Any, spread: Any, through: Any, blood: Any) -> tuple[Any, Any]:
-    """Part of the speed along a thin sheet that is left where a cell's share of it resists by `across`.
+    """Return the fractions of the tangential speed that remain in a cell of a screen and in the screen itself.
 
-    In the cell's half-force velocity, and in the sheet itself. A thin sheet brakes blood that has been slowed on its
-    way there, down to the speed that it leaves with. Parts a and b of it in two layers of cells, d apart, brake twice:
-    R + a b d R R / stir for R, where momentum goes from one to the other at the rate stir = viscosity + |u_n| / 2;
-    `spread` is a b d R of all layers, R the whole sheet's. And where a lattice is pushed by F its velocity stands out
-    by (1/4 - L) F / stir along an axis of the grid, by the `squared_reach` of that elsewhere, L being the product of
-    the relaxation times less a half each (the second difference of the force: Ginzburg, Silva and Talon 2015, Phys.
-    Rev. E 91, 023307): with L far below 1/4 a dense braid would take twice what it should. `blood` is the viscosity and
-    how much the velocity so stands out.
+    The first applies to the half-force velocity of the cell, the second to the velocity in an ideal thin sheet. Two
+    errors of a thin sheet on a grid are corrected:
+
+    - The sheet is spread over layers of cells and slows the blood several times. Parts a and b of it in two layers a
+      distance d apart act like the resistance R + a b d R R / stir instead of R. Here stir = viscosity + |u_n| / 2 is
+      the rate at which momentum is exchanged between layers.
+    - A force F on a cell changes its velocity by an additional (1/4 - L) F / stir along a grid axis, and by
+      `squared_reach` times that in other directions. L is the product of (relaxation time - 1/2) of the stress and of
+      the odd part. The term stems from the second difference of the force. With L far below 1/4 the drag of a dense
+      braid would be twice its true value.
+
+    Parameters
+    ----------
+    across
+        Tangential resistance of the cell per time step.
+    spread
+        Sum of a b d R over all pairs of layers, R being the resistance of the whole sheet.
+    through
+        Velocity normal to the sheet.
+    blood
+        Viscosity, and 1/4 - L times `squared_reach`.
+
+    References
+    ----------
+    Ginzburg, Silva and Talon 2015, Phys. Rev. E 91, 023307: the second difference of the force.
     """
     viscosity, shortfall = blood
     stir = viscosity + _HALF * larger(through, _ZERO - through)
-    # The sheet's speed over the lattice's is 2 stir / open: all in one division, for divisions are what this costs.
+    # The ratio of the sheet's speed to the cell's is 2 stir / open. One division serves both, because it is expensive.
     open = stir + root(stir * (stir + _FOUR * spread)) + _TWO * shortfall * across
     free = _ONE / (open + stir * across)
     return open * free, _TWO * stir * free
@@ -241,13 +299,24 @@ def of_thin_sheet(across: Any, spread: Any, through: Any, blood: Any) -> tuple[A
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def resist(normal: Any, entry: Any, u: Any, blood: Any) -> tuple[Any, Any]:
-    """Half-force velocity v inside a screen, and the force, from the velocity u without it: v = u + F / 2.
+    """Return the half-force velocity v = u + F / 2 in a screen, and its force F, from the velocity u without it.
 
-    `entry` holds the linear resistance along the unit normal and across it, and the quadratic one along it, all per
-    cell and time step, and the `spread`: F = -(along + quadratic size) v_n n - (across + quadratic size / 2) w_t, for
-    wires that cross at right angles are dragged half as much along their plane; w is the velocity in a thin sheet,
-    along it a part of v (`of_thin_sheet`), and size is |w|. Solved at once but for |w|, which is found in two rounds
-    from what the linear resistances leave: no stability limit.
+    The force is F = -(along + quadratic |w|) v_n n - (across + quadratic |w| / 2) w_t. Here w is the velocity in a thin
+    sheet, whose tangential part is a fraction of that of v (`of_thin_sheet`). The tangential quadratic term is halved
+    because wires that cross at right angles have half the drag along their plane. The equations are solved implicitly,
+    so that there is no stability limit; |w| is found by two iterations from the linear resistances.
+
+    Parameters
+    ----------
+    normal
+        Unit normal of the screen (3).
+    entry
+        Linear resistance along the normal, linear resistance across it, quadratic resistance along it, all per cell and
+        time step, and the `spread` of `of_thin_sheet`.
+    u
+        Velocity without the screen (3).
+    blood
+        Result of `rates`.
     """
     blood = blood[0], blood[1] * squared_reach(normal)
     through = u[0] * normal[0] + u[1] * normal[1] + u[2] * normal[2]
@@ -269,9 +338,23 @@ def resist(normal: Any, entry: Any, u: Any, blood: Any) -> tuple[Any, Any]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def collided(f: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any, Any]:
-    """Return what `relaxed` makes populations of that collide freely.
+    """Return the collided parts from which `relaxed` computes populations without a screen.
 
-    The even parts (10), the odd ones (9), and half of how much of the odd part is kept.
+    Parameters
+    ----------
+    f
+        Populations (19).
+    time
+        Relaxation time of the stress.
+    limit
+        Largest grid Reynolds number.
+    odd_rate
+        Relaxation rate of the odd part in slow flow.
+
+    Returns
+    -------
+    tuple
+        Even parts (10), odd parts (9), and half the fraction of the odd part that is kept.
     """
     density, u, flux = moments_of(f)
     keep, rate = _kept_and_rate(u, time, limit, odd_rate)
@@ -283,13 +366,23 @@ def collided(f: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any, An
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any, entry: Any) -> tuple[Any, Any, Any]:
-    """Return the same of populations in a screen (see `resist`).
+    """Return the collided parts of populations in a screen, from which `relaxed` computes them.
 
-    The force of Guo, Zheng and Shi 2002 (Phys. Rev. E 65, 046308, eq. 19 and 20): velocity with half the force, and the
-    force's first and second moment with the factors 1 - rate / 2.
+    The velocity includes half of the force. First and second moments of the force are multiplied by 1 - rate / 2.
+
+    Parameters
+    ----------
+    f, time, limit, odd_rate
+        As in `collided`.
+    normal, entry
+        Screen, as in `resist`.
+
+    References
+    ----------
+    Guo, Zheng and Shi 2002, Phys. Rev. E 65, 046308, eq. 19 and 20.
     """
     density, bare, flux = moments_of(f)
-    # With the rate of slow blood, as `lattice.resisted` reads it: the product of both times is near zero with either.
+    # The rate of slow flow is used, as in `d3q19.resisted`. With either rate the product of both times is near zero.
     u, force = resist(normal, entry, bare, rates(time, odd_rate))
     keep, rate = _kept_and_rate(u, time, limit, odd_rate)
     half, half_odd = _HALF + _HALF * keep, _ONE - _HALF * rate
@@ -314,12 +407,24 @@ def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any,
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def rescaled(f: Any, stretch: Any, stress: Any) -> tuple[Any, ...]:
-    """Return populations of the same flow in time steps `stretch` times as long, each in the place of its opposite.
+    """Return populations of the same flow for time steps `stretch` times as long, each in the place of its opposite.
 
-    Of `f` (19,), an array: speeds grow with the step, densities with its square, as does what the odd part has beyond
-    its equilibrium, for that is the density's gradient; the stress grows with the step times its relaxation time, by
-    `stress` (Thuerey, Pohl, Ruede, Oechsner and Koerner 2006, Comput. Fluids 35, 934). The momentum in a screen
-    is not that of the flow, by half the force: as little is it carried over, for a step.
+    Speeds grow with the time step and densities with its square. The non-equilibrium of the odd part also grows with
+    the square, because it is the density gradient. In a screen the momentum differs from that of the flow by half the
+    force. This difference is not rescaled exactly, with an effect on a single step.
+
+    Parameters
+    ----------
+    f
+        Populations (19), an array.
+    stretch
+        Ratio of the new to the old time step.
+    stress
+        Factor of the stress: `stretch` times the ratio of the relaxation times.
+
+    References
+    ----------
+    Thuerey, Pohl, Ruede, Oechsner and Koerner 2006, Comput. Fluids 35, 934.
     """
     density, u, flux = moments_of(f)
     held = _times(stress, departure(flux, u))

@@ -1,18 +1,20 @@
 """D3Q19 lattice-Boltzmann kernels on a sparse set of cells: in place, in rows, in single precision.
 
-Storage. Populations are shifted by their rest weights (f - w) and lie in one flat array: population q of storage place
-i is at q * stride + i. Storage places are the fluid cells *and* their solid neighbours, row by row along z, so that a
-*segment* (a run of fluid cells along z) and each of its 18 neighbouring runs are contiguous: one address per segment
-and population replaces one per cell, and eight or sixteen are worked on at once (`vstent.flow.lattice.kernels.lanes`).
+Storage: the rest weight w is subtracted from each population, and all are stored in one flat array. Population q of
+storage place i is at q * stride + i. Storage places exist for blood cells *and* for their solid neighbours, row by row
+along z. A *segment* is a run of blood cells along z. It and each of its 18 neighbouring runs are contiguous, so that
+one address per segment and direction suffices, and eight or sixteen cells are processed at once
+(`vstent.flow.lattice.kernels.lanes`).
 
-Update in place (the AA pattern; Bailey, Myre, Walsh, Lilja and Saar 2009, ICPP, 550). Even step: a cell reads its own
-populations and writes the collided ones back, each at the place of its opposite. Odd step: it reads where its
-neighbours have left them and writes to the same places. After an odd step every population is at home again.
+Update in place (AA pattern; Bailey, Myre, Walsh, Lilja and Saar 2009, ICPP, 550): in an even step a cell reads its own
+populations and writes each collided one to the place of its opposite. In an odd step it reads the populations where its
+neighbours have written them, and writes to the same places. After an odd step every population is *at home*, that is,
+stored at its own cell and direction.
 
-A link that leaves the fluid ends at a solid neighbour, whose storage place serves as the link's mailbox: what a wall or
-an opening sends back is put there (before an odd step) or taken from there (after it).
+A link from a blood cell to a solid neighbour uses the storage place of this neighbour as its *mailbox*. The population
+that a wall or an opening returns is written there before an odd step, and the outgoing one is read from there after it.
 
-Populations are numbered 0 rest, then in opposite pairs (1, 2), (3, 4), ... (17, 18).
+Population 0 is the rest population. The others are numbered in opposite pairs (1, 2), (3, 4), ... (17, 18).
 """
 
 from collections.abc import Sequence
@@ -37,43 +39,46 @@ from vstent.kernels.arrays import Floats, Ints
 from vstent.kernels.directions import VELOCITIES
 
 WEIGHTS: Final = np.where((squares := (VELOCITIES**2).sum(axis=1)) == 0, 1 / 3, np.where(squares == 1, 1 / 18, 1 / 36))
-"""(19,) rest weights."""
+"""(19,) weights of the populations at rest."""
 OPPOSITE: Final = np.array([0] + [q + 1 if q % 2 else q - 1 for q in range(1, 19)], dtype=np.int32)
-"""(19,) number of the opposite velocity."""
+"""(19,) number of the opposite direction."""
 SOUND: Final = 3**-0.5
-"""Speed of the lattice's sound, in cells per time step."""
+"""Speed of sound of the lattice, in cells per time step."""
 AXIAL: Final = 6
-"""Number of the last velocity along an axis; those after it are diagonal."""
+"""Number of the last direction along an axis; those after it are diagonal."""
 PRESSURE, INFLOW, OUTFLOW = 0.0, 1.0, 2.0
-"""What can be imposed at an opening (see `drive`)."""
+"""Boundary conditions of an opening (see `drive`)."""
 OWN_DENSITIES: Final = (2, 8)
-"""Columns of an opening that are densities of its own (see `drive`)."""
+"""Columns of an opening's row that hold densities which it updates itself (see `drive`)."""
 SLOWLY: Final = 0.1
-"""Part of the way that an outlet's pressure goes in a step pair; at once, it would chase its own answer."""
+"""Under-relaxation factor of an outlet's density per step pair. Without it the density would react to its own
+effect."""
 SEGMENT: Final = 128
-"""Longest segment, in cells."""
+"""Maximum length of a segment, in cells."""
 LINK_WORK, SCREENED_WORK = 0.06, 2.0
-"""Time that a link takes, and a vector of a segment with screened cells, over that of a vector without."""
+"""Run time of a link, and of a vector in a segment with screened cells, relative to that of a vector without."""
 ENTRY: Final = 7
-"""Numbers that say what a cell of a screen resists (see `resist`): the unit normal and four of the resistance."""
+"""Number of values per screen cell (see `resist`): unit normal (3) and resistance (4)."""
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _ROOT_THREE: Final = float(np.sqrt(3.0))
+"""Inverse speed of sound of the lattice."""
 _U = np.uint64
 _WIDE = SEGMENT + COUNT
+"""Length of a work array for one segment and a vector beyond it."""
 _KINDS: Final = 3
-"""Stages of a step: cells collide; links send back what these and the bands beside have sent; septa exchange what links
-of their band and the next have read."""
+"""Number of stages of a step. Stage 0: cells collide. Stage 1: links return what the cells of their band and of the
+adjacent bands have sent. Stage 2: septa exchange populations that the links of their band and the next have read."""
 _AFTER: Final = (0, 1, 2)
-"""Bands after a band that have to have collided before each stage can be done to it."""
+"""Number of following bands that must have collided before each stage of a band."""
 _BEFORE: Final = (0, 1, 1)
-"""Bands before it that have to."""
+"""Number of preceding bands that must have collided before each stage of a band."""
 _STEP: Final = 2
-"""The same, before and after, for it to begin the next step."""
+"""Number of bands on either side that must have finished a step before a band begins the next."""
 
 
 @njit(cache=True, inline="always")
 def even_part(q: int, density: float, ux: float, uy: float, uz: float) -> float:
-    """Even part of the equilibrium of population q over its weight (see `vstent.flow.lattice.kernels.collision`)."""
+    """Return the even part of the equilibrium of population `q`, divided by its weight (see `collision`)."""
     cx, cy, cz = VELOCITIES[q, 0], VELOCITIES[q, 1], VELOCITIES[q, 2]
     along = cx * ux + cy * uy + cz * uz
     beside = (1 - cx * cx) * ux * ux + (1 - cy * cy) * uy * uy + (1 - cz * cz) * uz * uz
@@ -83,7 +88,7 @@ def even_part(q: int, density: float, ux: float, uy: float, uz: float) -> float:
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _thin(f: Any, start: Any, n: int, time: float, law: Any, times: Any) -> None:
-    """Relaxation times of a segment of n cells whose blood thins with the shear rate, from the stress they hold."""
+    """Write the relaxation times of a segment of n cells of shear-thinning blood, from the stress they hold."""
     for k in range(0, n, COUNT):
         store(times, k, stress_size(gather(f, start, k)))
     for k in range(n):
@@ -92,7 +97,7 @@ def _thin(f: Any, start: Any, n: int, time: float, law: Any, times: Any) -> None
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _relax_pair(pair: int, f: Any, start: Any, k: int, cells: int, parts: Any) -> None:
-    """Relax the populations of a pair of opposite velocities (see `_relax`)."""
+    """Relax the populations of a pair of opposite directions (see `_relax`)."""
     here, opposite = start[2 * pair - 1] + k, start[2 * pair] + k
     a, b = load(f, here), load(f, opposite)
     new_a, new_b = relaxed_pair(a, b, parts[0][pair], parts[1][pair - 1], parts[2])
@@ -102,10 +107,10 @@ def _relax_pair(pair: int, f: Any, start: Any, k: int, cells: int, parts: Any) -
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _relax(f: Any, start: Any, k: int, cells: int, parts: Any) -> None:
-    """Relax a segment's cells from k on, as many as Lanes hold but no more than `cells`, by what `collided` returns.
+    """Relax the cells of a segment from `k` on, a vector but no more than `cells`, with the parts from `collided`.
 
-    Populations are read a second time for it, pair by pair: a processor's registers hold neither all of them nor all
-    that they become, and what lies in the cache anyway need not be put aside besides.
+    Populations are read a second time, pair by pair. They are still in the cache, and the registers of a processor
+    cannot hold all old and new ones.
     """
     _relax_pair(1, f, start, k, cells, parts)
     _relax_pair(2, f, start, k, cells, parts)
@@ -121,7 +126,7 @@ def _relax(f: Any, start: Any, k: int, cells: int, parts: Any) -> None:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _collide(f: Any, start: Any, k: int, cells: int, settings: Any) -> None:
-    """Collide a segment's cells from k on, as many as Lanes hold but no more than `cells`."""
+    """Collide the cells of a segment from `k` on, a vector but no more than `cells`."""
     times, limit, odd_rate = settings
     parts = collided(gather(f, start, k), load(times, k), limit, odd_rate)
     _relax(f, start, k, cells, parts)
@@ -129,7 +134,7 @@ def _collide(f: Any, start: Any, k: int, cells: int, settings: Any) -> None:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _collide_screened(f: Any, start: Any, k: int, cells: int, settings: Any, resistance: Any) -> None:
-    """Do what `_collide` does, where there are cells of a screen among them."""
+    """Collide a vector of cells of which some lie in a screen."""
     times, limit, odd_rate = settings
     normal = load(resistance, k), load(resistance, k + _WIDE), load(resistance, k + 2 * _WIDE)
     linear = load(resistance, k + 3 * _WIDE), load(resistance, k + 4 * _WIDE)
@@ -140,9 +145,9 @@ def _collide_screened(f: Any, start: Any, k: int, cells: int, settings: Any, res
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _collide_across(f: Any, start: Any, s: int, cells: int, settings: Any, screen: Any, scratch: Any) -> None:
-    """Collide the cells of segment s, which a screen crosses.
+    """Collide the cells of a segment `s` that a screen crosses.
 
-    Free and screened cells have a loop each: with both in one, a compiler keeps too little of either in registers.
+    Free and screened vectors have separate loops: in a common one the compiler keeps too few values in registers.
     """
     screen_start, screen_place, entry = screen
     resistance, marked, _ = scratch
@@ -166,7 +171,7 @@ def _collide_across(f: Any, start: Any, s: int, cells: int, settings: Any, scree
 def _update_some(
     f: Any, address: Any, length: Any, relaxation: Any, screen: Any, scratch: Any, begin: int, end: int
 ) -> None:
-    """Do what `update` does to the segments from `begin` on, before `end`."""
+    """Collide the segments from `begin` to before `end`."""
     time, law, limit, odd_rate = relaxation
     times = scratch[2]
     for s in range(begin, end):
@@ -186,7 +191,7 @@ def _update_some(
 
 @njit(cache=True, fastmath=True, forceinline=True)
 def _reflect(f: Any, path: Any, weight: Any, source: Any, k: int) -> None:
-    """Send back what crosses link k: a weighted sum of two and a source."""
+    """Write the population that link `k` returns: a weighted sum of two populations and a source."""
     link = _U(k)
     first, second, target = _U(path[link, 0]), _U(path[link, 1]), _U(path[link, 2])
     f[target] = weight[link, 0] * f[first] + weight[link, 1] * f[second] + source[link]
@@ -194,7 +199,7 @@ def _reflect(f: Any, path: Any, weight: Any, source: Any, k: int) -> None:
 
 @njit(cache=True)
 def _swap(f: Any, septa: Any, k: int) -> None:
-    """Exchange what two blood cells send each other through septum k."""
+    """Exchange the populations that two blood cells would send each other through septum `k`."""
     first, second = _U(septa[0, k]), _U(septa[1, k])
     kept = f[first]
     f[first] = f[second]
@@ -203,7 +208,7 @@ def _swap(f: Any, septa: Any, k: int) -> None:
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _do(stage: int, band: int, f: Any, cells: Any, links: Any, bands: Any, scratch: Any) -> None:
-    """Do a stage of the steps to a band (see `_KINDS`)."""
+    """Apply a stage of a step to a band (see `_KINDS`)."""
     address, length, relaxation, screen = cells
     path, weight, source, of_ends, place, refill, septa = links
     step, kind = stage // _KINDS, stage % _KINDS
@@ -224,7 +229,7 @@ def _do(stage: int, band: int, f: Any, cells: Any, links: Any, bands: Any, scrat
 
 @njit(cache=True)
 def _of_itself(stage: int, first: int, last: int, count: int) -> tuple[int, int]:
-    """First band, and the one after the last, to which a share can do a stage without waiting for the others."""
+    """Return the first band, and one after the last, on which a thread can do a stage without waiting for others."""
     step, kind = stage // _KINDS, stage % _KINDS
     before, after = _STEP * step + _BEFORE[kind], _STEP * step + _AFTER[kind]
     return first + (before if first > 0 else 0), last - (after if last < count else 0)
@@ -232,44 +237,53 @@ def _of_itself(stage: int, first: int, last: int, count: int) -> tuple[int, int]
 
 @njit(cache=True)
 def _scratch(time: float) -> tuple[Any, ...]:
-    """Return what one thread's collisions need: see `_collide_across` and `_thin`."""
+    """Return the work arrays of one thread (see `_collide_across` and `_thin`)."""
     resistance, marked = np.zeros(ENTRY * _WIDE, np.float32), np.zeros(_WIDE // COUNT + 1, np.bool_)
     return resistance, marked, np.full(_WIDE, time)
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def update(f: Any, cells: Any, links: Any, bands: Any, shares: Any) -> None:
-    """Make a step, or an even one and the odd one after it: collide and stream all cells, and send back at the walls.
+    """Make one time step, or an even and an odd one: collide and stream all cells, and reflect at walls and ends.
 
-    Both steps sweep over the bands together, the second so far behind the first that it needs nothing still to come:
-    it finds the populations, and the links' too, in the processor's cache, and memory is read once for both (time
-    skewing; Wonnacott 2002, Int. J. Parallel Program. 30, 181). Only bands at the ends of a thread's share wait for the
-    other threads.
+    Both steps sweep over the bands together. The second follows the first at a distance at which all its input is
+    ready, so that populations are read from memory once for both and are found in the cache the second time. Only bands
+    at the ends of a thread's share wait for other threads.
 
     Parameters
     ----------
-    f : (19 * stride + COUNT,) float32 populations, in place; up to COUNT - 1 places beyond a segment they may be read
-        and written again as they were: between the storage places of two bands lie as many that are no cell's.
-    cells : a tuple of
+    f : (19 * stride + COUNT,) float32
+        Populations, changed in place. Up to COUNT - 1 values beyond a segment may be read and rewritten unchanged; the
+        layout leaves as many unused places between two bands.
+    cells : tuple
+        - (steps, segments, 19) int32: address of the first population of each segment and direction, in an even step
+          its own, in an odd step its neighbours'.
+        - (segments,) int32: number of cells of each segment, at most SEGMENT.
+        - Relaxation, a tuple: float32 relaxation time of the stress at high shear rate; (4,) float32 Carreau-Yasuda
+          law, which holds the additional relaxation time at rest (0: Newtonian), the time constant, and the exponents a
+          and (n - 1) / a; (segments,) float32 largest grid Reynolds number, speed divided by viscosity, above which the
+          viscosity is raised; float32 relaxation rate of the odd part.
+        - Screen, a tuple: (segments + 1,) int32 first entry of every segment; (e,) int32 position within the segment;
+          (e, ENTRY) float32 unit normal and resistance (see `resist`).
+    links : tuple
+        - (steps, l, 3) addresses of two populations read and one written (see `paths`).
+        - (l, 2) float32 weights.
+        - (l,) float32 sources.
+        - (o,) int32 links of the ends.
+        - (w,) int32 addresses of rest populations to which the next array is added.
+        - (w,) float32 values added.
+        - (2, t) int32 addresses of populations exchanged at septa, that is, at a wall between two blood cells.
+    bands : (bands + 1, 5) int32
+        First segment, rest population, wall link, end link and septum of every band, and one past the last. What leaves
+        a cell stays in its band or enters an adjacent one. Septa lie between their band and the next.
+    shares : (threads + 1,) int32
+        First band of every thread, and the number of bands (see `share`).
 
-        - (steps, segments, 19) int32, where the populations of each segment begin: its own in an even step, its
-          neighbours' in an odd one;
-        - (segments,) int32 cells of each segment, at most SEGMENT;
-        - the relaxation: float32 time of the stress, at high shear; (4,) float32 what blood at rest has more of it, the
-          time by which shear rates count, and the exponents a and (n - 1) / a of Carreau and Yasuda's law, the first
-          being 0 where the viscosity is the same everywhere; (segments,) float32 largest cell Reynolds number, speed
-          over viscosity: faster blood is made that thick; float32 relaxation rate of the odd part;
-        - the screen: (segments + 1,) int32 first entry of every segment; (e,) int32 place within the segment; (e,
-          ENTRY) float32 unit normal and resistance (see `resist`).
-    links : a tuple of (steps, l, 3) two places read and the one written (see `paths`); (l, 2) float32 weights; (l,)
-        float32 sources; (o,) int32 those of the links that are no wall's; (w,) int32 rest populations to which (w,)
-        float32 is added; (2, t) int32 addresses of populations that a wall half-way between two cells exchanges.
-    bands : (bands + 1, 5) first segment, rest population, link of a wall, other link and septum of every band, and of
-        what would follow the last. What leaves a cell stays in its band or goes to one beside it; septa lie between
-        their band and the next.
-    shares : (threads + 1,) first band of every thread's share, and the number of bands (see `share`).
+    References
+    ----------
+    Wonnacott 2002, Int. J. Parallel Program. 30, 181: time skewing.
     """
-    address, length, relaxation, screen = cells  # threads cannot be given tuples of tuples
+    address, length, relaxation, screen = cells  # nested tuples cannot be passed to numba's threads
     threads, count, steps = len(shares) - 1, len(bands) - 1, len(address)
     stages = _KINDS * steps
     for chunk in prange(threads):
@@ -292,7 +306,19 @@ def update(f: Any, cells: Any, links: Any, bands: Any, shares: Any) -> None:
 
 
 def share(length: Ints, screen_start: Ints, bands: Ints, threads: int) -> Ints:
-    """Give every thread bands that keep it busy as long as the others: the `shares` of `update`."""
+    """Return the `shares` of `update` with which all threads have about the same work.
+
+    Parameters
+    ----------
+    length : (s,) int
+        Number of cells of every segment.
+    screen_start : (s + 1,) int
+        First screen entry of every segment.
+    bands : (b + 1, 5) int
+        As in `update`.
+    threads : int
+        Number of threads.
+    """
     vectors = -(-length // COUNT) * np.where(np.diff(screen_start) > 0, SCREENED_WORK, 1.0)
     done = np.r_[0.0, np.cumsum(vectors)][bands[:, 0]] + LINK_WORK * (bands[:, 2] - bands[0, 2] + bands[:, 3])
     wanted = done[-1] * np.arange(threads + 1) / threads
@@ -300,7 +326,7 @@ def share(length: Ints, screen_start: Ints, bands: Ints, threads: int) -> Ints:
 
 
 def undivided(segments: int, links: int = 0) -> tuple[Ints, Ints]:
-    """Return the `bands` and `shares` of `update` where there is a single band, with so many links of walls."""
+    """Return the `bands` and `shares` of `update` for a single band with `links` wall links."""
     return np.array([[0, 0, 0, 0, 0], [segments, 0, links, 0, 0]], np.int32), np.array([0, 1], np.int32)
 
 
@@ -313,20 +339,25 @@ NO_LINKS: Final = (
     np.zeros(0, np.float32),
     np.zeros((2, 0), np.int32),
 )
-"""What `update` takes for links where there are none."""
+"""The `links` of `update` where there are none."""
 
 
 def no_screen(segments: int) -> tuple[Ints, Ints, NDArray[np.float32]]:
-    """Return what `update` takes for the screen where there is none."""
+    """Return the screen of `update` where there is none."""
     return np.zeros(segments + 1, np.int32), np.zeros(0, np.int32), np.zeros((0, ENTRY), np.float32)
 
 
 def addresses(place: Ints, behind: Sequence[Ints], stride: int) -> Ints:
-    """Where populations of segments begin (2, s, 19), in an even and in an odd step.
+    """Return the address (2, s, 19) of the first population of every segment and direction, in an even and an odd step.
 
     Parameters
     ----------
-    place : (s,) storage place of every segment's first cell; behind : 19 of (s,), that of the cell each comes from.
+    place : (s,) int
+        Storage place of every segment's first cell.
+    behind : 19 arrays (s,) int
+        Storage place of the cell from which each population of this cell streams.
+    stride : int
+        Distance between two populations of a cell.
     """
     own = place[:, None] + stride * np.arange(19)
     neighbours = np.stack([OPPOSITE[q] * stride + behind[q] for q in range(19)], axis=1)
@@ -334,18 +365,23 @@ def addresses(place: Ints, behind: Sequence[Ints], stride: int) -> Ints:
 
 
 def paths(address: Ints, weight: Floats) -> tuple[Ints, NDArray[np.float32]]:
-    """Prepare `update` for links whose reflection needs at most two populations.
+    """Return the addresses and weights with which `update` reflects at links.
 
     Parameters
     ----------
-    address : (links, 6) places of, after an even step: what leaves along the link (a), what left the cell behind (b),
-        what leaves against the link (c), the mailbox (d); then (see `defer`) what left the second cell behind (e) and
-        what leaves the cell behind against the link (g). After an odd step a and d, b and c, e and g change roles.
-    weight : (links, 3) of a, b and c; b's or c's is zero.
+    address : (links, 6) int
+        Addresses after an even step of the populations that leave along the link (a), left the cell behind (b), leave
+        against the link (c), and of the mailbox (d). For `defer`: of those that left the second cell behind (e) and
+        leave the cell behind against the link (g). After an odd step a and d, b and c, e and g change roles.
+    weight : (links, 3)
+        Weights of a, b and c; that of b or of c is zero.
 
     Returns
     -------
-    The paths (2, links, 3) after an even and after an odd step, and their weights (links, 2).
+    path : (2, links, 3) int
+        Addresses read (two) and written (one), after an even and after an odd step.
+    weight : (links, 2) float32
+        Weights of the two populations read.
     """
     needs_c = weight[:, 2] != 0
     after_even = np.where(needs_c[:, None], address[:, (0, 2, 3)], address[:, (0, 1, 3)])
@@ -356,7 +392,7 @@ def paths(address: Ints, weight: Floats) -> tuple[Ints, NDArray[np.float32]]:
 
 @njit(cache=True, fastmath=True, forceinline=True)
 def defer_link(k: int, f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
-    """Do what `defer` does to its link k."""
+    """Apply `defer` to link `k`."""
     a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
     e, g = _U(address[k, 5]), _U(address[k, 4])
     lost[k] = f[a] - f[_U(address[k, 0])]
@@ -367,15 +403,29 @@ def defer_link(k: int, f: Any, address: Any, correction: Any, source: Any, lost:
 
 @njit(cache=True, parallel=True, fastmath=True)
 def defer(f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
-    """Move the walls' sources towards the difference between quadratic and linear interpolation (populations at home).
+    """Move the sources of wall links towards the difference between higher-order and linear interpolation.
 
-    Quadratic reflection itself can be unstable; as a correction that lags behind it is not, and the steady state is the
-    same (deferred correction, Khosla and Rubin 1974, Comput. Fluids 2, 207).
+    Higher-order bounce-back can be unstable. As a lagged correction it is stable, with the same steady state. Call it
+    when populations are at home.
 
     Parameters
     ----------
-    address : (links, 6) as in `paths`; correction : (links, 5) float32 weights of a, b, c, e and g.
-    lost : (links,) float32, set to what each link loses.
+    f : float32
+        Populations.
+    address : (links, 6) int
+        As in `paths`.
+    correction : (links, 5) float32
+        Weights of a, b, c, e and g.
+    source : (links,) float32
+        Sources, changed in place.
+    lost : (links,) float32
+        Set to the mass that each link loses.
+    part : float
+        Under-relaxation factor.
+
+    References
+    ----------
+    Khosla and Rubin 1974, Comput. Fluids 2, 207: deferred correction.
     """
     for k in prange(len(address)):
         defer_link(k, f, address, correction, source, lost, part)
@@ -383,7 +433,7 @@ def defer(f: Any, address: Any, correction: Any, source: Any, lost: Any, part: f
 
 @njit(cache=True, forceinline=True)
 def balance_group(g: int, lost: Any, groups: Any, refill: Any, part: float) -> None:
-    """Do what `balance` does to its group g."""
+    """Apply `balance` to group `g`."""
     link_start, link, member_start, member = groups
     total = 0.0
     for k in range(link_start[g], link_start[g + 1]):
@@ -396,12 +446,18 @@ def balance_group(g: int, lost: Any, groups: Any, refill: Any, part: float) -> N
 
 @njit(cache=True, parallel=True)
 def balance(lost: Any, groups: Any, refill: Any, part: float) -> None:
-    """Move the refill (w,) towards what the interpolated walls lose, spread over groups of wall cells.
+    """Move the refill of wall cells towards the mass lost at interpolated walls, averaged over groups of cells.
 
     Parameters
     ----------
-    lost : (links,) what each link of the walls loses (see `defer`).
-    groups : (g + 1,) first link of every group, and (links,) the links, group by group; then the same of wall cells.
+    lost : (links,) float32
+        Mass that each wall link loses (see `defer`).
+    groups : tuple
+        (g + 1,) first link of every group, (links,) links sorted by group, and the same two arrays for wall cells.
+    refill : (w,) float32
+        Mass added to every wall cell per step, changed in place.
+    part : float
+        Under-relaxation factor.
     """
     for g in prange(len(groups[0]) - 1):
         balance_group(g, lost, groups, refill, part)
@@ -409,7 +465,7 @@ def balance(lost: Any, groups: Any, refill: Any, part: float) -> None:
 
 @njit(cache=True, parallel=True)
 def moments(f: Any, stride: int, places: Any) -> Any:
-    """Density deviation and momentum (n, 4) of the storage `places` (n,), all populations being at home."""
+    """Return density deviation and momentum (n, 4) at storage `places` (n,); populations must be at home."""
     result = np.zeros((len(places), 4))
     for i in prange(len(places)):
         for q in range(19):
@@ -422,7 +478,7 @@ def moments(f: Any, stride: int, places: Any) -> Any:
 
 @njit(cache=True, parallel=True)
 def set_equilibrium(f: Any, stride: int, places: Any, density: Any, velocity: Any) -> None:
-    """Fill the populations of `places` (n,) with the equilibrium of density deviation (n,) and velocity (n, 3)."""
+    """Set the populations of `places` (n,) to the equilibrium of density deviation (n,) and velocity (n, 3)."""
     for i in prange(len(places)):
         ux, uy, uz = velocity[i, 0], velocity[i, 1], velocity[i, 2]
         for q in range(19):
@@ -432,9 +488,10 @@ def set_equilibrium(f: Any, stride: int, places: Any, density: Any, velocity: An
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def rescale(f: Any, stride: int, places: Any, links: Any, stretch: float, stress: float) -> None:
-    """Go on at `places` (n,) in time steps `stretch` times as long, all populations being at home (see `rescaled`).
+    """Convert the populations at `places` (n,) to time steps `stretch` times as long (see `collision.rescaled`).
 
-    What `links` (l, 6), addresses as in `paths`, have let through lies in their mailboxes still: so much more of it.
+    Populations must be at home. The flow that `links` (l, 6), addresses as in `paths`, have let through is still in
+    their mailboxes and is multiplied by `stretch`.
     """
     through = np.zeros(len(links), np.float32)
     for k in prange(len(links)):
@@ -452,7 +509,7 @@ def rescale(f: Any, stride: int, places: Any, links: Any, stretch: float, stress
 
 @njit(cache=True)
 def relaxation_times(f: Any, stride: int, places: Any, time: float, law: Any) -> Any:
-    """Relaxation times (n,) of blood that thins, at storage `places` (n,), all populations being at home."""
+    """Return relaxation times (n,) of shear-thinning blood at storage `places` (n,); populations must be at home."""
     result = np.zeros(len(places), np.float32)
     held = np.zeros(19, np.float32)
     for i in range(len(places)):
@@ -464,9 +521,18 @@ def relaxation_times(f: Any, stride: int, places: Any, time: float, law: Any) ->
 
 @njit(cache=True)
 def resisted(velocity: Any, entries: Any, times: Any, odd_rate: float) -> Any:
-    """Half-force velocity (e, 3) of screened cells from their momentum (e, 3) and entries (e, ENTRY) (see `resist`).
+    """Return the half-force velocity (e, 3) of cells in a screen.
 
-    And from their relaxation times (e,).
+    Parameters
+    ----------
+    velocity : (e, 3)
+        Momentum of the populations.
+    entries : (e, ENTRY)
+        Unit normal and resistance (see `resist`).
+    times : (e,)
+        Relaxation times of the stress.
+    odd_rate : float
+        Relaxation rate of the odd part.
     """
     result = np.zeros_like(velocity)
     for e in range(len(entries)):
@@ -478,7 +544,7 @@ def resisted(velocity: Any, entries: Any, times: Any, odd_rate: float) -> Any:
 
 @njit(cache=True, inline="always")
 def velocity_at(f: Any, stride: int, place: int) -> tuple[float, float, float]:
-    """Momentum of the populations of a storage place, all being at home."""
+    """Return the momentum (3) of the populations of a storage place; populations must be at home."""
     ux = uy = uz = 0.0
     for q in range(1, 19):
         population = f[q * stride + place]
@@ -490,8 +556,16 @@ def velocity_at(f: Any, stride: int, place: int) -> tuple[float, float, float]:
 
 @njit(cache=True, forceinline=True)
 def inflow_speed(opening: Any, density: float) -> float:
-    """Speed that inflow answers a mean density with; `opening` (9,) as in `drive`, what it remembers changes."""
-    # Against a high resistance the flow itself waits for the mean: forget faster the higher the pressure.
+    """Return the speed of an inflow whose mean density is given, so that sound can leave.
+
+    Parameters
+    ----------
+    opening : (9,)
+        As in `drive`; its remembered density changes in place.
+    density : float
+        Mean density deviation at the opening.
+    """
+    # With a high resistance downstream the flow would rise only as fast as the mean density follows: update faster.
     resistance = abs(density) / max(abs(opening[1]), 1e-6)
     rate = min(1.0, opening[3] * (1.0 + resistance / _ROOT_THREE))
     opening[2] += rate * (density - opening[2])
@@ -501,7 +575,15 @@ def inflow_speed(opening: Any, density: float) -> float:
 
 @njit(cache=True, forceinline=True)
 def outlet_density(opening: Any, flow: float) -> float:
-    """Density deviation that an outlet answers a flow through it with; what `opening` (9,) remembers changes."""
+    """Return the density deviation that an outlet imposes at a given flow rate.
+
+    Parameters
+    ----------
+    opening : (9,)
+        As in `drive`; its remembered and present density change in place.
+    flow : float
+        Flow rate out, in cells per time step.
+    """
     excess = flow / opening[7] - opening[1]
     opening[2] += opening[3] * excess
     opening[8] += SLOWLY * (opening[2] + _ROOT_THREE * excess - opening[8])
@@ -511,7 +593,7 @@ def outlet_density(opening: Any, flow: float) -> float:
 
 @njit(cache=True, forceinline=True)
 def outlet_source(velocity: Any, q: int, opening: Any, density: float) -> float:
-    """What an outlet (9,) of this density deviation sends back along velocity q into a cell, from its momentum (3)."""
+    """Return what an outlet of this density deviation sends along direction `q` into a cell with this velocity (3)."""
     ux, uy, uz = velocity
     inward = max(0.0, -(ux * opening[4] + uy * opening[5] + uz * opening[6]))
     return 2.0 * WEIGHTS[q] * even_part(q, density - 1.5 * inward * inward, ux, uy, uz)
@@ -519,7 +601,7 @@ def outlet_source(velocity: Any, q: int, opening: Any, density: float) -> float:
 
 @njit(cache=True, forceinline=True)
 def between(shape: Any, n: int, moment: Any) -> tuple[float, float]:
-    """Shape of link n between two moments of a cycle (see `drive`)."""
+    """Return the profile coefficients of link `n` between two moments of a cycle (see `drive`)."""
     now, following, part = int(moment[0]), int(moment[1]), moment[2]
     first, second = shape[now, n], shape[following, n]
     return first[0] + part * (second[0] - first[0]), first[1] + part * (second[1] - first[1])
@@ -527,7 +609,7 @@ def between(shape: Any, n: int, moment: Any) -> tuple[float, float]:
 
 @njit(cache=True)
 def _density(f: Any, stride: int, places: Any) -> float:
-    """Mean density deviation at places, one after the other where they are the same."""
+    """Return the density deviation at `places`, averaged over the links they belong to."""
     total, held = 0.0, 0.0
     for n in range(len(places)):
         if n == 0 or places[n] != places[n - 1]:
@@ -540,7 +622,7 @@ def _density(f: Any, stride: int, places: Any) -> float:
 
 @njit(cache=True)
 def outflow(f: Any, address: Any) -> float:
-    """Flow out through the links `address` (l, 6), all populations being at home."""
+    """Return the flow rate out through links with addresses (l, 6); populations must be at home."""
     total = 0.0
     for k in range(len(address)):
         total += float(f[address[k, 3]]) - float(f[address[k, 0]])
@@ -549,25 +631,40 @@ def outflow(f: Any, address: Any) -> float:
 
 @njit(cache=True)
 def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: Any) -> None:
-    """Set what every opening sends back during the next two steps (all populations being at home).
+    """Set what every opening returns during the next two steps; populations must be at home.
+
+    Inflow: half-way bounce-back at a moving wall, so that the flow rate is exact. Sound can leave: a density above the
+    remembered mean is answered with the outgoing wave.
+
+    Pressure: anti-bounce-back. Where blood flows back through an outlet, the total pressure is imposed; this bounds the
+    energy that enters.
+
+    Outflow: the density answers an excess of speed like an outgoing wave would, about a mean that changes until there
+    is no excess.
 
     Parameters
     ----------
-    openings : (k, 9) what is imposed (`PRESSURE`, `INFLOW` or `OUTFLOW`), the density deviation or speed wanted, the
-        remembered mean density, its rate of change, the outward normal (3), the area in cells, the density imposed.
-    links : (k + 1,) first link of every opening in what follows; (l, 6) addresses as in `paths`; (l,) storage place of
-        each link's cell; (l,) its direction; (m, l, 2) its shape at m moments of a cycle: what inflow sends back
-        through it, over its speed and over its speed squared; of what an outlet imposes, how much more its density is
-        there than the outlet's.
-    moment : (3,) the two of them between which these steps lie, and which part of the way.
-    source : (l,).
+    f : float32
+        Populations.
+    stride : int
+        Distance between two populations of a cell.
+    openings : (k, 9)
+        Condition (`PRESSURE`, `INFLOW` or `OUTFLOW`), density deviation or speed imposed, remembered mean density, its
+        rate of change, outward normal (3), area in cell faces, present density. The two densities change in place.
+    links : tuple
+        (k + 1,) first link of every opening in the following arrays; (l, 6) addresses as in `paths`; (l,) storage place
+        of each link's cell; (l,) direction; (m, l, 2) profile coefficients at m moments of a cycle. For an inflow they
+        multiply its speed and its squared speed. For an outlet the first is the local density minus that of the outlet.
+    moment : (3,)
+        The two moments between which these steps lie, and the fraction of the way.
+    source : (l,)
+        Sources of the links, changed in place.
 
-    Inflow: half-way reflection off a moving wall (Ladd 1994, J. Fluid Mech. 271, 285), so the flow is exact. It
-    lets sound out: a density above the remembered mean is answered by the wave that leaves (Poinsot and Lele 1992,
-    J. Comput. Phys. 101, 104). Pressure: anti-reflection (Ginzburg, Verhaeghe and d'Humieres 2008, Commun.
-    Comput. Phys. 3, 427, sec. 5.2). Where blood comes back through an outlet it is the total pressure that is
-    imposed, which bounds the energy that enters. Outflow: the pressure that answers the excess of speed as the wave
-    that leaves would, about a mean that moves until no excess is left.
+    References
+    ----------
+    Ladd 1994, J. Fluid Mech. 271, 285: moving wall.
+    Poinsot and Lele 1992, J. Comput. Phys. 101, 104: outgoing waves.
+    Ginzburg, Verhaeghe and d'Humieres 2008, Commun. Comput. Phys. 3, 427, sec. 5.2: anti-bounce-back.
     """
     start, address, place, direction, shape = links
     for k in range(len(openings)):
@@ -583,6 +680,6 @@ def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: A
             density = outlet_density(opening, outflow(f, address[first:last]))
         velocity = 0.0, 0.0, 0.0
         for n in range(first, last):
-            if n == first or place[n] != place[n - 1]:  # a cell's links follow each other
+            if n == first or place[n] != place[n - 1]:  # links of a cell are consecutive
                 velocity = velocity_at(f, stride, place[n])
             source[n] = outlet_source(velocity, direction[n], opening, density + between(shape, n, moment)[0])

@@ -1,8 +1,8 @@
-"""The kernels of `vstent.flow.lattice.kernels.d3q19` on a GPU, by numba-cuda: a thread for every cell, link or group.
+"""The kernels of `vstent.flow.lattice.kernels.d3q19` for a GPU (numba-cuda), one thread per cell, link or group.
 
-Storage, steps and arithmetic are the same; what a cell or an opening does is the same source. Sums are made in an order
-that does not depend on who comes first, so that a GPU repeats itself to the last bit. It differs from a processor in
-the last bits: that one's compiler fuses and reorders otherwise.
+Storage, steps and arithmetic are the same; the functions of one cell or opening are shared. Sums have a fixed order, so
+that a GPU reproduces its results to the last bit. They differ from those of a CPU in the last bits, because the
+compilers fuse and reorder operations differently.
 
 Import it only where a GPU is requested (`vstent.flow.lattice.gpu`).
 """
@@ -26,13 +26,13 @@ from vstent.flow.lattice.kernels.d3q19 import (
 )
 
 THREADS: Final = 128
-"""Threads of a block."""
+"""Number of threads per block."""
 _U = np.uint64
 
 
 @njit(forceinline=True)
 def _held(f: Any, address: Any, s: int, k: int) -> tuple[Any, ...]:
-    """Populations (19) of cell k of segment s, wherever this kind of step finds them."""
+    """Return the populations (19) of cell `k` of segment `s` from the addresses of this step."""
     return (
         f[_U(address[s, 0] + k)],
         f[_U(address[s, 1] + k)],
@@ -58,7 +58,7 @@ def _held(f: Any, address: Any, s: int, k: int) -> tuple[Any, ...]:
 
 @njit(forceinline=True)
 def _entry_of(s: int, k: int, screen_start: Any, screen_place: Any) -> int:
-    """Screen entry of cell k of segment s; -1 where it has none."""
+    """Return the screen entry of cell `k` of segment `s`, -1 where there is none."""
     for e in range(screen_start[s], screen_start[s + 1]):
         if screen_place[e] == k:
             return e
@@ -79,11 +79,14 @@ def update(
     screen_place: Any,
     screen: Any,
 ) -> None:
-    """Collide and stream every cell once (see `lattice.update`).
+    """Collide and stream every cell once (see `d3q19.update`).
 
     Parameters
     ----------
-    segment : (cells,) int32 segment of every cell; first_cell : (segments,) int32 first cell of every segment.
+    segment : (cells,) int32
+        Segment of every cell.
+    first_cell : (segments,) int32
+        First cell of every segment.
     """
     cell = cuda.grid(1)
     if cell >= segment.size:
@@ -107,7 +110,7 @@ def update(
 
 @cuda.jit(cache=True)
 def reflect(f: Any, path: Any, weight: Any, source: Any, place: Any, refill: Any) -> None:
-    """Send back what crosses a wall or an opening, and refill (see `lattice.update`)."""
+    """Return populations at walls and ends, and add the refill (see `d3q19.update`)."""
     k = cuda.grid(1)
     if k < source.size:
         first, second, target = _U(path[k, 0]), _U(path[k, 1]), _U(path[k, 2])
@@ -118,7 +121,7 @@ def reflect(f: Any, path: Any, weight: Any, source: Any, place: Any, refill: Any
 
 @cuda.jit(cache=True)
 def swap(f: Any, pairs: Any) -> None:
-    """Exchange the populations at addresses pairs[0] and pairs[1] (see `lattice.update`)."""
+    """Exchange the populations at addresses pairs[0] and pairs[1] (see `d3q19.update`)."""
     k = cuda.grid(1)
     if k < pairs.shape[1]:
         first, second = _U(pairs[0, k]), _U(pairs[1, k])
@@ -129,7 +132,7 @@ def swap(f: Any, pairs: Any) -> None:
 
 @cuda.jit(cache=True)
 def defer(f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
-    """Move the walls' sources towards quadratic interpolation (see `lattice.defer`)."""
+    """Move the sources of wall links towards higher-order interpolation (see `d3q19.defer`)."""
     k = cuda.grid(1)
     if k < source.size:
         defer_link(k, f, address, correction, source, lost, part)
@@ -137,7 +140,7 @@ def defer(f: Any, address: Any, correction: Any, source: Any, lost: Any, part: f
 
 @cuda.jit(cache=True)
 def balance(lost: Any, groups: Any, refill: Any, part: float) -> None:
-    """Move the refill towards what the walls lose, a thread for every group of wall cells (see `lattice.balance`)."""
+    """Move the refill towards the mass lost at the walls, one thread per group of wall cells (see `d3q19.balance`)."""
     g = cuda.grid(1)
     if g + 1 < groups[0].size:
         balance_group(g, lost, groups, refill, part)
@@ -145,7 +148,7 @@ def balance(lost: Any, groups: Any, refill: Any, part: float) -> None:
 
 @cuda.jit(cache=True)
 def moments(f: Any, stride: int, place: Any, result: Any) -> None:
-    """Density deviation and momentum (n, 4) float32 of storage places (n,), all populations being at home."""
+    """Write density deviation and momentum (n, 4) float32 at storage places (n,); populations must be at home."""
     i = cuda.grid(1)
     if i >= place.size:
         return
@@ -158,7 +161,7 @@ def moments(f: Any, stride: int, place: Any, result: Any) -> None:
 
 @njit(forceinline=True)
 def _sum(parts: Any) -> float:
-    """Sum of what the threads of a block have put down, in their order; for one of them to call."""
+    """Return the sum of the partial sums of a block's threads, in fixed order; to be called by one thread."""
     total = 0.0
     for t in range(THREADS):
         total += parts[t]
@@ -167,7 +170,7 @@ def _sum(parts: Any) -> float:
 
 @cuda.jit(cache=True)
 def outflow(f: Any, start: Any, address: Any, result: Any) -> None:
-    """Flow out (k,) through every opening, a block each, all populations being at home (see `lattice.outflow`)."""
+    """Write the flow rate (k,) out of every opening, one block each (see `d3q19.outflow`)."""
     k, t = cuda.blockIdx.x, cuda.threadIdx.x
     parts = cuda.shared.array(THREADS, np.float64)
     total = 0.0
@@ -190,11 +193,16 @@ def drive(
     moments: Any,
     pair: int,
 ) -> None:
-    """Set what every opening sends back during the next two steps, a block each (see `lattice.drive`).
+    """Set what every opening returns during the next two steps, one block each (see `d3q19.drive`).
 
     Parameters
     ----------
-    wanted : (pairs, k) speed or density wanted at every opening; moments : (pairs, 3); the row `pair` counts.
+    wanted : (pairs, k)
+        Speed or density imposed at every opening.
+    moments : (pairs, 3)
+        Moments of the cycle (see `d3q19.drive`).
+    pair : int
+        Row of these arrays that applies.
     """
     start, address, place, direction, shape = links
     k, t = cuda.blockIdx.x, cuda.threadIdx.x

@@ -1,8 +1,8 @@
-"""Eight or sixteen single-precision numbers at once, as a type of numba's: what a processor's vector register holds.
+"""Vectors of eight or sixteen float32 numbers as a numba type: the content of one vector register of the processor.
 
-A loop that the compiler turns into vector instructions itself pays for the cells that no whole vector holds, at both
-ends of every run of them; a few dozen cells long, they are most of the time. Whole vectors are named here instead.
-Arithmetic is numba's fast one: sums may be reordered, products and sums fused.
+Loops that the compiler vectorises itself are slow at both ends of every run of cells, where the cells do not fill a
+vector. Runs are a few dozen cells long, so that this is most of the time. Here whole vectors are named explicitly.
+Arithmetic uses fast-math: sums may be reordered, products and sums fused.
 """
 
 import math
@@ -17,7 +17,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic, models, overload, register_model
 
 COUNT: Final = 16 if get_host_cpu_features().get("avx512f") else 8
-"""Numbers in one."""
+"""Number of values in one Lanes."""
 _FLOAT: Final = ir.FloatType()
 _WHOLE: Final = ir.IntType(32)
 _VECTOR: Final = ir.VectorType(_FLOAT, COUNT)
@@ -25,39 +25,43 @@ _FAST: Final = ("fast",)
 
 
 class Lanes(types.Type):
-    """So many numbers."""
+    """The numba type of a vector of `COUNT` float32 numbers."""
 
     def __init__(self) -> None:
         super().__init__(name="Lanes")
 
 
 LANES: Final = Lanes()
+"""The type's only instance."""
 
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):
+    """Memory layout of Lanes: an LLVM vector."""
+
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _VECTOR)
 
 
 def _everywhere(builder: Any, number: Any) -> Any:
-    """Vector of the same number in every place."""
+    """Return a vector with the same number in every place."""
     undefined = ir.Constant(ir.VectorType(number.type, COUNT), ir.Undefined)
     first = builder.insert_element(undefined, number, _WHOLE(0))
     return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_WHOLE, COUNT), [0] * COUNT))
 
 
 def _widened(builder: Any, kind: Any, value: Any) -> Any:
-    """The same number in every place, unless it is Lanes already."""
+    """Return a vector with the same number in every place; Lanes are returned unchanged."""
     return value if kind == LANES else _everywhere(builder, value)
 
 
 def _is_pair(a: Any, b: Any) -> bool:
+    """Return whether both types are Lanes or float32 and at least one is Lanes."""
     return LANES in (a, b) and {a, b} <= {LANES, types.float32}
 
 
 def _arithmetic(operation: Callable[..., Any], instruction: str) -> None:
-    """Let numba apply an operator to two Lanes, or to one and a number."""
+    """Make numba apply an operator to two Lanes, or to Lanes and a number."""
 
     @intrinsic
     def apply(_: Any, a: Any, b: Any) -> Any:
@@ -86,6 +90,8 @@ for _operation, _instruction in (
 
 @intrinsic
 def _larger(_: Any, a: Any, b: Any) -> Any:
+    """Return the larger of two Lanes, element by element."""
+
     def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         x, y = (_widened(builder, *one) for one in zip(signature.args, arguments, strict=True))
         return builder.select(builder.fcmp_ordered(">", x, y), x, y)
@@ -95,6 +101,8 @@ def _larger(_: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def _root(_: Any, a: Any) -> Any:
+    """Return the square root of Lanes, element by element."""
+
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
         return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{COUNT}f32"), arguments)
@@ -103,12 +111,14 @@ def _root(_: Any, a: Any) -> Any:
 
 
 def larger(a: Any, b: Any) -> Any:
-    """Return the larger of two, number by number; numbers may be Lanes or float32."""
+    """Return the larger of two values element by element; values may be Lanes or float32."""
     return np.maximum(a, b)
 
 
 @overload(larger)
 def _larger_chosen(a: Any, b: Any) -> Any:
+    """Return the implementation of `larger` for Lanes or for numbers."""
+
     def of_lanes(a: Any, b: Any) -> Any:
         return _larger(a, b)
 
@@ -119,17 +129,19 @@ def _larger_chosen(a: Any, b: Any) -> Any:
 
 
 def root(a: Any) -> Any:
-    """Return the square root, number by number, of Lanes or float32."""
+    """Return the square root of Lanes, element by element, or of a float32."""
     return np.sqrt(a)
 
 
 @overload(root)
 def _root_chosen(a: Any) -> Any:
+    """Return the implementation of `root` for Lanes or for a number."""
+
     def of_lanes(a: Any) -> Any:
         return _root(a)
 
     def of_number(a: Any) -> Any:
-        return math.sqrt(a)  # unlike numpy's it is there on a GPU too
+        return math.sqrt(a)  # numpy's is not available on a GPU
 
     return of_lanes if a == LANES else of_number
 
@@ -147,13 +159,13 @@ def upto(_: Any, count: Any, a: Any, b: Any) -> Any:
 
 
 def _at(context: Any, builder: Any, array: Any, value: Any, place: Any) -> Any:
-    """Pointer to the numbers of an array from a place on."""
+    """Return a pointer to the values of an array from a place on."""
     data = context.make_array(array)(context, builder, value).data
     return builder.bitcast(builder.gep(data, [place]), _VECTOR.as_pointer())
 
 
 def _runs(context: Any, builder: Any, signature: Any, arguments: Any) -> list[Any]:
-    """Pointers to the numbers of an array (n,) from each start + offset on, `starts` being a tuple."""
+    """Return pointers to the values of an array (n,) from each start + offset on; `starts` is a tuple."""
     array, starts, offset = arguments[:3]
     places = [builder.add(start, offset) for start in cgutils.unpack_tuple(builder, starts)]
     return [_at(context, builder, signature.args[0], array, place) for place in places]
@@ -161,9 +173,9 @@ def _runs(context: Any, builder: Any, signature: Any, arguments: Any) -> list[An
 
 @intrinsic
 def starts(_: Any, address: Any, row: Any) -> Any:
-    """Return a row (19,) of addresses as a tuple, which stores to other arrays cannot change: it is read once.
+    """Return a row (19,) of addresses as a tuple, so that it is read once even where other arrays are written.
 
-    Rows must be contiguous.
+    The array must be C-contiguous.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -179,7 +191,7 @@ def starts(_: Any, address: Any, row: Any) -> Any:
 
 @intrinsic
 def load(_: Any, array: Any, place: Any) -> Any:
-    """Return the numbers of a float32 array (n,) from a place on."""
+    """Return Lanes with the values of a float32 array (n,) from a place on."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_at(context, builder, signature.args[0], *arguments), align=4)
@@ -189,7 +201,7 @@ def load(_: Any, array: Any, place: Any) -> Any:
 
 @intrinsic
 def gather(_: Any, array: Any, starts: Any, offset: Any) -> Any:
-    """Return Lanes of a float32 array (n,) from each start + offset on, as a tuple."""
+    """Return a tuple of Lanes: the values of a float32 array (n,) from each start + offset on."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         runs = _runs(context, builder, signature, arguments)

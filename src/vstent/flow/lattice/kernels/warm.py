@@ -1,7 +1,7 @@
-"""Compile the lattice's kernels ahead of their first use.
+"""Compile the lattice kernels ahead of their first use.
 
-A process that has compiled a flow's kernels itself runs other machine code than numba keeps of them, slower and
-different in the last bits from that of every later process: `keep_flow`.
+A process that compiles a kernel itself runs other machine code than processes that load it from numba's cache. That
+code is slower and differs in the last bits. `keep_flow` therefore lets another process compile.
 """
 
 import sys
@@ -15,12 +15,12 @@ from vstent.kernels.first_use import kept
 
 @cache
 def keep_flow() -> None:
-    """See that a flow runs the machine code that every process runs: if need be another one compiles it."""
+    """Make sure that numba's cache holds the kernels of a flow; another process compiles those that are missing."""
     kept(flow, (sys.executable, "-c", f"from {__name__} import flow; flow()"))
 
 
 def flow() -> None:
-    """Call every kernel of a flow on one cell at rest, with every argument of the type that a flow has."""
+    """Call every kernel of a flow on one cell at rest, with arguments of the types that a flow has."""
     stride = lanes.COUNT
     f, none = np.zeros(20 * stride, np.float32), np.zeros(0, np.int32)
     relaxation = np.float32(1.0), np.zeros(4, np.float32), np.full(1, np.inf, np.float32), np.float32(1.0)
