@@ -284,7 +284,7 @@ def mended_or_none(surface):
         ("aneurisk_beta.vtp", 6, ""),
         ("aneurisk_C0015_no_sac.vtp", 3, "6 degenerate faces"),
         ("visc2011_metres.stl", 1, "holes in the wall closed"),
-        ("siphon_dirty.stl", 0, "5673 duplicate faces removed.|1125 faces of sheets inside the lumen removed."),
+        ("siphon_dirty.stl", 0, "5673 duplicate faces dropped.|1125 faces of sheets inside the lumen removed."),
         ("healthy_siphon.vtk", 4, "inside out"),
         ("bifurcation_coarse.vtp", 0, "1613 faces reoriented"),
         ("bifurcation_with_sac.stl", 3, ""),

@@ -233,7 +233,7 @@ def test_an_outlet_nearly_as_wide_as_the_inlet_is_told_once_with_both_places(
         "because it is the widest opening" in note for note in trace(untraced, inlet_mm=vessel.inlet.center_mm).notes
     )
     for note in told:
-        places = [[float(x) for x in place.split(")")[0].split(",")] for place in note.split("(")[1:]]
+        places = [[float(x) for x in place.split(")")[0].split(",")] for place in note.split("at (")[1:]]
         np.testing.assert_allclose(places, [vessel.inlet.center_mm, vessel.outlets[0].center_mm], atol=0.05)
         widths = [float(width.split()[-1]) for width in note.split(" mm wide")[:-1]]
         np.testing.assert_allclose(widths, [vessel.inlet.diameter_mm, vessel.outlets[0].diameter_mm], atol=0.05)

@@ -190,7 +190,7 @@ def test_pushed_together_the_papers_own_device_is_shorter_too():
 def test_what_cannot_be_compacted_is_refused():
     with pytest.raises(DeviceError, match="its wires would be too steep"):
         formulas.compacted(SILK, SIZE, 0.5)
-    with pytest.raises(DeviceError, match=r"its wires would be pulled straight\. Give a part nearer to 0"):
+    with pytest.raises(DeviceError, match=r"its wires would be pulled straight\. Give a fraction nearer to 0"):
         formulas.compacted(SILK, SIZE, -3.0)
     with pytest.raises(DeviceError, match="its cells are joined"):
         formulas.compacted(ENTERPRISE, ENTERPRISE.sizes[0], 0.1)

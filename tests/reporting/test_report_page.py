@@ -6,46 +6,18 @@ import math
 import re
 from dataclasses import asdict, replace
 from html import unescape
-from html.parser import HTMLParser
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import report_case
+from pages import Page
 
 from vstent.flow.case import Blood, CarreauYasuda, FlowSettings, Phase
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE
 from vstent.reporting.page import as_html, contents_of, limits_of, report
 from vstent.reporting.quantities import compare, flatten, format_change, format_number, format_value, split_unit
-
-
-class Page(HTMLParser):
-    """Collects what a page refers to and says."""
-
-    def __init__(self, html):
-        super().__init__()
-        self.tags, self.scripts, self.words, self._inside = [], [], [], []
-        self.feed(html)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag in ("script", "style"):
-            self._inside.append(tag)
-
-    def handle_endtag(self, tag):
-        if self._inside and tag == self._inside[-1]:
-            self._inside.pop()
-
-    def handle_data(self, data):
-        if not self._inside:
-            self.words.append(data)
-        elif self._inside[-1] == "script":
-            self.scripts.append(data)
-
-    @property
-    def text(self):
-        return " ".join(" ".join(self.words).split())
 
 
 @pytest.fixture(scope="module")

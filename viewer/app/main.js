@@ -5,7 +5,7 @@ import { Axis } from "./axis.js";
 import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js";
 import { Deploying } from "./deploy.js";
 import { Neck } from "./neck.js";
-import { changeSheet, neckWords, placeWords, plainSheet, sureSheet } from "./numbers.js";
+import { changeSheet, neckWords, placeWords, plainSheet, qualitySheet, sureSheet } from "./numbers.js";
 import { panels, placeOf, spokenRole } from "./panels.js";
 import { Picture } from "./picture.js";
 import { rankingTable } from "./ranking.js";
@@ -450,7 +450,7 @@ class Page {
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
       const stale = this.view.steps.flow !== "done" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
-      parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole, (name) => this.deviceTitle(name)));
+      parts.push(head("Before and after"), ...stale, qualitySheet(flow), changeSheet(flow, this.isWhole, (name) => this.deviceTitle(name)));
     }
     if (["device", "deploy"].includes(this.step)) {
       const sheets = this.view.choices.devices.map(({ name }) => this.measures[name]).filter(Boolean);

@@ -17,6 +17,17 @@ export function plainSheet(sheets, isWhole) {
   return make("div", { className: `sheet columns-${sheets.length}` }, [...head, ...lines]);
 }
 
+/** Grades of the flows, each with its reasons and with what was computed. */
+export function qualitySheet({ qualities }) {
+  const one = ({ title, grade, mark, reasons, computation }) =>
+    make("li", { className: grade.replace(" ", "-") }, [
+      make("b", {}, [`${mark} ${title}: ${grade}`]),
+      reasons ? ` (${reasons})` : "",
+      make("small", {}, [computation]),
+    ]);
+  return make("ul", { className: "qualities", ariaLabel: "Grades of the flows" }, qualities.map(one));
+}
+
 /** Numbers before, after and change: a card each. */
 export function changeSheet(sheet, isWhole, named) {
   const rows = sheet.rows.filter((row) => isWhole || row.is_first);
@@ -25,17 +36,17 @@ export function changeSheet(sheet, isWhole, named) {
     { className: "cards" },
     rows.map((row) => {
       const columns = [cell("Before", "without a device", row.cells[0], "")];
-      sheet.names.forEach((name, i) => columns.push(cell(named(name), sheet.devices[i], row.cells[1 + 2 * i], row.cells[2 + 2 * i])));
+      sheet.names.forEach((name, i) => columns.push(cell(named(name), sheet.devices[i], row.cells[1 + 2 * i], row.cells[2 + 2 * i], row.senses[i])));
       return make("div", { className: "card" }, [term(row), make("div", { className: "card-cells" }, columns)]);
     }),
   );
 }
 
-function cell(words, title, value, change) {
+function cell(words, title, value, change, sense = "") {
   // The unit goes below its number where there is no room beside it.
   const [digits, ...unit] = value.split("\u202f");
   const parts = [make("small", { title }, [words]), make("b", {}, [digits, ...(unit.length ? [" ", make("span", { className: "unit" }, [unit.join("\u202f")])] : [])])];
-  if (change) parts.push(make("em", { className: change.startsWith("−") ? "down" : "up" }, [change]));
+  if (change) parts.push(make("em", { className: sense }, [change]));
   return make("div", {}, parts);
 }
 

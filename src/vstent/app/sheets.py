@@ -3,7 +3,8 @@
 from typing import Any, Final
 
 from vstent.reporting.definitions import HEADLINES
-from vstent.reporting.quantities import Quantity, compare, flatten, format_change
+from vstent.reporting.quality import qualities, unusable
+from vstent.reporting.quantities import Quantity, compare, flatten
 from vstent.reporting.uncertainty import uncertainty_of
 
 Sheet = dict[str, Any]
@@ -53,16 +54,19 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
     metrics : metrics of the case.
     titles : titles of the devices by name, in order.
     """
-    changes = compare(metrics)
+    changes = compare(metrics, unusable(metrics))
     rows = []
     for change in changes:
-        cells = [change.before.text]
+        cells, senses = [change.before.text], []
         for name in titles:
             after = change.after.get(name)
-            cells += [after.text, format_change(change.before.value, after.value)] if after else ["–", "–"]
-        rows.append(_row(change.before, cells, is_first=change.before.key in HEADLINES))
+            cells += [after.text, change.of(name)] if after else ["–", "–"]
+            senses.append(change.sense(name) if after else "")
+        row = _row(change.before, cells, is_first=change.before.key in HEADLINES)
+        rows.append(row | {"senses": senses})
     rows.sort(key=lambda row: HEADLINES.index(row["key"]) if row["key"] in HEADLINES else len(HEADLINES))
-    words = {"title": "Blood flow", "names": list(titles), "devices": list(titles.values())}
+    words: Sheet = {"title": "Blood flow", "names": list(titles), "devices": list(titles.values())}
+    words |= {"qualities": [one._asdict() | {"mark": one.mark} for one in qualities(metrics, titles)]}
     return [words | {"rows": rows}] if rows else []
 
 

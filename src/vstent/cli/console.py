@@ -93,17 +93,36 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
     if "bare" not in metrics:
         return table
     table.add_section()
+    _add_grades(table, metrics)
     for title, key in ROWS:
         bare = metrics["bare"].get(key)
         if bare is None:
             continue
-        table.add_row(title, _cell(key, bare), *(_change(key, bare, _of_flow(stent, key)) for stent in stents.values()))
+        table.add_row(title, *_flow_cells(metrics, key, bare))
     return table
 
 
-def _of_flow(stent: Mapping[str, Any], key: str) -> float | None:
-    """Return an index of the flow with a device; None where it was not computed."""
-    return stent.get("flow", {}).get(key)
+def _add_grades(table: Table, metrics: Mapping[str, Any]) -> None:
+    """Add the grades of the flows as a row, and their reasons and the grid as the caption."""
+    from vstent.reporting.quality import qualities
+
+    graded = {one.name: one for one in qualities(metrics, {name: name for name in metrics["stents"]})}
+    if graded:
+        cells = (graded[name].grade if name in graded else "" for name in ("bare", *metrics["stents"]))
+        table.add_row("Grade of the flow", *cells)
+        reasons = (one.sentence for one in graded.values() if one.reasons)
+        table.caption = "\n".join([f"Flow: {graded['bare'].computation}.", *reasons])
+        table.caption_justify = "left"
+
+
+def _flow_cells(metrics: Mapping[str, Any], key: str, bare: float) -> list[str]:
+    """Return a row of a flow index: without a device, and with each device and its change where that may be shown."""
+    from vstent.reporting.quality import unusable
+
+    hidden = unusable(metrics)
+    values = {name: stent.get("flow", {}).get(key) for name, stent in metrics["stents"].items()}
+    shown = (_cell(key, one) if name in hidden else _change(key, bare, one) for name, one in values.items())
+    return [_cell(key, bare), *shown]
 
 
 COHORT_COLUMNS: Final = (
@@ -210,9 +229,9 @@ def flow_table(metrics: Mapping[str, Any]) -> Table:
 
     stents = metrics["stents"]
     table = Table("flow", "bare", *stents)
+    _add_grades(table, metrics)
     for quantity in flatten(metrics["bare"]):
-        changes = (_change(quantity.key, quantity.value, _of_flow(stent, quantity.key)) for stent in stents.values())
-        table.add_row(quantity.name, _cell(quantity.key, quantity.value), *changes)
+        table.add_row(quantity.name, *_flow_cells(metrics, quantity.key, quantity.value))
     return table
 
 
@@ -254,11 +273,13 @@ def _spaced(text: str) -> str:
 
 
 def _change(key: str, bare: float, value: float | None) -> str:
-    """Return a value with its unit and its relative change; empty where there is none."""
-    from vstent.reporting.quantities import ERRORS
+    """Return a value with its unit and its change; empty where there is none."""
+    from vstent.reporting.quantities import ERRORS, format_change
 
-    has_change = value is not None and bare and key not in ERRORS
-    return f"{_cell(key, value)} ({value / bare - 1:+.0%})" if value is not None and has_change else _cell(key, value)
+    if value is None or key in ERRORS:
+        return _cell(key, value)
+    change = _spaced(format_change(bare, value, key)).replace(" %", "%").replace("−", "-")
+    return f"{_cell(key, value)} ({change})" if change != "–" else _cell(key, value)
 
 
 def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:

@@ -8,16 +8,17 @@ import numpy as np
 
 from vstent.flow.case import LATTICE, FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
+from vstent.flow.indices import NEAR_MM
 from vstent.flow.lattice.setup import CELL_REYNOLDS
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
+QUALITY: Final = "flow_quality"
+"""Key of the grades of all flows in the metrics of a case."""
 Level = Literal["good", "fair", "not usable"]
 GOOD: Final = "good"
 FAIR: Final = "fair"
 NOT_USABLE: Final = "not usable"
-NEAR_NECK_MM: Final = 10.0
-"""Distance from the neck within which the parent artery is measured, mm (as in `indices`)."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,19 @@ class Grade:
     measures: dict[str, float]
     """The measures that it rests on."""
 
-    @property
-    def words(self) -> str:
-        """The grade with its reasons, for a table or a sentence."""
-        return f"{self.level} ({'; '.join(self.reasons)})" if self.reasons else self.level
+
+def computation_of(case: FlowCase, field: FlowField) -> dict[str, float]:
+    """Return what was computed: grid spacing, cells, steps, inflow, and the Reynolds number of the widest inlet."""
+    inlet = case.vessel.inlet
+    speed_m_s = float(field.inlets_mL_s[0]) * 1e-6 / (inlet.area_mm2 * M_PER_MM**2)
+    viscosity_m2_s = field.blood.kinematic_viscosity_m2_s
+    return {
+        "grid_spacing_mm": field.cell_size_mm,
+        "cells_count": len(field.cells),
+        "steps_count": field.steps,
+        "inflow_mL_s": field.inflow_mL_s,
+        "inlet_reynolds_number_count": speed_m_s * inlet.diameter_mm * M_PER_MM / viscosity_m2_s,
+    }
 
 
 def grade(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> Grade:
@@ -118,15 +128,12 @@ def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) ->
 
 
 def _parent_mm(case: FlowCase) -> float:
-    """Return the diameter of the parent artery beside the neck: a low quartile, because a sac widens the spheres."""
+    """Return the diameter of the artery beside the neck: of the widest path, a low quartile because a sac widens it."""
     ostium = case.ostium
     assert ostium is not None
-    diameters = [
-        2 * line.inscribed_radius_mm[ostium.closest(line.points_mm)[1] < NEAR_NECK_MM]
-        for line in case.vessel.centerlines
-    ]
-    near_mm = np.concatenate(diameters) if diameters else np.zeros(0)
-    return float(np.quantile(near_mm, 0.25)) if len(near_mm) else mean_diameter_mm(case.vessel)
+    near = [line.inscribed_radius_mm[ostium.closest(line.points_mm)[1] < NEAR_MM] for line in case.vessel.centerlines]
+    widths_mm = [2 * float(np.quantile(radius_mm, 0.25)) for radius_mm in near if len(radius_mm)]
+    return max(widths_mm, default=mean_diameter_mm(case.vessel))
 
 
 def _imbalance(field: FlowField, found: Mapping[str, float]) -> float:

@@ -206,6 +206,34 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     ),
     "inlet_pressure_Pa": Definition("Inlet pressure", "Mean pressure over the inlet, relative to the outlets."),
     "pressure_drop_Pa": Definition("Pressure drop", "Pressure at the inlet minus pressure at the widest outlet."),
+    "grid_spacing_mm": Definition("Grid spacing", "Distance between neighboring cells of the flow's grid."),
+    "cells_count": Definition("Cells", "Number of cells of blood on the grid."),
+    "steps_count": Definition("Time steps", "Number of time steps or iterations on the finest grid."),
+    "inflow_mL_s": Definition("Inflow", "Mean flow rate through all inlets together."),
+    "inlet_reynolds_number_count": Definition(
+        "Reynolds number", "Mean speed × diameter / kinematic viscosity at the widest inlet."
+    ),
+    "cells_across_neck_count": Definition(
+        "Cells across the neck", "Diameter of a circle with the area of the neck / grid spacing."
+    ),
+    "cells_across_sac_count": Definition(
+        "Cells across the sac", "Diameter of a sphere with the volume of the sac / grid spacing."
+    ),
+    "cells_across_parent_count": Definition(
+        "Cells across the parent artery",
+        "Inscribed diameter within 10 mm of the neck (lower quartile of the widest path) / grid spacing.",
+    ),
+    "cells_across_outlet_count": Definition(
+        "Cells across the narrowest outlet", "Diameter of the narrowest outlet / grid spacing."
+    ),
+    "raised_viscosity_fraction": Definition(
+        "Raised viscosity",
+        "Fraction of the cells in the sac and around the neck in which the viscosity is raised for stability.",
+    ),
+    "neck_imbalance_fraction": Definition(
+        "Neck imbalance",
+        "Part of the neck inflow that leaves neither through the neck nor through a branch of the sac.",
+    ),
     "unsettled_fraction": Definition(
         "Convergence error",
         "Estimated relative distance from convergence of sac speed, neck inflow, inlet pressure and mean "
@@ -221,6 +249,14 @@ OF_PULSE: Final = (
 )
 """Note on all flow metrics of a pulsatile flow."""
 
+WANTED: Final = {
+    "neck_inflow_mL_s": -1,
+    "mean_sac_velocity_m_s": -1,
+    "sac_kinetic_energy_J": -1,
+    "turnover_time_s": 1,
+}
+"""Sign of the wanted change of a flow metric. Less and slower inflow is associated with occlusion; for other metrics
+no direction is agreed on."""
 HEADLINES: Final = (
     "neck_inflow_mL_s",
     "mean_sac_velocity_m_s",

@@ -15,17 +15,18 @@ from markupsafe import Markup
 from vstent.devices.design import BARE
 from vstent.devices.stent import Deployment
 from vstent.flow.case import LATTICE, OPENFOAM
+from vstent.flow.grade import QUALITY
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
 from vstent.reporting.figures import Picture, pictures
 from vstent.reporting.method import method_pictures
 from vstent.reporting.packing import pack
+from vstent.reporting.quality import OF_GRADES, Quality, qualities, unusable
 from vstent.reporting.quantities import (
     Change,
     Quantity,
     base_of,
     compare,
     flatten,
-    format_change,
     opening_rows,
     unit_of,
 )
@@ -116,6 +117,11 @@ class Contents:
         return uncertainty_of(self.metrics, dict(self.devices))
 
     @property
+    def qualities(self) -> list[Quality]:
+        """Grades of the flows, the one without a device first."""
+        return qualities(self.metrics, dict(self.devices))
+
+    @property
     def definitions(self) -> list[tuple[Definition, str]]:
         """Definition and unit of every metric, sorted by name.
 
@@ -135,7 +141,7 @@ def contents_of(case: "CaseResult") -> Contents:
         metrics=metrics,
         scene=scene,
         pictures=(before, *method_pictures(case, scene), *after),
-        changes=compare(metrics),
+        changes=compare(metrics, unusable(metrics)),
         stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
         openings=opening_rows(case.anatomy.vessel.openings),
         is_pulse=any(field.phases for field in case.fields.values()),
@@ -176,7 +182,8 @@ def as_html(told: Contents) -> str:
         style=Markup(asset("report.css") + asset("viewer.css")),
         **{name: Markup(script) for name, script in scripts.items()},
         devices=told.devices,
-        change=format_change,
+        qualities=told.qualities,
+        of_grades=OF_GRADES,
         summary=told.headlines,
         pictures=[_picture(picture) for picture in told.pictures],
         vessel=told.vessel,
@@ -245,7 +252,7 @@ def _pane_notes(headlines: list[Change]) -> dict[str, str]:
     for row in headlines[:1]:
         notes = {BARE: f"{row.before.name} {row.before.text}"}
         for name, after in row.after.items():
-            notes[name] = f"{after.name} {after.text} ({format_change(row.before.value, after.value)})"
+            notes[name] = f"{after.name} {after.text} ({row.of(name)})"
         return notes
     return {}
 
@@ -282,7 +289,7 @@ def _flow_only(metrics: dict[str, Any], rows: list[Change], titles: dict[str, st
 
 def _other(metrics: dict[str, Any]) -> list[Quantity]:
     """Return the metrics that no other section shows."""
-    top = {key: value for key, value in metrics.items() if key not in ("vessel", "bare", "stents")}
+    top = {key: value for key, value in metrics.items() if key not in ("vessel", "bare", "stents", QUALITY)}
     stents = {
         name: {key: value for key, value in stent.items() if key not in ("deployment", "flow", "ratios", "uncertainty")}
         for name, stent in metrics.get("stents", {}).items()

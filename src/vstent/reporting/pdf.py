@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from vstent.reporting.definitions import OF_PULSE
 from vstent.reporting.page import Contents, contents_of
-from vstent.reporting.quantities import Change, Quantity, format_change
+from vstent.reporting.quantities import Change, Quantity
 
 if TYPE_CHECKING:
     from vstent.reporting.figures import Picture
@@ -196,9 +196,14 @@ def _named(quantity: Quantity, skip: int) -> str:
 def _summary(paper: _Paper, told: Contents) -> None:
     """Write the title and the headline metrics."""
     paper.title(told.name)
-    paper.text("Virtual stenting report. Blood flow without and with each device; change is with / without − 1.")
+    paper.text(
+        "Virtual stenting report. Blood flow without and with each device; change is with / without − 1, or the "
+        "difference in percentage points."
+    )
     if told.headlines:
         paper.heading("Before and after")
+        for one in told.qualities:
+            paper.text(f"{one.sentence} {one.computation.capitalize()}.")
         _changes(paper, told, told.headlines)
         if told.is_pulse:
             paper.text(OF_PULSE)
@@ -216,7 +221,7 @@ def _changes(paper: _Paper, told: Contents, rows: list[Change]) -> None:
         line = [_named(row.before, 0), row.before.text]
         for name, _ in told.devices:
             after = row.after.get(name)
-            line.append(f"{after.text}  {format_change(row.before.value, after.value)}" if after else "–")
+            line.append(f"{after.text}  {row.of(name)}" if after else "–")
         cells.append(line)
     head = ("", "Before", *(title for _, title in told.devices))
     paper.table(cells, (first, rest, *[1.5 * rest] * len(told.devices)), head=head)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from vstent.geometry.vessel import Opening
-from vstent.reporting.definitions import DEFINITIONS, Definition
+from vstent.reporting.definitions import DEFINITIONS, WANTED, Definition
 
 UNITS: dict[str, tuple[str, float]] = {
     "Pa_per_m_s": ("Pa/(m/s)", 1.0),
@@ -118,6 +118,22 @@ class Change(NamedTuple):
     """Value without a device."""
     after: dict[str, Quantity]
     """Value with each device, by the name of the device."""
+    hidden: frozenset[str] = frozenset()
+    """Devices whose change is not shown, because the flow is not usable."""
+
+    def of(self, name: str) -> str:
+        """Return the change with a device: relative, or in percentage points for a percentage; a dash where hidden."""
+        if name in self.hidden:
+            return "–"
+        return format_change(self.before.value, self.after[name].value, self.before.key)
+
+    def sense(self, name: str) -> str:
+        """Return ``better`` or ``worse`` where that is defined for this quantity, else an empty string."""
+        before, after = self.before.value, self.after[name].value
+        wanted = WANTED.get(self.before.key, 0)
+        if name in self.hidden or not wanted or before == after:
+            return ""
+        return "better" if (after - before) * wanted > 0 else "worse"
 
 
 def base_of(key: str) -> tuple[str, str]:
@@ -188,15 +204,21 @@ def format_number(value: float) -> str:
     return f"{value:.{max(0, 2 - magnitude)}f}"
 
 
-def format_change(before: Any, after: Any) -> str:
+def format_change(before: Any, after: Any, key: str = "") -> str:
     """Return a relative change in percent, such as ``−35 %``; a dash where it is undefined.
+
+    The change of a percentage is a difference in percentage points, such as ``+1.2 points``.
 
     Parameters
     ----------
     before, after : values without and with a device.
+    key : key of the metric, which ends in its unit.
     """
-    numbers = all(isinstance(value, (int, float)) and math.isfinite(value) for value in (before, after))
-    if not numbers or before == 0:
+    if not all(isinstance(value, (int, float)) and math.isfinite(value) for value in (before, after)):
+        return "–"
+    if unit_of(key) == "%":
+        return f"{100 * (after - before):+.2g}\u202fpoints".replace("-", "−")
+    if before == 0:
         return "–"
     percent = 100 * (after / before - 1)
     digits = 0 if abs(percent) >= 10 else 1
@@ -234,7 +256,7 @@ def opening_rows(openings: Iterable[Opening]) -> list[tuple[str, str, str, str]]
     ]
 
 
-def compare(metrics: dict[str, Any]) -> list[Change]:
+def compare(metrics: dict[str, Any], hidden: frozenset[str] = frozenset()) -> list[Change]:
     """Return the flow metrics without (``bare``) and with each device (``stents.NAME.flow``), in order.
 
     Metrics that state the reliability of a result are left out.
@@ -244,7 +266,7 @@ def compare(metrics: dict[str, Any]) -> list[Change]:
     for quantity in flatten(metrics.get("bare", {})):
         found = {name: values[quantity.path] for name, values in after.items() if quantity.path in values}
         if found and _is_compared(quantity):
-            rows.append(Change(quantity, found))
+            rows.append(Change(quantity, found, hidden))
     return rows
 
 

@@ -95,7 +95,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
     failures |= unflown
     varied = vary_all(anatomy, deployments, settings, ledger, source)
     with ledger.stage("measure"):
-        metrics = measure_all(anatomy, deployments, fields)
+        metrics = measure_all(anatomy, deployments, fields, settings.flow)
         for name, spread in varied.items():
             metrics["stents"][name]["uncertainty"] = spread
         if failures:

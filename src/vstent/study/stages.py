@@ -26,6 +26,7 @@ from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, VstentError
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.convergence import Sensitivity, convergence
+from vstent.flow.grade import QUALITY, computation_of, grade
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
 from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
@@ -429,20 +430,24 @@ def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
 
 
 def measure_all(
-    anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]
+    anatomy: Anatomy,
+    deployments: Mapping[str, Deployment],
+    fields: Mapping[str, FlowField],
+    settings: FlowSettings | None = None,
 ) -> dict[str, Any]:
-    """Return the metrics of the vessel, every deployment and every flow, with ratios to the flow without a device.
+    """Return the metrics of the vessel, every deployment and every flow, with ratios and grades of the flows.
 
     Parameters
     ----------
     anatomy : vessel, parent artery and sacs.
     deployments : deployments by device name.
     fields : flows by name, ``bare`` first.
+    settings : settings of the flows; None: the default.
 
     Returns
     -------
     dict
-        Nested metrics; the end of each key is its unit.
+        Nested metrics; the end of each key is its unit. ``flow_quality`` holds the grade of every flow, by name.
     """
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
     shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
@@ -456,7 +461,18 @@ def measure_all(
         stents[name] = {"deployment": measure(anatomy, deployment)}
         if name in flow:
             stents[name] |= {"flow": flow[name] | left[name], "ratios": compare(flow[BARE], flow[name])}
-    return {"vessel": morphology(anatomy), "stents": stents} | ({BARE: flow[BARE] | left[BARE]} if flow else {})
+    found = {"vessel": morphology(anatomy), "stents": stents}
+    if not flow:
+        return found
+    case = flow_case(anatomy, None, settings)
+    quality = {name: _quality(case, field, flow[name]) for name, field in fields.items()}
+    return found | {BARE: flow[BARE] | left[BARE], QUALITY: quality}
+
+
+def _quality(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> dict[str, Any]:
+    """Return the grade of a flow, its reasons, and what was computed."""
+    judged = grade(case, field, found)
+    return {"grade": judged.level, "reasons": list(judged.reasons)} | judged.measures | computation_of(case, field)
 
 
 def _array(points_mm: Point | tuple[Point, ...] | None) -> Floats | None:

@@ -66,6 +66,7 @@ def restore(
         raise InputError(
             f"nothing bulges out of the artery near {place(at_mm)}: give a point in the dome of the sac, in LPS mm"
         )
+    found = bulges
     path, landing, sacs = _closed(vessel, bulges, outlet_mm, drawn)
     candidates = [_classified(vessel, landing, sac) for sac in sacs]
     if drawn is None and at_mm is None:
@@ -86,7 +87,7 @@ def restore(
         landing.surface,
         landing.is_restored.ravel(),
         aneurysms,
-        (*told(vessel, path, bulges, aneurysms), *candidates_told(aneurysms, candidates), *flat_told(flat)),
+        (*told(vessel, path, bulges or found, aneurysms), *candidates_told(aneurysms, candidates), *flat_told(flat)),
         tuple(candidates),
     )
 

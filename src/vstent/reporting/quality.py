@@ -1,0 +1,73 @@
+"""Grades of the flows as the reports, the page and the terminal state them, and which changes may be shown."""
+
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
+
+from vstent.devices.design import BARE
+from vstent.flow.grade import NOT_USABLE, QUALITY
+from vstent.reporting.quantities import format_value
+
+MARKS: Final = {"good": "✓", "fair": "~", NOT_USABLE: "✗"}
+"""Sign of every grade, so that color alone never carries it."""
+OF_GRADES: Final = (
+    "The grade of a flow follows from its grid, convergence and balance. A flow that is not usable shows no changes: "
+    "use a finer grid."
+)
+
+
+class Quality(NamedTuple):
+    """Grade of one flow in words."""
+
+    name: str
+    """Name of the flow: ``bare`` or a device."""
+    title: str
+    """Display name."""
+    grade: str
+    """``good``, ``fair`` or ``not usable``."""
+    reasons: str
+    """What keeps it from being good; empty for a good flow."""
+    computation: str
+    """Grid spacing, cells, steps, inflow and Reynolds number."""
+
+    @property
+    def mark(self) -> str:
+        """Sign of the grade."""
+        return MARKS[self.grade]
+
+    @property
+    def sentence(self) -> str:
+        """Display name, grade and reasons in one sentence."""
+        return f"{self.title}: {self.mark} {self.grade}{f' ({self.reasons})' if self.reasons else ''}."
+
+
+def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Quality]:
+    """Return the grade of every flow that has one, the flow without a device first.
+
+    Parameters
+    ----------
+    metrics : metrics of a case.
+    titles : titles of the devices by name.
+    """
+    graded = metrics.get(QUALITY, {})
+    named = {BARE: "Without a device"} | dict(titles)
+    return [
+        Quality(name, title, graded[name]["grade"], "; ".join(graded[name]["reasons"]), _computation(graded[name]))
+        for name, title in named.items()
+        if name in graded
+    ]
+
+
+def unusable(metrics: Mapping[str, Any]) -> frozenset[str]:
+    """Return the devices whose changes are not shown, because their flow or the bare one is not usable."""
+    graded = metrics.get(QUALITY, {})
+    poor = {name for name, one in graded.items() if one["grade"] == NOT_USABLE}
+    return frozenset(graded if BARE in poor else poor)
+
+
+def _computation(one: Mapping[str, Any]) -> str:
+    """Return what was computed, in words."""
+    spacing, inflow = (format_value(key, one[key]) for key in ("grid_spacing_mm", "inflow_mL_s"))
+    return (
+        f"grid spacing {spacing}, {one['cells_count']:,} cells, {one['steps_count']:,} time steps, inflow {inflow} "
+        f"(Reynolds number {one['inlet_reynolds_number_count']:.0f})"
+    )

@@ -1,0 +1,94 @@
+"""Grades of flows beside their numbers: in the report, the terminal and the page's tables; what may not be shown."""
+
+from dataclasses import replace
+
+import pytest
+import report_case
+from pages import Page
+
+from vstent.app import sheets
+from vstent.cli.console import comparison_table
+from vstent.reporting.page import as_html
+from vstent.reporting.quality import qualities, unusable
+from vstent.reporting.quantities import compare, format_change
+
+TITLES = {"silk": "Silk", "enterprise": "Enterprise"}
+
+
+def graded(**grades: str) -> dict:
+    """Return metrics in which each flow has a grade."""
+    measures = {
+        "grid_spacing_mm": 0.4,
+        "cells_count": 19152,
+        "steps_count": 4000,
+        "inflow_mL_s": 3.74,
+        "inlet_reynolds_number_count": 297.4,
+    }
+    quality = {
+        name: {"grade": grade, "reasons": [] if grade == "good" else ["9 cells across the neck"]} | measures
+        for name, grade in grades.items()
+    }
+    return report_case.metrics() | {"flow_quality": quality}
+
+
+def changes(metrics: dict) -> dict[str, list[str]]:
+    """Return the changes of neck inflow as report, page and terminal show them, silk first."""
+    (sheet,) = sheets.flow(metrics, TITLES)
+    row = next(row for row in sheet["rows"] if row["key"] == "neck_inflow_mL_s")
+    table = comparison_table(metrics)
+    names = list(table.columns[0].cells)
+    cells = [str(list(column.cells)[names.index("Neck inflow")]) for column in table.columns[2:]]
+    (first,) = (one for one in compare(metrics, unusable(metrics)) if one.before.key == "neck_inflow_mL_s")
+    return {
+        "page": row["cells"][2::2],
+        "report": [first.of(name) for name in TITLES],
+        "terminal": [cell.partition("(")[2].rstrip(")") or "–" for cell in cells],
+    }
+
+
+@pytest.mark.parametrize(
+    ("grades", "expected"),
+    [
+        ({"bare": "good", "silk": "fair", "enterprise": "good"}, ["-38%", "-13%"]),
+        ({"bare": "good", "silk": "not usable", "enterprise": "good"}, ["–", "-13%"]),
+        ({"bare": "not usable", "silk": "good", "enterprise": "good"}, ["–", "–"]),
+        ({}, ["-38%", "-13%"]),
+    ],
+)
+def test_no_change_is_shown_of_a_flow_that_is_not_usable(grades: dict[str, str], expected: list[str]) -> None:
+    for place, shown in changes(graded(**grades)).items():
+        plain = [one.replace("−", "-").replace("\u202f", "") for one in shown]
+        assert plain == expected, place
+
+
+def test_grade_and_grid_stand_before_the_first_number_of_the_report() -> None:
+    metrics = graded(bare="good", silk="fair", enterprise="not usable")
+    told = replace(report_case.contents(), metrics=metrics, changes=compare(metrics, unusable(metrics)))
+    text = Page(as_html(told)).text.replace("\u202f", " ")
+    before = text.partition("Neck inflow")[0]
+    assert "✓ Without a device: good" in before
+    assert "~ Silk" in before
+    assert "fair (9 cells across the neck)" in before
+    assert "not usable (9 cells across the neck)" in before
+    assert "grid spacing 0.400 mm, 19,152 cells, 4,000 time steps, inflow 3.74 mL/s (Reynolds number 297)" in before
+
+
+def test_a_case_without_grades_has_none() -> None:
+    assert qualities(report_case.metrics(), TITLES) == []
+    assert unusable(report_case.metrics()) == frozenset()
+
+
+def test_percentages_change_in_points() -> None:
+    """An area of 0.085 % that becomes 1.31 % has not grown by 1439 %."""
+    assert format_change(0.00085, 0.0131, "low_shear_area_fraction") == "+1.2\u202fpoints"
+    assert format_change(0.0, 0.25, "low_shear_area_fraction") == "+25\u202fpoints"
+
+
+def test_better_and_worse_only_where_a_direction_is_wanted() -> None:
+    rows = {row.before.key: row for row in compare(report_case.metrics())}
+    assert rows["neck_inflow_mL_s"].sense("silk") == "better"
+    assert rows["turnover_time_s"].sense("silk") == "better"  # longer
+    assert rows["mean_sac_wss_Pa"].sense("silk") == ""
+    worse = report_case.metrics()
+    worse["stents"]["silk"]["flow"]["neck_inflow_mL_s"] = 0.5
+    assert {row.before.key: row for row in compare(worse)}["neck_inflow_mL_s"].sense("silk") == "worse"
