@@ -38,7 +38,7 @@ def test_where_a_device_lies_is_not_guessed(studied: Path, tmp_path: Path, capsy
     (tmp_path / "case" / "run.json").write_text("{")
     words = ["export", "openfoam", str(tmp_path / "case"), "--device", "enterprise", "--out", str(tmp_path / "foam")]
     assert main(words) == 2
-    assert "where a device lies is not known" in " ".join(capsys.readouterr().err.split())
+    assert "so the position of the device is unknown" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "foam").exists()
 
 
