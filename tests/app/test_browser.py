@@ -357,7 +357,7 @@ def test_a_flow_goes_on_where_it_was_when_the_server_was_killed(artery, tmp_path
         page.wait_for_function("() => !document.querySelector('button[aria-label=Undo]').disabled")
         page.get_by_role("button", name="Run the flow").click()
         playwright.expect(page.locator(".work .hint")).to_contain_text("Flow, before", timeout=600 * SECOND)
-        playwright.expect(page.locator(".work-words")).to_contain_text("left to settle", timeout=600 * SECOND)
+        playwright.expect(page.locator(".work-words")).to_contain_text("from convergence", timeout=600 * SECOND)
         case = page.evaluate("location.hash").strip("#").partition("/")[0]
         page.goto("about:blank")  # a page whose server dies says so on the console
     (bare,) = (tmp_path / case / CACHE).glob("flow bare-*.npz")

@@ -261,7 +261,7 @@ class Page {
     try {
       const answer = await getBinary(`${this.path}/anatomy`);
       this.anatomy = answer.manifest;
-      this.picture.stage?.drop(({ id }) => id.startsWith("opening ") || ["lumen", "landing", "sac", "neck", "wires", "contour"].includes(id));
+      this.picture.stage?.drop(({ id }) => id.startsWith("opening ") || ["lumen", "landing", "continued", "sac", "neck", "wires", "contour"].includes(id));
       this.picture.put(answer);
       this.neck.given = null; // its curve is drawn anew over the one found
       this.axis = new Axis(answer.manifest.axis, this.picture);
@@ -612,7 +612,7 @@ const SPOKEN = {
 
 /** From where each step looks at first. */
 const VIEW = { image: "whole", vessel: "whole", sac: "profile", device: "profile", deploy: "profile", flow: "profile", report: "profile" };
-const LUMEN = { id: "lumen", title: "Lumen", on: true };
+const LUMEN = { id: "lumen", title: "Lumen", on: true, also: ["continued"] };
 const NECK = { id: "neck", title: "Neck", on: true };
 const LAYERS = {
   image: (page) =>

@@ -12,9 +12,9 @@ export { Stage } from "./stage.js";
 export { Raycaster, Vector2, Vector3 } from "three";
 
 const MODES = [
-  { id: "anatomy", title: "Anatomy", layers: ["lumen", "landing", "sac", "neck"] },
-  { id: "device", title: "Device", layers: ["lumen", "wires", "contour", "neck"] },
-  { id: "wires", title: "Wires", layers: ["lumen", "wires", "neck"] },
+  { id: "anatomy", title: "Anatomy", layers: ["lumen", "continued", "landing", "sac", "neck"] },
+  { id: "device", title: "Device", layers: ["lumen", "continued", "wires", "contour", "neck"] },
+  { id: "wires", title: "Wires", layers: ["lumen", "continued", "wires", "neck"] },
   { id: "flow", title: "Blood flow", layers: ["lumen", "streamlines", "neck"] },
   { id: "shear", title: "Wall shear stress", layers: ["shear", "neck"] },
 ];
@@ -22,6 +22,7 @@ const MODES = [
 const LAYERS = [
   ["lumen", "Lumen (patient)"],
   ["landing", "Restored parent artery"],
+  ["continued", "Continued artery (assumed)"],
   ["sac", "Sac"],
   ["neck", "Neck"],
   ["axis", "Parent axis"],

@@ -54,9 +54,9 @@ def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
     proximal_mm, distal_mm : mean diameter of each zone in mm.
     """
     proximal_mm, distal_mm = neck_span_mm(anatomy)
-    length_mm = anatomy.axis.length_mm
-    before = np.linspace(max(0.0, proximal_mm - ZONE_MM), max(0.0, proximal_mm), 51)
-    after = np.linspace(min(length_mm, distal_mm), min(length_mm, distal_mm + ZONE_MM), 51)
+    first_mm, last_mm = anatomy.own_mm
+    before = np.linspace(max(first_mm, proximal_mm - ZONE_MM), max(first_mm, proximal_mm), 51)
+    after = np.linspace(min(last_mm, distal_mm), min(last_mm, distal_mm + ZONE_MM), 51)
     diameter_mm = 2 * anatomy.section_radius_mm
     first, second = (np.interp(zone, anatomy.axis.abscissa_mm, diameter_mm).mean() for zone in (before, after))
     return float(first), float(second)

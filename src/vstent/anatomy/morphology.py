@@ -77,7 +77,8 @@ def _course(anatomy: Anatomy) -> Measures:
     """Return curvature and torsion of the parent axis; empty for an axis of few points."""
     axis = anatomy.axis
     diameter_mm = 2 * float(np.median(anatomy.section_radius_mm))
-    inner = (axis.abscissa_mm >= diameter_mm) & (axis.abscissa_mm <= axis.length_mm - diameter_mm)
+    first_mm, last_mm = anatomy.own_mm
+    inner = (axis.abscissa_mm >= first_mm + diameter_mm) & (axis.abscissa_mm <= last_mm - diameter_mm)
     if inner.sum() < FEWEST_AXIS_POINTS:
         return {}
     even_mm = curves.resample_evenly(axis.points_mm, len(axis.points_mm))

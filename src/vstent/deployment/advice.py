@@ -56,7 +56,7 @@ def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
     str
         One sentence, and a second one if the neck is on a fork.
     """
-    return f"{_lies(anatomy, stent, course, gaps)}{_of_fork(anatomy)}"
+    return f"{_lies(anatomy, stent, course, gaps)}{_beyond_patient(anatomy, stent)}{_of_fork(anatomy)}"
 
 
 def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
@@ -78,6 +78,14 @@ def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
         return f"{lies}; {1 - loose:.0%} of it is apposed."
     off = f"{loose:.0%} of it is not apposed, with gaps up to {gap_mm[is_at_patient].max():.2f} mm"
     return f"{lies}, and {off}: {_remedy(anatomy, stent, gap_mm, is_loose)}"
+
+
+def _beyond_patient(anatomy: Anatomy, stent: Stent) -> str:
+    """Return a sentence on the part of a device that lies in a continued artery, or an empty string."""
+    first_mm, last_mm = anatomy.own_mm
+    beyond_mm = {"proximal": first_mm - stent.proximal_abscissa_mm, "distal": stent.distal_abscissa_mm - last_mm}
+    parts = [f"{length:.1f} mm at its {end} end" for end, length in beyond_mm.items() if length > SHORT_MM]
+    return f" It leaves the patient's artery by {' and '.join(parts)}; the artery there is assumed." if parts else ""
 
 
 @lru_cache(maxsize=8)

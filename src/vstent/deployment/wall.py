@@ -102,7 +102,7 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = T
     wall : AbstractWall
         The wall.
     is_patient : (m,) array of bool
-        Faces that are the patient's own wall, neither restored wall nor device.
+        Faces that are the patient's own wall, neither restored or continued wall nor device.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = T
     """
     kind = TreeWall if search == TREE else plugins.load("vstent.walls", search, built_in=TREE)
     surface = anatomy.landing_surface
-    is_patient = ~anatomy.is_restored_face
+    is_patient = anatomy.is_patient_face
     for stent in inside:
         foot_mm = curves.project(anatomy.axis.points_mm, surface.corners_mm.mean(axis=1))[0]
         first_mm, last_mm = stent.proximal_abscissa_mm + OVERLAP_MM, stent.distal_abscissa_mm - OVERLAP_MM

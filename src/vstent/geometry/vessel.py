@@ -195,6 +195,10 @@ class Candidate:
         return f"{self.kind} at {place(self.point_mm)}: {', '.join(self.reasons)}"
 
 
+BEYOND_MM = 1e-6
+"""Rounding of abscissae, mm."""
+
+
 @dataclass(frozen=True, eq=False)
 class Anatomy:
     """A traced vessel with its parent artery restored."""
@@ -216,10 +220,33 @@ class Anatomy:
     """Findings and assumptions, one sentence each."""
     candidates: tuple[Candidate, ...] = ()
     """Every bulge that was examined, with its class."""
+    continued_mm: tuple[float, float] = (0.0, 0.0)
+    """Lengths at the proximal and distal end of the axis, mm, that are assumed: the patient's artery ends before."""
 
     def __post_init__(self) -> None:
         freeze(self, "section_radius_mm", np.float64, (len(self.axis.points_mm),))
         freeze(self, "is_restored", np.bool_, (len(self.landing_surface.vertices_mm),))
+
+    @property
+    def own_mm(self) -> tuple[float, float]:
+        """Where the patient's artery begins and ends on the axis, in mm."""
+        return self.continued_mm[0], self.axis.length_mm - self.continued_mm[1]
+
+    @cached_property
+    def is_continued(self) -> Bools:
+        """(v,) whether each vertex of the landing surface is in a continuation of the artery."""
+        if not any(self.continued_mm):
+            return np.zeros(len(self.is_restored), dtype=bool)
+        first_mm, last_mm = self.own_mm
+        abscissa_mm = self.axis.abscissa_mm
+        beyond = (abscissa_mm < first_mm - BEYOND_MM) | (abscissa_mm > last_mm + BEYOND_MM)
+        return np.repeat(beyond, len(self.is_restored) // len(abscissa_mm))
+
+    @cached_property
+    def is_patient_face(self) -> Bools:
+        """(f,) whether each triangle of the landing surface is the patient's own wall."""
+        faces = self.landing_surface.faces
+        return np.asarray(~self.is_restored_face & ~self.is_continued[faces].any(axis=1))
 
     @cached_property
     def is_restored_face(self) -> Bools:

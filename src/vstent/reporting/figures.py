@@ -73,7 +73,7 @@ def pictures(scene: Scene) -> list[Picture]:
 
 def overview(scene: Scene) -> bytes:
     """Return one wide PNG that sums up a case: wires across the neck, and streamlines where a flow was computed."""
-    layers = ("lumen", "wires", "neck", "streamlines")
+    layers = ("lumen", "continued", "wires", "neck", "streamlines")
     shots = [Shot(title, scene.pick(layers, pane), scene.view("profile")) for pane, title in scene.panes]
     scales = {scale.id for scale in scene.scales}
     return sheet(scene, shots, "speed" if "speed" in scales else "")
@@ -168,7 +168,7 @@ def _alphas(opacity: float, normals: Floats) -> Floats:
 
 def _anatomy(scene: Scene) -> Picture:
     """Return the picture of vessel, parent artery, sac and neck from three sides."""
-    ids = ("lumen", "landing", "sac", "neck")
+    ids = ("lumen", "continued", "landing", "sac", "neck")
     titles = {"profile": "In profile", "frontal": "Frontal", "lateral": "From the left"}
     shots = [Shot(title, scene.pick(ids, BARE), scene.view(view)) for view, title in titles.items()]
     caption = "The patient's lumen (glass), the restored parent artery (sand), the sac (red) and the neck (red line)."
@@ -177,7 +177,7 @@ def _anatomy(scene: Scene) -> Picture:
 
 def _contour(scene: Scene) -> Picture:
     """Return the picture of the deployed contours, colored by their gap to the wall."""
-    ids = ("lumen", "contour", "neck")
+    ids = ("lumen", "continued", "contour", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
     caption = "The deployed contour in the lumen, colored by its gap to the wall of the parent artery."
     return Picture("contour", "Position of the devices", caption, sheet(scene, shots, "wall_gap"))
@@ -185,7 +185,7 @@ def _contour(scene: Scene) -> Picture:
 
 def _coverage(scene: Scene) -> Picture:
     """Return the picture of the metal coverage of each device."""
-    ids = ("lumen", "coverage", "neck")
+    ids = ("lumen", "continued", "coverage", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
     caption = (
         "Metal coverage: fraction of the contour covered by metal, measured on the wires and averaged over a "
@@ -196,7 +196,10 @@ def _coverage(scene: Scene) -> Picture:
 
 def _wires(scene: Scene) -> Picture:
     """Return the picture of the wires in profile and seen from the sac."""
-    looks = {"profile": ("in profile", ("lumen", "wires", "neck")), "neck": ("seen from the sac", ("wires", "neck"))}
+    looks = {
+        "profile": ("in profile", ("lumen", "continued", "wires", "neck")),
+        "neck": ("seen from the sac", ("wires", "neck")),
+    }
     shots = [
         Shot(f"{title}: {looks[view.id][0]}", scene.pick(looks[view.id][1], pane), view)
         for pane, title in scene.panes[1:]

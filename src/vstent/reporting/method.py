@@ -53,7 +53,7 @@ def method_pictures(case: "CaseResult", scene: Scene) -> list[Picture]:
 def _restoration(scene: Scene) -> Picture:
     """Return the picture of the removal of the sac."""
     profile = scene.view("profile")
-    lumen, landing = scene.pick(("lumen",), BARE), scene.pick(("landing",), BARE)
+    lumen, landing = scene.pick(("lumen",), BARE), scene.pick(("continued", "landing"), BARE)
     cut = scene.pick(("lumen", "sac", "neck"), BARE)
     shots = [
         Shot("The wall as found", _opaque(lumen), profile),
@@ -163,7 +163,9 @@ def _fitted(scene: Scene) -> Picture:
         for pane, title in scene.panes[1:]
         for shot in (
             Shot(f"{title}: in the parent artery", (*_glass(scene), *scene.pick(("wires",), pane)), profile),
-            Shot(f"{title}: in the patient's artery", scene.pick(("lumen", "wires", "neck"), pane), profile),
+            Shot(
+                f"{title}: in the patient's artery", scene.pick(("lumen", "continued", "wires", "neck"), pane), profile
+            ),
         )
     ]
     caption = "The wires on the expanded contour, and in the patient's own artery with its sac (neck: red line)."

@@ -14,6 +14,7 @@ from vstent.flow.case import FlowField
 from vstent.flow.streamlines import inlet_seeds_mm, neck_seeds_mm, streamlines
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
+from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.reporting.thinning import thin_frames, thin_lines, thin_surface
 
@@ -175,25 +176,43 @@ _WALL = (0.62, 0.68, 0.73)
 _SAC = (0.80, 0.42, 0.36)
 _INK = (0.10, 0.17, 0.20)
 _STEEL = (0.33, 0.38, 0.43)
-"""Colors of wall, sac, lines and devices: red, green and blue, 0 to 1."""
+_ASSUMED = (0.45, 0.36, 0.58)
+"""Colors of wall, sac, lines, devices and assumed artery: red, green and blue, 0 to 1."""
+RING_MM = 1.0
+"""Distance between the rings that show a continued artery, in mm."""
 
 
 def anatomy_layers(anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
     """Return the layers of lumen, landing surface, centerlines, axis, sacs and necks."""
     lumen, _ = thin_surface(anatomy.vessel.lumen, 40_000)
-    landing, _ = thin_surface(anatomy.landing_surface, 24_000)
+    surface = anatomy.landing_surface
+    own = Surface(
+        *triangles.compact(surface.vertices_mm, surface.faces[~anatomy.is_continued[surface.faces].any(axis=1)])
+    )
+    landing, _ = thin_surface(own if any(anatomy.continued_mm) else surface, 24_000)
     layers: list[MeshLayer | LineLayer] = [
         MeshLayer(id="lumen", pane="", colour=_WALL, surface=lumen, opacity=0.16, **_PLAIN),
         MeshLayer(id="landing", pane="", colour=(0.80, 0.74, 0.66), surface=landing, **_PLAIN),
         curves_layer("centerlines", [line.points_mm for line in anatomy.vessel.centerlines], 0.05, (0.45, 0.36, 0.58)),
         curves_layer("axis", [anatomy.axis.points_mm], 0.06, (0.17, 0.32, 0.55)),
     ]
+    if any(anatomy.continued_mm):
+        layers += [curves_layer("continued", _continued_rings(anatomy), 0.05, _ASSUMED)]
     if anatomy.aneurysms:
         sacs = [thin_surface(aneurysm.sac, 12_000)[0] for aneurysm in anatomy.aneurysms]
         rings = [np.vstack([aneurysm.neck_mm, aneurysm.neck_mm[:1]]) for aneurysm in anatomy.aneurysms]
         layers += [MeshLayer(id="sac", pane="", colour=_SAC, surface=sac, opacity=0.45, **_PLAIN) for sac in sacs]
         layers += [curves_layer("neck", rings, 0.08, (0.72, 0.20, 0.16))]
     return layers
+
+
+def _continued_rings(anatomy: Anatomy) -> list[Floats]:
+    """Return closed rings of the continued artery, about `RING_MM` apart: assumed wall is not drawn solid."""
+    count = len(anatomy.axis.points_mm)
+    rings_mm = anatomy.landing_surface.vertices_mm.reshape(count, -1, 3)
+    is_assumed = anatomy.is_continued.reshape(count, -1).all(axis=1)
+    every = max(1, round(RING_MM / float(np.diff(anatomy.axis.abscissa_mm).mean())))
+    return [np.vstack([ring, ring[:1]]) for ring in rings_mm[is_assumed][::every]]
 
 
 def curves_layer(name: str, curves: list[Floats], radius_mm: float, colour: tuple[float, float, float]) -> LineLayer:

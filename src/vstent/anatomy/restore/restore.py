@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from vstent.anatomy.continuation import continued
 from vstent.anatomy.restore.axis import Mouth, fit_axis
 from vstent.anatomy.restore.bulges import Bulge, find_bulges, flat_bulges
 from vstent.anatomy.restore.candidates import classified
@@ -80,7 +81,7 @@ def restore(
         candidates += others
     aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
     flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm, path, landing)
-    return Anatomy(
+    anatomy = Anatomy(
         vessel,
         landing.axis,
         landing.section_radius_mm,
@@ -90,6 +91,7 @@ def restore(
         (*told(vessel, path, bulges or found, aneurysms), *candidates_told(aneurysms, candidates), *flat_told(flat)),
         tuple(candidates),
     )
+    return continued(anatomy)
 
 
 def _closed(
