@@ -61,7 +61,8 @@ def scanned_anatomy_of(phantom: phantoms.Phantom, voxel_mm: float) -> Anatomy:
 def relative_errors(anatomy: Anatomy, phantom: phantoms.Phantom) -> tuple[np.ndarray, np.ndarray]:
     """Radius error (fraction) of the landing surface's sections, and distance (mm) of its vertices to the true wall."""
     axis = anatomy.axis
-    inner = (axis.abscissa_mm > 3) & (axis.abscissa_mm < axis.length_mm - 3)
+    first_mm, last_mm = anatomy.own_mm
+    inner = (axis.abscissa_mm > first_mm + 3) & (axis.abscissa_mm < last_mm - 3)
     place = curves.project(phantom.parent.points_mm, axis.points_mm[inner])[0]
     true_mm = np.interp(place, phantom.parent.abscissa_mm, phantom.parent.inscribed_radius_mm)
     rings = anatomy.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
@@ -82,7 +83,8 @@ def beside_the_fork_without_sac(data: Path, side: float) -> tuple[Anatomy, Anato
         for name in ("with", "without")
     )
     axis = sick.axis
-    inner = (axis.abscissa_mm > 1.5) & (axis.abscissa_mm < axis.length_mm - 1.5)
+    first_mm, last_mm = sick.own_mm
+    inner = (axis.abscissa_mm > first_mm + 1.5) & (axis.abscissa_mm < last_mm - 1.5)
     place = curves.project(healthy.axis.points_mm, axis.points_mm[inner])[0]
     radius_mm = np.interp(place, healthy.axis.abscissa_mm, healthy.section_radius_mm)
     rings_mm = sick.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
@@ -92,5 +94,5 @@ def beside_the_fork_without_sac(data: Path, side: float) -> tuple[Anatomy, Anato
 
 def moved_mm(anatomy: Anatomy) -> float:
     """Largest distance from the lumen of what the landing surface keeps of it."""
-    own_mm = anatomy.landing_surface.vertices_mm[~anatomy.is_restored]
+    own_mm = anatomy.landing_surface.vertices_mm[~anatomy.is_restored & ~anatomy.is_continued]
     return float(anatomy.vessel.lumen.closest(own_mm)[1].max())

@@ -63,8 +63,14 @@ def test_every_size_at_every_shift_is_tried_once_and_sorted_by_the_stated_rule()
     wanted = [task for task in wanted if task[0] != "silk" or task[1] in SILK.sizes[4::11]]
     assert sorted(tried, key=str) == sorted(wanted, key=str)
     for one in found:
-        better = [c for c in found if (c.is_suitable, c.score) > (one.is_suitable, one.score)]
+        stands = one.is_suitable, one.is_proposed, one.score
+        better = [c for c in found if (c.is_suitable, c.is_proposed, c.score) > stands]
         assert len(better) <= found.index(one)
+    proposed = [c for c in found if c.is_proposed]
+    designs = (replace(SILK, sizes=SILK.sizes[4::11]), ENTERPRISE)
+    assert {(c.design.key, c.size, c.shift_mm) for c in proposed} == {
+        (d.key, propose_size(d, artery()), 0.0) for d in designs
+    }
 
 
 def test_scores_are_the_weighted_means_of_grades_of_what_was_measured():

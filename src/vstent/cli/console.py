@@ -14,7 +14,7 @@ from vstent.devices.design import Design
 from vstent.flow.convergence import Refinement
 from vstent.flow.positions import POSITIONS, Scatter
 from vstent.geometry.vessel import Opening
-from vstent.plan.rank import Ranking
+from vstent.plan.rank import Candidate, Ranking
 
 ROWS: Final = (
     ("Neck inflow", "neck_inflow_mL_s"),
@@ -153,13 +153,16 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
     shown : number of candidates to show.
     """
     table = Table("", "device and size", "shift", "score", *(title for title, _, _ in RANKING_COLUMNS))
-    for number, candidate in enumerate(ranking.candidates[:shown], start=1):
+    for number, candidate in _shown(ranking, shown):
         values = [(candidate.measures.get(key), form) for _, key, form in RANKING_COLUMNS]
         cells = ["" if value is None else form.format(value) for value, form in values]
         score = f"{candidate.score:.2f}" if candidate.is_suitable else "out"
         table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells)
     table.columns[1].no_wrap = True
-    table.caption = f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable"
+    table.caption = (
+        f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable. First the size that vstent run "
+        "proposes for each device."
+    )
     return table
 
 
@@ -171,8 +174,17 @@ def ranking_reasons(ranking: Ranking, shown: int) -> str:
     ranking : the ranking.
     shown : number of candidates to show.
     """
-    best = enumerate(ranking.candidates[:shown], start=1)
+    best = _shown(ranking, shown)
     return "\n".join(f"{number}. {candidate.label}: {candidate.reason}" for number, candidate in best)
+
+
+def _shown(ranking: Ranking, count: int) -> list[tuple[int, Candidate]]:
+    """Return the best candidates and the best one of every other device, each with its rank."""
+    numbered = list(enumerate(ranking.candidates, start=1))
+    best: dict[str, tuple[int, Candidate]] = {}
+    for number, candidate in numbered:
+        best.setdefault(candidate.design.key, (number, candidate))
+    return numbered[:count] + [one for one in best.values() if one[0] > count]
 
 
 def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:

@@ -1,7 +1,8 @@
 """Rank devices: every size is deployed, measured and graded, and the ranking gives a reason for each score."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -10,6 +11,7 @@ from vstent.anatomy.landing_zones import landing_diameters_mm
 from vstent.anatomy.morphology import Measures
 from vstent.deployment.deploy import deploy, propose_landing
 from vstent.deployment.measure import measure
+from vstent.deployment.sizing import propose_size
 from vstent.devices.design import Design, Size
 from vstent.devices.stent import Landing
 from vstent.errors import InputError, LandingError
@@ -45,6 +47,8 @@ class Candidate:
     """Whether no grade is 0."""
     reason: str
     """One sentence: the largest deductions, or why it could not be deployed."""
+    is_proposed: bool = False
+    """Whether `vstent.deployment.sizing.propose_size` proposes this size, at the proposed place."""
 
     @property
     def label(self) -> str:
@@ -52,10 +56,11 @@ class Candidate:
         return f"{self.design.name} {self.size.label}"
 
     @property
-    def order(self) -> tuple[bool, float, str, float, float, float]:
+    def order(self) -> tuple[bool, bool, float, str, float, float, float]:
         """Sort key that puts the best first; ties are sorted by name, size and shift, so the order is reproducible."""
         return (
             not self.is_suitable,
+            not self.is_proposed,
             -self.score,
             self.design.key,
             self.size.diameter_mm,
@@ -92,6 +97,7 @@ def _row(number: int, candidate: Candidate) -> dict[str, Any]:
         "label_length_mm": candidate.size.length_mm,
         "shift_mm": candidate.shift_mm,
         "is_suitable": candidate.is_suitable,
+        "is_proposed": candidate.is_proposed,
         "score": candidate.score,
         "reason": candidate.reason,
         **{f"grade_{key}": grade for key, grade in candidate.grades.items()},
@@ -128,7 +134,7 @@ def rank(
     Returns
     -------
     Ranking
-        All candidates, the best first.
+        All candidates, suitable ones first: of every device the size that a run proposes, then the others by score.
 
     Raises
     ------
@@ -136,15 +142,24 @@ def rank(
         There is no device or no shift to try.
     """
     criteria = criteria or default_criteria()
+    proposed = {(design.key, _proposed(design, anatomy)) for design in designs}
     tasks = [(design, size, float(shift)) for design in designs for size in design.sizes for shift in shifts_mm]
     if not tasks:
         raise InputError("There is nothing to rank: give at least one device and one landing shift.")
     graded = []
     for candidate in spread(_graded, (anatomy, criteria), tasks, jobs=jobs):
-        graded.append(candidate)
+        is_proposed = candidate.shift_mm == 0 and (candidate.design.key, candidate.size) in proposed
+        graded.append(replace(candidate, is_proposed=is_proposed))
         if progress is not None:
             progress(len(graded), len(tasks))
     return Ranking(tuple(sorted(graded, key=lambda candidate: candidate.order)), criteria)
+
+
+def _proposed(design: Design, anatomy: Anatomy) -> Size | None:
+    """Return the size of a device that a run proposes; None where none fits."""
+    with suppress(LandingError):
+        return propose_size(design, anatomy)
+    return None
 
 
 def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) -> Candidate:

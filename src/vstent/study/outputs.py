@@ -172,11 +172,12 @@ def write_ranking(out: Path, ranking: Ranking) -> None:
 
 
 def _ranked(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of a ranking in order: suitable ones by their score, then the rest, numbered anew."""
+    """Return the rows of a ranking in order (see `Candidate.order`), numbered anew."""
     size = ("device", "label_diameter_mm", "label_length_mm")
 
     def place(row: dict[str, Any]) -> tuple[Any, ...]:
-        return not row["is_suitable"], -row["score"], *(row[key] for key in size), abs(row["shift_mm"])
+        first = not row["is_suitable"], not row.get("is_proposed"), -row["score"]
+        return *first, *(row[key] for key in size), abs(row["shift_mm"])
 
     return [row | {"rank": number} for number, row in enumerate(sorted(rows, key=place), start=1)]
 
