@@ -4,6 +4,7 @@ import { drop, get, getBinary, Newest, post, put } from "./api.js";
 import { Axis } from "./axis.js";
 import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js";
 import { Deploying } from "./deploy.js";
+import { Flowing } from "./flowing.js";
 import { Neck } from "./neck.js";
 import { changeSheet, neckWords, placeWords, plainSheet, qualitySheet, sureSheet } from "./numbers.js";
 import { panels, placeOf, spokenRole } from "./panels.js";
@@ -78,6 +79,7 @@ class Page {
 
   close() {
     this.events?.close();
+    if (this.flowing?.isOn) this.flowing.turn(false);
     this.view = null;
     this.anatomyKey = this.flowKey = this.scanKey = undefined;
     this.anatomy = null;
@@ -119,6 +121,7 @@ class Page {
     this.picture = new Picture();
     this.along = new AlongChart();
     this.section = new SectionChart();
+    this.flowing = new Flowing({ path: () => this.path, picture: this.picture, changed: () => this.view && this.renderScene(), failed: (problem) => this.complain(problem) });
     this.deploying = new Deploying({
       path: () => this.path,
       picture: this.picture,
@@ -345,6 +348,7 @@ class Page {
     this.picture.setViews(...(isScan ? ["scan", this.scanViews] : ["vessel", this.anatomy?.views]), VIEW[this.step]);
     this.picture.setPanes(this.step === "flow" || this.step === "report" ? this.panes() : [{ id: this.device || "one", title: "" }]);
     this.picture.setLayers(layers, (this.memory[this.step] ??= {}));
+    this.flowing.isWatched = this.step === "deploy";
     this.picture.clicked = this.step === "sac" ? (point) => point && this.setSeed(point) : null;
     this.picture.moved = null;
     this.picture.setMarks(this.anatomy ? this.marks() : []);
@@ -626,7 +630,15 @@ const LAYERS = {
   ],
   sac: () => [LUMEN, { id: "landing", title: "Parent artery", on: true }, { id: "sac", title: "Sac", on: true }, NECK, { id: "axis", title: "Axis", on: false }],
   device: () => [LUMEN, { id: "landing", title: "Parent artery", on: true }, { id: "sac", title: "Sac", on: true }, NECK],
-  deploy: () => [LUMEN, { id: "wires", title: "Wires", on: true }, { id: "contour", title: "Contour", on: false }, NECK, { id: "axis", title: "Axis", on: true }, { id: "landing", title: "Parent artery", on: false }],
+  deploy: (page) => [
+    LUMEN,
+    { id: "wires", title: "Wires", on: true },
+    ...(page.flowing.isOn ? [{ id: "streamlines", title: "Live flow", on: true }] : []),
+    { id: "contour", title: "Contour", on: false },
+    NECK,
+    { id: "axis", title: "Axis", on: true },
+    { id: "landing", title: "Parent artery", on: false },
+  ],
   flow: (page) => {
     const mode = page.memory.mode || "streamlines";
     const shear = mode === "shear";

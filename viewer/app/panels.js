@@ -154,6 +154,7 @@ export const panels = {
     const place = make("div", { className: "place" });
     if (page.place && page.deploying.name === page.device) place.append(...placeWords(page.place));
     parts.push(place, ...colours(page), expansion(page));
+    if (page.anatomy?.neck?.length) parts.push(page.flowing.element);
     parts.push(make("p", { className: "advice" }, [page.advice && page.deploying.name === page.device ? page.advice : ""]), ...failure(page));
     parts.push(next(page, "flow", "Flow →"));
     return parts;

@@ -31,6 +31,7 @@ class Desk:
         self.jobs = Jobs()
         self.is_closing = False
         self._lives: dict[str, Any] = {}
+        self._previews: dict[str, Any] = {}
         self._scans: dict[str, Any] = {}
         self._lock = threading.Lock()
         self._loading = threading.Lock()
@@ -162,6 +163,36 @@ class Desk:
                 self._lives[case.id] = Live(case)
             return self._lives[case.id]
 
+    def preview(self, case: Case) -> Any:
+        """Return the live flow of a case; start it where it does not run, or runs for another anatomy or flow.
+
+        Raises
+        ------
+        InputError
+            The vessel has no sac.
+        """
+        from vstent.app.preview import Preview
+        from vstent.flow.case import FlowSettings
+
+        live, settings = self.live(case), case.state.settings().flow or FlowSettings()
+        with self._lock:
+            found = self._previews.get(case.id)
+            if found is None or found.anatomy is not live.anatomy or found.settings != settings:
+                for one in self._previews.values():
+                    one.stop()  # one at a time: each uses all cores
+                self._previews = {case.id: Preview(live.anatomy, settings)}
+                live.follow = self._previews[case.id].place
+            return self._previews[case.id]
+
+    def end_preview(self, case: Case) -> None:
+        """Stop the live flow of a case."""
+        with self._lock:
+            found = self._previews.pop(case.id, None)
+            if case.id in self._lives:
+                self._lives[case.id].follow = None
+        if found is not None:
+            found.stop()
+
     def scan(self, case: Case) -> Any:
         """Return the scan of a case.
 
@@ -239,8 +270,10 @@ class Desk:
             from vstent.flow import waveform  # noqa: F401
 
     def close(self) -> None:
-        """Stop all jobs; they are resumed later."""
+        """Stop all jobs, which are resumed later, and the live flow."""
         self.is_closing = True
+        for one in self._previews.values():
+            one.stop()
         self.jobs.abandon()
 
 

@@ -79,6 +79,7 @@ class Live:
 
     def __init__(self, case: Case) -> None:
         self.case = case
+        self.follow: Callable[[Stent], None] | None = None  # takes every device that is drawn, for the live flow
         self._memory: dict[Hashable, Any] = {}
 
     def remembered(self, key: Hashable, find: Callable[[], Found]) -> Found:
@@ -152,6 +153,11 @@ class Live:
         key = ("deployment", self.case.state.anatomy, *choice.model_dump().values())
         return self.remembered(key, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice)))
 
+    def _shown(self, stent: Stent) -> None:
+        """Tell the live flow which device is drawn."""
+        if self.follow is not None:
+            self.follow(stent)
+
     def _field(self, path: Path, moment: int | None) -> FlowField:
         """Return a flow: its mean, or one moment of its last cycle."""
         field = self.remembered(("flow", path, path.stat().st_mtime_ns), lambda: load_data(path, FlowField))
@@ -215,6 +221,7 @@ class Live:
         """
         with LOCK:
             found = self.sketch(choice, landing)
+            self._shown(found.stent)
             wires = _wires(choice.name, found.stent, found.gap_mm, colour, lambda: _formula_coverage(found.stent))
             return message([wires], scales_of([wires], self.anatomy), **_place(found, found.stent))
 
@@ -229,6 +236,7 @@ class Live:
         with LOCK:
             deployment = self.deployment(choice)
             stent, gap_mm = deployment.stent, deployment.wall_gap_mm
+            self._shown(stent)
             key = (self.case.state.anatomy, *choice.model_dump().values())
             measured = partial(self.remembered, ("coverage", *key), lambda: node_coverage(stent))
             wires = _wires(choice.name, stent, gap_mm, colour, measured)

@@ -308,6 +308,15 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
         desk.note_deployed(found, wanted.device)
         return Response(answer, media_type=BINARY)
 
+    @api.get("/api/cases/{case_id}/preview", summary="Live flow around the device that is drawn; starts it (binary)")
+    def preview(case_id: str) -> Response:
+        return Response(desk.preview(desk.store.get(case_id)).message(), media_type=BINARY)
+
+    @api.delete("/api/cases/{case_id}/preview", summary="Stop the live flow")
+    def end_preview(case_id: str) -> dict[str, Any]:
+        desk.end_preview(desk.store.get(case_id))
+        return {"is_on": False}
+
     @api.get("/api/cases/{case_id}/section", summary="The section by a plane across the parent axis")
     def section(case_id: str, abscissa_mm: Finite, device: str | None = None) -> dict[str, Any]:
         return desk.live(desk.store.get(case_id)).section(device, abscissa_mm)

@@ -10,6 +10,7 @@ from vstent.flow.case import LATTICE, FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
 from vstent.flow.indices import NEAR_MM
 from vstent.flow.lattice.setup import CELL_REYNOLDS
+from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
@@ -118,8 +119,8 @@ def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) ->
         measures["unsettled_fraction"] = field.unsettled_fraction
     if case.sac is None or case.ostium is None:
         return measures
-    measures["cells_across_parent_count"] = _parent_mm(case) / spacing_mm
-    measures["cells_across_neck_count"] = float(np.sqrt(4 * case.ostium.area_mm2 / np.pi)) / spacing_mm
+    measures["cells_across_parent_count"] = parent_diameter_mm(case) / spacing_mm
+    measures["cells_across_neck_count"] = neck_diameter_mm(case.ostium) / spacing_mm
     measures["cells_across_sac_count"] = float(np.cbrt(6 * abs(case.sac.volume_mm3) / np.pi)) / spacing_mm
     measures["neck_imbalance_fraction"] = _imbalance(field, found)
     if case.settings.engine == LATTICE:
@@ -127,7 +128,12 @@ def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) ->
     return measures
 
 
-def _parent_mm(case: FlowCase) -> float:
+def neck_diameter_mm(ostium: Surface) -> float:
+    """Return the diameter of a circle with the area of the ostium."""
+    return float(np.sqrt(4 * ostium.area_mm2 / np.pi))
+
+
+def parent_diameter_mm(case: FlowCase) -> float:
     """Return the diameter of the artery beside the neck: of the widest path, a low quartile because a sac widens it."""
     ostium = case.ostium
     assert ostium is not None
@@ -148,7 +154,7 @@ def _raised_fraction(case: FlowCase, field: FlowField) -> float:
     ostium, sac = case.ostium, case.sac
     assert ostium is not None
     assert sac is not None
-    width_mm = float(np.sqrt(4 * ostium.area_mm2 / np.pi))
+    width_mm = neck_diameter_mm(ostium)
     moments = [np.linalg.norm(phase.velocity_m_s, axis=1) for phase in field.phases] or [field.speed_m_s]
     fastest_m_s = np.max(moments, axis=0)
     middle_mm, reach_mm = sac.vertices_mm.mean(axis=0), np.ptp(sac.vertices_mm, axis=0).max()

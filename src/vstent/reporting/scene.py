@@ -311,9 +311,21 @@ def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer
         values=field.shear_Pa[origin],
         surface=wall,
     )
-    lines = streamlines(field, _seeds_mm(field, anatomy))
+    return [shear, stream_layer(name, field, _seeds_mm(field, anatomy))]
+
+
+def stream_layer(name: str, field: FlowField, seeds_mm: Floats) -> LineLayer:
+    """Return streamlines colored by speed.
+
+    Parameters
+    ----------
+    name : pane that shows them.
+    field : the flow.
+    seeds_mm : (s, 3) points through which they run.
+    """
+    lines = streamlines(field, seeds_mm)
     points, starts, speed = thin_lines(lines.points_mm, lines.starts, lines.speed_m_s, 24_000)
-    stream = LineLayer(
+    return LineLayer(
         id="streamlines",
         pane=name,
         colour=_INK,
@@ -323,7 +335,6 @@ def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer
         starts=starts,
         radius_mm=np.full(len(starts) - 1, 0.025),
     )
-    return [shear, stream]
 
 
 def _seeds_mm(field: FlowField, anatomy: Anatomy) -> Floats:

@@ -131,8 +131,8 @@ def step(state: State) -> None:
     state.loop_seconds += perf_counter() - began
     if state.since_check == state.steps_per_check:
         with np.errstate(over="ignore", invalid="ignore"):  # divergence is reported as an error, not as a warning
-            state.snapshots.append(_snapshot(state))
-            state.history.append(_monitor(state, state.snapshots[-1]))
+            state.snapshots.append(snapshot(state))
+            state.history.append(monitored(state, state.snapshots[-1]))
             state.since_check = 0
             _keep_pace(state)
 
@@ -248,7 +248,7 @@ def _settle(state: State, part: float) -> None:
     d3q19.balance(refill.lost, refill.groups, refill.refill, share)
 
 
-def _snapshot(state: State) -> Snapshot:
+def snapshot(state: State) -> Snapshot:
     """Return the present flow; in a screen the velocity includes half of its force."""
     moment, outflow = _read_here(state) if state.device is None else state.device.read()
     velocity = np.ascontiguousarray(moment[:, 1:])
@@ -279,7 +279,7 @@ def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
     return moment, np.array(outflow)
 
 
-def _monitor(state: State, now: Snapshot) -> Floats:
+def monitored(state: State, now: Snapshot) -> Floats:
     """Return the monitored quantities: mean speed in the sac, inlet pressure, mean speed in the vessel, neck inflow."""
     velocity_m_s = now.velocity_m_s
     speed_m_s = np.linalg.norm(velocity_m_s, axis=1)

@@ -1,0 +1,224 @@
+"""Live flow of a case, in a process of its own that steps while the page watches.
+
+The process ends when the server does. It only steps while somebody asks for its numbers, and it leaves the processor
+to everything else that the page does.
+"""
+
+import os
+import time
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from threading import Lock, Thread
+from typing import Any, Final
+
+from vstent.devices.stent import Stent
+from vstent.errors import InputError, VstentError
+from vstent.flow.case import FlowSettings
+from vstent.geometry.vessel import Anatomy
+from vstent.reporting.packing import message
+from vstent.reporting.scene import LineLayer, scales_of, stream_layer
+
+NICE: Final = 10
+"""Priority of the process, below that of the server."""
+SLICE_S: Final = 0.15
+"""Time between two messages of the process, in s."""
+LINES_S: Final = 0.5
+"""Time between two sets of streamlines, in s."""
+WATCHED_S: Final = 2.0
+"""Time after the last request for which the process goes on stepping, in s."""
+STALE_S: Final = 1.5
+"""Age of the last message from which it counts as stale, in s."""
+HISTORY: Final = 240
+"""Number of readings that the chart shows."""
+LINES: Final = 70
+"""Number of streamlines through the neck."""
+ERROR_POINTS: Final = 6.0
+"""Error band of the preview's reductions against the default grid, in percentage points (`benchmarks/live.py`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Said:
+    """The last message of the process."""
+
+    serial: int = 0
+    """Number of the device that the numbers belong to; 0: the flow without a device."""
+    fraction: float = 0.0
+    """Part of the flow without a device that is computed."""
+    values: dict[str, float] = field(default_factory=dict)
+    """Neck inflow (mL/s) and sac velocity (m/s), without a device and now, and the steps per second."""
+    is_settled: bool = False
+    """Whether the last readings agree."""
+    error: str = ""
+    """Why it cannot be computed."""
+    lines: LineLayer | None = None
+    """Streamlines through the neck; None: unchanged."""
+
+
+class Preview:
+    """Live flow of one anatomy.
+
+    Parameters
+    ----------
+    anatomy : vessel with a sac.
+    settings : settings of the flow; a preview is steady.
+
+    Raises
+    ------
+    InputError
+        The vessel has no sac.
+    """
+
+    def __init__(self, anatomy: Anatomy, settings: FlowSettings) -> None:
+        if not anatomy.aneurysms:
+            raise InputError("Live flow needs a sac, and none was found. Choose one in the step Sac and parent.")
+        self.anatomy, self.settings = anatomy, settings
+        self._lock, self._serial = Lock(), 0
+        self._stent: Stent | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        """Start the process."""
+        self._said, self._at_s = Said(), time.monotonic()
+        self._lines: LineLayer | None = None
+        self._history: deque[float] = deque(maxlen=HISTORY)
+        context = get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=work, args=(theirs, self.anatomy, self.settings), daemon=True)
+        self._process.start()
+        theirs.close()
+        Thread(target=self._follow, args=(self._pipe,), daemon=True).start()
+        if self._stent is not None:
+            self._send((self._serial, self._stent))
+
+    def _follow(self, pipe: Connection) -> None:
+        """Keep the last message of the process until it ends."""
+        with suppress(EOFError, OSError):
+            while True:
+                said = pipe.recv()
+                with self._lock:
+                    self._said, self._at_s = said, time.monotonic()
+                    self._lines = said.lines or self._lines
+                    if "now_neck_inflow_mL_s" in said.values:
+                        self._history.append(_reduction(said.values, "neck_inflow_mL_s"))
+
+    def _send(self, what: Any) -> None:
+        """Send something to the process; start it again where it was killed."""
+        with suppress(BrokenPipeError, OSError):
+            self._pipe.send(what)
+
+    def place(self, stent: Stent) -> None:
+        """Put a device into the flow in place of the last one."""
+        self._serial += 1
+        self._stent = stent
+        self._send((self._serial, stent))
+
+    def message(self) -> bytes:
+        """Return the numbers and the streamlines as a message for the page; the process goes on for a while."""
+        if not self._process.is_alive() and not self._said.error:
+            self._begin()
+        self._send(None)
+        with self._lock:
+            said, age_s, lines = self._said, time.monotonic() - self._at_s, self._lines
+            history = list(self._history)
+        layers = [] if lines is None else [lines]
+        return message(
+            layers,
+            scales_of(layers, self.anatomy),
+            fraction=said.fraction,
+            error=said.error,
+            is_settled=said.is_settled,
+            is_stale=said.serial != self._serial or age_s > STALE_S,
+            values=said.values,
+            reductions={key: _reduction(said.values, key) for key in _KEYS if f"now_{key}" in said.values},
+            history=history,
+            error_points=ERROR_POINTS,
+        )
+
+    def stop(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._pipe.close()
+
+
+_KEYS: Final = ("neck_inflow_mL_s", "sac_velocity_m_s")
+"""Names of the values that the page compares with the flow without a device."""
+
+
+def _reduction(values: dict[str, float], key: str) -> float:
+    """Return the relative change of a value against the flow without a device, in percent."""
+    return 100 * (values[f"now_{key}"] / max(values[f"bare_{key}"], 1e-12) - 1)
+
+
+def work(pipe: Connection, anatomy: Anatomy, settings: FlowSettings) -> None:
+    """Step the flow until the server ends; the body of the process.
+
+    Parameters
+    ----------
+    pipe : receives (number, stent) for a new device and None for a request, sends `Said`.
+    anatomy : vessel with a sac.
+    settings : settings of the flow.
+    """
+    with suppress(OSError, AttributeError):
+        os.nice(NICE)
+    with suppress(EOFError, BrokenPipeError, OSError, KeyboardInterrupt):
+        try:
+            _Worker(pipe, anatomy, settings).run()
+        except VstentError as error:
+            pipe.send(Said(error=str(error)))
+            while True:
+                pipe.recv()
+
+
+class _Worker:
+    """The flow and what was last said of it."""
+
+    def __init__(self, pipe: Connection, anatomy: Anatomy, settings: FlowSettings) -> None:
+        from vstent.flow.lattice.live import LiveFlow
+        from vstent.flow.simulation import flow_case
+
+        self.pipe, self.anatomy, self.settings = pipe, anatomy, settings
+        self.serial, self.watched_s, self.drawn_s = 0, time.monotonic(), 0.0
+        self.live = LiveFlow(flow_case(anatomy, None, settings), lambda done: pipe.send(Said(fraction=done)))
+
+    def run(self) -> None:
+        """Step, take devices, and report."""
+        while True:
+            self._take()
+            began = time.perf_counter()
+            steps = self.live.advance(SLICE_S)
+            self._say(steps / (time.perf_counter() - began))
+
+    def _take(self) -> None:
+        """Take the newest device; wait where nobody watches."""
+        newest = None
+        while self.pipe.poll() or time.monotonic() - self.watched_s > WATCHED_S:
+            newest = self.pipe.recv() or newest
+            self.watched_s = time.monotonic()
+        if newest is not None:
+            from vstent.flow.screen import screen
+
+            self.serial, stent = newest
+            self.live.place(screen(stent, self.settings.blood))
+
+    def _say(self, steps_per_s: float) -> None:
+        """Send the present numbers, and from time to time streamlines."""
+        bare, now = self.live.bare, self.live.read()
+        values = {
+            "bare_neck_inflow_mL_s": bare.neck_inflow_mL_s,
+            "bare_sac_velocity_m_s": bare.sac_velocity_m_s,
+            "now_neck_inflow_mL_s": now.neck_inflow_mL_s,
+            "now_sac_velocity_m_s": now.sac_velocity_m_s,
+            "grid_spacing_mm": self.live.cell_size_mm,
+            "steps_per_s": steps_per_s,
+        }
+        lines = None
+        if time.monotonic() - self.drawn_s > LINES_S:
+            from vstent.flow.streamlines import neck_seeds_mm
+
+            flow, self.drawn_s = self.live.field(), time.monotonic()
+            seeds_mm = neck_seeds_mm(flow, self.anatomy.aneurysms[0].neck, LINES)
+            lines = stream_layer("", flow, seeds_mm)
+        self.pipe.send(Said(self.serial, 1.0, values, now.is_settled, "", lines))

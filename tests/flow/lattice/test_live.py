@@ -1,0 +1,106 @@
+"""Live flow: whatever device was there before, it comes to the flow that a run of its own finds on the same grid."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import vstent
+from vstent import phantoms
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.flow.case import FlowCase, FlowSettings, Screen
+from vstent.flow.engines import run
+from vstent.flow.grade import neck_diameter_mm, parent_diameter_mm
+from vstent.flow.indices import indices
+from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.live import (
+    CELLS_ACROSS_NECK,
+    CELLS_ACROSS_PARENT,
+    LiveFlow,
+    preview_spacing_mm,
+)
+from vstent.flow.screen import screen
+from vstent.flow.simulation import flow_case
+from vstent.geometry.vessel import Anatomy, Vessel
+
+SETTINGS = FlowSettings(cell_size_mm=0.32, inflow_mL_s=1.5)
+"""A default grid coarser than a preview's: the preview takes it."""
+
+
+@cache
+def anatomy() -> Anatomy:
+    phantom = phantoms.with_sac(phantoms.tube(length_mm=28.0), abscissa_mm=14.0, width_mm=5.0, neck_mm=3.6)
+    return restore(trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.3))))
+
+
+@cache
+def case() -> FlowCase:
+    return flow_case(anatomy(), None, SETTINGS)
+
+
+@cache
+def screens() -> tuple[Screen, Screen]:
+    designs = (vstent.find_design(name) for name in ("silk", "enterprise"))
+    dense, sparse = (screen(vstent.deploy(one, anatomy()).stent, case().blood) for one in designs)
+    return dense, sparse
+
+
+@pytest.fixture(scope="module")
+def live() -> LiveFlow:
+    return LiveFlow(case())
+
+
+def settled(live: LiveFlow) -> tuple[float, float]:
+    """Return neck inflow and sac velocity once they stay within 0.1 % over a tenth of a second of blood."""
+    before = np.zeros(2)
+    for _ in range(60):
+        live.advance(0.0)
+        while not live.read().is_settled:
+            live.advance(0.2)
+        now = live.read()
+        found = np.array([now.neck_inflow_mL_s, now.sac_velocity_m_s])
+        if np.abs(found / np.maximum(before, 1e-12) - 1).max() < 1e-3:
+            break
+        before = found
+        live.advance(1.0)
+    return float(found[0]), float(found[1])
+
+
+def alone(live: LiveFlow, one: Screen | None) -> tuple[float, float]:
+    """Return neck inflow and sac velocity of a run of its own, in the same coarse flow."""
+    engine = LatticeBoltzmann(live.cell_size_mm, None, live.outer)
+    fine = replace(case(), screen=one, settings=replace(SETTINGS, tolerance=1e-3))
+    found = indices(run(engine, fine, start=live.outer), fine.sac, fine.ostium)
+    return found["neck_inflow_mL_s"], found["mean_sac_velocity_m_s"]
+
+
+def test_the_flow_without_a_device_is_that_of_a_run(live: LiveFlow) -> None:
+    found = live.bare.neck_inflow_mL_s, live.bare.sac_velocity_m_s
+    np.testing.assert_allclose(found, alone(live, None), rtol=0.03)
+
+
+def test_an_exchanged_device_comes_to_its_own_flow(live: LiveFlow) -> None:
+    dense, sparse = screens()
+    for one in (sparse, dense, None, dense):
+        live.place(one)
+        np.testing.assert_allclose(settled(live), alone(live, one), rtol=0.03)
+
+
+def test_an_exchange_changes_the_screen_and_nothing_else(live: LiveFlow) -> None:
+    live.place(screens()[0])
+    before = live.state.populations.copy()
+    live.place(screens()[1])
+    np.testing.assert_array_equal(live.state.populations, before)
+    assert len(live.state.screen.cell) > 0
+    live.place(None)
+    assert len(live.state.screen.cell) == 0
+
+
+def test_the_grid_is_as_coarse_as_neck_and_artery_allow() -> None:
+    fine = replace(case(), settings=replace(SETTINGS, cell_size_mm=0.05))
+    assert fine.ostium is not None
+    across = neck_diameter_mm(fine.ostium) / CELLS_ACROSS_NECK, parent_diameter_mm(fine) / CELLS_ACROSS_PARENT
+    assert preview_spacing_mm(fine) == min(across)
+    assert preview_spacing_mm(case()) == 0.32

@@ -1,0 +1,101 @@
+// Live flow: a switch, numbers against the flow without a device, a chart of the last minute, streamlines in the picture.
+import { make, svg } from "../src/dom.js";
+import { drop, getBinary } from "./api.js";
+
+const EVERY_MS = 220;
+const NAMES = { neck_inflow_mL_s: ["Neck inflow", "mL/s", 1], sac_velocity_m_s: ["Mean sac velocity", "mm/s", 1000] };
+
+export class Flowing {
+  /** @param host {path(), picture, changed(), failed(problem)} */
+  constructor(host) {
+    this.host = host;
+    this.isOn = false;
+    this.box = make("input", { type: "checkbox", id: "live-flow" });
+    this.box.addEventListener("change", () => this.turn(this.box.checked));
+    this.state = make("p", { className: "hint", role: "status" });
+    this.cards = make("div", { className: "live-cards" });
+    this.chart = svg("svg", { class: "live-chart", viewBox: "0 0 240 64", role: "img", "aria-label": "Change of the neck inflow over the last minute" });
+    this.body = make("div", { className: "live-body", hidden: true }, [this.state, this.cards, this.chart]);
+    this.element = make("div", { className: "live" }, [make("label", { htmlFor: "live-flow" }, [this.box, "Live blood flow (preview)"]), this.body]);
+    document.addEventListener("visibilitychange", () => this.watch());
+  }
+
+  turn(isOn) {
+    this.isOn = isOn;
+    this.box.checked = isOn;
+    this.body.hidden = !isOn;
+    if (!isOn) {
+      drop(`${this.host.path()}/preview`).catch(() => {});
+      this.host.picture.stage?.drop(({ id, pane }) => id === "streamlines" && pane === "");
+    } else {
+      this.say("Starting …");
+      this.watch();
+    }
+    this.host.changed();
+  }
+
+  /** Whether the page looks at the flow: only then it is computed. */
+  set isWatched(value) {
+    this.watched = value;
+    if (value) this.watch();
+    else this.host.picture.stage?.drop(({ id, pane }) => id === "streamlines" && pane === "");
+  }
+
+  async watch() {
+    if (this.isAsking) return;
+    this.isAsking = true;
+    while (this.isOn && this.watched && !document.hidden) {
+      const began = performance.now();
+      try {
+        this.take(await getBinary(`${this.host.path()}/preview`));
+      } catch (problem) {
+        this.turn(false);
+        this.host.failed(problem);
+      }
+      await new Promise((resolve) => setTimeout(resolve, Math.max(0, EVERY_MS - (performance.now() - began))));
+    }
+    this.isAsking = false;
+    this.element.classList.toggle("stale", this.isOn);
+  }
+
+  say(words) {
+    this.state.textContent = words;
+  }
+
+  take({ manifest, buffer }) {
+    if (!this.isOn || !this.watched) return;
+    if (manifest.error) {
+      this.turn(false);
+      return this.host.failed(new Error(manifest.error));
+    }
+    if (manifest.layers.length) this.host.picture.put({ manifest, buffer });
+    const { fraction, is_stale, is_settled, values, reductions, history, error_points } = manifest;
+    this.element.classList.toggle("stale", is_stale);
+    if (!reductions.neck_inflow_mL_s) return this.say(`Computing the flow without a device: ${Math.round(100 * fraction)} %`);
+    const moving = is_stale ? "The device has moved: new values follow." : is_settled ? "Steady." : "The flow is adapting to the device.";
+    this.say(`${moving} Grid spacing ${values.grid_spacing_mm.toFixed(2)} mm; differs from the full computation by up to ${error_points.toFixed(0)} percentage points.`);
+    this.cards.replaceChildren(
+      ...Object.entries(NAMES).map(([key, [name, unit, factor]]) =>
+        make("div", { className: "card" }, [
+          make("span", { className: "term" }, [name]),
+          make("b", {}, [`${reductions[key] > 0 ? "+" : "−"}${Math.abs(reductions[key]).toFixed(0)} %`]),
+          make("small", {}, [`${(factor * values[`now_${key}`]).toPrecision(3)} ${unit}, without a device ${(factor * values[`bare_${key}`]).toPrecision(3)}`]),
+        ]),
+      ),
+    );
+    this.draw(history);
+  }
+
+  draw(history) {
+    const low = Math.min(-10, ...history);
+    const [x, y] = [(i) => 30 + (206 * i) / Math.max(history.length - 1, 1), (v) => 6 + (52 * v) / low];
+    const line = history.map((v, i) => `${i ? "L" : "M"}${x(i).toFixed(1)} ${y(Math.min(v, 0)).toFixed(1)}`).join("");
+    const word = (v) => {
+      const text = svg("text", { x: 26, y: y(v) + 4, class: "tick end" });
+      text.textContent = `${v.toFixed(0).replace("-", "−")} %`;
+      return text;
+    };
+    const parts = [0, low].map((v) => svg("line", { x1: 30, x2: 236, y1: y(v), y2: y(v), class: "grid" }));
+    this.chart.replaceChildren(...parts, word(0), word(low), svg("path", { d: line, class: "line device" }));
+  }
+}
