@@ -554,7 +554,7 @@ def test_uncertainty_is_told_in_the_order_of_the_devices_with_its_causes():
     assert (silk["title"], enterprise["title"]) == ("Silk 4 x 15 mm", "Enterprise")
     (row,) = silk["rows"]
     assert [row[key].replace("\u202f", " ") for key in ("mean", "low", "high")] == ["16.5 mm", "15.0 mm", "18.0 mm"]
-    assert [cause for cause, _ in row["shares"]] == ["manufacturing tolerance", "landing", "interplay"]
+    assert [cause for cause, _ in row["shares"]] == ["manufacturing tolerance", "landing", "interplay and chance"]
     assert "16 deployments, of which 1 did not fit" in silk["words"]
     assert sheets.uncertainty({"stents": {"silk": {}}}, {"silk": "Silk"}) == []
 

@@ -83,6 +83,16 @@ def test_shares_of_two_causes_are_their_first_order_indices():
     assert found.shares("neck_to_distal_end_mm")["landing"] > 0.5
 
 
+def test_few_results_show_no_share_that_may_be_chance():
+    """Of causes without effect, one in twenty passes a test of 95 %; without the test each gets about a tenth."""
+    rng = np.random.default_rng(7)
+    found = [first_order_shares(rng.uniform(-1, 1, (16, 4)), rng.normal(size=16)) for _ in range(400)]
+    assert 0.02 < np.mean(np.array(found) > 0) < 0.08
+    strong = [rng.uniform(-1, 1, (16, 4)) for _ in range(50)]
+    shares = [first_order_shares(points, points[:, 0] + 0.1 * rng.normal(size=16)) for points in strong]
+    assert np.mean([share[0] > 0.8 for share in shares]) > 0.9
+
+
 def test_a_fit_finds_the_shares_of_any_sum_of_quadratics_and_leaves_interplay_to_the_rest():
     points = np.random.default_rng(1).uniform(-1, 1, (64, 3))
     x, y, _ = points.T

@@ -141,7 +141,15 @@ def test_pictures_of_a_case_are_pngs_with_colour():
     from matplotlib.image import imread
 
     found = figures.pictures(report_case.scene())
-    assert [picture.id for picture in found] == ["anatomy", "contour", "coverage", "wires", "streamlines", "shear"]
+    assert [picture.id for picture in found] == [
+        "anatomy",
+        "contour",
+        "coverage",
+        "wires",
+        "streamlines",
+        "shear",
+        "sac_shear",
+    ]
     for picture in found:
         image = imread(io.BytesIO(picture.png))
         height, width = image.shape[:2]

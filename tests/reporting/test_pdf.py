@@ -10,7 +10,8 @@ import report_case
 
 from vstent.reporting.definitions import OF_PULSE
 from vstent.reporting.method import _bead_layer, _expansion, _unit_sphere
-from vstent.reporting.pdf import WIDTH, _Paper, _wrapped, as_pdf
+from vstent.reporting.paper import WIDTH, Paper, wrapped
+from vstent.reporting.pdf import as_pdf
 from vstent.reporting.scene import scene_of
 from vstent.reporting.thinning import some_frames, thin_frames
 from vstent.reporting.write import write_report
@@ -24,14 +25,14 @@ def told():
 @pytest.fixture(scope="module")
 def printed(told):
     """The PDF, and all text that was put on its pages."""
-    put, words = _Paper._put, []
+    put, words = Paper._put, []
 
     def noted(paper, x, y, text, size, **more):
         words.append(text)
         put(paper, x, y, text, size, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_Paper, "_put", noted)
+        patch.setattr(Paper, "_put", noted)
         return as_pdf(told), " ".join(words)
 
 
@@ -83,7 +84,7 @@ def test_lines_keep_inside_the_page():
         "MMMMM WWWW The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way. "
     )
     metrics, font = TextToPath(), FontProperties(family="DejaVu Sans", size=8.5)
-    for line in _wrapped(words * 5, WIDTH, 8.5):
+    for line in wrapped(words * 5, WIDTH, 8.5):
         assert metrics.get_text_width_height_descent(line, font, ismath=False)[0] < 72 * WIDTH
 
 
@@ -91,7 +92,7 @@ def test_pictures_tell_the_way_from_the_artery_to_the_flow(told):
     names = [picture.id for picture in told.pictures]
     assert names == [
         *("anatomy", "restoration", "spheres", "first", "expansion-silk", "expansion-enterprise", "fitted"),
-        *("contour", "coverage", "wires", "streamlines", "shear"),
+        *("contour", "coverage", "wires", "streamlines", "shear", "sac_shear"),
     ]
 
 

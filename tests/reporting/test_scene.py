@@ -56,7 +56,7 @@ def test_the_side_that_hides_less_is_chosen():
 
 def test_one_scale_serves_every_pane():
     scene = report_case.scene()
-    assert sorted(scale.id for scale in scene.scales) == ["coverage", "shear", "speed", "wall_gap"]
+    assert sorted(scale.id for scale in scene.scales) == ["coverage", "sac_shear", "shear", "speed", "wall_gap"]
     shear = [layer for layer in scene.layers if layer.id == "shear"]
     assert [layer.pane for layer in shear] == ["bare", "silk", "enterprise"]
 

@@ -641,8 +641,8 @@ const LAYERS = {
   ],
   flow: (page) => {
     const mode = page.memory.mode || "streamlines";
-    const shear = mode === "shear";
-    return [{ id: "lumen", title: "Lumen", on: !shear }, { id: "streamlines", on: mode === "streamlines" }, { id: "slice", on: mode === "slice" }, { id: "shear", on: shear }, { id: "wires", title: "Wires", on: false }, NECK];
+    const modes = ["streamlines", "slice", "shear", "sac_shear"].map((id) => ({ id, on: mode === id }));
+    return [{ ...LUMEN, on: mode !== "shear" }, ...modes, { id: "wires", title: "Wires", on: false }, NECK];
   },
   report: (page) => LAYERS.flow(page),
 };

@@ -156,6 +156,7 @@ export const panels = {
     parts.push(place, ...colours(page), expansion(page));
     if (page.anatomy?.neck?.length) parts.push(page.flowing.element);
     parts.push(make("p", { className: "advice" }, [page.advice && page.deploying.name === page.device ? page.advice : ""]), ...failure(page));
+    parts.push(make("a", { className: "button wide", href: `${page.path}/plan.pdf`, target: "_blank", rel: "noopener" }, ["One-page plan (PDF)"]));
     parts.push(next(page, "flow", "Flow →"));
     return parts;
   },
@@ -362,7 +363,7 @@ function expansion(page) {
 }
 
 function modes(page) {
-  const options = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall shear stress"]].map(([id, words]) => {
+  const options = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall shear stress"], ["sac_shear", "Shear stress, sac"]].map(([id, words]) => {
     const button = make("button", { type: "button", ariaPressed: String((page.memory.mode || "streamlines") === id) }, [words]);
     button.addEventListener("click", () => {
       page.memory.mode = id;

@@ -17,6 +17,7 @@ const MODES = [
   { id: "wires", title: "Wires", layers: ["lumen", "continued", "wires", "neck"] },
   { id: "flow", title: "Blood flow", layers: ["lumen", "streamlines", "neck"] },
   { id: "shear", title: "Wall shear stress", layers: ["shear", "neck"] },
+  { id: "sac_shear", title: "Sac shear stress", layers: ["lumen", "sac_shear", "neck"] },
 ];
 
 const LAYERS = [
@@ -32,6 +33,7 @@ const LAYERS = [
   ["wires", "Wires"],
   ["streamlines", "Streamlines, by speed"],
   ["shear", "Wall shear stress"],
+  ["sac_shear", "Wall shear stress of the sac"],
 ];
 
 const VIEWS = { profile: "Profile", neck: "From the sac", frontal: "Frontal", lateral: "From the left" };
@@ -68,7 +70,7 @@ class Viewer {
     this.stage = new Stage(this.canvas, manifest, buffer);
     this.present = new Set(manifest.layers.map((layer) => layer.id));
     this.modes = MODES.filter((mode) => mode.layers.filter((id) => this.present.has(id)).length > 1).filter(
-      (mode) => !["device", "wires", "flow", "shear"].includes(mode.id) || this.present.has(needed(mode.id)),
+      (mode) => !["device", "wires", "flow", "shear", "sac_shear"].includes(mode.id) || this.present.has(needed(mode.id)),
     );
     this.shown = new Set();
     this.solo = null;
@@ -270,7 +272,7 @@ class Viewer {
   }
 }
 
-const needed = (mode) => ({ device: "contour", wires: "wires", flow: "streamlines", shear: "shear" })[mode];
+const needed = (mode) => ({ device: "contour", wires: "wires", flow: "streamlines", shear: "shear", sac_shear: "sac_shear" })[mode];
 
 function group(label, children, className = "") {
   const element = make("div", { className: `viewer-group ${className}`, role: "group", ariaLabel: label }, children);

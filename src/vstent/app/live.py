@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Hashable
+from datetime import date
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
@@ -24,7 +25,7 @@ from vstent.devices.catalogue import find_design
 from vstent.devices.design import BARE
 from vstent.devices.formulas import coverage_fraction
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.errors import ReadError
+from vstent.errors import InputError, ReadError
 from vstent.flow.case import FlowField
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Opening
@@ -172,6 +173,24 @@ class Live:
             return [*flow_layers(name, field, self.anatomy), cut(name, field, self.anatomy)]
 
         return self.remembered(key, find)
+
+    def plan(self) -> bytes:
+        """Return the plan of the chosen devices as PDF, one page each.
+
+        Raises
+        ------
+        InputError
+            No device is chosen, or one does not fit.
+        """
+        from vstent.reporting.plan_sheet import Planned, plan_pdf
+
+        state, day = self.case.state, date.today().isoformat()
+        if not state.choices.devices:
+            raise InputError("No device is chosen. Choose one in the step Device.")
+        with LOCK:
+            found = {choice.name: self.deployment(choice) for choice in state.choices.devices}
+            measures = {name: measure(self.anatomy, one) for name, one in found.items()}
+            return plan_pdf(Planned(state.name, self.anatomy, found, measures, state.source, day))
 
     # -- messages for the page -----------------------------------------------------------------------------------------
 

@@ -112,6 +112,7 @@ def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
     _add_input(api, desk)
     _add_jobs(api, desk)
     _add_scenes(api, desk)
+    _add_planning(api, desk)
     app.include_router(api)
     return Guard(app, token=token, hosts=hosts)
 
@@ -308,15 +309,6 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
         desk.note_deployed(found, wanted.device)
         return Response(answer, media_type=BINARY)
 
-    @api.get("/api/cases/{case_id}/preview", summary="Live flow around the device that is drawn; starts it (binary)")
-    def preview(case_id: str) -> Response:
-        return Response(desk.preview(desk.store.get(case_id)).message(), media_type=BINARY)
-
-    @api.delete("/api/cases/{case_id}/preview", summary="Stop the live flow")
-    def end_preview(case_id: str) -> dict[str, Any]:
-        desk.end_preview(desk.store.get(case_id))
-        return {"is_on": False}
-
     @api.get("/api/cases/{case_id}/section", summary="The section by a plane across the parent axis")
     def section(case_id: str, abscissa_mm: Finite, device: str | None = None) -> dict[str, Any]:
         return desk.live(desk.store.get(case_id)).section(device, abscissa_mm)
@@ -328,3 +320,20 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
     @api.get("/api/waveform", summary="The waveforms that can be chosen: the published one, or the case's own")
     def waveform(case_id: str | None = None) -> dict[str, Any]:
         return desks.pulse(None if case_id is None else desk.store.get(case_id))
+
+
+def _add_planning(api: APIRouter, desk: Desk) -> None:
+    """Add the routes of the live flow and of the plan."""
+
+    @api.get("/api/cases/{case_id}/preview", summary="Live flow around the device that is drawn; starts it (binary)")
+    def preview(case_id: str) -> Response:
+        return Response(desk.preview(desk.store.get(case_id)).message(), media_type=BINARY)
+
+    @api.delete("/api/cases/{case_id}/preview", summary="Stop the live flow")
+    def end_preview(case_id: str) -> dict[str, Any]:
+        desk.end_preview(desk.store.get(case_id))
+        return {"is_on": False}
+
+    @api.get("/api/cases/{case_id}/plan.pdf", summary="The plan of the chosen devices, one page each")
+    def plan(case_id: str) -> Response:
+        return Response(desk.live(desk.store.get(case_id)).plan(), media_type="application/pdf")

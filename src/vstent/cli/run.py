@@ -1,7 +1,7 @@
 """`vstent run`: from a scan or surface to the report."""
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,6 +37,9 @@ def add(commands: options.Commands) -> None:
     )
     add_study(parser)
     add_pdf(parser)
+    parser.add_argument(
+        "--plan", action="store_true", help="write the plan of every device on one page, plan.pdf, without the flow"
+    )
     parser.add_argument("--ro-crate", action="store_true", help="also describe the case folder as an RO-Crate")
     parser.add_argument(
         "--input", dest="moved_to", type=Path, metavar="PATH", help="present place of the input of a run.json to repeat"
@@ -112,6 +115,8 @@ def _run(arguments: argparse.Namespace) -> int:
         length_mm=arguments.length,
         center_mm=arguments.center,
     )
+    if arguments.plan:
+        settings = replace(settings, flow=None)
     if arguments.input.suffix == ".json":
         return _again(arguments, settings)
     case = study(arguments.input, arguments.out, settings, is_printed=arguments.pdf, replaces=arguments.replace)
@@ -142,9 +147,13 @@ def _again(arguments: argparse.Namespace, given: "Settings") -> int:
 
 
 def _finish(arguments: argparse.Namespace, case: "CaseResult") -> int:
-    """Write the RO-Crate if requested; return the exit code: 1 where a device or a flow failed."""
+    """Write plan and RO-Crate if requested; return the exit code: 1 where a device or a flow failed."""
     from vstent.study.crate import write_crate
 
+    if arguments.plan:
+        from vstent.reporting.write import write_plan
+
+        write_plan(case, arguments.out, date.today().isoformat())
     if arguments.ro_crate:
         write_crate(arguments.out, case.provenance, date.today().isoformat())
     return 1 if case.failures else 0

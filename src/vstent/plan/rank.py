@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from vstent.kernels.arrays import Floats
 from vstent.plan.criteria import Criteria, Criterion, default_criteria
 from vstent.plan.workers import spread
 
+Value = TypeVar("Value")
 TELLING: Final = 0.005
 """Loss of score above which a reason names a criterion."""
 TOLD: Final = 2
@@ -153,6 +154,39 @@ def rank(
         if progress is not None:
             progress(len(graded), len(tasks))
     return Ranking(tuple(sorted(graded, key=lambda candidate: candidate.order)), criteria)
+
+
+def alternatives(anatomy: Anatomy, design: Design, size: Size, *, count: int = 2) -> tuple[Candidate, ...]:
+    """Return the best of the sizes next to one: the neighboring lengths, and the neighboring diameters.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The restored artery.
+    design : Design
+        The device.
+    size : Size
+        The chosen size.
+    count : int, optional
+        Largest number of alternatives.
+    """
+    lengths = sorted(
+        (one for one in design.sizes if one.diameter_mm == size.diameter_mm), key=lambda one: one.length_mm
+    )
+    near = _beside(lengths, lengths.index(size))
+    diameters = sorted({one.diameter_mm for one in design.sizes})
+    for diameter_mm in _beside(diameters, diameters.index(size.diameter_mm)):
+        same = (one for one in design.sizes if one.diameter_mm == diameter_mm)
+        near += sorted(same, key=lambda one: abs(one.length_mm - size.length_mm))[:2]
+    if not near:
+        return ()
+    found = rank(anatomy, [replace(design, sizes=tuple(near))]).candidates
+    return tuple(sorted(found, key=lambda one: (not one.is_suitable, -one.score))[:count])
+
+
+def _beside(values: Sequence[Value], place: int) -> list[Value]:
+    """Return the values before and after a place."""
+    return [values[k] for k in (place - 1, place + 1) if 0 <= k < len(values)]
 
 
 def _proposed(design: Design, anatomy: Anatomy) -> Size | None:

@@ -7,18 +7,24 @@ result is a sum of quadratic functions. The residual of the fit contains interac
 degree.
 """
 
+from typing import Final
+
 import numpy as np
+from scipy.special import fdtri
 
 from vstent.kernels.arrays import Floats
 
-STEADY = 1e-9
+STEADY: Final = 1e-9
 """Relative range of a result below which it counts as constant."""
+CONFIDENCE: Final = 0.95
+"""Confidence of the F test by which the share of a cause must differ from chance."""
 
 
 def first_order_shares(points: Floats, values: Floats) -> Floats | None:
     """Compute the fraction of the variance of a result that is due to each cause.
 
-    Degree 2 is left out if there are fewer than twice as many results as unknowns.
+    Degree 2 is left out if there are fewer than twice as many results as unknowns. A share that so few results cannot
+    distinguish from chance (F test) is 0.
 
     Parameters
     ----------
@@ -45,6 +51,15 @@ def first_order_shares(points: Floats, values: Floats) -> Floats | None:
     is_quadratic = n >= 2 * (1 + 2 * d)
     basis = np.concatenate([np.ones((n, 1)), first, *([second] if is_quadratic else [])], axis=1)
     coefficients = np.linalg.lstsq(basis, values, rcond=None)[0]
-    left_over = float(((values - basis @ coefficients) ** 2).sum()) / (n - basis.shape[1])
+    terms, freedom = (basis.shape[1] - 1) // d, n - basis.shape[1]
+    left_over = _residual(basis, values) / freedom
     made = (coefficients[1:] ** 2).reshape(-1, d).sum(axis=0)
-    return np.asarray(made / (made.sum() + left_over))
+    others = (np.delete(basis, 1 + cause + d * np.arange(terms), axis=1) for cause in range(d))
+    explained = np.array([_residual(one, values) for one in others]) - freedom * left_over
+    is_clear = explained > terms * fdtri(terms, freedom, CONFIDENCE) * left_over
+    return np.where(is_clear, made, 0.0) / (made.sum() + left_over)
+
+
+def _residual(basis: Floats, values: Floats) -> float:
+    """Return the sum of squares that a fit of values (n,) by the columns of `basis` (n, k) leaves."""
+    return float(((values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]) ** 2).sum())

@@ -68,6 +68,8 @@ def pictures(scene: Scene) -> list[Picture]:
         found.append(_streamlines(scene))
     if "shear" in drawn:
         found.append(_shear(scene))
+    if "sac_shear" in drawn:
+        found.append(_sac_shear(scene))
     return found
 
 
@@ -225,6 +227,14 @@ def _shear(scene: Scene) -> Picture:
     shots = [Shot(title, scene.pick(("shear", "neck"), pane), scene.view("profile")) for pane, title in scene.panes]
     caption = f"Wall shear stress on the lumen, on one scale. {ABOVE}"
     return Picture("shear", "Wall shear stress before and after", caption, sheet(scene, shots, "shear"))
+
+
+def _sac_shear(scene: Scene) -> Picture:
+    """Return the picture of the sac's wall shear stress on its own scale, without and with each device."""
+    ids = ("sac_shear", "neck")
+    shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes]
+    caption = f"Wall shear stress of the sac alone, on the scale of the sac without a device. {ABOVE}"
+    return Picture("sac_shear", "Wall shear stress of the sac", caption, sheet(scene, shots, "sac_shear"))
 
 
 def sheet(scene: Scene, shots: list[Shot], scale: str) -> bytes:

@@ -11,6 +11,7 @@ from vstent.deployment.coverage import coverage_fractions
 from vstent.devices.design import BARE
 from vstent.devices.stent import Deployment, Stent
 from vstent.flow.case import FlowField
+from vstent.flow.indices import on_sac
 from vstent.flow.streamlines import inlet_seeds_mm, neck_seeds_mm, streamlines
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
@@ -178,6 +179,8 @@ _INK = (0.10, 0.17, 0.20)
 _STEEL = (0.33, 0.38, 0.43)
 _ASSUMED = (0.45, 0.36, 0.58)
 """Colors of wall, sac, lines, devices and assumed artery: red, green and blue, 0 to 1."""
+ON_SAC_CELLS = 0.2
+"""Distance from the sac, in cells, within which a vertex of the wall belongs to it (as in `flow.indices`)."""
 RING_MM = 1.0
 """Distance between the rings that show a continued artery, in mm."""
 
@@ -311,7 +314,20 @@ def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer
         values=field.shear_Pa[origin],
         surface=wall,
     )
-    return [shear, stream_layer(name, field, _seeds_mm(field, anatomy))]
+    of_sac = [_sac_shear(name, field, one.sac) for one in anatomy.aneurysms[:1]]
+    return [shear, *of_sac, stream_layer(name, field, _seeds_mm(field, anatomy))]
+
+
+def _sac_shear(name: str, field: FlowField, sac: Surface) -> MeshLayer:
+    """Return the wall of the sac colored by its shear stress, on a scale of its own."""
+    is_sac = on_sac(field.wall, sac, ON_SAC_CELLS * field.cell_size_mm)
+    faces = field.wall.faces[is_sac[field.wall.faces].all(axis=1)]
+    used = np.unique(faces)
+    place = np.zeros(len(field.wall.vertices_mm), dtype=np.int32)
+    place[used] = np.arange(len(used))
+    thin, origin = thin_surface(Surface(field.wall.vertices_mm[used], place[faces]), 20_000)
+    values = field.shear_Pa[used][origin]
+    return MeshLayer(id="sac_shear", pane=name, colour=_WALL, scale="sac_shear", values=values, surface=thin)
 
 
 def stream_layer(name: str, field: FlowField, seeds_mm: Floats) -> LineLayer:
@@ -347,12 +363,13 @@ def _seeds_mm(field: FlowField, anatomy: Anatomy) -> Floats:
 _SCALES = {
     "speed": ("Speed", "m/s", "viridis", 0.05),
     "shear": ("Wall shear stress", "Pa", "plasma", 1.0),
+    "sac_shear": ("Wall shear stress of the sac", "Pa", "plasma", 0.05),
     "wall_gap": ("Gap between device and wall", "mm", "cividis", 0.1),
     "coverage": ("Metal coverage", "%", "viridis", 40.0),
     "diameter": ("Deployed diameter", "mm", "viridis", 1.0),
 }
 """Name of a scale: title, unit, color map, and the smallest upper end of the scale."""
-_OF_FLOW = ("speed", "shear")
+_OF_FLOW = ("speed", "shear", "sac_shear")
 """Names of the color scales of the flow."""
 
 

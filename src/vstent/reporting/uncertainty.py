@@ -10,7 +10,7 @@ CAUSES: Final = {
     "landing": "landing",
     "device": "manufacturing tolerance",
     "inflow": "inflow",
-    "rest": "interplay",
+    "rest": "interplay and chance",
 }
 """Display names of the causes of uncertainty."""
 

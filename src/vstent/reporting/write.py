@@ -7,9 +7,25 @@ from vstent.io.files import atomic
 from vstent.io.writers import write_text
 from vstent.reporting.page import as_html, contents_of
 from vstent.reporting.pdf import as_pdf
+from vstent.reporting.plan_sheet import Planned, plan_pdf
 
 if TYPE_CHECKING:
     from vstent.study.types import CaseResult
+
+
+def write_plan(case: "CaseResult", out: Path, day: str) -> None:
+    """Write ``plan.pdf`` into a case folder: one page per device, without the flow.
+
+    Parameters
+    ----------
+    case : the finished case.
+    out : its case folder.
+    day : date of the plan, ISO 8601.
+    """
+    measures = {name: case.metrics["stents"][name]["deployment"] for name in case.deployments}
+    planned = Planned(case.name, case.anatomy, case.deployments, measures, case.provenance["input"]["sha256"], day)
+    with atomic(out / "plan.pdf") as partial:
+        partial.write_bytes(plan_pdf(planned))
 
 
 def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False) -> None:

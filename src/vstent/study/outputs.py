@@ -30,7 +30,7 @@ FIELD: Final = ("field.vtu", "wall.vtp")
 SACS: Final = ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp")
 """Files of sacs and necks, as patterns."""
 OF_STUDY: Final = (
-    *(METRICS, RUN, "report.html", "report.pdf", CRATE),
+    *(METRICS, RUN, "report.html", "report.pdf", "plan.pdf", CRATE),
     *(f"stents/*/{name}" for name in STENT),
     *(f"flow/*/{name}" for name in FIELD),
 )

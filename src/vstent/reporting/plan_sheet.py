@@ -1,0 +1,158 @@
+"""Plan of a treatment, one page per device: pictures, sizes, landing zones, fit, warnings, alternatives."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
+from vstent.deployment.method import laid_inside
+from vstent.deployment.sketch import bed, sketch
+from vstent.devices.stent import Deployment, Landing
+from vstent.errors import LandingError
+from vstent.geometry.vessel import Anatomy
+from vstent.plan.rank import Candidate, alternatives
+from vstent.reporting.figures import Picture, Shot, sheet
+from vstent.reporting.paper import QUIET, Paper
+from vstent.reporting.quantities import format_value
+from vstent.reporting.scene import device_title, scene_of
+
+PICTURE_SHARE: Final = 0.19
+"""Largest height of the picture as a fraction of the page."""
+MOST_NOTES: Final = 2
+"""Largest number of notes on a page; the report has all."""
+HASH_DIGITS: Final = 16
+"""Number of digits of the input's SHA-256 that are printed."""
+
+
+class Planned(NamedTuple):
+    """A case to plan."""
+
+    name: str
+    """Name of the case."""
+    anatomy: Anatomy
+    """Vessel, parent artery and sacs."""
+    deployments: Mapping[str, Deployment]
+    """Deployed devices by name."""
+    measures: Mapping[str, Mapping[str, Any]]
+    """Measures of every deployment (`vstent.deployment.measure.measure`)."""
+    source: str
+    """SHA-256 of the input."""
+    day: str
+    """Date of the plan, ISO 8601."""
+
+
+def plan_pdf(case: Planned) -> bytes:
+    """Return the plan of every device as PDF, one A4 page each.
+
+    Parameters
+    ----------
+    case : the case to plan; the flow is not needed.
+    """
+    from matplotlib import rc_context
+
+    with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
+        paper = Paper(case.name, "plan")
+        for number, name in enumerate(case.deployments):
+            if number:
+                paper.turn()
+            _page(paper, case, name)
+        return paper.done()
+
+
+def _page(paper: Paper, case: Planned, name: str) -> None:
+    """Write the page of one device."""
+    deployment, measures = case.deployments[name], case.measures[name]
+    paper.title(f"{case.name}: {device_title(deployment)}")
+    paper.text(
+        f"Plan of {case.day}. Input SHA-256 {case.source[:HASH_DIGITS]}… Deployed length and fit are predictions."
+    )
+    paper.picture(_picture(case, name), most=PICTURE_SHARE)
+    paper.heading("Device and landing")
+    paper.table(_device_rows(case.anatomy, deployment, measures), (0.62, 0.38))
+    paper.heading("Warnings and notes")
+    warnings = [deployment.advice, *case.anatomy.notes, *case.anatomy.vessel.notes]
+    for sentence in warnings[: 1 + MOST_NOTES]:
+        paper.text(f"– {sentence}", 8)
+    if len(warnings) > 1 + MOST_NOTES:
+        paper.text(f"{len(warnings) - 1 - MOST_NOTES} more notes are in the report.", 8, color=QUIET)
+    paper.heading("Alternative sizes")
+    paper.table(_alternative_rows(case.anatomy, deployment), (0.17, 0.09, 0.74), head=("Size", "Score", "Reason"))
+    paper.text("Blood flow is not part of this plan. Name, date, signature: ______________________________", 8.5)
+
+
+def _picture(case: Planned, name: str) -> Picture:
+    """Return the device in profile and seen from the sac."""
+    only = {name: case.deployments[name]}
+    scene = scene_of(SimpleNamespace(anatomy=case.anatomy, deployments=only, fields={}))  # type: ignore[arg-type]
+    looks = {
+        "profile": ("In profile", ("lumen", "continued", "sac", "wires", "neck")),
+        "neck": ("Seen from the sac", ("wires", "neck")),
+    }
+    shots = [
+        Shot(title, scene.pick(ids, name), scene.view(view))
+        for view, (title, ids) in looks.items()
+        if any(one.id == view for one in scene.views)
+    ]
+    caption = "The device in the patient's artery; the red line is the neck."
+    return Picture("plan", "Position", caption, sheet(scene, shots, ""))
+
+
+def _device_rows(anatomy: Anatomy, deployment: Deployment, measures: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the table of device, landing zones and fit."""
+    stent = deployment.stent
+    rows = [
+        ("Device and label size", f"{stent.design.name} {stent.size.label}"),
+        ("Deployed length (range for the uncertainty of diameters)", _length(anatomy, deployment)),
+        ("Position along the parent artery", f"{stent.proximal_abscissa_mm:.1f} to {stent.distal_abscissa_mm:.1f} mm"),
+    ]
+    for end, (first_mm, last_mm) in _zones_mm(anatomy).items():
+        inside = np.linspace(first_mm, last_mm, 51)
+        diameters = 2 * np.interp(inside, anatomy.axis.abscissa_mm, anatomy.section_radius_mm)
+        words = f"{diameters.min():.2f} to {diameters.max():.2f} mm"
+        rows.append((f"{end} landing zone, {ZONE_MM:g} mm: smallest and largest diameter", words))
+    keys = {
+        "neck_to_proximal_end_mm": "Length beyond the neck, proximal",
+        "neck_to_distal_end_mm": "Length beyond the neck, distal",
+        "neck_metal_coverage_fraction": "Metal coverage over the neck",
+        "apposed_fraction": "Apposed",
+        "max_wall_gap_mm": "Largest gap to the wall",
+        "jailed_branches_count": "Jailed branches",
+    }
+    return rows + [(words, format_value(key, measures[key])) for key, words in keys.items() if key in measures]
+
+
+def _zones_mm(anatomy: Anatomy) -> dict[str, tuple[float, float]]:
+    """Return the landing zones beside the neck within the patient's artery."""
+    first_mm, last_mm = anatomy.own_mm
+    proximal_mm, distal_mm = neck_span_mm(anatomy)
+    return {
+        "Proximal": (max(first_mm, proximal_mm - ZONE_MM), max(first_mm, proximal_mm)),
+        "Distal": (min(last_mm, distal_mm), min(last_mm, distal_mm + ZONE_MM)),
+    }
+
+
+def _length(anatomy: Anatomy, deployment: Deployment) -> str:
+    """Return the deployed length with its range."""
+    stent = deployment.stent
+    middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
+    try:
+        found = laid_inside(partial(sketch, bed(stent.design, stent.size, anatomy)), Landing(middle_mm))
+    except LandingError:
+        return f"{stent.deployed_length_mm:.1f} mm"
+    lengths = sorted(b - a for a, b in zip(found.proximal_band_mm, found.distal_band_mm, strict=True))
+    shift = stent.deployed_length_mm - found.stent.deployed_length_mm
+    return f"{stent.deployed_length_mm:.1f} mm ({lengths[0] + shift:.1f} to {lengths[-1] + shift:.1f} mm)"
+
+
+def _alternative_rows(anatomy: Anatomy, deployment: Deployment) -> Sequence[tuple[str, str, str]]:
+    """Return the two best neighboring sizes."""
+    found = alternatives(anatomy, deployment.stent.design, deployment.stent.size)
+    return [_alternative(one) for one in found] or [("none fits", "", "")]
+
+
+def _alternative(one: Candidate) -> tuple[str, str, str]:
+    """Return the row of one alternative."""
+    return one.size.label, f"{one.score:.2f}" if one.is_suitable else "unsuitable", one.reason
