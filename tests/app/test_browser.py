@@ -123,6 +123,41 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         page.wait_for_function("() => document.querySelector('button[aria-label=Undo]').disabled")
 
 
+RAMPS = """() => [...document.querySelectorAll('.viewer-bar')].map((bar) => {
+    const box = (name) => bar.querySelector(name).getBoundingClientRect();
+    const [ramp, ticks] = [box('.viewer-ramp'), box('.viewer-ticks')];
+    return [ramp.left - ticks.left, ramp.right - ticks.right, ramp.width];
+})"""
+"""How far the ends of every color ramp are from the ends of its numbers, in pixels, and its width."""
+
+
+def inflow_percent(page):
+    """The change of the neck inflow that the live flow shows."""
+    return float(page.locator(".live-cards b").first.inner_text().replace("−", "-").split()[0])
+
+
+def test_the_blood_follows_a_device_that_is_dragged(artery, tmp_path):
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        drop(page, artery)
+        page.wait_for_selector(".step.done:nth-child(3)")
+        step(page, "Deploy")
+        page.wait_for_selector(".sheet .row")
+        page.locator("#live-flow").check()
+        steady = page.locator(".live:not(.stale)", has_text="Steady.")
+        steady.wait_for(timeout=240 * SECOND)
+        over_neck = inflow_percent(page)
+        assert over_neck < -15
+        assert page.locator(".chip", has_text="Live flow").get_attribute("aria-pressed") == "true"
+        ramps = page.evaluate(RAMPS)
+        assert len(ramps) == 2  # gap to the wall, speed
+        assert all(abs(left) < 1 and abs(right) < 1 and width > 100 for left, right, width in ramps)
+        for _ in range(4):
+            drag(page, ".handle.distal .knob", -60, 0)
+        assert in_time(page, lambda: steady.is_visible() and inflow_percent(page) > over_neck + 5, 120)
+        page.locator("#live-flow").uncheck()
+        assert not page.locator(".live-cards").is_visible()
+
+
 def test_a_tick_lets_blood_enter_by_an_opening_as_well(artery, tmp_path):
     with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
         drop(page, artery)

@@ -287,7 +287,10 @@ def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
     ranking = client.get(f"{case}/ranking").json()
     assert ranking["is_current"]
     assert [row["rank"] for row in ranking["rows"]] == list(range(1, 1 + len(find_design("enterprise").sizes)))
-    scores = [row["score"] for row in ranking["rows"] if row["is_suitable"]]
+    first, *others = (row for row in ranking["rows"] if row["is_suitable"])
+    assert [row["is_proposed"] for row in ranking["rows"]].count(True) == 1
+    assert first["is_proposed"]
+    scores = [row["score"] for row in others]
     assert scores == sorted(scores, reverse=True)
     assert all(row["reason"] for row in ranking["rows"])
     choose(client, case, devices=[SILK])

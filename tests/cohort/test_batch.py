@@ -29,18 +29,20 @@ from vstent.io.tables import write_parquet
 from vstent.io.writers import write_stl
 from vstent.reporting.cohort import cohort_report, modified_z_scores
 from vstent.study.pipeline import run as run_study
-from vstent.study.types import Settings
+from vstent.study.types import Placing, Settings
 
-SETTINGS = Settings(devices=("silk", "enterprise"), flow=None, units="mm")
+PLACED = {"enterprise": Placing(center_mm=27.0)}
+"""Within an artery of 44 mm, beyond the end of one of 11 mm that is continued to 31.5 mm."""
+SETTINGS = Settings(devices=("silk", "enterprise"), flow=None, units="mm", placings=PLACED)
 
 needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="Dask is not installed")
 
 
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory):
-    """An artery with a sac, one too short for an Enterprise, and a file that is no surface."""
+    """An artery with a sac, one too short for the Enterprise where it is placed, and a file that is no surface."""
     folder = tmp_path_factory.mktemp("scäns of a cohort")
-    for name, length_mm in (("a", 22.0), ("b", 11.0)):
+    for name, length_mm in (("a", 44.0), ("b", 11.0)):
         artery = phantoms.with_sac(
             phantoms.tube(length_mm=length_mm), abscissa_mm=0.5 * length_mm, width_mm=5.0, neck_mm=3.5
         )
@@ -96,7 +98,7 @@ def test_the_table_has_a_row_a_case_and_device_with_every_metric_or_the_failure(
     assert by_name["b", "silk"]["outcome"] == "done"
     assert by_name["b", "enterprise"]["outcome"] == "failed"
     assert by_name["b", "enterprise"]["stage"] == "deploy enterprise"
-    assert "shortest would be" in by_name["b", "enterprise"]["sentence"]
+    assert "beyond the distal end" in by_name["b", "enterprise"]["sentence"]
     for device in SETTINGS.devices:
         assert by_name["c", device]["outcome"] == "failed"
         assert by_name["c", device]["stage"] == "segment"
@@ -179,7 +181,7 @@ def test_a_second_run_does_only_what_is_missing(scans, table, tmp_path):
 def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path, capsys):
     out = tmp_path / "out"
     listed = tmp_path / "cohort.csv"
-    listed.write_text(f"case,input,devices,at\nfirst,{scans / 'a.stl'},silk,\nlast,{scans / 'b.stl'},,\n")
+    listed.write_text(f"case,input,devices,at\nfirst,{scans / 'a.stl'},silk,\nlast,{scans / 'c.stl'},,\n")
     command = ["batch", str(listed), "--out", str(out), "--no-flow", "--units", "mm", "--device", "enterprise"]
     assert main([*command, "--jobs", "2", "--keep-files"]) == 0
     said = capsys.readouterr()
@@ -187,7 +189,7 @@ def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path,
     with (out / "cohort.csv").open(newline="") as file:
         first, last = csv.DictReader(file)
     assert (first["case"], first["device"], first["outcome"]) == ("first", "silk", "done")
-    assert (last["device"], last["outcome"], last["stage"]) == ("enterprise", "failed", "deploy enterprise")
+    assert (last["device"], last["outcome"], last["stage"]) == ("enterprise", "failed", "segment")
     alone = next(row for row in table if (row["case"], row["device"]) == ("a", "silk"))
     key = "deployment.deployed_length_mm"
     assert float(first[key]) == pytest.approx(alone[key], rel=1e-5)

@@ -24,9 +24,9 @@ from vstent.flow.lattice.state import NECK_INFLOW, State
 from vstent.flow.lattice.stepping import advance, is_at_check, monitored, snapshot
 from vstent.kernels.arrays import Floats
 
-CELLS_ACROSS_NECK: Final = 20.0
+CELLS_ACROSS_NECK: Final = 28.0
 """Number of cells across the neck. With 16 the demo reverses Silk and Enterprise, with 22 it does not."""
-CELLS_ACROSS_PARENT: Final = 14.0
+CELLS_ACROSS_PARENT: Final = 18.0
 """Number of cells across the parent artery."""
 TOLERANCE: Final = 0.02
 """Residual below which the flow without a device counts as converged in a preview."""
