@@ -50,7 +50,7 @@ def test_page_has_its_switches_and_asks_no_host(tmp_path):
     assert console == []
     assert dom.count('class="viewer-pane"') == 3
     assert re.findall(r'aria-pressed="true">([^<]+)<', dom) == ["Wires"]
-    assert len(re.findall(r'<input type="checkbox">', dom)) == 11
+    assert len(re.findall(r'<input type="checkbox">', dom)) == 12
     urls = set(re.findall(r'"url":"((?:https?|wss?):[^"]+)"', log.read_text(errors="replace")))
     assert {url for url in urls if "google" not in url} == set()  # the browser's own calls home fail and do not count
     assert json.dumps("report.html")[1:-1] in dom or "vstent report" in dom

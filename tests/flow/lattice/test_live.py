@@ -11,6 +11,7 @@ from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.flow.case import FlowCase, FlowSettings, Screen
+from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.engines import run
 from vstent.flow.grade import neck_diameter_mm, parent_diameter_mm
 from vstent.flow.indices import indices
@@ -25,7 +26,7 @@ from vstent.flow.screen import screen
 from vstent.flow.simulation import flow_case
 from vstent.geometry.vessel import Anatomy, Vessel
 
-SETTINGS = FlowSettings(cell_size_mm=0.32, inflow_mL_s=1.5)
+SETTINGS = FlowSettings(cells_per_diameter=13.0, inflow_mL_s=1.5)
 """A default grid coarser than a preview's: the preview takes it."""
 
 
@@ -99,8 +100,8 @@ def test_an_exchange_changes_the_screen_and_nothing_else(live: LiveFlow) -> None
 
 
 def test_the_grid_is_as_coarse_as_neck_and_artery_allow() -> None:
-    fine = replace(case(), settings=replace(SETTINGS, cell_size_mm=0.05))
+    fine = replace(case(), settings=replace(SETTINGS, cells_per_diameter=80.0, cell_size_mm=0.5))
     assert fine.ostium is not None
     across = neck_diameter_mm(fine.ostium) / CELLS_ACROSS_NECK, parent_diameter_mm(fine) / CELLS_ACROSS_PARENT
     assert preview_spacing_mm(fine) == min(across)
-    assert preview_spacing_mm(case()) == 0.32
+    assert preview_spacing_mm(case()) == default_cell_size_mm(case()) > preview_spacing_mm(fine)
