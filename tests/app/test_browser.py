@@ -151,8 +151,11 @@ def test_the_blood_follows_a_device_that_is_dragged(artery, tmp_path):
         ramps = page.evaluate(RAMPS)
         assert len(ramps) == 2  # gap to the wall, speed
         assert all(abs(left) < 1 and abs(right) < 1 and width > 100 for left, right, width in ramps)
-        for _ in range(4):
-            drag(page, ".handle.distal .knob", -60, 0)
+        drag(page, ".handle.distal .knob", -60, 0)
+        assert page.locator(".live.stale").count() == 1
+        page.locator(".handle.distal").focus()
+        for _ in range(7):  # 2 mm each, until the neck is free
+            page.keyboard.press("PageDown")
         assert in_time(page, lambda: steady.is_visible() and inflow_percent(page) > over_neck + 5, 120)
         page.locator("#live-flow").uncheck()
         assert not page.locator(".live-cards").is_visible()

@@ -93,6 +93,15 @@ class Preview:
         if self._stent is not None:
             self._send((self._serial, self._stent))
 
+    def _revive(self) -> None:
+        """Start the process again where it had begun to step; else say that it ends at once."""
+        if self._said.values:
+            self._begin()
+        else:
+            self._said = Said(
+                error="The live flow ended unexpectedly. Switch it on again, or run the step Flow instead."
+            )
+
     def _follow(self, pipe: Connection) -> None:
         """Keep the last message of the process until it ends."""
         with suppress(EOFError, OSError):
@@ -118,7 +127,7 @@ class Preview:
     def message(self) -> bytes:
         """Return the numbers and the streamlines as a message for the page; the process goes on for a while."""
         if not self._process.is_alive() and not self._said.error:
-            self._begin()
+            self._revive()
         self._send(None)
         with self._lock:
             said, age_s, lines = self._said, time.monotonic() - self._at_s, self._lines
