@@ -13,7 +13,6 @@ from vstent.anatomy.trace import trace
 from vstent.flow.case import FlowCase, FlowSettings, Screen
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.engines import run
-from vstent.flow.grade import neck_diameter_mm, parent_diameter_mm
 from vstent.flow.indices import indices
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.live import (
@@ -24,6 +23,7 @@ from vstent.flow.lattice.live import (
 )
 from vstent.flow.screen import screen
 from vstent.flow.simulation import flow_case
+from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
 from vstent.geometry.vessel import Anatomy, Vessel
 
 SETTINGS = FlowSettings(cells_per_diameter=13.0, inflow_mL_s=1.5)

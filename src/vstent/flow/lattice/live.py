@@ -16,12 +16,12 @@ import numpy as np
 from vstent.flow.case import FlowCase, FlowField, Screen
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.engines import run
-from vstent.flow.grade import neck_diameter_mm, parent_diameter_mm
 from vstent.flow.lattice.close_up import WIDTH
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.screen import build_screen
 from vstent.flow.lattice.state import NECK_INFLOW, State
 from vstent.flow.lattice.stepping import advance, is_at_check, monitored, snapshot
+from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
 from vstent.kernels.arrays import Floats
 
 CELLS_ACROSS_NECK: Final = 28.0
