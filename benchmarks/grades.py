@@ -22,7 +22,7 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.flow.case import FlowSettings
-from vstent.flow.grade import GOOD, grade_of, measures_of
+from vstent.flow.grade import GOOD, NOT_USABLE, grade_of, measures_of
 from vstent.flow.indices import indices
 from vstent.flow.simulation import flow_case, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
@@ -41,6 +41,8 @@ SPACINGS_MM = {
     "visc2011_metres.stl": (0.4, 0.32, 0.25, 0.2, 0.16),
 }
 """Grid spacings of every vessel, mm; the last one is the reference."""
+SURE = 0.01
+"""Difference between two reductions that the uncertainty of steady flows can make."""
 ALLOWED = 0.1
 """Largest difference from the finest grid that a flow graded good may have."""
 
@@ -110,7 +112,32 @@ def table(rows: dict[str, dict[str, Any]]) -> int:
                     f"| {name} | {spacing_mm} | {device} | {grade.level}{' WRONG' if is_wrong else ''} | {off[0]:+.0%} "
                     f"| {off[1]:+.0%} | {'; '.join(grade.reasons)} |"
                 )
-    return n_wrong
+    return n_wrong + reversed_pairs(rows)
+
+
+def reversed_pairs(rows: dict[str, dict[str, Any]]) -> int:
+    """Print the pairs of usable flows that reverse two devices against the finest grid; return their number."""
+    n_reversed = 0
+    for name, spacings_mm in SPACINGS_MM.items():
+        finest = _difference(rows, name, spacings_mm[-1])
+        for spacing_mm in spacings_mm:
+            keys = [f"{name} {spacing_mm} {one}" for one in ("bare", *DEVICES)]
+            found = _difference(rows, name, spacing_mm)
+            if found is None or finest is None or any(grade_of(rows[key]).level == NOT_USABLE for key in keys):
+                continue
+            if found * finest < 0 and min(abs(found), abs(finest)) > SURE:
+                n_reversed += 1
+                print(f"\nREVERSED: {name} at {spacing_mm} mm, {found:+.1%} instead of {finest:+.1%}")
+    return n_reversed
+
+
+def _difference(rows: dict[str, dict[str, Any]], name: str, spacing_mm: float) -> float | None:
+    """Return the reduction of the neck inflow by the first device minus that by the second; None where missing."""
+    keys = [f"{name} {spacing_mm} {one}" for one in ("bare", *DEVICES)]
+    if any(key not in rows for key in keys):
+        return None
+    bare, first, second = (rows[key]["neck_inflow_mL_s"] for key in keys)
+    return float((first - second) / bare)
 
 
 def main() -> int:

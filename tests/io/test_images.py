@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 
 import nibabel
 import numpy as np
@@ -9,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from vstent.anatomy.segment import segment
 from vstent.errors import InputError, ReadError, UnitError
 from vstent.geometry.image import Image
 from vstent.io.dicom_writer import write_dicom
@@ -620,6 +622,17 @@ def test_nothing_there_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["u1", "<i2", ">i2", "<f4", ">f4"])
+def test_raw_voxels_have_no_orientation_and_no_result_of_them_states_one(tmp_path):
+    """Left and right cannot be known: neither the scan nor the vessel found in it says that they are."""
+    grid = np.indices((24, 24, 24)) - 11.5
+    voxels = np.where(np.hypot(grid[0], grid[1]) < 6, 900, 100).astype(np.int16)
+    (tmp_path / "a.raw").write_bytes(voxels.transpose().tobytes())
+    image = read_image(tmp_path / "a.raw", spacing_mm=[0.5], shape=voxels.shape)
+    assert not image.is_oriented
+    assert not segment(image, threshold=500.0).is_oriented
+    assert segment(replace(image, is_oriented=True), threshold=500.0).is_oriented
+
+
 def test_raw_voxels_run_fastest_along_i_and_their_kind_is_guessed(tmp_path, kind):
     i, j, k = np.meshgrid(np.arange(6), np.arange(5), np.arange(4), indexing="ij")
     expected = i + 20 * j + 30 * k + (0.5 if "f" in kind else 0)

@@ -94,7 +94,7 @@ def test_resolve_averages_blocks():
 
 
 def scene_with(*layers, view):
-    return Scene(panes=(("bare", "Before"),), layers=layers, scales=(), views=(view,), fade_mm=1.0)
+    return Scene(panes=(("bare", "Before"),), layers=layers, scales=(), views=(view,), is_oriented=True, fade_mm=1.0)
 
 
 def mesh(surface, colour, opacity=1.0, name="thing"):

@@ -60,6 +60,7 @@ export class Picture {
     if (!this.stage) return;
     this.stage.put(manifest, buffer);
     if (manifest.fade) this.stage.shared.fade = manifest.fade;
+    if ("is_oriented" in manifest) this.stage.isOriented = manifest.is_oriented;
     this.apply();
   }
 

@@ -85,7 +85,7 @@ export class Slices {
       view.laid = laid(across, scan.affine_mm, view.axis);
       const { title, letters } = view.laid;
       view.slider.ariaLabel = `${title} slice`;
-      view.letters.forEach((element, i) => (element.textContent = letters[i]));
+      view.letters.forEach((element, i) => (element.textContent = scan.is_oriented ? letters[i] : ""));
       view.slider.max = scan.shape[view.axis] - 1;
       // The canvases stand in the order sagittal, coronal, axial, however the voxels are stored.
       view.element.style.order = across[view.axis] - 3;

@@ -29,11 +29,14 @@ export function annotations() {
 }
 
 /** Bring length bars and compasses to the camera as it is; `height` is that of a pane in pixels. */
-export function annotate(panes, { camera, orbit }, height) {
+export function annotate(panes, { camera, orbit, isOriented }, height) {
   const perMm = height / (2 * orbit.distance * Math.tan((camera.fov * Math.PI) / 360));
   const length = [50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1].find((mm) => mm * perMm < 110) || 0.1;
   const inverse = orbit.turned.clone().invert();
-  const arms = [["L", 1, 0, 0], ["P", 0, 1, 0], ["S", 0, 0, 1]].map(([name, ...axis]) => {
+  // Without an orientation in the file the arms are the axes of its grid.
+  const names = isOriented === false ? ["x", "y", "z"] : ["L", "P", "S"];
+  const arms = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((axis, i) => {
+    const name = names[i];
     const v = new Vector3(...axis).applyQuaternion(inverse);
     return { name, x: 17 * v.x, y: -17 * v.y, z: v.z };
   });

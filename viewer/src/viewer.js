@@ -78,6 +78,7 @@ class Viewer {
     this.moment = 1;
     this.build();
     this.stage.orbit.listen(this.area, () => this.paneSize()[1]);
+    this.stage.isOriented = manifest.is_oriented;
     this.stage.drawn = () => this.annotate();
     new ResizeObserver(() => this.layout()).observe(this.area);
     this.layout();

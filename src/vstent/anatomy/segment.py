@@ -90,7 +90,14 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     band = f"A change of the threshold by {off:.3g} ({BAND:.0%} of the step from tissue to lumen) changes diameters by "
     band += f"+-{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
     all_notes = (*image.notes, *notes, band, found, smooth_note, *decimation_notes)
-    return Vessel(surface, notes=all_notes, threshold_band_mm=band_mm, blur_mm=profile.blur_mm, voxel_mm=lumen.voxel_mm)
+    return Vessel(
+        surface,
+        notes=all_notes,
+        threshold_band_mm=band_mm,
+        blur_mm=profile.blur_mm,
+        voxel_mm=lumen.voxel_mm,
+        is_oriented=image.is_oriented,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -204,6 +204,7 @@ class Live:
             views=_views(anatomy),
             fade=1.2 * float(np.median(anatomy.section_radius_mm)),
             axis=_axis(anatomy),
+            is_oriented=anatomy.vessel.is_oriented,
             openings=[_said(opening) for opening in openings],
             notes=[*anatomy.vessel.notes, *anatomy.notes],
             neck=_neck_span(anatomy),

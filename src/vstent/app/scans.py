@@ -48,6 +48,7 @@ class Scan:
             "spacing_mm": self.image.spacing_mm.tolist(),
             "affine_mm": self.image.affine_mm.ravel().tolist(),
             "modality": self.image.modality,
+            "is_oriented": self.image.is_oriented,
             "range": self._range,
             "proposed_threshold": self.proposed_threshold,
         }

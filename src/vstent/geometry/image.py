@@ -23,6 +23,9 @@ class Image:
     notes: tuple[str, ...] = ()
     """Assumptions made while reading the scan, one sentence each."""
 
+    is_oriented: bool = True
+    """Whether the file states where left, right, front and back are; raw voxels do not."""
+
     def __post_init__(self) -> None:
         freeze(self, "voxels", np.asarray(self.voxels).dtype, (-1, -1, -1))
         freeze(self, "affine_mm", np.float64, (4, 4))

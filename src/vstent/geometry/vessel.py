@@ -114,6 +114,8 @@ class Vessel:
     """Standard deviation of the point spread with which the scan shows the wall; None where unknown."""
     voxel_mm: float | None = None
     """Edge length of a cube with the volume of a voxel; None for a vessel from a surface."""
+    is_oriented: bool = True
+    """Whether left, right, front and back are known (see `Image`)."""
 
     @property
     def closed(self) -> Surface:

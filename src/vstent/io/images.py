@@ -277,7 +277,8 @@ def _read_raw(
         )
     voxels = np.frombuffer(data, kind).reshape(tuple(shape)[::-1]).transpose()
     affine = np.diag([*spacing, 1.0])
-    return _plausible(Image(voxels.astype(kind.newbyteorder("="), copy=False), affine, notes=note), path)
+    image = Image(voxels.astype(kind.newbyteorder("="), copy=False), affine, notes=note, is_oriented=False)
+    return _plausible(image, path)
 
 
 SWAPPED_ROUGHNESS: Final = 2.0

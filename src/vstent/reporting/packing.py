@@ -100,6 +100,7 @@ def pack(scene: Scene, notes: dict[str, str]) -> tuple[dict[str, Any], str]:
         "panes": [{"id": name, "title": title, "note": notes.get(name, "")} for name, title in scene.panes],
         "scales": [_scale(scale, packer) for scale in scene.scales],
         "views": [_view(view) for view in scene.views],
+        "is_oriented": scene.is_oriented,
         "fade": scene.fade_mm,
         "layers": [_layer(layer, packer) for layer in scene.layers],
     }

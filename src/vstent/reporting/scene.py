@@ -131,6 +131,8 @@ class Scene:
     """Color scales in use."""
     views: tuple[View, ...]
     """Views offered, the best first."""
+    is_oriented: bool
+    """Whether left, right, front and back are known."""
     fade_mm: float
     """Depth behind the center of a picture at which wires are pale, so that the near side of a device stands out."""
 
@@ -161,6 +163,7 @@ def scene_of(case: "CaseResult") -> Scene:
         layers=tuple(layers),
         scales=scales_of(layers, anatomy),
         views=views_of(anatomy, case.deployments),
+        is_oriented=anatomy.vessel.is_oriented,
         fade_mm=1.2 * float(np.median(anatomy.section_radius_mm)),
     )
 
