@@ -621,7 +621,6 @@ def test_nothing_there_is_refused(tmp_path):
 # -- raw ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["u1", "<i2", ">i2", "<f4", ">f4"])
 def test_raw_voxels_have_no_orientation_and_no_result_of_them_states_one(tmp_path):
     """Left and right cannot be known: neither the scan nor the vessel found in it says that they are."""
     grid = np.indices((24, 24, 24)) - 11.5
@@ -633,6 +632,7 @@ def test_raw_voxels_have_no_orientation_and_no_result_of_them_states_one(tmp_pat
     assert segment(replace(image, is_oriented=True), threshold=500.0).is_oriented
 
 
+@pytest.mark.parametrize("kind", ["u1", "<i2", ">i2", "<f4", ">f4"])
 def test_raw_voxels_run_fastest_along_i_and_their_kind_is_guessed(tmp_path, kind):
     i, j, k = np.meshgrid(np.arange(6), np.arange(5), np.arange(4), indexing="ij")
     expected = i + 20 * j + 30 * k + (0.5 if "f" in kind else 0)
