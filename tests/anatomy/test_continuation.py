@@ -40,6 +40,13 @@ def test_a_long_artery_stays_as_it_is(whole: Anatomy) -> None:
     assert continued(healthy) is healthy
 
 
+def test_a_short_artery_without_a_sac_is_continued_about_its_middle() -> None:
+    short = restore(trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=12.0), edge_mm=0.3))))
+    assert not short.aneurysms
+    np.testing.assert_allclose(short.continued_mm, ENOUGH_MM - 6.0, atol=0.3)
+    assert short.axis.length_mm == pytest.approx(2 * ENOUGH_MM, abs=0.01)
+
+
 def test_a_straight_artery_is_continued_along_itself(whole: Anatomy) -> None:
     short = cut(whole, 6.0)
     first_mm, last_mm = neck_span_mm(short)

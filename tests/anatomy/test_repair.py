@@ -172,6 +172,19 @@ def test_an_opening_that_looks_sideways_out_of_the_wall_is_told_with_its_place()
     np.testing.assert_allclose(place_in(note), [1.8, 0, 7.5], atol=0.25)
 
 
+def test_a_sac_that_is_cut_open_is_closed():
+    """An opening in the side of the wall that is wider than both ends is no branch."""
+    phantom = with_sac(tube_phantom(length_mm=30.0, radius_mm=1.5), abscissa_mm=15.0, width_mm=6.0, neck_mm=3.0)
+    wall = phantom_surface(phantom, edge_mm=0.3)
+    dome_mm = wall.vertices_mm[np.argmax(np.linalg.norm(wall.vertices_mm[:, :2], axis=1))]
+    outward = dome_mm * [1, 1, 0] / np.linalg.norm(dome_mm[:2])
+    keep = (wall.corners_mm @ outward).max(axis=1) < dome_mm @ outward - 2.0
+    surface, notes = repair(Surface(wall.vertices_mm, wall.faces[keep]))
+    assert len(surface.boundary_loops) == 2
+    (note,) = (note for note in notes if "a sac that is cut open" in note)
+    np.testing.assert_allclose(place_in(note) @ outward, dome_mm @ outward - 2.0, atol=0.3)
+
+
 def test_the_piece_at_a_point_is_kept_however_small_but_for_debris():
     other = Surface(SOUND.vertices_mm * 0.5 + [20.0, 0, 0], SOUND.faces)
     both = with_faces(SOUND, other.faces + len(SOUND.vertices_mm), other.vertices_mm)

@@ -47,11 +47,9 @@ def continued(anatomy: Anatomy) -> Anatomy:
 
     Returns
     -------
-    anatomy : the same object where both ends are far enough, or where there is no aneurysm. Otherwise abscissae count
-        from the continued proximal end, and `continued_mm` tells the lengths that were added.
+    anatomy : the same object where both ends are far enough from the neck, or from the middle of an artery without one.
+        Otherwise abscissae count from the continued proximal end, and `continued_mm` tells the lengths that were added.
     """
-    if not anatomy.aneurysms:
-        return anatomy
     first_mm, last_mm = neck_span_mm(anatomy)
     spare_mm = first_mm, anatomy.axis.length_mm - last_mm
     added_mm = tuple(ENOUGH_MM - spare if spare < ENOUGH_MM else 0.0 for spare in spare_mm)

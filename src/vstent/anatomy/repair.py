@@ -190,19 +190,33 @@ def _filled(mesh: _Mesh) -> _Mesh:
     vertices, faces = triangles.cap(mesh.vertices, mesh.faces, loops)
     diameter = 4 * triangles.volume(vertices[faces]) / float(triangles.areas(mesh.vertices[mesh.faces]).sum())
     wall_normal = triangles.vertex_normals(mesh.vertices, mesh.faces)
-    is_hole = [_is_hole(mesh.vertices[loop], wall_normal[loop], diameter) for loop in loops]
-    holes = [loop for loop, hole in zip(loops, is_hole, strict=True) if hole]
-    sideways = [
-        mesh.vertices[loop]
-        for loop, hole in zip(loops, is_hole, strict=True)
-        if not hole and _is_in_wall(mesh.vertices[loop], wall_normal[loop])
-    ]
+    holes = [loop for loop in loops if _is_hole(mesh.vertices[loop], wall_normal[loop], diameter)]
+    left = [loop for loop in loops if not any(loop is hole for hole in holes)]
+    sideways = [loop for loop in left if _is_in_wall(mesh.vertices[loop], wall_normal[loop])]
+    ends_mm = [_width_mm(mesh, loop) for loop in left if not any(loop is one for one in sideways)]
+    # A branch is not wider than the artery that it leaves, so that a wider opening in the wall is a sac cut open.
+    domes = [loop for loop in sideways if len(ends_mm) > 1 and _width_mm(mesh, loop) > max(ends_mm)]
     filled_vertices, filled_faces = mesh.vertices, mesh.faces
-    for loop in holes:
+    for loop in holes + domes:
         filled_vertices, filled_faces = _fill(filled_vertices, filled_faces, loop)
     notes = [_hole_note([mesh.vertices[loop] for loop in holes])] if holes else []
-    notes += [_sideways_note(points) for points in sideways]
+    notes += [_dome_note(mesh.vertices[loop]) for loop in domes]
+    notes += [_sideways_note(mesh.vertices[loop]) for loop in sideways if not any(loop is dome for dome in domes)]
     return mesh.after(filled_vertices, filled_faces, " ".join(notes))
+
+
+def _width_mm(mesh: _Mesh, loop: Ints) -> float:
+    """Return the width of a loop: its length divided by pi."""
+    return triangles.perimeter(mesh.vertices[loop]) / np.pi
+
+
+def _dome_note(points: Floats) -> str:
+    """Return the note on a sac that is cut open."""
+    return (
+        f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at "
+        f"{place(triangles.polygon_centroid(points))} faces sideways and is wider than the artery: a sac that is cut "
+        "open. It was closed with a flat cap, so the sac is too small by the part that is missing."
+    )
 
 
 def _hole_note(holes_mm: list[Floats]) -> str:
