@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from told import place_in
 from tubes import line, tube
 
+from vstent import phantoms
 from vstent.anatomy.repair import repair
 from vstent.errors import InputError, VesselError
 from vstent.geometry.surface import Surface
@@ -173,9 +174,11 @@ def test_an_opening_that_looks_sideways_out_of_the_wall_is_told_with_its_place()
 
 
 def test_a_sac_that_is_cut_open_is_closed():
-    """An opening in the side of the wall that is wider than both ends is no branch."""
-    phantom = with_sac(tube_phantom(length_mm=30.0, radius_mm=1.5), abscissa_mm=15.0, width_mm=6.0, neck_mm=3.0)
-    wall = phantom_surface(phantom, edge_mm=0.3)
+    """The wall converges to an opening that is wider than both ends: that is no branch."""
+    phantom = phantoms.with_sac(
+        phantoms.tube(length_mm=30.0, radius_mm=1.5), abscissa_mm=15.0, width_mm=6.0, neck_mm=3.0
+    )
+    wall = phantoms.phantom_surface(phantom, edge_mm=0.3)
     dome_mm = wall.vertices_mm[np.argmax(np.linalg.norm(wall.vertices_mm[:, :2], axis=1))]
     outward = dome_mm * [1, 1, 0] / np.linalg.norm(dome_mm[:2])
     keep = (wall.corners_mm @ outward).max(axis=1) < dome_mm @ outward - 2.0

@@ -26,6 +26,8 @@ LONGEST_PATCHED: Final = 120
 number."""
 NOTABLE_OF_AREA: Final = 0.02
 """Removed pieces larger than this fraction of the area are reported one by one."""
+CONVERGING: Final = 0.25
+"""Mean component of the wall's normal along an opening's axis above which the wall converges to it."""
 
 
 def repair(surface: Surface, *, at_mm: Floats | None = None) -> tuple[Surface, tuple[str, ...]]:
@@ -192,10 +194,8 @@ def _filled(mesh: _Mesh) -> _Mesh:
     wall_normal = triangles.vertex_normals(mesh.vertices, mesh.faces)
     holes = [loop for loop in loops if _is_hole(mesh.vertices[loop], wall_normal[loop], diameter)]
     left = [loop for loop in loops if not any(loop is hole for hole in holes)]
+    domes = [loop for loop in left if _is_dome(mesh, loop, left, wall_normal)]
     sideways = [loop for loop in left if _is_in_wall(mesh.vertices[loop], wall_normal[loop])]
-    ends_mm = [_width_mm(mesh, loop) for loop in left if not any(loop is one for one in sideways)]
-    # A branch is not wider than the artery that it leaves, so that a wider opening in the wall is a sac cut open.
-    domes = [loop for loop in sideways if len(ends_mm) > 1 and _width_mm(mesh, loop) > max(ends_mm)]
     filled_vertices, filled_faces = mesh.vertices, mesh.faces
     for loop in holes + domes:
         filled_vertices, filled_faces = _fill(filled_vertices, filled_faces, loop)
@@ -205,17 +205,28 @@ def _filled(mesh: _Mesh) -> _Mesh:
     return mesh.after(filled_vertices, filled_faces, " ".join(notes))
 
 
-def _width_mm(mesh: _Mesh, loop: Ints) -> float:
-    """Return the width of a loop: its length divided by pi."""
-    return triangles.perimeter(mesh.vertices[loop]) / np.pi
+def _is_dome(mesh: _Mesh, loop: Ints, loops: list[Ints], wall_normal: Floats) -> bool:
+    """Return whether a loop is a sac cut open: the wall converges to it, yet it is wider than all other openings."""
+    # The end of an artery has walls along it, also where it is cut obliquely; a branch is narrower than its parent.
+    others_mm2 = [_area_mm2(mesh, one) for one in loops if one is not loop]
+    if len(others_mm2) < 2 or _area_mm2(mesh, loop) <= max(others_mm2):
+        return False
+    beside = mesh.vertices[mesh.faces[np.isin(mesh.faces, loop).any(axis=1)]].mean(axis=(0, 1))
+    axis = triangles.polygon_area_vector(_without_teeth(mesh.vertices[loop]))
+    axis *= np.sign(axis @ (triangles.polygon_centroid(mesh.vertices[loop]) - beside)) / np.linalg.norm(axis)
+    return bool((wall_normal[loop] @ axis).mean() > CONVERGING)
+
+
+def _area_mm2(mesh: _Mesh, loop: Ints) -> float:
+    """Return the area that a loop encloses."""
+    return float(np.linalg.norm(triangles.polygon_area_vector(_without_teeth(mesh.vertices[loop]))))
 
 
 def _dome_note(points: Floats) -> str:
     """Return the note on a sac that is cut open."""
     return (
-        f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at "
-        f"{place(triangles.polygon_centroid(points))} faces sideways and is wider than the artery: a sac that is cut "
-        "open. It was closed with a flat cap, so the sac is too small by the part that is missing."
+        f"The widest opening, at {place(triangles.polygon_centroid(points))}, is a sac that is cut open: the wall "
+        "converges to it. It was closed with a flat cap, so the sac is too small by the part that is missing."
     )
 
 
