@@ -103,6 +103,7 @@ export const panels = {
     if (page.view.is_scan && page.scan) parts.push(...threshold(page));
     if (!page.view.is_scan) {
       parts.push(select("units", "Length unit", page.view.choices.units ?? "", [["", "derived from the size"], ["mm", "mm"], ["cm", "cm"], ["m", "m"]], (unit) => page.choose({ units: unit || null })));
+      parts.push(select("frame", "Frame of the file", page.view.choices.frame ?? "", [["", "as stated, else LPS"], ["lps", "LPS (DICOM)"], ["ras", "RAS (3D Slicer)"]], (frame) => page.choose({ frame: frame || null })));
     }
     parts.push(...point(page, "at_mm", "Seed"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
     if (page.view.steps.image === "done") parts.push(next(page, "vessel", "Vessel →"));

@@ -109,13 +109,18 @@ def _differences(given: dict[str, Any], usual: dict[str, Any], before: str = "")
             yield f"{before}{name}" + ("" if isinstance(value, dict | tuple) else f" {value}")
 
 
+OF_IMAGE: Final = ("units", "spacing_mm", "shape", "threshold", "at_mm")
+"""Choices on which the step Image depends."""
+
+
 def dependencies(state: State) -> dict[str, str]:
     """Return a digest of everything that each step depends on, by step."""
     chosen = state.choices.model_dump(mode="json")
+    frame = [chosen["frame"]] if chosen["frame"] else []  # absent by default, so that older cases keep their digests
     sizes = [[device.name, device.diameter_mm, device.length_mm] for device in state.choices.devices]
     centers = [device.center_mm for device in state.choices.devices]
     parts: dict[str, Any] = {
-        "image": [state.source, *(chosen[name] for name in ("units", "spacing_mm", "shape", "threshold", "at_mm"))],
+        "image": [state.source, *(chosen[name] for name in OF_IMAGE), *frame],
         "vessel": [chosen[name] for name in ("inlet_mm", "upstream_mm", "downstream_mm")],
         "sac": [chosen["outlet_mm"], chosen["neck_mm"]],
         "device": sizes,

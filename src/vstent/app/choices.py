@@ -74,6 +74,8 @@ class Choices(Strict):
 
     units: Literal["m", "cm", "mm"] | None = None
     """Length unit of a surface file."""
+    frame: Literal["lps", "ras"] | None = None
+    """Frame of a surface file; None: as it states, else LPS."""
     spacing_mm: tuple[Length, Length, Length] | None = None
     """Voxel spacing of a raw volume."""
     shape: tuple[Count, Count, Count] | None = None
@@ -123,6 +125,7 @@ class Choices(Strict):
             center_mm=None,
             devices=tuple(device.name for device in self.devices),
             units=self.units,
+            frame=self.frame,
             spacing_mm=self.spacing_mm,
             shape=self.shape,
             threshold=self.threshold,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # loaded when a folder is opened, as in `vstent.app.choices`
     from vstent.study.types import Settings
 
 GEOMETRY: Final = (
-    *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
+    *("units", "frame", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
     *("neck_mm", "upstream_mm", "downstream_mm"),
 )
 """Settings of the vessel that the page can change."""
