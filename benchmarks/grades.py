@@ -33,10 +33,10 @@ TABLE = Path(__file__).with_suffix(".json")
 DATA = Path(__file__).parents[2] / "shared" / "data"
 DEVICES = ("silk", "enterprise")
 SPACINGS_MM = {
-    "demo": (0.4, 0.3, 0.22, 0.16, 0.12),
-    "arc": (0.4, 0.3, 0.22, 0.16, 0.12),
-    "t": (0.4, 0.3, 0.22, 0.16, 0.12),
-    "aneurisk_C0038.vtp": (0.4, 0.32, 0.25, 0.2, 0.16),
+    "demo": (0.4, 0.3, 0.22, 0.16, 0.14),
+    "arc": (0.4, 0.3, 0.22, 0.16),
+    "t": (0.4, 0.3, 0.22, 0.16),
+    "aneurisk_C0038.vtp": (0.4, 0.32, 0.25, 0.2),
     "aneurisk_beta.vtp": (0.4, 0.3, 0.22, 0.16, 0.13),
     "visc2011_metres.stl": (0.4, 0.32, 0.25, 0.2, 0.16),
 }

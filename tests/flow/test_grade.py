@@ -61,6 +61,9 @@ def test_a_branch_counts_where_its_resistance_decides(case: FlowCase) -> None:
     found = measures_of(fork, field, {})
     narrowest_mm = min(outlet.diameter_mm for outlet in vessel.outlets)
     assert found["cells_across_outlet_count"] == narrowest_mm / SPACING_MM
+    wide, narrow = vessel.outlets[0], replace(vessel.outlets[1], area_mm2=0.02 * vessel.outlets[0].area_mm2)
+    stub = replace(fork, vessel=replace(vessel, openings=(vessel.inlet, wide, narrow)))
+    assert measures_of(stub, field, {})["cells_across_outlet_count"] == wide.diameter_mm / SPACING_MM
     split = replace(fork, settings=replace(fork.settings, outlets="murray"))
     assert "cells_across_outlet_count" not in measures_of(split, field, {})
 

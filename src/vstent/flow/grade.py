@@ -1,6 +1,6 @@
 """Grade of a computed flow: good, fair or not usable, from stated criteria of grid, convergence and balance."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -10,6 +10,8 @@ from vstent.flow.case import LATTICE, FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
 from vstent.flow.lattice.setup import CELL_REYNOLDS
 from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
+from vstent.geometry.murray import murray_shares
+from vstent.geometry.vessel import Opening
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
@@ -19,6 +21,10 @@ Level = Literal["good", "fair", "not usable"]
 GOOD: Final = "good"
 FAIR: Final = "fair"
 NOT_USABLE: Final = "not usable"
+
+
+COUNTED_SHARE: Final = 0.04
+"""Share of the outflow by Murray's law below which an outlet's resistance hardly matters for the sac."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ CRITERIA: Final = (
     Criterion("cells_across_neck_count", 20.0, 18.0, "{:.0f} cells across the neck"),
     Criterion("cells_across_sac_count", 20.0, 14.0, "{:.0f} cells across the sac"),
     Criterion("cells_across_parent_count", 15.0, 12.0, "{:.0f} cells across the parent artery"),
-    Criterion("cells_across_outlet_count", 6.0, 4.0, "{:.1f} cells across the narrowest outlet"),
+    Criterion("cells_across_outlet_count", 6.0, 4.0, "{:.1f} cells across an outlet"),
     Criterion("raised_viscosity_fraction", 0.005, 0.05, "viscosity raised in {:.1%} of the sac and neck", False),
     Criterion("unsettled_fraction", 0.03, 0.1, "uncertainty of convergence {:.1%}", False),
     Criterion("neck_imbalance_fraction", 0.04, 0.08, "inflow and outflow of the neck differ by {:.1%}", False),
@@ -112,8 +118,7 @@ def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) ->
     spacing_mm = field.cell_size_mm
     measures = {"cells_across_parent_count": mean_diameter_mm(case.vessel) / spacing_mm}
     if len(case.vessel.outlets) > 1 and case.settings.outlets != "murray":
-        narrowest_mm = min(outlet.diameter_mm for outlet in case.vessel.outlets)
-        measures["cells_across_outlet_count"] = narrowest_mm / spacing_mm
+        measures["cells_across_outlet_count"] = _narrowest_mm(case.vessel.outlets) / spacing_mm
     if np.isfinite(field.unsettled_fraction):
         measures["unsettled_fraction"] = field.unsettled_fraction
     if case.sac is None or case.ostium is None:
@@ -125,6 +130,12 @@ def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) ->
     if case.settings.engine == LATTICE:
         measures["raised_viscosity_fraction"] = _raised_fraction(case, field)
     return measures
+
+
+def _narrowest_mm(outlets: Sequence[Opening]) -> float:
+    """Return the diameter of the narrowest outlet that carries a share of the flow worth counting."""
+    shares = murray_shares(outlets)
+    return min(outlet.diameter_mm for outlet, share in zip(outlets, shares, strict=True) if share >= COUNTED_SHARE)
 
 
 def _imbalance(field: FlowField, found: Mapping[str, float]) -> float:

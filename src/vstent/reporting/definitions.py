@@ -224,7 +224,8 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "Inscribed diameter within 10 mm of the neck (lower quartile of the widest path) / grid spacing.",
     ),
     "cells_across_outlet_count": Definition(
-        "Cells across the narrowest outlet", "Diameter of the narrowest outlet / grid spacing."
+        "Cells across an outlet",
+        "Diameter of the narrowest outlet with at least 4 % of the outflow by Murray's law / grid spacing.",
     ),
     "raised_viscosity_fraction": Definition(
         "Raised viscosity",
