@@ -36,7 +36,7 @@ HISTORY: Final = 240
 LINES: Final = 70
 """Number of streamlines through the neck."""
 ERROR_POINTS: Final = 6.0
-"""Error band of the preview's reductions in percentage points; the largest error measured is 4 (`benchmarks/live.py`)."""
+"""Error band of the reductions in percentage points; the largest error measured is 4 (`benchmarks/live.py`)."""
 
 
 @dataclass(frozen=True, eq=False)

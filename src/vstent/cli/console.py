@@ -142,6 +142,13 @@ RANKING_COLUMNS: Final = (
     ("metal at neck", "neck_metal_coverage_fraction", "{:.0%}"),
 )
 """Columns of the ranking: title, key of the measure and number format."""
+FLOW_COLUMNS: Final = (
+    ("neck inflow", "neck_inflow_change_fraction", "{:+.0%}"),
+    ("sac velocity", "sac_velocity_change_fraction", "{:+.0%}"),
+    ("±", "flow_uncertainty_fraction", "{:.1%}"),
+    ("flow", "flow_grade", "{}"),
+)
+"""Columns of a ranking by flow: title, key of the measure and number format."""
 
 
 def ranking_table(ranking: Ranking, shown: int) -> Table:
@@ -152,9 +159,11 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
     ranking : the ranking.
     shown : number of candidates to show.
     """
-    table = Table("", "device and size", "shift", "score", *(title for title, _, _ in RANKING_COLUMNS))
+    has_flow = any("flow_grade" in candidate.measures for candidate in ranking.candidates)
+    columns = RANKING_COLUMNS + FLOW_COLUMNS * has_flow
+    table = Table("", "device and size", "shift", "score", *(title for title, _, _ in columns))
     for number, candidate in _shown(ranking, shown):
-        values = [(candidate.measures.get(key), form) for _, key, form in RANKING_COLUMNS]
+        values = [(candidate.measures.get(key), form) for _, key, form in columns]
         cells = ["" if value is None else form.format(value) for value, form in values]
         score = f"{candidate.score:.2f}" if candidate.is_suitable else "out"
         table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells)

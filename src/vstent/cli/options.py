@@ -278,6 +278,13 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def whole(text: str) -> int:
+    """Return a whole number above zero read from text."""
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
+    return int(text)
+
+
 def _jobs(text: str) -> int:
     """Return a number of processes read from text."""
     if not text.isdigit() or int(text) < 1:

@@ -2,9 +2,14 @@
 
 import argparse
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from vstent.cli import options
+
+if TYPE_CHECKING:
+    from vstent.cli.console import Console
+    from vstent.geometry.vessel import Anatomy
+    from vstent.plan.rank import Ranking
 
 SHOWN: Final = 15
 """Number of rows shown on the terminal; the files hold all."""
@@ -29,7 +34,15 @@ def add(commands: options.Commands) -> None:
         metavar="MM,MM,...",
         help="shifts from the proposed landing to try, mm, positive distally (default: 0)",
     )
+    ranking.add_argument(
+        "--flow",
+        dest="flow_count",
+        type=options.whole,
+        metavar="N",
+        help="compute the flow with the N best sizes, the best of each device among them (default: none)",
+    )
     options.add_jobs(ranking)
+    options.add_flow(parser)
     parser.set_defaults(command=_rank)
 
 
@@ -59,8 +72,26 @@ def _rank(arguments: argparse.Namespace) -> int:
             jobs=arguments.jobs,
             progress=lambda done, total: console.progress("rank", done / total, f"{done} of {total}"),
         )
+        if arguments.flow_count:
+            ranking = _with_flows(arguments, anatomy, ranking, console)
     write_ranking(arguments.out, ranking)
     console.print(ranking_table(ranking, SHOWN))
     console.print(ranking_reasons(ranking, SHOWN))
     console.print(f"All in {arguments.out / 'ranking.csv'} and ranking.json. Research use only.")
     return 0
+
+
+def _with_flows(arguments: argparse.Namespace, anatomy: "Anatomy", ranking: "Ranking", console: "Console") -> "Ranking":
+    """Return the ranking with the flows of its best sizes; an interrupted one goes on."""
+    from vstent.plan.rank_flow import rank_flows
+    from vstent.study.flow_store import FlowStore
+
+    settings = options.given_flow(arguments)
+    return rank_flows(
+        anatomy,
+        ranking,
+        settings,
+        arguments.flow_count,
+        stored=FlowStore(arguments.out, anatomy, settings),
+        progress=lambda done, total, name: console.progress("rank by flow", done / total, f"{done} of {total}: {name}"),
+    )

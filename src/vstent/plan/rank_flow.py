@@ -1,0 +1,139 @@
+"""Rank by flow: the best sizes by geometry get a flow, and its reductions join the ranking."""
+
+from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import replace
+from typing import Any, Final
+
+from vstent.anatomy.morphology import Measures
+from vstent.deployment.deploy import deploy, propose_landing
+from vstent.devices.stent import Landing, Stent
+from vstent.errors import FlowError, InputError
+from vstent.flow.case import FlowField, FlowSettings
+from vstent.flow.grade import NOT_USABLE, grade
+from vstent.flow.indices import indices
+from vstent.flow.simulation import flow_case, simulate_case
+from vstent.geometry.vessel import Anatomy
+from vstent.plan.rank import Candidate, Ranking
+
+REDUCED: Final = {
+    "neck_inflow_mL_s": "neck_inflow_change_fraction",
+    "mean_sac_velocity_m_s": "sac_velocity_change_fraction",
+    "mean_sac_wss_Pa": "sac_wss_change_fraction",
+}
+"""Index of a flow, and the measure of its change against the flow without a device."""
+BARE: Final = "bare"
+"""Key of the flow without a device among the stored results."""
+
+Stored = MutableMapping[str, Mapping[str, Any]]
+"""Results of finished flows by key, so that an interrupted ranking goes on."""
+
+
+def rank_flows(
+    anatomy: Anatomy,
+    ranking: Ranking,
+    settings: FlowSettings,
+    count: int,
+    *,
+    stored: Stored | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Ranking:
+    """Compute the flow with the best candidates of a ranking, the best of every device among them.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The restored artery, with a sac.
+    ranking : Ranking
+        The ranking by geometry.
+    settings : FlowSettings
+        Settings of the flows.
+    count : int
+        Number of candidates that get a flow.
+    stored : mutable mapping, optional
+        Finished results; those that are there are not computed again, and new ones are added.
+    progress : callable, optional
+        Called with the number of finished flows, the number of all, and the name of the next.
+
+    Returns
+    -------
+    Ranking
+        The same candidates in the same order; those with a flow have its changes, its uncertainty and its grade among
+        their measures, and a sentence on it among their reasons.
+
+    Raises
+    ------
+    InputError
+        There is no sac, or no candidate is suitable.
+    FlowError
+        The flow without a device cannot be computed.
+    """
+    if not anatomy.aneurysms:
+        raise InputError("A ranking by flow needs a sac, and none was found. Rank without --flow.")
+    chosen = chosen_of(ranking, count)
+    if not chosen:
+        raise InputError("No size is suitable, so there is no flow to compute. Choose another device.")
+    found = {} if stored is None else stored
+    bare: FlowField | None = None
+    results: dict[int, Mapping[str, Any]] = {}
+    for done, candidate in enumerate([None, *chosen]):
+        key = BARE if candidate is None else key_of(candidate)
+        if progress is not None:
+            progress(done, 1 + len(chosen), "no device" if candidate is None else candidate.label)
+        if key not in found or (candidate is None and any(key_of(one) not in found for one in chosen)):
+            bare, found[key] = _computed(anatomy, candidate, settings, bare)
+        if candidate is not None:
+            results[id(candidate)] = found[key]
+    told = (_with_flow(one, found[BARE], results[id(one)]) if id(one) in results else one for one in ranking.candidates)
+    return replace(ranking, candidates=tuple(told))
+
+
+def chosen_of(ranking: Ranking, count: int) -> list[Candidate]:
+    """Return the best suitable candidate of every device, and others in their order, `count` in all if that is more."""
+    best: dict[str, Candidate] = {}
+    for candidate in ranking.suitable:
+        best.setdefault(candidate.design.key, candidate)
+    others = [one for one in ranking.suitable if one is not best[one.design.key]]
+    return [*best.values(), *others[: max(0, count - len(best))]]
+
+
+def key_of(candidate: Candidate) -> str:
+    """Return the key of a candidate among the stored results."""
+    size = candidate.size
+    return f"{candidate.design.key} {size.diameter_mm:g}x{size.length_mm:g} {candidate.shift_mm:+g}"
+
+
+def _computed(
+    anatomy: Anatomy, candidate: Candidate | None, settings: FlowSettings, bare: FlowField | None
+) -> tuple[FlowField | None, Mapping[str, Any]]:
+    """Return the flow without a device, and what is kept of the flow with a candidate or without one."""
+    case = flow_case(anatomy, None if candidate is None else _stent(anatomy, candidate), settings)
+    try:
+        field = simulate_case(case, start=bare)
+    except FlowError as error:
+        if candidate is None:
+            raise
+        return bare, {"error": str(error)}
+    values = indices(field, case.sac, case.ostium)
+    kept = {key: values[key] for key in REDUCED} | {"unsettled_fraction": field.unsettled_fraction}
+    level = grade(case, field, values).level
+    return (field if candidate is None else bare), kept | {"grade": level}
+
+
+def _stent(anatomy: Anatomy, candidate: Candidate) -> Stent:
+    """Return the deployed device of a candidate."""
+    design, size, shift_mm = candidate.design, candidate.size, candidate.shift_mm
+    landing = Landing(propose_landing(design, anatomy, size).abscissa_mm + shift_mm) if shift_mm else None
+    return deploy(design, anatomy, size=size, landing=landing).stent
+
+
+def _with_flow(candidate: Candidate, bare: Mapping[str, Any], flow: Mapping[str, Any]) -> Candidate:
+    """Return a candidate with the changes of its flow among its measures and reasons."""
+    if "error" in flow:
+        return replace(candidate, reason=f"{candidate.reason} Flow not computed: {flow['error']}")
+    found: Measures = {"flow_grade": flow["grade"], "flow_uncertainty_fraction": flow["unsettled_fraction"]}
+    if NOT_USABLE in (flow["grade"], bare["grade"]):
+        return replace(candidate, measures=candidate.measures | found, reason=f"{candidate.reason} Flow: {NOT_USABLE}.")
+    found |= {name: flow[key] / bare[key] - 1 for key, name in REDUCED.items() if bare[key]}
+    inflow, velocity = (float(found[REDUCED[key]]) for key in ("neck_inflow_mL_s", "mean_sac_velocity_m_s"))
+    words = f"Flow ({flow['grade']}): neck inflow {inflow:+.0%}, sac velocity {velocity:+.0%}."
+    return replace(candidate, measures=candidate.measures | found, reason=f"{candidate.reason} {words}")

@@ -1,0 +1,147 @@
+"""Rank by flow: the changes are those of flows of their own, each computed once, and an interrupted ranking goes on."""
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+import vstent
+from vstent import phantoms
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.cli import main
+from vstent.deployment.deploy import deploy
+from vstent.errors import DeviceError, FlowError, InputError
+from vstent.flow.case import FlowSettings
+from vstent.flow.indices import indices
+from vstent.flow.simulation import flow_case, simulate_case
+from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.io.writers import write_stl
+from vstent.plan import rank_flow
+from vstent.plan.rank import Ranking, rank
+from vstent.plan.rank_flow import chosen_of, rank_flows
+from vstent.study.flow_store import FlowStore
+
+SETTINGS = FlowSettings(cells_per_diameter=11.0, inflow_mL_s=1.5, tolerance=0.02)
+
+
+def wall():
+    phantom = phantoms.with_sac(phantoms.tube(length_mm=32.0), abscissa_mm=16.0, width_mm=5.0, neck_mm=3.6)
+    return phantoms.phantom_surface(phantom, edge_mm=0.35)
+
+
+@cache
+def anatomy() -> Anatomy:
+    return restore(trace(Vessel(wall())))
+
+
+@cache
+def ranking() -> Ranking:
+    silk, enterprise = (vstent.find_design(name) for name in ("silk", "enterprise"))
+    return rank(anatomy(), [replace(silk, sizes=silk.sizes[4::9]), enterprise])
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """One entry for every flow that is computed."""
+    calls: list[int] = []
+
+    def counting(case, **more):
+        calls.append(1)
+        return simulate_case(case, **more)
+
+    monkeypatch.setattr(rank_flow, "simulate_case", counting)
+    return calls
+
+
+def test_the_best_of_every_device_is_among_the_chosen() -> None:
+    best, *others = ranking().suitable
+    other = next(one for one in others if one.design.key != best.design.key)
+    assert chosen_of(ranking(), 1) == [best, other]
+    assert chosen_of(ranking(), 3)[:2] == [best, other]
+    assert len(chosen_of(ranking(), 3)) == 3
+    assert len(chosen_of(ranking(), 10**6)) == len(ranking().suitable)
+
+
+def test_changes_are_those_of_flows_of_their_own_and_an_interrupted_ranking_goes_on(counted, tmp_path) -> None:
+    (tmp_path / ".vstent-cache").mkdir(exist_ok=True)
+    seen: list[str] = []
+
+    def stopping(done: int, total: int, name: str) -> None:
+        seen.append(name)
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        rank_flows(
+            anatomy(), ranking(), SETTINGS, 2, stored=FlowStore(tmp_path, anatomy(), SETTINGS), progress=stopping
+        )
+    assert len(counted) == 2
+    found = rank_flows(anatomy(), ranking(), SETTINGS, 2, stored=FlowStore(tmp_path, anatomy(), SETTINGS))
+    assert len(counted) == 4  # the flow without a device once more, and the one that was missing
+    again = rank_flows(anatomy(), ranking(), SETTINGS, 2, stored=FlowStore(tmp_path, anatomy(), SETTINGS))
+    assert len(counted) == 4
+    assert [one.label for one in found.candidates] == [one.label for one in ranking().candidates]
+    with_flow = [one for one in found.candidates if "flow_grade" in one.measures]
+    assert len(with_flow) == 2
+    assert [one.measures for one in again.candidates] == [one.measures for one in found.candidates]
+    bare = flow_case(anatomy(), None, SETTINGS)
+    before = simulate_case(bare)
+    first = with_flow[0]
+    case = flow_case(anatomy(), deploy(first.design, anatomy(), size=first.size).stent, SETTINGS)
+    after = simulate_case(case, start=before)
+    ratio = (
+        indices(after, case.sac, case.ostium)["neck_inflow_mL_s"]
+        / indices(before, bare.sac, bare.ostium)["neck_inflow_mL_s"]
+    )
+    words = first.reason
+    if "neck_inflow_change_fraction" in first.measures:
+        assert first.measures["neck_inflow_change_fraction"] == pytest.approx(ratio - 1)
+        assert f"neck inflow {ratio - 1:+.0%}" in words
+    else:
+        assert words.endswith("Flow: not usable.")
+
+
+def test_a_flow_that_fails_is_a_reason_and_the_others_are_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+
+    def failing(case, **more):
+        calls.append(1)
+        if len(calls) == 2:
+            raise FlowError("it diverged")
+        return simulate_case(case, **more)
+
+    monkeypatch.setattr(rank_flow, "simulate_case", failing)
+    found = rank_flows(anatomy(), ranking(), SETTINGS, 2)
+    first, second = chosen_of(ranking(), 2)
+    by_label = {one.label: one for one in found.candidates}
+    assert by_label[first.label].reason.endswith("Flow not computed: it diverged")
+    assert "flow_grade" in by_label[second.label].measures
+
+
+def test_without_a_sac_or_a_suitable_size_there_is_none() -> None:
+    with pytest.raises(InputError, match="needs a sac"):
+        rank_flows(replace(anatomy(), aneurysms=()), ranking(), SETTINGS, 2)
+    none = replace(ranking(), candidates=tuple(replace(one, is_suitable=False) for one in ranking().candidates))
+    with pytest.raises((InputError, DeviceError), match="No size is suitable"):
+        rank_flows(anatomy(), none, SETTINGS, 2)
+
+
+def test_the_command_prints_and_writes_the_flows(tmp_path, capsys) -> None:
+    write_stl(tmp_path / "a.stl", wall())
+    command = [
+        "rank",
+        str(tmp_path / "a.stl"),
+        "--units",
+        "mm",
+        "--device",
+        "enterprise",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main([*command, "--flow", "1", "--grid-spacing", "0.4", "--flow-rate", "1.5"]) == 0
+    said = capsys.readouterr().out
+    assert "not usable" in said  # 0.4 mm is 9 cells across the neck
+    header, first, *_ = (tmp_path / "out" / "ranking.csv").read_text().splitlines()
+    assert dict(zip(header.split(","), first.split(","), strict=False))["rank"] == "1"
+    assert "flow_grade" in header
