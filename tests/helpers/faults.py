@@ -457,6 +457,33 @@ def _faces() -> np.ndarray:
     return np.array(artery().faces)
 
 
+def _without_a_dome() -> np.ndarray:
+    """Return the faces of the artery without the last 1.5 mm of its sac's dome."""
+    wall, sac = artery(), phantoms.demo_phantom().sac
+    assert sac is not None
+    top_mm = (wall.vertices_mm - sac.center_mm) @ sac.direction
+    return wall.faces[(top_mm[wall.faces] < top_mm.max() - 1.5).all(axis=1)]
+
+
+def _two_walls() -> np.ndarray:
+    """Return the vertices of the artery, and of a wall 0.4 mm outside it."""
+    wall = artery()
+    return np.concatenate([wall.vertices_mm, wall.vertices_mm + 0.4 * wall.vertex_normals])
+
+
+def _two_faces() -> np.ndarray:
+    """Return the faces of both walls; those of the inner one look inwards, as in a hollow model."""
+    faces = artery().faces
+    return np.concatenate([faces[:, ::-1], faces + len(artery().vertices_mm)])
+
+
+def _sheared(part: float) -> bytes:
+    """Return codes, quaternion and rows of a NIfTI header whose second axis leans by `part` towards the first."""
+    rows = np.diag([-SPACING_MM, -SPACING_MM, SPACING_MM]).astype("<f4")
+    rows[0, 1] = part * SPACING_MM
+    return struct.pack("<2h6f", 0, 1, *[0.0] * 6) + np.column_stack([rows, np.zeros(3, "<f4")]).astype("<f4").tobytes()
+
+
 def _doubled() -> Maker:
     return mesh(lambda: artery().corners_mm.reshape(-1, 3), lambda: np.arange(3 * len(_faces())).reshape(-1, 3))
 
@@ -529,6 +556,8 @@ FAULTS: tuple[Fault, ...] = (
     Fault(SHAPE, "no openings", lambda folder: closed_sphere(folder), INPUT, "openings"),
     Fault(SHAPE, "inside out", mesh(_vertices(np.array), lambda: _faces()[:, ::-1]), DONE, "inside out"),
     Fault(SHAPE, "wall that crosses itself", mesh(_vertices(_crossing), _faces), DONE, ""),
+    Fault(SHAPE, "sac cut open", mesh(_vertices(np.array), _without_a_dome), DONE, "cut open"),
+    Fault(SHAPE, "inner and outer wall", mesh(_two_walls, _two_faces), DONE, "inner"),
     Fault(SHAPE, "vertices of every triangle apart", _doubled(), DONE, "merged"),
     Fault(SHAPE, "a million points at one place", _million(), DONE, "merged", is_heavy=True),
     Fault(SCAN, "NIfTI, cut in its header", cut(".nii", 0.005), INPUT, _DAMAGED),
@@ -556,6 +585,9 @@ FAULTS: tuple[Fault, ...] = (
     Fault(SCAN, "NIfTI with a count below zero", nifti(42, struct.pack("<3h", -20, 20, 44)), INPUT, _DAMAGED),
     Fault(SCAN, "NIfTI with voxels of no size", nifti(80, bytes(12)), INPUT, "give --spacing"),
     Fault(SCAN, "NIfTI with voxels of no kind", nifti(70, struct.pack("<2h", 999, 16)), INPUT, _DAMAGED),
+    Fault(SCAN, "NIfTI with scaled voxels", nifti(112, struct.pack("<2f", 0.5, 10.0)), DONE, "Threshold"),
+    Fault(SCAN, "NIfTI with axes sheared by 0.4 %", nifti(252, _sheared(0.004)), DONE, "not perpendicular"),
+    Fault(SCAN, "NIfTI with a gantry tilt of 11 degrees", nifti(252, _sheared(0.2)), DONE, "not perpendicular"),
     Fault(SCAN, "NRRD, cut in its header", cut(".nrrd", b"encoding"), INPUT, _DAMAGED),
     Fault(SCAN, "NRRD, cut in its voxels", cut(".nrrd", 0.5), INPUT, _DAMAGED),
     Fault(SCAN, "NRRD packed, cut in its voxels", cut(".nrrd", 0.5, packed=True), INPUT, _DAMAGED),

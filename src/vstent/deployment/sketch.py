@@ -160,7 +160,7 @@ def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> Floats:
 
 
 def _wires(wall: Bed, nodes_mm: Floats) -> Wires:
-    """Return the wires of the device on its contour."""
+    """Return the wires of the device as polylines on the surface of its contour."""
     return draw(wall.design, wall.size, nodes_mm, _Nothing())
 
 

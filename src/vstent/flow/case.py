@@ -222,9 +222,9 @@ class FlowCase:
 
     @property
     def held_mL_s(self) -> Floats:
-        """Mean flow rate (k,) prescribed at each outlet by Murray's law; nan where the pressure is zero instead.
+        """Mean flow rate (k,) prescribed at each outlet by Murray's law; nan where zero pressure is prescribed instead.
 
-        With Murray's law only the widest outlet has zero pressure, otherwise all outlets.
+        With Murray's law that is the widest outlet. Without it every outlet has zero pressure, and all values are nan.
         """
         outlets = self.vessel.outlets
         held = self.inflow_mL_s * murray_shares(outlets)

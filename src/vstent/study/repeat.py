@@ -123,7 +123,7 @@ def settings_of(told: Mapping[str, Any]) -> Settings:
 
 @cache
 def _adapter() -> "TypeAdapter[Settings]":
-    """Return pydantic's reader of settings."""
+    """Return the pydantic adapter that reads and checks the settings of a study."""
     from pydantic import TypeAdapter  # its ValidationError is a ValueError
 
     return TypeAdapter(Settings)
