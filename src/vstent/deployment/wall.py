@@ -58,7 +58,7 @@ class AbstractWall(ABC):
 
     @abstractmethod
     def contact(self, points_mm: Floats) -> Contact:
-        """Return the wall point nearest to each of the points (n, 3), with its distance and face (see `Contact`), in mm."""
+        """Return the wall point nearest to each of the points (n, 3) in mm, with its distance and face."""
 
     @abstractmethod
     def crosses(self, starts_mm: Floats, ends_mm: Floats) -> Bools:
@@ -74,7 +74,7 @@ class TreeWall(AbstractWall):
     """Landing surface, with normals out of the lumen."""
 
     def contact(self, points_mm: Floats) -> Contact:
-        """Return the wall point nearest to each of the points (n, 3), with its distance and face (see `Contact`), in mm."""
+        """Return the wall point nearest to each of the points (n, 3) in mm, with its distance and face."""
         closest_mm, distance_mm, face = self.surface.closest(points_mm)
         return Contact(closest_mm, distance_mm, self.surface.normals[face], face)
 

@@ -253,7 +253,7 @@ def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) ->
 
 
 def _into_parent(landing: Landing, line: Centerline, bulge: Bulge) -> Centerline | None:
-    """Return the path from a branch into the parent artery, towards the sac unless that turns back; else None."""
+    """Return the path from a branch into the parent artery, towards the sac if possible; None if there is none."""
     depth = landing.solid.signed_distance(line.points_mm)
     inside = np.flatnonzero(depth < -0.5 * line.inscribed_radius_mm)
     if not len(inside):
