@@ -181,7 +181,7 @@ class Desk:
                 for one in self._previews.values():
                     one.stop()  # one at a time: each uses all cores
                 self._previews = {case.id: Preview(live.anatomy, settings)}
-                live.follow = self._previews[case.id].place
+                live.follow(self._previews[case.id].place)
             return self._previews[case.id]
 
     def end_preview(self, case: Case) -> None:
@@ -189,7 +189,7 @@ class Desk:
         with self._lock:
             found = self._previews.pop(case.id, None)
             if case.id in self._lives:
-                self._lives[case.id].follow = None
+                self._lives[case.id].follow(None)
         if found is not None:
             found.stop()
 

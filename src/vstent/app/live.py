@@ -80,7 +80,8 @@ class Live:
 
     def __init__(self, case: Case) -> None:
         self.case = case
-        self.follow: Callable[[Stent], None] | None = None  # takes every device that is drawn, for the live flow
+        self.shown: Stent | None = None  # the device that was drawn last
+        self._follow: Callable[[Stent], None] | None = None
         self._memory: dict[Hashable, Any] = {}
 
     def remembered(self, key: Hashable, find: Callable[[], Found]) -> Found:
@@ -154,10 +155,17 @@ class Live:
         key = ("deployment", self.case.state.anatomy, *choice.model_dump().values())
         return self.remembered(key, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice)))
 
-    def _shown(self, stent: Stent) -> None:
-        """Tell the live flow which device is drawn."""
-        if self.follow is not None:
-            self.follow(stent)
+    def follow(self, take: Callable[[Stent], None] | None) -> None:
+        """Hand the device that is drawn, and every later one, to the live flow; None: to nobody."""
+        self._follow = take
+        if take is not None and self.shown is not None:
+            take(self.shown)
+
+    def _show(self, stent: Stent) -> None:
+        """Note the device that is drawn, and tell the live flow."""
+        self.shown = stent
+        if self._follow is not None:
+            self._follow(stent)
 
     def _field(self, path: Path, moment: int | None) -> FlowField:
         """Return a flow: its mean, or one moment of its last cycle."""
@@ -241,7 +249,7 @@ class Live:
         """
         with LOCK:
             found = self.sketch(choice, landing)
-            self._shown(found.stent)
+            self._show(found.stent)
             wires = _wires(choice.name, found.stent, found.gap_mm, colour, lambda: _formula_coverage(found.stent))
             return message([wires], scales_of([wires], self.anatomy), **_place(found, found.stent))
 
@@ -256,7 +264,7 @@ class Live:
         with LOCK:
             deployment = self.deployment(choice)
             stent, gap_mm = deployment.stent, deployment.wall_gap_mm
-            self._shown(stent)
+            self._show(stent)
             key = (self.case.state.anatomy, *choice.model_dump().values())
             measured = partial(self.remembered, ("coverage", *key), lambda: node_coverage(stent))
             wires = _wires(choice.name, stent, gap_mm, colour, measured)
