@@ -42,7 +42,7 @@ def load(group: Group, name: str, *, built_in: str) -> Any:
     Parameters
     ----------
     group : entry point group.
-    name : name of the entry point.
+    name : which entry point of the group.
     built_in : built-in choices that the error message lists.
 
     Raises

@@ -156,7 +156,7 @@ def test_the_blood_follows_a_device_that_is_dragged(artery, tmp_path):
         page.locator(".handle.distal").focus()
         for _ in range(7):  # 2 mm each, until the neck is free
             page.keyboard.press("PageDown")
-        assert in_time(page, lambda: steady.is_visible() and inflow_percent(page) > over_neck + 5, 120)
+        assert in_time(page, lambda: steady.is_visible() and inflow_percent(page) > over_neck + 5, 300)
         page.locator("#live-flow").uncheck()
         assert not page.locator(".live-cards").is_visible()
 
