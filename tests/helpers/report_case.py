@@ -207,7 +207,8 @@ def case(name="Bent tube with a sac"):
 
 @cache
 def scene():
-    return scene_of(case())
+    shown = case()
+    return scene_of(shown.anatomy, shown.deployments, shown.fields)
 
 
 @cache

@@ -124,5 +124,5 @@ def test_a_contour_that_lies_on_the_wall_from_the_first_is_shown_too():
     still = np.repeat(deployment.history_mm[-1:], 3, axis=0)
     energy, gap = deployment.energy_mm2[:3], np.zeros_like(deployment.wall_gap_mm)
     case.deployments = {"silk": replace(deployment, history_mm=still, energy_mm2=energy, wall_gap_mm=gap)}
-    scene = scene_of(case)
+    scene = scene_of(case.anatomy, case.deployments, case.fields)
     assert _expansion("silk", case.deployments["silk"], case.anatomy, scene).png.startswith(b"\x89PNG")

@@ -16,7 +16,7 @@ from vstent.plan.rank import alternatives, rank
 from vstent.reporting.paper import Paper
 from vstent.reporting.plan_sheet import Planned, plan_pdf
 
-NOTES = tuple(f"A note of some length that tells what was found, number {k}." for k in range(9))
+NOTES = tuple(f"A note that fills a good part of a line on paper, number {k}." for k in range(9))
 
 
 @cache

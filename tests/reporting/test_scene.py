@@ -185,7 +185,7 @@ def test_a_case_without_flow_and_a_healthy_artery_have_scenes():
     healthy = type(anatomy)(
         anatomy.vessel, anatomy.axis, anatomy.section_radius_mm, anatomy.landing_surface, anatomy.is_restored, ()
     )
-    scene = scene_of(SimpleNamespace(anatomy=healthy, deployments={}, fields={}))
+    scene = scene_of(healthy, {}, {})
     assert {layer.id for layer in scene.layers} == {"lumen", "landing", "centerlines", "axis"}
     assert scene.scales == ()
     assert scene.view("profile").axes[2] @ [0, 1, 0] == pytest.approx(np.sign(scene.view("profile").axes[2][1]))

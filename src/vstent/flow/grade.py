@@ -21,8 +21,6 @@ Level = Literal["good", "fair", "not usable"]
 GOOD: Final = "good"
 FAIR: Final = "fair"
 NOT_USABLE: Final = "not usable"
-
-
 COUNTED_SHARE: Final = 0.04
 """Share of the outflow by Murray's law below which an outlet's resistance hardly matters for the sac."""
 
@@ -46,8 +44,8 @@ class Criterion:
         """Return the grade by this measure alone."""
         sign = 1 if self.is_at_least else -1
         if sign * value >= sign * self.good:
-            return "good"
-        return "fair" if sign * value >= sign * self.fair else "not usable"
+            return GOOD
+        return FAIR if sign * value >= sign * self.fair else NOT_USABLE
 
 
 CRITERIA: Final = (
@@ -105,7 +103,7 @@ def grade(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> Grade
 
 def grade_of(measures: Mapping[str, float]) -> Grade:
     """Return the grade that belongs to measures; a measure that is missing is not judged."""
-    order: tuple[Level, ...] = ("not usable", "fair", "good")
+    order: tuple[Level, ...] = (NOT_USABLE, FAIR, GOOD)
     judged = [(one, measures[one.key]) for one in CRITERIA if one.key in measures]
     poor = [(one.level(value), one.phrase.format(value)) for one, value in judged if one.level(value) != GOOD]
     poor.sort(key=lambda pair: order.index(pair[0]))

@@ -1,6 +1,6 @@
 """Rank devices: every size is deployed, measured and graded, and the ranking gives a reason for each score."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeVar
@@ -56,19 +56,6 @@ class Candidate:
         """Names of device and size."""
         return f"{self.design.name} {self.size.label}"
 
-    @property
-    def order(self) -> tuple[bool, bool, float, str, float, float, float]:
-        """Sort key that puts the best first; ties are sorted by name, size and shift, so the order is reproducible."""
-        return (
-            not self.is_suitable,
-            not self.is_proposed,
-            -self.score,
-            self.design.key,
-            self.size.diameter_mm,
-            self.size.length_mm,
-            abs(self.shift_mm),
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
@@ -104,6 +91,23 @@ def _row(number: int, candidate: Candidate) -> dict[str, Any]:
         **{f"grade_{key}": grade for key, grade in candidate.grades.items()},
         **{key: value for key, value in candidate.measures.items() if key not in ("device", "size")},
     }
+
+
+def order_of(row: Mapping[str, Any]) -> tuple[bool, bool, float, str, float, float, float]:
+    """Return the sort key of a row that puts the best first.
+
+    Ties are sorted by name, size and shift, so the order is reproducible. Rows of versions that proposed no size count
+    as not proposed.
+    """
+    return (
+        not row["is_suitable"],
+        not row.get("is_proposed"),
+        -row["score"],
+        row["device"],
+        row["label_diameter_mm"],
+        row["label_length_mm"],
+        abs(row["shift_mm"]),
+    )
 
 
 def rank(
@@ -153,7 +157,7 @@ def rank(
         graded.append(replace(candidate, is_proposed=is_proposed))
         if progress is not None:
             progress(len(graded), len(tasks))
-    return Ranking(tuple(sorted(graded, key=lambda candidate: candidate.order)), criteria)
+    return Ranking(tuple(sorted(graded, key=lambda candidate: order_of(_row(0, candidate)))), criteria)
 
 
 def alternatives(anatomy: Anatomy, design: Design, size: Size, *, count: int = 2) -> tuple[Candidate, ...]:

@@ -6,6 +6,7 @@ from typing import Any, Final
 
 from vstent.anatomy.morphology import Measures
 from vstent.deployment.deploy import deploy, propose_landing
+from vstent.devices.design import BARE
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import FlowError, InputError
 from vstent.flow.case import FlowField, FlowSettings
@@ -21,8 +22,6 @@ REDUCED: Final = {
     "mean_sac_wss_Pa": "sac_wss_change_fraction",
 }
 """Index of a flow, and the measure of its change against the flow without a device."""
-BARE: Final = "bare"
-"""Key of the flow without a device among the stored results."""
 
 Stored = MutableMapping[str, Mapping[str, Any]]
 """Results of finished flows by key, so that an interrupted ranking goes on."""

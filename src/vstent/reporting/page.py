@@ -134,7 +134,7 @@ class Contents:
 
 def contents_of(case: "CaseResult") -> Contents:
     """Return the contents of the report of a case, with all pictures rendered."""
-    scene, metrics = scene_of(case), case.metrics
+    scene, metrics = scene_of(case.anatomy, case.deployments, case.fields), case.metrics
     before, *after = pictures(scene)
     return Contents(
         name=case.name,

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -85,8 +84,7 @@ def _page(paper: Paper, case: Planned, name: str) -> None:
 
 def _picture(case: Planned, name: str) -> Picture:
     """Return the device in profile and seen from the sac."""
-    only = {name: case.deployments[name]}
-    scene = scene_of(SimpleNamespace(anatomy=case.anatomy, deployments=only, fields={}))  # type: ignore[arg-type]
+    scene = scene_of(case.anatomy, {name: case.deployments[name]}, {})
     looks = {
         "profile": ("In profile", ("lumen", "continued", "sac", "wires", "neck")),
         "neck": ("Seen from the sac", ("wires", "neck")),

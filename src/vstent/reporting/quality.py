@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from vstent.devices.design import BARE
-from vstent.flow.grade import NOT_USABLE, QUALITY
+from vstent.flow.grade import FAIR, GOOD, NOT_USABLE, QUALITY
 from vstent.reporting.quantities import format_value
 
-MARKS: Final = {"good": "✓", "fair": "~", NOT_USABLE: "✗"}
+MARKS: Final = {GOOD: "✓", FAIR: "~", NOT_USABLE: "✗"}
 """Sign of every grade, so that color alone never carries it."""
 OF_GRADES: Final = (
     "The grade of a flow follows from its grid, convergence and balance. A flow that is not usable shows no changes: "

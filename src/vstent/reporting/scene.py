@@ -1,8 +1,8 @@
 """Scene of a case: layers with colors, color scales and views, shared by the viewer and the pictures."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -23,9 +23,6 @@ N_INLET, N_NECK = 70, 60
 """Number of streamlines through the inlets and through the neck."""
 BESIDE_SAC_MM = 1.0
 """Distance from the sac, in mm, within which values set the range of the flow's color scales."""
-
-if TYPE_CHECKING:
-    from vstent.study.types import CaseResult
 
 FRONTAL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Axes (3, 3) of the frontal view, rows in LPS: the patient's left is on the right, the head is up."""
@@ -149,20 +146,26 @@ class Scene:
         return tuple(layer for layer in self.layers if layer.id in ids and layer.pane in ("", pane))
 
 
-def scene_of(case: "CaseResult") -> Scene:
-    """Return the scene of a case, decimated to the resolution of a screen."""
-    anatomy: Anatomy = case.anatomy
-    devices = tuple((name, device_title(deployment)) for name, deployment in case.deployments.items())
+def scene_of(anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]) -> Scene:
+    """Return the scene of a case, decimated to the resolution of a screen.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployed devices by name.
+    fields : flows by name, ``bare`` without a device; empty: no flow is shown.
+    """
+    devices = tuple((name, device_title(deployment)) for name, deployment in deployments.items())
     layers: list[MeshLayer | LineLayer] = anatomy_layers(anatomy)
-    for name, deployment in case.deployments.items():
+    for name, deployment in deployments.items():
         layers += [*device_layers(name, deployment, anatomy), coverage_layer(name, deployment.stent)]
-    for name, field in case.fields.items():
+    for name, field in fields.items():
         layers += flow_layers(name, field, anatomy)
     return Scene(
         panes=((BARE, "Before (no device)"), *devices),
         layers=tuple(layers),
         scales=scales_of(layers, anatomy),
-        views=views_of(anatomy, case.deployments),
+        views=views_of(anatomy, deployments),
         is_oriented=anatomy.vessel.is_oriented,
         fade_mm=1.2 * float(np.median(anatomy.section_radius_mm)),
     )
@@ -420,7 +423,7 @@ def _colours(name: str) -> Floats:
     return matplotlib.colormaps[name](np.linspace(0.0, 0.93, 256))[:, :3]
 
 
-def views_of(anatomy: Anatomy, deployments: dict[str, Deployment]) -> tuple[View, ...]:
+def views_of(anatomy: Anatomy, deployments: Mapping[str, Deployment]) -> tuple[View, ...]:
     """Return the views of a case, the profile of the first sac first.
 
     Parameters

@@ -19,7 +19,7 @@ from vstent.geometry.vessel import Anatomy, Centerline, Vessel
 from vstent.io import writers
 from vstent.io.tables import columns_of, write_rows
 from vstent.io.three_mf import write_3mf
-from vstent.plan.rank import Ranking
+from vstent.plan.rank import Ranking, order_of
 from vstent.study.crate import NAME as CRATE
 from vstent.study.provenance import METRICS, RUN
 
@@ -172,14 +172,8 @@ def write_ranking(out: Path, ranking: Ranking) -> None:
 
 
 def _ranked(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of a ranking in order (see `Candidate.order`), numbered anew."""
-    size = ("device", "label_diameter_mm", "label_length_mm")
-
-    def place(row: dict[str, Any]) -> tuple[Any, ...]:
-        first = not row["is_suitable"], not row.get("is_proposed"), -row["score"]
-        return *first, *(row[key] for key in size), abs(row["shift_mm"])
-
-    return [row | {"rank": number} for number, row in enumerate(sorted(rows, key=place), start=1)]
+    """Return the rows of a ranking in order, numbered anew."""
+    return [row | {"rank": number} for number, row in enumerate(sorted(rows, key=order_of), start=1)]
 
 
 def _former_rows(path: Path, ranking: Ranking, criteria: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -20,7 +20,7 @@ from vstent.flow.lattice.close_up import WIDTH
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.screen import build_screen
 from vstent.flow.lattice.state import NECK_INFLOW, State
-from vstent.flow.lattice.stepping import advance, is_at_check, monitored, snapshot
+from vstent.flow.lattice.stepping import advance, monitored, snapshot
 from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
 from vstent.kernels.arrays import Floats
 
@@ -80,15 +80,14 @@ class LiveFlow:
         """Advance the flow without a device until it has converged or its steps are used up."""
         limit = self._engine.max_checks(self.state)
         for check in range(limit):
-            while True:
+            left = None
+            while left is None:  # between checks
                 self._engine.step(self.state)
-                if is_at_check(self.state):
-                    break
+                left = self._engine.terminate(self.state)
             self._readings.append(self.state.history[-1])
-            left = self._engine.terminate(self.state)
             if told is not None:
                 told(0.4 + 0.6 * (check + 1) / limit)
-            if left is not None and left < TOLERANCE:
+            if left < TOLERANCE:
                 return
 
     def place(self, screen: Screen | None) -> None:
