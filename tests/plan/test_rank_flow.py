@@ -102,6 +102,17 @@ def test_changes_are_those_of_flows_of_their_own_and_an_interrupted_ranking_goes
         assert words.endswith("Flow: not usable.")
 
 
+def test_a_flow_of_a_device_whose_numbers_changed_is_not_found(tmp_path) -> None:
+    (tmp_path / ".vstent-cache").mkdir()
+    one = chosen_of(ranking(), 1)[0]
+    FlowStore(tmp_path, anatomy(), SETTINGS)[one] = {"grade": "good"}
+    store = FlowStore(tmp_path, anatomy(), SETTINGS)
+    assert store.get(replace(one, score=0.5)) == {"grade": "good"}
+    assert store.get(None) is None
+    assert store.get(replace(one, shift_mm=one.shift_mm + 1.0)) is None
+    assert store.get(replace(one, design=replace(one.design, maker="another"))) is None
+
+
 def test_a_flow_that_fails_is_a_reason_and_the_others_are_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
 

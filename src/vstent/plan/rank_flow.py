@@ -1,12 +1,11 @@
 """Rank by flow: the best sizes by geometry get a flow, and its reductions join the ranking."""
 
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from vstent.anatomy.morphology import Measures
 from vstent.deployment.deploy import deploy, propose_landing
-from vstent.devices.design import BARE
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import FlowError, InputError
 from vstent.flow.case import FlowField, FlowSettings
@@ -23,8 +22,15 @@ REDUCED: Final = {
 }
 """Index of a flow, and the measure of its change against the flow without a device."""
 
-Stored = MutableMapping[str, Mapping[str, Any]]
-"""Results of finished flows by key, so that an interrupted ranking goes on."""
+
+class Stored(Protocol):
+    """Results of finished flows by candidate, None for the flow without a device; a dict will do."""
+
+    def get(self, candidate: Candidate | None, /) -> Mapping[str, Any] | None:
+        """Return a result, or None if that flow is not finished."""
+
+    def __setitem__(self, candidate: Candidate | None, result: Mapping[str, Any], /) -> None:
+        """Keep a result."""
 
 
 def rank_flows(
@@ -48,8 +54,8 @@ def rank_flows(
         Settings of the flows.
     count : int
         Number of candidates that get a flow.
-    stored : mutable mapping, optional
-        Finished results; those that are there are not computed again, and new ones are added.
+    stored : Stored, optional
+        Finished results by candidate; those that are there are not computed again, and new ones are added.
     progress : callable, optional
         Called with the number of finished flows, the number of all, and the name of the next.
 
@@ -71,18 +77,19 @@ def rank_flows(
     chosen = chosen_of(ranking, count)
     if not chosen:
         raise InputError("No size is suitable, so there is no flow to compute. Choose another device.")
-    found = {} if stored is None else stored
+    found: Stored = {} if stored is None else stored
+    unfinished = [one for one in chosen if found.get(one) is None]
     bare: FlowField | None = None
-    results: dict[int, Mapping[str, Any]] = {}
+    results: dict[Candidate | None, Mapping[str, Any]] = {}
     for done, candidate in enumerate([None, *chosen]):
-        key = BARE if candidate is None else key_of(candidate)
         if progress is not None:
             progress(done, 1 + len(chosen), "no device" if candidate is None else candidate.label)
-        if key not in found or (candidate is None and any(key_of(one) not in found for one in chosen)):
-            bare, found[key] = _computed(anatomy, candidate, settings, bare)
-        if candidate is not None:
-            results[id(candidate)] = found[key]
-    told = (_with_flow(one, found[BARE], results[id(one)]) if id(one) in results else one for one in ranking.candidates)
+        result = found.get(candidate)
+        if result is None or (candidate is None and unfinished):
+            bare, result = _computed(anatomy, candidate, settings, bare)
+            found[candidate] = result
+        results[candidate] = result
+    told = (_with_flow(one, results[None], results[one]) if one in results else one for one in ranking.candidates)
     return replace(ranking, candidates=tuple(told))
 
 
@@ -93,12 +100,6 @@ def chosen_of(ranking: Ranking, count: int) -> list[Candidate]:
         best.setdefault(candidate.design.key, candidate)
     others = [one for one in ranking.suitable if one is not best[one.design.key]]
     return [*best.values(), *others[: max(0, count - len(best))]]
-
-
-def key_of(candidate: Candidate) -> str:
-    """Return the key of a candidate among the stored results."""
-    size = candidate.size
-    return f"{candidate.design.key} {size.diameter_mm:g}x{size.length_mm:g} {candidate.shift_mm:+g}"
 
 
 def _computed(

@@ -1,18 +1,20 @@
 """Stored results of the flows of a ranking, so that an interrupted one goes on."""
 
 import json
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from vstent.devices.design import BARE
 from vstent.flow.case import FlowSettings
 from vstent.geometry.vessel import Anatomy
 from vstent.io.writers import write_json
+from vstent.plan.rank import Candidate
 from vstent.study.folder import CACHE
 from vstent.study.ledger import key_of
 
 
-class FlowStore(MutableMapping[str, Mapping[str, Any]]):
+class FlowStore:
     """Results by candidate, in a file of the cache folder for an anatomy and settings of the flow.
 
     Parameters
@@ -31,19 +33,17 @@ class FlowStore(MutableMapping[str, Mapping[str, Any]]):
         except (OSError, ValueError):
             self._found = {}
 
-    def __getitem__(self, key: str) -> Mapping[str, Any]:
-        found: Mapping[str, Any] = self._found[key]
-        return found
+    def get(self, candidate: Candidate | None) -> Mapping[str, Any] | None:
+        """Return the result with a candidate (None: without a device), or None if there is none of these numbers."""
+        return self._found.get(_name_of(candidate))
 
-    def __setitem__(self, key: str, value: Mapping[str, Any]) -> None:
-        self._found[key] = dict(value)
+    def __setitem__(self, candidate: Candidate | None, result: Mapping[str, Any]) -> None:
+        self._found[_name_of(candidate)] = dict(result)
         write_json(self._path, self._found, is_exact=True)
 
-    def __delitem__(self, key: str) -> None:
-        del self._found[key]
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._found)
-
-    def __len__(self) -> int:
-        return len(self._found)
+def _name_of(candidate: Candidate | None) -> str:
+    """Return the name of a result; it contains a digest of the device's numbers, because a catalogue can change."""
+    if candidate is None:
+        return BARE
+    return f"{candidate.label} {key_of(candidate.design, candidate.size, candidate.shift_mm)}"
