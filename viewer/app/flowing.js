@@ -71,7 +71,7 @@ export class Flowing {
     if (manifest.layers.length) this.host.picture.put({ manifest, buffer });
     const { fraction, is_stale, is_settled, values, reductions, history, error_points } = manifest;
     this.element.classList.toggle("stale", is_stale);
-    if (!reductions.neck_inflow_mL_s) return this.say(`Computing the flow without a device: ${Math.round(100 * fraction)} %`);
+    if (!("neck_inflow_mL_s" in reductions)) return this.say(`Computing the flow without a device: ${Math.round(100 * fraction)} %`);
     const moving = is_stale ? "The device has moved: new values follow." : is_settled ? "Steady." : "The flow is adapting to the device.";
     this.say(`${moving} Grid spacing ${values.grid_spacing_mm.toFixed(2)} mm; differs from the full computation by up to ${error_points.toFixed(0)} percentage points.`);
     this.cards.replaceChildren(

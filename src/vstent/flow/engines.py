@@ -181,17 +181,29 @@ def run(
         return before + perf_counter() - began, loop_before + perf_counter() - loop_began
 
     while len(residual) < limit and not (residual and residual[-1] < tolerance):
-        state = _step(engine, state)
-        reached = engine.terminate(state)
+        state, reached = stepped(engine, state)
         if reached is not None:
-            if np.isnan(reached):
-                raise DivergenceError(engine.trouble(state))
             residual.append(reached)
             if progress is not None:
                 progress(_progress(residual, limit, tolerance, seconds()[1]))
         if saver.is_due():
             saver.save(engine.save(state), residual=residual, seconds=seconds())
     return engine.result(state, Outcome(residual[-1] < tolerance, tuple(residual), *seconds()))
+
+
+def stepped(engine: AbstractEngine[State], state: State) -> tuple[State, float | None]:
+    """Advance an engine once, and return its state and the residual there; None between checks.
+
+    Raises
+    ------
+    DivergenceError
+        The computation diverged.
+    """
+    state = _step(engine, state)
+    residual = engine.terminate(state)
+    if residual is not None and np.isnan(residual):
+        raise DivergenceError(engine.trouble(state))
+    return state, residual
 
 
 class _Saver:

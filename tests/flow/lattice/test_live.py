@@ -12,7 +12,7 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.flow.case import FlowCase, FlowSettings, Screen
 from vstent.flow.domain import default_cell_size_mm
-from vstent.flow.engines import run
+from vstent.flow.engines import DivergenceError, run
 from vstent.flow.indices import indices
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.live import (
@@ -21,6 +21,7 @@ from vstent.flow.lattice.live import (
     LiveFlow,
     preview_spacing_mm,
 )
+from vstent.flow.lattice.state import State
 from vstent.flow.screen import screen
 from vstent.flow.simulation import flow_case
 from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
@@ -97,6 +98,17 @@ def test_an_exchange_changes_the_screen_and_nothing_else(live: LiveFlow) -> None
     assert len(live.state.screen.cell) > 0
     live.place(None)
     assert len(live.state.screen.cell) == 0
+
+
+def test_a_flow_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminate = LatticeBoltzmann.terminate
+
+    def diverging(engine: LatticeBoltzmann, state: State) -> float | None:
+        return terminate(engine, state) if engine.outer is None else float("nan")
+
+    monkeypatch.setattr(LatticeBoltzmann, "terminate", diverging)
+    with pytest.raises(DivergenceError):
+        LiveFlow(case())
 
 
 def test_the_grid_is_as_coarse_as_neck_and_artery_allow() -> None:

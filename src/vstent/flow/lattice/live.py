@@ -15,7 +15,7 @@ import numpy as np
 
 from vstent.flow.case import FlowCase, FlowField, Screen
 from vstent.flow.domain import default_cell_size_mm
-from vstent.flow.engines import run
+from vstent.flow.engines import run, stepped
 from vstent.flow.lattice.close_up import WIDTH
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.screen import build_screen
@@ -57,6 +57,11 @@ class LiveFlow:
         The flow case without a device; it must have a sac and an ostium.
     told : callable, optional
         Called with the fraction that is done while the flow without a device is computed.
+
+    Raises
+    ------
+    FlowError
+        The flow without a device diverges.
     """
 
     def __init__(self, case: FlowCase, told: Callable[[float], None] | None = None) -> None:
@@ -82,8 +87,7 @@ class LiveFlow:
         for check in range(limit):
             left = None
             while left is None:  # between checks
-                self._engine.step(self.state)
-                left = self._engine.terminate(self.state)
+                self.state, left = stepped(self._engine, self.state)
             self._readings.append(self.state.history[-1])
             if told is not None:
                 told(0.4 + 0.6 * (check + 1) / limit)
