@@ -64,6 +64,11 @@ def devices() -> str:
         text.append(f"{len(design.sizes)} sizes, {_range(design.sizes)}.\n\n")
         rows = [[f"``{fact.name}``", fact.confidence, _escaped(fact.source)] for fact in design.facts]
         text.append(table(["number", "confidence", "source"], rows, "20 15 65"))
+        rows = [
+            [f"``{one.name}``", f"{one.value:g}", f"{one.low:g} to {one.high:g}", one.confidence, _escaped(one.reason)]
+            for one in design.ranges
+        ]
+        text.append(table(["number", "value", "range", "confidence", "reason for the range"], rows, "20 10 15 10 45"))
     return "".join(text)
 
 

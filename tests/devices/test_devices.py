@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from vstent.cli import main
-from vstent.devices import catalogue, formulas
+from vstent.devices import catalogue, formulas, ranges
 from vstent.devices import design as device
 from vstent.devices import schema as device_schema
 from vstent.devices.design import Braid, LaserCut, Size
@@ -90,6 +90,34 @@ def test_every_device_of_the_catalogue_is_sourced_and_possible(design):
         assert abs(formulas.deployed_length_mm(design, size, size.diameter_mm) - size.length_mm) <= half_row_mm + 1e-9
 
 
+@pytest.mark.parametrize("design", catalogue.catalogue().values(), ids=catalogue.catalogue())
+def test_every_number_of_the_catalogue_has_a_value_a_range_a_source_and_a_confidence(design):
+    assert [one.name for one in design.ranges] == list(ranges.numbers(design))
+    assert all(one.low <= one.value <= one.high and one.reason and one.confidence for one in design.ranges)
+    assert all(fact.source and fact.confidence for fact in design.facts)
+    for ends in ("low", "high"):
+        values = {one.name: getattr(one, ends) for one in design.ranges}
+        other, size = ranges.altered(design, design.sizes[0], values)  # checks that the device can be made
+        assert formulas.deployed_length_mm(other, size, 0.9 * size.diameter_mm) > 0
+
+
+def test_the_values_of_the_ranges_are_those_of_the_device():
+    for design in catalogue.catalogue().values():
+        size = design.sizes[0]
+        other, same = ranges.altered(design, size, {one.name: one.value for one in design.ranges})
+        assert (other.n_columns, other.angle_rad) == (design.n_columns, design.angle_rad)
+        assert other.wall_offset_um == design.wall_offset_um
+        assert (same.diameter_mm, same.length_mm) == (size.diameter_mm, size.length_mm)
+        assert same.free_diameter_mm == pytest.approx(size.free_diameter_mm, abs=1e-9)
+
+
+def test_a_catalogue_without_ranges_is_read_and_said_to_lack_them():
+    design = device_schema.parse(ENTRY)["x"]
+    assert design.ranges == ()
+    assert "no range for wire_count, wire_diameter_um, braid_angle_rad, free_" in ranges.how_sure(design)
+    assert "no range" not in ranges.how_sure(catalogue.find_design("silk"))
+
+
 def test_an_unknown_device_is_answered_with_the_nearest_and_the_list():
     with pytest.raises(DeviceError, match=r"no device called 'silc'\. Did you mean silk\? Choose one of: derivo"):
         catalogue.find_design("silc")
@@ -143,6 +171,15 @@ def test_a_catalogue_entry_becomes_a_design():
         ("lengths_mm = [10,", "lengths_mm = [1,", "3.00 x 1 mm is shorter than two rows of its cells, which are 0."),
         ('key = "x"', 'key = "bare"', "'bare', which is reserved for the flow without a device"),
         ('name = "X"', 'name = "Bare"', "'bare', which is reserved for the flow without a device"),
+        ("value = 1.0,", "value = 1.0, low = 0.9,", "a range needs its low end, its high end and its reason"),
+        (
+            "value = 1.0,",
+            "value = 1.0, low = 0.9, high = 1.1,",
+            "a range needs its low end, its high end and its reason",
+        ),
+        ("value = 1.0,", 'value = 1.0, low = 1.1, high = 1.2, reason = "why",', "does not contain the value 1"),
+        ("diameter_um = 40,", "diameter_um = 40, diameter_low_um = 30,", "a range needs its low end"),
+        ("lengths_mm = [10, 20],", "lengths_mm = [10, 20], length_tolerance_mm = 1,", "a range needs"),
         ("[[device]]", "[[device", "not valid TOML"),
     ],
 )

@@ -185,6 +185,13 @@ def test_keys_are_those_of_version_0_1_where_newer_settings_are_not_used() -> No
     assert key_of(Settings()) != key_of(Settings(without_flow=("silk",)))
 
 
+def test_flows_of_a_device_without_ranges_are_found_again():
+    design = find_design("silk")
+    assert design.ranges
+    assert key_of(replace(design, ranges=())) == key_of(design)
+    assert key_of(replace(design, braid_angle_rad=1.1)) != key_of(design)
+
+
 def test_a_ranking_of_another_device_keeps_the_rows_of_the_former_one(
     arteries: tuple[Path, Path], tmp_path: Path
 ) -> None:

@@ -37,6 +37,30 @@ class Fact:
 
 
 @dataclass(frozen=True)
+class Range:
+    """Range in which one number of the catalogue lies."""
+
+    name: str
+    """Field of the design, ``wire_count`` and ``wire_diameter_um`` (``wire_2_count`` for the second group of wires, and
+    so on), ``free_diameter_margin_mm`` or ``label_length_mm``."""
+    value: float
+    """Value of the catalogue; 0 for ``label_length_mm``, whose range is the same around every label."""
+    low: float
+    """Smallest plausible value."""
+    high: float
+    """Largest plausible value."""
+    reason: str
+    """Tolerance or class from which the range follows."""
+    confidence: Confidence
+    """How sure the value is."""
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether the range contains more than one value."""
+        return self.high > self.low
+
+
+@dataclass(frozen=True)
 class Size:
     """One size of a device. Its diameters are those of the contour, which runs through the middle of the wires."""
 
@@ -78,6 +102,8 @@ class Braid:
     """Manufacturer."""
     facts: tuple[Fact, ...] = ()
     """Source and confidence of every number."""
+    ranges: tuple[Range, ...] = ()
+    """Range of every number; a number of an older catalogue that states none is left out."""
     kind: Literal["braid"] = field(default="braid", init=False)
     """Device family."""
 
@@ -135,6 +161,8 @@ class LaserCut:
     """Manufacturer."""
     facts: tuple[Fact, ...] = ()
     """Source and confidence of every number."""
+    ranges: tuple[Range, ...] = ()
+    """Range of every number; a number of an older catalogue that states none is left out."""
     kind: Literal["laser_cut"] = field(default="laser_cut", init=False)
     """Device family."""
 

@@ -1,11 +1,15 @@
-"""Schema of the device catalogue: every number has a source and a confidence."""
+"""Schema of the device catalogue: every number has a source, a confidence and a range.
+
+Catalogues of version 0.1 state no ranges. They are read, and their devices have no range for the numbers concerned.
+"""
 
 import tomllib
+from collections.abc import Iterator
 from typing import Annotated, Final, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from vstent.devices.design import BARE, Braid, Confidence, Design, Fact, LaserCut, Size, called
+from vstent.devices.design import BARE, Braid, Confidence, Design, Fact, LaserCut, Range, Size, called
 from vstent.errors import DeviceError
 
 MOST_WIRES: Final = 1000
@@ -41,41 +45,101 @@ class _Strict(BaseModel):
 
 
 class _Sourced(_Strict):
-    """Entry with a source and a confidence."""
+    """Entry with a source, a confidence and the reason for its range."""
 
     source: str = Field(min_length=3)
     confidence: Confidence
+    reason: Annotated[str, Field(min_length=3)] | None = None
+    """Tolerance or class from which the range follows."""
+
+    def _range(self, name: str, value: float, ends: tuple[float | None, float | None]) -> Iterator[Range]:
+        """Yield the range of one number, if it is stated."""
+        if ends[0] is not None and ends[1] is not None:
+            yield Range(name, value, ends[0], ends[1], self.reason or "", self.confidence)
+
+    def _check_range(self, value: float, ends: tuple[float | None, float | None]) -> None:
+        """Raise a ValueError if a range lacks an end or its reason, or does not contain the value."""
+        if ends == (None, None):
+            return
+        if ends[0] is None or ends[1] is None or self.reason is None:
+            raise ValueError("a range needs its low end, its high end and its reason")
+        if not ends[0] <= value <= ends[1]:
+            raise ValueError(f"the range {ends[0]:g} to {ends[1]:g} does not contain the value {value:g}")
 
 
-class _Number(_Sourced):
+class _Ranged(_Sourced):
+    """Entry of one number with its range."""
+
+    value: FiniteFloat
+    low: FiniteFloat | None = None
+    """Smallest plausible value."""
+    high: FiniteFloat | None = None
+    """Largest plausible value."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "_Ranged":
+        """Return the entry, or raise a ValueError if its range is invalid."""
+        self._check_range(self.value, (self.low, self.high))
+        return self
+
+    def ranges(self, name: str) -> Iterator[Range]:
+        """Yield the range of the number, if it is stated."""
+        yield from self._range(name, self.value, (self.low, self.high))
+
+
+class _Number(_Ranged):
     """Positive number."""
 
     value: _Positive
 
 
-class _Width(_Sourced):
+class _Width(_Ranged):
     """Width or thickness of a strut, in um."""
 
     value: _Width_um
+    low: _Width_um | None = None
+    high: _Width_um | None = None
 
 
-class _Count(_Sourced):
+class _Count(_Ranged):
     """Number of wires or columns."""
 
     value: _Whole
+    low: _Whole | None = None
+    high: _Whole | None = None
 
 
-class _Margin(_Sourced):
+class _Margin(_Ranged):
     """Free diameter minus label diameter, in mm."""
 
     value: Annotated[float, Field(ge=0, le=1)]
+    low: Annotated[float, Field(ge=-1, le=1)] | None = None
+    high: Annotated[float, Field(ge=-1, le=1)] | None = None
 
 
 class _Wires(_Sourced):
     """Group of equal wires."""
 
     count: _Whole
+    count_low: _Whole | None = None
+    count_high: _Whole | None = None
     diameter_um: _Width_um
+    diameter_low_um: _Width_um | None = None
+    diameter_high_um: _Width_um | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "_Wires":
+        """Return the entry, or raise a ValueError if a range is invalid."""
+        self._check_range(self.count, (self.count_low, self.count_high))
+        self._check_range(self.diameter_um, (self.diameter_low_um, self.diameter_high_um))
+        return self
+
+    def ranges(self, group: int) -> Iterator[Range]:
+        """Yield the stated ranges of count and diameter; `group` counts from 1."""
+        nth = f"_{group}" if group > 1 else ""
+        yield from self._range(f"wire{nth}_count", self.count, (self.count_low, self.count_high))
+        ends_um = self.diameter_low_um, self.diameter_high_um
+        yield from self._range(f"wire{nth}_diameter_um", self.diameter_um, ends_um)
 
 
 class _Sizes(_Sourced):
@@ -83,6 +147,24 @@ class _Sizes(_Sourced):
 
     diameters_mm: _Lengths_mm
     lengths_mm: _Lengths_mm
+    length_tolerance_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)] | None = None
+    """Largest difference to either side between the label length and the length at the label diameter, in mm."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "_Sizes":
+        """Return the entry, or raise a ValueError if its tolerance has no reason."""
+        self._check_range(0.0, self._ends_mm)
+        return self
+
+    @property
+    def _ends_mm(self) -> tuple[float | None, float | None]:
+        """Ends of the range of the label length around its value, in mm."""
+        by_mm = self.length_tolerance_mm
+        return (None, None) if by_mm is None else (-by_mm, by_mm)
+
+    def ranges(self) -> Iterator[Range]:
+        """Yield the range of the label length around its value, if it is stated."""
+        yield from self._range("label_length_mm", 0.0, self._ends_mm)
 
 
 class _Device(_Strict):
@@ -100,6 +182,12 @@ class _Device(_Strict):
         margin_mm = self.free_diameter_margin_mm.value
         pairs = {(d, length) for block in self.sizes for d in block.diameters_mm for length in block.lengths_mm}
         return tuple(Size(d, length, round(d + margin_mm, 6)) for d, length in sorted(pairs))
+
+    def _shared_ranges(self) -> tuple[Range, ...]:
+        """Return the ranges of the numbers that both families have; of blocks of sizes the widest."""
+        lengths = [one for block in self.sizes for one in block.ranges()]
+        widest = sorted(lengths, key=lambda one: one.high)[-1:]
+        return (*self.free_diameter_margin_mm.ranges("free_diameter_margin_mm"), *widest)
 
     def _shared_facts(self) -> tuple[Fact, ...]:
         """Return the sources of the numbers that both families have."""
@@ -120,6 +208,7 @@ class _Braid(_Device):
         """Return the braid."""
         facts = (*(_fact("wires", group) for group in self.wires), _fact("braid_angle_rad", self.braid_angle_rad))
         groups = tuple((group.count, group.diameter_um) for group in self.wires)
+        of_wires = (one for number, group in enumerate(self.wires, start=1) for one in group.ranges(number))
         return Braid(
             key=self.key,
             name=self.name,
@@ -128,6 +217,7 @@ class _Braid(_Device):
             sizes=self._sizes(),
             maker=self.maker,
             facts=facts + self._shared_facts(),
+            ranges=(*of_wires, *self.braid_angle_rad.ranges("braid_angle_rad"), *self._shared_ranges()),
         )
 
 
@@ -153,6 +243,7 @@ class _LaserCut(_Device):
             sizes=self._sizes(),
             maker=self.maker,
             facts=tuple(_fact(name, getattr(self, name)) for name in names) + self._shared_facts(),
+            ranges=tuple(one for name in names for one in getattr(self, name).ranges(name)) + self._shared_ranges(),
         )
 
 

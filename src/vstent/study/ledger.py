@@ -10,6 +10,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from vstent.devices.design import Braid, LaserCut
 from vstent.errors import ReadError
 from vstent.flow.engines import Progress as FlowProgress
 from vstent.io.archive import load_data, save_data
@@ -205,4 +206,6 @@ _LATER: Final = {"without_flow": (), "acquisition": None, "frame": None}
 def _plain(part: Any) -> dict[str, Any]:
     """Return the fields of a data class that a key depends on."""
     fields = asdict(part)
+    if isinstance(part, (Braid, LaserCut)):
+        fields.pop("ranges")  # they change the bands, but no deployment and no flow
     return {key: value for key, value in fields.items() if key not in _LATER or value != _LATER[key]}

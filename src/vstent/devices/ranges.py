@@ -1,0 +1,92 @@
+"""Ranges of the numbers of a device: which are uncertain, which lack a range, and the device with other values."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from vstent.devices.design import Braid, Design, LaserCut, Range, Size
+
+MARGIN = "free_diameter_margin_mm"
+"""Name of the free diameter minus the label diameter."""
+LENGTH = "label_length_mm"
+"""Name of the difference between the length at the label diameter and the label length."""
+
+
+def numbers(design: Design) -> tuple[str, ...]:
+    """Return the names of all numbers of a device, as `Range.name` has them."""
+    if isinstance(design, LaserCut):
+        return ("n_columns", "strut_width_um", "strut_thickness_um", "cell_angle_rad", MARGIN, LENGTH)
+    groups = ("" if group == 1 else f"_{group}" for group in range(1, len(design.wires) + 1))
+    of_wires = (f"wire{group}_{what}" for group in groups for what in ("count", "diameter_um"))
+    return (*of_wires, "braid_angle_rad", MARGIN, LENGTH)
+
+
+def uncertain(design: Design) -> tuple[Range, ...]:
+    """Return the ranges of a device that contain more than one value."""
+    return tuple(one for one in design.ranges if one.is_wide)
+
+
+def without_range(design: Design) -> tuple[str, ...]:
+    """Return the names of the numbers whose catalogue entry states no range."""
+    known = {one.name for one in design.ranges}
+    return tuple(name for name in numbers(design) if name not in known)
+
+
+def altered(design: Design, size: Size, values: Mapping[str, float]) -> tuple[Design, Size]:
+    """Return a device and its size with other values of its numbers.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    size : Size
+        Its size.
+    values : dict
+        New values by the name of the number (`Range.name`). Counts are rounded to the nearest even number. The value of
+        ``label_length_mm`` is added to the length.
+
+    Returns
+    -------
+    design : Design
+        The device; it offers only the altered size.
+    size : Size
+        The altered size. Its label diameter stays, and its free diameter follows the margin.
+    """
+    margin_mm = values.get(MARGIN, size.free_diameter_mm - size.diameter_mm)
+    free_mm, length_mm = size.diameter_mm + margin_mm, size.length_mm + values.get(LENGTH, 0.0)
+    size = replace(size, free_diameter_mm=free_mm, length_mm=length_mm)
+    if isinstance(design, Braid):
+        wires = tuple(_wires(k, group, values) for k, group in enumerate(design.wires, start=1))
+        angle_rad = values.get("braid_angle_rad", design.braid_angle_rad)
+        return replace(design, wires=wires, braid_angle_rad=angle_rad, sizes=(size,)), size
+    fields = {
+        name: values[name] for name in ("strut_width_um", "strut_thickness_um", "cell_angle_rad") if name in values
+    }
+    columns = _even(values.get("n_columns", design.n_columns))
+    return replace(design, n_columns=columns, sizes=(size,), **fields), size  # type: ignore[arg-type]
+
+
+def _wires(number: int, group: tuple[int, float], values: Mapping[str, float]) -> tuple[int, float]:
+    """Return count and diameter (um) of the group of wires with this number, with other values."""
+    name = "wire" if number == 1 else f"wire_{number}"
+    return _even(values.get(f"{name}_count", group[0])), values.get(f"{name}_diameter_um", group[1])
+
+
+def _even(count: float) -> int:
+    """Return the nearest even number."""
+    return 2 * int(np.floor(0.5 * count + 0.5))
+
+
+def how_sure(design: Design) -> str:
+    """Return one sentence on how well the numbers of a device are known, and one more on missing ranges."""
+    levels = Counter(fact.confidence for fact in design.facts)
+    counted = ", ".join(f"{levels[level]} {level}" for level in ("cited", "derived", "estimated") if levels[level])
+    missing = without_range(design)
+    left = (
+        f" Its catalogue entry states no range for {', '.join(missing)}; their uncertainty is not part of the bands."
+        if missing
+        else ""
+    )
+    return f"Numbers of {design.name}: {counted}.{left}" if counted else f"{design.name} has no sources.{left}"
