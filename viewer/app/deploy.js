@@ -1,18 +1,20 @@
 // A device on the parent axis: handles at both ends that slide along it, the stent that follows, the cursor of the section.
 import { make } from "../src/dom.js";
-import { get, Newest, postBinary } from "./api.js";
+import { get, Newest, post, postBinary } from "./api.js";
 import { label, makeHandle } from "./handles.js";
 
 const STEP_MM = 0.2;
+const REST_MS = 400; // the bands are asked for when the device has lain still for so long, so that a drag never waits for them
 
 export class Deploying {
-  /** @param host {path, picture, along, section, colour(), choice(name), chosen(name, centerMm), told(name, manifest), failed} */
+  /** @param host {path, picture, along, section, colour(), choice(name), chosen(name, centerMm), told(name, manifest), banded(sheet or null), failed} */
   constructor(host) {
     this.host = host;
     this.name = null;
     this.place = null;
     this.sketches = new Newest((answer) => this.sketched(answer), host.failed);
     this.whole = new Newest((answer) => this.deployed(answer), host.failed);
+    this.bands = new Newest((sheet) => !this.isDragging && host.banded(sheet), host.failed);
     this.sections = new Newest((answer) => host.section.show(answer), () => {});
     this.cursorMark = { element: make("i", { className: "cursor-mark" }), point: () => this.cursor !== undefined && this.axis.at(this.cursor) };
     this.handles = ["proximal", "distal"].map((end, i) => this.handle(end, i));
@@ -35,6 +37,7 @@ export class Deploying {
 
   slide(anchor, mm) {
     this.wanted = mm;
+    if (!this.isDragging) this.host.banded(null);
     this.isDragging = true;
     const [device, colour] = [this.host.choice(this.name), this.host.colour()];
     this.sketches.ask(() =>
@@ -78,6 +81,11 @@ export class Deploying {
     if (this.isDragging) return;
     this.take(answer);
     this.host.told(this.name, answer.manifest, true);
+    const device = this.host.choice(this.name);
+    clearTimeout(this.rest);
+    this.rest = setTimeout(() => {
+      if (!this.isDragging && device) this.bands.ask(() => post(`${this.host.path()}/bands`, { device }));
+    }, REST_MS);
   }
 
   take(answer) {

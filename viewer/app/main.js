@@ -6,7 +6,7 @@ import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js
 import { Deploying } from "./deploy.js";
 import { Flowing } from "./flowing.js";
 import { Neck } from "./neck.js";
-import { changeSheet, neckWords, placeWords, plainSheet, qualitySheet, sureSheet } from "./numbers.js";
+import { bandWords, changeSheet, neckWords, placeWords, plainSheet, qualitySheet, sureSheet } from "./numbers.js";
 import { panels, placeOf, spokenRole } from "./panels.js";
 import { Picture } from "./picture.js";
 import { rankingTable } from "./ranking.js";
@@ -131,6 +131,7 @@ class Page {
       choice: (name) => this.view.choices.devices.find((device) => device.name === name),
       chosen: (name, center) => this.choose(center.then((mm) => deviceWith(name, { center_mm: Number(mm.toFixed(3)) }))),
       told: (name, manifest, isWhole) => this.toldDevice(name, manifest, isWhole),
+      banded: (sheet) => this.toldBands(sheet),
       failed: (problem) => this.complain(problem),
     });
     this.neck = new Neck({
@@ -479,6 +480,12 @@ class Page {
     }
     const place = this.panel.querySelector(".place");
     if (place) place.replaceChildren(...placeWords(manifest));
+  }
+
+  /** The bands of the device that lies still; null while it is dragged. */
+  toldBands(sheet) {
+    this.bands = sheet;
+    this.panel.querySelector(".bands")?.replaceChildren(...bandWords(sheet));
   }
 
   /** A stage of a job in words: ``flow silk``. */

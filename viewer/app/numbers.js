@@ -80,6 +80,16 @@ export function placeWords({ length_mm, length_band_mm, ends_mm, ends_band_mm })
   return rows.map(([name, value, range]) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [range])]));
 }
 
+/** How sure a device is: a sentence, and the band of each result with its largest cause. */
+export function bandWords(sheet) {
+  if (!sheet) return [];
+  const rows = sheet.rows.map(([name, value, low, high, cause]) =>
+    make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [`${low} to ${high}${cause ? `: ${cause}` : ""}`])]),
+  );
+  const details = make("details", {}, [make("summary", {}, ["Bands from the ranges of the device's numbers"]), ...rows]);
+  return [make("p", { className: "hint" }, [sheet.sentence]), ...(rows.length ? [details] : [])];
+}
+
 /** A neck as it is drawn, beside the one that was found. */
 export function neckWords(neck, found) {
   const row = (name, value, was) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [value === was ? "" : `of the vessel shown: ${was}`])]);

@@ -1,6 +1,6 @@
 // The left side: what each step is, what can be chosen in it, and its one main button.
 import { make } from "../src/dom.js";
-import { placeWords } from "./numbers.js";
+import { bandWords, placeWords } from "./numbers.js";
 
 /** Position of an opening, in the form of a study's settings. */
 export const placeOf = ({ center_mm }) => center_mm.map((x) => Number(x.toFixed(2)));
@@ -154,7 +154,9 @@ export const panels = {
     parts.push(make("div", { className: "tabs", role: "group", ariaLabel: "Device" }, tabs), ...sizes(page));
     const place = make("div", { className: "place" });
     if (page.place && page.deploying.name === page.device) place.append(...placeWords(page.place));
-    parts.push(place, ...colours(page), expansion(page));
+    const bands = make("div", { className: "bands" });
+    if (page.bands?.device === page.device) bands.append(...bandWords(page.bands));
+    parts.push(place, bands, ...colours(page), expansion(page));
     if (page.anatomy?.neck?.length) parts.push(page.flowing.element);
     parts.push(make("p", { className: "advice" }, [page.advice && page.deploying.name === page.device ? page.advice : ""]), ...failure(page));
     parts.push(make("a", { className: "button wide", href: `${page.path}/plan.pdf`, target: "_blank", rel: "noopener" }, ["One-page plan (PDF)"]));

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, TypeVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vstent.anatomy.morphology import morphology
+from vstent.anatomy.morphology import Measures, morphology
 from vstent.app import necks, sheets
 from vstent.app.cases import Case
 from vstent.app.choices import DeviceChoice, placing_of
@@ -24,6 +24,7 @@ from vstent.deployment.sketch import Bed, Sketch, bed, sketch
 from vstent.devices.catalogue import find_design
 from vstent.devices.design import BARE
 from vstent.devices.formulas import coverage_fraction
+from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import InputError, ReadError
 from vstent.flow.case import FlowField
@@ -32,6 +33,8 @@ from vstent.geometry.vessel import Anatomy, Opening
 from vstent.io.archive import load_data
 from vstent.kernels import clipping
 from vstent.kernels.arrays import Floats
+from vstent.plan.bands import bands
+from vstent.reporting import bands as words
 from vstent.reporting.packing import message
 from vstent.reporting.scene import (
     LineLayer,
@@ -155,6 +158,29 @@ class Live:
         key = ("deployment", self.case.state.anatomy, *choice.model_dump().values())
         return self.remembered(key, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice)))
 
+    def measures(self, choice: DeviceChoice) -> Measures:
+        """Return the measures of the deployed device."""
+        key = ("measures", self.case.state.anatomy, *choice.model_dump().values())
+        return self.remembered(key, lambda: measure(self.anatomy, self.deployment(choice)))
+
+    def bands(self, choice: DeviceChoice) -> dict[str, Any]:
+        """Return the bands of the deployed device and how sure it is, as in the metrics of a study."""
+        key = ("bands", self.case.state.anatomy, *choice.model_dump().values())
+        is_proposed = choice.diameter_mm is None and choice.length_mm is None
+
+        def find() -> dict[str, Any]:
+            deployment = self.deployment(choice)
+            found = bands(self.anatomy, deployment, self.measures(choice), is_proposed=is_proposed)
+            return found.metrics() | {"device": how_sure(deployment.stent.design)}
+
+        return self.remembered(key, find)
+
+    def bands_sheet(self, choice: DeviceChoice) -> dict[str, Any]:
+        """Return the bands of the deployed device as the page shows them."""
+        with LOCK:
+            metrics = {"deployment": self.measures(choice), "bands": self.bands(choice)}
+        return {"device": choice.name, "sentence": words.how_sure(metrics), "rows": words.rows(metrics)}
+
     def follow(self, take: Callable[[Stent], None] | None) -> None:
         """Hand the device that is drawn, and every later one, to the live flow; None: to nobody."""
         self._follow = take
@@ -197,8 +223,9 @@ class Live:
             raise InputError("No device is chosen. Choose one in the step Device.")
         with LOCK:
             found = {choice.name: self.deployment(choice) for choice in state.choices.devices}
-            measures = {name: measure(self.anatomy, one) for name, one in found.items()}
-            return plan_pdf(Planned(state.name, self.anatomy, found, measures, state.source, day))
+            measures = {choice.name: self.measures(choice) for choice in state.choices.devices}
+            told = {choice.name: self.bands(choice) for choice in state.choices.devices}
+            return plan_pdf(Planned(state.name, self.anatomy, found, measures, state.source, day, told))
 
     # -- messages for the page -----------------------------------------------------------------------------------------
 
@@ -272,14 +299,13 @@ class Live:
             layers = [wires, contour]
             center_mm = choice.center_mm if choice.center_mm is not None else _center_mm(stent)
             found = laid_inside(partial(sketch, self.bed(choice)), Landing(center_mm))
-            measures = self.remembered(("measures", *key), lambda: measure(self.anatomy, deployment))
             return message(
                 layers,
                 scales_of(layers, self.anatomy),
                 **_place(found, stent),
                 title=device_title(deployment),
                 advice=deployment.advice,
-                measures=sheets.device(device_title(deployment), measures),
+                measures=sheets.device(device_title(deployment), self.measures(choice)),
             )
 
     def flow_message(self, moment: int | None) -> bytes:

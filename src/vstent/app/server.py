@@ -309,6 +309,10 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
         desk.note_deployed(found, wanted.device)
         return Response(answer, media_type=BINARY)
 
+    @api.post("/api/cases/{case_id}/bands", summary="Bands of a deployed device from the ranges of its numbers")
+    def bands(case_id: str, wanted: DeviceWanted) -> dict[str, Any]:
+        return desk.live(desk.store.get(case_id)).bands_sheet(wanted.device)
+
     @api.get("/api/cases/{case_id}/section", summary="The section by a plane across the parent axis")
     def section(case_id: str, abscissa_mm: Finite, device: str | None = None) -> dict[str, Any]:
         return desk.live(desk.store.get(case_id)).section(device, abscissa_mm)

@@ -89,7 +89,7 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
     table = Table("", "bare", *stents)
     for title, key in DEVICE_ROWS:
         if any(key in stent["deployment"] for stent in stents.values()):
-            table.add_row(title, "", *(_cell(key, stent["deployment"].get(key)) for stent in stents.values()))
+            table.add_row(title, "", *(_banded(key, stent) for stent in stents.values()))
     if "bare" not in metrics:
         return table
     table.add_section()
@@ -100,6 +100,20 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
             continue
         table.add_row(title, *_flow_cells(metrics, key, bare))
     return table
+
+
+def _banded(key: str, stent: Mapping[str, Any]) -> str:
+    """Return a measure of a deployment with its band."""
+    from vstent.reporting.bands import ends
+
+    return f"{_cell(key, stent['deployment'].get(key))} {_spaced(ends(stent, key))}".rstrip()
+
+
+def device_sentences(metrics: Mapping[str, Any]) -> list[str]:
+    """Return how sure each device is, one text each; metrics of earlier versions do not state it."""
+    from vstent.reporting.bands import how_sure
+
+    return [_spaced(sentence) for stent in metrics["stents"].values() if (sentence := how_sure(stent))]
 
 
 def _add_grades(table: Table, metrics: Mapping[str, Any]) -> None:
@@ -165,14 +179,22 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
     for number, candidate in _shown(ranking, shown):
         values = [(candidate.measures.get(key), form) for _, key, form in columns]
         cells = ["" if value is None else form.format(value) for value, form in values]
+        cells[0] += _length_band(candidate.measures)
         score = f"{candidate.score:.2f}" if candidate.is_suitable else "out"
         table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells)
     table.columns[1].no_wrap = True
     table.caption = (
         f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable. First the size that vstent run "
-        "proposes for each device."
+        "proposes for each device. In brackets: 95 % band from the ranges of the device's numbers."
     )
     return table
+
+
+def _length_band(measures: Mapping[str, Any]) -> str:
+    """Return the band of the deployed length in brackets; empty where there is none."""
+    if "deployed_length_low_mm" not in measures:
+        return ""
+    return f" ({measures['deployed_length_low_mm']:.1f}-{measures['deployed_length_high_mm']:.1f})"
 
 
 def ranking_reasons(ranking: Ranking, shown: int) -> str:

@@ -86,7 +86,7 @@ def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool, repl
     is_printed : whether the report is also written as PDF.
     replaces : whether results of another input or of other settings are replaced.
     """
-    from vstent.cli.console import Console, comparison_table, uncertainty_table
+    from vstent.cli.console import Console, comparison_table, device_sentences, uncertainty_table
     from vstent.study.pipeline import run
 
     console = Console()
@@ -98,6 +98,8 @@ def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool, repl
         write_report(case, out, is_printed=is_printed)
         console.progress("report", 1.0, str(out / "report.html"))
     console.print(comparison_table(case.metrics))
+    for sentence in device_sentences(case.metrics):
+        console.print(sentence)
     if settings.uncertainty is not None:
         console.print(uncertainty_table(case.metrics))
     for name, sentence in case.failures.items():

@@ -54,18 +54,49 @@ def altered(design: Design, size: Size, values: Mapping[str, float]) -> tuple[De
     size : Size
         The altered size. Its label diameter stays, and its free diameter follows the margin.
     """
+    size = _size(size, values)
+    return _design(design, (size,), values), size
+
+
+def altered_sizes(design: Design, values: Mapping[str, float]) -> tuple[Design, dict[Size, Size]]:
+    """Return a device with other values of its numbers in all its sizes.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    values : dict
+        New values by the name of the number, as in `altered`.
+
+    Returns
+    -------
+    design : Design
+        The device with all its sizes altered.
+    originals : dict
+        Size of the catalogue by altered size.
+    """
+    originals = {_size(size, values): size for size in design.sizes}
+    return _design(design, tuple(originals), values), originals
+
+
+def _size(size: Size, values: Mapping[str, float]) -> Size:
+    """Return a size with other values of margin and length."""
     margin_mm = values.get(MARGIN, size.free_diameter_mm - size.diameter_mm)
-    free_mm, length_mm = size.diameter_mm + margin_mm, size.length_mm + values.get(LENGTH, 0.0)
-    size = replace(size, free_diameter_mm=free_mm, length_mm=length_mm)
+    length_mm = size.length_mm + values.get(LENGTH, 0.0)
+    return replace(size, free_diameter_mm=size.diameter_mm + margin_mm, length_mm=length_mm)
+
+
+def _design(design: Design, sizes: tuple[Size, ...], values: Mapping[str, float]) -> Design:
+    """Return a device with other sizes and other values of its wires or struts."""
     if isinstance(design, Braid):
         wires = tuple(_wires(k, group, values) for k, group in enumerate(design.wires, start=1))
         angle_rad = values.get("braid_angle_rad", design.braid_angle_rad)
-        return replace(design, wires=wires, braid_angle_rad=angle_rad, sizes=(size,)), size
+        return replace(design, wires=wires, braid_angle_rad=angle_rad, sizes=sizes)
     fields = {
         name: values[name] for name in ("strut_width_um", "strut_thickness_um", "cell_angle_rad") if name in values
     }
     columns = _even(values.get("n_columns", design.n_columns))
-    return replace(design, n_columns=columns, sizes=(size,), **fields), size  # type: ignore[arg-type]
+    return replace(design, n_columns=columns, sizes=sizes, **fields)  # type: ignore[arg-type]
 
 
 def _wires(number: int, group: tuple[int, float], values: Mapping[str, float]) -> tuple[int, float]:

@@ -13,11 +13,12 @@ from vstent.deployment.deploy import deploy, propose_landing
 from vstent.deployment.measure import measure
 from vstent.deployment.sizing import propose_size
 from vstent.devices.design import Design, Size
-from vstent.devices.stent import Landing
+from vstent.devices.stent import Deployment, Landing
 from vstent.errors import InputError, LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats
+from vstent.plan.bands import length_band
 from vstent.plan.criteria import Criteria, Criterion, default_criteria
 from vstent.plan.workers import spread
 
@@ -216,8 +217,19 @@ def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) 
     weight = sum(item.weight for item in asked)
     score = sum(item.weight * grades[item.key] for item in asked) / weight if weight else 0.0
     is_suitable = all(grades.values())
+    if is_suitable:
+        measures |= _length_band(anatomy, deployment, measures)
     reason = _reason(asked, grades, measures)
     return Candidate(design, size, shift_mm, measures, grades, score, is_suitable, reason)
+
+
+def _length_band(anatomy: Anatomy, deployment: Deployment, measures: Measures) -> Measures:
+    """Return the ends of the band of the deployed length and its main cause; empty for a device without ranges."""
+    band = length_band(anatomy, deployment, measures)
+    if band is None:
+        return {}
+    cause: Measures = {"deployed_length_band_cause": next(iter(band.shares))} if band.shares else {}
+    return {"deployed_length_low_mm": band.low, "deployed_length_high_mm": band.high} | cause
 
 
 def landing_measures(anatomy: Anatomy, measures: Measures) -> Measures:

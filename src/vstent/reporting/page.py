@@ -16,6 +16,7 @@ from vstent.devices.design import BARE
 from vstent.devices.stent import Deployment
 from vstent.flow.case import LATTICE, OPENFOAM
 from vstent.flow.grade import QUALITY
+from vstent.reporting import bands
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
 from vstent.reporting.figures import Picture, pictures
 from vstent.reporting.method import method_pictures
@@ -50,6 +51,8 @@ AT_OUTLETS: Final = {
     "murray": "the flow is split among the outlets by their diameter cubed, not measured in the patient",
 }
 """Limit that a report states, by the outlet setting of the flow."""
+SHOWN: Final = ("deployment", "bands", "flow", "ratios", "uncertainty")
+"""Metrics of a device that have a section of their own."""
 AT_INLETS: Final = "The flow through each inlet is assumed, not measured in the patient."
 """Limit that a report states where the vessel has several inlets."""
 OF_DEVICE: Final = {
@@ -272,6 +275,8 @@ def _stent(name: str, deployment: Deployment, metrics: dict[str, Any]) -> dict[s
         "words": f"{wires}. The contour {how} after {steps}, in {deployment.seconds:.2f} s.",
         "advice": deployment.advice,
         "quantities": values,
+        "how_sure": bands.how_sure(measured),
+        "bands": bands.rows(measured),
         "facts": [(Quantity((f.name,), None).name, f"{f.confidence}: {f.source}") for f in stent.design.facts],
     }
 
@@ -291,7 +296,7 @@ def _other(metrics: dict[str, Any]) -> list[Quantity]:
     """Return the metrics that no other section shows."""
     top = {key: value for key, value in metrics.items() if key not in ("vessel", "bare", "stents", QUALITY)}
     stents = {
-        name: {key: value for key, value in stent.items() if key not in ("deployment", "flow", "ratios", "uncertainty")}
+        name: {key: value for key, value in stent.items() if key not in SHOWN}
         for name, stent in metrics.get("stents", {}).items()
     }
     return flatten(top) + list(flatten(stents))

@@ -89,6 +89,11 @@ def _devices(paper: Paper, told: Contents) -> None:
         paper.text(stent["words"])
         paper.text(stent["advice"])
         paper.table(_rows(stent["quantities"], 3), (0.66, 0.34))
+        if stent["how_sure"]:
+            paper.text(stent["how_sure"])
+        if stent["bands"]:
+            cells = [(row.name, row.value, f"{row.low} to {row.high}", row.cause) for row in stent["bands"]]
+            paper.table(cells, (0.34, 0.13, 0.23, 0.30), head=("Result", "Value", "Band (95 %)", "Largest cause"))
         paper.text("Sources of the device's numbers:", 8, color=QUIET)
         paper.table(stent["facts"], (0.26, 0.74))
 

@@ -13,6 +13,7 @@ from vstent.devices.stent import Deployment, Landing
 from vstent.errors import LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.plan.rank import Candidate, alternatives
+from vstent.reporting.bands import ends, how_sure
 from vstent.reporting.figures import Picture, Shot, sheet
 from vstent.reporting.paper import QUIET, Paper
 from vstent.reporting.quantities import format_value
@@ -41,6 +42,8 @@ class Planned(NamedTuple):
     """SHA-256 of the input."""
     day: str
     """Date of the plan, ISO 8601."""
+    bands: Mapping[str, Mapping[str, Any]] = {}
+    """Bands of every deployment, as in the metrics of a study; devices of earlier versions have none."""
 
 
 def plan_pdf(case: Planned) -> bytes:
@@ -63,14 +66,16 @@ def plan_pdf(case: Planned) -> bytes:
 
 def _page(paper: Paper, case: Planned, name: str) -> None:
     """Write the page of one device."""
-    deployment, measures = case.deployments[name], case.measures[name]
+    deployment = case.deployments[name]
+    metrics = {"deployment": case.measures[name], "bands": case.bands.get(name, {})}
     paper.title(f"{case.name}: {device_title(deployment)}")
     paper.text(
         f"Plan of {case.day}. Input SHA-256 {case.source[:HASH_DIGITS]}… Deployed length and fit are predictions."
     )
     paper.picture(_picture(case, name), most=PICTURE_SHARE)
     paper.heading("Device and landing")
-    paper.table(_device_rows(case.anatomy, deployment, measures), (0.62, 0.38))
+    paper.table(_device_rows(case.anatomy, deployment, metrics), (0.62, 0.38))
+    paper.text(how_sure(metrics), 8)
     paper.heading("Warnings and notes")
     warnings = [deployment.advice, *case.anatomy.notes, *case.anatomy.vessel.notes]
     for sentence in warnings[: 1 + MOST_NOTES]:
@@ -98,14 +103,17 @@ def _picture(case: Planned, name: str) -> Picture:
     return Picture("plan", "Position", caption, sheet(scene, shots, ""))
 
 
-def _device_rows(anatomy: Anatomy, deployment: Deployment, measures: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the table of device, landing zones and fit."""
-    stent = deployment.stent
+def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the table of device, landing zones and fit, with bands where there are any."""
+    stent, measures = deployment.stent, metrics["deployment"]
     rows = [
         ("Device and label size", f"{stent.design.name} {stent.size.label}"),
         ("Deployed length (range for the uncertainty of diameters)", _length(anatomy, deployment)),
         ("Position along the parent artery", f"{stent.proximal_abscissa_mm:.1f} to {stent.distal_abscissa_mm:.1f} mm"),
     ]
+    band = ends(metrics, "deployed_length_mm")
+    if band:
+        rows.append(("Deployed length, band from the ranges of the device's numbers", band[1:-1]))
     for end, (first_mm, last_mm) in _zones_mm(anatomy).items():
         inside = np.linspace(first_mm, last_mm, 51)
         diameters = 2 * np.interp(inside, anatomy.axis.abscissa_mm, anatomy.section_radius_mm)
@@ -119,7 +127,11 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, measures: Mapping[str
         "max_wall_gap_mm": "Largest gap to the wall",
         "jailed_branches_count": "Jailed branches",
     }
-    return rows + [(words, format_value(key, measures[key])) for key, words in keys.items() if key in measures]
+    return rows + [
+        (words, f"{format_value(key, measures[key])} {ends(metrics, key)}".rstrip())
+        for key, words in keys.items()
+        if key in measures
+    ]
 
 
 def _zones_mm(anatomy: Anatomy) -> dict[str, tuple[float, float]]:

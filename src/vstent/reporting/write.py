@@ -30,7 +30,9 @@ def write_plan(case: "CaseResult", out: Path, day: str) -> None:
     day : date of the plan, ISO 8601.
     """
     measures = {name: case.metrics["stents"][name]["deployment"] for name in case.deployments}
-    planned = Planned(case.name, case.anatomy, case.deployments, measures, case.provenance["input"]["sha256"], day)
+    bands = {name: case.metrics["stents"][name].get("bands", {}) for name in case.deployments}
+    source = case.provenance["input"]["sha256"]
+    planned = Planned(case.name, case.anatomy, case.deployments, measures, source, day, bands)
     with atomic(out / "plan.pdf") as partial:
         partial.write_bytes(plan_pdf(planned))
 

@@ -29,6 +29,7 @@ from vstent.study.outputs import (
 from vstent.study.provenance import INPUT, METRICS, RUN, provenance
 from vstent.study.repeat import SECONDS, former_source, is_of_another
 from vstent.study.stages import (
+    band_all,
     check_inflow,
     compute_flows,
     deploy_all,
@@ -96,6 +97,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
     varied = vary_all(anatomy, deployments, settings, ledger, source)
     with ledger.stage("measure"):
         metrics = measure_all(anatomy, deployments, fields, settings.flow)
+        band_all(anatomy, deployments, metrics, settings)
         for name, spread in varied.items():
             metrics["stents"][name]["uncertainty"] = spread
         if failures:

@@ -22,6 +22,7 @@ from vstent.deployment.measure import measure
 from vstent.deployment.struts import over_restored
 from vstent.devices.catalogue import find_sizes
 from vstent.devices.design import BARE, Design, Size
+from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, VstentError
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
@@ -35,6 +36,7 @@ from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.io.surfaces import read_surface
 from vstent.kernels.arrays import Floats
+from vstent.plan.bands import bands
 from vstent.plan.uncertainty import Uncertainty, vary
 from vstent.study.checkpoint import FlowCheckpoint
 from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of, vessel_key
@@ -467,6 +469,25 @@ def measure_all(
     case = flow_case(anatomy, None, settings)
     quality = {name: _quality(case, field, flow[name]) for name, field in fields.items()}
     return found | {BARE: flow[BARE] | left[BARE], QUALITY: quality}
+
+
+def band_all(
+    anatomy: Anatomy, deployments: Mapping[str, Deployment], metrics: dict[str, Any], settings: Settings
+) -> None:
+    """Add the bands that the ranges of its device give to the metrics of every deployment, and how sure the device is.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployments by device name.
+    metrics : result of `measure_all`; every device gets the entry ``bands``.
+    settings : settings of the study, which tell whether a size was given.
+    """
+    for name, deployment in deployments.items():
+        placing, design = settings.placing(name), deployment.stent.design
+        is_proposed = placing.diameter_mm is None and placing.length_mm is None
+        found = bands(anatomy, deployment, metrics["stents"][name]["deployment"], is_proposed=is_proposed)
+        metrics["stents"][name]["bands"] = found.metrics() | {"device": how_sure(design)}
 
 
 def _quality(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> dict[str, Any]:
