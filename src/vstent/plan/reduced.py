@@ -6,7 +6,7 @@
   each place over the neck, which in a bend are not those of a straight artery. Rows move apart as in the closed
   formula, and a piece of wire keeps its length l, with l^2 = w^2 + h^2. Wires of diameter d of one hand cover the
   fraction d l / (2 w h).
-- *Gaps*: where a braid opens less wide, it stands off by half of the difference.
+- *Gaps*: a braid that opens less wide has a gap of half of the difference.
 """
 
 from dataclasses import dataclass, replace
