@@ -1,12 +1,9 @@
 """The screen model of a stent: a thin, local, anisotropic resistance at the position of the deployed wires."""
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
 
 from vstent.devices.design import LaserCut
 from vstent.devices.stent import Stent
-from vstent.flow import sampling
 from vstent.flow.case import Blood, Screen
 from vstent.flow.drag import (
     BREADTH,
@@ -18,6 +15,7 @@ from vstent.flow.drag import (
     tangential_share,
 )
 from vstent.geometry.surface import Surface
+from vstent.kernels import curves, nearby
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM, MM_PER_UM
 
@@ -48,7 +46,7 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     pieces = _pieces(stent)
     points_mm, along_mm, diameter_mm = pieces
     reach_mm = SMOOTHING_PORES * stent.spacing_mm
-    sheet = _sheet(stent.contour, points_mm, np.linalg.norm(along_mm, axis=1), reach_mm)
+    sheet = _sheet(stent.contour, points_mm, curves.lengths(along_mm), reach_mm)
     face = sheet.closest(points_mm)[2]
     spacing_mm, lengthwise, solidity = _net(stent, sheet, face, pieces, reach_mm)
     drag = drag_per_length(diameter_mm, spacing_mm) * crossing_factor(diameter_mm, spacing_mm)
@@ -81,10 +79,12 @@ def bands(points_mm: Floats, along_mm: Floats, normals: Floats, spacing_mm: Floa
     area_mm2 : (p,) float
         Area that each sample of a piece represents.
     """
-    length_mm = np.linalg.norm(along_mm, axis=1)
+    length_mm = curves.lengths(along_mm)
     sideways = np.cross(normals, along_mm) / length_mm[:, None]
     at_mm = BREADTH * spacing_mm[:, None] * ((np.arange(ACROSS) + 0.5) / ACROSS - 0.5)
-    return points_mm[:, None] + at_mm[:, :, None] * sideways[:, None], 0.5 * length_mm * spacing_mm / ACROSS
+    samples_mm = at_mm[:, :, None] * sideways[:, None]
+    samples_mm += points_mm[:, None]
+    return samples_mm, 0.5 * length_mm * spacing_mm / ACROSS
 
 
 def _net(
@@ -96,13 +96,14 @@ def _net(
     crossing families is then s = 2 / lambda. A piece takes the mean of the corners of the face below it.
     """
     points_mm, along_mm, diameter_mm = pieces
-    nodes, corners, length_mm = cKDTree(sheet.vertices_mm), sheet.faces[face], np.linalg.norm(along_mm, axis=1)
-    sample_mm, sample_mm2 = sampling.surface_samples(sheet, SAMPLE_REACHES * reach_mm)
-    area_mm2 = _kernel(nodes, sample_mm, reach_mm) @ np.linalg.norm(sample_mm2, axis=1)
-    lengthwise = _lengthwise(stent, corners, along_mm)
-    weight = _kernel(nodes, points_mm, reach_mm)
-    wire = (weight @ (length_mm * value) for value in (1.0, lengthwise, diameter_mm))
-    area_mm2, wire_mm, lengthwise_mm, covered_mm2 = (column[corners].mean(axis=1) for column in (area_mm2, *wire))
+    length_mm = curves.lengths(along_mm)
+    lengthwise = _lengthwise(stent, sheet.faces, face, along_mm)
+    columns = np.stack([length_mm, length_mm * lengthwise, length_mm * diameter_mm], axis=1)
+    nodes_mm = sheet.vertices_mm
+    of_wires = nearby.sums(nodes_mm, points_mm, columns, reach_mm)
+    area_mm2 = nearby.areas(nodes_mm, sheet.corners_mm, SAMPLE_REACHES * reach_mm, reach_mm)
+    around = np.column_stack([area_mm2, of_wires])[sheet.faces].mean(axis=1)
+    area_mm2, wire_mm, lengthwise_mm, covered_mm2 = around[face].T
     return 2 * area_mm2 / wire_mm, lengthwise_mm / wire_mm, 0.5 * covered_mm2 / area_mm2
 
 
@@ -110,16 +111,17 @@ def _sheet(contour: Surface, points_mm: Floats, length_mm: Floats, reach_mm: flo
     """Return the contour, moved along its normals to the mean height of the wires near it."""
     below_mm, _, face = contour.closest(points_mm)
     height_mm = np.einsum("pd,pd->p", points_mm - below_mm, contour.normals[face])
-    weight = _kernel(cKDTree(contour.vertices_mm), points_mm, reach_mm)
-    mean_mm = weight @ (length_mm * height_mm) / np.maximum(weight @ length_mm, 1e-300)
+    columns = np.stack([length_mm * height_mm, length_mm], axis=1)
+    risen_mm2, wire_mm = nearby.sums(contour.vertices_mm, points_mm, columns, reach_mm).T
+    mean_mm = risen_mm2 / np.maximum(wire_mm, 1e-300)
     return Surface(contour.vertices_mm + mean_mm[:, None] * contour.vertex_normals, contour.faces)
 
 
-def _lengthwise(stent: Stent, corners: Ints, along_mm: Floats) -> Floats:
+def _lengthwise(stent: Stent, faces: Ints, face: Ints, along_mm: Floats) -> Floats:
     """Return the squared cosine (p,) of the angle between pieces of wire and the device's axis."""
-    length_mm = np.gradient(stent.nodes_mm, axis=0).reshape(-1, 3)[corners].mean(axis=1)
-    size_mm2 = (length_mm**2).sum(axis=1) * (along_mm**2).sum(axis=1)
-    return np.asarray((length_mm * along_mm).sum(axis=1) ** 2 / size_mm2)
+    axis_mm = np.gradient(stent.nodes_mm, axis=0).reshape(-1, 3)[faces].mean(axis=1)
+    size_mm2 = (axis_mm**2).sum(axis=1)[face] * np.einsum("pd,pd->p", along_mm, along_mm)
+    return np.asarray(np.einsum("pd,pd->p", axis_mm[face], along_mm) ** 2 / size_mm2)
 
 
 def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
@@ -144,9 +146,3 @@ def _drag_diameters_um(stent: Stent) -> Floats:
         return stent.wire_diameter_um
     widths_um, which = np.unique(stent.wire_diameter_um, return_inverse=True)
     return np.array([round_diameter(width, stent.design.strut_thickness_um) for width in widths_um])[which]
-
-
-def _kernel(nodes: cKDTree, points_mm: Floats, reach_mm: float) -> csr_matrix:
-    """Return the weights (nodes, points) (1 - r^2 / reach^2)^2 within the reach."""
-    near = nodes.sparse_distance_matrix(cKDTree(points_mm), reach_mm, output_type="coo_matrix")
-    return csr_matrix(((1 - (near.data / reach_mm) ** 2) ** 2, (near.row, near.col)), shape=near.shape)

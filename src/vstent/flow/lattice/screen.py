@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from vstent.flow.case import FlowCase, Screen
 from vstent.flow.domain import Domain
 from vstent.flow.drag import concentration
-from vstent.flow.lattice.kernels import d3q19
+from vstent.flow.lattice.kernels import d3q19, sheet
 from vstent.flow.lattice.scales import Scales
 from vstent.flow.lattice.setup import Addressing
-from vstent.kernels import sampling
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
@@ -108,41 +107,33 @@ def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float)
     cell_size_mm : float
         Grid spacing.
     """
-    at = (screen.points_mm - origin_mm) / cell_size_mm
-    cells, weights = sampling.stencils(index, at)
-    share = np.where(cells >= 0, weights, 0.0)
-    is_used = share > 0
-    cell, owner = cells[is_used], np.broadcast_to(np.arange(len(cells))[:, None], cells.shape)[is_used]
-    per_volume = share[is_used] * screen.area_mm2[owner] / (cell_size_mm**3 * M_PER_MM)
-    found, place = np.unique(cell, return_inverse=True)
-
-    def gathered(values: Floats) -> Floats:
-        return np.bincount(place, per_volume * values[owner], len(found)).astype(np.float64)
-
+    factor, volume = _concentration(screen, cell_size_mm), cell_size_mm**3 * M_PER_MM
+    along_Pa_s_m, across_Pa_s_m = screen.normal_resistance_Pa_s_m, screen.tangential_resistance_Pa_s_m
+    values = screen.area_mm2 / volume, factor * along_Pa_s_m, factor * across_Pa_s_m, screen.inertial_loss
+    cells = int(index.max(initial=-1)) + 1
+    number, found, sums = np.full(cells, -1, np.int32), np.zeros(cells, np.int32), np.zeros((cells, sheet.COLUMNS))
+    frame = np.array([*origin_mm, cell_size_mm])
+    rows = sheet.spread(index, frame, (screen.points_mm, screen.normals, *values), number, found, sums)
+    order = np.argsort(found[:rows])
+    order = order[sums[order, 3] > 0]
+    found, sums = found[order], sums[order]
     # Normals of one sheet nearly agree. Where two sheets meet their signs may differ, but only n n^T enters.
-    normal = np.stack([gathered(component) for component in screen.normals.T], axis=1)
+    normal, along, across, squared, loss = np.split(sums, [3, 4, 5, 6], axis=1)
     length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    factor = concentration(screen.wire_diameter_mm, screen.spacing_mm, cell_size_mm)
-    along = gathered(factor * screen.normal_resistance_Pa_s_m)
-    across_Pa_s_m = factor * screen.tangential_resistance_Pa_s_m
-    across, twice = gathered(across_Pa_s_m), _twice(at, screen.normals)
-    kept = along > 0
     return GridResistance(
-        found[kept].astype(np.int32),
-        (normal / length)[kept],
-        along[kept],
-        across[kept],
-        (gathered(twice * across_Pa_s_m**2) / np.maximum(across, 1e-300))[kept],
-        0.5 * gathered(screen.inertial_loss)[kept],
+        found,
+        normal / length,
+        along[:, 0],
+        across[:, 0],
+        (squared / np.maximum(across, 1e-300))[:, 0],
+        0.5 * loss[:, 0],
     )
 
 
-def _twice(at: Floats, normals: Floats) -> Floats:
-    """Return the sum (p,), over pairs of cells near points (p, 3), of weight * weight * distance along the normal."""
-    part = at - np.floor(at)
-    corners = np.indices((2, 2, 2)).reshape(3, -1).T
-    weight = np.where(corners == 1, part[:, None], 1 - part[:, None]).prod(axis=2)
-    height = normals @ corners.T
-    return np.asarray(
-        sum(weight[:, a] * weight[:, b] * np.abs(height[:, a] - height[:, b]) for a in range(8) for b in range(a))
-    )
+def _concentration(screen: Screen, cell_size_mm: float) -> Floats:
+    """Return the factor on the drag of every sample (see `concentration`); neighbours on one wire share theirs."""
+    diameter_mm, spacing_mm = screen.wire_diameter_mm, screen.spacing_mm
+    is_new = np.ones(len(diameter_mm), dtype=bool)
+    is_new[1:] = (diameter_mm[1:] != diameter_mm[:-1]) | (spacing_mm[1:] != spacing_mm[:-1])
+    factor = concentration(diameter_mm[is_new], spacing_mm[is_new], cell_size_mm)
+    return np.repeat(factor, np.diff(np.flatnonzero(np.r_[is_new, True])))
