@@ -90,7 +90,7 @@ def test_in_a_straight_tube_no_cell_moves():
 
 
 def asked(monkeypatch):
-    """What the joints of the bend are asked: (net, length, width, held, laid)."""
+    """What the joints of the bend are asked: (net, length, width, joint, held, laid)."""
     seen = []
     monkeypatch.setattr(cells, "relax", lambda *question: seen.append(question) or np.zeros((len(question[0].line), 3)))
     deploy(ENTERPRISE, bend(), size=SIZE)
@@ -98,9 +98,9 @@ def asked(monkeypatch):
     return seen[0]
 
 
-def framed(net, length_mm, width_mm, held, laid):
+def framed(net, length_mm, width_mm, joint_mm, held, laid):
     pairs, free_mm = cells._diagonals(net, length_mm, width_mm)
-    return cells._Frame(net, laid, length_mm, pairs, free_mm, cells._keeping(net, held))
+    return cells._Frame(net, laid, length_mm, pairs, free_mm, joint_mm, cells._keeping(net, held))
 
 
 def test_the_joints_lie_where_an_independent_minimiser_puts_them(monkeypatch):
@@ -126,6 +126,21 @@ def test_the_slopes_are_those_of_the_residuals(monkeypatch):
     way = rng.normal(size=len(x)) * 1e-4
     ahead, behind = (cells._model(frame, x + sign * way).residual for sign in (1, -1))
     assert cells._model(frame, x).slopes @ way == pytest.approx(0.5 * (ahead - behind), abs=2e-6)
+
+
+def test_a_joint_that_passes_the_next_one_is_pushed_back(monkeypatch):
+    """A cell turned inside out is as wide as before in space, but not in sign."""
+    frame = framed(*asked(monkeypatch))
+    net, moves_mm = frame.net, np.zeros((len(frame.net.line), 3))
+    assert not cells._overlaps(frame, moves_mm)[0].any()
+    width_mm = 2 * net.spacing[1] * (net.chart.shape[1] // ENTERPRISE.n_columns)
+    moves_mm[40, 1] = 2 * width_mm  # as far beyond the next joint as it was before it
+    short_mm, slopes = cells._overlaps(frame, moves_mm)
+    assert np.flatnonzero(short_mm).tolist() == [40]
+    assert short_mm[40] == pytest.approx(-width_mm - 2e-3 * ENTERPRISE.strut_width_um)
+    way = np.random.default_rng(3).normal(size=moves_mm.shape) * 1e-3
+    ahead, behind = (cells._overlaps(frame, moves_mm + sign * way)[0] for sign in (1, -1))
+    assert slopes @ way.ravel() == pytest.approx(0.5 * (ahead - behind), abs=1e-12)
 
 
 def test_a_sketch_lifts_the_same_cells():

@@ -217,6 +217,33 @@ def test_rows_of_a_bend_tilt_and_draw_together_about_the_one_that_is_landed(held
     assert np.all((np.arange(n) - mean) * (np.arange(n) - held) >= -0.05)
 
 
+def tight_bend(bend_mm):
+    """A Pipeline in a half circle of an artery 3.2 mm wide, and the lengths of its cells along the device."""
+    pipeline = catalogue.find_design("pipeline")
+    size = device.Size(3.25, 12.0, 3.5)
+    anatomy = tube(arc(bend_mm, np.pi, 14), 1.6)
+    stent = deploy(pipeline, anatomy, size=size, landing=Landing(14 + bend_mm * np.pi / 2)).stent
+    row, column = np.nonzero(np.add.outer(np.arange(len(stent.nodes_mm) - 2), np.arange(48)) % 2 == 0)
+    return stent, row, np.linalg.norm(stent.nodes_mm[row + 2, column] - stent.nodes_mm[row, column], axis=1)
+
+
+def test_on_the_inner_side_of_a_bend_cells_are_as_short_as_the_net_of_chebyshev():
+    stent, row, cell_mm = tight_bend(3.0)
+    in_bend = np.abs(stent.row_abscissa_mm[row + 1] - 14 - 1.5 * np.pi) < 2.5
+    shortest_mm = [cell_mm[in_bend & (row == here)].min() for here in np.unique(row[in_bend])]
+    diameter_mm = float(np.median(stent.row_diameter_mm))
+    spacing_mm = formulas.row_spacing_mm(stent.design, stent.size, diameter_mm, 1 / 3.0)
+    expected_mm = float(2 * spacing_mm * (1 - diameter_mm / 6.0))
+    assert np.median(shortest_mm) == pytest.approx(expected_mm, rel=0.1)
+    assert shortest_mm == pytest.approx(np.full(len(shortest_mm), expected_mm), rel=0.25)
+
+
+def test_wires_beside_each_other_do_not_overlap():
+    _, _, cell_mm = tight_bend(2.2)
+    assert cell_mm.min() > 0.8 * np.sqrt(3) * 0.030
+    assert cell_mm.min() > 0.030
+
+
 def test_without_sliding_pieces_of_wire_in_the_bend_would_stretch(monkeypatch):
     monkeypatch.setattr(pieces, "slide", lambda design, size, nodes_mm, held, laid: _unslid(nodes_mm))
     found = stretch(deploy(SILK, bent(), size=SILK_SIZE).stent)

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import report_case
 
+from vstent.devices.stent import tube_faces
+from vstent.geometry.surface import Surface
 from vstent.kernels import raster
 from vstent.reporting import figures
 from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View
@@ -178,3 +180,23 @@ def place_of(point_mm, view, size_px):
     pixel = figures.span_mm(view, size_px) / size_px[0]
     x, y, _ = (point_mm - view.center_mm) @ view.axes.T
     return int(size_px[1] / 2 - y / pixel), int(size_px[0] / 2 + x / pixel)
+
+
+@pytest.mark.parametrize("toward", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (-0.6, 0.8, 0.0)])
+def test_a_contour_is_looked_at_from_the_side_of_its_gap(toward):
+    angle, height_mm = np.meshgrid(2 * np.pi * np.arange(48) / 48, np.arange(0, 20.5, 0.5))
+    ring = np.stack([2 * np.cos(angle), 2 * np.sin(angle), height_mm], axis=2).reshape(-1, 3)
+    gap_mm = np.maximum(ring @ np.array(toward) - 1.2, 0.0)
+    tube = Surface(ring, tube_faces(41, 48))
+    contour = MeshLayer("contour", "silk", (0.3, 0.3, 0.3), "wall_gap", gap_mm, tube)
+    view = figures.gap_view(contour, scene_of_view((1.0, 0.0, 0.0)))
+    np.testing.assert_allclose(view.axes[2], toward, atol=1e-9)
+    np.testing.assert_allclose(view.axes @ view.axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(view.axes) == pytest.approx(1.0)
+    assert np.linalg.norm(ring - view.center_mm, axis=1).max() >= view.radius_mm * 0.9
+
+
+def scene_of_view(toward):
+    """A view along `toward` with the z axis up."""
+    up = np.array([0.0, 0.0, 1.0])
+    return View("profile", np.stack([np.cross(up, toward), up, toward]), np.zeros(3), 10.0)

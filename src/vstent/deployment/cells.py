@@ -7,6 +7,7 @@ moves minimise
     sum over struts of (length - length as cut)^2
     +  sum over cells of (SPRINGINESS (width - free width^2 / width) / 2)^2, and the same for their heights
     +  sum over joints of (BENDING times the second difference, between neighbours, of the distance from the wall)^2
+    +  sum over joints of (overlap with the next joint of the row)^2
     +  penalties on moves out of a row, moves around, and unequal moves of joints on one line of struts,
 
 with no joint outside the wall. The cell springs open the device against the wall and keep cells from closing. A strut
@@ -70,6 +71,8 @@ class _Frame(NamedTuple):
     """(2, k) joints at both ends of the width and the height of every cell."""
     free_mm: Floats
     """(k,) distances between these joints in the free device, in mm."""
+    joint_mm: float
+    """Width of a joint, in mm."""
     keeping: csc_matrix
     """(n, 3 c) matrix of the penalties that are linear in the moves."""
 
@@ -88,7 +91,7 @@ class _Model(NamedTuple):
         return float(self.residual @ self.residual)
 
 
-def relax(net: Net, length_mm: float, width_mm: float, held: float, laid: Laid) -> Floats:
+def relax(net: Net, length_mm: float, width_mm: float, joint_mm: float, held: float, laid: Laid) -> Floats:
     """Compute the moves that restore the strut lengths of a laser-cut device.
 
     Parameters
@@ -99,6 +102,8 @@ def relax(net: Net, length_mm: float, width_mm: float, held: float, laid: Laid) 
         Length of a strut as cut, in mm.
     width_mm : float
         Width of a cell of the free device, in mm.
+    joint_mm : float
+        Width of a joint, in mm.
     held : float
         Row of joints whose mean move along the device is held at zero. A fraction lies between two rows.
     laid : callable
@@ -110,7 +115,7 @@ def relax(net: Net, length_mm: float, width_mm: float, held: float, laid: Laid) 
         Moves of the joints along, around and off the wall (positive: into the lumen).
     """
     pairs, free_mm = _diagonals(net, length_mm, width_mm)
-    frame = _Frame(net, laid, length_mm, pairs, free_mm, _keeping(net, held))
+    frame = _Frame(net, laid, length_mm, pairs, free_mm, joint_mm, _keeping(net, held))
     x, inertia = np.zeros(3 * len(net.line)), INERTIA
     here = _model(frame, x)
     for _ in range(STEPS):
@@ -159,8 +164,21 @@ def _model(frame: _Frame, x: Floats) -> _Model:
     ratio = open_mm / frame.free_mm
     spring = 0.5 * SPRINGINESS * frame.free_mm * (ratio - 1 / ratio)
     open_slopes = diags(0.5 * SPRINGINESS * (1 + 1 / ratio**2)) @ open_slopes
-    residual = np.concatenate([strut_mm - frame.length_mm, spring, frame.keeping @ x])
-    return _Model(residual, csc_matrix(vstack([strut_slopes, open_slopes, frame.keeping])))
+    short_mm, short_slopes = _overlaps(frame, moves)
+    residual = np.concatenate([strut_mm - frame.length_mm, spring, short_mm, frame.keeping @ x])
+    return _Model(residual, csc_matrix(vstack([strut_slopes, open_slopes, short_slopes, frame.keeping])))
+
+
+def _overlaps(frame: _Frame, moves: Floats) -> tuple[Floats, coo_matrix]:
+    """Return by how much neighbouring joints of a row overlap (c,), in mm and negative, and the derivatives."""
+    # The distance around the device has a sign, so that a cell that is turned inside out opens again.
+    net, n = frame.net, len(frame.net.line)
+    beside = net.beside.astype(int)
+    apart_mm = (net.column[beside] - net.column) % net.chart.shape[1] * net.spacing[1]
+    short_mm = np.minimum(apart_mm + moves[beside, 1] - moves[:, 1] - frame.joint_mm, 0.0)
+    near = np.flatnonzero(short_mm)
+    values, places = np.repeat([1.0, -1.0], len(near)), np.concatenate([3 * beside[near] + 1, 3 * near + 1])
+    return short_mm, coo_matrix((values, (np.tile(near, 2), places)), shape=(n, 3 * n))
 
 
 def as_drawn(points_mm: Floats, row: Floats, column: Floats) -> Floats:

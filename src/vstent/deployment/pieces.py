@@ -7,7 +7,8 @@ the device, so the device is shorter.
 
 Crossings are moved by `vstent.kernels.net`. Its first aim is the right length of all pieces of wire. Many nets of wires
 meet it, and among them it takes the one nearest to the original rows. On the outer side of a very tight bend even a
-straight wire can be too short. There no net meets the aim, and a penalty keeps the cells open.
+straight wire can be too short. There no net meets the aim, and a penalty keeps the cells open. On the inner side rows
+come close together, until neighbouring wires touch.
 
 Joints of a laser-cut device may also leave the wall and are moved by `vstent.deployment.cells`.
 """
@@ -19,10 +20,11 @@ import numpy as np
 
 from vstent.deployment import cells
 from vstent.deployment.contour import normals
-from vstent.devices.design import Design, LaserCut, Size, piece_length_mm
-from vstent.devices.formulas import Grid, grid
+from vstent.devices.design import Braid, Design, LaserCut, Size, piece_length_mm
+from vstent.devices.formulas import Grid, grid, row_spacing_mm
 from vstent.kernels import net
 from vstent.kernels.arrays import Floats, Ints
+from vstent.units import MM_PER_UM
 
 RESISTANCE: Final = 0.01
 """Weight of a crossing that leaves its row, relative to an equal stretch of a piece of wire, without unit."""
@@ -33,6 +35,9 @@ It is the smallest value that keeps every cell open in tight siphons.
 """
 STIFFNESS: Final = 0.1
 """Weight of a change in the bending of a wire, relative to an equal stretch of a piece of wire."""
+JAMMED: Final = np.sqrt(3)
+"""Smallest distance between neighbouring wires of one hand, in wire diameters, as a wire of the other hand passes
+between them (Peirce 1937, The geometry of cloth structure, J. Text. Inst. 28:T45: plain weave of round threads)."""
 DESCENT: Final = net.Descent(steps=8, gain=0.03, tolerance=0.2)
 """Stopping criteria of the iteration that moves the crossings."""
 
@@ -90,18 +95,33 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.L
         spacing_mm,
         _bulge_mm2(nodes_mm[:: shape.row_split, :: shape.column_split]),
         lattice.bends,
+        lattice.gaps,
     )
     length_mm, held_line = piece_length_mm(design, size), held / shape.row_split
     if isinstance(design, LaserCut):
         width_mm = size.free_diameter_mm * np.sin(2 * np.pi / design.n_columns)
-        moves_mm = cells.relax(pieces, length_mm, width_mm, held_line, lambda p, row, column: laid(p, row - 1, column))
+        joint_mm = 2 * design.strut_width_um * MM_PER_UM  # two struts, side by side
+
+        def put(points_mm: Floats, row: Floats, column: Floats) -> Floats:
+            return laid(points_mm, row - 1, column)
+
+        moves_mm = cells.relax(pieces, length_mm, width_mm, joint_mm, held_line, put)
     else:
-        weights = net.Weights(length_mm, RESISTANCE, CROWDING, STIFFNESS, round(held_line))
+        weights = net.Weights(
+            length_mm, RESISTANCE, CROWDING, STIFFNESS, round(held_line), _shortest_cell_mm(design, size)
+        )
         moves_mm = np.pad(net.slide(pieces, weights, DESCENT), ((0, 0), (0, 1)))
     rows, columns, off_mm = (_spread(moves, lattice, shape) for moves in (moves_mm / [*spacing_mm, 1.0]).T)
     row, column = np.arange(shape.rows)[:, None] + rows - rows[held].mean(), np.arange(shape.columns) + columns
     lift_mm = -off_mm[..., None] * _bilinear(normals(continued_mm), row + 1, column)
     return Slid(_bilinear(continued_mm, row + 1, column), row, column, lift_mm)
+
+
+def _shortest_cell_mm(design: Braid, size: Size) -> float:
+    """Return the length along the device at which the wires of a cell touch, at most that of a free cell, in mm."""
+    # The wires of a short cell are nearly perpendicular to the axis: its length is the distance between them.
+    mean_mm = sum(count * diameter_um for count, diameter_um in design.wires) / design.n_wires * MM_PER_UM
+    return min(JAMMED * mean_mm, 2 * float(row_spacing_mm(design, size, size.free_diameter_mm)))
 
 
 def _bulge_mm2(nodes_mm: Floats) -> Floats:
@@ -127,6 +147,8 @@ class _Lattice(NamedTuple):
     """(2, p) crossings at the two ends of every piece of wire."""
     bends: Ints
     """(3, b) all triples of consecutive crossings on a wire."""
+    gaps: Ints
+    """(2, g) crossings at the proximal and distal end of every cell, two rows apart."""
 
 
 @cache
@@ -145,8 +167,10 @@ def _lattice(shape: Grid) -> _Lattice:
         [number[line[inner] + way, (column[inner] + way * hand) % columns] for way in (-1, 0, 1)] for hand in (1, -1)
     ]
     bends = np.array(ways).transpose(1, 2, 0).reshape(3, -1)
+    near = np.flatnonzero(line < rows - 2)
+    gaps = np.stack([near, number[line[near] + 2, column[near]]])
     row, column = line * shape.row_split, column * shape.column_split
-    numbers = [values.astype(np.uint32, order="C") for values in (line, beside, both, bends)]
+    numbers = [values.astype(np.uint32, order="C") for values in (line, beside, both, bends, gaps)]
     return _Lattice(numbers[0], row, column, *numbers[1:])
 
 

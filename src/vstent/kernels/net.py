@@ -3,6 +3,7 @@
 The moves x (c, 2) of the crossings, along and around in mm, minimise
 
     sum over pieces of (length - manufactured length)^2
+    +  sum over cells of (length along the device - contact length)^2 where the cell is shorter
     +  sum over crossings of (resistance times their move relative to their row)^2
     +  sum over neighbours in a row of (crowding times the change of their distance)^2
     +  sum over neighbours on a wire of (stiffness times the second difference of their moves)^2
@@ -61,6 +62,8 @@ class Net(NamedTuple):
     wall."""
     bends: Ints
     """(3, b) all triples of consecutive crossings on a wire."""
+    gaps: Ints
+    """(2, g) crossings at the proximal and distal end of every cell, two rows apart."""
 
 
 class Weights(NamedTuple):
@@ -76,6 +79,8 @@ class Weights(NamedTuple):
     """Weight of the change of a wire's bending."""
     held: int
     """Row of crossings whose mean position is kept."""
+    contact: float
+    """Length of a cell along the device at which its wires touch."""
 
 
 class Descent(NamedTuple):
@@ -114,7 +119,7 @@ def _put(net: Any, x: Any, places: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def _cost(net: Any, weights: Any, places: Any, x: Any, excess: Any) -> float:
-    """Write the excess length (p,) of every piece and return the cost."""
+    """Write the excess length of every piece, then of every cell that is too short (p + g,), and return the cost."""
     total = 0.0
     for p in range(net.ends.shape[1]):
         a, b = net.ends[0, p], net.ends[1, p]
@@ -123,6 +128,13 @@ def _cost(net: Any, weights: Any, places: Any, x: Any, excess: Any) -> float:
             way += (places[b, k] - places[a, k]) ** 2
         excess[p] = np.sqrt(way) - weights.length
         total += excess[p] ** 2
+    pieces = net.ends.shape[1]
+    for g in range(net.gaps.shape[1]):
+        a, b, way = net.gaps[0, g], net.gaps[1, g], 0.0
+        for k in range(3):
+            way += (places[b, k] - places[a, k]) ** 2
+        excess[pieces + g] = min(0.0, np.sqrt(way) - weights.contact)
+        total += excess[pieces + g] ** 2
     mean, count = _row_means(net.line, x)
     for c in range(len(net.line)):
         off = x[c, 0] - mean[net.line[c]]
@@ -148,9 +160,15 @@ def _row_means(line: Any, x: Any) -> tuple[Any, Any]:
 
 
 @njit(cache=True, nogil=True)
-def _slopes(places: Any, ends: Any, slopes: Any) -> None:
-    """Write the derivatives (p, 4) of every piece's length with respect to the moves of its first and last end."""
+def _slopes(places: Any, ends: Any, pieces: int, excess: Any, slopes: Any) -> None:
+    """Write the derivatives (p + g, 4) of every length with respect to the moves of its first and last end.
+
+    They are zero for cells that are long enough.
+    """
     for p in range(ends.shape[1]):
+        if p >= pieces and excess[p] == 0.0:
+            slopes[p] = 0.0
+            continue
         a, b = ends[0, p], ends[1, p]
         d0, d1, d2 = places[b, 0] - places[a, 0], places[b, 1] - places[a, 1], places[b, 2] - places[a, 2]
         way = max(np.sqrt(d0 * d0 + d1 * d1 + d2 * d2), 1e-12)
@@ -161,9 +179,9 @@ def _slopes(places: Any, ends: Any, slopes: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _multiply(net: Any, weights: Any, inertia: float, slopes: Any, x: Any, result: Any) -> None:
+def _multiply(net: Any, weights: Any, inertia: float, ends: Any, slopes: Any, x: Any, result: Any) -> None:
     """Write the product of the normal matrix and x (c, 2)."""
-    line, beside, ends, bends = net.line, net.beside, net.ends, net.bends
+    line, beside, bends = net.line, net.beside, net.bends
     mean, _ = _row_means(line, x)
     damp, crowd, stiff = weights.resistance**2, weights.crowding**2, weights.stiffness**2
     for c in range(len(line)):
@@ -192,13 +210,13 @@ def _multiply(net: Any, weights: Any, inertia: float, slopes: Any, x: Any, resul
 
 
 @njit(cache=True, nogil=True)
-def _diagonal(net: Any, weights: Any, inertia: float, slopes: Any) -> Any:
+def _diagonal(net: Any, weights: Any, inertia: float, ends: Any, slopes: Any) -> Any:
     """Return the inverse of the normal matrix's diagonal (c, 2)."""
     inverse = np.zeros((len(net.line), 2))
     for p in range(len(slopes)):
         for k in range(2):
-            inverse[net.ends[0, p], k] += slopes[p, k] ** 2
-            inverse[net.ends[1, p], k] += slopes[p, 2 + k] ** 2
+            inverse[ends[0, p], k] += slopes[p, k] ** 2
+            inverse[ends[1, p], k] += slopes[p, 2 + k] ** 2
     # Each crossing is on two wires and in three triples (1, -2, 1) of each: 2 (1 + 4 + 1) = 12.
     rest = weights.resistance**2 + inertia + 12 * weights.stiffness**2
     for c in range(len(inverse)):
@@ -216,7 +234,7 @@ def _stretching(net: Any, slopes: Any, waves: Any) -> Any:
     line = net.line
     blocks = np.zeros((int(line[-1]) + 1, _BAND, _BAND))
     g = np.zeros(_BAND)
-    for p in range(len(slopes)):
+    for p in range(net.ends.shape[1]):
         a, b = net.ends[0, p], net.ends[1, p]
         for w in range(3):
             g[w], g[3 + w] = slopes[p, 0] * waves[a, w], slopes[p, 1] * waves[a, w]
@@ -305,24 +323,27 @@ def _dot(a: Any, b: Any) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _downhill(net: Any, weights: Any, slopes: Any, x: Any, excess: Any) -> Any:
+def _downhill(net: Any, weights: Any, ends: Any, slopes: Any, x: Any, excess: Any) -> Any:
     """Return half the negative gradient (c, 2) of the cost."""
     result = np.zeros((len(net.line), 2))
-    _multiply(net, weights, 0.0, slopes[:0], x, result)
+    _multiply(net, weights, 0.0, ends, slopes[:0], x, result)
     for c in range(len(result)):
         result[c, 0], result[c, 1] = -result[c, 0], -result[c, 1]
     for p in range(len(slopes)):
         for k in range(2):
-            result[net.ends[0, p], k] -= slopes[p, k] * excess[p]
-            result[net.ends[1, p], k] -= slopes[p, 2 + k] * excess[p]
+            result[ends[0, p], k] -= slopes[p, k] * excess[p]
+            result[ends[1, p], k] -= slopes[p, 2 + k] * excess[p]
     return result
 
 
 @njit(cache=True, nogil=True)
 def _step(net: Any, weights: Any, inertia: float, coarse: Any, slopes: Any, residual: Any, tolerance: float) -> Any:
-    """Return the moves (c, 2) of one step, by conjugate gradients; `coarse` is (factor, waves) of the coarse part."""
-    n, (factor, waves) = len(net.line), coarse
-    inverse = _diagonal(net, weights, inertia, slopes)
+    """Return the moves (c, 2) of one step, by conjugate gradients.
+
+    `coarse` is (factor, waves) of the coarse part, `slopes` (ends, slopes) of pieces and cells.
+    """
+    n, (factor, waves), (ends, slopes) = len(net.line), coarse, slopes
+    inverse = _diagonal(net, weights, inertia, ends, slopes)
     move, way, ready, image = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2))
     residual, goal, before = residual.copy(), 0.0, np.inf
     for _ in range(ROUNDS):
@@ -334,7 +355,7 @@ def _step(net: Any, weights: Any, inertia: float, coarse: Any, slopes: Any, resi
         for c in range(n):
             for k in range(2):
                 way[c, k] = ready[c, k] + size / before * way[c, k]
-        _multiply(net, weights, inertia, slopes, way, image)
+        _multiply(net, weights, inertia, ends, slopes, way, image)
         share, before = size / _dot(way, image), size
         for c in range(n):
             for k in range(2):
@@ -347,16 +368,18 @@ def _step(net: Any, weights: Any, inertia: float, coarse: Any, slopes: Any, resi
 def _slide(net: Any, weights: Any, waves: Any, descent: Any) -> Any:
     """Return the moves (c, 2) that minimise the cost."""
     n, pieces = len(net.row), net.ends.shape[1]
+    ends = np.concatenate((net.ends, net.gaps), axis=1)
     x, inertia = np.zeros((n, 2)), INERTIA
-    places, excess, slopes = np.zeros((n, 9)), np.zeros(pieces), np.zeros((pieces, 4))
+    places, excess, slopes = np.zeros((n, 9)), np.zeros(ends.shape[1]), np.zeros((ends.shape[1], 4))
     _put(net, x, places)
     cost = _cost(net, weights, places, x, excess)
     for _ in range(descent.steps):
-        _slopes(places, net.ends, slopes)
-        residual, before, stretching = _downhill(net, weights, slopes, x, excess), cost, _stretching(net, slopes, waves)
+        _slopes(places, ends, pieces, excess, slopes)
+        residual, before = _downhill(net, weights, ends, slopes, x, excess), cost
+        stretching = _stretching(net, slopes, waves)
         while True:
             coarse = _coarse(net, weights, inertia, stretching, waves), waves
-            tried = x + _step(net, weights, inertia, coarse, slopes, residual, descent.tolerance)
+            tried = x + _step(net, weights, inertia, coarse, (ends, slopes), residual, descent.tolerance)
             _put(net, tried, places)
             cost = _cost(net, weights, places, tried, excess)
             if cost < before:

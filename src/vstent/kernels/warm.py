@@ -48,8 +48,8 @@ def _slide(nodes_mm: np.ndarray) -> None:
     chart = np.concatenate([nodes_mm, np.gradient(nodes_mm, axis=0), around_mm], axis=2)
     beside, bends = np.array([1, 0, 3, 2, 5, 4]), np.array([[0], [2], [5]])
     few, next_to, pieces, wires = (values.astype(np.uint32) for values in (line, beside, ends, bends))
-    tiny = net.Net(chart, line, column, few, next_to, pieces, np.ones(2), np.zeros(3), wires)
-    net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1), net.Descent(1, 0.1, 0.1))
+    tiny = net.Net(chart, line, column, few, next_to, pieces, np.ones(2), np.zeros(3), wires, pieces)
+    net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1, 0.1), net.Descent(1, 0.1, 0.1))
 
 
 def _sample() -> None:

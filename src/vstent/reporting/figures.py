@@ -9,7 +9,7 @@ import numpy as np
 from vstent.devices.design import BARE
 from vstent.kernels import raster
 from vstent.kernels.arrays import Floats
-from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View
+from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View, view_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,6 +24,8 @@ _LIGHT = np.array([-0.35, 0.50, 0.79])
 """Direction to the light in view axes (right, up, toward the eye), not normalized."""
 _SUPERSAMPLING = 2
 """Rendered pixels per picture pixel along each axis, averaged to smooth the edges."""
+SEEN_GAP_MM = 0.1
+"""Gap in mm from which a contour is shown from the side of its largest gap."""
 ABOVE = "Values above the scale have its last color."
 """Caption sentence on values above a color scale."""
 
@@ -180,9 +182,38 @@ def _anatomy(scene: Scene) -> Picture:
 def _contour(scene: Scene) -> Picture:
     """Return the picture of the deployed contours, colored by their gap to the wall."""
     ids = ("lumen", "continued", "contour", "neck")
-    shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
-    caption = "The deployed contour in the lumen, colored by its gap to the wall of the parent artery."
+    shots = []
+    for pane, title in scene.panes[1:]:
+        contour = next(layer for layer in scene.pick(("contour",), pane) if isinstance(layer, MeshLayer))
+        largest_mm = float(contour.values.max())
+        profile, is_seen = scene.view("profile"), largest_mm >= SEEN_GAP_MM
+        words = f"gap of {largest_mm:.2f} mm" if is_seen else f"gaps below {SEEN_GAP_MM:g} mm"
+        view = gap_view(contour, profile) if is_seen else profile
+        shots.append(Shot(f"{title}: {words}", scene.pick(ids, pane), view))
+    caption = (
+        "The deployed contour in the lumen, colored by its gap to the wall of the parent artery and seen from the side "
+        "where the gap is largest."
+    )
     return Picture("contour", "Position of the devices", caption, sheet(scene, shots, "wall_gap"))
+
+
+def gap_view(contour: MeshLayer, profile: View) -> View:
+    """Return the view of a contour from the side where it is farthest from the wall.
+
+    Parameters
+    ----------
+    contour : contour of a device with its gaps as values.
+    profile : the view whose upward direction is kept as far as possible.
+    """
+    normals = contour.surface.vertex_normals
+    # A high power of the gap leaves the place of the largest one, and is smooth where several are equal.
+    toward = ((contour.values / contour.values.max()) ** 8) @ normals
+    toward /= np.linalg.norm(toward)
+    right, up, _ = profile.axes
+    up = up if abs(float(up @ toward)) < 0.9 else right
+    up = up - (up @ toward) * toward
+    up /= np.linalg.norm(up)
+    return view_of("gap", np.stack([np.cross(up, toward), up, toward]), contour.surface.vertices_mm)
 
 
 def _coverage(scene: Scene) -> Picture:
