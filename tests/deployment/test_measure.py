@@ -66,6 +66,8 @@ def test_the_morphology_of_a_cut_sphere():
     r, h = 3.0, 2.0
     neck_mm = np.sqrt(r**2 - h**2)
     found = morphology(replace(tube(line(32), 1.9), aneurysms=(spherical_sac(r, h),)))
+    volume_mm3, wall_mm2 = np.pi * (r + h) ** 2 * (3 * r - (r + h)) / 3, 2 * np.pi * r * (r + h)
+    slender = 1 - (18 * np.pi) ** (1 / 3) * volume_mm3 ** (2 / 3) / wall_mm2
     expected = {
         "sac_volume_mm3": np.pi * (r + h) ** 2 * (3 * r - (r + h)) / 3,
         "sac_area_mm2": 2 * np.pi * r * (r + h),
@@ -81,6 +83,10 @@ def test_the_morphology_of_a_cut_sphere():
         "neck_max_diameter_mm": 2 * neck_mm,
         "aspect_ratio": (r + h) / (2 * neck_mm),
         "size_ratio": (r + h) / 3.8,
+        "undulation_index": 0.0,
+        "ellipticity_index": slender,
+        "nonsphericity_index": slender,
+        "inflow_angle_rad": np.pi,  # the sac lies straight ahead
         "parent_proximal_diameter_mm": 3.8,
         "parent_distal_diameter_mm": 3.8,
         **STRAIGHT,

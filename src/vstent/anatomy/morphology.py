@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from vstent.anatomy.landing_zones import landing_diameters_mm, neck_span_mm
-from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Aneurysm
+from vstent.anatomy.shape import beyond_plane, shape_indices
+from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 
@@ -21,6 +21,8 @@ PARTED: Final = 0.9
 artery's wall rises through the plane there."""
 FEWEST_AXIS_POINTS: Final = 9
 """Fewest axis points from which curvature and torsion are computed."""
+LEAST_UPSTREAM: Final = 0.25
+"""Least length of artery before the neck, in its diameters, from which the inflow angle is computed."""
 BENT: Final = 0.1
 """An axis is bent, and has a torsion, where its curvature exceeds this value divided by the artery's diameter."""
 
@@ -36,6 +38,11 @@ def morphology(anatomy: Anatomy) -> Morphology:
     instead (Raghavan et al. 2005). For comparison, the volume beyond the neck plane and the area of the section are
     listed too. That plane passes through the center of the neck, perpendicular to its vector area. The section is left
     out where the artery's wall rises through the plane and divides it.
+
+    The shape indices of Raghavan et al. 2005 are those of the sac beyond the neck plane (`vstent.anatomy.shape`). The
+    inflow angle (Baharoglu et al. 2010) lies between the parent axis over one diameter before the neck and the line
+    from the center of the neck to the farthest point of the dome. It is 90 degrees for a sac beside a straight artery,
+    and 180 degrees for one straight ahead of the flow.
 
     Curvature and torsion are those of the parent axis (Piccinelli et al. 2009), from a quartic fitted over one diameter
     on both sides. The same length is left out at both ends of the axis.
@@ -54,6 +61,8 @@ def morphology(anatomy: Anatomy) -> Morphology:
 
     Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355.
 
+    Baharoglu et al. 2010, Stroke 41:1423.
+
     Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141.
     """
     found: Morphology = {**_parent(anatomy)}
@@ -62,7 +71,7 @@ def morphology(anatomy: Anatomy) -> Morphology:
     found |= _course(anatomy)
     for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
         beside = _parent(replace(anatomy, aneurysms=(aneurysm,)))
-        measures = _sac(aneurysm, 0.5 * sum(beside.values()))
+        measures = _sac(aneurysm, anatomy.axis, 0.5 * sum(beside.values()))
         found |= measures if number == 1 else {f"sac_{number}": {**beside, **measures}}
     return found
 
@@ -96,7 +105,7 @@ def _course(anatomy: Anatomy) -> Measures:
     return found
 
 
-def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
+def _sac(aneurysm: Aneurysm, axis: Centerline, parent_diameter_mm: float) -> Measures:
     """Return the measures of a sac and its neck."""
     rim_mm, dome_mm = aneurysm.neck_mm, aneurysm.sac.vertices_mm
     center_mm = triangles.polygon_centroid(rim_mm)
@@ -107,14 +116,14 @@ def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
     reach_mm = float(np.linalg.norm(dome_mm - center_mm, axis=1).max())
     neck_mean_mm = float(2 * np.linalg.norm(rim_mm - center_mm, axis=1).mean())
     width_mm = _widths_mm(rim_mm, normal)
-    plane_area_mm2, plane_volume_mm3 = _beyond(aneurysm.sac, center_mm, normal)
+    beyond = beyond_plane(aneurysm, center_mm, normal)
     found: Measures = {
         "sac_volume_mm3": abs(aneurysm.sac.volume_mm3),
         "sac_area_mm2": aneurysm.sac.area_mm2 - aneurysm.neck.area_mm2,
         "sac_height_mm": height_mm,
         "sac_max_height_mm": reach_mm,
         "sac_max_diameter_mm": _diameter_mm(dome_mm),
-        "sac_plane_volume_mm3": plane_volume_mm3,
+        "sac_plane_volume_mm3": beyond.volume_mm3,
         "neck_area_mm2": neck_area_mm2,
         "neck_surface_area_mm2": aneurysm.neck.area_mm2,
         "neck_perimeter_mm": triangles.perimeter(rim_mm),
@@ -122,20 +131,27 @@ def _sac(aneurysm: Aneurysm, parent_diameter_mm: float) -> Measures:
         "neck_max_diameter_mm": float(width_mm.max()),
         "aspect_ratio": height_mm / neck_mean_mm,
         "size_ratio": reach_mm / parent_diameter_mm,
+        **shape_indices(beyond, normal),
+        **_inflow_angle(aneurysm, axis, center_mm, parent_diameter_mm),
     }
-    if plane_area_mm2 > PARTED * neck_area_mm2:
-        found["neck_plane_area_mm2"] = plane_area_mm2
+    if beyond.section_mm2 > PARTED * neck_area_mm2:
+        found["neck_plane_area_mm2"] = beyond.section_mm2
     return found
 
 
-def _beyond(sac: Surface, center_mm: Floats, normal: Floats) -> tuple[float, float]:
-    """Return the area of the largest piece of a sac's section by a plane, and the volume beyond that plane."""
-    below_mm = -(sac.vertices_mm - center_mm) @ normal
-    vertices, faces, _ = triangles.clip(sac.vertices_mm, sac.faces, below_mm)
-    loops = triangles.boundary_loops(vertices, faces)
-    capped, closed = triangles.cap(vertices, faces, loops)
-    areas = [float(np.linalg.norm(triangles.polygon_area_vector(vertices[loop]))) for loop in loops]
-    return max(areas, default=0.0), triangles.volume(capped[closed])
+def _inflow_angle(
+    aneurysm: Aneurysm, axis: Centerline, center_mm: Floats, parent_diameter_mm: float
+) -> dict[str, float]:
+    """Return the angle between the artery upstream and the longest height of the sac; empty without artery upstream."""
+    neck_mm = float(np.clip(aneurysm.proximal_abscissa_mm, 0.0, axis.length_mm))
+    before_mm, here_mm = axis.at(np.array([max(neck_mm - parent_diameter_mm, 0.0), neck_mm]))
+    if neck_mm < LEAST_UPSTREAM * parent_diameter_mm:
+        return {}
+    dome_mm = aneurysm.sac.vertices_mm - center_mm
+    height_mm = dome_mm[np.linalg.norm(dome_mm, axis=1).argmax()]
+    upstream_mm = before_mm - here_mm
+    cosine = height_mm @ upstream_mm / np.linalg.norm(height_mm) / np.linalg.norm(upstream_mm)
+    return {"inflow_angle_rad": float(np.arccos(np.clip(cosine, -1.0, 1.0)))}
 
 
 def _diameter_mm(points_mm: Floats) -> float:

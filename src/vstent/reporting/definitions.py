@@ -16,6 +16,7 @@ class Definition(NamedTuple):
 
 _DHAR: Final = "Dhar et al. 2008, Neurosurgery 63:185"
 _RAGHAVAN: Final = "Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355"
+_BAHAROGLU: Final = "Baharoglu et al. 2010, Stroke 41:1423"
 _PICCINELLI: Final = "Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141"
 """Publications that define metrics."""
 
@@ -53,6 +54,27 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "neck_max_diameter_mm": Definition("Neck width, largest", "Largest width of the neck curve in its mean plane."),
     "aspect_ratio": Definition("Aspect ratio", "Sac height divided by the mean diameter of the neck.", _DHAR),
     "size_ratio": Definition("Size ratio", "Longest sac height divided by the parent artery's diameter.", _DHAR),
+    "undulation_index": Definition(
+        "Undulation index",
+        "1 - V / Vh: volume V of the sac beyond the neck plane, Vh of its convex hull; 0 without dents and blebs.",
+        _RAGHAVAN,
+    ),
+    "ellipticity_index": Definition(
+        "Ellipticity index",
+        "1 - (18 pi)^(1/3) Vh^(2/3) / Sh: volume and area of the convex hull without the neck plane; half sphere: 0.",
+        _RAGHAVAN,
+    ),
+    "nonsphericity_index": Definition(
+        "Nonsphericity index",
+        "1 - (18 pi)^(1/3) V^(2/3) / S: volume and wall area of the sac beyond the neck plane; 0 for a half sphere.",
+        _RAGHAVAN,
+    ),
+    "inflow_angle_rad": Definition(
+        "Inflow angle",
+        "Angle between the parent artery upstream of the neck and the longest height of the sac; 180° is straight ahead "
+        "of the flow.",
+        _BAHAROGLU,
+    ),
     "diameter_threshold_band_mm": Definition(
         "Diameter band",
         "Change of every diameter when the threshold of the scan changes by 5 % of the step from tissue to lumen.",
