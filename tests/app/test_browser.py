@@ -1,70 +1,23 @@
 """The page in a real browser, as a user goes through it: nothing complains, nothing is fetched from elsewhere."""
 
-import base64
 import json
-import shutil
 import socket
 import subprocess
 import sys
 import time
 from contextlib import contextmanager
-from pathlib import Path
-from urllib.parse import urlsplit
 
 import app_case
 import numpy as np
 import pytest
+from browsing import SECOND, at, browsing, drop, in_time, needs_browser, playwright, step
 
 from vstent import phantoms
 from vstent.io.writers import write_stl
 from vstent.study.folder import CACHE
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: no test in a real browser")
-pytestmark = pytest.mark.skipif(
-    BROWSER is None, reason="no chromium on this machine: the page is not tried in a browser"
-)
-
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
-SECOND = 1000
+pytestmark = needs_browser
 COARSE_MM = "0.4"
-
-
-def browsing(client, width=1280, height=720):
-    """The page of a server of the tests."""
-    return at(f"http://{client.base_url.netloc.decode()}/?token={app_case.TOKEN}", width, height)
-
-
-@contextmanager
-def at(address, width=1280, height=720):
-    """A page let in by the address that the server prints; it ends without a word on the console or a foreign call."""
-    host = urlsplit(address).netloc
-    complaints: list[str] = []
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=BROWSER, args=FLAGS)
-        page = browser.new_page(viewport={"width": width, "height": height})
-        page.set_default_timeout(120 * SECOND)
-        page.on("console", lambda message: complaints.append(message.text))
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        own = (f"http://{host}/", "data:", "blob:")
-        page.on("request", lambda request: request.url.startswith(own) or complaints.append(request.url))
-        page.goto(address)
-        yield page
-        browser.close()
-    assert not complaints, complaints
-
-
-def drop(page, path: Path):
-    """Drop a file on the page as a hand does."""
-    page.wait_for_selector(".drop")
-    give = """([name, text]) => {
-        const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-        const transfer = new DataTransfer();
-        transfer.items.add(new File([bytes], name));
-        return transfer;
-    }"""
-    transfer = page.evaluate_handle(give, [path.name, base64.b64encode(path.read_bytes()).decode()])
-    page.dispatch_event(".drop", "drop", {"dataTransfer": transfer})
 
 
 def place_of(page, end):
@@ -72,10 +25,6 @@ def place_of(page, end):
     word = page.locator(f".handle.{end} .handle-word")
     playwright.expect(word).to_contain_text("mm", timeout=120 * SECOND)  # kernels may have to be compiled
     return float(word.inner_text().split()[0])
-
-
-def step(page, title):
-    page.locator(".stepper").get_by_role("button", name=title, exact=False).click()
 
 
 def drawn(page, box):
@@ -188,84 +137,6 @@ def test_a_tick_lets_blood_enter_by_an_opening_as_well(artery, tmp_path):
         boxes.nth(1).uncheck()
         playwright.expect(page.locator(".given")).not_to_contain_text("; ")
         assert boxes.nth(1).is_checked() is False
-
-
-CENTER_MM = np.array([10.0, -20.0, 30.0])
-"""Middle of the scan of a ball, in LPS."""
-OFFSET_MM = np.array([6.0, -4.0, 5.0])
-"""The ball lies to the left, to the front and to the head of it."""
-LOOKS = {"Sagittal": (1, 2, "APSI", 0.5), "Coronal": (0, 2, "RLSI", 0.8), "Axial": (0, 1, "RLAP", 0.5)}
-"""World axes to the right and downwards, the letters at the left, right, top and bottom, and the pixel in mm."""
-
-
-def ball_scan(path):
-    """A bright ball in a scan whose axes run to the feet, to the right and to the back, 1.5, 0.8 and 0.5 mm apart."""
-    import SimpleITK
-
-    axes, spacing_mm, shape = np.array([[0, 0, -1], [-1, 0, 0], [0, 1, 0]]), [1.5, 0.8, 0.5], [30, 50, 70]
-    origin_mm = CENTER_MM - 0.5 * (np.array(shape) - 1) * spacing_mm @ axes
-    places_mm = np.moveaxis(np.indices(shape), 0, -1) * spacing_mm @ axes + origin_mm
-    inside = np.linalg.norm(places_mm - CENTER_MM - OFFSET_MM, axis=-1) < 8.5
-    image = SimpleITK.GetImageFromArray((200 * inside).astype(np.uint8).T)
-    image.SetSpacing(spacing_mm)
-    image.SetOrigin(origin_mm)
-    image.SetDirection(axes.T.ravel().astype(float))
-    SimpleITK.WriteImage(image, path)
-
-
-def test_slices_lie_as_a_radiologist_expects_however_the_voxels_are_stored(tmp_path):
-    ball_scan(tmp_path / "ball.nii.gz")
-    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
-        drop(page, tmp_path / "ball.nii.gz")
-        page.wait_for_selector(".step.failed")  # a ball is no vessel
-        step(page, "Image")
-        page.wait_for_selector(".slice-canvas")
-        for place, (title, (right, down, letters, pixel_mm)) in enumerate(LOOKS.items()):
-            pane = page.locator(f".slice:has-text('{title}')")
-            playwright.expect(pane).to_be_visible()
-            assert "".join(pane.locator(".slice-side").all_inner_texts()) == letters
-            box = pane.bounding_box()
-            assert (box["x"] > 500, box["y"] > 300) == [(False, False), (True, False), (False, True)][place]
-            wanted = CENTER_MM.copy()
-            wanted[[right, down]] += OFFSET_MM[[right, down]]
-            offset = OFFSET_MM[right] / pixel_mm, OFFSET_MM[down] / (pixel_mm if down == 1 else -pixel_mm)
-            page.mouse.click(*on_slice(pane.locator("canvas"), *offset))
-            assert in_time(page, lambda wanted=wanted: is_near(chosen(client)["at_mm"], wanted))
-        # What is drawn lies where a click finds it.
-        brightest = page.locator(".slice-canvas").last.evaluate(MIDDLE_OF_WHITE)
-        width_mm, height_mm = 50 * 0.8, 70 * 0.5
-        assert brightest == pytest.approx([0.5 + 6 / width_mm, 0.5 - 4 / height_mm], abs=0.02)
-
-
-MIDDLE_OF_WHITE = """(canvas) => {
-    const { width, height } = canvas;
-    const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
-    let [n, x, y] = [0, 0, 0];
-    for (let i = 0; i < width * height; i++) {
-        if (data[4 * i] > 128) (n++, (x += i % width), (y += Math.floor(i / width)));
-    }
-    return [(x / n + 0.5) / width, (y / n + 0.5) / height];
-}"""
-
-
-def on_slice(canvas, right, down):
-    """Where on the page lies what is so many pixels of the slice from its middle."""
-    box = canvas.bounding_box()
-    width, height = canvas.evaluate("(canvas) => [canvas.width, canvas.height]")
-    scale = min(box["width"] / width, box["height"] / height)
-    return box["x"] + box["width"] / 2 + right * scale, box["y"] + box["height"] / 2 + down * scale
-
-
-def is_near(point_mm, wanted_mm):
-    return point_mm is not None and np.abs(np.array(point_mm) - wanted_mm).max() < 0.8
-
-
-def in_time(page, is_so, seconds=30):
-    """Ask until it is so; a message on the page may be that of something else."""
-    until = time.monotonic() + seconds
-    while not is_so() and time.monotonic() < until:
-        page.wait_for_timeout(100)
-    return is_so()
 
 
 def chosen(client):

@@ -5,12 +5,12 @@ import { Axis } from "./axis.js";
 import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js";
 import { Deploying } from "./deploy.js";
 import { Flowing } from "./flowing.js";
+import { Imaging } from "./imaging.js";
 import { Neck } from "./neck.js";
 import { bandWords, changeSheet, neckWords, placeWords, plainSheet, qualitySheet, sureSheet } from "./numbers.js";
 import { panels, placeOf, spokenRole } from "./panels.js";
 import { Picture } from "./picture.js";
 import { rankingTable } from "./ranking.js";
-import { Slices } from "./slices.js";
 import { startPage } from "./start.js";
 import { Trimming } from "./trimming.js";
 
@@ -83,7 +83,7 @@ class Page {
     this.view = null;
     this.anatomyKey = this.flowKey = this.scanKey = undefined;
     this.anatomy = null;
-    this.scan = this.slices = this.scanViews = null;
+    this.scan = this.imaging = null;
     this.measures = {};
     this.moment = this.times = this.flowPanes = this.sheets = this.pulse = undefined;
   }
@@ -91,9 +91,11 @@ class Page {
   async openCase(id, step) {
     this.close();
     this.path = `/api/cases/${encodeURIComponent(id)}`;
+    const opening = (this.opening = Symbol(id));
     let view;
     try {
       view = await get(this.path);
+      if (this.opening !== opening) return; // another one was opened meanwhile
     } catch (problem) {
       this.complain(problem);
       location.hash = "";
@@ -143,15 +145,7 @@ class Page {
     });
     this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
     this.along.chosen = (mm) => this.deploying.look(mm);
-    this.surfaces = new Newest(
-      (answer) => {
-        this.picture.put(answer);
-        if (this.scanViews?.length) return;
-        this.scanViews = answer.manifest.views;
-        this.renderScene();
-      },
-      (problem) => this.complain(problem),
-    );
+    this.imaging = new Imaging(this);
     this.moments = new Newest(
       () => {},
       (problem) => this.complain(problem),
@@ -162,14 +156,13 @@ class Page {
     this.caseName = make("span", { className: "case-name" });
     this.panel = make("section", { className: "panel", ariaLabel: "Step" });
     this.work = make("section", { className: "work", ariaLabel: "At work" });
-    this.sliceBox = make("div", { className: "slices", hidden: true });
     this.strip = make("section", { className: "strip", ariaLabel: "Details" });
     this.numbers = make("section", { className: "numbers", ariaLabel: "Numbers" });
     this.frame = make("div", { className: "page" }, [
       make("header", {}, [this.brand(), this.caseName, this.stepper, make("div", { className: "spring" }), this.undoButton, this.redoButton, this.badge()]),
       make("main", { className: "desk" }, [
         make("aside", { className: "left" }, [this.panel, this.work]),
-        make("div", { className: "middle" }, [this.sliceBox, this.picture.element, this.strip]),
+        make("div", { className: "middle" }, [this.imaging.box, this.picture.element, this.strip]),
         make("aside", { className: "right" }, [this.numbers]),
       ]),
     ]);
@@ -201,6 +194,7 @@ class Page {
       return;
     }
     this.shape = shape;
+    this.imaging.follow(view);
     this.render();
   }
 
@@ -233,31 +227,17 @@ class Page {
 
   async loadScan(grid) {
     this.scanKey = grid;
-    this.scanViews = null;
-    try {
-      const scan = await get(`${this.path}/image`);
-      this.scan = scan;
-      this.slices = new Slices(this.path, (point, isLumen) => (isLumen ? this.setSeed(point) : this.tell("There is no lumen at that point: click a bright one.")), (problem) => this.complain(problem));
-      this.sliceBox.replaceChildren(...this.slices.elements);
-      this.slices.show(scan);
-      this.lookAtNeck();
-      this.showThreshold(this.view.choices.threshold ?? scan.proposed_threshold);
-      this.render();
-    } catch (problem) {
-      this.complain(problem);
-    }
+    await this.imaging.load(grid).catch((problem) => this.complain(problem));
   }
 
   /** Turn the slices to the middle of the neck, once one is known. */
   lookAtNeck() {
     const neck = this.anatomy?.neck;
-    if (neck?.length) this.slices?.look(this.axis.at((neck[0] + neck[1]) / 2));
+    if (neck?.length) this.imaging.slices?.look(this.axis.at((neck[0] + neck[1]) / 2));
   }
 
-  /** The live surface and the outline at a threshold. */
   showThreshold(threshold) {
-    this.slices?.setThreshold(threshold);
-    this.surfaces.ask(() => getBinary(`${this.path}/image/surface?threshold=${threshold}`));
+    this.imaging.showThreshold(threshold);
   }
 
   async loadAnatomy() {
@@ -273,6 +253,7 @@ class Page {
       this.trimming.set(this.axis, answer.manifest.neck);
       this.along.set({ axis: answer.manifest.axis, neck: answer.manifest.neck });
       this.lookAtNeck();
+      this.imaging.follow(this.view);
       this.sheets = (await get(`${this.path}/numbers`));
       this.measures = {};
       this.render();
@@ -342,17 +323,17 @@ class Page {
   }
 
   renderScene() {
-    const isScan = this.step === "image" && this.view.is_scan && this.slices;
-    this.sliceBox.hidden = !isScan;
+    const isScan = this.step === "image" && this.view.is_scan && this.imaging.slices;
+    this.imaging.box.hidden = !isScan;
     this.frame.classList.toggle("with-slices", Boolean(isScan));
     const layers = LAYERS[this.step](this);
-    this.picture.setViews(...(isScan ? ["scan", this.scanViews] : ["vessel", this.anatomy?.views]), VIEW[this.step]);
+    this.picture.setViews(...(isScan ? ["scan", this.imaging.views] : ["vessel", this.anatomy?.views]), VIEW[this.step]);
     this.picture.setPanes(this.step === "flow" || this.step === "report" ? this.panes() : [{ id: this.device || "one", title: "" }]);
     this.picture.setLayers(layers, (this.memory[this.step] ??= {}));
     this.flowing.isWatched = this.step === "deploy";
-    this.picture.clicked = this.step === "sac" ? (point) => point && this.setSeed(point) : null;
+    this.picture.clicked = isScan ? (point) => this.imaging.clicked(point) : this.step === "sac" ? (point) => point && this.setSeed(point) : null;
     this.picture.moved = null;
-    this.picture.setMarks(this.anatomy ? this.marks() : []);
+    this.picture.setMarks(isScan ? this.imaging.marks : this.anatomy ? this.marks() : []);
     if (this.anatomy && this.step === "deploy") this.renderDeploy();
   }
 
@@ -627,7 +608,7 @@ const LUMEN = { id: "lumen", title: "Lumen", on: true, also: ["continued"] };
 const NECK = { id: "neck", title: "Neck", on: true };
 const LAYERS = {
   image: (page) =>
-    page.view.is_scan && page.slices
+    page.view.is_scan && page.imaging.slices
       ? [{ id: "live", title: "Surface at the threshold", on: true }]
       : [{ ...LUMEN, title: "Vessel" }, { id: "landing", title: "Inside", on: false }],
   vessel: (page) => [

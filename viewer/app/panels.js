@@ -53,7 +53,7 @@ function words(key, label, unit, values, placeholder, changed) {
   const input = make("input", { type: "text", value: values?.join(" ") ?? "", placeholder, id: `field-${key}` });
   input.dataset.key = key;
   input.addEventListener("change", () => changed(input.value));
-  return make("label", { className: "field", htmlFor: `field-${key}` }, [make("span", {}, [label]), input, make("small", {}, [unit])]);
+  return make("label", { className: "field three", htmlFor: `field-${key}` }, [make("span", {}, [label]), input, make("small", {}, [unit])]);
 }
 
 function select(key, label, value, options, changed) {
@@ -223,7 +223,9 @@ function grid(page) {
 function threshold(page) {
   const { scan, view } = page;
   const value = view.choices.threshold ?? scan.proposed_threshold;
+  const size = `${scan.shape.join(" × ")} voxels of ${scan.spacing_mm.map((x) => x.toFixed(2)).join(" × ")} mm.`;
   const [low, high] = scan.range;
+  if (value === undefined) return [make("p", { className: "hint", role: "status" }, ["The threshold is being proposed …"]), make("p", { className: "hint" }, [size])];
   const slider = make("input", { type: "range", min: low, max: high, step: (high - low) / 500, value, id: "field-threshold" });
   slider.dataset.key = "threshold";
   const shown = make("b", {}, [value.toFixed(0)]);
@@ -238,15 +240,16 @@ function threshold(page) {
     timer = setTimeout(() => page.choose({ threshold: Number(slider.value) }), 250);
   });
   const parts = [make("label", { className: "slider", htmlFor: "field-threshold" }, [make("span", {}, ["Threshold ", shown]), slider])];
-  if (view.choices.threshold !== null) {
+  if (view.choices.threshold !== null && scan.proposed_threshold !== undefined) {
     const reset = () => {
       page.choose({ threshold: null });
       page.showThreshold(scan.proposed_threshold);
     };
     parts.push(make("button", { type: "button", className: "link", onClick: reset }, [`Back to the proposed ${scan.proposed_threshold.toFixed(0)}`]));
   }
-  const size = `${scan.shape.join(" × ")} voxels of ${scan.spacing_mm.map((x) => x.toFixed(2)).join(" × ")} mm`;
-  parts.push(make("p", { className: "hint" }, [`${size}. Drag in a slice for window and level, click for a seed, turn the wheel for the next slice. Orange is the wall at the threshold.`]));
+  parts.push(make("p", { className: "hint" }, [size]));
+  const keys = [["Wheel", "next slice"], ["Ctrl + wheel", "zoom"], ["Shift + drag", "move the picture"], ["Right button", "window and level"], ["Double click", "one slice alone"]];
+  parts.push(make("dl", { className: "keys" }, keys.flatMap(([key, what]) => [make("dt", {}, [key]), make("dd", {}, [what])])));
   return parts;
 }
 

@@ -1,230 +1,335 @@
-// Three orthogonal slices of a scan, laid as a radiologist expects them: the patient's right on the left, the head on top;
-// window and level, the mask's outline, a click for the seed.
+// Three linked slices of a scan: one cross-hair, one window, one zoom; tools for window and level, ruler, seed and crop box.
 import { make } from "../src/dom.js";
-import { numbers } from "../src/decode.js";
+import { integers, numbers } from "../src/decode.js";
 import { getBinary, Newest } from "./api.js";
+import { SliceBar } from "./slicebar.js";
+import { pathOf, SliceView } from "./sliceview.js";
+import { Handling } from "./slicetools.js";
+import { toIndex, toMm } from "./voxels.js";
 
-/** By the axis of the world (to the left, to the back, to the head) that a slice is across. */
-const PLANES = [
-  { title: "Sagittal", right: [1, 1], down: [2, -1], letters: ["A", "P", "S", "I"] },
-  { title: "Coronal", right: [0, 1], down: [2, -1], letters: ["R", "L", "S", "I"] },
-  { title: "Axial", right: [0, 1], down: [1, 1], letters: ["R", "L", "A", "P"] },
-];
-const SIDES = ["left", "right", "top", "bottom"];
+const KEPT = 90;
+const AHEAD = 2;
 
 export class Slices {
-  constructor(path, seeded, failed) {
-    this.path = path;
-    this.seeded = seeded;
-    this.buffer = document.createElement("canvas");
+  /** @param host {path, seeded(mm), cropped(corners or null), looked(mm), told(), device(), failed} */
+  constructor(host) {
+    this.host = host;
     this.threshold = null;
-    this.window = null;
-    this.views = [0, 1, 2].map((axis) => this.view(axis, failed));
-    this.elements = this.views.map(({ element }) => element);
-  }
-
-  view(axis, failed) {
-    const canvas = make("canvas", { className: "slice-canvas" });
-    const slider = make("input", { type: "range", min: 0, value: 0 });
-    const label = make("span", { className: "slice-label" });
-    const letters = SIDES.map((side) => make("span", { className: `slice-side at-${side}` }));
-    const element = make("div", { className: "slice" }, [canvas, label, ...letters, slider]);
-    const view = { axis, canvas, slider, label, letters, element, plane: null };
-    view.line = new Newest(({ manifest, buffer }) => {
-      view.plane = { width: manifest.width, height: manifest.height, values: numbers(buffer, manifest.values) };
-      this.paint(view);
-    }, failed);
-    slider.addEventListener("input", () => this.turn(view));
-    element.addEventListener(
-      "wheel",
-      (event) => {
-        event.preventDefault();
-        slider.value = Number(slider.value) + Math.sign(event.deltaY);
-        this.turn(view);
-      },
-      { passive: false },
-    );
-    this.listen(view);
-    return view;
-  }
-
-  /** Drag changes window and level; a click sets the seed. */
-  listen(view) {
-    let last = null;
-    let moved = 0;
-    view.canvas.addEventListener("pointerdown", (event) => {
-      view.canvas.setPointerCapture(event.pointerId);
-      last = event;
-      moved = 0;
-    });
-    view.canvas.addEventListener("pointermove", (event) => {
-      if (!last || !this.scan) return;
-      moved += Math.abs(event.clientX - last.clientX) + Math.abs(event.clientY - last.clientY);
-      const step = (this.scan.range[1] - this.scan.range[0]) / 400;
-      this.window = {
-        width: Math.max(this.window.width + (event.clientX - last.clientX) * step, 4 * step),
-        level: this.window.level - (event.clientY - last.clientY) * step,
-      };
-      last = event;
-      this.views.forEach((one) => this.paint(one));
-    });
-    view.canvas.addEventListener("pointerup", (event) => {
-      if (last && moved < 4 && view.plane) this.seeded(this.toMm(view, event), this.valueAt(view, event) >= this.threshold);
-      last = null;
-    });
+    this.on = { threshold: true, lumen: true, parent: false, sac: true, neck: true, wires: true };
+    this.tool = "cross";
+    this.zoom = 1;
+    this.slab = 0;
+    this.rulers = [];
+    this.seed = null;
+    this.crop = null;
+    this.cross = [0, 0, 0];
+    this.pointer = null;
+    this.greys = new Uint32Array(65536);
+    this.kept = new Map();
+    this.views = [0, 1, 2].map((axis) => new SliceView(axis, this));
+    this.lines = this.views.map(() => new Newest((answer) => answer && this.arrived(answer), host.failed));
+    this.outlineLines = this.views.map(() => new Newest((answer) => answer && this.outlined(answer), host.failed));
+    this.views.forEach((view) => new Handling(view, this));
+    this.bar = new SliceBar(this);
+    this.elements = [this.bar.element, ...this.views.map(({ element }) => element)];
   }
 
   /** Begin with a scan: its middle slices. */
   show(scan) {
     this.scan = scan;
     this.isTurned = false;
-    const [low, high] = scan.range;
-    this.window = { width: (high - low) * 0.9, level: low + (high - low) * 0.5 };
-    const across = worldAxes(scan.affine_mm);
-    for (const view of this.views) {
-      view.laid = laid(across, scan.affine_mm, view.axis);
-      const { title, letters } = view.laid;
-      view.slider.ariaLabel = `${title} slice`;
-      view.letters.forEach((element, i) => (element.textContent = scan.is_oriented ? letters[i] : ""));
-      view.slider.max = scan.shape[view.axis] - 1;
-      // The canvases stand in the order sagittal, coronal, axial, however the voxels are stored.
-      view.element.style.order = across[view.axis] - 3;
-    }
-    this.go(scan.shape.map((n) => Math.floor(n / 2)));
+    this.resetWindow();
+    for (const view of this.views) view.show(scan);
+    this.bar.show(scan);
+    this.put(scan.shape.map((n) => Math.floor(n / 2)));
   }
 
   /** Show the slices through a point of the world, unless somebody has turned to others. */
-  look(point) {
-    if (this.scan && !this.isTurned) this.go(indexOf(this.scan.affine_mm, point));
+  look(point, isForced = false) {
+    if (this.scan && (isForced || !this.isTurned)) this.put(toIndex(this.scan.affine_mm, point));
+    if (isForced) this.isTurned = true;
   }
 
-  go(index) {
-    for (const view of this.views) {
-      view.slider.value = Math.round(index[view.axis]);
-      this.load(view);
-    }
+  /** Put the cross-hair at an index of the volume. */
+  put(index) {
+    this.cross = index.map((place, axis) => Math.min(Math.max(place, 0), this.scan.shape[axis] - 1));
+    for (const view of this.views) this.load(view);
+    this.bar.say();
+    this.host.looked(this.crossMm);
   }
 
-  turn(view) {
+  get crossMm() {
+    return toMm(this.scan.affine_mm, this.cross);
+  }
+
+  /** A slice was chosen. */
+  turn(view, index) {
     this.isTurned = true;
-    this.load(view);
+    const cross = [...this.cross];
+    cross[view.axis] = Math.min(Math.max(index, 0), this.scan.shape[view.axis] - 1);
+    this.put(cross);
+  }
+
+  colourOf(axis) {
+    return this.views[axis].laid.colour;
+  }
+
+  /** The slices that are shown: all, or one alone. */
+  get visible() {
+    const alone = this.views.filter(({ element }) => element.classList.contains("alone"));
+    return alone.length ? alone : this.views;
+  }
+
+  paint() {
+    for (const view of this.views) view.paint();
+  }
+
+  // -- what the server sends ------------------------------------------------------------------------------------------
+
+  /** Slices on each side that a slab of mm includes. */
+  slabOf(view) {
+    return Math.round(this.slab / 2 / this.scan.spacing_mm[view.axis]);
   }
 
   load(view) {
-    const index = Number(view.slider.value);
-    view.label.textContent = `${view.laid.title} ${index + 1} / ${this.scan.shape[view.axis]}`;
-    view.line.ask(() => getBinary(`${this.path}/image/slice?axis=${view.axis}&index=${index}`));
+    const { index } = view;
+    view.slider.value = index;
+    view.label.textContent = `${view.laid.title} ${index + 1} / ${this.scan.shape[view.axis]}${this.slab ? ` · MIP ${this.slabName}` : ""}`;
+    view.label.style.setProperty("--plane", view.laid.colour);
+    const key = this.keyOf(view, index);
+    const plane = this.kept.get(key);
+    if (plane && view.plane !== plane) view.take(plane);
+    else view.paint();
+    this.lines[view.axis].ask(() => this.fetch(view, index, true));
+    this.loadOutlines(view);
+  }
+
+  get slabName() {
+    return this.slab > 500 ? "of all" : `${this.slab} mm`;
+  }
+
+  keyOf(view, index) {
+    return `${view.axis} ${index} ${this.slabOf(view)}`;
+  }
+
+  /** A slice from memory or from the server; those beside it follow while nothing else is wanted. */
+  async fetch(view, index, isFirst) {
+    const key = this.keyOf(view, index);
+    const { scan } = this;
+    let plane = this.kept.get(key);
+    if (!plane) {
+      const { manifest, buffer } = await getBinary(`${this.host.path()}/image/slice?axis=${view.axis}&index=${index}&slab=${this.slabOf(view)}`);
+      plane = { width: manifest.width, height: manifest.height, values: integers(buffer, manifest.values) };
+      if (scan !== this.scan) return null;
+      this.keep(key, plane);
+    }
+    if (isFirst && !this.slab) this.fetchBeside(view, index);
+    return { view, key, plane };
+  }
+
+  fetchBeside(view, index) {
+    const beside = [];
+    for (let step = 1; step <= AHEAD; step++) beside.push(index + step, index - step);
+    const next = beside.find((one) => one >= 0 && one < this.scan.shape[view.axis] && !this.kept.has(this.keyOf(view, one)));
+    const line = this.lines[view.axis];
+    if (next !== undefined && !line.waiting) setTimeout(() => !line.waiting && view.index === index && line.ask(() => this.fetch(view, next, false).then(() => (this.fetchBeside(view, index), null))), 0);
+  }
+
+  keep(key, plane) {
+    this.kept.set(key, plane);
+    for (const old of this.kept.keys()) {
+      if (this.kept.size <= KEPT) break;
+      this.kept.delete(old);
+    }
+  }
+
+  arrived({ view, key, plane }) {
+    if (key !== this.keyOf(view, view.index) || view.plane === plane) return;
+    view.take(plane);
+    this.bar.say();
+  }
+
+  /** The anatomy that was found, and the name and place of a device in it: their outlines are drawn from here on. */
+  setFound(anatomy, device, place) {
+    const found = anatomy ? [anatomy, device, place].join(" ") : null;
+    if (found === this.found) return;
+    this.found = found;
+    this.device = device;
+    this.reloadOutlines();
+    this.bar.renderChips();
+  }
+
+  reloadOutlines() {
+    for (const view of this.views) {
+      view.outlines = null;
+      if (this.scan) this.loadOutlines(view);
+    }
+  }
+
+  loadOutlines(view) {
+    if (!this.found) return;
+    const [index, { found, device }] = [view.index, this];
+    if (view.outlines?.index === index && view.outlines.found === found) return;
+    const wires = device && this.on.wires ? `&device=${encodeURIComponent(device)}` : "";
+    this.outlineLines[view.axis].ask(async () => {
+      if (index !== view.index) return null;
+      return { view, index, found, answer: await getBinary(`${this.host.path()}/image/outlines?axis=${view.axis}&index=${index}${wires}`) };
+    });
+  }
+
+  outlined({ view, index, found, answer: { manifest, buffer } }) {
+    if (found !== this.found) return;
+    const outlines = { index, found };
+    for (const [name, block] of Object.entries(manifest.segments)) outlines[name] = pathOf(numbers(buffer, block));
+    if (manifest.wires) outlines.wires = numbers(buffer, manifest.wires);
+    view.element.dataset.outlines = Object.entries(manifest.segments).filter(([, { length }]) => length).map(([name]) => name).concat(outlines.wires?.length ? ["wires"] : []).join(" ");
+    view.outlines = outlines;
+    view.paint();
+  }
+
+  // -- grey values ----------------------------------------------------------------------------------------------------
+
+  resetWindow() {
+    const [low, high] = this.scan.range;
+    this.setWindow({ level: low + (high - low) * 0.5, width: (high - low) * 0.9, isInverted: false });
+  }
+
+  /** Window and level: the grey of every stored integer, once for all slices. */
+  setWindow(changes) {
+    this.window = { ...this.window, ...changes };
+    const { level, isInverted } = this.window;
+    const { ends, step } = this.scan;
+    const width = (this.window.width = Math.max(this.window.width, step));
+    const count = Math.round((ends[1] - ends[0]) / step) + 1;
+    for (let i = 0; i < count; i++) {
+      const share = Math.min(Math.max((ends[0] + step * i - level) / width + 0.5, 0), 1);
+      const grey = Math.round(255 * (isInverted ? 1 - share : share));
+      this.greys[i] = 0xff000000 | (grey << 16) | (grey << 8) | grey;
+    }
+    for (const view of this.views) view.grey();
+    this.bar?.sayWindow();
   }
 
   setThreshold(threshold) {
     this.threshold = threshold;
-    this.views.forEach((view) => this.paint(view));
+    this.paint();
+    this.bar.renderChips();
   }
 
-  /** Axes of the volume that a slice's columns and rows run along. */
-  axes(view) {
-    return [0, 1, 2].filter((axis) => axis !== view.axis);
+  setSlab(mm) {
+    this.slab = mm;
+    for (const view of this.views) this.load(view);
   }
 
-  paint(view) {
-    if (!view.plane) return;
-    const { width, height, values } = view.plane;
-    const image = new ImageData(width, height);
-    const low = this.window.level - this.window.width / 2;
-    const scale = 255 / this.window.width;
-    const wall = this.threshold ?? Infinity;
-    for (let i = 0; i < values.length; i++) {
-      const value = values[i];
-      const x = i % width;
-      const isIn = value >= wall;
-      const isRim =
-        isIn && ((x > 0 && values[i - 1] < wall) || (x < width - 1 && values[i + 1] < wall) || values[i - width] < wall || values[i + width] < wall);
-      const grey = (value - low) * scale;
-      const colour = isRim ? [240, 160, 40] : [grey, grey, grey];
-      image.data.set([...colour, 255], 4 * i);
-    }
-    this.buffer.width = width;
-    this.buffer.height = height;
-    this.buffer.getContext("2d").putImageData(image, 0, 0);
-    const [w, h] = this.size(view);
-    view.canvas.width = w;
-    view.canvas.height = h;
-    const context = view.canvas.getContext("2d");
-    const [a, c, e, b, d, f] = this.onCanvas(view);
-    context.setTransform(a, b, c, d, e, f);
-    context.drawImage(this.buffer, 0, 0);
+  setTool(tool) {
+    this.tool = tool;
+    for (const view of this.views) view.area.dataset.tool = tool;
+    this.bar.renderTools();
+    this.paint();
+    this.host.told();
   }
 
-  /** Pixels of a canvas: voxels need not be cubes, it has the shape of what they show. */
-  size(view) {
-    const { right, down } = view.laid;
-    const unit = Math.min(this.scan.spacing_mm[right.axis], this.scan.spacing_mm[down.axis]);
-    return [right, down].map(({ axis }) => Math.round((this.scan.shape[axis] * this.scan.spacing_mm[axis]) / unit));
+  toggle(name) {
+    this.on[name] = !this.on[name];
+    this.bar.renderChips();
+    if (name === "wires" && this.on.wires) this.reloadOutlines();
+    this.paint();
   }
 
-  /** Rows [a, c, e], [b, d, f] of the map from column and row of the slice to pixels of its canvas. */
-  onCanvas(view) {
-    const { right, down } = view.laid;
-    const [columns] = this.axes(view);
-    return this.size(view).flatMap((pixels, i) => {
-      const { axis, sign } = [right, down][i];
-      const scale = (sign * pixels) / this.scan.shape[axis];
-      const begin = sign < 0 ? pixels : 0;
-      return axis === columns ? [scale, 0, begin] : [0, scale, begin];
-    });
+  // -- seed, ruler, crop box ------------------------------------------------------------------------------------------
+
+  /** The seed that is chosen, in LPS mm, or null. */
+  setSeed(point) {
+    this.seed = point && this.scan ? toIndex(this.scan.affine_mm, point) : null;
+    this.paint();
   }
 
-  /** Column and row under a pointer: the canvas is as large as its box, the picture in it keeps its shape. */
-  place(view, event) {
-    const box = view.canvas.getBoundingClientRect();
-    const [width, height] = this.size(view);
-    const scale = Math.min(box.width / width, box.height / height);
-    const x = (event.clientX - box.left - box.width / 2) / scale + width / 2;
-    const y = (event.clientY - box.top - box.height / 2) / scale + height / 2;
-    const [a, c, e, b, d, f] = this.onCanvas(view);
-    const whole = a * d - b * c;
-    // Voxels have their middles at whole numbers, pixels at halves.
-    return [(d * (x - e) - c * (y - f)) / whole - 0.5, (a * (y - f) - b * (x - e)) / whole - 0.5];
+  /** Choose a seed: an index of the volume. */
+  plant(view, index) {
+    const isLumen = this.threshold === null || (view.valueAt(index) ?? -Infinity) >= this.threshold;
+    this.host.seeded(toMm(this.scan.affine_mm, index), isLumen);
   }
 
-  valueAt(view, event) {
-    const [column, row] = this.place(view, event).map(Math.round);
-    return view.plane.values[row * view.plane.width + column] ?? -Infinity;
+  measure(view, ends, isNew) {
+    const between = ends.map((end) => toMm(this.scan.affine_mm, end));
+    const mm = Math.hypot(...[0, 1, 2].map((i) => between[1][i] - between[0][i]));
+    if (isNew) this.rulers.push({});
+    Object.assign(this.rulers.at(-1), { axis: view.axis, index: view.index, ends, mm });
+    this.paint();
+    this.bar.renderTools();
   }
 
-  toMm(view, event) {
-    const place = this.place(view, event);
-    const index = [0, 0, 0];
-    index[view.axis] = Number(view.slider.value);
-    this.axes(view).forEach((axis, i) => (index[axis] = place[i]));
-    const a = this.scan.affine_mm;
-    return [0, 1, 2].map((row) => a[4 * row] * index[0] + a[4 * row + 1] * index[1] + a[4 * row + 2] * index[2] + a[4 * row + 3]);
+  clearRulers(count = this.rulers.length) {
+    this.rulers.splice(this.rulers.length - count, count);
+    this.paint();
+    this.bar.renderTools();
   }
-}
 
-/** Axis of the world that each axis of the voxels runs along, one each: the best of the six ways. */
-function worldAxes(a) {
-  const ways = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
-  const along = (way) => way.reduce((sum, world, axis) => sum + Math.abs(a[4 * world + axis]) / Math.hypot(a[axis], a[4 + axis], a[8 + axis]), 0);
-  return ways.reduce((best, way) => (along(way) > along(best) ? way : best));
-}
+  /** First and last voxel of the crop box. */
+  get cropBox() {
+    return this.crop ?? [[0, 0, 0], this.scan.shape.map((n) => n - 1)];
+  }
 
-/** How the slice across an axis of the voxels is laid: its plane, and the axes and directions to the right and down. */
-function laid(across, affine, axis) {
-  const plane = PLANES[across[axis]];
-  const [right, down] = [plane.right, plane.down].map(([world, wanted]) => {
-    const voxels = across.indexOf(world);
-    return { axis: voxels, sign: wanted * (affine[4 * world + voxels] < 0 ? -1 : 1) };
-  });
-  return { ...plane, right, down };
-}
+  get isCropped() {
+    return this.crop !== null && this.crop.some((corner, end) => corner.some((place, axis) => place !== (end ? this.scan.shape[axis] - 1 : 0)));
+  }
 
-/** Voxel index of a point: the affine's inverse by Cramer's rule. */
-function indexOf(a, point) {
-  const [x, y, z] = [point[0] - a[3], point[1] - a[7], point[2] - a[11]];
-  const det = (u, v, w) => u[0] * (v[1] * w[2] - v[2] * w[1]) - v[0] * (u[1] * w[2] - u[2] * w[1]) + w[0] * (u[1] * v[2] - u[2] * v[1]);
-  const [i, j, k] = [0, 1, 2].map((column) => [a[column], a[4 + column], a[8 + column]]);
-  const b = [x, y, z];
-  const whole = det(i, j, k);
-  return [det(b, j, k) / whole, det(i, b, k) / whole, det(i, j, b) / whole];
+  /** The box that is chosen, as opposite corners in LPS mm, or null. */
+  setCrop(corners) {
+    if (!this.scan) return;
+    const found = corners?.map((corner) => toIndex(this.scan.affine_mm, corner).map(Math.round));
+    this.crop = found ? [0, 1].map((end) => found[0].map((_, axis) => Math[end ? "max" : "min"](found[0][axis], found[1][axis]))) : null;
+    this.bar.renderTools();
+    this.paint();
+    this.host.told();
+  }
+
+  /** Move one edge of the crop box. */
+  pullCrop(axis, end, place) {
+    const box = this.cropBox.map((corner) => [...corner]);
+    const [least, most] = end ? [box[0][axis] + 7, this.scan.shape[axis] - 1] : [0, box[1][axis] - 7];
+    box[end][axis] = Math.min(Math.max(Math.round(place), least), most);
+    this.crop = box;
+    this.paint();
+    this.host.told();
+  }
+
+  letCropGo() {
+    this.bar.renderTools();
+    this.host.cropped(this.isCropped ? this.crop.map((corner) => toMm(this.scan.affine_mm, corner)) : null);
+  }
+
+  // -- the views together ---------------------------------------------------------------------------------------------
+
+  zoomBy(factor, view, place) {
+    const was = this.views.map(({ scale }) => scale);
+    this.zoom = Math.min(Math.max(this.zoom * factor, 0.5), 40);
+    this.views.forEach((one, i) => one.keep(one === view && place ? place : one.onPageAt(this.cross, was[i]), was[i]));
+    this.paint();
+  }
+
+  resetView() {
+    this.zoom = 1;
+    for (const view of this.views) view.fit();
+    this.paint();
+  }
+
+  maximise(view) {
+    const isAlone = view.element.classList.toggle("alone");
+    for (const one of this.views) if (one !== view) one.element.classList.remove("alone");
+    this.host.alone(isAlone);
+  }
+
+  /** What is under the pointer, or at the cross-hair. */
+  point(view, index) {
+    this.pointer = view && view.isInside(index) ? { view, index } : null;
+    this.bar.say();
+  }
+
+  /** Index, value and positions to read out. */
+  get reading() {
+    const view = this.pointer?.view ?? this.views.find(({ plane }) => plane) ?? this.views[0];
+    const index = this.pointer?.index ?? this.cross;
+    return { index: index.map(Math.round), mm: toMm(this.scan.affine_mm, index), value: view.valueAt(index), isPointer: Boolean(this.pointer) };
+  }
 }

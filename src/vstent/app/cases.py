@@ -116,11 +116,12 @@ OF_IMAGE: Final = ("units", "spacing_mm", "shape", "threshold", "at_mm")
 def dependencies(state: State) -> dict[str, str]:
     """Return a digest of everything that each step depends on, by step."""
     chosen = state.choices.model_dump(mode="json")
-    frame = [chosen["frame"]] if chosen["frame"] else []  # absent by default, so that older cases keep their digests
+    # Absent by default, so that older cases keep their digests.
+    later = [chosen[name] for name in ("frame", "crop_mm") if chosen[name]]
     sizes = [[device.name, device.diameter_mm, device.length_mm] for device in state.choices.devices]
     centers = [device.center_mm for device in state.choices.devices]
     parts: dict[str, Any] = {
-        "image": [state.source, *(chosen[name] for name in OF_IMAGE), *frame],
+        "image": [state.source, *(chosen[name] for name in OF_IMAGE), *later],
         "vessel": [chosen[name] for name in ("inlet_mm", "upstream_mm", "downstream_mm")],
         "sac": [chosen["outlet_mm"], chosen["neck_mm"]],
         "device": sizes,

@@ -80,6 +80,8 @@ class Choices(Strict):
     """Voxel spacing of a raw volume."""
     shape: tuple[Count, Count, Count] | None = None
     """Number of voxels of a raw volume."""
+    crop_mm: tuple[Point, Point] | None = None
+    """Opposite corners of the box to which a scan is cropped."""
     threshold: Annotated[float, Field(allow_inf_nan=False)] | None = None
     """Intensity at the lumen wall of a scan."""
     at_mm: Point | None = None
@@ -128,6 +130,7 @@ class Choices(Strict):
             frame=self.frame,
             spacing_mm=self.spacing_mm,
             shape=self.shape,
+            crop_mm=self.crop_mm,
             threshold=self.threshold,
             at_mm=self.at_mm,
             inlet_mm=self.inlet_mm,

@@ -201,17 +201,39 @@ class Desk:
         InputError
             The case has a surface, or no input yet.
         """
+        import numpy as np
+
         from vstent.app.scans import Scan
         from vstent.io.images import read_image
 
         if _is_surface(case):
             raise InputError("This case has no scan, because it began with a surface.")
         choices = case.state.choices
-        grid = choices.spacing_mm, choices.shape
+        grid, crop = (choices.spacing_mm, choices.shape), choices.crop_mm
         with self._lock:
-            if case.id not in self._scans or self._scans[case.id][0] != grid:
-                self._scans[case.id] = grid, Scan(read_image(case.input, spacing_mm=grid[0], shape=grid[1]))
-            return self._scans[case.id][1]
+            given, found = self._scans.get(case.id, (None, None))
+            if given != (grid, crop):
+                is_read = given is not None and given[0] == grid
+                image = found.image if is_read else read_image(case.input, spacing_mm=grid[0], shape=grid[1])
+                found = Scan(image, None if crop is None else np.array(crop, dtype=np.float64))
+                self._scans[case.id] = (grid, crop), found
+            return found
+
+    def outlines(self, case: Case, device: str | None, axis: int, index: int) -> bytes:
+        """Return the outlines on a slice as a message for the page.
+
+        Parameters
+        ----------
+        case : the case.
+        device : chosen device whose wires are cut; None: none.
+        axis : voxel axis across the slice.
+        index : voxel index along that axis.
+        """
+        from vstent.app.outlines import outlines
+
+        live = self.live(case)
+        stent = None if device is None else live.deployment(live.choice(device)).stent
+        return outlines(self.scan(case).image, live.anatomy, stent, axis, index)
 
     def surface(self, case: Case, threshold: float) -> bytes:
         """Return the surface of the scan at a threshold, as a message for the page."""

@@ -35,6 +35,8 @@ BEAT_S: Final = 15.0
 
 Finite = Annotated[float, Query(allow_inf_nan=False)]
 """A finite number in a query."""
+Axis = Annotated[int, Query(ge=0, le=2)]
+"""Voxel axis across a slice."""
 Revision = Annotated[int, Field(ge=0)]
 """Revision of a case."""
 
@@ -240,13 +242,21 @@ def _add_input(api: APIRouter, desk: Desk) -> None:
         desk.begin(found)
         return desk.view(found)
 
-    @api.get("/api/cases/{case_id}/image", summary="Shape, spacing, range and proposed threshold of the scan")
+    @api.get("/api/cases/{case_id}/image", summary="Shape, spacing and intensities of the scan")
     def image(case_id: str) -> dict[str, Any]:
         return desk.scan(desk.store.get(case_id)).told()
 
-    @api.get("/api/cases/{case_id}/image/slice", summary="One slice of the scan (binary)")
-    def one_slice(case_id: str, axis: Annotated[int, Query(ge=0, le=2)], index: int) -> Response:
-        return Response(desk.scan(desk.store.get(case_id)).slice(axis, index), media_type=BINARY)
+    @api.get("/api/cases/{case_id}/image/threshold", summary="The proposed threshold of the scan")
+    def threshold(case_id: str) -> dict[str, float]:
+        return {"proposed_threshold": desk.scan(desk.store.get(case_id)).proposed_threshold}
+
+    @api.get("/api/cases/{case_id}/image/slice", summary="One slice of the scan, or the maximum of a slab (binary)")
+    def one_slice(case_id: str, axis: Axis, index: int, slab: Annotated[int, Query(ge=0)] = 0) -> Response:
+        return Response(desk.scan(desk.store.get(case_id)).slice(axis, index, slab), media_type=BINARY)
+
+    @api.get("/api/cases/{case_id}/image/outlines", summary="Sections of vessel, sac, neck and device (binary)")
+    def outlines(case_id: str, axis: Axis, index: int, device: str | None = None) -> Response:
+        return Response(desk.outlines(desk.store.get(case_id), device, axis, index), media_type=BINARY)
 
     @api.get("/api/cases/{case_id}/image/surface", summary="The surface at a threshold (binary)")
     def surface(case_id: str, threshold: Finite) -> Response:

@@ -143,6 +143,12 @@ def add_given(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
         "--shape", type=_shape, metavar="I,J,K", help="number of voxels of a raw volume, fastest axis first"
     )
     given.add_argument(
+        "--crop",
+        type=_box,
+        metavar="X,Y,Z,X,Y,Z",
+        help="opposite corners, mm, of the box along the image axes to which a scan is cropped (default: whole scan)",
+    )
+    given.add_argument(
         "--threshold",
         type=number,
         metavar="T",
@@ -382,6 +388,12 @@ def _point(text: str) -> tuple[float, float, float]:
     return _three(text, float)
 
 
+def _box(text: str) -> tuple["Point", "Point"]:
+    """Return two points read from text."""
+    a, b, c, d, e, f = _numbers(text, float, 6)
+    return (a, b, c), (d, e, f)
+
+
 def _shape(text: str) -> tuple[float, float, float]:
     """Return the numbers of voxels read from text."""
     return _three(text, int)
@@ -397,12 +409,14 @@ def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
     in_lps = _from_ras if arguments.frame == "ras" else _as_given
     inlets = tuple(map(in_lps, arguments.inlet)) if arguments.inlet else None
     at, outlet, neck = arguments.at, getattr(arguments, "outlet", None), _neck(getattr(arguments, "neck", None))
+    crop = arguments.crop
     return {
         "units": arguments.units,
         "frame": arguments.frame,
         "acquisition": arguments.acquisition,
         "spacing_mm": arguments.spacing,
         "shape": arguments.shape,
+        "crop_mm": crop and tuple(map(in_lps, crop)),
         "threshold": arguments.threshold,
         "at_mm": at and in_lps(at),
         "inlet_mm": inlets,

@@ -1,13 +1,17 @@
 """A scan on a regular, possibly oblique grid in the LPS frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.kernels.arrays import Floats, freeze
+from vstent.errors import InputError
+from vstent.kernels.arrays import Floats, Ints, freeze
+
+FEWEST_ACROSS: Final = 8
+"""Smallest number of voxels along each axis of a cropped scan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,3 +47,32 @@ class Image:
         """Return the fractional voxel indices (n, 3) of positions (n, 3) in LPS mm."""
         inverse = np.linalg.inv(self.affine_mm)
         return np.asarray(points_mm, dtype=np.float64) @ inverse[:3, :3].T + inverse[:3, 3]
+
+    def box_between(self, corners_mm: Floats) -> Ints:
+        """Return the voxel indices (2, 3) of the first and last voxel of the box that two points (2, 3) in mm span."""
+        index = np.rint(np.sort(self.to_index(corners_mm), axis=0))
+        return np.clip(index, 0, np.array(self.voxels.shape) - 1).astype(np.int32)
+
+    def cropped(self, corners_mm: Floats) -> "Image":
+        """Return the voxels of a box along the image axes.
+
+        Parameters
+        ----------
+        corners_mm : (2, 3) opposite corners of the box in LPS mm.
+
+        Raises
+        ------
+        InputError
+            The box holds too few voxels.
+        """
+        first, last = self.box_between(corners_mm)
+        if (last - first + 1 < FEWEST_ACROSS).any():
+            raise InputError(
+                f"The crop box holds fewer than {FEWEST_ACROSS} voxels along an axis of the scan. Choose a larger box."
+            )
+        affine_mm = self.affine_mm.copy()
+        affine_mm[:3, 3] = self.to_mm(first[None])[0]
+        voxels = self.voxels[tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))]
+        of = " x ".join(map(str, self.voxels.shape))
+        note = f"The scan is cropped to {' x '.join(map(str, voxels.shape))} of {of} voxels."
+        return replace(self, voxels=voxels, affine_mm=affine_mm, notes=(*self.notes, note))

@@ -189,7 +189,7 @@ def vessel_key(source: str, settings: Settings) -> str:
     settings : settings of the study.
     """
     given = settings.units, settings.spacing_mm, settings.shape, settings.threshold, settings.at_mm, settings.inlet_mm
-    later = [value for value in (settings.frame, settings.acquisition) if value is not None]
+    later = [value for value in (settings.frame, settings.acquisition, settings.crop_mm) if value is not None]
     return key_of(source, "vessel", given, *later)
 
 
@@ -199,7 +199,7 @@ def key_of(*parts: Any) -> str:
     return hashlib.sha256(json.dumps([RESULTS_VERSION, plain], sort_keys=True).encode()).hexdigest()[:16]
 
 
-_LATER: Final = {"without_flow": (), "acquisition": None, "frame": None}
+_LATER: Final = {"without_flow": (), "acquisition": None, "frame": None, "crop_mm": None}
 """Settings that version 0.1 does not have, with defaults for which the keys equal those of version 0.1."""
 
 

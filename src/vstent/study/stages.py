@@ -31,6 +31,7 @@ from vstent.flow.grade import QUALITY, computation_of, grade
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
 from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
+from vstent.geometry.image import Image
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
@@ -102,7 +103,7 @@ def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
     x, y, z = settings.at_mm or (0.0, 0.0, 0.0)
     yield "the point given is RAS", (-x, -y, z)
     if not (path.is_file() and is_surface_file(path)):
-        image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape, acquisition=settings.acquisition)
+        image = _image(path, replace(settings, crop_mm=None))
         if all(0 <= i < n for i, n in zip((x, y, z), image.voxels.shape, strict=True)):
             i, j, k = image.to_mm(np.array([[x, y, z]]))[0].tolist()
             yield "the point given is a voxel index", (i, j, k)
@@ -162,11 +163,17 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
         surface, notes = read_surface(path, units=settings.units, frame=settings.frame)
         vessel = Vessel(surface, notes=notes)
     else:
-        image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape, acquisition=settings.acquisition)
+        image = _image(path, settings)
         vessel = segment(image, threshold=settings.threshold, at_mm=_array(settings.at_mm))
     near_mm = _array(settings.inlet_mm if settings.at_mm is None else settings.at_mm)
     lumen, repairs = repair(vessel.lumen, at_mm=None if near_mm is None else np.atleast_2d(near_mm)[0])
     return replace(vessel, lumen=lumen, notes=(*vessel.notes, *repairs))
+
+
+def _image(path: Path, settings: Settings) -> Image:
+    """Return the scan, cropped where requested."""
+    image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape, acquisition=settings.acquisition)
+    return image if settings.crop_mm is None else image.cropped(np.array(settings.crop_mm, dtype=np.float64))
 
 
 def deploy_all(

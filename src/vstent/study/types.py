@@ -40,6 +40,8 @@ class Settings:
     """Voxel spacing of a raw volume, in mm."""
     shape: tuple[int, int, int] | None = None
     """Number of voxels of a raw volume."""
+    crop_mm: tuple[Point, Point] | None = None
+    """Opposite corners, LPS mm, of the box along the image axes to which a scan is cropped."""
     threshold: float | None = None
     """Intensity at the lumen wall of a scan."""
     at_mm: Point | None = None

@@ -1,0 +1,82 @@
+"""Outlines on a slice of the scan: where its plane cuts the surfaces and the wires that were found."""
+
+from typing import Any
+
+import numpy as np
+
+from vstent.devices.stent import Stent
+from vstent.geometry.image import Image
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy
+from vstent.kernels import clipping
+from vstent.kernels.arrays import Floats
+from vstent.reporting.packing import Packer
+
+
+def outlines(image: Image, anatomy: Anatomy, stent: Stent | None, axis: int, index: int) -> bytes:
+    """Return the exact sections of all surfaces and wires by the plane of a slice, as a message for the page.
+
+    Positions are voxel indices (column, row) in the slice. Surfaces give segments, wires give the points where their
+    axis crosses the plane.
+
+    Parameters
+    ----------
+    image : the scan.
+    anatomy : vessel, parent artery and sacs.
+    stent : device with wires; None: none.
+    axis : voxel axis across the slice: 0, 1 or 2.
+    index : voxel index along that axis.
+    """
+    packer = Packer()
+    curves = {
+        name: packer.add_numbers(np.concatenate([section(image, one, axis, index) for one in surfaces]).reshape(-1, 4))
+        for name, surfaces in _surfaces(anatomy).items()
+        if surfaces
+    }
+    told: dict[str, Any] = {"segments": curves}
+    if stent is not None:
+        told["wires"] = packer.add_numbers(crossings(image, stent, axis, index))
+    return packer.framed(told)
+
+
+def _surfaces(anatomy: Anatomy) -> dict[str, list[Surface]]:
+    """Return the surfaces that are cut, by the name of their outline."""
+    return {
+        "lumen": [anatomy.vessel.lumen],
+        "parent": [anatomy.landing_surface],
+        "sac": [aneurysm.sac for aneurysm in anatomy.aneurysms],
+        "neck": [aneurysm.neck for aneurysm in anatomy.aneurysms],
+    }
+
+
+def section(image: Image, surface: Surface, axis: int, index: int) -> Floats:
+    """Return the segments (s, 2, 2) in which the plane of a slice cuts a surface, as voxel indices in the slice.
+
+    Parameters
+    ----------
+    image : the scan.
+    surface : the surface.
+    axis : voxel axis across the slice.
+    index : voxel index along that axis.
+    """
+    place = image.to_index(surface.vertices_mm)
+    found = clipping.section(place, surface.faces, place[:, axis] - index)
+    return np.delete(found, axis, axis=2)
+
+
+def crossings(image: Image, stent: Stent, axis: int, index: int) -> Floats:
+    """Return where wires cross the plane of a slice (n, 3): column, row and diameter of the wire in mm.
+
+    Parameters
+    ----------
+    image : the scan.
+    stent : device with wires.
+    axis : voxel axis across the slice.
+    index : voxel index along that axis.
+    """
+    place = image.to_index(stent.wire_points_mm)
+    offset, first = place[:, axis] - index, stent.piece_starts
+    first = first[(offset[first] > 0) != (offset[first + 1] > 0)]
+    share = (offset[first] / (offset[first] - offset[first + 1]))[:, None]
+    points = np.delete(place[first] + share * (place[first + 1] - place[first]), axis, axis=1)
+    return np.column_stack([points, stent.wire_diameter_um[stent.point_wires[first]] / 1000])

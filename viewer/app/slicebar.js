@@ -1,0 +1,128 @@
+// The bar over the slices: tools, window presets, slab, outlines, and what is under the pointer.
+import { make } from "../src/dom.js";
+import { LINES, SEED } from "./sliceview.js";
+
+const TOOLS = [
+  ["cross", "Cross-hair", "Click or drag: the other slices and the 3-D view follow (key C)"],
+  ["window", "Window", "Drag: width to the right, level upwards; the right mouse button does it with every tool (key W)"],
+  ["ruler", "Ruler", "Drag from one point to another (key M); Escape removes the last one"],
+  ["seed", "Seed", "Click in the artery to choose the vessel (key S)"],
+  ["crop", "Crop", "Drag an edge of the box: the vessel is sought inside it (key B)"],
+];
+/** Windows of a CT by name: width and level in HU. */
+const CT = { "CT angiography": [700, 300], Brain: [80, 40], "Soft tissue": [350, 50], Bone: [2000, 500] };
+const SLABS = [[0, "Single slice"], [5, "MIP 5 mm"], [10, "MIP 10 mm"], [20, "MIP 20 mm"], [1000, "MIP, whole scan"]];
+const minus = (x, digits) => x.toFixed(digits).replace("-", "−");
+
+export class SliceBar {
+  constructor(slices) {
+    this.slices = slices;
+    this.tools = make("div", { className: "tabs slice-tools", role: "group", ariaLabel: "Tool on the slices" });
+    this.extra = make("span", { className: "slice-extra" });
+    this.presets = make("select", { ariaLabel: "Window and level" });
+    this.presets.addEventListener("change", () => this.choose(this.presets.value));
+    this.slab = make("select", { ariaLabel: "Slab" }, SLABS.map(([mm, title]) => make("option", { value: mm }, [title])));
+    this.slab.addEventListener("change", () => slices.setSlab(Number(this.slab.value)));
+    this.words = make("span", { className: "slice-window" });
+    this.invert = make("button", { type: "button", title: "Dark vessels on a bright ground", ariaPressed: "false", onClick: () => slices.setWindow({ isInverted: !slices.window.isInverted }) }, ["Invert"]);
+    const reset = make("button", { type: "button", title: "Window, zoom and slab as at first", onClick: () => this.reset() }, ["Reset"]);
+    this.chips = make("div", { className: "slice-chips", role: "group", ariaLabel: "Outlines on the slices" });
+    this.reading = make("output", { className: "slice-reading" });
+    this.element = make("div", { className: "slice-bar" }, [
+      make("div", { className: "slice-row" }, [this.tools, this.extra, this.presets, this.words, this.invert, this.slab, reset]),
+      make("div", { className: "slice-row" }, [this.chips, this.reading]),
+    ]);
+  }
+
+  show(scan) {
+    const isCt = scan.modality === "CT" || (scan.modality === "" && scan.ends[0] <= -500);
+    this.windows = { Automatic: null, "Vessels": null, "Whole range": null, ...(isCt ? CT : {}) };
+    this.presets.replaceChildren(make("option", { value: "" }, ["Window …"]), ...Object.keys(this.windows).map((name) => make("option", { value: name }, [name])));
+    this.presets.value = "Automatic";
+    this.renderTools();
+    this.renderChips();
+  }
+
+  choose(name) {
+    const { slices } = this;
+    const { ends, quantiles } = slices.scan;
+    if (name === "Automatic") slices.resetWindow();
+    else if (name === "Whole range") slices.setWindow({ level: (ends[0] + ends[1]) / 2, width: ends[1] - ends[0] });
+    else if (name === "Vessels") {
+      const wall = slices.threshold ?? quantiles[3];
+      slices.setWindow({ level: wall, width: 2 * Math.max(wall - quantiles[2], ends[1] / 100) });
+    } else if (CT[name]) slices.setWindow({ width: CT[name][0], level: CT[name][1] });
+    this.presets.value = name;
+  }
+
+  reset() {
+    this.slab.value = "0";
+    this.slices.setSlab(0);
+    this.choose("Automatic");
+    this.slices.resetView();
+  }
+
+  sayWindow() {
+    const { level, width, isInverted } = this.slices.window;
+    this.words.textContent = `W ${minus(width, width < 10 ? 2 : 0)} L ${minus(level, Math.abs(width) < 10 ? 2 : 0)}`;
+    this.invert.setAttribute("aria-pressed", String(isInverted));
+    this.presets.value = "";
+  }
+
+  renderTools() {
+    const { slices } = this;
+    const focus = this.tools.contains(document.activeElement) ? document.activeElement.dataset.tool : null;
+    this.tools.replaceChildren(
+      ...TOOLS.map(([id, title, hint]) => {
+        const button = make("button", { type: "button", title: hint, ariaPressed: String(slices.tool === id), onClick: () => slices.setTool(id) }, [title]);
+        button.dataset.tool = id;
+        return button;
+      }),
+    );
+    if (focus) this.tools.querySelector(`[data-tool="${focus}"]`)?.focus();
+    const extra = [];
+    if (slices.rulers.length) extra.push(`${slices.rulers.at(-1).mm.toFixed(1)} mm`, this.small("Remove rulers", () => slices.clearRulers()));
+    if (slices.scan && slices.isCropped) extra.push(this.small("Whole scan", () => (slices.setCrop(null), slices.letCropGo())));
+    this.extra.replaceChildren(...extra);
+  }
+
+  small(title, act) {
+    return make("button", { type: "button", className: "link", onClick: act }, [title]);
+  }
+
+  renderChips() {
+    const { slices } = this;
+    const found = Boolean(slices.found);
+    const has = { threshold: slices.threshold !== null, lumen: found, parent: found, sac: found && slices.hasSac, neck: found && slices.hasSac, wires: found && Boolean(slices.device) };
+    const focus = this.chips.contains(document.activeElement) ? document.activeElement.dataset.line : null;
+    this.chips.replaceChildren(
+      ...Object.entries(LINES)
+        .filter(([name]) => has[name])
+        .map(([name, { title, colour, dash, width }]) => {
+          const swatch = make("i", { className: name === "wires" ? "swatch wires" : "swatch" });
+          swatch.style.borderTop = `${Math.round(width + 0.6)}px ${dash.length ? (dash[0] > 4 ? "dashed" : "dotted") : "solid"} ${colour}`;
+          const button = make("button", { type: "button", className: "slice-chip", ariaPressed: String(slices.on[name]), onClick: () => slices.toggle(name) }, [swatch, title]);
+          button.dataset.line = name;
+          return button;
+        }),
+    );
+    if (slices.seed) {
+      const dot = make("i", { className: "swatch seed" });
+      dot.style.borderColor = SEED;
+      this.chips.append(make("button", { type: "button", className: "slice-chip", title: "Turn the slices to the seed", onClick: () => slices.put(slices.seed) }, [dot, "Seed"]));
+    }
+    if (focus) this.chips.querySelector(`[data-line="${focus}"]`)?.focus();
+  }
+
+  /** Value and position under the pointer, or at the cross-hair. */
+  say() {
+    const { scan } = this.slices;
+    if (!scan) return;
+    const { index, mm, value, isPointer } = this.slices.reading;
+    const at = (point) => point.map((x) => minus(x, 1)).join(", ");
+    const places = scan.is_oriented ? `LPS ${at(mm)} · RAS ${at([-mm[0], -mm[1], mm[2]])} mm` : `x, y, z ${at(mm)} mm`;
+    const shown = value === undefined ? "–" : minus(value, Number.isInteger(value) ? 0 : 2);
+    this.reading.replaceChildren(make("b", {}, [`${this.slices.slab ? "Maximum" : "Value"} ${shown}`]), ` · ${places} · voxel ${index.join(", ")}`);
+    this.reading.dataset.at = isPointer ? "pointer" : "cross";
+  }
+}
