@@ -71,8 +71,8 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     ),
     "inflow_angle_rad": Definition(
         "Inflow angle",
-        "Angle between the parent artery upstream of the neck and the longest height of the sac; 180° is straight ahead "
-        "of the flow.",
+        "Angle between the parent artery upstream of the neck and the longest height of the sac; 180° is straight "
+        "ahead of the flow.",
         _BAHAROGLU,
     ),
     "diameter_threshold_band_mm": Definition(

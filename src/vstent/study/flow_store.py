@@ -11,7 +11,7 @@ from vstent.geometry.vessel import Anatomy
 from vstent.io.writers import write_json
 from vstent.plan.rank import Candidate
 from vstent.study.folder import CACHE
-from vstent.study.ledger import key_of
+from vstent.study.ledger import DEPLOYMENT_VERSION, key_of
 
 
 class FlowStore:
@@ -46,4 +46,5 @@ def _name_of(candidate: Candidate | None) -> str:
     """Return the name of a result; it contains a digest of the device's numbers, because a catalogue can change."""
     if candidate is None:
         return BARE
-    return f"{candidate.label} {key_of(candidate.design, candidate.size, candidate.shift_mm)}"
+    key = key_of(DEPLOYMENT_VERSION, candidate.design, candidate.size, candidate.shift_mm)
+    return f"{candidate.label} {key}"

@@ -21,6 +21,9 @@ from vstent.study.types import Progress, Settings
 Kept = TypeVar("Kept")
 RESULTS_VERSION: Final = "0.1.0"
 """Version of the computations: it changes only when results change, so that a new release keeps stored results."""
+DEPLOYMENT_VERSION: Final = "0.2.0"
+"""Version of the deployment: it changes when deployed devices change, so that what was computed with them is computed
+again; anatomies and flows without a device are kept."""
 ANATOMY: Final = "anatomy"
 """Name under which an anatomy is stored."""
 

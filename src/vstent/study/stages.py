@@ -40,7 +40,7 @@ from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
 from vstent.plan.uncertainty import Uncertainty, vary
 from vstent.study.checkpoint import FlowCheckpoint
-from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of, vessel_key
+from vstent.study.ledger import ANATOMY, DEPLOYMENT_VERSION, Ledger, anatomy_key, key_of, vessel_key
 from vstent.study.outputs import write_field
 from vstent.study.types import Placing, Point, Settings
 from vstent.units import counted
@@ -357,7 +357,7 @@ def flow_key(source: str, settings: Settings, name: str, design: Design | None) 
     name : ``bare``, or the name of the device.
     design : the device; None: no device.
     """
-    placed = (design, settings.placing(name)) if design else ()
+    placed = (DEPLOYMENT_VERSION, design, settings.placing(name)) if design else ()
     return key_of(anatomy_key(source, settings), settings.flow, name, *placed)
 
 
@@ -419,7 +419,7 @@ def vary_all(
     found = {}
     for name, deployment in deployments.items():
         stage = f"vary {name}"
-        placed = deployment.stent.design, settings.placing(name)
+        placed = DEPLOYMENT_VERSION, deployment.stent.design, settings.placing(name)
         key = key_of(anatomy_key(source, settings), settings.uncertainty, flow, name, *placed)
         varied = ledger.recall(stage, key, Uncertainty)
         if varied is None:
