@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from math import degrees
 from statistics import median
 from typing import Any, Final
 
@@ -11,6 +12,8 @@ from rich.status import Status
 from rich.table import Table
 
 from vstent.devices.design import Design
+from vstent.devices.fit import Fitted
+from vstent.devices.ranges import MARGIN
 from vstent.flow.convergence import Refinement
 from vstent.flow.positions import POSITIONS, Scatter
 from vstent.geometry.vessel import Opening
@@ -346,3 +349,51 @@ def device_table(devices: Mapping[str, Design]) -> Table:
         sizes = f"{diameters[0]:g} to {diameters[-1]:g} x {lengths[0]:g} to {lengths[-1]:g} ({len(design.sizes)} sizes)"
         table.add_row(name, design.name, design.kind.replace("_", "-"), sizes, " / ".join(map(str, sure)))
     return table
+
+
+def fit_table(fitted: Fitted) -> Table:
+    """Return the table of fitted numbers: value, standard error, that of the prior, and whether it is determined."""
+    table = Table("number", "value", "standard error", "before", "determined", title="fit")
+    for name, value, error, before, is_determined in zip(
+        fitted.names, fitted.values, fitted.errors, fitted.prior_errors, fitted.is_determined, strict=True
+    ):
+        form = _degrees if name.endswith("_rad") else _plain_number
+        unit = "°" if name.endswith("_rad") else "um" if name.endswith("_um") else "mm"
+        cells = (f"{form(one)} {unit}" for one in (value, error, before))
+        table.add_row(_number_title(name), *cells, "yes" if is_determined else "no, as the similar device")
+    residuals = fitted.residuals
+    worst = int(abs(residuals).argmax())
+    table.caption = (
+        f"{len(residuals)} measurements; chi-squared {float((residuals**2).sum()):.1f}. Largest residual: "
+        f"{residuals[worst]:+.1f} standard errors, {fitted.measurements[worst].where}."
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def correlation_table(fitted: Fitted) -> Table:
+    """Return the table of correlations of the fitted numbers."""
+    table = Table("correlation", *(str(k) for k in range(1, len(fitted.names) + 1)))
+    for k, (name, row) in enumerate(zip(fitted.names, fitted.correlation, strict=True), start=1):
+        table.add_row(f"{k} {_number_title(name)}", *(f"{value:+.2f}" for value in row))
+    return table
+
+
+def _degrees(value: float) -> str:
+    """Return an angle in rad as degrees."""
+    return f"{degrees(value):.2f}"
+
+
+def _plain_number(value: float) -> str:
+    """Return a number with three decimals."""
+    return f"{value:.3f}"
+
+
+def _number_title(name: str) -> str:
+    """Return the display name of a fitted number."""
+    from vstent.reporting.bands import number_name
+
+    base, _, label = name.partition(" ")
+    if label:
+        return f"{label} mm: length minus label"
+    return "free diameter minus label" if base == MARGIN else number_name(base)

@@ -10,8 +10,9 @@ def add(commands: options.Commands) -> None:
     """Add the command and its subcommand ``add``."""
     parser = options.add_command(commands, "devices", "List the devices of the catalogue, or add your own.", "devices")
     parser.set_defaults(command=_devices)
+    commands_of_devices = parser.add_subparsers(metavar="COMMAND")
     adding = options.add_command(
-        parser.add_subparsers(metavar="COMMAND"),
+        commands_of_devices,
         "add",
         "Add devices of your own to the catalogue.",
         "devices add mine.toml",
@@ -20,6 +21,25 @@ def add(commands: options.Commands) -> None:
         "file", type=Path, help="TOML file in the form of vstent's catalogue.toml: every number with its source"
     )
     adding.set_defaults(command=_add)
+    fitting = options.add_command(
+        commands_of_devices,
+        "fit",
+        "Fit the numbers of a device to measurements, and write a catalogue entry and a picture.",
+        "devices fit measurements.csv --like pipeline --out mine.toml",
+    )
+    fitting.add_argument(
+        "file", type=Path, nargs="?", metavar="MEASUREMENTS.csv", help="measured values, one row per tube"
+    )
+    fitting.add_argument("--like", metavar="DEVICE", help="similar device: its numbers are the first guess")
+    fitting.add_argument(
+        "--out", type=Path, metavar="FILE", help="entry to write (.toml); the picture has its name (.png)"
+    )
+    fitting.add_argument(
+        "--name", help="name of the device (default: that of the similar device, followed by measured)"
+    )
+    fitting.add_argument("--all-sizes", action="store_true", help="offer the device in all sizes of the similar one")
+    fitting.add_argument("--template", action="store_true", help="print an example of the CSV file")
+    fitting.set_defaults(command=_fit)
 
 
 def _devices(arguments: argparse.Namespace) -> int:
@@ -37,4 +57,42 @@ def _add(arguments: argparse.Namespace) -> int:
     from vstent.devices.catalogue import add_devices
 
     Console().print(device_table(add_devices(arguments.file)))
+    return 0
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    """Fit a device to measurements, write its entry and its picture, and print the numbers; return the exit code."""
+    from vstent.cli.console import Console, correlation_table, fit_table
+    from vstent.devices.catalogue import find_design
+    from vstent.devices.entry import entry
+    from vstent.devices.fit import fit
+    from vstent.devices.measurements import TEMPLATE, read_measurements
+    from vstent.devices.schema import parse
+    from vstent.errors import InputError
+    from vstent.io.files import atomic
+    from vstent.io.writers import write_text
+    from vstent.reporting.device_fit import picture
+
+    console = Console()
+    if arguments.template:
+        print(TEMPLATE, end="")
+        return 0
+    if arguments.file is None or arguments.like is None or arguments.out is None:
+        raise InputError(
+            "Give the measurements, --like with a similar device, and --out. --template prints an example."
+        )
+    like = find_design(arguments.like)
+    fitted = fit(read_measurements(arguments.file, like), like)
+    name = arguments.name or f"{like.name} measured"
+    text = entry(fitted, like, name, source=arguments.file.name, has_all_sizes=arguments.all_sizes)
+    parse(text, "The fitted entry")  # refuses a device that cannot be made
+    write_text(arguments.out, text)
+    with atomic(arguments.out.with_suffix(".png")) as partial:
+        partial.write_bytes(picture(fitted, name))
+    console.print(fit_table(fitted))
+    console.print(correlation_table(fitted))
+    console.print(
+        f"Entry in {arguments.out}, picture in {arguments.out.with_suffix('.png')}. "
+        f"Add it to the catalogue: vstent devices add {arguments.out}"
+    )
     return 0

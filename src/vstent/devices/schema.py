@@ -112,7 +112,7 @@ class _Count(_Ranged):
 class _Margin(_Ranged):
     """Free diameter minus label diameter, in mm."""
 
-    value: Annotated[float, Field(ge=0, le=1)]
+    value: Annotated[float, Field(ge=-1, le=1)]
     low: Annotated[float, Field(ge=-1, le=1)] | None = None
     high: Annotated[float, Field(ge=-1, le=1)] | None = None
 

@@ -1,0 +1,168 @@
+"""Write a fitted device as an entry of a catalogue, in the form of ``catalogue.toml``."""
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any, Final
+
+from vstent.devices.design import Braid, Design, LaserCut
+from vstent.devices.fit import Fitted, labels
+from vstent.devices.ranges import LENGTH, MARGIN
+
+ERRORS: Final = 2.0
+"""Standard errors to either side of a fitted value in its range: 95 % of normal errors lie in it."""
+REASON: Final = "two standard errors of the fit"
+"""Reason of the range of a fitted number."""
+DIGITS: Final = 4
+"""Significant digits of fitted values."""
+
+
+def key_of_name(name: str) -> str:
+    """Return a key of the catalogue for the name of a device: lower-case letters, digits and underscores."""
+    return re.sub(r"[^a-z0-9]+", "_", name.casefold()).strip("_") or "device"
+
+
+def entry(fitted: Fitted, like: Design, name: str, *, source: str, has_all_sizes: bool = False) -> str:
+    """Return the entry of a fitted device.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The fit.
+    like : Design
+        The similar device. Numbers that the measurements do not determine are taken from it, with their confidence.
+    name : str
+        Name of the device.
+    source : str
+        Where the measurements are.
+    has_all_sizes : bool, optional
+        Whether the device is offered in all sizes of the similar one, and not only in the measured sizes.
+
+    Returns
+    -------
+    str
+        TOML text.
+    """
+    writer = _Writer(fitted, like, source)
+    lines = ["[[device]]", *(f"{key} = {_text(value)}" for key, value in _head(fitted.design, like, name))]
+    lines += writer.wires() if isinstance(fitted.design, Braid) else writer.struts()
+    lines += [writer.number(MARGIN), "sizes = [", *writer.sizes(has_all_sizes), "]"]
+    return "\n".join(lines) + "\n"
+
+
+def _head(design: Design, like: Design, name: str) -> Iterator[tuple[str, str]]:
+    """Yield key, name, maker and kind."""
+    yield from (("key", key_of_name(name)), ("name", name), ("maker", like.maker), ("kind", design.kind))
+
+
+def _text(value: Any) -> str:
+    """Return a value as TOML."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_text, value))}]"
+    return str(value) if isinstance(value, int) else f"{value:.{DIGITS + 2}g}"
+
+
+def _table(fields: dict[str, Any]) -> str:
+    """Return fields as an inline table of TOML."""
+    return f"{{ {', '.join(f'{key} = {_text(value)}' for key, value in fields.items())} }}"
+
+
+class _Writer:
+    """Writes the numbers of one fitted device."""
+
+    def __init__(self, fitted: Fitted, like: Design, source: str) -> None:
+        self.fitted, self.like = fitted, like
+        sources = dict.fromkeys(one.source for one in fitted.measurements if one.source)
+        told = f" ({'; '.join(sources)})" if sources else ""
+        self.source = f"fitted to {len(fitted.measurements)} measurements in {source}{told}"
+        self.by_name = {
+            one: (float(value), float(error))
+            for one, value, error, is_determined in zip(
+                fitted.names, fitted.values, fitted.errors, fitted.is_determined, strict=True
+            )
+            if is_determined
+        }
+        self.ranges = {one.name: one for one in like.ranges}
+
+    def number(self, name: str) -> str:
+        """Return the line of one number."""
+        return f"{name} = {_table(self._number(name))}"
+
+    def _number(self, name: str) -> dict[str, Any]:
+        """Return value, range, source and confidence of a number: fitted where it is determined, else as it was."""
+        if name in self.by_name:
+            value, error = self.by_name[name]
+            by = ERRORS * error
+            ends = {"low": round(value - by, 5), "high": round(value + by, 5)}
+            told = {"source": f"{self.source}; standard error {error:.2g}", "confidence": "derived", "reason": REASON}
+            return {"value": round(value, 5)} | ends | told
+        value = getattr(self.fitted.design, name)
+        if name == "n_columns" and name in self.fitted.counted:
+            return {"value": value, "low": value, "high": value} | self._counted()
+        return {"value": value} | self._kept(name, name, ("low", "high"))
+
+    def _counted(self) -> dict[str, str]:
+        """Return source and confidence of a count."""
+        return {"source": f"counted, as in {self.source}", "confidence": "derived", "reason": "a count"}
+
+    def _kept(self, fact: str, name: str, keys: tuple[str, str], group: int = 0) -> dict[str, Any]:
+        """Return range, source and confidence of a number of the similar device."""
+        facts = [one for one in self.like.facts if one.name == fact]
+        told = facts[min(group, len(facts) - 1)] if facts else None
+        found: dict[str, Any] = {
+            "source": f"{self.like.name}: {told.source}" if told else f"as {self.like.name}",
+            "confidence": told.confidence if told else "estimated",
+        }
+        if name in self.ranges:
+            found |= dict(zip(keys, (self.ranges[name].low, self.ranges[name].high), strict=True))
+            found["reason"] = self.ranges[name].reason
+        return found
+
+    def struts(self) -> list[str]:
+        """Return the lines of columns, widths and angle of a laser-cut device."""
+        assert isinstance(self.fitted.design, LaserCut)
+        return [self.number(name) for name in ("n_columns", "strut_width_um", "strut_thickness_um", "cell_angle_rad")]
+
+    def wires(self) -> list[str]:
+        """Return the lines of wires and angle of a braid."""
+        assert isinstance(self.fitted.design, Braid)
+        groups = [f"    {_table(self._wires(k, *group))}," for k, group in enumerate(self.fitted.design.wires)]
+        return ["wires = [", *groups, "]", self.number("braid_angle_rad")]
+
+    def _wires(self, group: int, count: int, diameter_um: float) -> dict[str, Any]:
+        """Return count, diameter and source of a group of wires."""
+        stem = "wire" if group == 0 else f"wire_{group + 1}"
+        name, ends = f"{stem}_diameter_um", ("diameter_low_um", "diameter_high_um")
+        is_counted = f"{stem}_count" in self.fitted.counted
+        found = {"count": count, "diameter_um": round(diameter_um, 2)} | self._kept("wires", name, ends, group)
+        if is_counted or f"{stem}_count" not in self.ranges:
+            found |= {"count_low": count, "count_high": count}
+        else:
+            one = self.ranges[f"{stem}_count"]
+            found |= {"count_low": int(one.low), "count_high": int(one.high)}
+        if name in self.by_name:
+            value, error = self.by_name[name]
+            found |= {ends[0]: round(value - ERRORS * error, 2), ends[1]: round(value + ERRORS * error, 2)}
+            found |= {"source": self.source, "confidence": "derived", "reason": f"{REASON}; {count} wires"}
+        return found
+
+    def sizes(self, has_all: bool) -> Iterator[str]:
+        """Yield the blocks of sizes."""
+        for diameter_mm, length_mm in labels(self.fitted.measurements):
+            value, error = self.by_name.get(f"{LENGTH} {diameter_mm:g} x {length_mm:g}", (0.0, 0.5))
+            told = {
+                "source": self.source,
+                "confidence": "derived",
+                "reason": f"difference from the label, and {REASON}",
+            }
+            tolerance_mm = round(abs(value) + ERRORS * error, 2)
+            block = {"diameters_mm": [diameter_mm], "lengths_mm": [length_mm], "length_tolerance_mm": tolerance_mm}
+            yield f"    {_table(block | told)},"
+        if has_all:
+            for diameter_mm in sorted({size.diameter_mm for size in self.like.sizes}):
+                lengths_mm = sorted(one.length_mm for one in self.like.sizes if one.diameter_mm == diameter_mm)
+                kept = self._kept("sizes", LENGTH, ("", "length_tolerance_mm"))
+                kept.pop("", None)
+                yield f"    {_table({'diameters_mm': [diameter_mm], 'lengths_mm': lengths_mm} | kept)},"
