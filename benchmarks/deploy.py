@@ -30,9 +30,9 @@ from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.kernels.arrays import Bools, Floats
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
+sys.path[:0] = [str(Path(__file__).parents[1] / "tests" / folder) for folder in ("helpers", "deployment")]
 from brute import BruteWall
-from test_deploy_rods import compared
+from test_braid_rods import compared
 from tubes import arc, line, tube
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -116,6 +116,60 @@ def test_the_blood_follows_a_device_that_is_dragged(artery, tmp_path):
         assert not page.locator(".live-cards").is_visible()
 
 
+def test_sizes_are_sorted_compared_and_saved_as_a_picture(artery, tmp_path):
+    with app_case.served(tmp_path / "cases") as client, browsing(client, 1024, 768) as page:
+        drop(page, artery)
+        page.wait_for_selector(".step.done:nth-child(3)")
+        step(page, "Device")
+        page.locator(".device", has_text="Silk").locator("input").uncheck()
+        page.wait_for_selector(".device:has-text('Silk') input:not(:checked)")
+        page.get_by_role("button", name="Rank all sizes").click()
+        rows = page.locator(".ranking tbody tr")
+        rows.first.wait_for()
+        playwright.expect(page.locator(".work")).to_be_hidden(timeout=120 * SECOND)
+        found = client.get(f"/api/cases/{client.get('/api/cases').json()['cases'][0]['id']}/ranking").json()["rows"]
+        page.get_by_role("button", name="Length", exact=True).click()
+        lengths = [float(words.split()[0]) for words in rows.locator("td:nth-child(6)").all_inner_texts()]
+        assert lengths == sorted(lengths)
+        assert page.locator("th[aria-sort=ascending]").count() == 1
+        page.get_by_label("suitable only").check()
+        assert rows.count() == sum(row["is_suitable"] for row in found)
+        page.get_by_label("suitable only").uncheck()
+        page.get_by_label("best of each device").check()
+        assert rows.count() == 1
+        page.get_by_label("best of each device").uncheck()
+        for k in range(4):
+            page.locator("td.compare input").nth(k).check()
+        page.get_by_role("button", name="Compare 4 side by side").click()
+        panes = page.locator(".viewer-pane")
+        playwright.expect(panes).to_have_count(4)
+        tops = {round(panes.nth(k).bounding_box()["y"]) for k in range(4)}
+        assert len(tops) == 2  # two rows of two
+        assert page.locator(".sheet.columns-4 .row.head b").count() == 4
+        assert drawn(page, panes.nth(3).bounding_box()) > 0.05
+        panes.nth(3).locator(".viewer-solo").click()
+        assert [panes.nth(k).is_visible() for k in range(4)] == [False, False, False, True]
+        panes.nth(3).locator(".viewer-solo").click()
+        assert picture_size(page) == (round(85 / 25.4 * 150), 150)
+        page.get_by_role("button", name="End comparison").click()
+        playwright.expect(panes).to_have_count(1)
+
+
+def picture_size(page):
+    """Width in pixels and resolution in dots per inch of the picture that the page saves, for one column."""
+    from PIL import Image
+
+    page.locator(".export summary").click()
+    page.locator(".export-form select").nth(0).select_option("85")
+    page.locator(".export-form select").nth(1).select_option("150")
+    with page.expect_download() as waited:
+        page.get_by_role("button", name="Save PNG").click()
+    image = Image.open(waited.value.path())
+    colours = np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0)
+    assert len(colours) > 500  # wires, wall and color bar, not an empty canvas
+    return image.width, round(image.info["dpi"][0])
+
+
 def test_a_tick_lets_blood_enter_by_an_opening_as_well(artery, tmp_path):
     with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
         drop(page, artery)

@@ -17,8 +17,9 @@ import report_case
 
 import vstent
 from vstent import phantoms
-from vstent.app import cuts, intake, sheets
+from vstent.app import cuts, intake, ranking, sheets
 from vstent.app.cases import STEPS, Store, load
+from vstent.app.choices import DeviceChoice
 from vstent.app.desk import Desk
 from vstent.app.finished import kept_flows
 from vstent.cli import main
@@ -35,7 +36,8 @@ from vstent.io.images import read_image
 from vstent.io.writers import write_stl
 from vstent.plan.uncertainty import Ranges
 from vstent.study.folder import CACHE
-from vstent.study.ledger import Ledger
+from vstent.study.flow_store import FlowStore
+from vstent.study.ledger import Ledger, hash_of
 from vstent.study.repeat import settings_of
 from vstent.study.stages import flow_key
 from vstent.study.types import Settings
@@ -284,17 +286,67 @@ def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
     client.post(f"{case}/jobs/rank")
     view = app_case.wait(client, case.rpartition("/")[2])
     assert view["failed"] == {}
-    ranking = client.get(f"{case}/ranking").json()
-    assert ranking["is_current"]
-    assert [row["rank"] for row in ranking["rows"]] == list(range(1, 1 + len(find_design("enterprise").sizes)))
-    first, *others = (row for row in ranking["rows"] if row["is_suitable"])
-    assert [row["is_proposed"] for row in ranking["rows"]].count(True) == 1
+    found = client.get(f"{case}/ranking").json()
+    assert found["is_current"]
+    assert [row["rank"] for row in found["rows"]] == list(range(1, 1 + len(find_design("enterprise").sizes)))
+    first, *others = (row for row in found["rows"] if row["is_suitable"])
+    assert [row["is_proposed"] for row in found["rows"]].count(True) == 1
     assert first["is_proposed"]
     scores = [row["score"] for row in others]
     assert scores == sorted(scores, reverse=True)
-    assert all(row["reason"] for row in ranking["rows"])
+    assert all(row["reason"] for row in found["rows"])
+    columns = {column["key"]: column for column in found["columns"]}
+    assert columns["landing_length_mm"]["meaning"]
+    assert all(column["meaning"] and key in first for key, column in columns.items())
     choose(client, case, devices=[SILK])
     assert not client.get(f"{case}/ranking").json()["is_current"]
+
+
+def test_sizes_side_by_side_are_the_deployments_on_one_scale(client, case):
+    devices = [SILK | {"diameter_mm": 4.0, "length_mm": length} for length in (15.0, 20.0)] + [{"name": "enterprise"}]
+    wanted = {"devices": devices, "colour": "wall_gap"}
+    told, data = app_case.opened(client.post(f"{case}/comparison", json=wanted))
+    assert [one["pane"] for one in told["compared"]] == ["compared 0", "compared 1", "compared 2"]
+    assert [scale["id"] for scale in told["scales"]] == ["wall_gap"]
+    assert told["compared"][0]["title"] == "Silk 4 × 15 mm"
+    for device, one in zip(devices, told["compared"], strict=True):
+        alone, alone_data = app_case.opened(client.post(f"{case}/deployment", json={"device": device}))
+        assert one["measures"] == alone["measures"]
+        both = [
+            app_case.numbers(next(x for x in said["layers"] if (x["id"], x["pane"]) == ("wires", pane))["points"], raw)
+            for said, raw, pane in ((told, data, one["pane"]), (alone, alone_data, device["name"]))
+        ]
+        np.testing.assert_allclose(*both, atol=2e-3)
+    assert client.post(f"{case}/comparison", json={"devices": 5 * [SILK]}).status_code == 422
+
+
+def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp_path, monkeypatch):
+    """The flows are those of `rank_flows`, given the number that was chosen and a store in the case folder."""
+    asked = {}
+
+    def flows(anatomy, found, settings, count, *, stored, progress):
+        asked.update(count=count, store=type(stored), before=json.loads((folder / "ranking.json").read_text()))
+        progress(0, 3, "no device")
+        best, *others = found.candidates
+        best = replace(best, measures=best.measures | {"neck_inflow_change_fraction": -0.4})
+        return replace(found, candidates=(best, *others))
+
+    case = Store(tmp_path).create("ranked")
+    folder = case.folder
+    shutil.copy(artery, folder / "artery.stl")
+    choices = case.state.choices.model_copy(update={"devices": (DeviceChoice(name="enterprise"),), "ranking_flows": 2})
+    case.update(input="artery.stl", source=hash_of(folder / "artery.stl"), choices=choices)
+    monkeypatch.setattr(ranking, "rank_flows", flows)
+    said = []
+    ranking.rank_sizes(case, lambda stage, fraction, detail: said.append((stage, fraction, detail)))
+    assert asked["count"] == 2
+    assert asked["store"] is FlowStore
+    after = json.loads((folder / "ranking.json").read_text())
+    assert "neck_inflow_change_fraction" not in {column["key"] for column in asked["before"]["columns"]}
+    assert "neck_inflow_change_fraction" in {column["key"] for column in after["columns"]}
+    assert after["rows"][0]["neck_inflow_change_fraction"] == -0.4
+    assert ("rank_flow", 0.0, "0 of 3: no device") in said
+    assert said[-1][:2] == ("rank_flow", 1.0)
 
 
 def test_a_job_computes_what_was_chosen_when_it_was_started(client, case):
@@ -604,6 +656,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 import httpx, uvicorn
 from vstent.app.cases import Store
+from vstent.app.choices import DeviceChoice
 from vstent.app.desk import Desk
 from vstent.app.server import create
 

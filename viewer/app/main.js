@@ -10,7 +10,7 @@ import { Neck } from "./neck.js";
 import { bandWords, changeSheet, neckWords, placeWords, plainSheet, qualitySheet, sureSheet } from "./numbers.js";
 import { panels, placeOf, spokenRole } from "./panels.js";
 import { Picture } from "./picture.js";
-import { rankingTable } from "./ranking.js";
+import { Ranking } from "./ranking.js";
 import { startPage } from "./start.js";
 import { Trimming } from "./trimming.js";
 
@@ -121,6 +121,7 @@ class Page {
   build() {
     this.frame?.remove();
     this.picture = new Picture();
+    this.ranking = new Ranking(this);
     this.along = new AlongChart();
     this.section = new SectionChart();
     this.flowing = new Flowing({ path: () => this.path, picture: this.picture, changed: () => this.view && this.renderScene(), failed: (problem) => this.complain(problem) });
@@ -190,7 +191,7 @@ class Page {
     this.load();
     const shape = JSON.stringify([view.choices, view.steps, view.failed, view.has_report, view.has_ranking, !view.job, this.step, view.anatomy]);
     if (shape === this.shape) {
-      if (this.step === "flow") this.renderStrip();
+      if (this.step === "flow" || (this.step === "device" && view.job?.kind === "rank")) this.renderStrip();
       return;
     }
     this.shape = shape;
@@ -328,7 +329,8 @@ class Page {
     this.frame.classList.toggle("with-slices", Boolean(isScan));
     const layers = LAYERS[this.step](this);
     this.picture.setViews(...(isScan ? ["scan", this.imaging.views] : ["vessel", this.anatomy?.views]), VIEW[this.step]);
-    this.picture.setPanes(this.step === "flow" || this.step === "report" ? this.panes() : [{ id: this.device || "one", title: "" }]);
+    this.frame.classList.toggle("comparing", this.isComparing);
+    this.picture.setPanes(this.panes());
     this.picture.setLayers(layers, (this.memory[this.step] ??= {}));
     this.flowing.isWatched = this.step === "deploy";
     this.picture.clicked = isScan ? (point) => this.imaging.clicked(point) : this.step === "sac" ? (point) => point && this.setSeed(point) : null;
@@ -351,7 +353,16 @@ class Page {
     return this.step === "deploy" && this.device ? [...this.deploying.handles, this.deploying.cursorMark] : [];
   }
 
+  get isComparing() {
+    return this.step === "device" && this.ranking.comparing.isSeen;
+  }
+
   panes() {
+    if (this.isComparing) return this.ranking.comparing.panes();
+    return this.step === "flow" || this.step === "report" ? this.flowPanesShown() : [{ id: this.device || "one", title: "" }];
+  }
+
+  flowPanesShown() {
     const names = this.flowPanes?.length ? this.flowPanes : ["bare"];
     const sheet = this.sheets?.flow?.[0];
     const row = sheet?.rows.find(({ key }) => key === "neck_inflow_mL_s");
@@ -399,12 +410,12 @@ class Page {
 
   renderStrip() {
     const parts = {
-      device: () => (this.view.has_ranking || this.view.job?.kind === "rank" ? [rankingTable(this)] : []),
+      device: () => (this.view.has_ranking || this.view.job?.kind === "rank" ? [this.ranking.element()] : []),
       deploy: () => [this.along.element, this.section.element],
       flow: () => this.flowStrip(),
     }[this.step]?.() || [];
     this.frame.classList.toggle("with-strip", parts.length > 0);
-    if (this.step === "deploy" && this.strip.firstChild === this.along.element) return;
+    if (parts.length && ["deploy", "device"].includes(this.step) && this.strip.firstChild === parts[0]) return;
     this.strip.replaceChildren(...parts);
   }
 
@@ -438,7 +449,8 @@ class Page {
       const stale = this.view.steps.flow !== "done" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
       parts.push(head("Before and after"), ...stale, qualitySheet(flow), changeSheet(flow, this.isWhole, (name) => this.deviceTitle(name)));
     }
-    if (["device", "deploy"].includes(this.step)) {
+    if (this.isComparing) parts.push(head("Compared"), plainSheet(this.ranking.comparing.sheets(), this.isWhole));
+    else if (["device", "deploy"].includes(this.step)) {
       const sheets = this.view.choices.devices.map(({ name }) => this.measures[name]).filter(Boolean);
       if (sheets.length) parts.push(head("Deployed"), plainSheet(sheets, this.isWhole));
     }
@@ -598,7 +610,7 @@ const deviceWith = (name, changes) => ({ devices }) => ({
   devices: devices.map((device) => (device.name === name ? { ...device, ...changes } : device)),
 });
 const SPOKEN = {
-  scan: "Scan", vessel: "Vessel", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes",
+  scan: "Scan", vessel: "Vessel", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes", rank_flow: "Flow of the best sizes",
   deploy: "Deploying", struts: "Wires of", plan: "Run time of the flow", flow: "Flow,", vary: "Uncertainty of", measure: "Metrics", report: "Report",
 };
 
@@ -617,7 +629,10 @@ const LAYERS = {
     { id: "opening 0", title: "Openings", on: true, also: (page.anatomy?.openings || []).map((_, k) => `opening ${k}`) },
   ],
   sac: () => [LUMEN, { id: "landing", title: "Parent artery", on: true }, { id: "sac", title: "Sac", on: true }, NECK, { id: "axis", title: "Axis", on: false }],
-  device: () => [LUMEN, { id: "landing", title: "Parent artery", on: true }, { id: "sac", title: "Sac", on: true }, NECK],
+  device: (page) =>
+    page.isComparing
+      ? [LUMEN, { id: "wires", title: "Wires", on: true }, { id: "contour", title: "Contour", on: false }, NECK]
+      : [LUMEN, { id: "landing", title: "Parent artery", on: true }, { id: "sac", title: "Sac", on: true }, NECK],
   deploy: (page) => [
     LUMEN,
     { id: "wires", title: "Wires", on: true },

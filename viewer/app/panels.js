@@ -133,7 +133,7 @@ export const panels = {
     const chosen = new Map(choices.devices.map((device) => [device.name, device]));
     const parts = [...title("Device", "Choose up to three devices to compare. Every size of each is deployed in this artery and ranked."), ...earlier(page)];
     parts.push(make("div", { className: "devices" }, page.catalogue.map((design) => deviceBox(page, design, chosen))));
-    parts.push(...failure(page));
+    parts.push(...failure(page), ...flowsOfRanking(page));
     if (!job) parts.push(main(page, has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !chosen.size));
     parts.push(next(page, "deploy", "Deploy →"));
     return parts;
@@ -203,6 +203,17 @@ export const panels = {
     return parts;
   },
 };
+
+/** How many of the best sizes get a flow when they are ranked. */
+function flowsOfRanking(page) {
+  if (!page.anatomy?.neck?.length) return [];
+  const options = [["", "none"], ...[2, 4, 6, 12].map((n) => [String(n), `the best ${n}`])];
+  const hint = "The best size of each device is among them. The changes of neck inflow, sac velocity and wall shear stress join the table. Finished flows are kept: a cancelled ranking goes on when it is started again.";
+  return [
+    select("rank-flows", "Flows", page.view.choices.ranking_flows ?? "", options, (count) => page.choose({ ranking_flows: count ? Number(count) : null })),
+    ...(page.view.choices.ranking_flows ? [make("p", { className: "hint" }, [hint])] : []),
+  ];
+}
 
 /** How many and how large the voxels are, where the file has no header that tells. */
 function grid(page) {

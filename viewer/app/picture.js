@@ -3,8 +3,10 @@ import { Raycaster, Vector2, Vector3 } from "three";
 import { make } from "../src/dom.js";
 import { annotate, annotations, colourBar } from "../src/furniture.js";
 import { Stage } from "../src/stage.js";
+import { Exporting } from "./exporting.js";
 
 const VIEWS = { profile: ["Profile", "The neck in profile"], whole: ["Whole", "The whole vessel"], neck: ["Neck", "From the sac onto the neck"], frontal: ["Front", "From the front"], lateral: ["Left", "From the left"] };
+const NARROW = 900;
 const EMPTY = { scales: [], layers: [], views: [], fade: 2 };
 
 export class Picture {
@@ -20,6 +22,7 @@ export class Picture {
       [this.canvas, this.grid, this.marks],
     );
     this.element = make("div", { className: "picture" }, [this.area, this.toolbar, this.bars]);
+    this.exporting = new Exporting(this);
     this.views = [];
     this.panes = [];
     this.switches = [];
@@ -77,9 +80,15 @@ export class Picture {
     this.panes = panes.map(({ id, title, note }) => {
       const { length, compass } = annotations();
       const head = make("div", { className: "viewer-title" }, [make("strong", {}, [title || ""]), make("span", {}, [note || ""])]);
-      const element = make("div", { className: "viewer-pane" }, [head, length, compass]);
-      return { id, title, note, element, length, compass };
+      const button = make("button", { type: "button", className: "viewer-solo", title: "Show this alone, or all again", ariaLabel: `Show ${title || "this"} alone, or all again` }, ["⤢"]);
+      button.addEventListener("click", () => {
+        this.solo = this.solo === id ? null : id;
+        this.layout();
+      });
+      const element = make("div", { className: "viewer-pane" }, [head, length, compass, ...(panes.length > 1 ? [button] : [])]);
+      return { id, title, note, element, length, compass, button };
     });
+    if (!this.panes.some(({ id }) => id === this.solo)) this.solo = null;
     this.grid.replaceChildren(...this.panes.map(({ element }) => element));
     this.layout();
   }
@@ -110,21 +119,38 @@ export class Picture {
     const views = this.views.map(({ id }, i) =>
       make("button", { type: "button", className: "chip view", title: `${VIEWS[id][1]} (key ${i + 1})`, onClick: () => this.look(id) }, [VIEWS[id][0]]),
     );
-    this.toolbar.replaceChildren(make("div", { className: "chips" }, layers), make("div", { className: "chips" }, views));
+    const save = this.stage ? [this.exporting.element] : [];
+    this.toolbar.replaceChildren(make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...save]));
+    this.makeRoom();
+  }
+
+  /** Titles stand below the buttons, which may need a second line. */
+  makeRoom() {
+    this.grid.style.setProperty("--tools", `${this.toolbar.offsetHeight + 16}px`);
   }
 
   apply() {
     if (!this.stage) return;
     this.stage.show([...this.shown]);
+    const scales = this.scalesShown();
+    this.bars.replaceChildren(...scales.map(colourBar));
+    this.bars.hidden = !scales.length;
+  }
+
+  /** The colour scales of what is seen. */
+  scalesShown() {
     const panes = new Set(this.panes.map(({ id }) => id));
     const used = new Set(
       this.stage.layers
         .filter((layer) => this.shown.has(layer.id) && (layer.pane === "" || panes.has(layer.pane)))
         .map((layer) => layer.scale),
     );
-    const scales = Object.values(this.stage.scales).filter((scale) => used.has(scale.id));
-    this.bars.replaceChildren(...scales.map(colourBar));
-    this.bars.hidden = !scales.length;
+    return Object.values(this.stage.scales).filter((scale) => used.has(scale.id));
+  }
+
+  /** All panes, or the one that is shown alone. */
+  visiblePanes() {
+    return this.panes.filter(({ element }) => !element.hidden);
   }
 
   look(id, glide = true) {
@@ -136,14 +162,22 @@ export class Picture {
   }
 
   paneSize() {
-    const { element } = this.panes[0];
+    const { element } = this.visiblePanes()[0];
     return [Math.max(element.clientWidth, 1), Math.max(element.clientHeight, 1)];
   }
 
   layout() {
     if (!this.stage || !this.panes.length) return;
     const [width, height] = [this.area.clientWidth, this.area.clientHeight];
-    const places = this.panes.map(({ id, element }) => ({
+    for (const { id, element, button } of this.panes) {
+      element.hidden = Boolean(this.solo) && this.solo !== id;
+      button.setAttribute("aria-pressed", String(this.solo === id));
+    }
+    this.makeRoom();
+    const count = this.visiblePanes().length;
+    this.grid.classList.toggle("four", count === 4 || (count === 3 && width < NARROW));
+    this.grid.classList.toggle("alone", count === 1);
+    const places = this.visiblePanes().map(({ id, element }) => ({
       id,
       left: element.offsetLeft,
       bottom: height - element.offsetTop - element.offsetHeight,
@@ -207,9 +241,9 @@ export class Picture {
     mark.element.classList.toggle("flipped", x > this.area.clientWidth - 170);
   }
 
-  /** Pixel in the first pane where a point of the world is seen, and its depth from -1, near, to 1. */
+  /** Pixel in the first visible pane where a point of the world is seen, and its depth from -1, near, to 1. */
   onScreen(point) {
-    const { element } = this.panes[0];
+    const { element } = this.visiblePanes()[0];
     const camera = this.stage.camera;
     camera.aspect = element.offsetWidth / Math.max(element.offsetHeight, 1);
     camera.updateProjectionMatrix();
@@ -238,7 +272,7 @@ export class Picture {
 
   /** Points where the sight through a pixel meets layers, the nearest first. */
   hits([x, y], isChosen) {
-    const { element } = this.panes[0];
+    const { element } = this.visiblePanes()[0];
     this.onScreen([0, 0, 0]);
     const place = new Vector2((2 * (x - element.offsetLeft)) / element.offsetWidth - 1, 1 - (2 * (y - element.offsetTop)) / element.offsetHeight);
     const caster = new Raycaster();

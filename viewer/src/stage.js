@@ -104,6 +104,19 @@ export class Stage {
     this.redraw();
   }
 
+  /** Draw once with `scale` pixels per CSS pixel and hand the canvas over; then the picture is as before. */
+  photograph(scale, taken) {
+    const { renderer } = this;
+    const [before, width, height] = [renderer.getPixelRatio(), renderer.domElement.width / renderer.getPixelRatio(), renderer.domElement.height / renderer.getPixelRatio()];
+    renderer.setPixelRatio(scale);
+    renderer.setSize(width, height, false);
+    this.draw();
+    taken(renderer.domElement);
+    renderer.setPixelRatio(before);
+    renderer.setSize(width, height, false);
+    this.draw();
+  }
+
   /** Show the layers of these ids, hide all others. */
   show(ids) {
     this.shown = new Set(ids);

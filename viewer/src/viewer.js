@@ -251,6 +251,7 @@ class Viewer {
     }
     const box = this.area.getBoundingClientRect();
     const [width, height] = [this.area.clientWidth, this.area.clientHeight];
+    this.grid.classList.toggle("four", this.panes.filter(({ element }) => !element.hidden).length === 4);
     const places = this.panes
       .filter(({ element }) => !element.hidden)
       .map(({ id, element }) => {

@@ -102,6 +102,8 @@ class Choices(Strict):
     """Devices with their sizes and positions."""
     flow: FlowChoice = FlowChoice()
     """Settings of the flow."""
+    ranking_flows: Annotated[int, Field(ge=1, le=24)] | None = None
+    """Number of best sizes of a ranking that get a flow; None: none."""
     uncertainty_samples: Annotated[int, Field(ge=8, le=256)] | None = None
     """Number of deployments with uncertain inputs varied; None: none."""
 

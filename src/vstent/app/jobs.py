@@ -31,6 +31,7 @@ STAGES: Final = {
     "anatomy": "sac",
     "restore": "sac",
     "rank": "device",
+    "rank_flow": "device",
     "deploy": "deploy",
     "struts": "deploy",
     "plan": "flow",

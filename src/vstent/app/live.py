@@ -1,7 +1,7 @@
 """Answer the page immediately, from the results that a case has so far."""
 
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -307,6 +307,27 @@ class Live:
                 advice=deployment.advice,
                 measures=sheets.device(device_title(deployment), self.measures(choice)),
             )
+
+    def comparison_message(self, choices: Sequence[DeviceChoice], colour: Colour) -> bytes:
+        """Return several deployed devices or sizes, each in a pane of its own, on common color scales.
+
+        Parameters
+        ----------
+        choices : the devices, in the order of the panes ``compared 0``, ``compared 1`` and so on.
+        colour : quantity that colors the wires.
+        """
+        with LOCK:
+            layers, told = [], []
+            for number, choice in enumerate(choices):
+                deployment, pane = self.deployment(choice), f"compared {number}"
+                stent, key = deployment.stent, (self.case.state.anatomy, *choice.model_dump().values())
+                measured = partial(self.remembered, ("coverage", *key), partial(node_coverage, stent))
+                layers += [_wires(pane, stent, deployment.wall_gap_mm, colour, measured)]
+                layers += [device_layers(pane, deployment, self.anatomy)[0]]
+                measures = self.remembered(("measures", *key), partial(measure, self.anatomy, deployment))
+                title = device_title(deployment)
+                told.append({"pane": pane, "title": title, "measures": sheets.device(title, measures)})
+            return message(layers, scales_of(layers, self.anatomy), compared=told)
 
     def flow_message(self, moment: int | None) -> bytes:
         """Return wall shear stress, streamlines and a cut of every flow, on common color scales.

@@ -1,4 +1,4 @@
-"""Deploy and rank all sizes of the chosen devices, and store the ranking for the page."""
+"""Deploy and rank all sizes of the chosen devices, with the flow of the best, and store the ranking for the page."""
 
 import os
 from typing import Any, Final
@@ -6,8 +6,13 @@ from typing import Any, Final
 from vstent.app.cases import Case
 from vstent.app.jobs import RANKING
 from vstent.devices.catalogue import find_design
+from vstent.flow.case import FlowSettings
+from vstent.geometry.vessel import Anatomy
 from vstent.io.writers import write_json
-from vstent.plan.rank import rank
+from vstent.plan.rank import Ranking, rank
+from vstent.plan.rank_flow import rank_flows
+from vstent.reporting.definitions import DEFINITIONS
+from vstent.study.flow_store import FlowStore
 from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, anatomy_key
 from vstent.study.stages import find_anatomy
@@ -18,9 +23,26 @@ MOST_PROCESSES: Final = 4
 WORTH_A_PROCESS: Final = 12
 """Number of sizes whose deployment takes longer than starting another process."""
 
+COLUMNS: Final = {
+    "deployed_length_mm": ("Length", ""),
+    "landing_length_mm": ("Landing", "Shorter of the two lengths of device beyond the ends of the neck."),
+    "neck_metal_coverage_fraction": ("Coverage", ""),
+    "apposed_fraction": ("Apposed", ""),
+    "max_wall_gap_mm": ("Largest gap", ""),
+    "jailed_branches_count": ("Branches", ""),
+    "neck_inflow_change_fraction": ("Neck inflow", "Change of the neck inflow against the flow without a device."),
+    "sac_velocity_change_fraction": ("Sac velocity", "Change of the mean sac velocity against no device."),
+    "sac_wss_change_fraction": ("Sac shear", "Change of the mean wall shear stress on the sac against no device."),
+    "flow_uncertainty_fraction": ("± flow", "Estimated relative distance of the flow from convergence."),
+    "flow_grade": ("Grade", "Grade of the flow: good, fair or not usable."),
+}
+"""Heading and meaning of every column of measures; an empty meaning is that of `DEFINITIONS`."""
+
 
 def rank_sizes(case: Case, progress: Progress) -> None:
     """Rank every size of the chosen devices and store the ranking in the case folder.
+
+    The ranking by geometry is stored before the first flow. Finished flows are kept, so that a stopped ranking goes on.
 
     Parameters
     ----------
@@ -30,7 +52,9 @@ def rank_sizes(case: Case, progress: Progress) -> None:
     Raises
     ------
     InputError
-        No device is chosen.
+        No device is chosen, or flows are wanted and there is no sac or no suitable size.
+    FlowError
+        The flow without a device cannot be computed.
     """
     settings = case.state.settings()
     ledger = Ledger(case.folder / CACHE, progress)
@@ -44,12 +68,39 @@ def rank_sizes(case: Case, progress: Progress) -> None:
     n_sizes = sum(len(design.sizes) for design in designs)
     jobs = min(os.cpu_count() or 1, MOST_PROCESSES, 1 + n_sizes // WORTH_A_PROCESS)
     found = rank(anatomy, designs, jobs=jobs, progress=told)
+    key = anatomy_key(case.state.source, settings)
+    _write(case, key, found)
+    progress("rank", 1.0, f"{len(found.suitable)} of {len(found.candidates)} sizes are suitable.")
+    if case.state.choices.ranking_flows:
+        _write(case, key, _with_flows(case, anatomy, found, settings.flow or FlowSettings(), progress))
+        progress("rank_flow", 1.0, "")
+
+
+def _with_flows(case: Case, anatomy: Anatomy, found: Ranking, settings: FlowSettings, progress: Progress) -> Ranking:
+    """Return the ranking with the flows of its best sizes."""
+    progress("rank_flow", 0.0, "")
+    return rank_flows(
+        anatomy,
+        found,
+        settings,
+        case.state.choices.ranking_flows or 0,
+        stored=FlowStore(case.folder, anatomy, settings),
+        progress=lambda done, n_all, name: progress("rank_flow", min(done / n_all, 0.99), f"{done} of {n_all}: {name}"),
+    )
+
+
+def _write(case: Case, anatomy: str, found: Ranking) -> None:
+    """Store a ranking with the names of its devices and its columns."""
     rows = found.rows()
     content: dict[str, Any] = {
-        "anatomy": anatomy_key(case.state.source, settings),
-        "devices": sorted(settings.devices),
-        "names": {design.key: design.name for design in designs},
+        "anatomy": anatomy,
+        "devices": sorted({candidate.design.key for candidate in found.candidates}),
+        "names": {candidate.design.key: candidate.design.name for candidate in found.candidates},
+        "columns": [
+            {"key": key, "title": title, "meaning": meaning or DEFINITIONS[key].meaning}
+            for key, (title, meaning) in COLUMNS.items()
+            if any(key in row for row in rows)
+        ],
         "rows": rows,
     }
     write_json(case.folder / RANKING, content)
-    progress("rank", 1.0, f"{len(found.suitable)} of {len(rows)} sizes are suitable.")

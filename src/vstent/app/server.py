@@ -74,6 +74,13 @@ class SketchWanted(DeviceWanted):
     abscissa_mm: float | None = Field(default=None, ge=-1000, le=1000)
 
 
+class ComparisonWanted(Strict):
+    """Devices or sizes to draw side by side."""
+
+    devices: tuple[DeviceChoice, ...] = Field(min_length=1, max_length=4)
+    colour: Literal["wall_gap", "coverage", "diameter"] = "wall_gap"
+
+
 class NeckWanted(Strict):
     """A neck to draw, optionally with one handle moved to a point on the wall."""
 
@@ -337,7 +344,7 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
 
 
 def _add_planning(api: APIRouter, desk: Desk) -> None:
-    """Add the routes of the live flow and of the plan."""
+    """Add the routes of the live flow, of comparisons and of the plan."""
 
     @api.get("/api/cases/{case_id}/preview", summary="Live flow around the device that is drawn; starts it (binary)")
     def preview(case_id: str) -> Response:
@@ -347,6 +354,11 @@ def _add_planning(api: APIRouter, desk: Desk) -> None:
     def end_preview(case_id: str) -> dict[str, Any]:
         desk.end_preview(desk.store.get(case_id))
         return {"is_on": False}
+
+    @api.post("/api/cases/{case_id}/comparison", summary="Up to four devices or sizes, deployed, on one scale (binary)")
+    def comparison(case_id: str, wanted: ComparisonWanted) -> Response:
+        live = desk.live(desk.store.get(case_id))
+        return Response(live.comparison_message(wanted.devices, wanted.colour), media_type=BINARY)
 
     @api.get("/api/cases/{case_id}/plan.pdf", summary="The plan of the chosen devices, one page each")
     def plan(case_id: str) -> Response:
