@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from vstent.anatomy.segment import segment as segment
     from vstent.anatomy.trace import trace as trace
     from vstent.anatomy.trim import trim as trim
+    from vstent.angiography.angiogram import angiogram as angiogram
     from vstent.deployment.deploy import deploy as deploy
     from vstent.deployment.measure import measure as measure
     from vstent.deployment.struts import struts as struts
@@ -40,6 +41,7 @@ _HOMES = {
     "struts": "vstent.deployment.struts",
     "measure": "vstent.deployment.measure",
     "simulate": "vstent.flow.simulation",
+    "angiogram": "vstent.angiography.angiogram",
     "rank": "vstent.plan.rank",
     "run": "vstent.study.pipeline",
     "report": "vstent.reporting.page",

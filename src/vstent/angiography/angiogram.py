@@ -1,0 +1,295 @@
+"""Compute an angiogram: carry an injection through a flow, and measure how it fills and leaves the sac."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vstent.angiography import washout as washouts
+from vstent.angiography.bolus import Bolus
+from vstent.angiography.curves import Curves
+from vstent.angiography.network import Network, network
+from vstent.angiography.transport import Frame, Transport
+from vstent.errors import FlowError, InputError
+from vstent.flow import sampling
+from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.indices import on_sac
+from vstent.flow.memory import free_memory_bytes
+from vstent.flow.simulation import flow_case
+from vstent.geometry.vessel import Anatomy
+from vstent.kernels.arrays import Bools, Floats, Ints, freeze
+
+FINE_MM: Final = 1.0
+"""Distance from the sac, mm, within which the cells of the flow are kept; elsewhere blocks of eight are used."""
+REGION_MM: Final = 3.0
+"""Distance from the sac, mm, within which its washout is followed; blood that gets farther does not come back."""
+BYTES_PER_CELL: Final = 900
+"""Peak memory per cell of the flow, in bytes."""
+MOST_WASHOUT_S: Final = 20.0
+"""Longest washout that is marched, in s."""
+
+Watch = Callable[[Floats, Floats], Callable[[float, NDArray[np.float32]], None]]
+"""Takes the cell centers (n, 3) in mm (LPS) and their edges (n,) in mm; returns a function that is called with the time
+in s and the iodine concentration (n,) in mg/mL of every frame."""
+
+
+@dataclass(frozen=True)
+class AngiogramSettings:
+    """Settings of an angiogram."""
+
+    bolus: Bolus = field(default_factory=Bolus)
+    """The injection."""
+    window_s: float = 6.0
+    """Time that is computed, from the start of the injection."""
+    frames_per_s: float = 15.0
+    """Frames per second."""
+    diffusivity_mm2_s: float = 4e-4
+    """Molecular diffusivity of the agent in blood; iohexol in water: 4e-10 m2/s in order of magnitude."""
+    is_preview: bool = False
+    """Whether the grid is twice as coarse, about ten times faster."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError where a value cannot be used."""
+        if not 0.1 <= self.window_s <= 120:
+            raise InputError(f"a window of {self.window_s:g} s cannot be computed: give 0.1 to 120 s")
+        if not 0.5 <= self.frames_per_s <= 120:
+            raise InputError(f"{self.frames_per_s:g} frames per s cannot be computed: give 0.5 to 120")
+        if not 0 <= self.diffusivity_mm2_s <= 1:
+            raise InputError(f"a diffusivity of {self.diffusivity_mm2_s:g} mm2/s is not possible: give 0 to 1 mm2/s")
+
+
+@dataclass(frozen=True, eq=False)
+class Angiogram:
+    """Result of an angiogram."""
+
+    curves: Curves
+    """Time-density curves."""
+    washout_time_s: Floats
+    """(w,) times of the washout of the sac; empty without a sac."""
+    washout_fraction: Floats
+    """(w,) part of the sac's blood that is still in it."""
+    measures: dict[str, float]
+    """Times, volumes and areas; the end of each key is its unit."""
+    advice: str
+    """Sentences on the grid and on what the window did not reach."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "washout_time_s", np.float64, (-1,))
+        freeze(self, "washout_fraction", np.float64, (len(self.washout_time_s),))
+
+
+@dataclass(frozen=True, eq=False)
+class Injection:
+    """An injection into a flow, ready to be marched: the grid and its frames."""
+
+    network: Network
+    """Cells and flow rates."""
+    transport: Transport
+    """The concentration."""
+    settings: AngiogramSettings
+    """Settings."""
+
+    @property
+    def points_mm(self) -> Floats:
+        """Cell centers (n, 3), LPS."""
+        return self.network.points_mm
+
+    @property
+    def spacing_mm(self) -> Floats:
+        """Edge (n,) of a cube with the volume of each cell."""
+        return self.network.edge_mm
+
+    def frames(self) -> Iterator[Frame]:
+        """March once, and yield time in s since the start of the waveform and iodine in mg/mL (n,) of every frame."""
+        settings = self.settings
+        return self.transport.frames(1 / settings.frames_per_s, settings.bolus.begin_s + settings.window_s)
+
+
+def injection(case: FlowCase, field: FlowField, settings: AngiogramSettings) -> Injection:
+    """Prepare an injection into a flow.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case.
+    field : FlowField
+        Its flow.
+    settings : AngiogramSettings
+        Settings.
+
+    Raises
+    ------
+    FlowError
+        The flow does not fit in the free memory, or its flow rates cannot be balanced.
+    """
+    need_bytes = BYTES_PER_CELL * len(field.cells)
+    if need_bytes > free_memory_bytes():
+        raise FlowError(
+            f"an angiogram on {len(field.cells):,} cells needs {need_bytes / 1e9:.2g} GB of memory, more than is free: "
+            "compute the flow with a wider grid spacing"
+        )
+    whole = network(case, field)
+    if settings.is_preview:
+        whole = whole.merged(np.ones(len(whole.cells), dtype=bool))
+    if case.sac is not None:
+        whole = whole.merged(_distance_mm(whole, case) > FINE_MM)
+    inflow, most = settings.bolus.inflow(field.inflow_mL_s)
+    march = Transport(whole, diffusivity_mm2_s=settings.diffusivity_mm2_s, inflow=inflow, upper=most)
+    return Injection(whole, march, settings)
+
+
+def angiogram(
+    anatomy: Anatomy,
+    field: FlowField,
+    settings: AngiogramSettings | None = None,
+    *,
+    watch: Watch | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Angiogram:
+    """Carry an injection of contrast through a flow, and measure how it fills and leaves the sac.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The patient's vessel and aneurysms.
+    field : FlowField
+        Flow without or with a device, steady or pulsatile.
+    settings : AngiogramSettings, optional
+        Injection, window and frame rate.
+    watch : callable, optional
+        Takes the cell centers and edges and returns a function that is called with every frame (see `Watch`).
+    progress : callable, optional
+        Called with the finished fraction.
+
+    Raises
+    ------
+    InputError
+        The window is too short for contrast to reach the sac.
+    FlowError
+        The flow does not fit in the free memory, or its flow rates cannot be balanced.
+    """
+    settings = settings or AngiogramSettings()
+    case = flow_case(anatomy, None)
+    tell = progress or (lambda _: None)
+    ready = injection(case, field, settings)
+    sac = _sac_cells(ready.network, case)
+    share = 1.0 if case.sac is None else 0.6
+    curves = _curves(ready, anatomy, sac, watch, lambda part: tell(share * part))
+    measures = curves.measures()
+    if not measures:
+        raise InputError(
+            f"no contrast reaches the {'vessel' if case.sac is None else 'sac'} within {settings.window_s:g} s: give a "
+            "longer window"
+        )
+    balance = ready.transport.balance()
+    measures |= {"contrast_balance_error_fraction": balance.error_fraction}
+    if case.sac is None:
+        return Angiogram(curves, np.zeros(0), np.zeros(0), measures, _advice(ready, measures, None))
+    region = _distance_mm(ready.network, case) <= REGION_MM
+    near, own = ready.network.within(region), np.flatnonzero(np.isin(np.flatnonzero(region), sac))
+    found = washouts.wash_out(
+        near,
+        own,
+        end_s=MOST_WASHOUT_S,
+        diffusivity_mm2_s=settings.diffusivity_mm2_s,
+        told=lambda part: tell(share + (1 - share) * part),
+    )
+    measures |= _stay(found, near, own, case)
+    return Angiogram(curves, found.time_s, found.left_fraction, measures, _advice(ready, measures, found))
+
+
+def _curves(
+    ready: Injection, anatomy: Anatomy, sac: Ints, watch: Watch | None, tell: Callable[[float], None]
+) -> Curves:
+    """Return the curves of an injection; `watch` sees every frame."""
+    volume = ready.network.volume_mm3
+    parts = sac, _parent_cells(ready.network, anatomy, sac)
+    weights = [volume[part] / volume[part].sum() for part in parts]
+    show = None if watch is None else watch(ready.points_mm, ready.spacing_mm)
+    rows, bolus = [], ready.settings.bolus
+    for time_s, values in ready.frames():
+        rows.append(
+            [time_s - bolus.begin_s, *(float(w @ values[part]) for w, part in zip(weights, parts, strict=True))]
+        )
+        if show is not None:
+            show(time_s, values)
+        tell(time_s / (bolus.begin_s + ready.settings.window_s))
+    table = np.array(rows)
+    table = table[table[:, 0] >= -1e-9]
+    return Curves(*table.T)
+
+
+def _stay(found: washouts.Washout, near: Network, own: Ints, case: FlowCase) -> dict[str, float]:
+    """Return mean age, and the volume and wall area without exchange after 1, 2 and 5 s."""
+    assert case.sac is not None
+    result = {"mean_sac_age_s": found.mean_age_s, "sac_age_extrapolated_fraction": found.tail_fraction}
+    wall = case.vessel.lumen
+    mine = np.flatnonzero(on_sac(wall, case.sac, 0.2 * near.spacing_mm))
+    area_mm2 = np.bincount(wall.faces.ravel(), np.repeat(wall.areas_mm2 / 3, 3), len(wall.vertices_mm))[mine]
+    beside = cKDTree(near.points_mm[own]).query(wall.vertices_mm[mine])[1]
+    weight = near.volume_mm3[own] / near.volume_mm3[own].sum()
+    volume_mm3 = abs(case.sac.volume_mm3)
+    for moment, values in zip(washouts.MOMENTS_S, found.stayed, strict=False):
+        is_old = values > washouts.STAYED
+        result[f"unexchanged_after_{moment:g}s_volume_mm3"] = float(weight[is_old].sum()) * volume_mm3
+        result[f"unexchanged_after_{moment:g}s_area_mm2"] = float(area_mm2[is_old[beside]].sum())
+    return result
+
+
+def _distance_mm(grid: Network, case: FlowCase) -> Floats:
+    """Return the distance (n,) of the cells from the sac, 0 inside."""
+    assert case.sac is not None
+    distance = case.sac.closest(grid.points_mm)[1]
+    distance[_sac_cells(grid, case)] = 0.0
+    return distance
+
+
+def _sac_cells(grid: Network, case: FlowCase) -> Ints:
+    """Return the cells in the sac, or all cells where there is none."""
+    if case.sac is None:
+        return np.arange(len(grid.cells))
+    fine = int(grid.width.min())
+    is_fine = grid.width == fine
+    at_mm = grid.spacing_mm * (grid.cells[is_fine] + 0.5 * (fine - 1))  # the grid's own centers, in its own frame
+    shift_mm = np.median(grid.points_mm[is_fine] - at_mm, axis=0)
+    found = sampling.cells_inside(case.sac, at_mm + shift_mm, fine * grid.spacing_mm)
+    if len(found) == 0:
+        raise FlowError("no cell of the flow lies in the sac: compute the flow with a finer grid spacing")
+    return np.flatnonzero(is_fine)[found]
+
+
+def _parent_cells(grid: Network, anatomy: Anatomy, sac: Ints) -> Ints:
+    """Return the cells of the parent artery over one diameter proximal to the neck, or next to the inlet."""
+    axis = anatomy.axis
+    end_mm = anatomy.aneurysms[0].proximal_abscissa_mm if anatomy.aneurysms else 0.5 * axis.length_mm
+    place = int(np.argmin(np.abs(axis.abscissa_mm - end_mm)))
+    diameter_mm = 2 * float(axis.inscribed_radius_mm[place])
+    first_mm = max(end_mm - 1.5 * diameter_mm, 0.0)
+    last_mm = max(end_mm - 0.5 * diameter_mm, first_mm + 0.5 * diameter_mm)
+    chosen = (axis.abscissa_mm >= first_mm) & (axis.abscissa_mm <= last_mm)
+    line, radius_mm = axis.points_mm[chosen], axis.inscribed_radius_mm[chosen]
+    distance_mm, nearest = cKDTree(line).query(grid.points_mm)
+    inside: Bools = distance_mm < 0.8 * radius_mm[nearest]
+    inside[sac] &= not anatomy.aneurysms
+    return np.flatnonzero(inside)
+
+
+def _advice(ready: Injection, measures: dict[str, float], found: washouts.Washout | None) -> str:
+    """Return sentences on the grid and on what the window did not reach."""
+    grid = ready.network
+    widths = sorted({float(width) * grid.spacing_mm for width in np.unique(grid.width)})
+    spacing = " and ".join(f"{width:.3g}" for width in widths)
+    said = (
+        f"{len(grid.cells):,} cells of {spacing} mm; the flow rates were corrected by {grid.correction_fraction:.1%}."
+    )
+    if "washout_half_life_s" not in measures:
+        said += (
+            f" The sac keeps more than half of its peak to the end of the {ready.settings.window_s:g} s: a longer "
+            "window is needed for half-life and retention."
+        )
+    if found is not None and found.tail_fraction > 0.1:
+        said += f" {found.tail_fraction:.0%} of the mean age is extrapolated from the last seconds of the washout."
+    return said

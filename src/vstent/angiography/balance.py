@@ -1,0 +1,113 @@
+"""Smallest correction of flow rates between cells after which as much leaves every cell as enters it."""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse.linalg import LinearOperator, cg, splu
+
+from vstent.errors import FlowError
+from vstent.kernels.arrays import Floats, Ints
+
+COARSEST: Final = 1500
+"""Number of unknowns that are solved directly."""
+SMOOTHING: Final = 0.7
+"""Damping of the Jacobi smoother."""
+TOLERANCE: Final = 1e-9
+"""Imbalance that is left, relative to the imbalance before (root mean square)."""
+MOST_ITERATIONS: Final = 400
+"""Maximum number of iterations."""
+
+
+class _Level:
+    """One level of the multigrid hierarchy: matrix, inverse diagonal, and the coarse unknown of each unknown."""
+
+    def __init__(self, matrix: csr_matrix, cells: Ints) -> None:
+        self.matrix = matrix
+        self.inverse = 1 / np.maximum(matrix.diagonal(), 1e-12)
+        self.is_last = len(cells) <= COARSEST
+        if self.is_last:
+            self.factor = splu(csr_matrix(matrix + 1e-9 * diags(np.ones(len(cells)))).tocsc())
+            return
+        coarse, label = np.unique(cells // 2, axis=0, return_inverse=True)
+        of_coarse = csr_matrix((np.ones(len(cells)), (np.arange(len(cells)), label.ravel())))
+        self.spread = of_coarse
+        self.gather = csr_matrix(of_coarse.T)
+        # Constants on blocks make the coarse matrix twice too stiff, because its cells are twice as far apart.
+        self.next = _Level(csr_matrix(0.5 * (self.gather @ matrix @ of_coarse)), coarse)
+
+    def cycle(self, right: Floats) -> Floats:
+        """Return the result of one symmetric V-cycle from zero."""
+        if self.is_last:
+            return np.asarray(self.factor.solve(right))
+        found = SMOOTHING * self.inverse * right
+        found += SMOOTHING * self.inverse * (right - self.matrix @ found)
+        found += self.spread @ self.next.cycle(self.gather @ (right - self.matrix @ found))
+        for _ in range(2):
+            found += SMOOTHING * self.inverse * (right - self.matrix @ found)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Balancer:
+    """Solver that balances flow rates on one set of cells and faces."""
+
+    left: Ints
+    """(f,) cell on the lower side of each face."""
+    right: Ints
+    """(f,) cell on the upper side."""
+    level: Any
+    """Multigrid hierarchy of the Laplacian."""
+
+    def __call__(self, flux: Floats, source: Floats, guess: Floats | None = None) -> tuple[Floats, Floats]:
+        """Return the corrected flow rates (f,) and the potential (n,) of the correction.
+
+        Parameters
+        ----------
+        flux : (f,) float
+            Flow rate to the upper side of each face.
+        source : (n,) float
+            Flow rate into each cell through openings; its sum is 0.
+        guess : (n,) float, optional
+            First guess of the potential.
+
+        Raises
+        ------
+        FlowError
+            The correction is not found.
+        """
+        right = self.inflow(flux) + source
+        right -= right.mean()
+        n = len(right)
+        hierarchy = LinearOperator((n, n), matvec=self.level.cycle, dtype=np.float64)
+        potential, failed = cg(self.level.matrix, right, x0=guess, rtol=TOLERANCE, maxiter=MOST_ITERATIONS, M=hierarchy)
+        if failed:
+            raise FlowError(
+                "the flow rates between the cells cannot be balanced, so contrast would appear from nothing: compute "
+                "the flow again with another grid spacing"
+            )
+        return flux + potential[self.left] - potential[self.right], potential
+
+    def inflow(self, flux: Floats) -> Floats:
+        """Return the net flow rate (n,) into each cell through its faces."""
+        n = self.level.matrix.shape[0]
+        gain = np.bincount(self.right, flux, n) - np.bincount(self.left, flux, n)
+        return np.asarray(gain, dtype=np.float64)
+
+
+def balancer(cells: Ints, left: Ints, right: Ints) -> Balancer:
+    """Build the solver for connected cells.
+
+    Parameters
+    ----------
+    cells : (n, 3) int
+        Grid coordinates.
+    left, right : (f,) int
+        Cells on both sides of each face.
+    """
+    n, ones = len(cells), np.ones(len(left))
+    degree = np.bincount(left, minlength=n) + np.bincount(right, minlength=n)
+    places = np.r_[left, right, np.arange(n)], np.r_[right, left, np.arange(n)]
+    matrix = csr_matrix(coo_matrix((np.r_[-ones, -ones, degree], places), shape=(n, n)))
+    return Balancer(left, right, _Level(matrix, cells - cells.min(axis=0)))

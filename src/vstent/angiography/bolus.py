@@ -1,0 +1,106 @@
+"""The injection: concentration of iodine in the blood that enters the vessel, over time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import exp, gamma
+from typing import Final, Literal
+
+import numpy as np
+
+from vstent.errors import InputError
+
+GAMMA_EXPONENT: Final = 3.0
+"""Exponent of the gamma-variate curve (Thompson et al. 1964, Circ. Res. 14, 502, fit 1.5 to 5 to dilution curves)."""
+RAMP_S: Final = 0.05
+"""Time in which a constant injection rises and falls, in s."""
+
+
+@dataclass(frozen=True)
+class Bolus:
+    """An injection of contrast agent into the parent artery, mixed with the blood of the inlet.
+
+    The blood that enters carries iodine_mg_mL times rate / flow rate of the inlets, at most iodine_mg_mL. The flow
+    itself does not change.
+    """
+
+    iodine_mg_mL: float = 300.0
+    """Iodine in the agent."""
+    amount_mL: float = 3.0
+    """Volume injected."""
+    rate_mL_s: float = 3.0
+    """Mean injection rate; the injection lasts amount / rate."""
+    start_s: float = 0.0
+    """Start of the injection; in a pulsatile flow, time since the start of the waveform."""
+    shape: Literal["constant", "gamma"] = "constant"
+    """A constant rate, or a gamma-variate curve that peaks after amount / rate."""
+    curve: tuple[tuple[float, float], ...] = ()
+    """Times in s and iodine concentrations at the inlet in mg/mL, linear in between; they replace the values above."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError where a value cannot be used."""
+        if self.curve:
+            self._check_curve()
+            return
+        for name, value in (
+            ("iodine concentration", self.iodine_mg_mL),
+            ("injected amount", self.amount_mL),
+            ("injection rate", self.rate_mL_s),
+        ):
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"the {name} is {value:g}: give a positive number")
+        if not (np.isfinite(self.start_s) and self.start_s >= 0):
+            raise InputError(f"the injection starts at {self.start_s:g} s: give 0 s or later")
+
+    def _check_curve(self) -> None:
+        """Raise InputError where the curve cannot be used."""
+        times, values = np.array(self.curve, dtype=np.float64).T
+        if not np.isfinite(self.curve).all() or (np.diff(times) <= 0).any() or times[0] < 0:
+            raise InputError("the times of the injection curve do not increase from 0 s or later: sort the rows")
+        if values.min() < 0 or values.max() <= 0:
+            raise InputError("the injection curve has no or negative concentrations: give mg/mL of iodine, 0 or more")
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the start to the end of the injection (gamma-variate: to its peak)."""
+        return self.curve[-1][0] - self.curve[0][0] if self.curve else self.amount_mL / self.rate_mL_s
+
+    @property
+    def begin_s(self) -> float:
+        """Time at which contrast starts to enter."""
+        return self.curve[0][0] if self.curve else self.start_s
+
+    def inflow(self, flow_mL_s: float) -> tuple[Callable[[float], float], float]:
+        """Return the iodine concentration of the entering blood in mg/mL as a function of time in s, and its maximum.
+
+        Parameters
+        ----------
+        flow_mL_s : float
+            Mean flow rate through the inlets.
+        """
+        if self.curve:
+            times, values = np.array(self.curve, dtype=np.float64).T
+            return (lambda time_s: float(np.interp(time_s, times, values, left=0.0, right=0.0))), float(values.max())
+        mixed = self.iodine_mg_mL * min(self.rate_mL_s / flow_mL_s, 1.0)
+        return (self._gamma if self.shape == "gamma" else self._constant)(mixed)
+
+    def _constant(self, mixed_mg_mL: float) -> tuple[Callable[[float], float], float]:
+        """Return a trapezoid whose integral is that of the constant rate."""
+        end_s = self.start_s + self.duration_s
+        ramp_s = min(RAMP_S, 0.5 * self.duration_s)
+        times = [self.start_s, self.start_s + ramp_s, end_s, end_s + ramp_s]
+
+        def at(time_s: float) -> float:
+            return mixed_mg_mL * float(np.interp(time_s, times, [0.0, 1.0, 1.0, 0.0]))
+
+        return at, mixed_mg_mL
+
+    def _gamma(self, mixed_mg_mL: float) -> tuple[Callable[[float], float], float]:
+        """Return a gamma-variate curve with the integral of the constant rate."""
+        a, peak_s = GAMMA_EXPONENT, self.duration_s
+        top_mg_mL = mixed_mg_mL * a ** (a + 1) / (exp(a) * gamma(a + 1))
+
+        def at(time_s: float) -> float:
+            x = max(time_s - self.start_s, 0.0) / peak_s
+            return float(top_mg_mL * x**a * exp(a * (1 - x)))
+
+        return at, top_mg_mL

@@ -1,0 +1,300 @@
+"""Flow rates between the cells of a computed flow, balanced in every cell: what carries the contrast."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from vstent.angiography.balance import balancer
+from vstent.errors import FlowError
+from vstent.flow import domain as domains
+from vstent.flow.case import FlowCase, FlowField
+from vstent.geometry.surface import Surface
+from vstent.kernels.arrays import Bools, Floats, Ints, freeze
+
+MM3_PER_ML: Final = 1e3
+"""Cubic millimeters in a milliliter."""
+ALONG_AXES: Final = (1, 3, 5)
+"""Numbers of the lattice directions along +x, +y and +z."""
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """Cells of blood and the flow rates through the faces between them, at one moment or at several of a cycle.
+
+    Faces to an opening have a number from n upwards on that side: n + k for opening k.
+    """
+
+    cells: Ints
+    """(n, 3) grid coordinates, in cells of the flow; of a block of cells, its first."""
+    width: Ints
+    """(n,) edge of each cell or block, in cells of the flow."""
+    spacing_mm: float
+    """Edge of a cell of the flow."""
+    points_mm: Floats
+    """(n, 3) center of the blood in each cell, LPS."""
+    volume_mm3: Floats
+    """(n,) volume of blood in each cell."""
+    left: Ints
+    """(f,) cell on the lower side of each face."""
+    right: Ints
+    """(f,) cell on the upper side."""
+    axis: Ints
+    """(f,) axis across each face: 0, 1 or 2."""
+    flux_mm3_s: Floats
+    """(p, f) flow rate to the upper side, for every stored moment."""
+    time_s: Floats
+    """(p,) moments, from 0; only 0 for a steady flow."""
+    period_s: float
+    """Length of a cycle; inf for a steady flow."""
+    openings: int
+    """Number of openings, inlets first."""
+    inlets: int
+    """Number of inlets."""
+    correction_fraction: float
+    """Root mean square of the change that balances the flow rates, relative to theirs."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "cells", np.int32, (-1, 3))
+        freeze(self, "width", np.int32, (len(self.cells),))
+        freeze(self, "points_mm", np.float64, (len(self.cells), 3))
+        freeze(self, "volume_mm3", np.float64, (len(self.cells),))
+        freeze(self, "left", np.int32, (-1,))
+        freeze(self, "right", np.int32, (len(self.left),))
+        freeze(self, "axis", np.int8, (len(self.left),))
+        freeze(self, "time_s", np.float64, (-1,))
+        freeze(self, "flux_mm3_s", np.float64, (len(self.time_s), len(self.left)))
+
+    @property
+    def edge_mm(self) -> Floats:
+        """Edge (n,) of a cube with the volume of blood of each cell."""
+        return np.asarray(np.cbrt(self.volume_mm3), dtype=np.float64)
+
+    @cached_property
+    def area_mm2(self) -> Floats:
+        """Area (f,) of every face."""
+        return (self._narrower * self.spacing_mm) ** 2
+
+    @cached_property
+    def _narrower(self) -> Ints:
+        """Width (f,) of the narrower of the two cells of each face, in cells of the flow."""
+        beyond = np.r_[self.width, np.full(self.openings, np.iinfo(np.int32).max)]
+        return np.minimum(beyond[self.left], beyond[self.right])
+
+    @cached_property
+    def outflow_per_s(self) -> Floats:
+        """Flow rate (n,) out of each cell, at most over the cycle, divided by its volume."""
+        n = len(self.cells)
+        most = np.zeros(n)
+        for flux in self.flux_mm3_s:
+            leaves = np.bincount(self.left, np.maximum(flux, 0), n + self.openings)
+            leaves += np.bincount(self.right, np.maximum(-flux, 0), n + self.openings)
+            most = np.maximum(most, leaves[:n])
+        return most / self.volume_mm3
+
+    @property
+    def at_openings(self) -> tuple[Ints, Ints, Floats]:
+        """Faces (b,) of openings, the opening (b,) of each, and the sign (b,) of a flow out of the vessel."""
+        n = len(self.cells)
+        faces = np.flatnonzero((self.left >= n) | (self.right >= n))
+        leaves = self.right[faces] >= n
+        return faces, np.where(leaves, self.right[faces], self.left[faces]) - n, np.where(leaves, 1.0, -1.0)
+
+    def through_mL_s(self) -> Floats:
+        """Return the flow rate (p, o) out of the vessel through every opening, negative into it."""
+        faces, opening, sign = self.at_openings
+        rows = [np.bincount(opening, sign * flux[faces], self.openings) for flux in self.flux_mm3_s]
+        return np.array(rows) / MM3_PER_ML
+
+    def merged(self, chosen: Bools) -> "Network":
+        """Return the network with blocks of 2 x 2 x 2 of the chosen cells (n,); its flow rates balance too.
+
+        Cells of a block that is not chosen as a whole stay as they are.
+        """
+        n, wide = len(self.cells), 2 * self.width[:, None]
+        corner = np.where(chosen[:, None], self.cells // wide * wide, self.cells)
+        block, of_block = np.unique(np.c_[self.cells // wide * wide, wide], axis=0, return_inverse=True)
+        stays = np.zeros(len(block), dtype=bool)
+        stays[of_block.ravel()[~chosen]] = True
+        whole = ~stays[of_block.ravel()]
+        corner = np.where(whole[:, None], corner, self.cells)
+        found, label = np.unique(np.c_[corner, np.where(whole, wide[:, 0], self.width)], axis=0, return_inverse=True)
+        count, label = len(found), np.r_[label.ravel(), len(found) + np.arange(self.openings)]
+        left, right = label[self.left].astype(np.int64), label[self.right].astype(np.int64)
+        between = left != right
+        key = (left[between] * (count + self.openings) + right[between]) * 3 + self.axis[between]
+        kept, place = np.unique(key, return_inverse=True)
+        flux = [np.bincount(place.ravel(), one[between], len(kept)) for one in self.flux_mm3_s]
+        volume_mm3 = np.bincount(label[:n], self.volume_mm3, count)
+        points = [np.bincount(label[:n], self.volume_mm3 * x, count) / volume_mm3 for x in self.points_mm.T]
+        return replace(
+            self,
+            cells=found[:, :3],
+            width=found[:, 3],
+            points_mm=np.stack(points, axis=1),
+            volume_mm3=volume_mm3.astype(np.float64),
+            left=kept // 3 // (count + self.openings),
+            right=kept // 3 % (count + self.openings),
+            axis=kept % 3,
+            flux_mm3_s=np.array(flux),
+        )
+
+    def within(self, chosen: Bools) -> "Network":
+        """Return the network of some cells (n,); what leaves them leaves through one opening."""
+        n = int(chosen.sum())
+        number = np.full(len(chosen) + self.openings, n, dtype=np.int64)
+        number[: len(chosen)][chosen] = np.arange(n)
+        kept = (number[self.left] < n) | (number[self.right] < n)
+        return replace(
+            self,
+            cells=self.cells[chosen],
+            width=self.width[chosen],
+            points_mm=self.points_mm[chosen],
+            volume_mm3=self.volume_mm3[chosen],
+            left=number[self.left[kept]],
+            right=number[self.right[kept]],
+            axis=self.axis[kept],
+            flux_mm3_s=self.flux_mm3_s[:, kept],
+            openings=1,
+            inlets=0,
+        )
+
+
+def network(case: FlowCase, field: FlowField) -> Network:
+    """Return the balanced flow rates between the cells of a flow.
+
+    The flow rate through a face is the mean velocity of its two cells times its area. Walls are closed, also walls
+    thinner than a cell. The openings carry the flow rates of the result. The smallest change (least squares) that
+    balances every cell is added, because the contrast would otherwise exceed its bounds.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case.
+    field : FlowField
+        Its flow, steady or pulsatile.
+
+    Raises
+    ------
+    FlowError
+        No cell of the flow is at an inlet, or the flow rates cannot be balanced.
+    """
+    surface, face_patch, _ = domains.extend(case.vessel)
+    neighbour = domains.neighbours(field.index, field.cells)
+    is_open = neighbour >= 0
+    parted = domains.septa(surface, neighbour, field.cells, field.origin_mm, field.cell_size_mm)
+    is_open[parted] = False
+    left, axis = np.nonzero(is_open[:, ALONG_AXES])
+    right = neighbour[left, 2 * axis + 1]
+    at_cell, at_axis, at_sign, opening = _mouths(case, field, neighbour, surface, face_patch)
+    kept = _connected(len(field.cells), left, right, at_cell[opening < len(case.vessel.inlets)])
+    if not kept.any():
+        raise FlowError("no cell of the flow lies at an inlet, so no contrast can enter: compute the flow again")
+    solver_faces = kept[left] & kept[right]
+    number = np.cumsum(kept) - 1
+    left, right, axis = number[left[solver_faces]], number[right[solver_faces]], axis[solver_faces]
+    at_open = kept[at_cell]
+    mouths = _Mouths(number[at_cell[at_open]], at_axis[at_open], at_sign[at_open], opening[at_open])
+    return _balanced(case, field, kept, (left, right, axis), mouths)
+
+
+@dataclass(frozen=True, eq=False)
+class _Mouths:
+    """Faces at the openings."""
+
+    cell: Ints
+    """(b,) cell of each face."""
+    axis: Ints
+    """(b,) axis across it."""
+    sign: Ints
+    """(b,) 1 where the outside is on the upper side, else -1."""
+    opening: Ints
+    """(b,) number of the opening."""
+
+    def outflow(self, velocity_m_s: Floats, through_mL_s: Floats) -> Floats:
+        """Return the flow rate (b,) out of each face, as the velocity has it and in total as each opening has it."""
+        out = self.sign * velocity_m_s[self.cell, self.axis]
+        found = np.zeros(len(out))
+        for k, total in enumerate(through_mL_s):
+            own = self.opening == k
+            part = np.maximum(np.sign(total) * out[own], 0.0)
+            if own.any():
+                found[own] = MM3_PER_ML * total * (part / part.sum() if part.sum() > 0 else 1 / own.sum())
+        return found
+
+
+def _mouths(
+    case: FlowCase, field: FlowField, neighbour: Ints, surface: Surface, face_patch: Ints
+) -> tuple[Ints, Ints, Ints, Ints]:
+    """Return cell, axis, sign and opening (b,) of every face at an opening."""
+    cell, direction = np.nonzero(neighbour[:, 1:7] < 0)
+    axis, sign = direction // 2, 1 - 2 * (direction % 2)
+    middle = field.centers_mm[cell]
+    middle[np.arange(len(cell)), axis] += 0.5 * sign * field.cell_size_mm
+    near = np.zeros(len(cell), dtype=bool)
+    for mouth in case.vessel.openings:
+        near |= (middle - mouth.center_mm) @ mouth.normal > -field.cell_size_mm
+    cell, axis, sign, middle = cell[near], axis[near], sign[near], middle[near]
+    patch = face_patch[surface.closest(middle)[2]]
+    is_mouth = patch > 0
+    return cell[is_mouth], axis[is_mouth], sign[is_mouth], patch[is_mouth] - 1
+
+
+def _connected(n: int, left: Ints, right: Ints, entries: Ints) -> Bools:
+    """Return the cells (n,) that are connected to the inlets."""
+    graph = coo_matrix((np.ones(len(left)), (left, right)), shape=(n, n))
+    part = connected_components(graph, directed=False)[1]
+    return np.asarray(np.isin(part, part[entries]))
+
+
+def _balanced(
+    case: FlowCase, field: FlowField, kept: Bools, faces: tuple[Ints, Ints, Ints], mouths: _Mouths
+) -> Network:
+    """Return the network of the kept cells (n,), with the flow rates of every moment balanced."""
+    left, right, axis = faces
+    cells = field.cells[kept]
+    n, n_openings, h = len(cells), len(case.vessel.openings), field.cell_size_mm
+    solve, guess = balancer(cells, left, right), None
+    rows, change, size = [], 0.0, 0.0
+    for moment in field.phases or (field,):
+        velocity = moment.velocity_m_s[kept].astype(np.float64)
+        inner = 0.5 * (velocity[left, axis] + velocity[right, axis]) * h**2 * MM3_PER_ML
+        through = np.r_[-moment.inlets_mL_s, _reached(moment.outlets_mL_s, mouths, len(moment.inlets_mL_s))]
+        through[len(moment.inlets_mL_s) :] *= moment.inflow_mL_s / through[len(moment.inlets_mL_s) :].sum()
+        out = mouths.outflow(velocity, through)
+        fixed, guess = solve(inner, -np.bincount(mouths.cell, out, n).astype(np.float64), guess)
+        change, size = change + ((fixed - inner) ** 2).sum(), size + (inner**2).sum()
+        rows.append(np.r_[fixed, mouths.sign * out])
+    beyond = n + mouths.opening
+    return Network(
+        cells=cells,
+        width=np.ones(n, dtype=np.int32),
+        spacing_mm=h,
+        points_mm=field.centers_mm[kept],
+        volume_mm3=np.full(n, h**3),
+        left=np.r_[left, np.where(mouths.sign > 0, mouths.cell, beyond)],
+        right=np.r_[right, np.where(mouths.sign > 0, beyond, mouths.cell)],
+        axis=np.r_[axis, mouths.axis],
+        flux_mm3_s=np.array(rows),
+        time_s=np.array([phase.time_s for phase in field.phases] or [0.0]),
+        period_s=_period_s(field),
+        openings=n_openings,
+        inlets=len(case.vessel.inlets),
+        correction_fraction=float(np.sqrt(change / size)),
+    )
+
+
+def _reached(outlets_mL_s: Floats, mouths: _Mouths, n_inlets: int) -> Floats:
+    """Return the flow rates (k,) of the outlets, 0 where no cell is at one."""
+    is_there = np.isin(n_inlets + np.arange(len(outlets_mL_s)), mouths.opening)
+    return np.where(is_there, outlets_mL_s, 0.0)
+
+
+def _period_s(field: FlowField) -> float:
+    """Return the length of the cycle of a pulsatile flow, inf for a steady one."""
+    if len(field.phases) < 2:
+        return float("inf")
+    return (field.phases[1].time_s - field.phases[0].time_s) * len(field.phases)

@@ -1,0 +1,103 @@
+"""Washout of a sac: how long its own blood stays, where, and how old it is."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from vstent.angiography.network import Network
+from vstent.angiography.transport import Transport
+from vstent.kernels.arrays import Floats, Ints, freeze
+
+INTERVAL_S: Final = 0.05
+"""Time between samples of the washout, in s."""
+ENOUGH: Final = 0.02
+"""Fraction of the sac's blood left at which the washout is stopped."""
+MOMENTS_S: Final = (1.0, 2.0, 5.0)
+"""Times at which the part without exchange is reported, in s."""
+STAYED: Final = 0.5
+"""Fraction of the first blood above which a place counts as not exchanged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Washout:
+    """Blood that is in the sac at 0 s, and how it is replaced."""
+
+    time_s: Floats
+    """(t,) times from 0."""
+    left_fraction: Floats
+    """(t,) part of that blood still, or again, in the sac."""
+    stayed: tuple[Floats, ...]
+    """For each of `MOMENTS_S` that was reached, the fraction (n,) of that blood in every cell of the sac."""
+    age_s: Floats
+    """(n,) mean time that the blood in each cell of the region has spent in the sac."""
+    tail_fraction: float
+    """Part of the mean age that is extrapolated from the last times."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "time_s", np.float64, (-1,))
+        freeze(self, "left_fraction", np.float64, (len(self.time_s),))
+        freeze(self, "age_s", np.float64, (-1,))
+
+    @property
+    def mean_age_s(self) -> float:
+        """Mean time that the blood in the sac has been there."""
+        inside = float(np.trapezoid(self.left_fraction, self.time_s))
+        return inside / (1 - self.tail_fraction)
+
+
+def wash_out(
+    network: Network,
+    sac: Ints,
+    *,
+    end_s: float,
+    diffusivity_mm2_s: float = 0.0,
+    told: Callable[[float], None] | None = None,
+) -> Washout:
+    """March the washout of a sac.
+
+    Parameters
+    ----------
+    network : Network
+        The sac and its surroundings.
+    sac : (s,) int
+        Cells of the sac.
+    end_s : float
+        Time after which the march stops; it stops earlier when hardly any of the blood is left.
+    diffusivity_mm2_s : float
+        Molecular diffusivity.
+    told : callable, optional
+        Called with the finished fraction.
+    """
+    first = np.zeros(len(network.cells))
+    first[sac] = 1.0
+    march = Transport(network, diffusivity_mm2_s=diffusivity_mm2_s, initial=first)
+    weight = network.volume_mm3[sac] / network.volume_mm3[sac].sum()
+    times: list[float] = []
+    left: list[float] = []
+    stayed: list[Floats] = []
+    age, last = np.zeros(len(first)), first
+    for time_s, values in march.frames(INTERVAL_S, end_s):
+        age += 0.5 * INTERVAL_S * (last + values) if times else 0.0
+        last = values.astype(np.float64)
+        times.append(time_s)
+        left.append(float(weight @ values[sac]))
+        if any(abs(time_s - moment) < 1e-6 for moment in MOMENTS_S):
+            stayed.append(last[sac])
+        if told is not None:
+            told(time_s / end_s)
+        if left[-1] < ENOUGH and time_s > MOMENTS_S[-1] + 1e-6:
+            break
+    decay_s = _decay_s(np.array(times), np.array(left))
+    age += decay_s * last
+    tail = decay_s * left[-1]
+    tail_fraction = tail / (float(np.trapezoid(left, times)) + tail)
+    return Washout(np.array(times), np.array(left), tuple(stayed), age, tail_fraction)
+
+
+def _decay_s(times: Floats, left: Floats) -> float:
+    """Return the time constant of the last half of a washout."""
+    late = slice(len(times) // 2, None)
+    drop = np.log(np.maximum(left[late][0], 1e-12) / np.maximum(left[late][-1], 1e-12))
+    return float((times[late][-1] - times[late][0]) / max(drop, 1e-3))
