@@ -71,12 +71,13 @@ class Network:
     @property
     def edge_mm(self) -> Floats:
         """Edge (n,) of a cube with the volume of blood of each cell."""
-        return np.asarray(np.cbrt(self.volume_mm3), dtype=np.float64)
+        edge_mm: Floats = np.cbrt(self.volume_mm3)
+        return edge_mm
 
     @cached_property
     def area_mm2(self) -> Floats:
         """Area (f,) of every face."""
-        return (self._narrower * self.spacing_mm) ** 2
+        return np.square(self._narrower * self.spacing_mm)
 
     @cached_property
     def _narrower(self) -> Ints:

@@ -97,7 +97,7 @@ def wash_out(
 
 
 def _decay_s(times: Floats, left: Floats) -> float:
-    """Return the time constant of the last half of a washout."""
+    """Return the time constant of the last half of a washout, at most the time marched."""
     late = slice(len(times) // 2, None)
     drop = np.log(np.maximum(left[late][0], 1e-12) / np.maximum(left[late][-1], 1e-12))
-    return float((times[late][-1] - times[late][0]) / max(drop, 1e-3))
+    return float(min((times[late][-1] - times[late][0]) / max(drop, 1e-9), times[-1]))

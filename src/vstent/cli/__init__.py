@@ -10,12 +10,12 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from vstent.cli import app, batch, demo, devices, export, flow, rank, restore, run, trace
+from vstent.cli import angiogram, app, batch, demo, devices, export, flow, rank, restore, run, trace
 from vstent.cli.interrupt import borne_interrupts
 from vstent.cli.options import EPILOG, renamed
 from vstent.errors import InputError, VstentError
 
-COMMANDS: Final = (run, app, trace, restore, rank, batch, flow, export, demo, devices)
+COMMANDS: Final = (run, app, trace, restore, rank, batch, flow, angiogram, export, demo, devices)
 """Commands in the order of the help."""
 BAD_INPUT: Final = 2
 """Exit code where an input or option cannot be used."""

@@ -26,6 +26,23 @@ ROWS: Final = (
     ("Turnover time", "turnover_time_s"),
 )
 """Rows of the comparison of flows: title and key of the index."""
+CONTRAST_ROWS: Final = (
+    "contrast_arrival_s",
+    "contrast_peak_s",
+    "contrast_peak_fraction",
+    "washout_half_life_s",
+    "contrast_retention_s",
+    "contrast_mean_transit_s",
+    "mean_sac_age_s",
+    "turnover_time_s",
+    "unexchanged_after_1s_volume_mm3",
+    "unexchanged_after_2s_volume_mm3",
+    "unexchanged_after_5s_volume_mm3",
+    "unexchanged_after_5s_area_mm2",
+    "fast_sac_volume_mm3",
+    "mean_sac_velocity_m_s",
+)
+"""Keys of the table of angiograms."""
 DEVICE_ROWS: Final = (
     ("Size (label)", "size"),
     ("Deployed length", "deployed_length_mm"),
@@ -278,6 +295,21 @@ def flow_table(metrics: Mapping[str, Any]) -> Table:
     _add_grades(table, metrics)
     for quantity in flatten(metrics["bare"]):
         table.add_row(quantity.name, *_flow_cells(metrics, quantity.key, quantity.value))
+    return table
+
+
+def angiogram_table(metrics: Mapping[str, Any]) -> Table:
+    """Return the table of angiograms: without a device, and with each device and its relative change."""
+    from vstent.reporting.definitions import INDICES_WITH_OCCLUSION
+    from vstent.reporting.quantities import flatten
+
+    table = Table("angiogram", "bare", *metrics["stents"])
+    _add_grades(table, metrics)
+    for key in CONTRAST_ROWS:
+        if key in metrics["bare"]:
+            name = flatten({key: 0.0})[0].name
+            table.add_row(name, *_flow_cells(metrics, key, metrics["bare"][key]))
+    table.caption = "\n".join([str(table.caption or ""), *INDICES_WITH_OCCLUSION]).strip()
     return table
 
 

@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vstent.cli import options
+from vstent.cli.angiogram import add_injection, given_angiogram
+from vstent.errors import InputError
 
 if TYPE_CHECKING:
+    from vstent.angiography.angiogram import AngiogramSettings
     from vstent.study.types import CaseResult, Settings
 
 
@@ -36,6 +39,8 @@ def add(commands: options.Commands) -> None:
         help="position of the device's middle along the parent artery, mm (default: proposed)",
     )
     add_study(parser)
+    parser.add_argument("--angiogram", action="store_true", help="also carry contrast through the flows (see below)")
+    add_injection(parser)
     add_pdf(parser)
     parser.add_argument(
         "--plan", action="store_true", help="write the plan of every device on one page, plan.pdf, without the flow"
@@ -75,7 +80,15 @@ def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
     return Settings(devices=devices, flow=flow, uncertainty=ranges, **given)  # type: ignore[arg-type]
 
 
-def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool, replaces: bool) -> "CaseResult":
+def study(
+    path: Path,
+    out: Path,
+    settings: "Settings",
+    *,
+    is_printed: bool,
+    replaces: bool,
+    injected: "AngiogramSettings | None" = None,
+) -> "CaseResult":
     """Run a study, show its progress, write its reports and print its tables.
 
     Parameters
@@ -85,13 +98,23 @@ def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool, repl
     settings : settings of the study.
     is_printed : whether the report is also written as PDF.
     replaces : whether results of another input or of other settings are replaced.
+    injected : settings of the angiograms; None: none are computed.
     """
-    from vstent.cli.console import Console, comparison_table, device_sentences, uncertainty_table
+    from vstent.cli.console import (
+        Console,
+        angiogram_table,
+        comparison_table,
+        device_sentences,
+        uncertainty_table,
+    )
+    from vstent.study.contrast import add_angiograms
     from vstent.study.pipeline import run
 
     console = Console()
     with console.live():
         case = run(path, out, settings, console.progress, replaces=replaces)
+        if injected is not None:
+            add_angiograms(case, out, injected, console.progress)
         console.progress("report", 0.0, "")
         from vstent.reporting.write import write_report
 
@@ -102,6 +125,8 @@ def study(path: Path, out: Path, settings: "Settings", *, is_printed: bool, repl
         console.print(sentence)
     if settings.uncertainty is not None:
         console.print(uncertainty_table(case.metrics))
+    if injected is not None:
+        console.print(angiogram_table(case.metrics))
     for name, sentence in case.failures.items():
         console.say(f"vstent: {name}: {sentence}")
     console.print(f"Results in {out}; open {out / 'report.html'}. Research use only.")
@@ -119,16 +144,19 @@ def _run(arguments: argparse.Namespace) -> int:
     )
     if arguments.plan:
         settings = replace(settings, flow=None)
+    injected = given_angiogram(arguments) if arguments.angiogram else None
+    if injected is not None and settings.flow is None:
+        raise InputError("contrast moves with the flow: leave out --no-flow and --plan, or --angiogram.")
     if arguments.input.suffix == ".json":
         return _again(arguments, settings)
-    case = study(arguments.input, arguments.out, settings, is_printed=arguments.pdf, replaces=arguments.replace)
+    given = {"is_printed": arguments.pdf, "replaces": arguments.replace, "injected": injected}
+    case = study(arguments.input, arguments.out, settings, **given)
     return _finish(arguments, case)
 
 
 def _again(arguments: argparse.Namespace, given: "Settings") -> int:
     """Repeat a run from its ``run.json`` and compare the results; return the exit code."""
     from vstent.cli.console import Console
-    from vstent.errors import InputError
     from vstent.study.repeat import agreement, read_record
     from vstent.study.types import Settings
 

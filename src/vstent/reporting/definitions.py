@@ -18,6 +18,7 @@ _DHAR: Final = "Dhar et al. 2008, Neurosurgery 63:185"
 _RAGHAVAN: Final = "Raghavan, Ma and Harbaugh 2005, J. Neurosurg. 102:355"
 _BAHAROGLU: Final = "Baharoglu et al. 2010, Stroke 41:1423"
 _PICCINELLI: Final = "Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141"
+_MEIER: Final = "Meier and Zierler 1954, J. Appl. Physiol. 6:731"
 """Publications that define metrics."""
 
 DEFINITIONS: Final[dict[str, Definition]] = {
@@ -263,8 +264,58 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "speed. Of an unsteady flow: three standard errors of the means, or the range where there are too few "
         "checks. Of a pulse: change between its last two cycles.",
     ),
+    # the angiogram
+    "contrast_arrival_s": Definition(
+        "Contrast arrival",
+        "Time from the start of the injection until the mean iodine of the sac reaches a tenth of its peak.",
+    ),
+    "contrast_peak_s": Definition(
+        "Contrast peak, time", "Time from the start of the injection until the mean iodine of the sac peaks."
+    ),
+    "contrast_peak_mg_mL": Definition("Contrast peak", "Largest mean iodine concentration of the sac."),
+    "contrast_peak_fraction": Definition(
+        "Contrast peak, relative",
+        "Largest mean iodine concentration of the sac divided by that of the parent artery proximal to the neck.",
+    ),
+    "washout_half_life_s": Definition(
+        "Washout half-life", "Time from the peak of the sac's mean iodine until it falls to half."
+    ),
+    "contrast_retention_s": Definition(
+        "Contrast retention",
+        "Time by which the sac falls to half of its peak later than the parent artery. Hadad et al. 2023 found "
+        "stagnation above 0.46 s of their retention time (14 aneurysms), whose definition may differ.",
+        "after Hadad et al. 2023, Int. J. Num. Methods Biomed. Eng. 39:e3740",
+    ),
+    "contrast_mean_transit_s": Definition(
+        "Mean transit time", "Centroid of the sac's curve in time minus that of the parent artery's.", _MEIER
+    ),
+    "contrast_balance_error_fraction": Definition(
+        "Contrast balance", "Contrast that entered minus that which left or is inside, relative to what entered."
+    ),
+    "mean_sac_age_s": Definition(
+        "Age of the sac's blood", "Mean time that the blood in the sac has been there (integral of the washout)."
+    ),
+    "sac_age_extrapolated_fraction": Definition(
+        "Age, extrapolated part", "Part of the mean age that lies beyond the computed washout."
+    ),
+} | {
+    f"unexchanged_after_{moment}s_{key}": Definition(
+        f"{what} without exchange, {moment} s",
+        f"{what} of the sac where more than half of the blood is the same after {moment} s.",
+    )
+    for moment in (1, 2, 5)
+    for key, what in (("volume_mm3", "Volume"), ("area_mm2", "Wall area"))
 }
 """Definition of every metric by its key; the end of a key is its unit."""
+
+INDICES_WITH_OCCLUSION: Final = (
+    "Indices that studies associate with occlusion, not a prognosis:",
+    "Volume of the sac with fast blood (8 cm/s or more; Beppu et al. 2020, AJNR 41:2107, 27 patients, divided by the "
+    "volume of the dome).",
+    "Reduction of the mean sac velocity: by 35 % or more in Ouared et al. 2016, J. Neurointerv. Surg. 8:1288; a trend "
+    "only (p = 0.08) in Brina et al. 2019, AJNR 40:2117, 23 patients.",
+)
+"""Sentences on flow metrics that studies associate with occlusion after flow diversion."""
 
 OF_PULSE: Final = (
     "In pulsatile flow every number is the mean over the last cycle, unless its name says largest; wall shear "

@@ -14,6 +14,7 @@ from vstent.devices.catalogue import find_design
 from vstent.flow.convergence import Sensitivity
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
+from vstent.study.contrast import add_measures, kept_measures
 from vstent.study.crate import NAME as CRATE
 from vstent.study.folder import CACHE, claiming
 from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
@@ -98,6 +99,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
     with ledger.stage("measure"):
         metrics = measure_all(anatomy, deployments, fields, settings.flow)
         band_all(anatomy, deployments, metrics, settings)
+        add_measures(metrics, kept_measures(out, source, settings) if fields else {})
         for name, spread in varied.items():
             metrics["stents"][name]["uncertainty"] = spread
         if failures:

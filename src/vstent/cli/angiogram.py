@@ -1,0 +1,98 @@
+"""`vstent angiogram`: carry contrast through the flows of a finished case."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vstent.cli import options
+
+if TYPE_CHECKING:
+    from vstent.angiography.angiogram import AngiogramSettings
+
+
+def add(commands: options.Commands) -> None:
+    """Add the command."""
+    parser = options.add_command(
+        commands,
+        "angiogram",
+        "Carry contrast through the flows of a case, and measure how it fills and leaves the sac.",
+        "angiogram case --rate 3 --amount 4",
+    )
+    parser.add_argument("case", type=Path, help="case folder of `vstent run` with flows")
+    add_injection(parser)
+    parser.set_defaults(command=_angiogram)
+
+
+def add_injection(parser: argparse.ArgumentParser) -> None:
+    """Add the options on the injection and on what is computed."""
+    group = parser.add_argument_group("injection")
+    group.add_argument(
+        "--iodine", type=options.positive, default=300.0, metavar="MG_ML", help="iodine, mg/mL (default: 300)"
+    )
+    group.add_argument(
+        "--amount", type=options.positive, default=3.0, metavar="ML", help="injected volume, mL (default: 3)"
+    )
+    group.add_argument(
+        "--rate", type=options.positive, default=3.0, metavar="ML_S", help="injection rate, mL/s (default: 3)"
+    )
+    group.add_argument(
+        "--start",
+        type=options.within(0, 60, "s"),
+        default=0.0,
+        metavar="S",
+        help="start of the injection; with a pulsatile flow the time since the start of the cycle, s (default: 0)",
+    )
+    shape = group.add_mutually_exclusive_group()
+    shape.add_argument("--gamma", action="store_true", help="gamma-variate injection curve (default: constant rate)")
+    shape.add_argument(
+        "--curve", type=Path, metavar="CSV", help="time (s) and iodine concentration at the inlet (mg/mL), two columns"
+    )
+    group.add_argument(
+        "--window",
+        type=options.within(0.1, 120, "s"),
+        default=6.0,
+        metavar="S",
+        help="time to compute from the start of the injection, s (default: 6)",
+    )
+    group.add_argument("--preview", action="store_true", help="use a grid twice as coarse, for a first look")
+
+
+def given_angiogram(arguments: argparse.Namespace) -> "AngiogramSettings":
+    """Return the settings of the angiograms.
+
+    Raises
+    ------
+    InputError
+        A value cannot be used.
+    """
+    from vstent.angiography.angiogram import AngiogramSettings
+    from vstent.angiography.bolus import Bolus
+    from vstent.io.tables import read_columns
+
+    curve = () if arguments.curve is None else tuple((t, c) for t, c in read_columns(arguments.curve, 2).tolist())
+    bolus = Bolus(
+        iodine_mg_mL=arguments.iodine,
+        amount_mL=arguments.amount,
+        rate_mL_s=arguments.rate,
+        start_s=arguments.start,
+        shape="gamma" if arguments.gamma else "constant",
+        curve=curve,
+    )
+    return AngiogramSettings(bolus=bolus, window_s=arguments.window, is_preview=arguments.preview)
+
+
+def _angiogram(arguments: argparse.Namespace) -> int:
+    """Run the command; return the exit code."""
+    import json
+
+    from vstent.cli.console import Console, angiogram_table
+    from vstent.study.contrast import FOLDER, angiograms
+    from vstent.study.provenance import METRICS
+
+    settings = given_angiogram(arguments)
+    console = Console()
+    with console.live():
+        angiograms(arguments.case, settings, console.progress)
+    console.print(angiogram_table(json.loads((arguments.case / METRICS).read_text(encoding="utf-8"))))
+    console.print(f"Results in {arguments.case / FOLDER}. Research use only.")
+    return 0

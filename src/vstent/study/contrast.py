@@ -1,0 +1,196 @@
+"""Angiograms of the flows of a case folder: computed from its stored flows, stored, and added to its metrics."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.angiography.angiogram import Angiogram, AngiogramSettings, Watch, angiogram
+from vstent.devices.catalogue import find_design
+from vstent.devices.design import BARE
+from vstent.errors import InputError, ReadError
+from vstent.flow.case import FlowField
+from vstent.flow.indices import compare
+from vstent.geometry.vessel import Anatomy
+from vstent.io.tables import write_rows
+from vstent.io.writers import write_json
+from vstent.study.folder import CACHE, claimed
+from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of
+from vstent.study.provenance import METRICS, RUN
+from vstent.study.repeat import UNTOLD, told_in
+from vstent.study.stages import flow_key
+from vstent.study.types import CaseResult, Progress, Settings
+
+FOLDER: Final = "angiogram"
+"""Subfolder of the case folder with the results."""
+CURVES: Final = "curves.csv"
+"""File with the time-density curves of all flows."""
+NUMBERS: Final = "angiogram.json"
+"""File with settings, measures and advice of all flows."""
+
+Record = Callable[[str, Path], AbstractContextManager[Watch | None]]
+"""Takes the name of a flow and its stored file; its context yields what watches the frames, or None."""
+
+
+def angiograms(
+    out: Path, settings: AngiogramSettings, progress: Progress, *, record: Record | None = None
+) -> dict[str, Angiogram]:
+    """Compute the angiogram of every flow of a case folder, and write curves, numbers and metrics.
+
+    An angiogram that is stored for the same flow and settings is not computed again, unless its frames are watched.
+
+    Parameters
+    ----------
+    out : the case folder of a finished run with flows.
+    settings : settings of the angiograms.
+    progress : called at every stage.
+    record : returns what watches the frames of a flow (see `Record`).
+
+    Returns
+    -------
+    dict
+        Angiograms by name of the flow, ``bare`` first.
+
+    Raises
+    ------
+    ReadError
+        The folder holds no finished run of this version.
+    InputError
+        The run has no flow, or the window is too short for contrast to reach the sac.
+    FlowError
+        A flow does not fit in the free memory.
+    """
+    source, study = _study(out)
+    with claimed(out):
+        ledger = Ledger(out / CACHE, progress)
+        anatomy = ledger.recall(ANATOMY, anatomy_key(source, study), Anatomy)
+        if anatomy is None:
+            raise ReadError(f"{out} does not hold the artery of its run: give the same command as for that run again")
+        found = {
+            name: _one(out, anatomy, name, key, settings, ledger, record)
+            for name, key in _flow_keys(source, study).items()
+        }
+        _write(out, found, settings, _flow_keys(source, study))
+    return found
+
+
+def add_angiograms(case: CaseResult, out: Path, settings: AngiogramSettings, progress: Progress) -> None:
+    """Compute the angiograms of a finished study and add their measures to its metrics.
+
+    Parameters
+    ----------
+    case : the study; its metrics are changed in place.
+    out : its case folder.
+    settings : settings of the angiograms.
+    progress : called at every stage.
+    """
+    found = angiograms(out, settings, progress)
+    add_measures(case.metrics, {name: one.measures for name, one in found.items()})
+
+
+def _study(out: Path) -> tuple[str, Settings]:
+    """Return the SHA-256 of the input and the settings of the run of a case folder."""
+    if not (out / RUN).is_file():
+        raise ReadError(f"{out} is not a case folder with a finished run: run `vstent run` with this --out first")
+    try:
+        told, study = told_in(out / RUN)
+        return str(told["input"]["sha256"]), study
+    except UNTOLD:
+        raise ReadError(f"{out / RUN} is from another version: run the case again") from None
+
+
+def _flow_keys(source: str, study: Settings) -> dict[str, str]:
+    """Return the keys of the flows of a run by name, ``bare`` first."""
+    names = (BARE, *(name for name in study.devices if name not in study.without_flow))
+    return {name: flow_key(source, study, name, None if name == BARE else find_design(name)) for name in names}
+
+
+def _one(
+    out: Path,
+    anatomy: Anatomy,
+    name: str,
+    key: str,
+    settings: AngiogramSettings,
+    ledger: Ledger,
+    record: Record | None,
+) -> Angiogram:
+    """Return the angiogram of one flow, stored or computed."""
+    stored = ledger.folder / f"flow {name}-{key}.npz"
+    stage, own = f"angiogram {name}", key_of(key, settings)
+    with nullcontext() if record is None else record(name, stored) as watch:
+        found = None if watch else ledger.recall(stage, own, Angiogram)
+        if found is not None:
+            return found
+        field = ledger.recall(f"flow {name}", key, FlowField)
+        if field is None:
+            raise InputError(
+                f"{out} holds no flow of {name}, and contrast moves with the flow: run the case again without --no-flow"
+            )
+        with ledger.stage(stage) as tell:
+            found = angiogram(
+                anatomy, field, settings, watch=watch, progress=lambda part: ledger.progress(stage, 0.99 * part, "")
+            )
+            tell(found.advice)
+        ledger.keep(stage, own, found)
+        return found
+
+
+def _write(out: Path, found: Mapping[str, Angiogram], settings: AngiogramSettings, keys: Mapping[str, str]) -> None:
+    """Write the curves, the numbers, and the metrics with the numbers added."""
+    folder = out / FOLDER
+    folder.mkdir(exist_ok=True)
+    write_rows(folder / CURVES, list(_rows(found)))
+    flows = {name: {"flow": keys[name], "measures": one.measures, "advice": one.advice} for name, one in found.items()}
+    write_json(folder / NUMBERS, {"settings": asdict(settings), "flows": flows, "research_use_only": True})
+    metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
+    add_measures(metrics, {name: one.measures for name, one in found.items()})
+    write_json(out / METRICS, metrics)
+
+
+def _rows(found: Mapping[str, Angiogram]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of the table of curves."""
+    for name, one in found.items():
+        curves = one.curves
+        for time_s, sac, parent in zip(curves.time_s, curves.sac_mg_mL, curves.parent_mg_mL, strict=True):
+            yield {
+                "flow": name,
+                "time_s": float(time_s),
+                "sac_iodine_mg_mL": float(sac),
+                "parent_artery_iodine_mg_mL": float(parent),
+            }
+
+
+def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, float]]) -> None:
+    """Add the measures of angiograms to the flows of nested metrics.
+
+    Parameters
+    ----------
+    metrics : metrics of a case; changed in place.
+    measures : measures by name of the flow.
+    """
+    for name, values in measures.items():
+        stent = metrics["stents"].get(name)
+        if name == BARE and BARE in metrics:
+            metrics[BARE].update(values)
+        elif stent is not None and "flow" in stent:
+            stent["flow"].update(values)
+            stent["ratios"].update(compare(dict(measures.get(BARE, {})), dict(values)))
+
+
+def kept_measures(out: Path, source: str, study: Settings) -> dict[str, dict[str, float]]:
+    """Return the measures of the angiograms in a case folder that belong to the flows of a run, by name.
+
+    Parameters
+    ----------
+    out : the case folder.
+    source : SHA-256 of the input.
+    study : settings of the run.
+    """
+    try:
+        flows = json.loads((out / FOLDER / NUMBERS).read_text(encoding="utf-8"))["flows"]
+        keys = _flow_keys(source, study)
+        return {name: dict(one["measures"]) for name, one in flows.items() if one["flow"] == keys.get(name)}
+    except UNTOLD:
+        return {}
