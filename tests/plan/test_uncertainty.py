@@ -1,6 +1,7 @@
 """Uncertainty: intervals and shares against closed formulas, and against brute-force integrals."""
 
 import json
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +13,7 @@ from vstent.anatomy.trace import trace
 from vstent.cli import main
 from vstent.deployment.deploy import deploy
 from vstent.devices import catalogue, formulas
+from vstent.devices.ranges import altered, uncertain
 from vstent.devices.stent import Landing
 from vstent.errors import InputError
 from vstent.flow.case import FlowSettings
@@ -19,12 +21,13 @@ from vstent.geometry.vessel import Vessel
 from vstent.io.writers import write_stl
 from vstent.phantoms import demo_phantom, phantom_surface
 from vstent.plan import uncertainty
+from vstent.plan.bands import values_at
 from vstent.plan.shares import first_order_shares
 from vstent.plan.uncertainty import CAUSES, Ranges, vary
 from vstent.plan.widening import widened
 from vstent.study.checkpoint import FlowCheckpoint
 
-SILK = catalogue.find_design("silk")
+SILK = replace(catalogue.find_design("silk"), ranges=())  # the numbers of the device are held where not said otherwise
 SIZE = catalogue.find_size(SILK, diameter_mm=4, length_mm=15)
 RADIUS_MM, LENGTH_MM, DD_MM = 1.9, 32.0, 0.05
 
@@ -135,6 +138,27 @@ def test_metrics_are_finite_numbers_in_their_units():
     assert set(found["shares"]["deployed_length_mm"]) == {f"{name}_fraction" for name in (*CAUSES, "rest")}
 
 
+def test_the_numbers_of_the_device_vary_within_their_ranges():
+    design = catalogue.find_design("silk")
+    lies = deploy(design, artery(), size=SIZE, landing=Landing(16.0))
+    still = {"threshold_mm": 0.0, "landing_mm": 0.0, "device_mm": 0.0, "inflow_fraction": 0.0}
+    found = vary(artery(), lies, Ranges(32, **still))
+    assert found.numbers == tuple(one.name for one in uncertain(design))
+    wanted = []
+    for point in found.points[:, len(CAUSES) :]:
+        other, size = altered(design, SIZE, values_at(uncertain(design), point))
+        wanted.append(formulas.deployed_length_mm(other, size, 2 * (RADIUS_MM - other.wall_offset_um * 1e-3)))
+    assert found.values[:, 0] == pytest.approx(wanted, rel=2e-3)
+    shares = found.shares("deployed_length_mm")
+    assert max(shares, key=shares.get) in ("braid_angle_rad", "free_diameter_margin_mm", "label_length_mm")
+    assert "braid_angle_rad" in found.metrics()["numbers"]
+    assert vary(artery(), lies, Ranges(2, numbers_factor=0.0, **still)).interval("deployed_length_mm")[1:] == (
+        pytest.approx(2 * (lies.stent.deployed_length_mm,), rel=1e-9)
+    )
+    (half,) = (one for one in Ranges(numbers_factor=0.5).numbers_of(design) if one.name == "braid_angle_rad")
+    assert (half.low, half.high) == pytest.approx((1.152 - 0.051, 1.152 + 0.049))
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [
@@ -145,6 +169,7 @@ def test_metrics_are_finite_numbers_in_their_units():
         ({"threshold_mm": float("inf")}, "threshold_mm"),
         ({"device_mm": -0.1}, "device_mm"),
         ({"inflow_fraction": 1.0}, "less than 1"),
+        ({"numbers_factor": 1.5}, "give 0 to 1"),
     ],
 )
 def test_ranges_that_cannot_be_are_refused(given, said):

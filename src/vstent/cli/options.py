@@ -324,7 +324,8 @@ def add_uncertainty(parser: argparse.ArgumentParser) -> None:
         metavar="CAUSE=RANGE",
         help="range to either side: threshold=MM (change of diameters; "
         "default: the scan's own), landing=MM (default: 1), "
-        "device=MM (default: 0.1), inflow=FRACTION (default: 0.2)",
+        "device=MM (default: 0.1), inflow=FRACTION (default: 0.2), numbers=FACTOR (of the ranges of the device's "
+        "numbers in the catalogue, 0 to 1; default: 1)",
     )
 
 
@@ -333,6 +334,7 @@ RANGES: Final = {
     "landing": "landing_mm",
     "device": "device_mm",
     "inflow": "inflow_fraction",
+    "numbers": "numbers_factor",
 }
 """Causes of uncertainty on the command line, and the fields that hold their ranges."""
 

@@ -1,13 +1,14 @@
 """Uncertainty of a deployment: intervals of its results, and the share of each cause.
 
 Four causes are varied, each uniformly within plus or minus its range and independently of the others: the threshold of
-the scan (all diameters), the landing position, the manufactured diameter of the device, and the mean inflow. Points are
-those of a Sobol sequence (scipy.stats.qmc), each in the middle of its stratum. Every cause alone is thus sampled
-evenly, and the same study gives the same result.
+the scan (all diameters), the landing position, the manufactured diameter of the device, and the mean inflow. The
+numbers of the device vary with them, each within its range in the catalogue (`vstent.devices.ranges`). Points are those
+of a Sobol sequence (scipy.stats.qmc), each in the middle of its stratum. Every cause alone is thus sampled evenly, and
+the same study gives the same result.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
@@ -16,15 +17,17 @@ import numpy as np
 
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
-from vstent.devices.design import Design, Size
+from vstent.devices.design import Design, Range, Size
+from vstent.devices.ranges import altered, uncertain
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.errors import InputError, LandingError
+from vstent.errors import DeviceError, InputError, LandingError
 from vstent.flow.case import FlowSettings
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
 from vstent.flow.simulation import Checkpoint, flow_case, simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats, freeze
+from vstent.plan.bands import sobol_points, values_at
 from vstent.plan.shares import first_order_shares
 from vstent.plan.widening import widened
 
@@ -63,6 +66,8 @@ class Ranges:
     """Range of the free diameter as made, in mm; the number of pieces of wire stays the same."""
     inflow_fraction: float = 0.2
     """Range of the mean inflow, relative."""
+    numbers_factor: float = 1.0
+    """Factor, 0 to 1, of the ranges of the device's numbers in the catalogue; 0 leaves them out."""
 
     def __post_init__(self) -> None:
         if self.samples < 2 or self.flow_samples < 0:
@@ -70,10 +75,14 @@ class Ranges:
                 f"{self.samples} samples, {self.flow_samples} of them with flows, are too few for a spread: "
                 "give at least 2 samples, and 0 or more flows"
             )
-        for name in ("threshold_mm", "landing_mm", "device_mm", "inflow_fraction"):
+        for name in ("threshold_mm", "landing_mm", "device_mm", "inflow_fraction", "numbers_factor"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < math.inf:
                 raise InputError(f"{value:g} is not a range of {name}: give 0 or more, to either side")
+        if self.numbers_factor > 1:
+            raise InputError(
+                f"ranges of the device's numbers cannot be {self.numbers_factor:g} times as wide: give 0 to 1"
+            )
         if self.inflow_fraction >= 1:
             raise InputError(
                 f"an inflow that varies by a fraction of {self.inflow_fraction:g} could vanish: give less than 1"
@@ -84,24 +93,44 @@ class Ranges:
         band_mm = anatomy.vessel.threshold_band_mm if self.threshold_mm is None else self.threshold_mm
         return np.array([band_mm, self.landing_mm, self.device_mm, self.inflow_fraction])
 
+    def numbers_of(self, design: Design) -> tuple[Range, ...]:
+        """Return the ranges of the numbers of a device that are varied."""
+        if not self.numbers_factor:
+            return ()
+        return tuple(_narrowed(one, self.numbers_factor) for one in uncertain(design))
+
+
+def _narrowed(one: Range, factor: float) -> Range:
+    """Return a range whose ends are nearer to the value by a factor."""
+    return replace(
+        one, low=one.value + factor * (one.low - one.value), high=one.value + factor * (one.high - one.value)
+    )
+
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
     """Result of an uncertainty study."""
 
     ranges: Floats
-    """(4,) range of every cause to either side, in the order of `CAUSES`: mm, mm, mm, fraction."""
+    """(4 + d,) range of every cause to either side: `CAUSES` (mm, mm, mm, fraction), then `numbers`."""
     points: Floats
-    """(n, 4) value of every cause in its range, -1 to 1."""
+    """(n, 4 + d) value of every cause in its range, -1 to 1."""
     names: tuple[str, ...]
     """Names of the results."""
     values: Floats
     """(n, k) results; NaN if the device did not fit or the flow was not computed."""
+    numbers: tuple[str, ...] = ()
+    """(d) numbers of the device that were varied."""
 
     def __post_init__(self) -> None:
-        freeze(self, "ranges", np.float64, (len(CAUSES),))
-        freeze(self, "points", np.float64, (-1, len(CAUSES)))
+        freeze(self, "ranges", np.float64, (len(self.causes),))
+        freeze(self, "points", np.float64, (-1, len(self.causes)))
         freeze(self, "values", np.float64, (len(self.points), len(self.names)))
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Names of all causes, in the order of the columns of the points."""
+        return (*CAUSES, *self.numbers)
 
     @property
     def n_failed(self) -> int:
@@ -121,11 +150,11 @@ class Uncertainty:
         found = first_order_shares(points[:, varied], values)
         if found is None:
             return {}
-        shares = {CAUSES[cause]: float(share) for cause, share in zip(varied, found, strict=True)}
+        shares = {self.causes[cause]: float(share) for cause, share in zip(varied, found, strict=True)}
         return shares | {"rest": max(0.0, 1.0 - sum(shares.values())) if any(shares.values()) else 0.0}
 
     def _found(self, name: str) -> tuple[Floats, Floats]:
-        """Return the points (m, 4) and values (m,) of a result where it was computed."""
+        """Return the points (m, 4 + d) and values (m,) of a result where it was computed."""
         column = self.values[:, self.names.index(name)]
         is_found = ~np.isnan(column)
         return self.points[is_found], column[is_found]
@@ -133,11 +162,12 @@ class Uncertainty:
     def metrics(self) -> dict[str, Any]:
         """Return all results as numbers whose names end in their unit."""
         told = [name for name in self.names if len(self._found(name)[1]) > 1]
-        ranges = dict(zip(("threshold_mm", "landing_mm", "device_mm", "inflow_fraction"), self.ranges, strict=True))
+        ranges = dict(zip(("threshold_mm", "landing_mm", "device_mm", "inflow_fraction"), self.ranges, strict=False))
         return {
             "samples_count": len(self.points),
             "failed_count": self.n_failed,
             "ranges": {name: float(value) for name, value in ranges.items()},
+            "numbers": ", ".join(self.numbers),
             "intervals": {name: dict(zip(("mean", "low", "high"), self.interval(name), strict=True)) for name in told},
             "shares": {
                 name: {f"{cause}_fraction": share for cause, share in self.shares(name).items()} for name in told
@@ -183,7 +213,8 @@ def vary(
     FlowError
         A flow cannot be computed.
     """
-    spread, points = ranges.of(anatomy), _points(ranges)
+    spread, numbers = ranges.of(anatomy), ranges.numbers_of(deployment.stent.design)
+    points = sobol_points(len(CAUSES) + len(numbers), ranges.samples)
     if 2 * spread[0] > anatomy.section_radius_mm.min():
         raise InputError(
             f"diameters that vary by {spread[0]:.2g} mm would close the artery: give a smaller range of the threshold"
@@ -197,25 +228,19 @@ def vary(
         )
     middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
     rows = []
-    for number, offset in enumerate(points * spread):
+    for number, point in enumerate(points):
         wanted = flow if number < ranges.flow_samples else None
-        sample = partial(_sample, anatomy, stent, middle_mm, offset, wanted)
+        made = values_at(numbers, point[len(CAUSES) :])
+        sample = partial(_sample, anatomy, stent, middle_mm, point[: len(CAUSES)] * spread, made, wanted)
         # a sample without a flow is computed faster than it is read back
         rows.append(sample() if wanted is None or checkpoint is None else _once(sample, checkpoint, f"sample-{number}"))
         if progress is not None:
             progress(number + 1, len(points))
     names = tuple(name for name in (*RESULTS, *FLOW_RESULTS) if any(name in row for row in rows))
     values = np.array([[row.get(name, np.nan) for name in names] for row in rows], dtype=np.float64)
-    return Uncertainty(spread, points, names, values.reshape(len(points), len(names)))
-
-
-def _points(ranges: Ranges) -> Floats:
-    """Return the points (n, 4) of a Sobol sequence, -1 to 1, each in the middle of its stratum."""
-    from scipy.stats import qmc
-
-    power = int(np.ceil(np.log2(ranges.samples)))
-    unit = qmc.Sobol(len(CAUSES), scramble=False).random_base2(power)
-    return 2 * (unit + 0.5 / len(unit)) - 1
+    half = [0.5 * (one.high - one.low) for one in numbers]
+    told = tuple(one.name for one in numbers)
+    return Uncertainty(np.append(spread, half), points, names, values.reshape(len(points), len(names)), told)
 
 
 def made_wider(design: Design, size: Size, by_mm: float) -> Size:
@@ -240,15 +265,21 @@ def _once(sample: Callable[[], dict[str, float]], checkpoint: Checkpoint, name: 
 
 
 def _sample(
-    anatomy: Anatomy, stent: Stent, middle_mm: float, offset: Floats, flow: FlowSettings | None
+    anatomy: Anatomy,
+    stent: Stent,
+    middle_mm: float,
+    offset: Floats,
+    made: Mapping[str, float],
+    flow: FlowSettings | None,
 ) -> dict[str, float]:
-    """Return the results with the causes changed by `offset` (4,); empty if the device does not fit."""
+    """Return the results with causes changed by `offset` (4,) and numbers `made`; empty if the device does not fit."""
     diameter_mm, along_mm, wider_mm, inflow_fraction = (float(value) for value in offset)
     other = widened(anatomy, diameter_mm) if diameter_mm else anatomy
-    size = made_wider(stent.design, stent.size, wider_mm)
     try:
-        deployed = deploy(stent.design, other, size=size, landing=Landing(middle_mm + along_mm))
-    except LandingError:
+        design, size = altered(stent.design, stent.size, made)
+        size = made_wider(design, size, wider_mm)
+        deployed = deploy(design, other, size=size, landing=Landing(middle_mm + along_mm))
+    except (DeviceError, LandingError):
         return {}
     measures = measure(other, deployed)
     found: dict[str, float] = {name: float(measures[name]) for name in RESULTS if name in measures}

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
+from vstent.reporting.bands import number_name
 from vstent.reporting.quantities import Quantity, format_value
 
 CAUSES: Final = {
@@ -49,7 +50,8 @@ def intervals(stent: Mapping[str, Any]) -> list[Interval]:
 
 def _interval(key: str, ends: Mapping[str, float], shares: Mapping[str, float]) -> Interval:
     """Return the uncertainty of one result as text."""
-    parts = [(CAUSES[cause.removesuffix("_fraction")], share) for cause, share in shares.items()]
+    names = [(cause.removesuffix("_fraction"), share) for cause, share in shares.items()]
+    parts = [(CAUSES.get(cause) or number_name(cause), share) for cause, share in names]
     parts.sort(key=lambda part: -part[1])
     mean, low, high = (format_value(key, ends[end]) for end in ("mean", "low", "high"))
     return Interval(Quantity((key,), 0.0).name, mean, low, high, parts)
@@ -76,5 +78,7 @@ def _words(varied: Mapping[str, Any]) -> str:
     told = [
         f"{CAUSES[key.rsplit('_', 1)[0]]} ±{format_value(key, value)}" for key, value in ranges.items() if value > 0
     ]
+    if varied.get("numbers"):
+        told.append("the numbers of the device within their ranges in the catalogue")
     failed = f", of which {varied['failed_count']} did not fit the artery" if varied["failed_count"] else ""
     return f"{varied['samples_count']} deployments{failed}. Varied: {', '.join(told)}."

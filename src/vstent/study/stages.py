@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -419,7 +419,9 @@ def vary_all(
     found = {}
     for name, deployment in deployments.items():
         stage = f"vary {name}"
-        placed = DEPLOYMENT_VERSION, deployment.stent.design, settings.placing(name)
+        design = deployment.stent.design
+        numbers = [asdict(one) for one in settings.uncertainty.numbers_of(design)]
+        placed = DEPLOYMENT_VERSION, design, settings.placing(name), numbers
         key = key_of(anatomy_key(source, settings), settings.uncertainty, flow, name, *placed)
         varied = ledger.recall(stage, key, Uncertainty)
         if varied is None:
