@@ -30,7 +30,8 @@ from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.kernels.arrays import Bools, Floats
 
-sys.path[:0] = [str(Path(__file__).parents[1] / "tests" / folder) for folder in ("helpers", "deployment")]
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "deployment"))
 from brute import BruteWall
 from test_braid_rods import compared
 from tubes import arc, line, tube

@@ -35,8 +35,8 @@ from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
 from vstent.io.writers import write_stl
 from vstent.plan.uncertainty import Ranges
-from vstent.study.folder import CACHE
 from vstent.study.flow_store import FlowStore
+from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, hash_of
 from vstent.study.repeat import settings_of
 from vstent.study.stages import flow_key
