@@ -317,16 +317,16 @@ class Live:
         colour : quantity that colors the wires.
         """
         with LOCK:
-            layers, told = [], []
+            layers: list[MeshLayer | LineLayer] = []
+            told = []
             for number, choice in enumerate(choices):
                 deployment, pane = self.deployment(choice), f"compared {number}"
                 stent, key = deployment.stent, (self.case.state.anatomy, *choice.model_dump().values())
                 measured = partial(self.remembered, ("coverage", *key), partial(node_coverage, stent))
                 layers += [_wires(pane, stent, deployment.wall_gap_mm, colour, measured)]
                 layers += [device_layers(pane, deployment, self.anatomy)[0]]
-                measures = self.remembered(("measures", *key), partial(measure, self.anatomy, deployment))
                 title = device_title(deployment)
-                told.append({"pane": pane, "title": title, "measures": sheets.device(title, measures)})
+                told.append({"pane": pane, "title": title, "measures": sheets.device(title, self.measures(choice))})
             return message(layers, scales_of(layers, self.anatomy), compared=told)
 
     def flow_message(self, moment: int | None) -> bytes:
