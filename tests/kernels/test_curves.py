@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import savgol_filter
 from scipy.special import ellipe
 
 from vstent.kernels import curves
@@ -87,3 +88,11 @@ def test_a_straight_line_neither_bends_nor_twists() -> None:
     curvature, torsion = curves.curvature_and_torsion(line, 2.0)
     np.testing.assert_allclose(curvature, 0, atol=1e-9)
     np.testing.assert_allclose(torsion, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("n", "window"), [(7, 7), (50, 7), (50, 21), (60, 59)])
+def test_curvature_comes_from_the_derivatives_of_savitzky_and_golay(n: int, window: int) -> None:
+    points = np.cumsum(np.random.default_rng(n).normal(size=(n, 3)), axis=0)
+    for k, found in enumerate(curves._derivatives(points, window, 0.3), start=1):
+        wanted = savgol_filter(points, window, 4, deriv=k, delta=0.3, axis=0)
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-10 * np.abs(wanted).max())

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 from scipy.ndimage import percentile_filter
-from scipy.signal import savgol_filter
 from scipy.sparse import csc_matrix, diags, eye
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
@@ -139,12 +138,30 @@ def curvature_and_torsion(points: Floats, reach: float) -> tuple[Floats, Floats]
     """
     step = float(arc_length(points)[-1]) / (len(points) - 1)
     window = min(2 * max(3, round(reach / step)) + 1, len(points) - 1 + len(points) % 2)
-    a, b, c = (savgol_filter(points, window, 4, deriv=k, delta=step, axis=0) for k in (1, 2, 3))
+    a, b, c = _derivatives(points, window, step)
     cross = np.cross(a, b)
     size = np.linalg.norm(cross, axis=1)
     is_bent = size > 1e-6
     torsion = np.einsum("ij,ij->i", cross, c) / np.where(is_bent, size, 1.0) ** 2
     return size / np.linalg.norm(a, axis=1) ** 3, np.where(is_bent, torsion, 0.0)
+
+
+def _derivatives(points: Floats, window: int, step: float) -> list[Floats]:
+    """Return the first three derivatives (n, 3) of quartic fits through `window` points each, an odd number.
+
+    The first and the last fit also apply to the points between them and the ends. scipy.signal, which has the same
+    filter, is not used because its import takes a second.
+    """
+    half, order = window // 2, 4
+    fit = np.linalg.pinv(np.vander(np.arange(-half, half + 1.0) / half, order + 1, increasing=True))
+    start = np.clip(np.arange(len(points)) - half, 0, len(points) - window)
+    at = (np.arange(len(points)) - start - half)[:, None] / half
+    of_windows = np.lib.stride_tricks.sliding_window_view(points, window, axis=0) @ fit.T
+    found, power = [], of_windows[start]
+    for k in (1, 2, 3):
+        power = power[..., 1:] * np.arange(1.0, order + 2 - k)
+        found.append(np.polynomial.polynomial.polyval(at, np.moveaxis(power, -1, 0), tensor=False) / (half * step) ** k)
+    return found
 
 
 def any_perpendicular(direction: Floats) -> Floats:

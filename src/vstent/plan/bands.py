@@ -21,6 +21,7 @@ from vstent.devices.stent import Deployment
 from vstent.errors import DeviceError, LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats
+from vstent.kernels.sobol import centered_points
 from vstent.plan.cells_in_bends import GAPS, NECK, plane
 from vstent.plan.reduced import Changed, Reduced
 from vstent.plan.shares import first_order_shares
@@ -100,7 +101,7 @@ def bands(anatomy: Anatomy, deployment: Deployment, measures: Measures, *, is_pr
     ranges = uncertain(stent.design)
     if not ranges:
         return Bands({})
-    points = sobol_points(len(ranges), SAMPLES)
+    points = centered_points(len(ranges), SAMPLES)
     samples = _samples(anatomy, deployment, measures, _devices(deployment, ranges, points))
     results: dict[str, Band] = {name: _band(points, samples[name], ranges) for name in BANDED if name in samples}
     if not is_proposed:
@@ -131,30 +132,9 @@ def length_band(anatomy: Anatomy, deployment: Deployment, measures: Measures) ->
     ranges = uncertain(deployment.stent.design)
     if not ranges:
         return None
-    points = sobol_points(len(ranges), FEW_SAMPLES)
+    points = centered_points(len(ranges), FEW_SAMPLES)
     samples = _reduced(Reduced(anatomy, deployment), measures, _devices(deployment, ranges, points))
     return _band(points, samples[LENGTH], ranges)
-
-
-def sobol_points(dimensions: int, samples: int) -> Floats:
-    """Return points of a Sobol sequence, each in the middle of its stratum.
-
-    Parameters
-    ----------
-    dimensions : int
-        Number d of dimensions.
-    samples : int
-        Number of points; it is rounded up to a power of two.
-
-    Returns
-    -------
-    (n, d) array
-        Points, -1 to 1.
-    """
-    from scipy.stats import qmc
-
-    unit = qmc.Sobol(dimensions, scramble=False).random_base2(int(np.ceil(np.log2(samples))))
-    return 2 * (unit + 0.5 / len(unit)) - 1
 
 
 def values_at(ranges: tuple[Range, ...], point: Floats) -> dict[str, float]:

@@ -3,7 +3,7 @@
 Four causes are varied, each uniformly within plus or minus its range and independently of the others: the threshold of
 the scan (all diameters), the landing position, the manufactured diameter of the device, and the mean inflow. The
 numbers of the device vary with them, each within its range in the catalogue (`vstent.devices.ranges`). Points are those
-of a Sobol sequence (scipy.stats.qmc), each in the middle of its stratum. Every cause alone is thus sampled evenly, and
+of a Sobol sequence, each in the middle of its stratum. Every cause alone is thus sampled evenly, and
 the same study gives the same result.
 """
 
@@ -27,7 +27,8 @@ from vstent.flow.ostium import ostium
 from vstent.flow.simulation import Checkpoint, flow_case, simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats, freeze
-from vstent.plan.bands import sobol_points, values_at
+from vstent.kernels.sobol import centered_points
+from vstent.plan.bands import values_at
 from vstent.plan.shares import first_order_shares
 from vstent.plan.widening import widened
 
@@ -214,7 +215,7 @@ def vary(
         A flow cannot be computed.
     """
     spread, numbers = ranges.of(anatomy), ranges.numbers_of(deployment.stent.design)
-    points = sobol_points(len(CAUSES) + len(numbers), ranges.samples)
+    points = centered_points(len(CAUSES) + len(numbers), ranges.samples)
     if 2 * spread[0] > anatomy.section_radius_mm.min():
         raise InputError(
             f"diameters that vary by {spread[0]:.2g} mm would close the artery: give a smaller range of the threshold"
