@@ -50,3 +50,16 @@ def test_the_same_surface_gives_the_same_file(tmp_path):
     for name in "ab":
         write_3mf(tmp_path / name, corner)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_every_number_is_written_as_python_writes_it(tmp_path):
+    rng = np.random.default_rng(5)
+    vertices = np.concatenate([rng.uniform(-2, 2, (200, 3)) * 10.0 ** rng.integers(-7, 4, (200, 3)), np.zeros((1, 3))])
+    solid = Surface(vertices, rng.integers(0, 201, (300, 3)))
+    write_3mf(tmp_path / "solid.3mf", solid)
+    model = ZipFile(tmp_path / "solid.3mf").read("3D/3dmodel.model").decode()
+    rows = [" ".join(f'{k}="{v:.6f}"' for k, v in zip("xyz", p, strict=True)) for p in vertices.tolist()]
+    wanted = "\n".join(f"<vertex {row}/>".replace('"-0.000000"', '"0.000000"') for row in rows)
+    assert model.split("<vertices>\n")[1].split("\n</vertices>")[0] == wanted
+    wanted = "\n".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in solid.faces.tolist())
+    assert model.split("<triangles>\n")[1].split("\n</triangles>")[0] == wanted

@@ -42,12 +42,13 @@ def write_dicom(image: Image, folder: Path, *, description: str = "3DRA of a pha
     folder.parent.mkdir(parents=True, exist_ok=True)
     building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
+        plane = _dataset(digest, description)
+        plane.ImageOrientationPatient = [_decimal(v) for v in (*axes[:, 0], *axes[:, 1])]
+        plane.PixelSpacing = [_decimal(spacing[1]), _decimal(spacing[0])]
+        plane.SliceThickness = plane.SpacingBetweenSlices = _decimal(spacing[2])
         for k in range(voxels.shape[2]):
-            plane = _dataset(digest, k, description)
+            _number(plane, digest, k)
             plane.ImagePositionPatient = [_decimal(v) for v in image.to_mm(np.array([[0, 0, k]]))[0]]
-            plane.ImageOrientationPatient = [_decimal(v) for v in (*axes[:, 0], *axes[:, 1])]
-            plane.PixelSpacing = [_decimal(spacing[1]), _decimal(spacing[0])]
-            plane.SliceThickness = plane.SpacingBetweenSlices = _decimal(spacing[2])
             _put_pixels(plane, voxels[:, :, k].T)
             plane.save_as(building / f"IM{k + 1:04d}.dcm", enforce_file_format=True)
         building.chmod(0o755)
@@ -72,20 +73,18 @@ def _decimal(value: float) -> str:
     return format_number_as_ds(float(value) + 0.0)
 
 
-def _dataset(digest: str, k: int, description: str) -> Any:
-    """Return the header of slice `k` without geometry and pixels."""
+def _dataset(digest: str, description: str) -> Any:
+    """Return the header that all slices share, without geometry and pixels."""
     from pydicom.dataset import Dataset, FileMetaDataset
     from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 
     plane = Dataset()
     plane.SOPClassUID = CT_IMAGE_STORAGE
-    plane.SOPInstanceUID = generate_uid(entropy_srcs=[digest, "instance", str(k)])
     plane.StudyInstanceUID = generate_uid(entropy_srcs=[digest, "study"])
     plane.SeriesInstanceUID = generate_uid(entropy_srcs=[digest, "series"])
     plane.FrameOfReferenceUID = generate_uid(entropy_srcs=[digest, "frame"])
     plane.file_meta = FileMetaDataset()
     plane.file_meta.MediaStorageSOPClassUID = plane.SOPClassUID
-    plane.file_meta.MediaStorageSOPInstanceUID = plane.SOPInstanceUID
     plane.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
     plane.PatientName, plane.PatientID = "Phantom^vstent", "PHANTOM"
     plane.PatientBirthDate = plane.PatientSex = plane.AccessionNumber = plane.ReferringPhysicianName = ""
@@ -97,9 +96,18 @@ def _dataset(digest: str, k: int, description: str) -> Any:
     plane.ImageComments = "Synthetic phantom, for research only"
     plane.StudyDate = plane.SeriesDate = plane.AcquisitionDate = plane.ContentDate = MOMENT[0]
     plane.StudyTime = plane.SeriesTime = plane.AcquisitionTime = plane.ContentTime = MOMENT[1]
-    plane.SeriesNumber, plane.AcquisitionNumber, plane.InstanceNumber = 1, 1, k + 1
+    plane.SeriesNumber, plane.AcquisitionNumber = 1, 1
     plane.KVP = None
     return plane
+
+
+def _number(plane: Any, digest: str, k: int) -> None:
+    """Make a header that of slice `k`."""
+    from pydicom.uid import generate_uid
+
+    plane.SOPInstanceUID = generate_uid(entropy_srcs=[digest, "instance", str(k)])
+    plane.file_meta.MediaStorageSOPInstanceUID = plane.SOPInstanceUID
+    plane.InstanceNumber = k + 1
 
 
 def _put_pixels(plane: Any, pixels: NDArray[np.int16]) -> None:
