@@ -9,7 +9,7 @@ import report_case
 from vstent.devices.stent import tube_faces
 from vstent.geometry.surface import Surface
 from vstent.kernels import raster
-from vstent.reporting import figures
+from vstent.reporting import figures, lettering
 from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View
 
 RED, BLUE = [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
@@ -200,3 +200,33 @@ def scene_of_view(toward):
     """A view along `toward` with the z axis up."""
     up = np.array([0.0, 0.0, 1.0])
     return View("profile", np.stack([np.cross(up, toward), up, toward]), np.zeros(3), 10.0)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "wanted"),
+    [(0, 0.4, 0.05), (0, 1, 0.2), (-0.1, 2.3, 0.5), (0.3, 0.31, 0.002), (0, 9000, 2000), (12, 13.5, 0.2)],
+)
+def test_ticks_are_the_multiples_of_a_round_step_within_the_scale(low, high, wanted):
+    found = lettering.ticks(low, high)
+    multiples = np.round(np.array(found) / wanted)
+    np.testing.assert_allclose(multiples * wanted, found, atol=1e-12)
+    np.testing.assert_array_equal(np.diff(multiples), 1)
+    assert found[0] - wanted < low - 1e-9 <= found[0]
+    assert found[-1] <= high + 1e-9 < found[-1] + wanted
+    assert 3 < len(found) <= lettering.TICKS
+    assert "-0" not in map(str, found)
+
+
+def test_a_scale_of_one_value_has_no_ticks():
+    assert lettering.ticks(1.0, 1.0) == []
+
+
+def test_the_color_bar_shows_its_colors_and_the_length_bar_its_length():
+    picture = lettering.blank(400, 200)
+    colors = np.linspace(0, 1, 256)[:, None] * [1.0, 0.5, 0.0]
+    lettering.color_bar(picture, colors, (0.0, 1.0), "Speed [m/s]")
+    row = np.asarray(picture)[200 - 60, 120:280]
+    np.testing.assert_allclose(row, 255 * np.linspace(0, 1, 160)[:, None] * [1.0, 0.5, 0.0], atol=2)
+    panel = lettering.blank(400, 120)
+    lettering.length_bar(panel, 40.0, (0, 0), (400, 120))
+    assert (np.asarray(panel)[114, :, 0] < 60).sum() == pytest.approx(100, abs=2)  # 10 mm of 40 mm

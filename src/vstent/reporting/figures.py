@@ -1,25 +1,20 @@
-"""Render pictures of a scene without a graphics library: a depth buffer for the geometry, matplotlib for the labels."""
+"""Render pictures of a scene without a graphics library: a depth buffer for the geometry, Pillow for the labels."""
 
 import io
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vstent.devices.design import BARE
 from vstent.kernels import raster
 from vstent.kernels.arrays import Floats
+from vstent.reporting.lettering import blank, color_bar, length_bar, points_px, put, put_title
 from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View, view_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 BACKGROUND = (0.965, 0.973, 0.978)
 """Background color: red, green and blue, 0 to 1."""
-_INK = "#16262e"
-_QUIET = "#54666f"
-"""Colors of the lettering."""
+_TITLE_PX, _FOOT_PX, _EDGE_PX = 45, 93, 15
+"""Heights of the titles, of the color bar and of the edge without one, in pixels; the edge also parts the panels."""
 _LIGHT = np.array([-0.35, 0.50, 0.79])
 """Direction to the light in view axes (right, up, toward the eye), not normalized."""
 _SUPERSAMPLING = 2
@@ -277,53 +272,20 @@ def sheet(scene: Scene, shots: list[Shot], scale: str) -> bytes:
     shots : panels; four are laid out in two rows, others in rows of at most three.
     scale : name of the scale of the color bar; empty: no color bar.
     """
-    from matplotlib.figure import Figure
-
     columns = 2 if len(shots) == 4 else min(len(shots), 3)
     rows = -(-len(shots) // columns)
     panel = (760, 560) if columns < 3 else (520, 480)
-    foot = 0.62 if scale else 0.10
-    inches = (columns * panel[0] / 150, rows * (panel[1] / 150 + 0.30) + foot)
-    figure = Figure(figsize=inches, facecolor="white")
-    grid = figure.subplots(rows, columns, squeeze=False)
-    figure.subplots_adjust(0, foot / inches[1], 1, 1 - 0.30 / inches[1], 0.02, 0.30 * rows / inches[1] * 0.35)
-    for axes in grid.ravel():
-        axes.set_axis_off()
-    for axes, shot in zip(grid.ravel(), shots, strict=False):
-        axes.imshow(draw(shot.layers, scene, shot.view, panel), interpolation="antialiased")
-        axes.set_title(shot.title, fontsize=8.5, color=_INK, loc="left", pad=4)
-        _length_bar(axes, span_mm(shot.view, panel), panel)
+    foot = _FOOT_PX if scale else _EDGE_PX
+    picture = blank(columns * (panel[0] + _EDGE_PX) - _EDGE_PX, rows * (panel[1] + _TITLE_PX) + foot)
+    for number, shot in enumerate(shots):
+        row, column = divmod(number, columns)
+        left, top = column * (panel[0] + _EDGE_PX), row * (panel[1] + _TITLE_PX) + _TITLE_PX
+        put(picture, draw(shot.layers, scene, shot.view, panel), (left, top))
+        put_title(picture, shot.title, left, top - points_px(4))
+        length_bar(picture, span_mm(shot.view, panel), (left, top), panel)
     if scale:
-        _colour_bar(figure, scene, scale, inches)
-    return _png(figure)
-
-
-def _length_bar(axes: "Axes", width_mm: float, size_px: tuple[int, int]) -> None:
-    """Draw a bar of a round length in mm into a panel."""
-    width, height = size_px
-    length_mm = next((step for step in (20.0, 10.0, 5.0, 2.0, 1.0) if step < 0.3 * width_mm), 0.5)
-    start, y = 0.04 * width, 0.95 * height
-    axes.plot([start, start + length_mm / width_mm * width], [y, y], color=_INK, linewidth=1.6)
-    chip = {"facecolor": BACKGROUND, "edgecolor": "none", "alpha": 0.75, "pad": 1.0}
-    axes.text(start, y - 0.025 * height, f"{length_mm:g} mm", fontsize=7, color=_INK, va="bottom", bbox=chip)
-
-
-def _colour_bar(figure: "Figure", scene: Scene, name: str, inches: tuple[float, float]) -> None:
-    """Draw the color bar of a scale below the panels."""
-    scale = scene.scale(name)
-    axes = figure.add_axes((0.30, 0.34 / inches[1], 0.40, 0.12 / inches[1]))
-    axes.imshow(scale.colours[None], aspect="auto", extent=(scale.low, scale.high, 0.0, 1.0))
-    axes.set_yticks([])
-    axes.tick_params(labelsize=7, colors=_QUIET, length=2, pad=2)
-    axes.set_title(f"{scale.title} [{scale.unit}]", fontsize=7.5, color=_INK, pad=3)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def _png(figure: "Figure") -> bytes:
-    """Return a figure as PNG without metadata on the software, so that equal figures give equal bytes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
+        chosen = scene.scale(scale)
+        color_bar(picture, chosen.colours, (chosen.low, chosen.high), f"{chosen.title} [{chosen.unit}]")
     stream = io.BytesIO()
-    FigureCanvasAgg(figure).print_figure(stream, dpi=150, format="png", metadata={"Software": None})
+    picture.save(stream, "PNG")  # without metadata, so that equal pictures give equal bytes
     return stream.getvalue()
