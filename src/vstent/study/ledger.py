@@ -24,6 +24,8 @@ RESULTS_VERSION: Final = "0.1.0"
 DEPLOYMENT_VERSION: Final = "0.2.0"
 """Version of the deployment: it changes when deployed devices change, so that what was computed with them is computed
 again; anatomies and flows without a device are kept."""
+KEY_DIGITS: Final = 16
+"""Number of digits of a key."""
 ANATOMY: Final = "anatomy"
 """Name under which an anatomy is stored."""
 
@@ -129,7 +131,8 @@ class Ledger:
         path = self.folder / f"{name}-{key}.npz"
         self.folder.mkdir(parents=True, exist_ok=True)
         told = path.with_suffix(".json")
-        stale = set(self.folder.glob(f"{name}-*")) - {path, told}
+        # The digits keep the results of another device whose name begins with this one.
+        stale = set(self.folder.glob(f"{name}-{KEY_DIGITS * '[0-9a-f]'}.*")) - {path, told}
         write_json(told, seconds, is_exact=True)
         save_data(path, result)
         for old in stale:
@@ -199,7 +202,7 @@ def vessel_key(source: str, settings: Settings) -> str:
 def key_of(*parts: Any) -> str:
     """Return a short digest of everything that a result depends on, including `RESULTS_VERSION`."""
     plain = [_plain(part) if is_dataclass(part) and not isinstance(part, type) else part for part in parts]
-    return hashlib.sha256(json.dumps([RESULTS_VERSION, plain], sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps([RESULTS_VERSION, plain], sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]
 
 
 _LATER: Final = {"without_flow": (), "acquisition": None, "frame": None, "crop_mm": None}

@@ -5,12 +5,16 @@ no files. After that each finished stage is stored in the folder under a key of 
 same study reads it instead of computing it.
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vstent.anatomy.morphology import morphology
 from vstent.devices.catalogue import find_design
+from vstent.devices.stent import Deployment
+from vstent.flow.case import FlowField
 from vstent.flow.convergence import Sensitivity
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
@@ -18,8 +22,9 @@ from vstent.study.contrast import add_measures, kept_measures
 from vstent.study.crate import NAME as CRATE
 from vstent.study.folder import CACHE, claiming
 from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
-from vstent.study.ledger import ANATOMY, Ledger, hash_of
+from vstent.study.ledger import ANATOMY, Ledger, hash_of, key_of
 from vstent.study.outputs import (
+    STENT,
     take_away_measures,
     take_away_results,
     take_away_study,
@@ -34,6 +39,7 @@ from vstent.study.stages import (
     check_inflow,
     compute_flows,
     deploy_all,
+    deployment_key,
     engine_folders,
     find_anatomy,
     find_vessel,
@@ -42,6 +48,7 @@ from vstent.study.stages import (
     vary_all,
 )
 from vstent.study.types import CaseResult, Progress, Settings
+from vstent.study.written import code_key, compute_once, write_once
 
 
 @claiming
@@ -81,7 +88,7 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
     designs = {name: find_design(name) for name in settings.devices}
     anatomy = find_anatomy(path, source, settings, ledger)
     check_inflow(anatomy, settings.flow)
-    deployments, failures = deploy_all(designs, anatomy, settings, ledger)
+    deployments, failures = deploy_all(designs, anatomy, settings, ledger, source)
     told = provenance(path, source, settings)
     has_former = replaces and is_of_another(out, told)
     _settle(path, out, source, ledger)
@@ -91,26 +98,37 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
     (out / CRATE).unlink(missing_ok=True)  # it describes files that this run replaces
     write_anatomy(out, anatomy)
     for name, deployment in deployments.items():
-        with ledger.stage(f"struts {name}") as tell:
-            tell(write_stent(out / "stents" / name, deployment))
+        folder, key = out / "stents" / name, deployment_key(source, settings, name, designs[name])
+        write_once(ledger, f"struts {name}", key, folder, STENT, partial(write_stent, folder, deployment))
     fields, unflown = compute_flows(out, anatomy, deployments, settings, ledger, source)
     failures |= unflown
     varied = vary_all(anatomy, deployments, settings, ledger, source)
-    with ledger.stage("measure"):
-        metrics = measure_all(anatomy, deployments, fields, settings.flow)
-        band_all(anatomy, deployments, metrics, settings)
-        add_measures(metrics, kept_measures(out, source, settings) if fields else {})
-        for name, spread in varied.items():
-            metrics["stents"][name]["uncertainty"] = spread
-        if failures:
-            metrics["failures"] = failures
-        writers.write_json(out / METRICS, metrics)
+    measures = partial(_measures, anatomy, deployments, fields, settings, varied, failures)
+    metrics = compute_once(ledger, "measure", key_of(code_key(), told, failures), measures)
+    add_measures(metrics, kept_measures(out, source, settings) if fields else {})
+    writers.write_json(out / METRICS, metrics)
     told[SECONDS] = ledger.seconds
     writers.write_json(out / RUN, told, is_exact=True)
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
     notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
     return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, failures, notes)
+
+
+def _measures(
+    anatomy: Anatomy,
+    deployments: Mapping[str, Deployment],
+    fields: Mapping[str, FlowField],
+    settings: Settings,
+    varied: Mapping[str, Any],
+    failures: Mapping[str, str],
+) -> dict[str, Any]:
+    """Return all metrics of a study: of vessel, devices and flows, with bands, uncertainties and failures."""
+    metrics = measure_all(anatomy, deployments, fields, settings.flow)
+    band_all(anatomy, deployments, metrics, settings)
+    for name, spread in varied.items():
+        metrics["stents"][name]["uncertainty"] = spread
+    return metrics | ({"failures": dict(failures)} if failures else {})
 
 
 @claiming

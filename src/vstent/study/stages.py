@@ -43,6 +43,7 @@ from vstent.study.checkpoint import FlowCheckpoint
 from vstent.study.ledger import ANATOMY, DEPLOYMENT_VERSION, Ledger, anatomy_key, key_of, vessel_key
 from vstent.study.outputs import write_field
 from vstent.study.types import Placing, Point, Settings
+from vstent.study.written import code_key
 from vstent.units import counted
 
 SLOWEST_M_S: Final = 0.01
@@ -177,16 +178,17 @@ def _image(path: Path, settings: Settings) -> Image:
 
 
 def deploy_all(
-    designs: Mapping[str, Design], anatomy: Anatomy, settings: Settings, ledger: Ledger
+    designs: Mapping[str, Design], anatomy: Anatomy, settings: Settings, ledger: Ledger, source: str
 ) -> tuple[dict[str, Deployment], dict[str, str]]:
-    """Deploy every device in the given or the proposed size.
+    """Deploy every device in the given or the proposed size; a stored deployment is returned without computation.
 
     Parameters
     ----------
     designs : designs by device name.
     anatomy : vessel, parent artery and sacs.
     settings : settings of the study.
-    ledger : record of the study.
+    ledger : record of the study; it keeps new deployments in memory until its `settle` stores them.
+    source : SHA-256 of the input.
 
     Returns
     -------
@@ -203,16 +205,35 @@ def deploy_all(
     deployments: dict[str, Deployment] = {}
     failures: dict[str, str] = {}
     for name, design in designs.items():
+        stage, key = f"deploy {name}", deployment_key(source, settings, name, design)
+        kept = ledger.recall(stage, key, Deployment)
+        if kept is not None:
+            deployments[name] = kept
+            continue
         try:
-            with ledger.stage(f"deploy {name}") as tell:
+            with ledger.stage(stage) as tell:
                 deployments[name] = deploy_one(design, anatomy, settings.placing(name))
                 tell(deployments[name].advice)
+            ledger.hold(stage, key, deployments[name])
         except (DeviceError, LandingError) as error:
             if len(failures) + 1 == len(designs):  # the last one too
                 raise
             failures[name] = f"not deployed: {error}"
-            ledger.progress(f"deploy {name}", 1.0, failures[name])
+            ledger.progress(stage, 1.0, failures[name])
     return deployments, failures
+
+
+def deployment_key(source: str, settings: Settings, name: str, design: Design) -> str:
+    """Return the key of one deployment.
+
+    Parameters
+    ----------
+    source : SHA-256 of the input.
+    settings : settings of the study.
+    name : name of the device.
+    design : the device.
+    """
+    return key_of(code_key(), anatomy_key(source, settings), name, design, settings.placing(name))
 
 
 def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
