@@ -8,7 +8,7 @@ fraction of a second. ``benchmarks/ranges.py`` compares the two.
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -25,6 +25,7 @@ from vstent.kernels.sobol import centered_points
 from vstent.plan.cells_in_bends import GAPS, NECK, plane
 from vstent.plan.reduced import Changed, Reduced
 from vstent.plan.shares import first_order_shares
+from vstent.plan.shortening import shortening
 
 LENGTH: Final = "deployed_length_mm"
 """Name of the deployed length."""
@@ -155,10 +156,13 @@ def _samples(
     anatomy: Anatomy, deployment: Deployment, measures: Measures, devices: list[tuple[Design, Size]]
 ) -> dict[str, Floats]:
     """Return the results (n,) of altered devices by name."""
-    stent, model = deployment.stent, Reduced(anatomy, deployment)
+    stent, ranges = deployment.stent, uncertain(deployment.stent.design)
+    model = Reduced(anatomy, deployment)
+    if not isinstance(stent.design, LaserCut):
+        model = replace(model, shortening=shortening(anatomy, stent, ranges, model.landing).change)
     found = _reduced(model, measures, devices)
     if isinstance(stent.design, LaserCut) and GAPS[0] in measures:
-        fit = plane(anatomy, stent, measures, uncertain(stent.design), model.landing)
+        fit = plane(anatomy, stent, measures, ranges, model.landing)
         fitted = [fit.at(design) for design, _ in devices if isinstance(design, LaserCut)]
         found |= {name: np.array([one[name] for one in fitted]) for name in fit.names}
     return found

@@ -1,7 +1,7 @@
 """Reduced model of a deployed device: what changes with its numbers, without another deployment.
 
 - *Ends*: the rows are marched again (`vstent.deployment.braid.march`), with the altered wires, in the artery as the
-  deployed device measured it.
+  deployed device measured it. A braid is shortened besides (`vstent.plan.shortening`).
 - *Coverage and pore density over the neck*: the deployed device states the height h and the width w of the lattice at
   each place over the neck, which in a bend are not those of a straight artery. Rows move apart as in the closed
   formula, and a piece of wire keeps its length l, with l^2 = w^2 + h^2. Wires of diameter d of one hand cover the
@@ -9,6 +9,7 @@
 - *Gaps*: a braid that opens less wide has a gap of half of the difference.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, NamedTuple
@@ -66,6 +67,8 @@ class Reduced:
     """The artery."""
     deployment: Deployment
     """The deployed device."""
+    shortening: Callable[[Design, Size], Floats] | None = None
+    """Change (2,) of the lengths of both sides relative to those of marched rows, for an altered device."""
 
     @cached_property
     def landing(self) -> Landing:
@@ -89,13 +92,13 @@ class Reduced:
             Ends, gaps, coverage and pore density of the reduced model.
         """
         profile = self._profile(design, size)
-        rows_mm = march(design, size, self.landing, profile)
+        ends_mm, at_mm = march(design, size, self.landing, profile)[[0, -1]], self.landing.abscissa_mm
+        shorter = np.zeros(2) if self.shortening is None else self.shortening(design, size)
+        first_mm, last_mm = (ends_mm + shorter * (ends_mm - at_mm)).tolist()
         wider_mm = profile.at(self._rows_mm) - self._nominal.at(self._rows_mm)
         inward_mm = (design.wall_offset_um - self.deployment.stent.design.wall_offset_um) * MM_PER_UM
         gap_mm = np.maximum(self.deployment.wall_gap_mm - (0.5 * wider_mm + inward_mm)[:, None], 0.0)
-        return Changed(
-            float(rows_mm[0]), float(rows_mm[-1]), gap_mm[self._is_at_patient], *self._density(design, size, profile)
-        )
+        return Changed(first_mm, last_mm, gap_mm[self._is_at_patient], *self._density(design, size, profile))
 
     @property
     def _rows_mm(self) -> Floats:
