@@ -23,7 +23,7 @@ from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import Bed, Sketch, bed, sketch
 from vstent.devices.catalogue import find_design
 from vstent.devices.design import BARE
-from vstent.devices.formulas import coverage_fraction
+from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import InputError, ReadError
@@ -522,6 +522,6 @@ def _row(deployment: Deployment, at_mm: float, center: Floats, frame: Floats) ->
     return {
         "device": np.round(np.append(ring, ring[:1], axis=0) + middle, 3).ravel().tolist(),
         "device_diameter_mm": float(stent.row_diameter_mm[row]),
-        "free_diameter_mm": stent.size.free_diameter_mm,
+        "free_diameter_mm": float(free_diameters_mm(stent.design, stent.size)[row]),
         "max_gap_mm": float(deployment.wall_gap_mm[row].max()),
     }

@@ -17,6 +17,7 @@ from vstent.deployment.sizing import (
     wanted_margin_mm,
 )
 from vstent.devices.design import LaserCut
+from vstent.devices.formulas import free_diameters_mm
 from vstent.devices.stent import Stent
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats
@@ -115,7 +116,8 @@ def _reach(anatomy: Anatomy, stent: Stent) -> str:
     if not anatomy.aneurysms:
         return ""
     proximal_mm, distal_mm = neck_span_mm(anatomy)
-    before_mm, after_mm = proximal_mm - stent.proximal_abscissa_mm, stent.distal_abscissa_mm - distal_mm
+    first_mm, last_mm = stent.mesh_abscissa_mm
+    before_mm, after_mm = proximal_mm - first_mm, last_mm - distal_mm
     end, beyond_mm, move = (
         ("proximal", before_mm, "proximally") if before_mm < after_mm else ("distal", after_mm, "distally")
     )
@@ -148,7 +150,7 @@ def _remedy_of_reach(anatomy: Anatomy, stent: Stent, beyond_mm: Floats, move: st
 def _remedy(anatomy: Anatomy, stent: Stent, gap_mm: Floats, is_loose: Bools) -> str:
     """Return why nodes have gaps `gap_mm` (rows, columns) to the wall, and what to do."""
     free_mm = stent.size.free_diameter_mm
-    could_open = stent.row_diameter_mm + 2 * gap_mm.mean(axis=1) < free_mm
+    could_open = stent.row_diameter_mm + 2 * gap_mm.mean(axis=1) < free_diameters_mm(stent.design, stent.size)
     if isinstance(stent.design, LaserCut) and is_loose[could_open].sum() > 0.5 * is_loose.sum():
         return (
             "its struts keep their length, and the way around the outside of the bend is longer. Choose a "

@@ -11,7 +11,7 @@ from vstent.deployment.active_contour import State
 from vstent.deployment.contour import evenly_spaced, perimeters, planes
 from vstent.deployment.method import AbstractMethod, Opened, Placement, check_inside
 from vstent.devices.design import Design, LaserCut, Size
-from vstent.devices.formulas import grid, row_spacing_mm
+from vstent.devices.formulas import free_diameters_mm, grid, row_spacing_mm
 from vstent.devices.stent import Landing, row_diameters_mm
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints
@@ -23,6 +23,8 @@ SETTLED_MM = 0.1
 """Largest movement of a row between two rounds at which the rows have converged, in mm."""
 LAST_STEPS = 5
 """Largest number of extra steps for the remaining nodes after 99 % have terminated."""
+FLARE_ROUNDS = 6
+"""Number of times that the rows of a device are placed whose free diameter varies along it."""
 TABLE_ROWS = 501
 """Number of samples of the row spacing along the artery."""
 FREELY = 0.999
@@ -101,7 +103,7 @@ def expected_profile(design: Design, size: Size, anatomy: Anatomy) -> Profile:
         Expected diameter along the parent axis, with its curvature for a braid.
     """
     offset_mm = design.wall_offset_um * MM_PER_UM
-    diameter_mm = np.minimum(2 * (anatomy.section_radius_mm - offset_mm), size.free_diameter_mm)
+    diameter_mm = np.minimum(2 * (anatomy.section_radius_mm - offset_mm), size.widest_mm)
     if isinstance(design, LaserCut):
         return Profile(anatomy.axis.abscissa_mm, diameter_mm)
     return Profile(anatomy.axis.abscissa_mm, diameter_mm, bend(anatomy))
@@ -123,7 +125,8 @@ def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Flo
     """Compute the arc length of every row from the row spacing that the wires impose.
 
     The distance from one row to the next is h(D), the row spacing at the local diameter. Row numbers are therefore the
-    integral of ds / h, counted from the landing point.
+    integral of ds / h, counted from the landing point. Where the free diameter varies along the device, D depends on
+    where its rows lie, and the rows are placed repeatedly.
 
     Parameters
     ----------
@@ -141,6 +144,20 @@ def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Flo
     (rows,) array, mm
         Arc lengths of the rows. They may lie beyond the artery, where the diameter is taken as that at its end.
     """
+    rows_mm = _marched(design, size, landing, profile)
+    if not size.free_profile_mm:
+        return rows_mm
+    free_mm = free_diameters_mm(design, size)
+    for _ in range(FLARE_ROUNDS):
+        # Samples at the rows resolve a flare that is shorter than the table's step.
+        where_mm = np.union1d(profile.abscissa_mm, rows_mm)
+        diameter_mm = np.minimum(profile.at(where_mm), np.interp(where_mm, rows_mm, free_mm))
+        rows_mm = _marched(design, size, landing, replace(profile, abscissa_mm=where_mm, diameter_mm=diameter_mm))
+    return rows_mm
+
+
+def _marched(design: Design, size: Size, landing: Landing, profile: Profile) -> Floats:
+    """Return the arc lengths (rows,) of the rows for a profile that does not depend on where they lie, in mm."""
     shape = grid(design, size)
     start = landed_row(design, size, landing)
     first, last = profile.abscissa_mm[[0, -1]]
@@ -156,8 +173,8 @@ def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Flo
 class FreeDiameter:
     """Limit of the perimeter of a row: it stops where it reaches that of the free device, even in a wider artery."""
 
-    diameter_mm: float
-    """Free diameter, in mm."""
+    diameter_mm: Floats
+    """(rows,) free diameter of every row, in mm."""
 
     def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
         """Move every row as far as its perimeter may grow.
@@ -201,7 +218,7 @@ class ConstantWire(AbstractMethod):
         """Return the closed device, its rows where they would lie if the device filled the artery."""
         profile = expected_profile(placement.design, placement.size, placement.anatomy)
         rows_mm = march(placement.design, placement.size, placement.landing, profile)
-        return Opened(placement.start(self.contour, rows_mm, placement.size.free_diameter_mm), rows_mm)
+        return Opened(placement.start(self.contour, rows_mm, _free_mm(placement)), rows_mm)
 
     def step(self, placement: Placement, opened: Opened) -> Opened:
         """Return the device after one step of the contour; once it is open, its row positions are recomputed."""
@@ -237,7 +254,7 @@ class ConstantWire(AbstractMethod):
             state = replace(state, nodes_mm=on_wall_mm.reshape(slid.nodes_mm.shape) + slid.lift_mm)
             return Opened(self.contour.classify(state, everywhere, placement.wall), rows_mm)
         state, laid_mm = self._laid(placement, replace(state, nodes_mm=slid.nodes_mm), everywhere)
-        return Opened(replace(state, nodes_mm=self._no_wider(state.nodes_mm, laid_mm, size.free_diameter_mm)), rows_mm)
+        return Opened(replace(state, nodes_mm=self._no_wider(state.nodes_mm, laid_mm, _free_mm(placement))), rows_mm)
 
     def _between(self, placement: Placement, opened: Opened, points_mm: Floats, row: Floats, column: Floats) -> Floats:
         """Return (n, 3) points between the nodes, put on the wall like their nearest node, in mm."""
@@ -249,12 +266,12 @@ class ConstantWire(AbstractMethod):
         where_mm = pieces.extrapolated(np.arange(len(opened.abscissa_mm)), opened.abscissa_mm, row)
         state = contour.near(points_mm, placement.across.middle(where_mm), rows, columns)
         # Points of rows that stopped at the free diameter stay in place unless they are outside the wall.
-        is_narrow = perimeters(contour.nodes_mm)[rows] < FREELY * np.pi * placement.size.free_diameter_mm
-        state = replace(state, is_terminated=state.is_terminated & is_narrow[:, None])
+        is_narrow = perimeters(contour.nodes_mm) < FREELY * np.pi * _free_mm(placement)
+        state = replace(state, is_terminated=state.is_terminated & is_narrow[rows, None])
         return self._laid(placement, state, np.ones_like(state.is_terminated))[1].reshape(-1, 3)
 
     @staticmethod
-    def _no_wider(slid_mm: Floats, laid_mm: Floats, free_mm: float) -> Floats:
+    def _no_wider(slid_mm: Floats, laid_mm: Floats, free_mm: Floats) -> Floats:
         """Return rows on the wall as far as their diameter, seen along the device, does not exceed the free one."""
         old, new = row_diameters_mm(slid_mm), row_diameters_mm(laid_mm)
         share = np.where(new > free_mm, (free_mm - old) / np.maximum(new - old, 1e-12), 1.0)
@@ -266,7 +283,7 @@ class ConstantWire(AbstractMethod):
     def _grown(self, placement: Placement, opened: Opened) -> Opened:
         """Return the device after one step of the contour; a row that reaches the free diameter stops there."""
         before, after = opened.contour, self.contour.step(opened.contour, placement.wall)
-        free = FreeDiameter(placement.size.free_diameter_mm)
+        free = FreeDiameter(_free_mm(placement))
         nodes_mm, is_stopped = free(before.nodes_mm, after.nodes_mm)
         after = replace(after, nodes_mm=nodes_mm, is_terminated=after.is_terminated | is_stopped)
         return replace(opened, contour=after)
@@ -296,7 +313,7 @@ class ConstantWire(AbstractMethod):
         is_beyond = (rows_mm < before_mm[0]) | (rows_mm > before_mm[-1])
         is_asked = np.broadcast_to(is_beyond[:, None], nodes_mm.shape[:2])
         state, laid_mm = self._laid(placement, replace(state, nodes_mm=nodes_mm), is_asked)
-        free = FreeDiameter(placement.size.free_diameter_mm)
+        free = FreeDiameter(_free_mm(placement))
         return Opened(replace(state, nodes_mm=free(state.nodes_mm, laid_mm)[0]), rows_mm)
 
     def _laid(self, placement: Placement, state: State, is_asked: Bools) -> tuple[State, Floats]:
@@ -308,6 +325,11 @@ class ConstantWire(AbstractMethod):
         is_off = held.ravel() & (state.contact.distance_mm > self.contour.dd_mm)
         back_mm = self.contour.relocated_mm(points_mm, np.zeros_like(is_off), state.contact)
         return state, np.where(is_off[:, None], back_mm, points_mm).reshape(state.nodes_mm.shape)
+
+
+def _free_mm(placement: Placement) -> Floats:
+    """Return the free diameter of every row of a device (rows,), in mm."""
+    return free_diameters_mm(placement.design, placement.size)
 
 
 def _nearest(row: Floats, rows: int) -> Ints:

@@ -91,7 +91,7 @@ class _Model(NamedTuple):
         return float(self.residual @ self.residual)
 
 
-def relax(net: Net, length_mm: float, width_mm: float, joint_mm: float, held: float, laid: Laid) -> Floats:
+def relax(net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid) -> Floats:
     """Compute the moves that restore the strut lengths of a laser-cut device.
 
     Parameters
@@ -100,8 +100,8 @@ def relax(net: Net, length_mm: float, width_mm: float, joint_mm: float, held: fl
         Joints and struts on the wall, with c joints.
     length_mm : float
         Length of a strut as cut, in mm.
-    width_mm : float
-        Width of a cell of the free device, in mm.
+    width_mm : (rows,) array, mm
+        Width of a cell of the free device on every row of joints.
     joint_mm : float
         Width of a joint, in mm.
     held : float
@@ -215,7 +215,7 @@ def _lengths(points_mm: Floats, change: Floats, ends: Ints, bulge_mm2: Floats) -
     return length_mm, coo_matrix((np.concatenate(slopes).ravel(), (piece, move)), shape=shape)
 
 
-def _diagonals(net: Net, length_mm: float, width_mm: float) -> tuple[Ints, Floats]:
+def _diagonals(net: Net, length_mm: float, width_mm: Floats) -> tuple[Ints, Floats]:
     """Return the joints at both ends of every cell's width and height (2, k), and their free distances (k,) in mm."""
     stride, n = net.chart.shape[1], len(net.line)
     key = net.line.astype(int) * stride + net.column
@@ -223,7 +223,7 @@ def _diagonals(net: Net, length_mm: float, width_mm: float) -> tuple[Ints, Float
     lower = np.flatnonzero(ahead < n)
     pairs = np.concatenate([np.stack([np.arange(n), net.beside]), np.stack([lower, ahead[lower]])], axis=1)
     height_mm = 2 * np.sqrt(length_mm**2 - (0.5 * width_mm) ** 2)
-    return pairs, np.repeat([width_mm, height_mm], [n, len(lower)])
+    return pairs, np.concatenate([width_mm[net.line], height_mm[net.line[lower] + 1]])
 
 
 def _keeping(net: Net, held: float) -> csc_matrix:

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from vstent.anatomy.morphology import Measures
-from vstent.devices.formulas import coverage_fraction, grid, pore_density_per_mm2
+from vstent.devices.formulas import coverage_fraction, grid, mesh_rows, pore_density_per_mm2
 from vstent.devices.stent import Stent
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
@@ -38,7 +38,8 @@ def coverage_fractions(stent: Stent) -> Floats:
 def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats]:
     """Compute the area and the center of every whole pore.
 
-    Pores lie where the lattice has no junction. Each fills half of the four lattice cells around it.
+    Pores lie where the lattice has no junction. Each fills half of the four lattice cells around it. The wires of an
+    outer layer do not divide them, and its ends without a mesh have none.
 
     Parameters
     ----------
@@ -61,7 +62,8 @@ def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats]:
     pairs = cell_mm2 + np.roll(cell_mm2, 1, axis=1)
     area_mm2 = 0.5 * (pairs[:-1] + pairs[1:])
     row, column = np.meshgrid(np.arange(1, shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
-    is_pore = (row + column) % 2 == 1
+    first, last = mesh_rows(stent.design, stent.size)
+    is_pore = ((row + column) % 2 == 1) & (row > first) & (row < last)
     return area_mm2[is_pore], lattice_mm[1:-1][is_pore]
 
 
@@ -78,16 +80,18 @@ def density(anatomy: Anatomy, stent: Stent) -> Measures:
     Returns
     -------
     dict
-        Coverage (fraction) and pore density (1/mm2), with the closed formulas at the mean diameter. Numbers over the
-        neck are left out where nothing of the device lies over it.
+        Coverage (fraction) and pore density (1/mm2), with the closed formulas at the mean diameter. Those of the whole
+        device refer to its mesh. Numbers over the neck are left out where nothing of the device lies over it.
     """
     quads_mm = 0.25 * (stent.nodes_mm[1:] + stent.nodes_mm[:-1])
     quads_mm = (quads_mm + np.roll(quads_mm, -1, axis=1)).reshape(-1, 3)
-    hidden, area_mm2 = coverage_fractions(stent).ravel(), quad_areas_mm2(stent).ravel()
+    covered, quad_mm2 = coverage_fractions(stent), quad_areas_mm2(stent)
+    hidden, area_mm2 = covered.ravel(), quad_mm2.ravel()
     pore_mm2, pores_mm = pore_areas_mm2(stent)
-    diameter_mm = float(stent.row_diameter_mm.mean())
+    mesh = slice(*stent.mesh_nodes)
+    diameter_mm = float(stent.row_diameter_mm[mesh.start : mesh.stop + 1].mean())
     found: Measures = {
-        "metal_coverage_fraction": float(np.average(hidden, weights=area_mm2)),
+        "metal_coverage_fraction": float(np.average(covered[mesh].ravel(), weights=quad_mm2[mesh].ravel())),
         "metal_coverage_formula_fraction": coverage_fraction(stent.design, stent.size, diameter_mm),
         "pore_density_formula_per_mm2": pore_density_per_mm2(stent.design, stent.size, diameter_mm),
     }

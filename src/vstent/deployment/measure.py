@@ -55,7 +55,8 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
 def _position(anatomy: Anatomy, stent: Stent) -> Measures:
     """Return length, ends, diameters and the distances from the neck."""
     proximal_mm, distal_mm = neck_span_mm(anatomy)
-    before_mm, after_mm = proximal_mm - stent.proximal_abscissa_mm, stent.distal_abscissa_mm - distal_mm
+    first_mm, last_mm = stent.mesh_abscissa_mm
+    before_mm, after_mm = proximal_mm - first_mm, last_mm - distal_mm
     diameter_mm = stent.row_diameter_mm
     found: Measures = {
         "device": stent.design.name,
@@ -70,6 +71,8 @@ def _position(anatomy: Anatomy, stent: Stent) -> Measures:
         "mean_diameter_mm": float(diameter_mm.mean()),
         "max_diameter_mm": float(diameter_mm.max()),
     }
+    if stent.design.beyond_mm:
+        found["mesh_length_mm"] = last_mm - first_mm
     if anatomy.aneurysms:
         found["neck_to_proximal_end_mm"] = before_mm
         found["neck_to_distal_end_mm"] = after_mm

@@ -57,7 +57,7 @@ class Placement:
         """Planes across the parent axis that hold the rows."""
         return planes(self.anatomy.axis)
 
-    def start(self, contour: ActiveContour, rows_mm: Floats, widest_mm: float = np.inf) -> State:
+    def start(self, contour: ActiveContour, rows_mm: Floats, widest_mm: Floats | float = np.inf) -> State:
         """Create the closed contour from circles of the maximum inscribed spheres.
 
         Parameters
@@ -66,8 +66,8 @@ class Placement:
             The active contour with its weights.
         rows_mm : (rows,) array, mm
             Arc lengths of the rows.
-        widest_mm : float, optional
-            Largest diameter of a row, in mm.
+        widest_mm : (rows,) array or float, optional
+            Largest diameter of every row, in mm.
 
         Returns
         -------

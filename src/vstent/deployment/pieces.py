@@ -21,7 +21,7 @@ import numpy as np
 from vstent.deployment import cells
 from vstent.deployment.contour import normals
 from vstent.devices.design import Braid, Design, LaserCut, Size, piece_length_mm
-from vstent.devices.formulas import Grid, grid, row_spacing_mm
+from vstent.devices.formulas import Grid, free_diameters_mm, grid, row_spacing_mm
 from vstent.kernels import net
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import MM_PER_UM
@@ -99,7 +99,8 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.L
     )
     length_mm, held_line = piece_length_mm(design, size), held / shape.row_split
     if isinstance(design, LaserCut):
-        width_mm = size.free_diameter_mm * np.sin(2 * np.pi / design.n_columns)
+        free_mm = free_diameters_mm(design, size)[:: shape.row_split]
+        width_mm = free_mm * np.sin(2 * np.pi / design.n_columns)
         joint_mm = 2 * design.strut_width_um * MM_PER_UM  # two struts, side by side
 
         def put(points_mm: Floats, row: Floats, column: Floats) -> Floats:

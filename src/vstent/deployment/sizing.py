@@ -19,9 +19,11 @@ from vstent.anatomy.landing_zones import landing_diameters_mm, neck_span_mm
 from vstent.deployment.braid import expected_profile, march
 from vstent.deployment.sketch import bed
 from vstent.devices.design import Design, Size
+from vstent.devices.formulas import grid, mesh_rows
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import LandingError
 from vstent.geometry.vessel import Anatomy
+from vstent.kernels.arrays import Floats
 
 MARGIN_MM: Final = 4.0
 """Smallest length, in mm, by which a device extends beyond the neck; one artery diameter if that is more."""
@@ -145,19 +147,18 @@ def reach_mm(design: Design, anatomy: Anatomy, size: Size) -> float:
     float
         Length on the shorter side, in mm; -inf where the size does not fit the artery.
     """
-    first_mm, last_mm = _span(design, anatomy, size)
-    return _margin(anatomy, first_mm, last_mm) if _fits(anatomy, first_mm, last_mm) else -inf
+    fits = _fits(anatomy, *_span(design, anatomy, size))
+    return _margin(design, anatomy, size) if fits else -inf
 
 
 def _of_label(design: Design, anatomy: Anatomy, label_mm: float) -> Size | None:
     """Return the shortest size of a label diameter that extends far enough, the longest that fits, or None."""
     same = sorted((size for size in design.sizes if size.diameter_mm == label_mm), key=lambda size: size.length_mm)
-    spans = {size: _span(design, anatomy, size) for size in same}
-    fitting = [size for size in same if _fits(anatomy, *spans[size])]
+    fitting = [size for size in same if _fits(anatomy, *_span(design, anatomy, size))]
     if not fitting:
         return None
     wanted_mm = wanted_margin_mm(anatomy)
-    return next((size for size in fitting if _margin(anatomy, *spans[size]) >= wanted_mm), fitting[-1])
+    return next((size for size in fitting if _margin(design, anatomy, size) >= wanted_mm), fitting[-1])
 
 
 def _lies(design: Design, anatomy: Anatomy, size: Size) -> bool:
@@ -171,9 +172,14 @@ def _lies(design: Design, anatomy: Anatomy, size: Size) -> bool:
     return not is_loose.size or bool(is_loose.mean() <= LOOSE_FRACTION)
 
 
+def _rows_mm(design: Design, anatomy: Anatomy, size: Size) -> Floats:
+    """Return the expected arc lengths (rows,) of the rows of a size, landed as proposed, in mm."""
+    return march(design, size, propose_landing(design, anatomy, size), expected_profile(design, size, anatomy))
+
+
 def _span(design: Design, anatomy: Anatomy, size: Size) -> tuple[float, float]:
     """Return the expected proximal and distal end of a size, landed as proposed, in mm."""
-    rows_mm = march(design, size, propose_landing(design, anatomy, size), expected_profile(design, size, anatomy))
+    rows_mm = _rows_mm(design, anatomy, size)
     return float(rows_mm[0]), float(rows_mm[-1])
 
 
@@ -182,7 +188,9 @@ def _fits(anatomy: Anatomy, first_mm: float, last_mm: float) -> bool:
     return first_mm > 0 and last_mm < anatomy.axis.length_mm
 
 
-def _margin(anatomy: Anatomy, first_mm: float, last_mm: float) -> float:
-    """Return the length beyond the neck on the shorter side, in mm."""
+def _margin(design: Design, anatomy: Anatomy, size: Size) -> float:
+    """Return the length of the mesh beyond the neck on the shorter side, in mm."""
+    rows_mm, split = _rows_mm(design, anatomy, size), grid(design, size).row_split
+    first, last = mesh_rows(design, size)
     proximal_mm, distal_mm = neck_span_mm(anatomy)
-    return min(proximal_mm - first_mm, last_mm - distal_mm)
+    return min(proximal_mm - float(rows_mm[first * split]), float(rows_mm[last * split]) - distal_mm)

@@ -19,7 +19,7 @@ from vstent.deployment.method import check_inside, check_landing
 from vstent.deployment.wall import AbstractWall, Contact
 from vstent.deployment.wires import Wires, draw
 from vstent.devices.design import Design, Size
-from vstent.devices.formulas import grid
+from vstent.devices.formulas import free_diameters_mm, grid
 from vstent.devices.stent import Landing, Stent
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves
@@ -96,7 +96,7 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     abscissa_mm = np.linspace(0.0, axis.length_mm, max(8, round(axis.length_mm / STEP_MM) + 1))
     radius_mm = np.interp(abscissa_mm, axis.abscissa_mm, axis.inscribed_radius_mm)
     dd_mm = design.wall_offset_um * MM_PER_UM
-    inner = circles(np.minimum(radius_mm - dd_mm, 0.5 * size.free_diameter_mm), columns)
+    inner = circles(np.minimum(radius_mm - dd_mm, 0.5 * size.widest_mm), columns)
     centers_mm, frames = across.at(abscissa_mm)
     rays = circles(np.ones(len(abscissa_mm)), columns) @ frames[:, 1:]
     origins_mm = np.repeat(centers_mm, columns, axis=0)
@@ -105,7 +105,7 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     section_mm = np.interp(abscissa_mm, axis.abscissa_mm, anatomy.section_radius_mm)[:, None]
     reach_mm = np.where(reach_mm < 1.6 * section_mm, reach_mm, section_mm)
     outer = np.maximum(reach_mm - dd_mm, 0.1)[..., None] * circles(np.ones(len(abscissa_mm)), columns)
-    in_plane_mm = evenly_spaced(FreeDiameter(size.free_diameter_mm)(inner, outer)[0])
+    in_plane_mm = evenly_spaced(FreeDiameter(np.full(len(inner), size.widest_mm))(inner, outer)[0])
     nodes_mm = across.place(abscissa_mm, in_plane_mm).reshape(-1, 3)
     gap_mm = np.maximum(anatomy.landing_surface.closest(nodes_mm)[1] - dd_mm, 0.0).reshape(-1, columns)
     band_mm = anatomy.vessel.threshold_band_mm or ASSUMED_BAND_MM
@@ -138,6 +138,8 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
     check_inside(design, size, rows_mm, float(wall.abscissa_mm[-1]))
     flat = np.concatenate([wall.in_plane_mm, wall.gap_mm[..., None]], axis=2).reshape(len(wall.abscissa_mm), -1)
     laid = curves.interpolate(wall.abscissa_mm, flat, rows_mm).reshape(len(rows_mm), -1, 3)
+    if size.free_profile_mm:
+        laid = _no_wider(laid, free_diameters_mm(design, size))
     held = landed_row(design, size, landing)
     slid = pieces.slide(design, size, wall.across.place(rows_mm, laid[..., :2]), held, cells.as_drawn)
     rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), rows_mm, slid.row.mean(axis=1))
@@ -154,9 +156,18 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
 
 def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> Floats:
     """Return the proximal and distal end (2,), mm along the axis, for an artery wider by `wider_mm`."""
-    diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.free_diameter_mm)
+    diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.widest_mm)
     profile = replace(wall.profile, diameter_mm=diameter_mm)
     return march(wall.design, wall.size, landing, profile)[[0, -1]]
+
+
+def _no_wider(laid_mm: Floats, free_mm: Floats) -> Floats:
+    """Return rows (rows, columns, 3) of plane coordinates and gaps, shrunk to their free diameters (rows,), in mm."""
+    middle_mm = laid_mm[..., :2].mean(axis=1, keepdims=True)
+    share = np.minimum(np.pi * free_mm / perimeters(laid_mm[..., :2]), 1.0)[:, None, None]
+    moved_mm = (share - 1) * (laid_mm[..., :2] - middle_mm)
+    gap_mm = laid_mm[..., 2:] + np.linalg.norm(moved_mm, axis=2, keepdims=True)
+    return np.concatenate([laid_mm[..., :2] + moved_mm, gap_mm], axis=2)
 
 
 def _wires(wall: Bed, nodes_mm: Floats) -> Wires:

@@ -123,8 +123,8 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = T
 
 
 def inner_face(stent: Stent) -> Surface:
-    """Return the inner face of a device: its contour moved inward by the wire that fits between contour and wall."""
-    nodes_mm = stent.nodes_mm - stent.design.wall_offset_um * MM_PER_UM * normals(stent.nodes_mm)
+    """Return the inner face of a device: its contour moved inward by the thickness of its mesh."""
+    nodes_mm = stent.nodes_mm - stent.design.mesh_offset_um * MM_PER_UM * normals(stent.nodes_mm)
     return Surface(nodes_mm.reshape(-1, 3), stent.contour.faces)
 
 

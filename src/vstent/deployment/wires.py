@@ -9,8 +9,8 @@ from scipy.sparse import csr_matrix
 
 from vstent.deployment.contour import normals
 from vstent.deployment.wall import AbstractWall
-from vstent.devices.design import Braid, Design, LaserCut, Size, piece_length_mm
-from vstent.devices.formulas import Grid, grid
+from vstent.devices.design import Braid, Design, LaserCut, Size, Strands, angle_rad, piece_length_mm
+from vstent.devices.formulas import Grid, grid, mesh_rows
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import MM_PER_UM
@@ -19,6 +19,8 @@ POINT_SPACING_MM = 0.1
 """Largest distance between points of a braided wire's axis, in mm. There are at least four points between crossings."""
 CROWN_SHARE = 0.2
 """Half-width of the rounding of a laser-cut crown, in lattice columns."""
+LOOP_SHARE = 0.5
+"""Half-width of the loop in which a wire turns back at a closed end of a braid, in lattice columns."""
 POINTS_PER_STRUT = 16
 """Points on a laser-cut strut, crowns included."""
 PAD = 8
@@ -60,7 +62,7 @@ def draw(design: Design, size: Size, nodes_mm: Floats, wall: AbstractWall) -> Wi
     """
     shape = grid(design, size)
     if isinstance(design, Braid):
-        wires, depth_mm = _braided(design, size, shape, nodes_mm)
+        wires, depth_mm = _braid(design, size, shape, nodes_mm)
     else:
         wires, depth_mm = _laser_cut(design, shape, nodes_mm)
     return wires._replace(points_mm=_kept_inside(wires.points_mm, 0.5 * depth_mm, wall))
@@ -118,38 +120,142 @@ def wire_diameters_um(design: Braid) -> Floats:
     return np.array([diameter for _, diameter in sorted(places)])
 
 
-def _braided(design: Braid, size: Size, shape: Grid, nodes_mm: Floats) -> tuple[Wires, Floats]:
-    """Return the wires of a diamond braid (one over, one under) and their diameters (p,) in mm at every point."""
+class _Braided(NamedTuple):
+    """Wires of both hands of one layer of a braid, before loops join them at closed ends."""
+
+    points_mm: Floats
+    """(2, w, p, 3) axes: of the hand that turns with increasing columns, and of the other one."""
+    diameter_um: Floats
+    """(w,) diameters of the wires of one hand, in um."""
+
+
+def _braid(design: Braid, size: Size, shape: Grid, nodes_mm: Floats) -> tuple[Wires, Floats]:
+    """Return the wires of a braid, mesh and strands, and their diameters (p,) in mm at every point."""
+    spline, samples = _spline(nodes_mm), max(4, int(np.ceil(piece_length_mm(design, size) / POINT_SPACING_MM)))
+    mesh = _mesh(design, size, shape, spline, samples)
+    wires = [_looped(mesh, mesh_rows(design, size)) if design.has_closed_ends else _open(mesh)]
+    wires += [_open(_strands(design, size, strands, spline, samples)) for strands in design.strands]
+    counts = np.concatenate([np.diff(one.starts) for one in wires])
+    diameter_um = np.concatenate([one.diameter_um for one in wires])
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    depth_mm = np.repeat(diameter_um * MM_PER_UM, counts)
+    return Wires(np.concatenate([one.points_mm for one in wires]), starts, diameter_um), depth_mm
+
+
+def _open(layer: _Braided) -> Wires:
+    """Return the wires of a layer whose ends are open."""
+    hands, wires, points = layer.points_mm.shape[:3]
+    starts = np.arange(hands * wires + 1, dtype=np.int32) * points
+    return Wires(layer.points_mm.reshape(-1, 3), starts, np.tile(layer.diameter_um, hands))
+
+
+def _looped(layer: _Braided, ends: tuple[int, int]) -> Wires:
+    """Return the wires of a layer as closed curves: at both ends, a wire of one hand turns into one of the other."""
+    # Wire k of the first hand and wire k + i of the second meet on lattice row i. A closed curve runs up the first,
+    # down the second and so comes to wire k + last - first of the first hand.
+    wires = layer.points_mm.shape[1]
+    turn = (ends[1] - ends[0]) % wires
+    is_left, curves_mm = np.ones(wires, dtype=bool), []
+    for first in range(wires):
+        parts, k = [], first
+        while is_left[k]:
+            is_left[k] = False
+            down = (k + ends[1]) % wires
+            parts += [layer.points_mm[0, k, :-1], layer.points_mm[1, down, :0:-1]]
+            k = (k + turn) % wires
+        if parts:
+            curves_mm.append(np.concatenate([*parts, parts[0][:1]]))
+    starts = np.cumsum([0, *map(len, curves_mm)]).astype(np.int32)
+    return Wires(np.concatenate(curves_mm), starts, np.full(len(curves_mm), layer.diameter_um[0]))
+
+
+def _mesh(design: Braid, size: Size, shape: Grid, spline: Floats, samples: int) -> _Braided:
+    """Return the wires of the mesh of a braid, one over, one under."""
     # Wire k of the first hand passes column (2 k + row) mod n on every row, wire k of the second hand column
     # (2 k - row) mod n. All wires therefore cross on every second column. The first hand is outside on even rows,
     # the second on odd rows, so that every wire goes over and under in turn. At a crossing both axes are
     # (d1 + d2) / 4 from the contour, so that the wires just touch. Between crossings a wire changes
     # sides along a cosine.
     rows, half = shape.lattice_rows, shape.lattice_columns // 2
+    ends = mesh_rows(design, size)
     diameter_um = wire_diameters_um(design)
     k, row = np.meshgrid(np.arange(half), np.arange(rows), indexing="ij")
-    samples = max(4, int(np.ceil(piece_length_mm(design, size) / POINT_SPACING_MM)))
-    fraction = np.arange((rows - 1) * samples + 1) / samples
-    spline = _spline(nodes_mm)
-    points, depths = [], []
+    fraction = ends[0] + np.arange((ends[1] - ends[0]) * samples + 1) / samples
+    hands = []
     for hand in (1, -1):
         partner = (k + hand * row) % half
         side = hand * (1 - 2 * (row % 2))
         height_mm = 0.25 * side * (diameter_um[k] + diameter_um[partner]) * MM_PER_UM
-        base_mm, normal = _drawn(spline, _along_wires(shape, hand, samples))
-        points.append(base_mm + _eased(height_mm, fraction).reshape(-1, 1) * normal)
-        depths.append(np.repeat(diameter_um * MM_PER_UM, len(fraction)))
-    starts = np.arange(2 * half + 1, dtype=np.int32) * len(fraction)
-    return Wires(np.concatenate(points), starts, np.tile(diameter_um, 2)), np.concatenate(depths)
+        if design.has_closed_ends:
+            height_mm[:, list(ends)] = 0.0
+        along = _Helices(hand, 0.0, 2.0, ends, samples, design.has_closed_ends)
+        base_mm, normal = _drawn(spline, _along_wires(shape, along))
+        hands.append(base_mm + _eased(height_mm, fraction).reshape(-1, 1) * normal)
+    return _Braided(np.reshape(hands, (2, half, -1, 3)), diameter_um)
 
 
-@lru_cache(maxsize=8)
-def _along_wires(shape: Grid, hand: int, samples: int) -> csr_matrix:
-    """Return the samples along all wires of one hand of a braid, `samples` of them from each row to the next."""
-    fraction = np.arange((shape.lattice_rows - 1) * samples + 1) / samples
-    column = 2 * np.arange(shape.lattice_columns // 2)[:, None] + hand * fraction
-    along = np.broadcast_to(fraction, column.shape)
+def _strands(design: Braid, size: Size, strands: Strands, spline: Floats, samples: int) -> _Braided:
+    """Return strands of a braid: a layer around the mesh, or beside wires of the mesh and woven with them."""
+    shape = grid(design, size)
+    ends = (0, shape.lattice_rows - 1) if strands.beyond_mm else mesh_rows(design, size)
+    fraction = ends[0] + np.arange((ends[1] - ends[0]) * samples + 1) / samples
+    apart = 2 * design.n_wires / strands.count
+    shift, layer_um, period = _between(design, size, strands, apart)
+    lag = 0.5 * shift if strands.place == "beside" else 0.0  # it crosses wires of the mesh so much before they cross
+    hands = []
+    for hand in (1, -1):
+        along = _Helices(hand, shift, apart, ends, samples, False)
+        base_mm, normal = _drawn(spline, _along_wires(shape, along))
+        woven = hand * np.cos(np.pi * (fraction + hand * lag) / period)
+        height_um = layer_um + 0.5 * strands.diameter_um * woven
+        hands.append(base_mm + np.tile(height_um * MM_PER_UM, strands.count // 2)[:, None] * normal)
+    half = strands.count // 2
+    return _Braided(np.reshape(hands, (2, half, -1, 3)), np.full(half, strands.diameter_um))
+
+
+def _between(design: Braid, size: Size, strands: Strands, apart: float) -> tuple[float, float, float]:
+    """Return the column of the first strand, the height of its layer in um, and the rows between its crossings."""
+    if strands.place == "outside":  # strands cross each other only, above the pores of the mesh
+        return 1.0, design.mesh_offset_um + strands.diameter_um, 0.5 * apart
+    # Side by side with a wire of the mesh at the widest diameter; where the device is narrower, they are farther apart.
+    wire_um = max(diameter for _, diameter in design.wires)
+    across_mm = 0.5 * (strands.diameter_um + wire_um) * MM_PER_UM / np.cos(angle_rad(design, size, size.widest_mm))
+    return float(across_mm * design.n_columns / (np.pi * size.widest_mm)), 0.0, 1.0
+
+
+class _Helices(NamedTuple):
+    """Evenly spaced wires of one hand on the lattice, and their samples."""
+
+    hand: int
+    """1: columns increase with rows. -1: they decrease."""
+    first: float
+    """Column of the first wire on row 0."""
+    apart: float
+    """Columns between wires."""
+    ends: tuple[int, int]
+    """First and last lattice row."""
+    samples: int
+    """Samples from each row to the next."""
+    is_rounded: bool
+    """Whether the ends are rounded to half of a loop."""
+
+
+@lru_cache(maxsize=16)
+def _along_wires(shape: Grid, helices: _Helices) -> csr_matrix:
+    """Return the samples along all wires of one hand of a layer of a braid."""
+    hand, first, apart, ends, samples, is_rounded = helices
+    fraction = ends[0] + np.arange((ends[1] - ends[0]) * samples + 1) / samples
+    wires = round(shape.lattice_columns / apart)
+    column = first + apart * np.arange(wires)[:, None] + hand * fraction
+    along = np.broadcast_to(_with_loops(fraction, ends) if is_rounded else fraction, column.shape)
     return _samples(shape, (along * shape.row_split).ravel(), (column * shape.column_split).ravel())
+
+
+def _with_loops(fraction: Floats, ends: tuple[int, int]) -> Floats:
+    """Return the rows of samples whose ends are rounded to parabolas of half-width LOOP_SHARE."""
+    from_end = np.minimum(fraction - ends[0], ends[1] - fraction)
+    drawn_back = np.where(from_end < LOOP_SHARE, (LOOP_SHARE - from_end) ** 2 / (2 * LOOP_SHARE), 0.0)
+    return np.where(fraction - ends[0] < ends[1] - fraction, fraction + drawn_back, fraction - drawn_back)
 
 
 def _eased(values: Floats, position: Floats) -> Floats:

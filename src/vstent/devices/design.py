@@ -72,6 +72,11 @@ class Size:
     """Diameter outside an artery, in mm; the device never becomes wider."""
     compaction_fraction: float = 0.0
     """Fraction by which pushing has shortened a braid at its label diameter; negative when pulled."""
+    free_profile_mm: tuple[tuple[float, float], ...] = ()
+    """Pairs of a fraction of the length, 0 at the proximal end, and the free diameter there, in mm, if it varies.
+
+    It is linear between the pairs. `free_diameter_mm` is that of the body, and the angle of the wires is given there.
+    """
 
     @property
     def compacted_length_mm(self) -> float:
@@ -79,14 +84,36 @@ class Size:
         return self.length_mm * (1 - self.compaction_fraction)
 
     @property
+    def widest_mm(self) -> float:
+        """Largest free diameter along the device, in mm."""
+        return max((diameter for _, diameter in self.free_profile_mm), default=self.free_diameter_mm)
+
+    @property
     def label(self) -> str:
         """Size as printed on the box."""
         return f"{self.diameter_mm:.2f} x {self.length_mm:g} mm"
 
 
+@dataclass(frozen=True)
+class Strands:
+    """Further wires of a braid, half of either hand, at the same angle as the wires of its mesh.
+
+    Both layers of a dual-layer device shorten together because their wires have the same angle at every diameter.
+    """
+
+    count: int
+    """Number of wires of both hands, evenly spaced around the device."""
+    diameter_um: float
+    """Wire diameter, in um."""
+    place: Literal["outside", "beside"]
+    """``outside``: a layer of its own around the mesh. ``beside``: next to wires of the mesh and woven with them."""
+    beyond_mm: float = 0.0
+    """Length by which a layer outside is longer than the mesh at each end, at the label diameter, in mm."""
+
+
 @dataclass(frozen=True, eq=False)
 class Braid:
-    """A tube braided from round wires of two hands."""
+    """A tube braided from round wires of two hands, with further strands where it has them."""
 
     key: str
     """Short lower-case name."""
@@ -104,6 +131,10 @@ class Braid:
     """Source and confidence of every number."""
     ranges: tuple[Range, ...] = ()
     """Range of every number; a number of an older catalogue that states none is left out."""
+    strands: tuple[Strands, ...] = ()
+    """Outer layer of a dual-layer device, or radiopaque strands beside the wires of the mesh."""
+    has_closed_ends: bool = False
+    """Whether the wires turn back in loops at both ends, as in a braid of a single wire."""
     kind: Literal["braid"] = field(default="braid", init=False)
     """Device family."""
 
@@ -116,6 +147,7 @@ class Braid:
                     f"{self.name} has {count} wires of {diameter_um:g} um, but half of the wires of each kind "
                     "run either way. Give an even number."
                 )
+        _check_strands(self)
         _check_sizes(self)
 
     @property
@@ -134,14 +166,29 @@ class Braid:
         return self.braid_angle_rad
 
     @property
+    def beyond_mm(self) -> float:
+        """Length of each end of the device without a mesh, at the label diameter, in mm."""
+        return max((strands.beyond_mm for strands in self.strands), default=0.0)
+
+    @property
+    def mesh_offset_um(self) -> float:
+        """Distance from the outer face of the mesh to its middle, in um: the diameter of its thickest wire."""
+        beside = [strands.diameter_um for strands in self.strands if strands.place == "beside"]
+        return max([diameter for _, diameter in self.wires] + beside)
+
+    @property
     def wall_offset_um(self) -> float:
-        """Distance from the wall to the contour, in um (dd in Zhong et al. 2016): the diameter of the thickest wire."""
-        return max(diameter for _, diameter in self.wires)
+        """Distance from the wall to the contour, in um (dd in Zhong et al. 2016).
+
+        The contour runs through the middle of the mesh. Outside it lie one wire of the mesh, and two of an outer layer.
+        """
+        outside = [strands.diameter_um for strands in self.strands if strands.place == "outside"]
+        return self.mesh_offset_um + 2 * max(outside, default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class LaserCut:
-    """A tube cut into closed cells: zigzag rings whose crowns are joined."""
+    """A tube cut into zigzag rings whose crowns are joined: all of them (closed cells) or some (open cells)."""
 
     key: str
     """Short lower-case name."""
@@ -163,18 +210,41 @@ class LaserCut:
     """Source and confidence of every number."""
     ranges: tuple[Range, ...] = ()
     """Range of every number; a number of an older catalogue that states none is left out."""
+    joined_crowns: tuple[str, ...] = ()
+    """Which crowns between two rings are joined, for an open-cell device: one text for each row of crowns, ``1`` for a
+    joined and ``0`` for a free crown. The texts are repeated around and along the device. Empty: all are joined."""
+    crown_gap_um: float = 0.0
+    """Distance along the device between the tips of two free crowns that face each other, in um."""
     kind: Literal["laser_cut"] = field(default="laser_cut", init=False)
     """Device family."""
 
     def __post_init__(self) -> None:
         _check_columns(self.name, self.n_columns)
         _check_angle(self.name, self.cell_angle_rad)
+        _check_crowns(self)
         _check_sizes(self)
 
     @property
     def angle_rad(self) -> float:
         """Angle between strut and axis at the free diameter, in rad."""
         return self.cell_angle_rad
+
+    @property
+    def beyond_mm(self) -> float:
+        """Length of each end of the device without a mesh, in mm: none."""
+        return 0.0
+
+    def is_joined(self, row: int, crown: int) -> bool:
+        """Return whether a crown on a row between two rings is joined; both are counted from 0."""
+        if not self.joined_crowns:
+            return True
+        around = self.joined_crowns[row % len(self.joined_crowns)]
+        return around[crown % len(around)] == "1"
+
+    @property
+    def mesh_offset_um(self) -> float:
+        """Distance from the outer face of the device to its contour, in um: the thickness of a strut."""
+        return self.strut_thickness_um
 
     @property
     def wall_offset_um(self) -> float:
@@ -198,9 +268,52 @@ def _check_angle(name: str, angle_rad: float) -> None:
         raise DeviceError(f"{name} has an angle of {angle_rad:.3f} rad to the axis. Give 0.1 to 1.5 rad.")
 
 
+def _check_strands(braid: Braid) -> None:
+    """Raise a DeviceError if strands cannot be placed around the mesh, or a braid of closed ends has several wires."""
+    for strands in braid.strands:
+        if strands.count % 2 or not 2 <= strands.count <= braid.n_wires:
+            raise DeviceError(
+                f"{braid.name} has {strands.count} strands {strands.place} a mesh of {braid.n_wires} wires. Give an "
+                "even number of at least 2 that is not above the number of wires."
+            )
+        if strands.place == "beside" and braid.n_wires % strands.count:
+            raise DeviceError(
+                f"{braid.name} has {strands.count} strands beside wires of a mesh of {braid.n_wires}. Give a number "
+                "that divides the number of wires."
+            )
+        if strands.beyond_mm and strands.place == "beside":
+            raise DeviceError(
+                f"{braid.name} has strands beside the wires of its mesh that are longer than the mesh. Place them "
+                "outside, or let them end with the mesh."
+            )
+    if braid.has_closed_ends and len({diameter for _, diameter in braid.wires}) > 1:
+        raise DeviceError(
+            f"{braid.name} has closed ends but wires of several diameters, so no two of them are one wire. Give one "
+            "diameter, and thicker ones as strands."
+        )
+
+
+def _check_crowns(design: LaserCut) -> None:
+    """Raise a DeviceError if the pattern of joined crowns is no pattern, or leaves rings unconnected."""
+    around = design.n_columns // 2
+    for text in design.joined_crowns:
+        if not text or set(text) - set("01") or around % len(text):
+            raise DeviceError(
+                f"{design.name} has the pattern {text!r} of joined crowns. Give 0 and 1, as many as divide its "
+                f"{around} crowns around."
+            )
+        if "1" not in text:
+            raise DeviceError(f"{design.name} has a row without joined crowns, so its rings are separate. Join one.")
+
+
 def _check_sizes(design: Design) -> None:
-    """Raise a DeviceError if the wires of a size have no room side by side, or it is shorter than two rows of cells."""
+    """Raise a DeviceError if wires have no room side by side, turn across the axis, or a size is below two rows."""
     for size in design.sizes:
+        if free_sine(design, size) * size.widest_mm > np.sin(STEEP_RAD[1]) * size.free_diameter_mm:
+            raise DeviceError(
+                f"{design.name} {size.label} cannot open to {size.widest_mm:.2f} mm, because its wires or struts "
+                "would lie across the axis. Give a smaller flare or angle."
+            )
         taken = strips_fraction(design, size, size.free_diameter_mm)
         if taken >= 1:
             raise DeviceError(
@@ -239,18 +352,18 @@ def angle_rad(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np
     size : Size
         Its size.
     diameter_mm : float or array, mm
-        Local diameter; values above the free diameter count as the free diameter.
+        Local diameter; values above the largest free diameter count as that.
 
     Returns
     -------
     array of the shape of `diameter_mm`, rad
         Angle between wire and axis.
     """
-    return np.arcsin(free_sine(design, size) * np.minimum(diameter_mm, size.free_diameter_mm) / size.free_diameter_mm)
+    return np.arcsin(free_sine(design, size) * np.minimum(diameter_mm, size.widest_mm) / size.free_diameter_mm)
 
 
 def strips_fraction(design: Design, size: Size, diameter_mm: float) -> float:
-    """Compute the fraction of the circumference that wires of one hand, or all struts, occupy side by side.
+    """Compute the fraction of the circumference that wires of one hand of the mesh, or all struts, occupy side by side.
 
     Parameters
     ----------
@@ -269,7 +382,8 @@ def strips_fraction(design: Design, size: Size, diameter_mm: float) -> float:
     per_axis_mm = np.pi * diameter_mm * float(np.cos(angle_rad(design, size, diameter_mm)))
     if isinstance(design, LaserCut):
         return float(design.n_columns * design.strut_width_um * MM_PER_UM / per_axis_mm)
-    hand_um = 0.5 * sum(count * diameter for count, diameter in design.wires)
+    beside = [(strands.count, strands.diameter_um) for strands in design.strands if strands.place == "beside"]
+    hand_um = 0.5 * sum(count * diameter for count, diameter in [*design.wires, *beside])
     return float(hand_um * MM_PER_UM / per_axis_mm)
 
 

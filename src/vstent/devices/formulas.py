@@ -17,6 +17,7 @@ from vstent.devices.design import (
     strips_fraction,
 )
 from vstent.errors import DeviceError
+from vstent.units import MM_PER_UM
 
 BEND_SAMPLES, BEND_STEPS = 12, 6
 """Row spacing in a bend: angles around half of the axis (the other half is symmetric), and number of Newton steps."""
@@ -54,10 +55,31 @@ class Grid(NamedTuple):
 def grid(design: Design, size: Size) -> Grid:
     """Return the grid of the contour: one node per lattice row and column, more where cells are large."""
     spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
-    rows = max(2, round(size.compacted_length_mm / spacing_mm) + 1)
+    rows = max(2, round(size.compacted_length_mm / spacing_mm) + 1) + 2 * _bare_rows(design, size)
     row_split = int(np.ceil(spacing_mm / NODE_SPACING_LIMIT_MM))
     column_split = int(np.ceil(np.pi * size.diameter_mm / design.n_columns / NODE_SPACING_LIMIT_MM))
     return Grid((rows - 1) * row_split + 1, design.n_columns * column_split, row_split, column_split)
+
+
+def _bare_rows(design: Design, size: Size) -> int:
+    """Return the number of lattice rows at each end that carry only an outer layer."""
+    beyond_mm = design.beyond_mm * (1 - size.compaction_fraction)
+    return round(beyond_mm / float(row_spacing_mm(design, size, size.diameter_mm))) if beyond_mm else 0
+
+
+def mesh_rows(design: Design, size: Size) -> tuple[int, int]:
+    """Return the first and the last lattice row of the mesh; a dual-layer device has further rows at both ends."""
+    bare = _bare_rows(design, size)
+    return bare, grid(design, size).lattice_rows - 1 - bare
+
+
+def free_diameters_mm(design: Design, size: Size) -> np.ndarray:
+    """Return the free diameter of every row of nodes (rows,), in mm."""
+    rows = grid(design, size).rows
+    if not size.free_profile_mm:
+        return np.full(rows, size.free_diameter_mm)
+    where, diameter_mm = np.transpose(size.free_profile_mm)
+    return np.interp(np.linspace(0.0, 1.0, rows), where, diameter_mm)
 
 
 def compacted(design: Design, size: Size, fraction: float) -> Size:
@@ -114,7 +136,7 @@ def row_spacing_mm(
     size : Size
         Its size.
     diameter_mm : float or array, mm
-        Local diameter D; values above the free diameter count as the free diameter.
+        Local diameter D; values above the largest free diameter count as that.
     curvature_per_mm : float or array, per mm, optional
         Curvature of the axis.
 
@@ -143,7 +165,7 @@ def row_spacing_mm(
     piece_mm, angle = piece_length_mm(design, size), angle_rad(design, size, diameter_mm)
     if not np.any(curvature_per_mm):
         return piece_mm * np.cos(angle)
-    opened_mm = np.minimum(diameter_mm, size.free_diameter_mm)
+    opened_mm = np.minimum(diameter_mm, size.widest_mm)
     bend = np.minimum(0.5 * np.abs(curvature_per_mm) * opened_mm, STEEPEST_BEND)
     apart = 1 + np.multiply.outer(bend, np.cos(np.pi * (np.arange(BEND_SAMPLES) + 0.5) / BEND_SAMPLES))
     longest = STRAIGHTEST / (1 + bend)
@@ -158,8 +180,12 @@ def row_spacing_mm(
 
 def deployed_length_mm(design: Design, size: Size, diameter_mm: float) -> float:
     """Return the length of the device in a straight tube with the contour diameter `diameter_mm`, in mm."""
-    rows = grid(design, size).lattice_rows
-    return float((rows - 1) * row_spacing_mm(design, size, diameter_mm))
+    shape = grid(design, size)
+    if size.free_profile_mm:
+        opened_mm = np.minimum(diameter_mm, free_diameters_mm(design, size))
+        step_mm = row_spacing_mm(design, size, opened_mm) / shape.row_split
+        return float(0.5 * (step_mm[1:] + step_mm[:-1]).sum())
+    return float((shape.lattice_rows - 1) * row_spacing_mm(design, size, diameter_mm))
 
 
 def foreshortening_fraction(design: Design, size: Size, diameter_mm: float) -> float:
@@ -189,7 +215,8 @@ def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
     """Compute the fraction of the wall under metal at a local diameter.
 
     With f = sum of the wire diameters of one hand / (pi D cos(alpha)), the two hands of a braid cover 1 - (1 - f)^2.
-    For laser-cut struts, which meet without crossing, f counts all struts and is the coverage.
+    An outer layer leaves the fraction (1 - g)^2 of the rest open, g being the same for its wires. For laser-cut struts,
+    which meet without crossing, f counts all struts and is the coverage.
 
     Parameters
     ----------
@@ -206,7 +233,12 @@ def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
         Metal coverage.
     """
     strips = min(1.0, strips_fraction(design, size, diameter_mm))
-    return strips if isinstance(design, LaserCut) else 1 - (1 - strips) ** 2
+    if isinstance(design, LaserCut):
+        return strips
+    per_axis_mm = np.pi * diameter_mm * float(np.cos(angle_rad(design, size, diameter_mm)))
+    outside = (one.count * one.diameter_um for one in design.strands if one.place == "outside")
+    layer = min(1.0, 0.5 * sum(outside) * MM_PER_UM / per_axis_mm)
+    return 1 - (1 - strips) ** 2 * (1 - layer) ** 2
 
 
 def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> float:

@@ -5,11 +5,12 @@ Catalogues of version 0.1 state no ranges. They are read, and their devices have
 
 import tomllib
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from vstent.devices.design import BARE, Braid, Confidence, Design, Fact, LaserCut, Range, Size, called
+from vstent.devices.design import BARE, Braid, Confidence, Design, Fact, LaserCut, Range, Size, Strands, called
 from vstent.errors import DeviceError
 
 MOST_WIRES: Final = 1000
@@ -134,12 +135,85 @@ class _Wires(_Sourced):
         self._check_range(self.diameter_um, (self.diameter_low_um, self.diameter_high_um))
         return self
 
-    def ranges(self, group: int) -> Iterator[Range]:
-        """Yield the stated ranges of count and diameter; `group` counts from 1."""
-        nth = f"_{group}" if group > 1 else ""
-        yield from self._range(f"wire{nth}_count", self.count, (self.count_low, self.count_high))
+    def ranges(self, name: str) -> Iterator[Range]:
+        """Yield the stated ranges of count and diameter of wires called `name`."""
+        yield from self._range(f"{name}_count", self.count, (self.count_low, self.count_high))
         ends_um = self.diameter_low_um, self.diameter_high_um
-        yield from self._range(f"wire{nth}_diameter_um", self.diameter_um, ends_um)
+        yield from self._range(f"{name}_diameter_um", self.diameter_um, ends_um)
+
+
+class _Layer(_Wires):
+    """Outer layer of a dual-layer device."""
+
+    beyond_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)]
+    """Length by which it is longer than the mesh at each end, at the label diameter, in mm."""
+    beyond_low_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)] | None = None
+    beyond_high_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)] | None = None
+
+    @model_validator(mode="after")
+    def _check_beyond(self) -> "_Layer":
+        """Return the entry, or raise a ValueError if the range of the length is invalid."""
+        self._check_range(self.beyond_mm, (self.beyond_low_mm, self.beyond_high_mm))
+        return self
+
+    def ranges(self, name: str) -> Iterator[Range]:
+        """Yield the stated ranges of count, diameter and length of the layer."""
+        yield from super().ranges(name)
+        yield from self._range(f"{name}_beyond_mm", self.beyond_mm, (self.beyond_low_mm, self.beyond_high_mm))
+
+
+class _Flag(_Sourced):
+    """Property that a device has or has not."""
+
+    value: bool
+
+
+class _Crowns(_Sourced):
+    """Pattern of joined and free crowns."""
+
+    value: list[Annotated[str, Field(pattern="^[01]+$")]] = Field(min_length=1, max_length=MOST_SIZES)
+
+
+class _FreeProfile(_Sourced):
+    """Free diameter that varies along a device, relative to that of its body."""
+
+    wider_mm: list[Annotated[float, Field(ge=-5, le=5)]] = Field(min_length=2, max_length=MOST_SIZES)
+    """How much wider than the body the free device is at the places, in mm; linear between them."""
+    wider_tolerance_mm: Annotated[float, Field(ge=0, le=5)] | None = None
+    """Largest difference of these numbers to either side, in mm."""
+    from_ends_mm: list[Annotated[float, Field(ge=0, le=LARGEST_MM)]] | None = None
+    """Distances from either end that the numbers refer to, in mm, for a device with flared ends."""
+    fractions: list[Annotated[float, Field(ge=0, le=1)]] | None = None
+    """Fractions of the length, 0 at the proximal end, that the numbers refer to, for a tapered device."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "_FreeProfile":
+        """Return the entry, or raise a ValueError if places and numbers do not match."""
+        places = self.from_ends_mm if self.fractions is None else self.fractions
+        if places is None or (self.from_ends_mm is not None and self.fractions is not None):
+            raise ValueError("give the places of wider_mm, either as from_ends_mm or as fractions")
+        if len(places) != len(self.wider_mm) or any(b <= a for a, b in pairwise(places)):
+            raise ValueError("give as many increasing places as there are numbers in wider_mm")
+        self._check_range(0.0, self._ends_mm)
+        return self
+
+    @property
+    def _ends_mm(self) -> tuple[float | None, float | None]:
+        """Ends of the range of `wider_mm` around its values, in mm."""
+        by_mm = self.wider_tolerance_mm
+        return (None, None) if by_mm is None else (-by_mm, by_mm)
+
+    def ranges(self, name: str) -> Iterator[Range]:
+        """Yield the range of `wider_mm` around its values, if it is stated."""
+        yield from self._range(name, 0.0, self._ends_mm)
+
+    def along(self, free_mm: float, length_mm: float) -> tuple[tuple[float, float], ...]:
+        """Return pairs of a fraction of the length and the free diameter there, in mm."""
+        pairs = {where: free_mm + wider for where, wider in zip(self.fractions or [], self.wider_mm, strict=False)}
+        for from_end_mm, wider in zip(self.from_ends_mm or [], self.wider_mm, strict=False):
+            where = min(from_end_mm / length_mm, 0.5)
+            pairs |= {where: free_mm + wider, 1 - where: free_mm + wider}
+        return tuple((where, round(diameter_mm, 6)) for where, diameter_mm in sorted(pairs.items()))
 
 
 class _Sizes(_Sourced):
@@ -176,24 +250,37 @@ class _Device(_Strict):
     free_diameter_margin_mm: _Margin
     """Free diameter minus label diameter, in mm."""
     sizes: list[_Sizes] = Field(min_length=1)
+    free_profile: _FreeProfile | None = None
+    """Flared ends, or a free diameter that tapers along the device."""
 
     def _sizes(self) -> tuple[Size, ...]:
         """Return all sizes of the device."""
-        margin_mm = self.free_diameter_margin_mm.value
         pairs = {(d, length) for block in self.sizes for d in block.diameters_mm for length in block.lengths_mm}
-        return tuple(Size(d, length, round(d + margin_mm, 6)) for d, length in sorted(pairs))
+        return tuple(self._size(diameter_mm, length_mm) for diameter_mm, length_mm in sorted(pairs))
+
+    def _size(self, diameter_mm: float, length_mm: float) -> Size:
+        """Return one size of the device."""
+        free_mm, whole_mm = round(diameter_mm + self.free_diameter_margin_mm.value, 6), length_mm + self._beyond_mm()
+        along = self.free_profile.along(free_mm, whole_mm) if self.free_profile else ()
+        return Size(diameter_mm, length_mm, free_mm, free_profile_mm=along)
+
+    def _beyond_mm(self) -> float:
+        """Return the length of both ends of the device that the label does not count, in mm."""
+        return 0.0
 
     def _shared_ranges(self) -> tuple[Range, ...]:
         """Return the ranges of the numbers that both families have; of blocks of sizes the widest."""
         lengths = [one for block in self.sizes for one in block.ranges()]
         widest = sorted(lengths, key=lambda one: one.high)[-1:]
-        return (*self.free_diameter_margin_mm.ranges("free_diameter_margin_mm"), *widest)
+        flare = tuple(self.free_profile.ranges("free_profile")) if self.free_profile else ()
+        return (*self.free_diameter_margin_mm.ranges("free_diameter_margin_mm"), *widest, *flare)
 
     def _shared_facts(self) -> tuple[Fact, ...]:
         """Return the sources of the numbers that both families have."""
         return (
             _fact("free_diameter_margin_mm", self.free_diameter_margin_mm),
             *(_fact("sizes", block) for block in self.sizes),
+            *([_fact("free_profile", self.free_profile)] if self.free_profile else []),
         )
 
 
@@ -203,21 +290,59 @@ class _Braid(_Device):
     kind: Literal["braid"]
     wires: list[_Wires] = Field(min_length=1)
     braid_angle_rad: _Number
+    outer_layer: _Layer | None = None
+    """Few thick wires around the mesh, longer than it."""
+    strands: list[_Wires] = Field(default=[], max_length=MOST_SIZES)
+    """Radiopaque wires beside those of the mesh."""
+    closed_ends: _Flag | None = None
+    """Whether wires turn back in loops at both ends."""
 
     def design(self) -> Design:
         """Return the braid."""
-        facts = (*(_fact("wires", group) for group in self.wires), _fact("braid_angle_rad", self.braid_angle_rad))
-        groups = tuple((group.count, group.diameter_um) for group in self.wires)
-        of_wires = (one for number, group in enumerate(self.wires, start=1) for one in group.ranges(number))
         return Braid(
             key=self.key,
             name=self.name,
-            wires=groups,
+            wires=tuple((group.count, group.diameter_um) for group in self.wires),
             braid_angle_rad=self.braid_angle_rad.value,
             sizes=self._sizes(),
             maker=self.maker,
-            facts=facts + self._shared_facts(),
-            ranges=(*of_wires, *self.braid_angle_rad.ranges("braid_angle_rad"), *self._shared_ranges()),
+            facts=(*(_fact(name, one) for name, one in self._of_braid()), *self._shared_facts()),
+            ranges=self._ranges(),
+            strands=self._strands(),
+            has_closed_ends=self.closed_ends is not None and self.closed_ends.value,
+        )
+
+    def _beyond_mm(self) -> float:
+        """Return the length of both ends of the device that the label does not count, in mm."""
+        return 2 * self.outer_layer.beyond_mm if self.outer_layer else 0.0
+
+    def _of_braid(self) -> Iterator[tuple[str, _Sourced]]:
+        """Yield the numbers that only braids have, with the name of their fact."""
+        yield from (("wires", group) for group in self.wires)
+        yield "braid_angle_rad", self.braid_angle_rad
+        if self.outer_layer is not None:
+            yield "outer_layer", self.outer_layer
+        yield from (("strands", group) for group in self.strands)
+        if self.closed_ends is not None:
+            yield "closed_ends", self.closed_ends
+
+    def _strands(self) -> tuple[Strands, ...]:
+        """Return the further wires of the braid."""
+        beside = tuple(Strands(group.count, group.diameter_um, "beside") for group in self.strands)
+        if self.outer_layer is None:
+            return beside
+        layer = self.outer_layer
+        return (*beside, Strands(layer.count, layer.diameter_um, "outside", layer.beyond_mm))
+
+    def _ranges(self) -> tuple[Range, ...]:
+        """Return the ranges of all numbers."""
+        layer = [] if self.outer_layer is None else self.outer_layer.ranges("outer_layer")
+        return (
+            *(one for number, group in enumerate(self.wires) for one in group.ranges(_nth("wire", number))),
+            *self.braid_angle_rad.ranges("braid_angle_rad"),
+            *layer,
+            *(one for number, group in enumerate(self.strands) for one in group.ranges(_nth("strand", number))),
+            *self._shared_ranges(),
         )
 
 
@@ -229,10 +354,23 @@ class _LaserCut(_Device):
     strut_width_um: _Width
     strut_thickness_um: _Width
     cell_angle_rad: _Number
+    joined_crowns: _Crowns | None = None
+    """Which crowns are joined, for a device with open cells."""
+    crown_gap_um: _Width | None = None
+    """Distance between free crowns that face each other, in um."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "_LaserCut":
+        """Return the entry, or raise a ValueError if an open-cell device states only half of its cells."""
+        if (self.joined_crowns is None) != (self.crown_gap_um is None):
+            raise ValueError("a device with open cells needs both joined_crowns and crown_gap_um")
+        return self
 
     def design(self) -> Design:
         """Return the laser-cut device."""
-        names = ("n_columns", "strut_width_um", "strut_thickness_um", "cell_angle_rad")
+        names = ["n_columns", "strut_width_um", "strut_thickness_um", "cell_angle_rad"]
+        numbers = names + (["crown_gap_um"] if self.crown_gap_um else [])
+        words = numbers + (["joined_crowns"] if self.joined_crowns else [])
         return LaserCut(
             key=self.key,
             name=self.name,
@@ -242,8 +380,10 @@ class _LaserCut(_Device):
             cell_angle_rad=self.cell_angle_rad.value,
             sizes=self._sizes(),
             maker=self.maker,
-            facts=tuple(_fact(name, getattr(self, name)) for name in names) + self._shared_facts(),
-            ranges=tuple(one for name in names for one in getattr(self, name).ranges(name)) + self._shared_ranges(),
+            facts=tuple(_fact(name, getattr(self, name)) for name in words) + self._shared_facts(),
+            ranges=tuple(one for name in numbers for one in getattr(self, name).ranges(name)) + self._shared_ranges(),
+            joined_crowns=tuple(self.joined_crowns.value) if self.joined_crowns else (),
+            crown_gap_um=self.crown_gap_um.value if self.crown_gap_um else 0.0,
         )
 
 
@@ -256,6 +396,11 @@ class _Catalogue(_Strict):
 def _fact(name: str, sourced: _Sourced) -> Fact:
     """Return the source of one number."""
     return Fact(name, sourced.source, sourced.confidence)
+
+
+def _nth(name: str, number: int) -> str:
+    """Return the name of a group of wires, counted from 0: wire, wire_2 and so on."""
+    return f"{name}_{number + 1}" if number else name
 
 
 def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:

@@ -7,6 +7,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from vstent.devices.design import Design, Size
+from vstent.devices.formulas import grid, mesh_rows
 from vstent.errors import LandingError
 from vstent.geometry.surface import Surface
 from vstent.kernels import curves
@@ -102,6 +103,19 @@ class Stent:
     def distal_abscissa_mm(self) -> float:
         """Arc length of the distal end on the parent axis, in mm."""
         return float(self.row_abscissa_mm[-1])
+
+    @cached_property
+    def mesh_nodes(self) -> tuple[int, int]:
+        """First and last row of nodes of the mesh. A dual-layer device has only its outer layer beyond them."""
+        first, last = mesh_rows(self.design, self.size)
+        split = grid(self.design, self.size).row_split
+        return first * split, last * split
+
+    @property
+    def mesh_abscissa_mm(self) -> tuple[float, float]:
+        """Arc lengths of the proximal and the distal end of the mesh on the parent axis, in mm."""
+        first, last = self.row_abscissa_mm[list(self.mesh_nodes)]
+        return float(first), float(last)
 
     @property
     def deployed_length_mm(self) -> float:

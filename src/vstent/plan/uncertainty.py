@@ -252,6 +252,7 @@ def made_wider(design: Design, size: Size, by_mm: float) -> Size:
         diameter_mm=size.diameter_mm * factor,
         length_mm=size.length_mm * factor,
         free_diameter_mm=size.free_diameter_mm * factor,
+        free_profile_mm=tuple((where, diameter_mm * factor) for where, diameter_mm in size.free_profile_mm),
     )
 
 

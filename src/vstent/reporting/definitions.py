@@ -96,6 +96,11 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "label_diameter_mm": Definition("Label diameter", "Nominal diameter of the size."),
     "label_length_mm": Definition("Label length", "Nominal length of the size."),
     "deployed_length_mm": Definition("Deployed length", "Length along the parent axis between the ends of the device."),
+    "mesh_length_mm": Definition(
+        "Dense mesh, deployed length",
+        "Length along the parent axis between the ends of the dense mesh of a dual-layer device. Its outer layer is "
+        "longer.",
+    ),
     "oversizing_fraction": Definition(
         "Oversizing", "Label diameter divided by the mean diameter of the artery along the device, minus one."
     ),
@@ -113,10 +118,12 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "Deployed diameter, largest", "Largest perimeter of a row of the device, divided by pi."
     ),
     "neck_to_proximal_end_mm": Definition(
-        "Landing zone, proximal", "Length of the device proximal to the neck, along the parent axis."
+        "Landing zone, proximal",
+        "Length of the device proximal to the neck, along the parent axis; of a dual-layer device its dense mesh.",
     ),
     "neck_to_distal_end_mm": Definition(
-        "Landing zone, distal", "Length of the device distal to the neck, along the parent axis."
+        "Landing zone, distal",
+        "Length of the device distal to the neck, along the parent axis; of a dual-layer device its dense mesh.",
     ),
     "neck_covered_fraction": Definition(
         "Neck spanned", "100 % where the device spans the whole neck along the parent axis."
@@ -142,7 +149,9 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         "Outside the artery, largest", "Largest distance of a node outside the landing surface; 0 in a good deployment."
     ),
     "metal_coverage_fraction": Definition(
-        "Metal coverage", "Fraction of the device's surface covered by metal, measured on the deployed wires."
+        "Metal coverage",
+        "Fraction of the device's surface covered by metal, measured on the deployed wires; of a dual-layer device "
+        "where it has both layers.",
     ),
     "metal_coverage_formula_fraction": Definition(
         "Metal coverage, formula",
