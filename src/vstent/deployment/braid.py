@@ -109,6 +109,12 @@ def expected_profile(design: Design, size: Size, anatomy: Anatomy) -> Profile:
     return Profile(anatomy.axis.abscissa_mm, diameter_mm, bend(anatomy))
 
 
+def over_openings(anatomy: Anatomy, nodes_mm: Floats) -> Bools:
+    """Return which points (..., 3) on a device lie over restored wall, where a neck or an ostium has none."""
+    face = anatomy.landing_surface.closest(nodes_mm.reshape(-1, 3))[2]
+    return np.asarray(anatomy.is_restored_face[face].reshape(nodes_mm.shape[:-1]))
+
+
 def bend(anatomy: Anatomy) -> tuple[Floats, Floats]:
     """Return arc lengths (m,) along the parent axis, in mm, and its curvature (m,), per mm."""
     across = planes(anatomy.axis)
@@ -242,7 +248,10 @@ class ConstantWire(AbstractMethod):
         design, size, rows = placement.design, placement.size, np.arange(len(opened.abscissa_mm))
         held = landed_row(design, size, placement.landing)
         laid = partial(self._between, placement, opened)
-        slid = pieces.slide(design, size, opened.contour.nodes_mm, held, laid)
+        is_opening = None
+        if isinstance(design, LaserCut) and design.joined_crowns:
+            is_opening = over_openings(placement.anatomy, opened.contour.nodes_mm)
+        slid = pieces.slide(design, size, opened.contour.nodes_mm, held, laid, is_opening)
         rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
         check_inside(design, size, rows_mm, placement.anatomy.axis.length_mm)
         where_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row)
@@ -252,7 +261,7 @@ class ConstantWire(AbstractMethod):
         if isinstance(design, LaserCut):  # the springs of its cells already limit its diameter
             on_wall_mm = laid(slid.nodes_mm.reshape(-1, 3), slid.row.ravel(), slid.column.ravel())
             state = replace(state, nodes_mm=on_wall_mm.reshape(slid.nodes_mm.shape) + slid.lift_mm)
-            return Opened(self.contour.classify(state, everywhere, placement.wall), rows_mm)
+            return Opened(self.contour.classify(state, everywhere, placement.wall), rows_mm, slid.crowns)
         state, laid_mm = self._laid(placement, replace(state, nodes_mm=slid.nodes_mm), everywhere)
         return Opened(replace(state, nodes_mm=self._no_wider(state.nodes_mm, laid_mm, _free_mm(placement))), rows_mm)
 

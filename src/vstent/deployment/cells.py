@@ -13,6 +13,9 @@ moves minimise
 with no joint outside the wall. The cell springs open the device against the wall and keep cells from closing. A strut
 is as thick as it is wide, so cells resist bending off the wall about as much as they resist being drawn out. The sum is
 minimised by the Levenberg-Marquardt method.
+
+A free tip of an open cell (`vstent.deployment.crowns`) resists leaving the line of struts that leads to it, by BENDING
+times the second difference of their positions. It may leave the artery where a neck or an ostium has no wall.
 """
 
 from collections.abc import Callable
@@ -22,6 +25,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix, diags, identity, kron, vstack
 from scipy.sparse.linalg import spsolve
 
+from vstent.deployment.crowns import Split
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.net import Net
 
@@ -44,6 +48,8 @@ LEVEL: Final = 0.01
 """Weight of a joint that moves out of its row or around the device, relative to an equal stretch of a strut."""
 STIFFNESS: Final = 0.015
 """Weight of the bending of a line of struts on the wall, relative to an equal stretch of a strut."""
+OUTWARD_MM: Final = 2.0
+"""Largest distance by which a free crown may point out of the artery over a neck or an ostium, in mm."""
 STEPS: Final = 40
 """Largest number of steps."""
 GAIN: Final = 0.002
@@ -56,6 +62,15 @@ STUCK: Final = 1e3
 """Damping above which no further step is tried."""
 TINY_MM: Final = 0.02
 """Step of the central differences by which joint positions are differentiated, in mm."""
+
+
+class Cut(NamedTuple):
+    """Free crowns of an open-cell device."""
+
+    split: Split
+    """Net of the device, split at its free crowns."""
+    is_over_opening: Bools
+    """(j,) free crowns over a neck or an ostium, where no wall holds them."""
 
 
 class _Frame(NamedTuple):
@@ -73,8 +88,25 @@ class _Frame(NamedTuple):
     """(k,) distances between these joints in the free device, in mm."""
     joint_mm: float
     """Width of a joint, in mm."""
+    weight: Floats
+    """(k,) weights of their springs."""
+    lowest_mm: Floats
+    """(c,) smallest distance of every joint from the wall into the lumen, in mm; negative where there is no wall."""
+    tips: "_Tips"
+    """Free tips of open cells."""
     keeping: csc_matrix
     """(n, 3 c) matrix of the penalties that are linear in the moves."""
+
+
+class _Tips(NamedTuple):
+    """Free tips of open cells, which continue the line of struts that leads to them."""
+
+    joints: Ints
+    """(3, t) joint before, joint and tip."""
+    outward: Floats
+    """(t, 3) unit normals of the wall at the middle joints."""
+    rest_mm: Floats
+    """(t,) second difference of the three joints along the normal on a straight tube, in mm."""
 
 
 class _Model(NamedTuple):
@@ -91,7 +123,9 @@ class _Model(NamedTuple):
         return float(self.residual @ self.residual)
 
 
-def relax(net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid) -> Floats:
+def relax(
+    net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid, cut: Cut | None = None
+) -> Floats:
     """Compute the moves that restore the strut lengths of a laser-cut device.
 
     Parameters
@@ -108,22 +142,26 @@ def relax(net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: f
         Row of joints whose mean move along the device is held at zero. A fraction lies between two rows.
     laid : callable
         Puts points of the chart on the wall.
+    cut : Cut, optional
+        Free crowns of an open-cell device; None: all crowns are joined.
 
     Returns
     -------
     (c, 3) array, mm
-        Moves of the joints along, around and off the wall (positive: into the lumen).
+        Moves of the joints along, around and off the wall (positive: into the lumen). With `cut`, of its joints.
     """
-    pairs, free_mm = _diagonals(net, length_mm, width_mm)
-    frame = _Frame(net, laid, length_mm, pairs, free_mm, joint_mm, _keeping(net, held))
-    x, inertia = np.zeros(3 * len(net.line)), INERTIA
+    if cut is None:
+        frame = _closed_frame(net, length_mm, width_mm, joint_mm, held, laid)
+    else:
+        frame = _open_frame(cut, length_mm, width_mm, joint_mm, held, laid)
+    x, inertia = np.zeros(3 * len(frame.net.line)), INERTIA
     here = _model(frame, x)
     for _ in range(STEPS):
-        tried = _stepped(here, x, inertia)
+        tried = _stepped(frame, here, x, inertia)
         there = _model(frame, tried)
         while there.cost >= here.cost and inertia < STUCK:
             inertia *= CALMING**2
-            tried = _stepped(here, x, inertia)
+            tried = _stepped(frame, here, x, inertia)
             there = _model(frame, tried)
         if there.cost >= here.cost:
             break
@@ -134,39 +172,81 @@ def relax(net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: f
     return x.reshape(-1, 3)
 
 
-def _stepped(here: _Model, x: Floats, inertia: float) -> Floats:
+def _closed_frame(
+    net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid
+) -> _Frame:
+    """Return the least-squares problem of a device whose crowns are all joined."""
+    pairs, free_mm = _diagonals(net, length_mm, width_mm)
+    none = _Tips(np.zeros((3, 0), dtype=int), np.zeros((0, 3)), np.zeros(0))
+    on_wall_mm = np.zeros(len(net.line))
+    alike, keeping = np.ones(len(free_mm)), _keeping(net, held)
+    return _Frame(net, laid, length_mm, pairs, free_mm, joint_mm, alike, on_wall_mm, none, keeping)
+
+
+def _open_frame(
+    cut: Cut, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid
+) -> _Frame:
+    """Return the least-squares problem of a device with free crowns."""
+    net, split = cut.split.net, cut.split
+    height_mm = 2 * np.sqrt(length_mm**2 - (0.5 * width_mm) ** 2)
+    free_mm = np.where(split.is_width, width_mm[split.pair_line], height_mm[split.pair_line])
+    lowest_mm = np.where(cut.is_over_opening, -OUTWARD_MM, 0.0)
+    ring = _ring(split.rings, len(net.line), np.where(split.is_free[split.rings[1]], LEVEL, BENDING))
+    keeping = _keeping(net, held, ring)
+    springs = split.pairs, free_mm, joint_mm, split.pair_weight
+    return _Frame(net, laid, length_mm, *springs, lowest_mm, _tips(split), keeping)
+
+
+def _tips(split: Split) -> _Tips:
+    """Return the free tips of a device with what they are on a straight tube."""
+    net, base = split.net, split.tips[1]
+    points_mm = positions_mm(net, np.zeros((len(net.line), 3)), as_drawn)
+    beside = net.beside.astype(int)
+    before = np.zeros(len(beside), dtype=int)
+    before[beside] = np.arange(len(beside))
+    chart = net.chart[net.row[base], net.column[base]]
+    outward = np.cross(chart[:, 6:], chart[:, 3:6])
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    around_mm = points_mm[before[base]] - 2 * points_mm[base] + points_mm[beside[base]]
+    # Neighbours on a ring are two columns away and those on a line of struts one: a quarter of the second difference.
+    return _Tips(split.tips, outward, 0.25 * np.einsum("tk,tk->t", outward, around_mm))
+
+
+def _stepped(frame: _Frame, here: _Model, x: Floats, inertia: float) -> Floats:
     """Return the moves (3 c,) after one damped step from moves x (3 c,), none of them outside the wall."""
     downhill = -here.slopes.T @ here.residual
-    free = np.flatnonzero(~_is_pressed(x, downhill))
+    free = np.flatnonzero(~_is_pressed(x, downhill, frame.lowest_mm))
     slopes = here.slopes[:, free]
     tried = x.copy()
     tried[free] += spsolve(csc_matrix(slopes.T @ slopes + inertia * identity(len(free))), downhill[free])
-    tried[2::3] = np.maximum(tried[2::3], 0.0)
+    tried[2::3] = np.maximum(tried[2::3], frame.lowest_mm)
     return tried
 
 
-def _is_pressed(x: Floats, downhill: Floats) -> Bools:
+def _is_pressed(x: Floats, downhill: Floats, lowest_mm: Floats) -> Bools:
     """Return which moves (3 c,) belong to joints on the wall that the step would push through it."""
     pressed = np.zeros(len(x), dtype=bool)
-    pressed[2::3] = (x[2::3] <= 0) & (downhill[2::3] <= 0)
+    pressed[2::3] = (x[2::3] <= lowest_mm) & (downhill[2::3] <= 0)
     return pressed
 
 
 def _model(frame: _Frame, x: Floats) -> _Model:
     """Return residuals and derivatives at moves x (3 c,)."""
     net, moves = frame.net, x.reshape(-1, 3)
-    points_mm = _points_mm(net, moves, frame.laid)
+    points_mm = positions_mm(net, moves, frame.laid)
     ways = TINY_MM * np.eye(3)
-    moved_mm = [_points_mm(net, moves + way, as_drawn) - _points_mm(net, moves - way, as_drawn) for way in ways]
+    moved_mm = [positions_mm(net, moves + way, as_drawn) - positions_mm(net, moves - way, as_drawn) for way in ways]
     change = np.stack(moved_mm, axis=1) / (2 * TINY_MM)
     strut_mm, strut_slopes = _lengths(points_mm, change, net.ends, net.bulge[net.line[net.ends[0]]])
     open_mm, open_slopes = _lengths(points_mm, change, frame.pairs, np.zeros(len(frame.free_mm)))
     ratio = open_mm / frame.free_mm
-    spring = 0.5 * SPRINGINESS * frame.free_mm * (ratio - 1 / ratio)
-    open_slopes = diags(0.5 * SPRINGINESS * (1 + 1 / ratio**2)) @ open_slopes
+    spring = frame.weight * (0.5 * SPRINGINESS * frame.free_mm * (ratio - 1 / ratio))
+    open_slopes = diags(frame.weight * (0.5 * SPRINGINESS * (1 + 1 / ratio**2))) @ open_slopes
     short_mm, short_slopes = _overlaps(frame, moves)
-    residual = np.concatenate([strut_mm - frame.length_mm, spring, short_mm, frame.keeping @ x])
-    return _Model(residual, csc_matrix(vstack([strut_slopes, open_slopes, short_slopes, frame.keeping])))
+    tip_mm, tip_slopes = _bent(points_mm, change, frame.tips)
+    residual = np.concatenate([strut_mm - frame.length_mm, spring, short_mm, frame.keeping @ x, BENDING * tip_mm])
+    slopes = [strut_slopes, open_slopes, short_slopes, frame.keeping, BENDING * tip_slopes]
+    return _Model(residual, csc_matrix(vstack(slopes)))
 
 
 def _overlaps(frame: _Frame, moves: Floats) -> tuple[Floats, coo_matrix]:
@@ -181,12 +261,23 @@ def _overlaps(frame: _Frame, moves: Floats) -> tuple[Floats, coo_matrix]:
     return short_mm, coo_matrix((values, (np.tile(near, 2), places)), shape=(n, 3 * n))
 
 
+def _bent(points_mm: Floats, change: Floats, tips: _Tips) -> tuple[Floats, coo_matrix]:
+    """Return how far tips (t,) are off the line of struts that leads to them, in mm, and the derivatives (t, 3 c)."""
+    weights = np.array([1.0, -2.0, 1.0])
+    ends_mm = np.einsum("i,itk->tk", weights, points_mm[tips.joints])
+    off_mm = np.einsum("tk,tk->t", ends_mm, tips.outward) - tips.rest_mm
+    slopes = np.einsum("i,itmk,tk->itm", weights, change[tips.joints], tips.outward)
+    number = np.tile(np.repeat(np.arange(len(off_mm)), 3), 3)
+    move = (3 * tips.joints.astype(int)[..., None] + np.arange(3)).ravel()
+    return off_mm, coo_matrix((slopes.ravel(), (number, move)), shape=(len(off_mm), 3 * len(points_mm)))
+
+
 def as_drawn(points_mm: Floats, row: Floats, column: Floats) -> Floats:
     """Return the points unchanged: a `Laid` for a chart that already lies on the wall."""
     return points_mm
 
 
-def _points_mm(net: Net, moves: Floats, laid: Laid) -> Floats:
+def positions_mm(net: Net, moves: Floats, laid: Laid) -> Floats:
     """Return the positions (c, 3) of the joints after moves (c, 3), in mm."""
     rows, columns = net.chart.shape[:2]
     along = net.row + moves[:, 0] / net.spacing[0]
@@ -226,8 +317,17 @@ def _diagonals(net: Net, length_mm: float, width_mm: Floats) -> tuple[Ints, Floa
     return pairs, np.concatenate([width_mm[net.line], height_mm[net.line[lower] + 1]])
 
 
-def _keeping(net: Net, held: float) -> csc_matrix:
-    """Return the matrix (k, 3 c) of the penalties on moves out of a row or around, on bending, and on the held row."""
+def _ring(rings: Ints, n: int, weight: Floats) -> coo_matrix:
+    """Return the weighted second differences (r, n) of n joints along rings of consecutive joints (3, r)."""
+    number = np.tile(np.arange(rings.shape[1]), 3)
+    return coo_matrix((np.concatenate([weight, -2 * weight, weight]), (number, rings.ravel())), (rings.shape[1], n))
+
+
+def _keeping(net: Net, held: float, ring: coo_matrix | None = None) -> csc_matrix:
+    """Return the matrix (k, 3 c) of the penalties on moves out of a row or around, on bending, and on the held row.
+
+    `ring` (r, c) holds the weighted second differences around the rings of an open-cell device.
+    """
     n, bends = len(net.line), net.bends.astype(int)
     member = coo_matrix((np.ones(n), (net.line, np.arange(n)))).tocsr()
     mean = diags(1 / np.bincount(net.line)) @ member
@@ -236,9 +336,10 @@ def _keeping(net: Net, held: float) -> csc_matrix:
     anchor = csc_matrix(np.maximum(1 - np.abs(lines - held), 0.0)) @ mean
     weights, number = np.repeat([1.0, -2.0, 1.0], bends.shape[1]), np.tile(np.arange(bends.shape[1]), 3)
     line = coo_matrix((weights, (number, bends.ravel())), shape=(bends.shape[1], n))
-    beside = coo_matrix((np.ones(n), (np.arange(n), net.beside.astype(int))), shape=(n, n))
-    ring = beside - 2 * identity(n) + beside.T
+    if ring is None:
+        beside = coo_matrix((np.ones(n), (np.arange(n), net.beside.astype(int))), shape=(n, n))
+        ring = BENDING * (beside - 2 * identity(n) + beside.T)
     along, around, off = (csc_matrix(np.eye(3)[[k]]) for k in range(3))
     level = [LEVEL * kron(off_row, along), LEVEL * kron(identity(n), around), kron(anchor, along)]
     smooth = [STIFFNESS * kron(line, along), STIFFNESS * kron(line, around), BENDING * kron(line, off)]
-    return csc_matrix(vstack([*level, *smooth, BENDING * kron(ring, off)]))
+    return csc_matrix(vstack([*level, *smooth, kron(ring, off)]))

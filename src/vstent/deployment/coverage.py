@@ -6,6 +6,8 @@ from typing import Final
 import numpy as np
 
 from vstent.anatomy.morphology import Measures
+from vstent.deployment.crowns import free_crowns
+from vstent.devices.design import LaserCut
 from vstent.devices.formulas import coverage_fraction, grid, mesh_rows, pore_density_per_mm2
 from vstent.devices.stent import Stent
 from vstent.geometry.surface import Surface
@@ -35,8 +37,8 @@ def coverage_fractions(stent: Stent) -> Floats:
     return covered_fractions(stent.nodes_mm, points_mm[here], points_mm[here + 1], radius_mm, SAMPLES_PER_QUAD)
 
 
-def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats]:
-    """Compute the area and the center of every whole pore.
+def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats, Floats]:
+    """Compute the area, the center and the number of every whole pore.
 
     Pores lie where the lattice has no junction. Each fills half of the four lattice cells around it. The wires of an
     outer layer do not divide them, and its ends without a mesh have none.
@@ -52,6 +54,8 @@ def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats]:
         Areas of the pores.
     centers_mm : (p, 3) array, mm
         Centers of the pores.
+    number : (p,) array
+        1; less by 0.5 for each free crown of open cells beside a pore, which leaves two of them joined.
     """
     shape = grid(stent.design, stent.size)
     lattice_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
@@ -64,7 +68,11 @@ def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats]:
     row, column = np.meshgrid(np.arange(1, shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
     first, last = mesh_rows(stent.design, stent.size)
     is_pore = ((row + column) % 2 == 1) & (row > first) & (row < last)
-    return area_mm2[is_pore], lattice_mm[1:-1][is_pore]
+    number = np.ones(is_pore.shape)
+    if isinstance(stent.design, LaserCut):
+        is_free = free_crowns(stent.design, shape)[1:-1]
+        number -= 0.5 * (np.roll(is_free, 1, axis=1).astype(float) + np.roll(is_free, -1, axis=1))
+    return area_mm2[is_pore], lattice_mm[1:-1][is_pore], number[is_pore]
 
 
 def density(anatomy: Anatomy, stent: Stent) -> Measures:
@@ -87,7 +95,7 @@ def density(anatomy: Anatomy, stent: Stent) -> Measures:
     quads_mm = (quads_mm + np.roll(quads_mm, -1, axis=1)).reshape(-1, 3)
     covered, quad_mm2 = coverage_fractions(stent), quad_areas_mm2(stent)
     hidden, area_mm2 = covered.ravel(), quad_mm2.ravel()
-    pore_mm2, pores_mm = pore_areas_mm2(stent)
+    pore_mm2, pores_mm, pores = pore_areas_mm2(stent)
     mesh = slice(*stent.mesh_nodes)
     diameter_mm = float(stent.row_diameter_mm[mesh.start : mesh.stop + 1].mean())
     found: Measures = {
@@ -96,14 +104,14 @@ def density(anatomy: Anatomy, stent: Stent) -> Measures:
         "pore_density_formula_per_mm2": pore_density_per_mm2(stent.design, stent.size, diameter_mm),
     }
     if len(pores_mm):
-        found["pore_density_per_mm2"] = float(len(pore_mm2) / pore_mm2.sum())
+        found["pore_density_per_mm2"] = float(pores.sum() / pore_mm2.sum())
     if anatomy.aneurysms:
         on_neck = is_over_neck(anatomy, quads_mm)
         if on_neck.any():
             found["neck_metal_coverage_fraction"] = float(np.average(hidden[on_neck], weights=area_mm2[on_neck]))
         on_neck = is_over_neck(anatomy, pores_mm)
         if on_neck.any():
-            found["neck_pore_density_per_mm2"] = float(on_neck.sum() / pore_mm2[on_neck].sum())
+            found["neck_pore_density_per_mm2"] = float(pores[on_neck].sum() / pore_mm2[on_neck].sum())
     return found
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from vstent.deployment import sizing, wires
 from vstent.deployment.advice import Gaps, advise
 from vstent.deployment.braid import ConstantWire
+from vstent.deployment.crowns import shifts_mm
 from vstent.deployment.evenly_spaced import Zhong2016
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, laid_inside, run
 from vstent.deployment.wall import landing_wall
@@ -88,8 +89,9 @@ def deploy(
 
     course = laid_inside(opened_at, propose_landing(design, anatomy, size)) if landing is None else opened_at(landing)
     nodes_mm = course.opened.contour.nodes_mm
-    drawn = wires.draw(design, size, nodes_mm, wall)
-    stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, drawn.points_mm, drawn.starts, drawn.diameter_um)
+    crowns = course.opened.crowns
+    drawn = wires.draw(design, size, nodes_mm, wall, crowns)
+    stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, *drawn, shifts_mm(crowns))
     contact = wall.contact(nodes_mm.reshape(-1, 3))
     gap_mm = np.maximum(contact.distance_mm - chosen.contour.dd_mm, 0.0).reshape(nodes_mm.shape[:2])
     is_at_patient = is_patient[contact.face].reshape(gap_mm.shape)

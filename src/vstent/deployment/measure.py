@@ -8,8 +8,9 @@ from vstent.anatomy.landing_zones import neck_points_mm, neck_span_mm
 from vstent.anatomy.morphology import Measures
 from vstent.deployment.apposition import apposition
 from vstent.deployment.coverage import density
+from vstent.deployment.crowns import free_crowns
 from vstent.deployment.sizing import oversizing_fraction
-from vstent.devices.design import piece_length_mm
+from vstent.devices.design import LaserCut, piece_length_mm
 from vstent.devices.formulas import grid
 from vstent.devices.stent import Deployment, Stent
 from vstent.geometry.vessel import Anatomy
@@ -44,6 +45,7 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
         | apposition(anatomy, deployment)
         | density(anatomy, deployment.stent)
         | _stretch(deployment.stent)
+        | _free_crowns(anatomy, deployment.stent)
         | _branches(anatomy, deployment.stent)
         | {
             "iterations_count": float(len(deployment.terminated_fraction)),
@@ -99,8 +101,11 @@ def wire_stretches(stent: Stent) -> Floats:
     junctions_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
     row, column = np.meshgrid(np.arange(shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
     row, column = row[(row + column) % 2 == 0], column[(row + column) % 2 == 0]
-    ends_mm = [junctions_mm[row + 1, (column + hand) % shape.lattice_columns] for hand in (1, -1)]
-    length_mm = np.linalg.norm(np.stack(ends_mm) - junctions_mm[row, column], axis=2).ravel()
+    lower_mm = upper_mm = junctions_mm
+    if stent.crown_shift_mm.size:
+        upper_mm, lower_mm = junctions_mm + stent.crown_shift_mm
+    ends_mm = [upper_mm[row + 1, (column + hand) % shape.lattice_columns] for hand in (1, -1)]
+    length_mm = np.linalg.norm(np.stack(ends_mm) - lower_mm[row, column], axis=2).ravel()
     return length_mm / piece_length_mm(stent.design, stent.size) - 1
 
 
@@ -110,6 +115,25 @@ def _stretch(stent: Stent) -> Measures:
     return {
         "mean_wire_stretch_fraction": float(stretch.mean()),
         "p95_wire_stretch_fraction": float(np.quantile(np.abs(stretch), 0.95)),
+    }
+
+
+def _free_crowns(anatomy: Anatomy, stent: Stent) -> Measures:
+    """Return the number of free crowns, and how far the farthest ones point out of the artery and into the lumen."""
+    if not stent.crown_shift_mm.size or not isinstance(stent.design, LaserCut):
+        return {}
+    shape = grid(stent.design, stent.size)
+    is_free = free_crowns(stent.design, shape)
+    nodes_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split][is_free]
+    tips_mm = (nodes_mm + stent.crown_shift_mm[:, is_free]).reshape(-1, 3)
+    middle_mm = np.tile(stent.nodes_mm.mean(axis=1)[:: shape.row_split][np.nonzero(is_free)[0]], (2, 1))
+    distance_mm = anatomy.landing_surface.closest(tips_mm)[1]
+    is_outside = anatomy.landing_surface.crosses(middle_mm, tips_mm)
+    from_wall_mm = distance_mm - stent.design.wall_offset_um * MM_PER_UM
+    return {
+        "free_crowns_count": float(len(tips_mm)),
+        "max_crown_outward_mm": float(np.where(is_outside, distance_mm, 0.0).max(initial=0.0)),
+        "max_crown_inward_mm": float(np.where(is_outside, 0.0, from_wall_mm).max(initial=0.0)),
     }
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from vstent.deployment.active_contour import ActiveContour, State
 from vstent.deployment.contour import Planes, circles, planes
+from vstent.deployment.crowns import Crowns
 from vstent.deployment.wall import TREE, AbstractWall
 from vstent.devices.design import Design, Size
 from vstent.devices.formulas import grid
@@ -98,6 +99,8 @@ class Opened:
     """Its contour."""
     abscissa_mm: Floats
     """(rows,) arc length of every row on the parent axis, in mm."""
+    crowns: Crowns | None = None
+    """Free crowns of an open-cell device, once it is deployed."""
 
 
 @dataclass(frozen=True, eq=False)

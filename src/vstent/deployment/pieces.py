@@ -20,10 +20,11 @@ import numpy as np
 
 from vstent.deployment import cells
 from vstent.deployment.contour import normals
+from vstent.deployment.crowns import Crowns, free_crowns, split
 from vstent.devices.design import Braid, Design, LaserCut, Size, piece_length_mm
 from vstent.devices.formulas import Grid, free_diameters_mm, grid, row_spacing_mm
 from vstent.kernels import net
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM
 
 RESISTANCE: Final = 0.01
@@ -53,9 +54,13 @@ class Slid(NamedTuple):
     """(rows, columns) fractional column of the original contour at which each node lies."""
     lift_mm: Floats
     """(rows, columns, 3) displacement of each node from the wall into the lumen, in mm; not included in `nodes_mm`."""
+    crowns: Crowns | None = None
+    """Free crowns of an open-cell device."""
 
 
-def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.Laid) -> Slid:
+def slide(
+    design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.Laid, is_opening: Bools | None = None
+) -> Slid:
     """Move the crossings of a device along its contour until the pieces of wire have their length.
 
     Nodes between crossings move with them.
@@ -72,6 +77,8 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.L
         Row of nodes whose mean position along the device stays the same.
     laid : callable
         Puts points between the contour's nodes on the wall. Only laser-cut devices use it.
+    is_opening : (rows, columns) array of bool, optional
+        Nodes over a neck or an ostium, where free crowns of open cells may leave the artery.
 
     Returns
     -------
@@ -98,15 +105,19 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.L
         lattice.gaps,
     )
     length_mm, held_line = piece_length_mm(design, size), held / shape.row_split
+    crowns = None
     if isinstance(design, LaserCut):
+
+        def on_wall(points_mm: Floats, row: Floats, column: Floats) -> Floats:
+            return laid(points_mm, row - 1, column)
+
         free_mm = free_diameters_mm(design, size)[:: shape.row_split]
         width_mm = free_mm * np.sin(2 * np.pi / design.n_columns)
         joint_mm = 2 * design.strut_width_um * MM_PER_UM  # two struts, side by side
-
-        def put(points_mm: Floats, row: Floats, column: Floats) -> Floats:
-            return laid(points_mm, row - 1, column)
-
-        moves_mm = cells.relax(pieces, length_mm, width_mm, joint_mm, held_line, put)
+        cut = _cut(design, shape, pieces, is_opening) if design.joined_crowns else None
+        moves_mm = cells.relax(pieces, length_mm, width_mm, joint_mm, held_line, on_wall, cut)
+        if cut is not None:
+            moves_mm, crowns = _parted(pieces, cut, moves_mm, on_wall, shape)
     else:
         weights = net.Weights(
             length_mm, RESISTANCE, CROWDING, STIFFNESS, round(held_line), _shortest_cell_mm(design, size)
@@ -115,7 +126,34 @@ def slide(design: Design, size: Size, nodes_mm: Floats, held: int, laid: cells.L
     rows, columns, off_mm = (_spread(moves, lattice, shape) for moves in (moves_mm / [*spacing_mm, 1.0]).T)
     row, column = np.arange(shape.rows)[:, None] + rows - rows[held].mean(), np.arange(shape.columns) + columns
     lift_mm = -off_mm[..., None] * _bilinear(normals(continued_mm), row + 1, column)
-    return Slid(_bilinear(continued_mm, row + 1, column), row, column, lift_mm)
+    return Slid(_bilinear(continued_mm, row + 1, column), row, column, lift_mm, crowns)
+
+
+def _cut(design: LaserCut, shape: Grid, pieces: net.Net, is_opening: Bools | None) -> cells.Cut:
+    """Return the free crowns of an open-cell device."""
+    line, column = pieces.line.astype(int), pieces.column // shape.column_split
+    divided = split(pieces, free_crowns(design, shape)[line, column])
+    if is_opening is None:
+        return cells.Cut(divided, np.zeros(len(divided.crossing), dtype=bool))
+    is_over = is_opening[pieces.row - 1, pieces.column][divided.crossing]
+    return cells.Cut(divided, divided.is_free & is_over)
+
+
+def _parted(
+    pieces: net.Net, cut: cells.Cut, moves_mm: Floats, on_wall: cells.Laid, shape: Grid
+) -> tuple[Floats, Crowns]:
+    """Return the moves (c, 3) of the crossings, in mm, and the free crowns relative to them."""
+    crown = cut.split.crown
+    mean_mm = 0.5 * (moves_mm[crown[0]] + moves_mm[crown[1]])
+    mean_mm[:, 2] = np.maximum(mean_mm[:, 2], 0.0)  # the contour of the device stays in the artery
+    at_mm = cells.positions_mm(pieces, mean_mm, on_wall)
+    tips_mm = cells.positions_mm(cut.split.net, moves_mm, on_wall)
+    line, column = pieces.line.astype(int), pieces.column // shape.column_split
+    shift_mm = np.zeros((2, shape.lattice_rows, shape.lattice_columns, 3))
+    shift_mm[:, line, column] = tips_mm[crown] - at_mm
+    is_over_opening = np.zeros(shift_mm.shape[1:3], dtype=bool)
+    is_over_opening[line, column] = cut.is_over_opening[crown[0]]
+    return mean_mm, Crowns(shift_mm, is_over_opening)
 
 
 def _shortest_cell_mm(design: Braid, size: Size) -> float:

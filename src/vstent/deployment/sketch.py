@@ -13,11 +13,12 @@ from typing import Final, final
 import numpy as np
 
 from vstent.deployment import cells, pieces
-from vstent.deployment.braid import FreeDiameter, Profile, expected_profile, landed_row, march
+from vstent.deployment.braid import FreeDiameter, Profile, expected_profile, landed_row, march, over_openings
 from vstent.deployment.contour import Planes, circles, evenly_spaced, perimeters, planes
+from vstent.deployment.crowns import shifts_mm
 from vstent.deployment.method import check_inside, check_landing
 from vstent.deployment.wall import AbstractWall, Contact
-from vstent.deployment.wires import Wires, draw
+from vstent.deployment.wires import draw
 from vstent.devices.design import Design, Size
 from vstent.devices.formulas import free_diameters_mm, grid
 from vstent.devices.stent import Landing, Stent
@@ -48,6 +49,8 @@ class Bed:
     """(k, columns, 2) plane coordinates of the device's contour on every ring, in mm."""
     gap_mm: Floats
     """(k, columns) gap between the outer face of the device and the wall, in mm."""
+    is_opening: Bools
+    """(k, columns) whether a neck or an ostium lies there."""
     expected: Profile
     """Expected profile. Its curvature sets the row spacing."""
     diameter_band_mm: float
@@ -109,7 +112,9 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     nodes_mm = across.place(abscissa_mm, in_plane_mm).reshape(-1, 3)
     gap_mm = np.maximum(anatomy.landing_surface.closest(nodes_mm)[1] - dd_mm, 0.0).reshape(-1, columns)
     band_mm = anatomy.vessel.threshold_band_mm or ASSUMED_BAND_MM
-    return Bed(design, size, across, abscissa_mm, in_plane_mm, gap_mm, expected_profile(design, size, anatomy), band_mm)
+    is_opening = over_openings(anatomy, nodes_mm).reshape(gap_mm.shape)
+    expected = expected_profile(design, size, anatomy)
+    return Bed(design, size, across, abscissa_mm, in_plane_mm, gap_mm, is_opening, expected, band_mm)
 
 
 def sketch(wall: Bed, landing: Landing) -> Sketch:
@@ -141,13 +146,15 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
     if size.free_profile_mm:
         laid = _no_wider(laid, free_diameters_mm(design, size))
     held = landed_row(design, size, landing)
-    slid = pieces.slide(design, size, wall.across.place(rows_mm, laid[..., :2]), held, cells.as_drawn)
+    is_opening = wall.is_opening[np.abs(np.subtract.outer(rows_mm, wall.abscissa_mm)).argmin(axis=1)]
+    nodes_mm = wall.across.place(rows_mm, laid[..., :2])
+    slid = pieces.slide(design, size, nodes_mm, held, cells.as_drawn, is_opening)
     rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), rows_mm, slid.row.mean(axis=1))
     near = np.clip(np.rint(slid.row).astype(int), 0, len(rows_mm) - 1)
     gap_mm = np.take_along_axis(laid[..., 2], near, axis=0) + np.linalg.norm(slid.lift_mm, axis=2)
     nodes_mm = slid.nodes_mm + slid.lift_mm
-    wires = _wires(wall, nodes_mm)
-    stent = Stent(design, size, nodes_mm, rows_mm, wires.points_mm, wires.starts, wires.diameter_um)
+    wires = draw(design, size, nodes_mm, _Nothing(), slid.crowns)
+    stent = Stent(design, size, nodes_mm, rows_mm, *wires, shifts_mm(slid.crowns))
     moved_mm = (rows_mm - marched_mm)[[0, -1]]
     ends_mm = [_ends_mm(wall, landing, sense * wall.diameter_band_mm) + moved_mm for sense in (-1, 1)]
     (first, last), (other_first, other_last) = (ends.tolist() for ends in ends_mm)
@@ -168,11 +175,6 @@ def _no_wider(laid_mm: Floats, free_mm: Floats) -> Floats:
     moved_mm = (share - 1) * (laid_mm[..., :2] - middle_mm)
     gap_mm = laid_mm[..., 2:] + np.linalg.norm(moved_mm, axis=2, keepdims=True)
     return np.concatenate([laid_mm[..., :2] + moved_mm, gap_mm], axis=2)
-
-
-def _wires(wall: Bed, nodes_mm: Floats) -> Wires:
-    """Return the wires of the device as polylines on the surface of its contour."""
-    return draw(wall.design, wall.size, nodes_mm, _Nothing())
 
 
 @final

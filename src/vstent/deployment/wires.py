@@ -8,11 +8,12 @@ from scipy.ndimage import spline_filter1d
 from scipy.sparse import csr_matrix
 
 from vstent.deployment.contour import normals
+from vstent.deployment.crowns import Crowns, free_crowns
 from vstent.deployment.wall import AbstractWall
 from vstent.devices.design import Braid, Design, LaserCut, Size, Strands, angle_rad, piece_length_mm
-from vstent.devices.formulas import Grid, grid, mesh_rows
+from vstent.devices.formulas import Grid, grid, mesh_rows, row_spacing_mm
 from vstent.kernels import curves
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM
 
 POINT_SPACING_MM = 0.1
@@ -38,11 +39,11 @@ class Wires(NamedTuple):
     """(w,) wire diameter or strut width of every polyline, in um."""
 
 
-def draw(design: Design, size: Size, nodes_mm: Floats, wall: AbstractWall) -> Wires:
+def draw(design: Design, size: Size, nodes_mm: Floats, wall: AbstractWall, crowns: Crowns | None = None) -> Wires:
     """Draw the wires of a device on its contour.
 
     The outer face of a wire never passes the wall. Where it would, the axis is moved to half the wire's depth from the
-    wall.
+    wall. Free crowns over a neck or an ostium may leave the artery.
 
     Parameters
     ----------
@@ -54,6 +55,8 @@ def draw(design: Design, size: Size, nodes_mm: Floats, wall: AbstractWall) -> Wi
         Nodes of the contour.
     wall : AbstractWall
         Wall of the artery.
+    crowns : Crowns, optional
+        Free crowns of an open-cell device; None: they lie where they would be joined.
 
     Returns
     -------
@@ -63,9 +66,11 @@ def draw(design: Design, size: Size, nodes_mm: Floats, wall: AbstractWall) -> Wi
     shape = grid(design, size)
     if isinstance(design, Braid):
         wires, depth_mm = _braid(design, size, shape, nodes_mm)
-    else:
-        wires, depth_mm = _laser_cut(design, shape, nodes_mm)
-    return wires._replace(points_mm=_kept_inside(wires.points_mm, 0.5 * depth_mm, wall))
+        return wires._replace(points_mm=_kept_inside(wires.points_mm, 0.5 * depth_mm, wall))
+    wires, is_out = _laser_cut(design, size, shape, nodes_mm, crowns)
+    clearance_mm = np.full(len(is_out), 0.5 * design.strut_thickness_um * MM_PER_UM)
+    kept_mm = _kept_inside(wires.points_mm, clearance_mm, wall)
+    return wires._replace(points_mm=np.where(is_out[:, None], wires.points_mm, kept_mm))
 
 
 def _kept_inside(points_mm: Floats, clearance_mm: Floats, wall: AbstractWall) -> Floats:
@@ -198,6 +203,10 @@ def _strands(design: Braid, size: Size, strands: Strands, spline: Floats, sample
     """Return strands of a braid: a layer around the mesh, or beside wires of the mesh and woven with them."""
     shape = grid(design, size)
     ends = (0, shape.lattice_rows - 1) if strands.beyond_mm else mesh_rows(design, size)
+    if (
+        design.has_closed_ends and ends[1] > ends[0] + 3
+    ):  # strands end before the loops, which lie in the middle of the mesh
+        ends = ends[0] + 1, ends[1] - 1
     fraction = ends[0] + np.arange((ends[1] - ends[0]) * samples + 1) / samples
     apart = 2 * design.n_wires / strands.count
     shift, layer_um, period = _between(design, size, strands, apart)
@@ -265,22 +274,47 @@ def _eased(values: Floats, position: Floats) -> Floats:
     return (1 - share) * values[:, i] + share * values[:, i + 1]
 
 
-def _laser_cut(design: LaserCut, shape: Grid, nodes_mm: Floats) -> tuple[Wires, Floats]:
-    """Return zigzag rings between lattice rows, each a closed polyline, and their strut thickness (p,) in mm."""
+def _laser_cut(
+    design: LaserCut, size: Size, shape: Grid, nodes_mm: Floats, crowns: Crowns | None
+) -> tuple[Wires, Bools]:
+    """Return zigzag rings between lattice rows, each a closed polyline, and which points (p,) leave the artery."""
     # The crowns of ring j lie on row j, on the columns whose parity is that of j, and on row j + 1, where they meet
     # the crowns of ring j + 1. Crowns are rounded to parabolas. The outer face of the struts lies on the wall.
     rings, n = shape.lattice_rows - 1, shape.lattice_columns
     column = np.arange(n * POINTS_PER_STRUT + 1) / POINTS_PER_STRUT
     ring = np.arange(rings)[:, None]
     rise = _rounded_zigzag(column + ring % 2)
+    strut = _struts(shape, column)
+    free = free_crowns(design, shape)
+    if free.any():  # a free crown ends short of where it would be joined
+        short = 0.5 * design.crown_gap_um * MM_PER_UM / float(row_spacing_mm(design, size, size.diameter_mm))
+        low, high = short * free[ring, strut[0]], 1 - short * free[ring + 1, strut[1]]
+        rise = low + (high - low) * rise
     along = (ring + rise) * shape.row_split
     around = np.broadcast_to(column * shape.column_split, along.shape)
     base_mm, normal = _drawn(_spline(nodes_mm), _samples(shape, along.ravel(), around.ravel()))
     outward_mm = (design.wall_offset_um - 0.5 * design.strut_thickness_um) * MM_PER_UM
+    points_mm, is_out = base_mm + outward_mm * normal, np.zeros(len(base_mm), dtype=bool)
+    if crowns is not None:
+        shift_mm, is_out = _shifted(crowns, ring, strut, rise, normal)
+        points_mm = points_mm + shift_mm
     starts = np.arange(rings + 1, dtype=np.int32) * len(column)
-    width_um = np.full(rings, design.strut_width_um)
-    depth_mm = np.full(len(base_mm), design.strut_thickness_um * MM_PER_UM)
-    return Wires(base_mm + outward_mm * normal, starts, width_um), depth_mm
+    return Wires(points_mm, starts, np.full(rings, design.strut_width_um)), is_out
+
+
+def _struts(shape: Grid, column: Floats) -> Ints:
+    """Return the columns (2, rings, p) of the lower and the upper crown of the strut at columns (p,) of every ring."""
+    k = np.minimum(column.astype(int), shape.lattice_columns - 1)
+    is_low = (k + np.arange(shape.lattice_rows - 1)[:, None]) % 2 == 0
+    return np.where([is_low, ~is_low], k, k + 1) % shape.lattice_columns
+
+
+def _shifted(crowns: Crowns, ring: Ints, strut: Ints, rise: Floats, normal: Floats) -> tuple[Floats, Bools]:
+    """Return the displacement (p, 3) of points on struts with free crowns, and which points leave the artery (p,)."""
+    lower_mm, upper_mm = crowns.shift_mm[1, ring, strut[0]], crowns.shift_mm[0, ring + 1, strut[1]]
+    shift_mm = ((1 - rise)[..., None] * lower_mm + rise[..., None] * upper_mm).reshape(-1, 3)
+    is_beside = crowns.is_over_opening[ring, strut[0]] | crowns.is_over_opening[ring + 1, strut[1]]
+    return shift_mm, is_beside.ravel() & (np.einsum("pk,pk->p", shift_mm, normal) > 0)
 
 
 def _rounded_zigzag(x: Floats) -> Floats:

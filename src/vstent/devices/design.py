@@ -234,6 +234,12 @@ class LaserCut:
         """Length of each end of the device without a mesh, in mm: none."""
         return 0.0
 
+    @property
+    def joined_fraction(self) -> float:
+        """Fraction of the crowns between two rings that are joined."""
+        shares = [text.count("1") / len(text) for text in self.joined_crowns]
+        return sum(shares) / len(shares) if shares else 1.0
+
     def is_joined(self, row: int, crown: int) -> bool:
         """Return whether a crown on a row between two rings is joined; both are counted from 0."""
         if not self.joined_crowns:

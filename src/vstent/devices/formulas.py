@@ -216,7 +216,8 @@ def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
 
     With f = sum of the wire diameters of one hand / (pi D cos(alpha)), the two hands of a braid cover 1 - (1 - f)^2.
     An outer layer leaves the fraction (1 - g)^2 of the rest open, g being the same for its wires. For laser-cut struts,
-    which meet without crossing, f counts all struts and is the coverage.
+    which meet without crossing, f counts all struts and is the coverage; free crowns of open cells are shorter by half
+    of the gap between them.
 
     Parameters
     ----------
@@ -234,7 +235,8 @@ def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
     """
     strips = min(1.0, strips_fraction(design, size, diameter_mm))
     if isinstance(design, LaserCut):
-        return strips
+        spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
+        return strips * (1 - (1 - design.joined_fraction) * design.crown_gap_um * MM_PER_UM / spacing_mm)
     per_axis_mm = np.pi * diameter_mm * float(np.cos(angle_rad(design, size, diameter_mm)))
     outside = (one.count * one.diameter_um for one in design.strands if one.place == "outside")
     layer = min(1.0, 0.5 * sum(outside) * MM_PER_UM / per_axis_mm)
@@ -243,6 +245,8 @@ def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
 
 def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> float:
     """Compute the number of pores per area of wall at a local diameter: 2 (n/2)^2 tan(alpha) / (pi D)^2.
+
+    A free crown of open cells leaves two pores joined, so the number is multiplied by the fraction of joined crowns.
 
     Parameters
     ----------
@@ -259,4 +263,5 @@ def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> floa
         Pore density, per mm2.
     """
     tangent = float(np.tan(angle_rad(design, size, diameter_mm)))
-    return float(0.5 * design.n_columns**2 * tangent / (np.pi * diameter_mm) ** 2)
+    joined = design.joined_fraction if isinstance(design, LaserCut) else 1.0
+    return float(joined * 0.5 * design.n_columns**2 * tangent / (np.pi * diameter_mm) ** 2)

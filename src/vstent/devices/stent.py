@@ -1,6 +1,6 @@
 """Data classes of a device in an artery: `Landing`, `Stent` and `Deployment`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, Literal, get_args
 
@@ -53,6 +53,9 @@ class Stent:
     """(w + 1,) first point of every polyline, followed by p."""
     wire_diameter_um: Floats
     """(w,) wire diameter, or strut width of a laser-cut device, of every polyline, in um."""
+    crown_shift_mm: Floats = field(default_factory=lambda: np.zeros((2, 0, 0, 3)))
+    """(2, lattice rows, lattice columns, 3) displacement of the crowns of the ring below and of the ring above from the
+    node at which they would be joined, in mm; empty unless the device has open cells."""
 
     def __post_init__(self) -> None:
         freeze(self, "nodes_mm", np.float64, (-1, -1, 3))
@@ -60,6 +63,7 @@ class Stent:
         freeze(self, "wire_points_mm", np.float64, (-1, 3))
         freeze(self, "wire_starts", np.int32, (-1,))
         freeze(self, "wire_diameter_um", np.float64, (len(self.wire_starts) - 1,))
+        freeze(self, "crown_shift_mm", np.float64, (2, -1, -1, 3))
 
     @cached_property
     def contour(self) -> Surface:

@@ -167,7 +167,8 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     ),
     "pore_density_formula_per_mm2": Definition(
         "Pore density, formula",
-        "At the mean deployed diameter D, for n wires at an angle a to the axis: 2 (n/2)² tan(a) / (pi D)².",
+        "At the mean deployed diameter D, for n wires at an angle a to the axis: 2 (n/2)² tan(a) / (pi D)²; for open "
+        "cells times the fraction of joined crowns.",
     ),
     "neck_pore_density_per_mm2": Definition(
         "Pore density on the neck", ("Number of pores per area of the device over the neck.")
@@ -191,6 +192,17 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     ),
     "p95_wire_stretch_fraction": Definition(
         "Wire stretch, 95 %", "95 % of the wires between crossings change their length by less than this."
+    ),
+    "free_crowns_count": Definition(
+        "Free crowns", "Number of crowns of an open-cell device that are joined to no other."
+    ),
+    "max_crown_outward_mm": Definition(
+        "Free crown outside the artery, largest",
+        "Largest distance of the tip of a free crown outside the landing surface, over a neck or an ostium.",
+    ),
+    "max_crown_inward_mm": Definition(
+        "Free crown in the lumen, largest",
+        "Largest clearance between the outer face of a free crown's tip and the landing surface.",
     ),
     # the flow
     "inlet_flow_mL_s": Definition("Inlet flow", "Flow of blood through the inlet."),
