@@ -303,9 +303,9 @@ def _check_crowns(design: LaserCut) -> None:
     """Raise a DeviceError if the pattern of joined crowns is no pattern, or leaves rings unconnected."""
     around = design.n_columns // 2
     for text in design.joined_crowns:
-        if not text or set(text) - set("01") or around % len(text):
+        if set(text) - set("01") or len(text) > around:
             raise DeviceError(
-                f"{design.name} has the pattern {text!r} of joined crowns. Give 0 and 1, as many as divide its "
+                f"{design.name} has the pattern {text!r} of joined crowns. Give 0 and 1, at most one for each of its "
                 f"{around} crowns around."
             )
         if "1" not in text:

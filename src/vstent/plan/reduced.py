@@ -19,7 +19,7 @@ import numpy as np
 from vstent.deployment.braid import FREELY, Profile, expected_profile, march
 from vstent.deployment.coverage import is_over_neck, quad_areas_mm2
 from vstent.devices.design import Design, LaserCut, Size, piece_length_mm
-from vstent.devices.formulas import grid
+from vstent.devices.formulas import free_diameters_mm, grid
 from vstent.devices.stent import Deployment, Landing
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints
@@ -108,7 +108,7 @@ class Reduced:
     def _profile(self, design: Design, size: Size) -> Profile:
         """Return the diameter of the contour of a device along the artery."""
         offset_mm = 2 * design.wall_offset_um * MM_PER_UM
-        return replace(self._wall, diameter_mm=np.minimum(self._wall.diameter_mm - offset_mm, size.free_diameter_mm))
+        return replace(self._wall, diameter_mm=np.minimum(self._wall.diameter_mm - offset_mm, size.widest_mm))
 
     @cached_property
     def _nominal(self) -> Profile:
@@ -122,7 +122,7 @@ class Reduced:
         expected = expected_profile(stent.design, stent.size, self.anatomy)
         artery = replace(expected, diameter_mm=2 * self.anatomy.section_radius_mm)
         seen_mm = stent.row_diameter_mm + 2 * stent.design.wall_offset_um * MM_PER_UM
-        is_free = stent.row_diameter_mm >= FREELY * stent.size.free_diameter_mm
+        is_free = stent.row_diameter_mm >= FREELY * free_diameters_mm(stent.design, stent.size)
         return artery.corrected(rows_mm, np.where(is_free, np.maximum(artery.at(rows_mm), seen_mm), seen_mm))
 
     @cached_property
@@ -163,16 +163,23 @@ class Reduced:
         height_mm = neck.height_mm * taller[neck.station]
         piece_mm = longer * np.hypot(neck.height_mm, neck.width_mm)
         width_mm = np.sqrt(np.maximum(piece_mm**2 - height_mm**2, (NARROWEST * piece_mm) ** 2))
-        strips = np.minimum(0.5 * _strip_mm(design) * piece_mm / (width_mm * height_mm), 1.0)
-        covered = strips if isinstance(design, LaserCut) else 1 - (1 - strips) ** 2
+        per_mm = 0.5 * piece_mm / (width_mm * height_mm)
+        strips, layer = (np.minimum(one_mm * per_mm, 1.0) for one_mm in _strips_mm(design))
+        covered = strips if isinstance(design, LaserCut) else 1 - (1 - strips) ** 2 * (1 - layer) ** 2
         pores_per_mm2 = 0.5 / (width_mm * height_mm)
         return float(np.average(covered, weights=neck.area_mm2)), float(
             np.average(pores_per_mm2, weights=neck.area_mm2)
         )
 
 
-def _strip_mm(design: Design) -> float:
-    """Return the mean diameter of the wires, or the width of the struts of both directions, in mm."""
+def _strips_mm(design: Design) -> tuple[float, float]:
+    """Return the wires per column of the mesh and of an outer layer, or the struts of both directions, in mm."""
     if isinstance(design, LaserCut):
-        return 2 * design.strut_width_um * MM_PER_UM
-    return sum(count * diameter_um for count, diameter_um in design.wires) / design.n_wires * MM_PER_UM
+        return 2 * design.strut_width_um * MM_PER_UM, 0.0
+    outside = [(one.count, one.diameter_um) for one in design.strands if one.place == "outside"]
+    beside = [(one.count, one.diameter_um) for one in design.strands if one.place == "beside"]
+    mesh_mm, layer_mm = (
+        sum(count * diameter_um for count, diameter_um in wires) / design.n_wires * MM_PER_UM
+        for wires in ([*design.wires, *beside], outside)
+    )
+    return mesh_mm, layer_mm
