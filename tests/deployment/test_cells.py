@@ -90,7 +90,7 @@ def test_in_a_straight_tube_no_cell_moves():
 
 
 def asked(monkeypatch):
-    """What the joints of the bend are asked: (net, length, width, joint, held, laid)."""
+    """What the joints of the bend are asked: (net, length, width, joint, held, laid, None)."""
     seen = []
     monkeypatch.setattr(cells, "relax", lambda *question: seen.append(question) or np.zeros((len(question[0].line), 3)))
     deploy(ENTERPRISE, bend(), size=SIZE)
@@ -98,9 +98,8 @@ def asked(monkeypatch):
     return seen[0]
 
 
-def framed(net, length_mm, width_mm, joint_mm, held, laid):
-    pairs, free_mm = cells._diagonals(net, length_mm, width_mm)
-    return cells._Frame(net, laid, length_mm, pairs, free_mm, joint_mm, cells._keeping(net, held))
+def framed(*question):
+    return cells._closed_frame(*question[:6])
 
 
 def test_the_joints_lie_where_an_independent_minimiser_puts_them(monkeypatch):

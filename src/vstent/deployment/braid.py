@@ -10,7 +10,7 @@ from vstent.deployment import pieces
 from vstent.deployment.active_contour import State
 from vstent.deployment.contour import evenly_spaced, perimeters, planes
 from vstent.deployment.method import AbstractMethod, Opened, Placement, check_inside
-from vstent.devices.design import Design, LaserCut, Size
+from vstent.devices.design import Design, LaserCut, Size, widest_mm
 from vstent.devices.formulas import free_diameters_mm, grid, row_spacing_mm
 from vstent.devices.stent import Landing, row_diameters_mm
 from vstent.geometry.vessel import Anatomy
@@ -103,7 +103,7 @@ def expected_profile(design: Design, size: Size, anatomy: Anatomy) -> Profile:
         Expected diameter along the parent axis, with its curvature for a braid.
     """
     offset_mm = design.wall_offset_um * MM_PER_UM
-    diameter_mm = np.minimum(2 * (anatomy.section_radius_mm - offset_mm), size.widest_mm)
+    diameter_mm = np.minimum(2 * (anatomy.section_radius_mm - offset_mm), widest_mm(design, size))
     if isinstance(design, LaserCut):
         return Profile(anatomy.axis.abscissa_mm, diameter_mm)
     return Profile(anatomy.axis.abscissa_mm, diameter_mm, bend(anatomy))

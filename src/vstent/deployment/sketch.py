@@ -19,7 +19,7 @@ from vstent.deployment.crowns import shifts_mm
 from vstent.deployment.method import check_inside, check_landing
 from vstent.deployment.wall import AbstractWall, Contact
 from vstent.deployment.wires import draw
-from vstent.devices.design import Design, Size
+from vstent.devices.design import Design, Size, widest_mm
 from vstent.devices.formulas import free_diameters_mm, grid
 from vstent.devices.stent import Landing, Stent
 from vstent.geometry.vessel import Anatomy
@@ -99,7 +99,7 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     abscissa_mm = np.linspace(0.0, axis.length_mm, max(8, round(axis.length_mm / STEP_MM) + 1))
     radius_mm = np.interp(abscissa_mm, axis.abscissa_mm, axis.inscribed_radius_mm)
     dd_mm = design.wall_offset_um * MM_PER_UM
-    inner = circles(np.minimum(radius_mm - dd_mm, 0.5 * size.widest_mm), columns)
+    inner = circles(np.minimum(radius_mm - dd_mm, 0.5 * widest_mm(design, size)), columns)
     centers_mm, frames = across.at(abscissa_mm)
     rays = circles(np.ones(len(abscissa_mm)), columns) @ frames[:, 1:]
     origins_mm = np.repeat(centers_mm, columns, axis=0)
@@ -108,7 +108,7 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     section_mm = np.interp(abscissa_mm, axis.abscissa_mm, anatomy.section_radius_mm)[:, None]
     reach_mm = np.where(reach_mm < 1.6 * section_mm, reach_mm, section_mm)
     outer = np.maximum(reach_mm - dd_mm, 0.1)[..., None] * circles(np.ones(len(abscissa_mm)), columns)
-    in_plane_mm = evenly_spaced(FreeDiameter(np.full(len(inner), size.widest_mm))(inner, outer)[0])
+    in_plane_mm = evenly_spaced(FreeDiameter(np.full(len(inner), widest_mm(design, size)))(inner, outer)[0])
     nodes_mm = across.place(abscissa_mm, in_plane_mm).reshape(-1, 3)
     gap_mm = np.maximum(anatomy.landing_surface.closest(nodes_mm)[1] - dd_mm, 0.0).reshape(-1, columns)
     band_mm = anatomy.vessel.threshold_band_mm or ASSUMED_BAND_MM
@@ -163,7 +163,7 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
 
 def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> Floats:
     """Return the proximal and distal end (2,), mm along the axis, for an artery wider by `wider_mm`."""
-    diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, wall.size.widest_mm)
+    diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, widest_mm(wall.design, wall.size))
     profile = replace(wall.profile, diameter_mm=diameter_mm)
     return march(wall.design, wall.size, landing, profile)[[0, -1]]
 

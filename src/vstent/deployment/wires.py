@@ -226,10 +226,10 @@ def _between(design: Braid, size: Size, strands: Strands, apart: float) -> tuple
     """Return the column of the first strand, the height of its layer in um, and the rows between its crossings."""
     if strands.place == "outside":  # strands cross each other only, above the pores of the mesh
         return 1.0, design.mesh_offset_um + strands.diameter_um, 0.5 * apart
-    # Side by side with a wire of the mesh at the widest diameter; where the device is narrower, they are farther apart.
-    wire_um = max(diameter for _, diameter in design.wires)
-    across_mm = 0.5 * (strands.diameter_um + wire_um) * MM_PER_UM / np.cos(angle_rad(design, size, size.widest_mm))
-    return float(across_mm * design.n_columns / (np.pi * size.widest_mm)), 0.0, 1.0
+    # Side by side with a wire of the mesh at the free diameter; where the device is narrower, they are farther apart.
+    wire_um, free_mm = max(diameter for _, diameter in design.wires), size.free_diameter_mm
+    across_mm = 0.5 * (strands.diameter_um + wire_um) * MM_PER_UM / np.cos(angle_rad(design, size, free_mm))
+    return float(across_mm * design.n_columns / (np.pi * free_mm)), 0.0, 1.0
 
 
 class _Helices(NamedTuple):

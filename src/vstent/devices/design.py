@@ -84,11 +84,6 @@ class Size:
         return self.length_mm * (1 - self.compaction_fraction)
 
     @property
-    def widest_mm(self) -> float:
-        """Largest free diameter along the device, in mm."""
-        return max((diameter for _, diameter in self.free_profile_mm), default=self.free_diameter_mm)
-
-    @property
     def label(self) -> str:
         """Size as printed on the box."""
         return f"{self.diameter_mm:.2f} x {self.length_mm:g} mm"
@@ -313,13 +308,8 @@ def _check_crowns(design: LaserCut) -> None:
 
 
 def _check_sizes(design: Design) -> None:
-    """Raise a DeviceError if wires have no room side by side, turn across the axis, or a size is below two rows."""
+    """Raise a DeviceError if the wires of a size have no room side by side, or it is shorter than two rows of cells."""
     for size in design.sizes:
-        if free_sine(design, size) * size.widest_mm > np.sin(STEEP_RAD[1]) * size.free_diameter_mm:
-            raise DeviceError(
-                f"{design.name} {size.label} cannot open to {size.widest_mm:.2f} mm, because its wires or struts "
-                "would lie across the axis. Give a smaller flare or angle."
-            )
         taken = strips_fraction(design, size, size.free_diameter_mm)
         if taken >= 1:
             raise DeviceError(
@@ -337,6 +327,18 @@ def _check_sizes(design: Design) -> None:
 def piece_length_mm(design: Design, size: Size) -> float:
     """Return the length l/n of the wire or strut between junctions, in mm; it is the same at every diameter."""
     return float(np.pi * size.free_diameter_mm / (design.n_columns * free_sine(design, size)))
+
+
+def widest_mm(design: Design, size: Size) -> float:
+    """Return the largest free diameter along a device, in mm.
+
+    A flare opens at most until its wires lie across the axis (`STEEP_RAD`), because their pieces are as long there as
+    in the body.
+    """
+    if not size.free_profile_mm:
+        return size.free_diameter_mm
+    flare_mm = max(diameter for _, diameter in size.free_profile_mm)
+    return min(flare_mm, size.free_diameter_mm * float(np.sin(STEEP_RAD[1])) / free_sine(design, size))
 
 
 def free_sine(design: Design, size: Size) -> float:
@@ -365,7 +367,7 @@ def angle_rad(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np
     array of the shape of `diameter_mm`, rad
         Angle between wire and axis.
     """
-    return np.arcsin(free_sine(design, size) * np.minimum(diameter_mm, size.widest_mm) / size.free_diameter_mm)
+    return np.arcsin(free_sine(design, size) * np.minimum(diameter_mm, widest_mm(design, size)) / size.free_diameter_mm)
 
 
 def strips_fraction(design: Design, size: Size, diameter_mm: float) -> float:

@@ -15,6 +15,7 @@ from vstent.devices.design import (
     free_sine,
     piece_length_mm,
     strips_fraction,
+    widest_mm,
 )
 from vstent.errors import DeviceError
 from vstent.units import MM_PER_UM
@@ -79,7 +80,7 @@ def free_diameters_mm(design: Design, size: Size) -> np.ndarray:
     if not size.free_profile_mm:
         return np.full(rows, size.free_diameter_mm)
     where, diameter_mm = np.transpose(size.free_profile_mm)
-    return np.interp(np.linspace(0.0, 1.0, rows), where, diameter_mm)
+    return np.minimum(np.interp(np.linspace(0.0, 1.0, rows), where, diameter_mm), widest_mm(design, size))
 
 
 def compacted(design: Design, size: Size, fraction: float) -> Size:
@@ -165,7 +166,7 @@ def row_spacing_mm(
     piece_mm, angle = piece_length_mm(design, size), angle_rad(design, size, diameter_mm)
     if not np.any(curvature_per_mm):
         return piece_mm * np.cos(angle)
-    opened_mm = np.minimum(diameter_mm, size.widest_mm)
+    opened_mm = np.minimum(diameter_mm, widest_mm(design, size))
     bend = np.minimum(0.5 * np.abs(curvature_per_mm) * opened_mm, STEEPEST_BEND)
     apart = 1 + np.multiply.outer(bend, np.cos(np.pi * (np.arange(BEND_SAMPLES) + 0.5) / BEND_SAMPLES))
     longest = STRAIGHTEST / (1 + bend)

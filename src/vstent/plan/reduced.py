@@ -18,7 +18,7 @@ import numpy as np
 
 from vstent.deployment.braid import FREELY, Profile, expected_profile, march
 from vstent.deployment.coverage import is_over_neck, quad_areas_mm2
-from vstent.devices.design import Design, LaserCut, Size, piece_length_mm
+from vstent.devices.design import Design, LaserCut, Size, piece_length_mm, widest_mm
 from vstent.devices.formulas import free_diameters_mm, grid
 from vstent.devices.stent import Deployment, Landing
 from vstent.geometry.vessel import Anatomy
@@ -108,7 +108,7 @@ class Reduced:
     def _profile(self, design: Design, size: Size) -> Profile:
         """Return the diameter of the contour of a device along the artery."""
         offset_mm = 2 * design.wall_offset_um * MM_PER_UM
-        return replace(self._wall, diameter_mm=np.minimum(self._wall.diameter_mm - offset_mm, size.widest_mm))
+        return replace(self._wall, diameter_mm=np.minimum(self._wall.diameter_mm - offset_mm, widest_mm(design, size)))
 
     @cached_property
     def _nominal(self) -> Profile:
