@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 GENERATED = Path(__file__).parent / "generated"
 
 
@@ -43,7 +45,7 @@ def table(titles: list[str], rows: list[list[str]], widths: str = "auto") -> str
 
 
 def devices() -> str:
-    """Return one section a device, every number with its source and confidence, and a count of these."""
+    """Return one section a device: drawing, every number with its source and confidence; and a count of these."""
     from vstent.devices.catalogue import catalogue
     from vstent.devices.design import Braid
 
@@ -61,7 +63,14 @@ def devices() -> str:
             else f"{design.n_columns} struts round, {design.strut_width_um:g} um wide"
         )
         text.append(f"``{design.key}``, {design.maker}: {kind}, {wires}, {design.angle_rad:.3f} rad to the axis; ")
-        text.append(f"{len(design.sizes)} sizes, {_range(design.sizes)}.\n\n")
+        text.append(f"{len(design.sizes)} sizes, {_range(design.sizes)}.{_structure(design)}\n\n")
+        size = _middle_size(design)
+        draw_device(design, size, GENERATED / f"device_{design.key}.png")
+        text.append(f".. figure:: ../generated/device_{design.key}.png\n   :width: 100%\n\n")
+        text.append(
+            f"   {design.name} {size.label}, outside an artery and in an artery of {_artery_mm(design, size):.2f} mm. "
+            "Both drawings have one scale; wires and struts have their own width.\n\n"
+        )
         rows = [[f"``{fact.name}``", fact.confidence, _escaped(fact.source)] for fact in design.facts]
         text.append(table(["number", "confidence", "source"], rows, "20 15 65"))
         rows = [
@@ -70,6 +79,63 @@ def devices() -> str:
         ]
         text.append(table(["number", "value", "range", "confidence", "reason for the range"], rows, "20 10 15 10 45"))
     return "".join(text)
+
+
+def _structure(design: Any) -> str:
+    """Return a sentence on what a device has beside a plain mesh or closed cells, or an empty string."""
+    from vstent.devices.design import Braid
+
+    parts = []
+    if isinstance(design, Braid):
+        for strands in design.strands:
+            what = "outer layer" if strands.place == "outside" else "strands beside its wires"
+            beyond = f", {strands.beyond_mm:g} mm longer at each end" if strands.beyond_mm else ""
+            parts.append(f"{what} of {strands.count} wires of {strands.diameter_um:g} um{beyond}")
+        parts += ["wires that turn back at both ends"] if design.has_closed_ends else []
+    elif design.joined_crowns:
+        parts.append(f"open cells, {design.joined_fraction:.0%} of the crowns joined")
+    parts += ["flared ends"] if any(size.free_profile_mm for size in design.sizes) else []
+    return f" Structure: {'; '.join(parts)}." if parts else ""
+
+
+def _middle_size(design: Any) -> Any:
+    """Return a size in the middle of a device's diameters, about 20 mm long."""
+    diameters = sorted({size.diameter_mm for size in design.sizes})
+    middle = diameters[len(diameters) // 2]
+    return min((one for one in design.sizes if one.diameter_mm == middle), key=lambda one: abs(one.length_mm - 20))
+
+
+def _artery_mm(design: Any, size: Any) -> float:
+    """Return the diameter of the artery in which a device is drawn: 15 % below its label, in mm."""
+    return 0.85 * size.diameter_mm + 2e-3 * design.wall_offset_um
+
+
+def draw_device(design: Any, size: Any, path: Path) -> None:
+    """Draw a device at its free diameter and in an artery, from the wires that `sketch` lays in a straight tube."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+    from tubes import line, tube
+
+    from vstent.deployment.sketch import bed, sketch
+    from vstent.devices.stent import Landing
+
+    wide = 1.4 * max([size.free_diameter_mm, *(diameter for _, diameter in size.free_profile_mm)])
+    figure = Figure(figsize=(9, 2.6))
+    axes = figure.subplots(2, 1, sharex=True, sharey=True)
+    for axis, diameter_mm in zip(axes, (wide, _artery_mm(design, size)), strict=True):
+        stent = sketch(bed(design, size, tube(line(100), 0.5 * diameter_mm)), Landing(50.0)).stent
+        here = stent.piece_starts
+        ends = np.stack([stent.wire_points_mm[here], stent.wire_points_mm[here + 1]], axis=1)
+        width = stent.wire_diameter_um[stent.point_wires[here]] * 1e-3 * 72 * 9 * 0.95 / 50  # mm to points
+        is_front = ends[:, 0, 1] < 0
+        for side, color in ((~is_front, "#c3ccd4"), (is_front, "#22384d")):
+            axis.add_collection(
+                LineCollection(ends[side][:, :, [2, 0]] - [50, 0], linewidths=width[side], colors=color)
+            )
+        axis.set(xlim=(-25, 25), ylim=(-0.55 * wide / 1.4, 0.55 * wide / 1.4), aspect="equal")
+        axis.set_axis_off()
+    figure.tight_layout(pad=0.1)
+    figure.savefig(path, dpi=110)
 
 
 def options() -> str:

@@ -172,9 +172,7 @@ def relax(
     return x.reshape(-1, 3)
 
 
-def _closed_frame(
-    net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid
-) -> _Frame:
+def _closed_frame(net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid) -> _Frame:
     """Return the least-squares problem of a device whose crowns are all joined."""
     pairs, free_mm = _diagonals(net, length_mm, width_mm)
     none = _Tips(np.zeros((3, 0), dtype=int), np.zeros((0, 3)), np.zeros(0))
@@ -183,9 +181,7 @@ def _closed_frame(
     return _Frame(net, laid, length_mm, pairs, free_mm, joint_mm, alike, on_wall_mm, none, keeping)
 
 
-def _open_frame(
-    cut: Cut, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid
-) -> _Frame:
+def _open_frame(cut: Cut, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid) -> _Frame:
     """Return the least-squares problem of a device with free crowns."""
     net, split = cut.split.net, cut.split
     height_mm = 2 * np.sqrt(length_mm**2 - (0.5 * width_mm) ** 2)
