@@ -8,7 +8,7 @@ from vstent.cli import main
 from vstent.devices import catalogue, formulas, ranges
 from vstent.devices import design as device
 from vstent.devices import schema as device_schema
-from vstent.devices.design import Braid, LaserCut, Size
+from vstent.devices.design import Braid, LaserCut, Size, Strands
 from vstent.errors import DeviceError
 
 
@@ -204,6 +204,73 @@ def test_one_key_for_two_devices_is_refused():
 def test_importing_devices_does_not_load_pydantic():
     code = "import sys, vstent.devices.design; sys.exit('pydantic' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+SOURCED = 'source = "here", confidence = "estimated"'
+STRUCTURES = (
+    f"outer_layer = {{ count = 4, diameter_um = 60, beyond_mm = 3.0, {SOURCED} }}\n"
+    f"strands = [{{ count = 2, diameter_um = 50, {SOURCED} }}]\n"
+    f"closed_ends = {{ value = true, {SOURCED} }}\n"
+    f"free_profile = {{ from_ends_mm = [0.0, 1.6], wider_mm = [0.4, 0.0], {SOURCED} }}\n"
+)
+LASER_CUT = f"""
+[[device]]
+key = "cut"
+name = "Cut"
+maker = "Y"
+kind = "laser_cut"
+n_columns = {{ value = 16, {SOURCED} }}
+strut_width_um = {{ value = 60, {SOURCED} }}
+strut_thickness_um = {{ value = 60, {SOURCED} }}
+cell_angle_rad = {{ value = 0.6, {SOURCED} }}
+free_diameter_margin_mm = {{ value = 0.0, {SOURCED} }}
+sizes = [{{ diameters_mm = [4], lengths_mm = [20], {SOURCED} }}]
+joined_crowns = {{ value = ["10", "01"], {SOURCED} }}
+crown_gap_um = {{ value = 150, {SOURCED} }}
+free_profile = {{ fractions = [0.0, 1.0], wider_mm = [0.5, -0.5], {SOURCED} }}
+"""
+
+
+def test_structures_are_read_with_their_sources_and_their_ranges_change_them():
+    braid = device_schema.parse(ENTRY + STRUCTURES)["x"]
+    assert braid.strands == (Strands(2, 50.0, "beside"), Strands(4, 60.0, "outside", 3.0))
+    assert braid.has_closed_ends
+    # The device is 10 mm long and its outer layer 6 mm longer.
+    assert braid.sizes[0].free_profile_mm == ((0.0, 3.5), (0.1, 3.1), (0.9, 3.1), (1.0, 3.5))
+    assert {"outer_layer", "strands", "closed_ends", "free_profile"} < {fact.name for fact in braid.facts}
+    values = {"outer_layer_beyond_mm": 2.0, "strand_diameter_um": 55.0, "free_profile": 0.1, ranges.MARGIN: 0.2}
+    other, size = ranges.altered(braid, braid.sizes[0], values)
+    assert other.strands == (Strands(2, 55.0, "beside"), Strands(4, 60.0, "outside", 2.0))
+    assert size.free_profile_mm == pytest.approx(np.array([(0.0, 3.7), (0.1, 3.2), (0.9, 3.2), (1.0, 3.7)]))
+    cut = device_schema.parse(LASER_CUT)["cut"]
+    assert [[cut.is_joined(row, crown) for crown in range(4)] for row in (0, 1, 2)] == [
+        [True, False, True, False],
+        [False, True, False, True],
+        [True, False, True, False],
+    ]
+    assert cut.joined_fraction == 0.5
+    free_mm = formulas.free_diameters_mm(cut, cut.sizes[0])
+    assert free_mm == pytest.approx(np.linspace(4.5, 3.5, len(free_mm)))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("from_ends_mm = [0.0, 1.6]", "fractions = [0.0]", "as many increasing places"),
+        ("from_ends_mm = [0.0, 1.6], ", "", "give the places of wider_mm"),
+        ("beyond_mm = 3.0", "beyond_mm = -3.0", "outer_layer"),
+        ("strands = [{ count = 2", "strands = [{ count = 5", "even number"),
+    ],
+)
+def test_a_wrong_structure_is_refused_with_its_place(before, after, said):
+    assert before in ENTRY + STRUCTURES
+    with pytest.raises(DeviceError, match=said):
+        device_schema.parse((ENTRY + STRUCTURES).replace(before, after))
+
+
+def test_open_cells_need_the_gap_of_their_crowns():
+    with pytest.raises(DeviceError, match="both joined_crowns and crown_gap_um"):
+        device_schema.parse("".join(line for line in LASER_CUT.splitlines(keepends=True) if "crown_gap" not in line))
 
 
 OWN = """
