@@ -6,6 +6,7 @@ import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js
 import { Deploying } from "./deploy.js";
 import { Flowing } from "./flowing.js";
 import { Imaging } from "./imaging.js";
+import { SacLabel } from "./labels.js";
 import { Neck } from "./neck.js";
 import { bandWords, changeSheet, neckWords, placeWords, plainSheet, qualitySheet, sureSheet } from "./numbers.js";
 import { panels, placeOf, spokenRole } from "./panels.js";
@@ -122,6 +123,7 @@ class Page {
     this.frame?.remove();
     this.picture = new Picture();
     this.ranking = new Ranking(this);
+    this.sacLabel = new SacLabel(this.picture);
     this.along = new AlongChart();
     this.section = new SectionChart();
     this.flowing = new Flowing({ path: () => this.path, picture: this.picture, changed: () => this.view && this.renderScene(), failed: (problem) => this.complain(problem) });
@@ -348,8 +350,9 @@ class Page {
     if (this.step === "sac") {
       const { curve_mm, handles } = this.anatomy.drawn;
       this.neck.set(this.view.choices.neck_mm ?? curve_mm, handles);
-      return this.neck.handles;
+      return [...this.neck.handles, this.sacLabel.mark];
     }
+    if (this.step === "device" && !this.isComparing) return [this.sacLabel.mark];
     return this.step === "deploy" && this.device ? [...this.deploying.handles, this.deploying.cursorMark] : [];
   }
 

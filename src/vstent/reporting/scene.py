@@ -180,7 +180,7 @@ def device_title(deployment: Deployment) -> str:
 _PLAIN: dict[str, Any] = {"scale": "", "values": np.zeros(0)}
 """Fields of a layer without values."""
 _WALL = (0.62, 0.68, 0.73)
-_SAC = (0.80, 0.42, 0.36)
+_SAC = (0.62, 0.13, 0.16)
 _INK = (0.10, 0.17, 0.20)
 _STEEL = (0.33, 0.38, 0.43)
 _ASSUMED = (0.45, 0.36, 0.58)
