@@ -1,5 +1,6 @@
 // Words with the server: JSON, binary messages, events; and a line in which the newest request wins.
 import { opened } from "../src/decode.js";
+import { askForKey } from "./dialogs.js";
 
 /** What the server refused, in its own sentence. */
 export class Refusal extends Error {
@@ -20,9 +21,10 @@ async function ask(method, path, body) {
   try {
     answer = await fetch(path, options);
   } catch {
-    throw new Refusal(0, "The server does not answer: is `vstent app` still running?");
+    throw new Refusal(0, `The server does not answer. Start it again with: vstent app --port ${location.port}`);
   }
   if (answer.ok) return answer;
+  if (answer.status === 401) askForKey();
   const text = await answer.text();
   let sentence = text;
   try {
@@ -37,6 +39,7 @@ async function ask(method, path, body) {
 export const get = async (path) => (await ask("GET", path)).json();
 export const post = async (path, body) => (await ask("POST", path, body)).json();
 export const put = async (path, body) => (await ask("PUT", path, body)).json();
+export const putBytes = (path, blob) => ask("PUT", path, blob);
 export const drop = async (path) => (await ask("DELETE", path)).json();
 export const getBinary = async (path) => opened(await (await ask("GET", path)).arrayBuffer());
 export const postBinary = async (path, body) => opened(await (await ask("POST", path, body)).arrayBuffer());

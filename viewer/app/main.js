@@ -13,7 +13,9 @@ import { panels, placeOf, spokenRole } from "./panels.js";
 import { Picture } from "./picture.js";
 import { Ranking } from "./ranking.js";
 import { startPage } from "./start.js";
+import { listenForTips } from "./tips.js";
 import { Trimming } from "./trimming.js";
+import { Portrait } from "./portrait.js";
 
 export const STEPS = [
   ["image", "Image"],
@@ -32,6 +34,7 @@ class Page {
     this.root = root;
     this.toasts = make("div", { className: "toasts", role: "status", ariaLive: "polite" });
     this.root.append(this.toasts);
+    listenForTips(document.body);
     this.colour = "wall_gap";
     this.memory = {};
     this.changes = Promise.resolve();
@@ -55,7 +58,7 @@ class Page {
   route() {
     const [id, step] = decodeURIComponent(location.hash.slice(1)).split("/");
     if (!id) return this.showStart();
-    if (this.view?.id === id) return this.go(step, false);
+    if (this.view?.id === id) return this.go(step, null);
     this.openCase(id, step);
   }
 
@@ -82,7 +85,7 @@ class Page {
     this.events?.close();
     if (this.flowing?.isOn) this.flowing.turn(false);
     this.view = null;
-    this.anatomyKey = this.flowKey = this.scanKey = undefined;
+    this.anatomyKey = this.flowKey = this.scanKey = this.inputKey = this.inputViews = this.proposed = undefined;
     this.anatomy = null;
     this.scan = this.imaging = null;
     this.measures = {};
@@ -103,11 +106,15 @@ class Page {
       return;
     }
     this.build();
-    this.step = step || this.proposedStep(view);
+    this.step = STEPS.some(([name]) => name === step) ? step : this.proposedStep(view);
+    history.replaceState(null, "", `#${id}/${this.step}`);
     this.take(view);
     this.events = new EventSource(`${this.path}/events`);
     this.events.onmessage = ({ data }) => this.take(JSON.parse(data));
-    this.events.onerror = () => this.frame?.classList.add("lost");
+    this.events.onerror = () => {
+      this.frame?.classList.add("lost");
+      get(this.path).catch(() => {}); // a server with another key answers so, one that is gone does not
+    };
     this.events.onopen = () => this.frame?.classList.remove("lost");
   }
 
@@ -146,6 +153,7 @@ class Page {
       told: (neck) => this.toldNeck(neck),
       failed: (problem) => this.complain(problem),
     });
+    this.portrait = new Portrait(this);
     this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.imaging = new Imaging(this);
@@ -156,7 +164,7 @@ class Page {
     this.stepper = make("nav", { className: "stepper", ariaLabel: "Steps" });
     this.undoButton = make("button", { type: "button", className: "icon", title: "Undo (Ctrl+Z)", ariaLabel: "Undo", onClick: () => this.stepBack("undo") }, ["↶"]);
     this.redoButton = make("button", { type: "button", className: "icon", title: "Redo (Ctrl+Shift+Z)", ariaLabel: "Redo", onClick: () => this.stepBack("redo") }, ["↷"]);
-    this.caseName = make("span", { className: "case-name" });
+    this.caseName = make("h1", { className: "case-name" });
     this.panel = make("section", { className: "panel", ariaLabel: "Step" });
     this.work = make("section", { className: "work", ariaLabel: "At work" });
     this.strip = make("section", { className: "strip", ariaLabel: "Details" });
@@ -164,9 +172,9 @@ class Page {
     this.frame = make("div", { className: "page" }, [
       make("header", {}, [this.brand(), this.caseName, this.stepper, make("div", { className: "spring" }), this.undoButton, this.redoButton, this.badge()]),
       make("main", { className: "desk" }, [
-        make("aside", { className: "left" }, [this.panel, this.work]),
+        make("aside", { className: "left", ariaLabel: "Settings" }, [this.panel, this.work]),
         make("div", { className: "middle" }, [this.imaging.box, this.picture.element, this.strip]),
-        make("aside", { className: "right" }, [this.numbers]),
+        make("aside", { className: "right", ariaLabel: "Results" }, [this.numbers]),
       ]),
     ]);
     this.root.prepend(this.frame);
@@ -204,15 +212,15 @@ class Page {
   /** Go along with a job through its steps. */
   follow(view) {
     const running = STEPS.find(([name]) => view.steps[name] === "running");
-    if (running && ["image", "vessel", "sac"].includes(this.step)) this.go(running[0]);
-    else if (running && running[0] === "flow") this.go("flow");
+    if (running && ["image", "vessel", "sac"].includes(this.step)) this.go(running[0], "replace");
+    else if (running && running[0] === "flow") this.go("flow", "replace");
   }
 
   finished(before) {
     const failed = Object.entries(this.view.failed)[0];
     if (failed) return;
-    if (before.job.kind === "anatomy") this.go("sac");
-    if (before.job.kind === "flow") this.go("flow");
+    if (before.job.kind === "anatomy") this.go("sac", "replace");
+    if (before.job.kind === "flow") this.go("flow", "replace");
   }
 
   /** Fetch what has changed for the picture. */
@@ -221,10 +229,26 @@ class Page {
     const grid = JSON.stringify([view.id, view.choices.shape, view.choices.spacing_mm]);
     if (view.is_scan && !view.wants_grid && this.step === "image" && this.scanKey !== grid) this.loadScan(grid);
     if (view.has_anatomy && this.anatomyKey !== view.anatomy) this.loadAnatomy();
+    const read = JSON.stringify([view.choices.units, view.choices.frame]);
+    if (view.has_input && !view.is_scan && !view.has_anatomy && this.inputKey !== read) this.loadInput(read);
     const flow = view.has_flow ? `${view.steps.flow} ${view.anatomy} ${!view.job}` : undefined;
     if (view.has_flow && !view.job && this.flowKey !== flow && ["flow", "report"].includes(this.step)) {
       this.flowKey = flow;
       this.loadFlow();
+    }
+  }
+
+  /** Show a surface as it was read, while the vessel in it is sought. */
+  async loadInput(read) {
+    this.inputKey = read;
+    try {
+      const answer = await getBinary(`${this.path}/input/surface`);
+      if (this.anatomy) return;
+      this.picture.put(answer);
+      this.inputViews = answer.manifest.views;
+      this.render();
+    } catch {
+      // what is wrong with the file is said by the step that fails
     }
   }
 
@@ -248,7 +272,7 @@ class Page {
     try {
       const answer = await getBinary(`${this.path}/anatomy`);
       this.anatomy = answer.manifest;
-      this.picture.stage?.drop(({ id }) => id.startsWith("opening ") || ["lumen", "landing", "continued", "sac", "neck", "wires", "contour"].includes(id));
+      this.picture.stage?.drop(({ id }) => id === "input" || id.startsWith("opening ") || ["lumen", "landing", "continued", "sac", "neck", "wires", "contour"].includes(id));
       this.picture.put(answer);
       this.neck.given = null; // its curve is drawn anew over the one found
       this.axis = new Axis(answer.manifest.axis, this.picture);
@@ -257,9 +281,11 @@ class Page {
       this.along.set({ axis: answer.manifest.axis, neck: answer.manifest.neck });
       this.lookAtNeck();
       this.imaging.follow(this.view);
-      this.sheets = (await get(`${this.path}/numbers`));
+      this.sheets = await get(`${this.path}/numbers`);
+      this.proposed = await get(`${this.path}/proposed`);
       this.measures = {};
       this.render();
+      this.portrait.take(this.anatomyKey);
     } catch (problem) {
       this.complain(problem);
     }
@@ -294,11 +320,13 @@ class Page {
     );
   }
 
-  go(step, push = true) {
+  /** Turn to a step; the address follows, as an entry of the history where a user has turned there. */
+  go(step, entry = "push") {
     if (!step || !STEPS.some(([name]) => name === step)) return;
     if (VIEW[step] !== VIEW[this.step]) this.picture.look(VIEW[step]);
     this.step = step;
-    if (push) history.replaceState(null, "", `#${this.view.id}/${step}`);
+    const address = `#${this.view.id}/${step}`;
+    if (entry && address !== location.hash) history[`${entry}State`](null, "", address);
     this.shape = null;
     this.renderSteps();
     this.load();
@@ -330,7 +358,7 @@ class Page {
     this.imaging.box.hidden = !isScan;
     this.frame.classList.toggle("with-slices", Boolean(isScan));
     const layers = LAYERS[this.step](this);
-    this.picture.setViews(...(isScan ? ["scan", this.imaging.views] : ["vessel", this.anatomy?.views]), VIEW[this.step]);
+    this.picture.setViews(...(isScan ? ["scan", this.imaging.views] : ["vessel", this.anatomy?.views ?? this.inputViews]), VIEW[this.step]);
     this.frame.classList.toggle("comparing", this.isComparing);
     this.picture.setPanes(this.panes());
     this.picture.setLayers(layers, (this.memory[this.step] ??= {}));
@@ -350,7 +378,8 @@ class Page {
     if (this.step === "sac") {
       const { curve_mm, handles } = this.anatomy.drawn;
       this.neck.set(this.view.choices.neck_mm ?? curve_mm, handles);
-      return [...this.neck.handles, this.sacLabel.mark];
+      const outlets = this.openingMarks((opening) => opening.role !== "inlet" && this.choose({ outlet_mm: placeOf(opening) }), "Click to let the parent artery lead here");
+      return [...this.neck.handles, ...outlets, this.sacLabel.mark];
     }
     if (this.step === "device" && !this.isComparing) return [this.sacLabel.mark];
     return this.step === "deploy" && this.device ? [...this.deploying.handles, this.deploying.cursorMark] : [];
@@ -377,16 +406,17 @@ class Page {
     });
   }
 
-  openingMarks() {
-    return this.anatomy.openings.map(({ role, center_mm, area_mm2, diameter_mm, colour }) => {
+  openingMarks(chosen = ({ role, center_mm }) => role !== "inlet" && this.choose({ inlet_mm: placeOf({ center_mm }) }), hint = "Click to let blood enter here") {
+    return this.anatomy.openings.map((opening) => {
+      const { role, center_mm, area_mm2, diameter_mm, colour } = opening;
       const dot = make("i");
       dot.style.background = `rgb(${colour})`;
-      const element = make("button", { type: "button", className: "opening", title: role.startsWith("inlet") ? "Blood enters here" : "Click to let blood enter here" }, [
+      const element = make("button", { type: "button", className: "opening", title: role.startsWith("inlet") ? "Blood enters here" : hint }, [
         dot,
         make("b", {}, [spokenRole(role)]),
         make("span", {}, [`${area_mm2.toFixed(1)} mm² · ⌀ ${diameter_mm.toFixed(1)} mm`]),
       ]);
-      element.addEventListener("click", () => role !== "inlet" && this.choose({ inlet_mm: placeOf({ center_mm }) }));
+      element.addEventListener("click", () => chosen(opening));
       return { element, isLabel: true, point: () => center_mm };
     });
   }
@@ -460,7 +490,7 @@ class Page {
     if (this.step === "report") for (const varied of this.sheets?.uncertainty || []) parts.push(...sureSheet(varied));
     if (this.sheets?.anatomy?.length && !(flow && ["flow", "report"].includes(this.step))) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));
     if (!parts.length) parts.push(make("h2", {}, ["Numbers"]), make("p", { className: "hint" }, ["Metrics appear here when a step is finished, each with its unit and definition."]));
-    else parts.push(make("p", { className: "hint" }, ["Hold the pointer over a name to see its definition."]));
+    else parts.push(make("p", { className: "hint" }, ["Rest on a name, or touch it, to see its definition."]));
     this.numbers.replaceChildren(...parts);
   }
 
@@ -470,6 +500,7 @@ class Page {
       this.measures[name] = manifest.measures;
       this.advice = manifest.advice;
       this.renderNumbers();
+      this.portrait.take(`${name} ${JSON.stringify(manifest.ends_mm)}`);
       this.panel.querySelector(".advice")?.replaceChildren(manifest.advice);
       if (this.deploying.cursor === undefined && this.anatomy.neck.length) this.deploying.look((this.anatomy.neck[0] + this.anatomy.neck[1]) / 2);
       else this.deploying.look(this.deploying.cursor);
@@ -620,18 +651,20 @@ const SPOKEN = {
 /** From where each step looks at first. */
 const VIEW = { image: "whole", vessel: "whole", sac: "profile", device: "profile", deploy: "profile", flow: "profile", report: "profile" };
 const LUMEN = { id: "lumen", title: "Lumen", on: true, also: ["continued"] };
+const INPUT = { id: "input", title: "", on: true };
 const NECK = { id: "neck", title: "Neck", on: true };
 const LAYERS = {
   image: (page) =>
     page.view.is_scan && page.imaging.slices
       ? [{ id: "live", title: "Surface at the threshold", on: true }]
-      : [{ ...LUMEN, title: "Vessel" }, { id: "landing", title: "Inside", on: false }],
+      : [INPUT, { ...LUMEN, title: "Vessel" }, { id: "landing", title: "Inside", on: false }],
   vessel: (page) => [
+    ...(page.anatomy ? [] : [INPUT]),
     LUMEN,
     { id: "centerlines", title: "Centerlines", on: true },
     { id: "opening 0", title: "Openings", on: true, also: (page.anatomy?.openings || []).map((_, k) => `opening ${k}`) },
   ],
-  sac: () => [LUMEN, { id: "landing", title: "Parent artery", on: true }, { id: "sac", title: "Sac", on: true }, NECK, { id: "axis", title: "Axis", on: false }],
+  sac: (page) => [...(page.anatomy ? [] : [INPUT]), LUMEN, { id: "landing", title: "Parent artery", on: true }, { id: "sac", title: "Sac", on: true }, NECK, { id: "axis", title: "Axis", on: false }],
   device: (page) =>
     page.isComparing
       ? [LUMEN, { id: "wires", title: "Wires", on: true }, { id: "contour", title: "Contour", on: false }, NECK]

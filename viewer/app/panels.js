@@ -23,8 +23,8 @@ function staleness(page) {
 /** A word where the vessel itself is out of date. */
 function earlier(page) {
   const stale = ["image", "vessel", "sac"].find((step) => page.view.steps[step] === "stale");
-  if (!stale) return [];
-  return [make("p", { className: "note stale" }, ["The vessel shown is of an earlier choice. ", make("button", { type: "button", className: "link", onClick: () => page.go(stale) }, ["Find it again"])])];
+  if (!stale || page.view.job) return [];
+  return [make("p", { className: "note stale" }, ["The vessel shown is of an earlier choice. ", make("button", { type: "button", className: "link", onClick: () => page.start("anatomy") }, ["Find it again"])])];
 }
 
 /** Further settings of the study that the case was opened from. */
@@ -41,13 +41,17 @@ function next(page, step, words) {
   return make("button", { type: "button", className: "wide next", onClick: () => page.go(step) }, [words]);
 }
 
-function number(page, key, label, unit, value, changed, { placeholder = "proposed", step = "any", min } = {}) {
+function number(page, key, label, unit, value, changed, { placeholder = "", step = "any", min } = {}) {
   const input = make("input", { type: "number", value: value ?? "", placeholder, step, id: `field-${key}` });
   if (min !== undefined) input.min = min;
   input.dataset.key = key;
   input.addEventListener("change", () => changed(input.value === "" ? null : Number(input.value)));
-  return make("label", { className: "field", htmlFor: `field-${key}` }, [make("span", {}, [label]), input, make("small", {}, [unit])]);
+  const mark = value === null || value === undefined ? [make("em", { className: "proposed" }, ["proposed"])] : [];
+  return make("label", { className: "field", htmlFor: `field-${key}` }, [make("span", {}, [label, ...mark]), input, make("small", {}, [unit])]);
 }
+
+/** A proposed value, to be seen where none is chosen. */
+const proposal = (value, digits) => value?.toFixed(digits) ?? "";
 
 function words(key, label, unit, values, placeholder, changed) {
   const input = make("input", { type: "text", value: values?.join(" ") ?? "", placeholder, id: `field-${key}` });
@@ -121,7 +125,7 @@ export const panels = {
 
   sac(page) {
     const parts = [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Drag the points on the neck to draw it anew; click a sac to choose it.")];
-    if (page.anatomy) parts.push(select("outlet", "Parent leads to", near(page), [["", "proposed"], ...outlets(page)], (role) => page.choose({ outlet_mm: center(page, role) })));
+    if (page.anatomy) parts.push(select("outlet", "Parent leads to", near(page), [["", proposedOutlet(page)], ...outlets(page)], (role) => page.choose({ outlet_mm: center(page, role) })));
     if (page.anatomy?.drawn.curve_mm.length) parts.push(make("div", { className: "place" }, page.neckPlace()), ...drawn(page));
     parts.push(...point(page, "at_mm", "Seed"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
     if (page.view.steps.sac === "done") parts.push(next(page, "device", "Device →"));
@@ -169,8 +173,8 @@ export const panels = {
     const { flow } = choices;
     const parts = [...title("Blood flow", "The flow without a device, then with each. All pictures share one camera and one scale.")];
     parts.push(
-      number(page, "inflow", "Mean inflow", "mL/s", flow.inflow_mL_s, (value) => page.chooseFlow({ inflow_mL_s: value }), { min: 0 }),
-      number(page, "cell", "Grid spacing", "mm", flow.cell_size_mm, (value) => page.chooseFlow({ cell_size_mm: value }), { min: 0.04, step: 0.01 }),
+      number(page, "inflow", "Mean inflow", "mL/s", flow.inflow_mL_s, (value) => page.chooseFlow({ inflow_mL_s: value }), { min: 0, placeholder: proposal(page.proposed?.inflow_mL_s, 2) }),
+      number(page, "cell", "Grid spacing", "mm", flow.cell_size_mm, (value) => page.chooseFlow({ cell_size_mm: value }), { min: 0.04, step: 0.01, placeholder: proposal(page.proposed?.cell_size_mm, 3) }),
       select("pulse", "Inlet", flow.is_pulsatile ? "1" : "", [["", "steady, at the mean"], ["1", "pulse of the carotid"]], (value) => page.chooseFlow({ is_pulsatile: Boolean(value) })),
       select("outlets", "Outlets", flow.outlets, [["zero_pressure", "zero pressure"], ["murray", "split by r³ (Murray)"]], (value) => page.chooseFlow({ outlets: value })),
     );
@@ -271,7 +275,7 @@ function openings(page) {
     const dot = make("i", { className: "dot" });
     dot.style.background = `rgb(${colour})`;
     const isFirst = opening === entered[0];
-    const box = make("input", { type: "checkbox", checked: entered.includes(opening), title: `${spokenRole(role)}: blood enters here` });
+    const box = make("input", { type: "checkbox", checked: entered.includes(opening), title: "Blood enters here", ariaLabel: `${spokenRole(role)}: blood enters here` });
     box.disabled = isFirst;
     box.dataset.key = `brings-${role}`;
     box.addEventListener("change", () => {
@@ -301,7 +305,8 @@ const nearest = (openings, point) => openings.map((one) => [Math.hypot(...one.ce
 /** How much of the vessel is kept beside the sac. */
 function kept(page) {
   const { upstream_mm, downstream_mm } = page.view.choices;
-  const field = (key, words, value) => number(page, key, words, "mm", value, (mm) => page.choose({ [key]: mm }), { min: 1 });
+  const most = { upstream_mm: 35, downstream_mm: 25 }; // what a study keeps, if the artery is that long
+  const field = (key, words, value) => number(page, key, words, "mm", value, (mm) => page.choose({ [key]: mm }), { min: 1, placeholder: proposal(Math.min(most[key], page.trimming.most(key)), 1) });
   return [field("upstream_mm", "Before sac", upstream_mm), field("downstream_mm", "Beyond sac", downstream_mm), make("p", { className: "hint" }, ["Lengths of vessel that are kept; every branch is cut as far beyond the sac."])];
 }
 
@@ -319,6 +324,13 @@ function center(page, role) {
   return opening ? placeOf(opening) : null;
 }
 
+/** The outlet to which the parent artery leads, as it was found. */
+function proposedOutlet(page) {
+  const end = page.anatomy.axis.points.slice(-3);
+  const role = nearest(farEnds(page), end)?.role;
+  return role && !page.view.choices.outlet_mm ? `${role.replace("_", " ")} (proposed)` : "proposed";
+}
+
 function near(page) {
   const given = page.view.choices.outlet_mm;
   return (given && nearest(farEnds(page), given)?.role) || "";
@@ -333,12 +345,13 @@ function deviceBox(page, design, chosen) {
     const others = (devices) => devices.filter(({ name }) => name !== design.key);
     page.choose(({ devices }) => ({ devices: box.checked ? [...others(devices), { name: design.key }] : others(devices) }));
   });
-  const size = device?.diameter_mm ? `${device.diameter_mm} × ${device.length_mm} mm` : device ? "size proposed" : design.kind;
+  const size = device?.diameter_mm ? `${device.diameter_mm} × ${device.length_mm} mm` : device ? page.proposed?.sizes[design.key]?.replace(" x ", " × ") ?? "" : design.kind;
+  const mark = device && !device.diameter_mm ? [make("small", {}, ["proposed"])] : [];
   const sure = `${design.n_facts - design.n_estimated} of ${design.n_facts} numbers are cited or derived, the rest estimated`;
   return make("label", { className: "device", title: `${design.maker}, ${design.sizes.length} sizes; ${sure}` }, [
     box,
     make("span", {}, [make("b", {}, [design.name]), make("small", {}, [design.maker])]),
-    make("em", {}, [size]),
+    make("em", {}, [size, ...mark]),
   ]);
 }
 

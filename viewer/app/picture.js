@@ -223,7 +223,7 @@ export class Picture {
     for (const mark of labels.sort((a, b) => a.at[1] - b.at[1])) {
       const { offsetWidth: w, offsetHeight: h } = mark.element;
       const [x, y] = mark.at;
-      const left = x + w + 14 > width ? x - w - 18 : x;
+      const left = Math.min(Math.max(x + w + 14 > width ? x - w - 18 : x, 0), Math.max(width - w - 12, 0));
       let middle = Math.min(Math.max(y, top), height - h);
       for (const other of taken) if (left < other.right && left + w > other.left && middle < other.bottom + h / 2 + 3) middle = other.bottom + h / 2 + 3;
       taken.push({ left, right: left + w, bottom: middle + h / 2 });

@@ -1,6 +1,7 @@
 // Where a case begins: drop a scan, open a case, or try the demo.
 import { make } from "../src/dom.js";
-import { get, post, put } from "./api.js";
+import { drop as remove, get, post, put } from "./api.js";
+import { ask } from "./dialogs.js";
 
 const KINDS = "DICOM folder or ZIP · NIfTI · NRRD · MHA · RAW · STL · VTP · VTK · OBJ · PLY";
 
@@ -38,22 +39,39 @@ export function startPage(open, complain) {
     bring(await dropped(event.dataTransfer));
   });
   const list = make("div", { className: "recent" });
-  get("/api/cases").then(({ cases }) => list.replaceChildren(...recent(cases, open)));
+  const show = ({ cases }) => list.replaceChildren(...recent(cases, { open, show, complain }));
+  get("/api/cases").then(show).catch(complain);
   const privacy = "Files stay on this machine. Of DICOM files only the image is kept, without name, date and number of the patient.";
   return make("main", { className: "start" }, [zone, make("p", { className: "hint" }, [privacy]), list]);
 }
 
-function recent(cases, open) {
+/** The earlier cases, each with picture, name, progress and date, and what can be done with it. */
+function recent(cases, host) {
   if (!cases.length) return [];
-  return [
-    make("h2", {}, ["Open an earlier case"]),
-    ...cases.slice(0, 12).map(({ id, name, done }) =>
-      make("button", { type: "button", className: "recent-case", onClick: () => open(id) }, [
-        make("b", {}, [name]),
-        make("span", {}, [done.length ? `${done.length} of 7 steps done` : "no step done"]),
-      ]),
-    ),
-  ];
+  return [make("h2", {}, ["Open an earlier case"]), ...cases.map((one) => recentCase(one, host))];
+}
+
+const DATE = new Intl.DateTimeFormat(undefined, { dateStyle: "medium", timeStyle: "short" });
+
+function recentCase({ id, name, done, changed_s, has_picture }, { open, show, complain }) {
+  const picture = has_picture ? make("img", { src: `/api/cases/${encodeURIComponent(id)}/picture?${changed_s}`, alt: "", width: 320, height: 200 }) : make("i", { className: "no-picture" });
+  const words = make("span", {}, [`${done.length ? `${done.length} of 7 steps done` : "no step done"} · ${DATE.format(new Date(1000 * changed_s))}`]);
+  const rename = async () => {
+    const given = await ask({ title: "Rename the case", words: [], field: "Name", value: name, button: "Rename" });
+    if (given && given !== name) await put(`/api/cases/${encodeURIComponent(id)}/name`, { name: given.slice(0, 120) }).then(show).catch(complain);
+  };
+  const discard = async () => {
+    const sentences = [`This deletes the folder of ${name} with its copy of the scan and all results. It cannot be undone.`];
+    const isSure = await ask({ title: `Delete ${name}?`, words: sentences, button: "Delete", isDangerous: true });
+    if (isSure) await remove(`/api/cases/${encodeURIComponent(id)}`).then(show).catch(complain);
+  };
+  return make("article", { className: "recent-card" }, [
+    make("button", { type: "button", className: "recent-case", onClick: () => open(id) }, [picture, make("b", {}, [name]), words]),
+    make("div", { className: "recent-tools" }, [
+      make("button", { type: "button", className: "link", ariaLabel: `Rename ${name}`, onClick: rename }, ["Rename"]),
+      make("button", { type: "button", className: "link", ariaLabel: `Delete ${name}`, onClick: discard }, ["Delete"]),
+    ]),
+  ]);
 }
 
 /** All files of what was dropped, folders walked through. */

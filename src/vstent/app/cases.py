@@ -4,6 +4,7 @@ import asyncio
 import hashlib
 import json
 import re
+import shutil
 import threading
 from collections.abc import Iterator, Set
 from contextlib import suppress
@@ -252,6 +253,10 @@ class Case:
         self.tell()
         return self._state
 
+    def rename(self, name: str) -> State:
+        """Change the display name; folder and address stay."""
+        return self.update(name=name)
+
     def _check(self, revision: int) -> None:
         """Raise Conflict where the case was changed since a revision."""
         if revision != self._state.revision:
@@ -358,6 +363,23 @@ class Store:
                 if case.state.input == str(path):
                     return case
         return None
+
+    def remove(self, case: Case) -> None:
+        """Delete a case of the workspace with its folder.
+
+        Raises
+        ------
+        InputError
+            The folder lies elsewhere, because it was given on the command line.
+        """
+        if case.folder.resolve().parent != self.workspace.resolve():
+            raise InputError(
+                f"{case.folder} is not in the folder of the page's cases. Delete it there if you do not need it."
+            )
+        with self._lock:
+            self._cases.pop(case.id, None)
+            shutil.rmtree(case.folder)
+        case.tell()
 
     def adopt(self, folder: Path) -> Case:
         """Add a case folder outside the workspace."""

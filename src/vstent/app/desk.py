@@ -5,7 +5,7 @@ import tempfile
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Absent, Case, Conflict, Store, dependencies, failures, statuses
@@ -14,7 +14,10 @@ from vstent.app.finished import REPORT, RUN, kept_flows, lost_steps
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.app.reopening import reopened, stem
 from vstent.errors import InputError, ReadError
-from vstent.io.files import existing
+from vstent.io.files import atomic, existing
+
+PICTURE: Final = ".picture.png"
+"""File of a case folder with its picture in the list of cases."""
 
 
 class Desk:
@@ -67,8 +70,28 @@ class Desk:
                 steps = statuses(case.state, "", lost_steps(case.folder, case.state))
             except ReadError:
                 continue  # a folder of something else, or a damaged one
-            found.append({"id": case_id, "name": case.state.name, "done": [s for s in STEPS if steps[s] == "done"]})
+            done = [step for step in STEPS if steps[step] == "done"]
+            changed_s = (case.folder / STATE).stat().st_mtime
+            has_picture = (case.folder / PICTURE).is_file()
+            found.append(
+                {
+                    "id": case_id,
+                    "name": case.state.name,
+                    "done": done,
+                    "changed_s": changed_s,
+                    "has_picture": has_picture,
+                }
+            )
         return found
+
+    def remove(self, case: Case) -> None:
+        """Stop everything that works on a case, and delete it with its folder."""
+        self.jobs.stop(case)
+        self.end_preview(case)
+        self.store.remove(case)
+        with self._lock:
+            self._lives.pop(case.id, None)
+            self._scans.pop(case.id, None)
 
     def view(self, case: Case) -> dict[str, Any]:
         """Return the state of a case as clients read it."""
@@ -235,6 +258,20 @@ class Desk:
         stent = None if device is None else live.deployment(live.choice(device)).stent
         return outlines(self.scan(case).image, live.anatomy, stent, axis, index)
 
+    def input_surface(self, case: Case) -> bytes:
+        """Return the surface of the input as read, as a message for the page.
+
+        Raises
+        ------
+        InputError
+            The case has a scan, or the surface cannot be read.
+        """
+        from vstent.app.intake_view import read_layer
+
+        if not _is_surface(case):
+            raise InputError("This case has a scan and not a surface.")
+        return read_layer(case.input, case.state.choices)
+
     def surface(self, case: Case, threshold: float) -> bytes:
         """Return the surface of the scan at a threshold, as a message for the page."""
         from vstent.app.live import LOCK
@@ -306,6 +343,20 @@ def code_of(error: Exception) -> int:
     if isinstance(error, Absent):
         return 404
     return 422 if isinstance(error, InputError) else 500
+
+
+def keep_picture(case: Case, data: bytes) -> None:
+    """Store the picture of a case.
+
+    Raises
+    ------
+    InputError
+        It is not a PNG file.
+    """
+    if not data.startswith(b"\x89PNG\r\n\x1a\n"):
+        raise InputError("The picture of a case must be a PNG file.")
+    with atomic(case.folder / PICTURE) as partial:
+        partial.write_bytes(data)
 
 
 def begin_upload(case: Case, name: str) -> Path:

@@ -2,6 +2,8 @@
 
 import threading
 from collections.abc import Callable, Hashable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -26,8 +28,9 @@ from vstent.devices.design import BARE
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.errors import InputError, ReadError
-from vstent.flow.case import FlowField
+from vstent.errors import InputError, ReadError, VstentError
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.domain import default_cell_size_mm
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Opening
 from vstent.io.archive import load_data
@@ -51,6 +54,7 @@ from vstent.reporting.scene import (
 )
 from vstent.study.folder import CACHE
 from vstent.study.stages import deploy_one, size_of
+from vstent.study.types import Placing
 
 Colour = Literal["wall_gap", "coverage", "diameter"]
 """Quantity that colors the wires."""
@@ -264,6 +268,22 @@ class Live:
         """Return the metrics of the anatomy."""
         measures = self.remembered(("morphology", self.case.state.anatomy), lambda: morphology(self.anatomy))
         return sheets.anatomy(measures)
+
+    def proposed(self) -> dict[str, Any]:
+        """Return the values that the study proposes where none is chosen: inflow, grid spacing and device sizes."""
+        key = ("proposed", self.case.state.anatomy, *(choice.name for choice in self.case.state.choices.devices))
+
+        def find() -> dict[str, Any]:
+            given = self.case.state.former_settings().flow or FlowSettings()
+            case = FlowCase(self.anatomy.vessel, settings=replace(given, inflow_mL_s=None, cell_size_mm=None))
+            sizes = {}
+            for choice in self.case.state.choices.devices:
+                with suppress(VstentError):
+                    design = find_design(choice.name)
+                    sizes[choice.name] = size_of(design, self.anatomy, Placing()).label
+            return {"inflow_mL_s": case.inflow_mL_s, "cell_size_mm": default_cell_size_mm(case), "sizes": sizes}
+
+        return self.remembered(key, find)
 
     def sketch_message(self, choice: DeviceChoice, landing: Landing | None, colour: Colour) -> bytes:
         """Return the wires of a device at its expected position.

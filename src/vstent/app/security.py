@@ -3,11 +3,12 @@
 import hmac
 from collections.abc import Iterable
 from http.cookies import CookieError, SimpleCookie
+from importlib.resources import files
 from typing import Final
 from urllib.parse import parse_qs
 
 from starlette.exceptions import HTTPException
-from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 POLICY: Final = (
@@ -23,6 +24,11 @@ REPORT_POLICY: Final = (
 
 The policy in the report allows only those exact scripts; this one isolates the report from the page.
 """
+LOCKED_POLICY: Final = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'self'; "
+    "frame-ancestors 'none'"
+)
+"""Content security policy of the page that asks for the key: it has no script, and its form is sent only here."""
 BODY_LIMIT: Final = 1 << 20
 """Largest size of a request other than an upload, in bytes."""
 UPLOAD_LIMIT: Final = 2 << 30
@@ -83,11 +89,15 @@ class Guard:
         if headers.get("origin", next(iter(own))) not in own or headers.get("sec-fetch-site") == "cross-site":
             return PlainTextResponse("Requests from other sites are refused.", 403)
         query = parse_qs(scope["query_string"].decode("latin-1"))
-        if scope["path"] == "/" and self._is_right(query.get("token", [""])[0]):
+        given = query.get("token", [""])[0].rpartition("token=")[2].strip()  # the key, or the whole printed address
+        if scope["path"] == "/" and self._is_right(given):
             welcome = RedirectResponse("/", 303)
             welcome.set_cookie(self.cookie, self.token, httponly=True, samesite="strict", path="/")
             return welcome
         if not self._is_right(_token(headers, self.cookie)):
+            if scope["path"] == "/" and "text/html" in headers.get("accept", ""):
+                page = files("vstent").joinpath("app", "assets", "locked.html").read_text(encoding="utf-8")
+                return HTMLResponse(page, 401, {"content-security-policy": LOCKED_POLICY})
             return PlainTextResponse("Open the address that `vstent app` printed: it contains the key.", 401)
         return None
 

@@ -118,6 +118,7 @@ def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
     _add_page(app)
     api = APIRouter(dependencies=[Depends(desk.load)])
     _add_cases(api, desk)
+    _add_case_list(api, desk)
     _add_input(api, desk)
     _add_jobs(api, desk)
     _add_scenes(api, desk)
@@ -211,6 +212,33 @@ def _add_cases(api: APIRouter, desk: Desk) -> None:
         return StreamingResponse(_stream(desk, found), media_type="text/event-stream")
 
 
+def _add_case_list(api: APIRouter, desk: Desk) -> None:
+    """Add the routes of the list of cases: rename, delete, picture."""
+
+    @api.delete("/api/cases/{case_id}", summary="Delete a case with its folder")
+    def remove(case_id: str) -> dict[str, Any]:
+        desk.remove(desk.store.get(case_id))
+        return {"cases": desk.listed()}
+
+    @api.put("/api/cases/{case_id}/name", summary="Change the displayed name of a case")
+    def rename(case_id: str, wanted: NewCase) -> dict[str, Any]:
+        desk.store.get(case_id).rename(wanted.name)
+        return {"cases": desk.listed()}
+
+    @api.put("/api/cases/{case_id}/picture", summary="Store the picture of a case in the list of cases (PNG)")
+    async def keep_picture(case_id: str, request: Request) -> dict[str, Any]:
+        found = await asyncio.to_thread(desk.store.get, case_id)
+        await asyncio.to_thread(desks.keep_picture, found, await request.body())
+        return {"kept": True}
+
+    @api.get("/api/cases/{case_id}/picture", summary="Picture of a case (PNG)")
+    def picture(case_id: str) -> Response:
+        path = desk.store.get(case_id).folder / desks.PICTURE
+        if not path.is_file():
+            raise Absent("This case has no picture yet.")
+        return FileResponse(path, media_type="image/png")
+
+
 async def _stream(desk: Desk, case: Any) -> AsyncIterator[str]:
     """Yield the state of a case whenever it changes, as server-sent events."""
     event = case.listen()
@@ -248,6 +276,10 @@ def _add_input(api: APIRouter, desk: Desk) -> None:
         found = desk.store.get(case_id)
         desk.begin(found)
         return desk.view(found)
+
+    @api.get("/api/cases/{case_id}/input/surface", summary="The surface as read (binary)")
+    def input_surface(case_id: str) -> Response:
+        return Response(desk.input_surface(desk.store.get(case_id)), media_type=BINARY)
 
     @api.get("/api/cases/{case_id}/image", summary="Shape, spacing and intensities of the scan")
     def image(case_id: str) -> dict[str, Any]:
@@ -308,6 +340,11 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
     @api.get("/api/cases/{case_id}/anatomy", summary="Vessel, sac, neck and parent artery (binary)")
     def anatomy(case_id: str) -> Response:
         return Response(desk.live(desk.store.get(case_id)).anatomy_message(), media_type=BINARY)
+
+    @api.get("/api/cases/{case_id}/proposed", summary="Values that are proposed where none is chosen")
+    def proposed(case_id: str) -> dict[str, Any]:
+        found: dict[str, Any] = desk.live(desk.store.get(case_id)).proposed()
+        return found
 
     @api.post("/api/cases/{case_id}/neck", summary="The neck with a handle moved, and its area (binary)")
     def neck(case_id: str, wanted: NeckWanted) -> Response:

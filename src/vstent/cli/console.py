@@ -371,9 +371,11 @@ def truth_table(rows: list[tuple[str, float, float, str]]) -> Table:
 
 def device_table(devices: Mapping[str, Design]) -> Table:
     """Return the table of the catalogue: names, construction, sizes, and how well the numbers are sourced."""
-    table = Table(
-        "name", "device", "construction", "sizes (diameter x length, mm)", "numbers cited / derived / estimated"
-    )
+    table = Table()
+    # A name is typed as it stands: it is never cut, however narrow the terminal.
+    table.add_column("name", no_wrap=True, min_width=max(map(len, devices), default=0))
+    for title in ("device", "construction", "sizes (diameter x length, mm)", "numbers cited / derived / estimated"):
+        table.add_column(title, overflow="fold")
     for name, design in devices.items():
         sure = [sum(fact.confidence == level for fact in design.facts) for level in ("cited", "derived", "estimated")]
         diameters = sorted({size.diameter_mm for size in design.sizes})

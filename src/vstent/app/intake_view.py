@@ -1,0 +1,28 @@
+"""The input as it was read, to be seen while the vessel in it is sought."""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from vstent.app.choices import Choices
+from vstent.io.surfaces import read_surface
+from vstent.reporting.packing import message
+from vstent.reporting.scene import FRONTAL, MeshLayer, view_of
+from vstent.reporting.thinning import thin_surface
+
+FACES: Final = 40_000
+"""Number of triangles above which the surface is decimated."""
+
+
+def read_layer(path: Path, choices: Choices) -> bytes:
+    """Return a surface file as a message for the page.
+
+    Parameters
+    ----------
+    path : the file.
+    choices : length unit and frame as chosen.
+    """
+    surface = thin_surface(read_surface(path, units=choices.units, frame=choices.frame)[0], FACES)[0]
+    layer = MeshLayer("input", "", (0.62, 0.68, 0.73), "", np.zeros(0), surface)
+    return message([layer], views=[view_of("whole", FRONTAL, surface.vertices_mm)])
