@@ -150,11 +150,11 @@ OUTSIDE = """() => {
     const found = [];
     if (document.documentElement.scrollWidth > w) found.push("the page is wider than the window");
     if (box(".stepper").right > box("button[aria-label=Undo]").left + 1) found.push("the steps lie under the buttons");
-    for (const name of ["header", ".left", ".middle", ".panel"]) {
+    for (const name of ["header", ".left", "div.middle", ".panel"]) {
         const { left, right, top } = box(name);
         if (left < -1 || right > w + 1 || top > h) found.push(name);
     }
-    const { width, height } = box(".middle");
+    const { width, height } = box("div.middle");
     if (width * height < 0.38 * w * h) found.push(`the picture has ${Math.round((100 * width * height) / w / h)} %`);
     return found;
 }"""
