@@ -281,9 +281,10 @@ class Page {
       this.along.set({ axis: answer.manifest.axis, neck: answer.manifest.neck });
       this.lookAtNeck();
       this.imaging.follow(this.view);
+      this.measures = {};
+      this.render(); // the picture does not wait for the numbers
       this.sheets = await get(`${this.path}/numbers`);
       this.proposed = await get(`${this.path}/proposed`);
-      this.measures = {};
       this.render();
       this.portrait.take(this.anatomyKey);
     } catch (problem) {
@@ -358,7 +359,7 @@ class Page {
     this.imaging.box.hidden = !isScan;
     this.frame.classList.toggle("with-slices", Boolean(isScan));
     const layers = LAYERS[this.step](this);
-    this.picture.setViews(...(isScan ? ["scan", this.imaging.views] : ["vessel", this.anatomy?.views ?? this.inputViews]), VIEW[this.step]);
+    this.picture.setViews(...(isScan ? ["scan", this.imaging.views] : this.anatomy ? ["vessel", this.anatomy.views] : ["input", this.inputViews]), VIEW[this.step]);
     this.frame.classList.toggle("comparing", this.isComparing);
     this.picture.setPanes(this.panes());
     this.picture.setLayers(layers, (this.memory[this.step] ??= {}));
@@ -378,7 +379,8 @@ class Page {
     if (this.step === "sac") {
       const { curve_mm, handles } = this.anatomy.drawn;
       this.neck.set(this.view.choices.neck_mm ?? curve_mm, handles);
-      const outlets = this.openingMarks((opening) => opening.role !== "inlet" && this.choose({ outlet_mm: placeOf(opening) }), "Click to let the parent artery lead here");
+      const choose = (opening) => opening.role !== "inlet" && this.choose({ outlet_mm: placeOf(opening) });
+      const outlets = this.openingMarks(choose, "Click to let the parent artery lead here", "opening name");
       return [...this.neck.handles, ...outlets, this.sacLabel.mark];
     }
     if (this.step === "device" && !this.isComparing) return [this.sacLabel.mark];
@@ -406,12 +408,12 @@ class Page {
     });
   }
 
-  openingMarks(chosen = ({ role, center_mm }) => role !== "inlet" && this.choose({ inlet_mm: placeOf({ center_mm }) }), hint = "Click to let blood enter here") {
+  openingMarks(chosen = ({ role, center_mm }) => role !== "inlet" && this.choose({ inlet_mm: placeOf({ center_mm }) }), hint = "Click to let blood enter here", className = "opening") {
     return this.anatomy.openings.map((opening) => {
       const { role, center_mm, area_mm2, diameter_mm, colour } = opening;
       const dot = make("i");
       dot.style.background = `rgb(${colour})`;
-      const element = make("button", { type: "button", className: "opening", title: role.startsWith("inlet") ? "Blood enters here" : hint }, [
+      const element = make("button", { type: "button", className, title: role.startsWith("inlet") ? "Blood enters here" : hint }, [
         dot,
         make("b", {}, [spokenRole(role)]),
         make("span", {}, [`${area_mm2.toFixed(1)} mm² · ⌀ ${diameter_mm.toFixed(1)} mm`]),

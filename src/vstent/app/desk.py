@@ -324,7 +324,7 @@ class Desk:
         Two threads that import a package and one of its modules at the same time may get incomplete modules.
         """
         with self._loading:
-            from vstent.app import live, scans, sheets  # noqa: F401
+            from vstent.app import intake_view, live, outlines, scans, sheets  # noqa: F401
             from vstent.devices import schema as device_schema  # noqa: F401
             from vstent.flow import waveform  # noqa: F401
 
