@@ -1,0 +1,1 @@
+"""Virtual angiogram: flow in, films out; open ``film.py`` first."""
