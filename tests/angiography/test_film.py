@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vstent.angiogram.film import (
+from vstent.angiography.film import (
     PAPER,
     WIRE_PER_MM,
     film_of,
@@ -12,8 +12,8 @@ from vstent.angiogram.film import (
     window_of,
     wire_shadow,
 )
-from vstent.angiogram.projection import projector_of
-from vstent.angiogram.view import View, angles_of, fitted
+from vstent.angiography.projection import projector_of
+from vstent.angiography.view import View, angles_of, fitted
 from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Stent
 from vstent.errors import InputError

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vstent.angiogram.view import View, angles_of, axes_of, fitted
+from vstent.angiography.view import View, angles_of, axes_of, fitted
 from vstent.errors import InputError
 
 LEFT, FRONT, HEAD = np.array([1.0, 0, 0]), np.array([0, -1.0, 0]), np.array([0, 0, 1.0])

@@ -7,8 +7,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.angiogram.projection import Projector, projector_of
-from vstent.angiogram.view import View
+from vstent.angiography.projection import Projector, projector_of
+from vstent.angiography.view import View
 from vstent.devices.stent import Stent
 from vstent.errors import InputError
 from vstent.kernels import curves

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from vstent.angiogram.projection import projector_of
-from vstent.angiogram.view import View, angles_of, fitted
+from vstent.angiography.projection import projector_of
+from vstent.angiography.view import View, angles_of, fitted
 
 
 def lattice(half_mm: float, spacing_mm: float) -> np.ndarray:

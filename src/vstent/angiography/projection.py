@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.angiogram.view import View
+from vstent.angiography.view import View
 from vstent.kernels.arrays import Floats
 from vstent.kernels.footprints import footprints
 

@@ -1,1 +1,0 @@
-"""Virtual angiogram: flow in, films out; open ``film.py`` first."""

@@ -1,0 +1,211 @@
+"""Present films: grey frames, films before and after side by side, key frames, and files for viewers."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.angiography.film import Film, levels_of
+from vstent.io.files import atomic
+from vstent.io.films import animation, write_frames
+from vstent.io.xa_writer import BITS, XaHeader, write_xa
+from vstent.reporting.figures import Picture, png_of
+
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont
+
+CAPTION_PX: Final = 22
+"""Height of the line of text above a film."""
+GAP_PX: Final = 6
+"""Distance between films."""
+LATE_S: Final = 5.0
+"""Time after the peak at which a film is compared: contrast in the sac then is stagnation."""
+SMALL_BYTES: Final = 2_000_000
+"""Largest film that the report holds."""
+OF_FILM: Final = (
+    "Computed from the flow; quantum noise, bone, motion and the pulse width of a frame are not modeled. "
+    "All films have one grey scale."
+)
+"""What every picture of a film states."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A film with the still pictures that are shown with it."""
+
+    title: str
+    """What it shows: Before, or the device."""
+    film: Film
+    """The film."""
+    wires: NDArray[np.float32] | None = None
+    """(rows, columns) absorption by the wires; None: not shown."""
+    vessel: NDArray[np.float32] | None = None
+    """(rows, columns) path length within the lumen; None: not shown."""
+
+    def levels(self, window: float) -> Iterator[NDArray[np.float32]]:
+        """Yield the grey levels (rows, columns) of every frame, 0 to 1."""
+        return levels_of(self.film, window, wires=self.wires, vessel=self.vessel)
+
+
+def bytes_of(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return grey levels from 0 to 1 as bytes."""
+    return np.rint(255 * levels).astype(np.uint8)
+
+
+def beside(shown: Sequence[Shown], window: float) -> list[NDArray[np.uint8]]:
+    """Return the frames of films side by side, each with its title, direction and time above it.
+
+    Parameters
+    ----------
+    shown : films of equal times.
+    window : absorption that is shown black.
+    """
+    from PIL import Image, ImageDraw
+
+    font = _font(12)
+    frames = []
+    for k, levels in enumerate(zip(*(one.levels(window) for one in shown), strict=True)):
+        rows = max(frame.shape[0] for frame in levels)
+        sheet = Image.new("L", (sum(f.shape[1] for f in levels) + GAP_PX * (len(levels) - 1), rows + CAPTION_PX), 255)
+        pen, left = ImageDraw.Draw(sheet), 0
+        for one, frame in zip(shown, levels, strict=True):
+            sheet.paste(Image.fromarray(bytes_of(frame)), (left, CAPTION_PX))
+            words = f"{one.title}   {one.film.view.name}   {one.film.time_s[k]:.2f} s"
+            pen.text((left + 4, 3), words, fill=30, font=font)
+            left += frame.shape[1] + GAP_PX
+        frames.append(np.asarray(sheet))
+    return frames
+
+
+def _font(size: int) -> "FreeTypeFont":
+    """Return the font that matplotlib brings along."""
+    from matplotlib import get_data_path
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
+
+
+def key_times_s(before: Film) -> tuple[tuple[str, float], ...]:
+    """Return title and time of the key frames: early, peak, late, and 5 s after the peak where the film is that long.
+
+    The peak is the frame with the most contrast in the picture, early and late those with half of it.
+
+    Parameters
+    ----------
+    before : the film without a device.
+    """
+    total = before.absorption.sum(axis=(1, 2), dtype=np.float64)
+    peak = int(np.argmax(total))
+    half = 0.5 * total[peak]
+    early = int(np.argmax(total >= half))
+    after = np.flatnonzero(total[peak:] <= half)
+    late = peak + (int(after[0]) if len(after) else len(total) - 1 - peak)
+    times = [("early", early), ("peak", peak), ("late", late)]
+    found = [(name, float(before.time_s[k])) for name, k in times]
+    last = before.time_s[peak] + LATE_S
+    if last <= before.time_s[-1] + 1e-6:
+        found.append((f"{LATE_S:g} s after the peak", float(last)))
+    return tuple(found)
+
+
+def key_frames(shown: Sequence[Shown], window: float) -> Picture:
+    """Return the picture of the key frames: one row per film, one column per moment.
+
+    Parameters
+    ----------
+    shown : the film without a device first.
+    window : absorption that is shown black.
+    """
+    from matplotlib.figure import Figure
+
+    moments = key_times_s(shown[0].film)
+    rows, columns = shown[0].film.absorption.shape[1:]
+    width = 10.2 / len(moments)
+    height = width * rows / columns
+    figure = Figure(figsize=(10.2, len(shown) * (height + 0.25)), facecolor="white")
+    grid = figure.subplots(len(shown), len(moments), squeeze=False)
+    figure.subplots_adjust(0, 0, 1, 1 - 0.25 / (len(shown) * (height + 0.25)), 0.02, 0.25 / height)
+    for one, line in zip(shown, grid, strict=True):
+        levels = list(one.levels(window))
+        for (name, time_s), axes in zip(moments, line, strict=True):
+            axes.set_axis_off()
+            axes.imshow(levels[one.film.at(time_s)], cmap="gray", vmin=0, vmax=1, interpolation="antialiased")
+            axes.set_title(f"{one.title}: {name}, {time_s:.1f} s", fontsize=7.5, loc="left", pad=3)
+    caption = (
+        f"Contrast agent along {shown[0].film.view.name}, at equal times: half of the largest amount in the picture "
+        f"(early, late), the largest (peak), and {LATE_S:g} s later. {OF_FILM}"
+    )
+    return Picture("angiogram", "Angiogram before and after", caption, png_of(figure))
+
+
+def write_films(
+    out: Path,
+    shown: Mapping[str, Shown],
+    window: float,
+    *,
+    study: Mapping[str, Any] | None = None,
+) -> list[str]:
+    """Write films into a folder: PNG frames and a DICOM file of each, and one animation of all side by side.
+
+    Parameters
+    ----------
+    out : the folder.
+    shown : films by name, ``bare`` first.
+    window : absorption that is shown black.
+    study : fields of patient and study for the DICOM files (`vstent.io.xa_writer.study_of`); None: none.
+
+    Returns
+    -------
+    list of str
+        Names of what was written, relative to `out`.
+    """
+    written = []
+    for number, (name, one) in enumerate(shown.items(), start=1):
+        levels = list(one.levels(window))
+        write_frames(out / name, [bytes_of(frame) for frame in levels])
+        write_xa(out / f"{name}.dcm", _stored(levels), header_of(one, window, number, dict(study or {})))
+        written += [name, f"{name}.dcm"]
+    all_frames = beside(list(shown.values()), window)
+    step_s = 1.0 / next(iter(shown.values())).film.frame_rate_Hz
+    for path in (out / "angiogram.webp",):
+        with atomic(path) as partial:
+            partial.write_bytes(animation(all_frames, step_s))
+        written.append(path.name)
+    return written
+
+
+def _stored(levels: Sequence[NDArray[np.float32]]) -> NDArray[np.uint16]:
+    """Return grey levels from 0 to 1 as the values of a DICOM film."""
+    return np.stack([np.rint(((1 << BITS) - 1) * frame).astype(np.uint16) for frame in levels])
+
+
+def header_of(one: Shown, window: float, number: int, study: dict[str, Any]) -> XaHeader:
+    """Return the DICOM header of a film.
+
+    Parameters
+    ----------
+    one : the film.
+    window : absorption that is shown black.
+    number : number of the series.
+    study : fields of patient and study; empty: none.
+    """
+    view = one.film.view
+    return XaHeader(
+        primary_rad=view.primary_rad,
+        secondary_rad=view.secondary_rad,
+        axes=view.axes,
+        source_detector_mm=view.source_detector_mm,
+        source_isocenter_mm=view.source_isocenter_mm,
+        pixel_mm=view.pixel_mm,
+        frame_time_s=1.0 / one.film.frame_rate_Hz,
+        series=f"Virtual angiogram, {one.title}, {view.name}"[:64],
+        number=number,
+        derivation=(
+            "Contrast agent carried by a computed flow, absorption -ln(I/I0) along cone-beam rays; "
+            f"0 (black) is an absorption of {window:.3g}, linear. Research use only."
+        ),
+        study=study,
+    )
