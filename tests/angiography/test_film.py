@@ -69,7 +69,7 @@ def test_wires_absorb_by_their_volume():
     stent = Stent(
         design, design.sizes[0], np.zeros((2, 3, 3)), np.zeros(2), np.concatenate([ring, line]), [0, 40, 80], [50, 30]
     )
-    arm = fitted(stent.wire_points_mm, *angles_of("LAO 30 CRA 40"))
+    arm = fitted(stent.wire_points_mm, angles_of("LAO 30 CRA 40"))
     image = wire_shadow(arm, stent)
     lengths = [np.linalg.norm(np.diff(wire, axis=0), axis=1).sum() for wire in (ring, line)]
     volume_mm3 = np.pi / 4 * (0.05**2 * lengths[0] + 0.03**2 * lengths[1])

@@ -22,7 +22,7 @@ def test_the_detector_holds_the_weighted_mass(text):
     points = ball(4.0, 0.25) + np.array([25, -11, 140])
     away = points + 30 * np.array([0.3, 0.5, -0.2])  # far from the axis of the beam too
     both, mass_mg = np.concatenate([points, away]), np.random.default_rng(0).uniform(0, 300, 2 * len(points))
-    arm = fitted(both, *angles_of(text))
+    arm = fitted(both, angles_of(text))
     image = projector_of(arm, both, np.full(len(both), 0.25))(mass_mg)
     from_source = both - arm.source_mm
     depth_mm = from_source @ arm.axes[2]

@@ -72,12 +72,12 @@ def test_angles_and_distances_out_of_range_are_refused():
     with pytest.raises(InputError, match="lies within the vessel"):
         view("AP").pixels_of(np.array([[0.0, 745, 0]]))
     with pytest.raises(InputError, match="larger detector pixel"):
-        fitted(np.array([[-150.0, 0, 0], [150, 0, 0]]), 0, 0)
+        fitted(np.array([[-150.0, 0, 0], [150, 0, 0]]), (0, 0))
 
 
 def test_a_fitted_detector_shows_every_point():
     points_mm = np.random.default_rng(3).uniform(-12, 15, (400, 3)) + np.array([30, -20, 100])
-    arm = fitted(points_mm, *angles_of("RAO 35 CRA 20"))
+    arm = fitted(points_mm, angles_of("RAO 35 CRA 20"))
     pixels, _ = arm.pixels_of(points_mm)
     assert pixels.min() > 0
     assert (pixels.max(axis=0) < [arm.rows - 1, arm.columns - 1]).all()

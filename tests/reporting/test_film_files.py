@@ -9,7 +9,7 @@ from PIL import Image
 
 from vstent.angiography.film import PAPER, Film
 from vstent.angiography.view import View, angles_of
-from vstent.reporting.films import CAPTION_PX, GAP_PX, Shown, beside, key_frames, key_times_s, write_films
+from vstent.reporting.films import CAPTION_PX, GAP_PX, Shown, beside, kept_films, key_frames, key_times_s, write_films
 
 VIEW = View(*angles_of("RAO 30 CRA 20"), np.zeros(3), 32, 48)
 
@@ -46,7 +46,7 @@ def test_films_side_by_side_keep_their_pixels_below_the_captions():
 def test_files_hold_the_same_grey(tmp_path):
     shown = {"bare": Shown("Before", film()), "silk": Shown("Silk", film(3.0))}
     written = write_films(tmp_path, shown, 0.8)
-    assert written == ["bare", "bare.dcm", "silk", "silk.dcm", "angiogram.webp"]
+    assert written == ["bare", "bare.dcm", "silk", "silk.dcm", "angiogram.webp", "key_frames.png", "films.json"]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(written)
     xa = pydicom.dcmread(tmp_path / "silk.dcm")
     frame = np.asarray(Image.open(tmp_path / "silk" / "frame_0041.png"))
@@ -62,6 +62,17 @@ def test_files_hold_the_same_grey(tmp_path):
             animated.load()
             total_ms += animated.info["duration"]
         assert total_ms == 8100
+
+
+def test_the_report_finds_the_films_of_a_case(tmp_path):
+    assert kept_films(tmp_path) is None
+    shown = {"bare": Shown("Before", film())}
+    write_films(tmp_path / "angiogram", shown, 0.8)
+    kept = kept_films(tmp_path)
+    assert kept.animation == (tmp_path / "angiogram" / "angiogram.webp").read_bytes()
+    assert kept.picture.png == key_frames([*shown.values()], 0.8).png
+    (tmp_path / "angiogram" / "angiogram.webp").write_bytes(bytes(3_000_000))
+    assert kept_films(tmp_path).animation == b""  # too large for the report
 
 
 def test_key_frames_are_a_picture():

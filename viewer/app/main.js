@@ -4,6 +4,7 @@ import { drop, get, getBinary, Newest, post, put } from "./api.js";
 import { Axis } from "./axis.js";
 import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js";
 import { Deploying } from "./deploy.js";
+import { Films, inWords } from "./films.js";
 import { Flowing } from "./flowing.js";
 import { Imaging } from "./imaging.js";
 import { SacLabel } from "./labels.js";
@@ -154,6 +155,7 @@ class Page {
       failed: (problem) => this.complain(problem),
     });
     this.portrait = new Portrait(this);
+    this.films = new Films({ path: () => this.path, title: (name) => (name === "bare" ? "Before" : this.deviceTitle(name)), changed: () => this.view && this.renderFilms(), failed: (problem) => this.complain(problem) });
     this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.imaging = new Imaging(this);
@@ -173,7 +175,7 @@ class Page {
       make("header", {}, [this.brand(), this.caseName, this.stepper, make("div", { className: "spring" }), this.undoButton, this.redoButton, this.badge()]),
       make("main", { className: "desk" }, [
         make("aside", { className: "left", ariaLabel: "Settings" }, [this.panel, this.work]),
-        make("div", { className: "middle" }, [this.imaging.box, this.picture.element, this.strip]),
+        make("div", { className: "middle" }, [this.imaging.box, this.picture.element, this.films.element, this.strip]),
         make("aside", { className: "right", ariaLabel: "Results" }, [this.numbers]),
       ]),
     ]);
@@ -194,12 +196,15 @@ class Page {
     this.redoButton.disabled = !view.can_redo;
     this.renderSteps();
     this.renderWork();
-    if (before?.job && !view.job) this.flowKey = undefined; // what it has found is to be fetched
+    if (before?.job && !view.job) {
+      this.flowKey = undefined; // what it has found is to be fetched
+      this.films.forget();
+    }
     const follows = before?.job && !view.job && before.steps[this.step] === "running";
     if (before?.job && view.job && before.steps[this.step] === "running" && view.steps[this.step] !== "running") this.follow(view);
     if (follows) this.finished(before);
     this.load();
-    const shape = JSON.stringify([view.choices, view.steps, view.failed, view.has_report, view.has_ranking, !view.job, this.step, view.anatomy]);
+    const shape = JSON.stringify([view.choices, view.steps, view.failed, view.has_report, view.has_ranking, view.has_angiogram, !view.job, this.step, view.anatomy]);
     if (shape === this.shape) {
       if (this.step === "flow" || (this.step === "device" && view.job?.kind === "rank")) this.renderStrip();
       return;
@@ -364,6 +369,9 @@ class Page {
     this.picture.setPanes(this.panes());
     this.picture.setLayers(layers, (this.memory[this.step] ??= {}));
     this.flowing.isWatched = this.step === "deploy";
+    this.picture.element.hidden = this.isFilm;
+    this.films.element.hidden = !this.isFilm;
+    if (this.isFilm && !this.films.hasFilm) this.films.ask();
     this.picture.clicked = isScan ? (point) => this.imaging.clicked(point) : this.step === "sac" ? (point) => point && this.setSeed(point) : null;
     this.picture.moved = null;
     this.picture.setMarks(isScan ? this.imaging.marks : this.anatomy ? this.marks() : []);
@@ -454,8 +462,21 @@ class Page {
     this.strip.replaceChildren(...parts);
   }
 
+  /** Whether the films are shown in place of the 3-D picture. */
+  get isFilm() {
+    return this.step === "flow" && this.memory.mode === "angiogram" && this.view.has_angiogram && !this.view.job;
+  }
+
+  /** The films have changed: their direction, and the strip where they were not there before. */
+  renderFilms() {
+    const field = this.panel.querySelector("#field-carm");
+    if (field && document.activeElement !== field) field.value = inWords(this.films.angles);
+    if (this.isFilm && this.strip.firstChild !== this.films.strip[0]) this.renderStrip();
+  }
+
   flowStrip() {
     const { job } = this.view;
+    if (this.isFilm && this.films.hasFilm) return this.films.strip;
     return job?.kind === "flow" ? [residualChart(job.residual)] : [];
   }
 
@@ -647,7 +668,7 @@ const deviceWith = (name, changes) => ({ devices }) => ({
 });
 const SPOKEN = {
   scan: "Scan", vessel: "Vessel", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes", rank_flow: "Flow of the best sizes",
-  deploy: "Deploying", struts: "Wires of", plan: "Run time of the flow", flow: "Flow,", vary: "Uncertainty of", measure: "Metrics", report: "Report",
+  deploy: "Deploying", struts: "Wires of", plan: "Run time of the flow", flow: "Flow,", vary: "Uncertainty of", measure: "Metrics", report: "Report", angiogram: "Angiogram,", film: "Films",
 };
 
 /** From where each step looks at first. */

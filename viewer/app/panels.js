@@ -180,7 +180,7 @@ export const panels = {
     );
     parts.push(page.pulseChart(), ...unseen(page), ...failure(page), ...staleness(page));
     if (!job) parts.push(main(page, steps.flow === "done" ? "Run again" : "Run the flow", () => page.start("flow"), !page.view.has_anatomy || !page.device));
-    if (page.flowPanes?.length) parts.push(modes(page));
+    if (page.flowPanes?.length) parts.push(modes(page), ...films(page));
     if (page.view.has_report && steps.report === "done") parts.push(next(page, "report", "Report →"));
     return parts;
   },
@@ -392,8 +392,21 @@ function expansion(page) {
   return play;
 }
 
+/** The angiogram: what is chosen for its films, or the button that computes it. */
+function films(page) {
+  const { has_angiogram, job, steps } = page.view;
+  if (page.memory.mode !== "angiogram") return [];
+  if (has_angiogram) return page.films.controls();
+  if (job) return [];
+  const isOff = steps.flow !== "done";
+  return [
+    make("p", { className: "hint" }, ["Contrast agent is carried through every flow, and filmed as on an angiography unit."]),
+    main(page, "Compute the angiogram", () => page.start("angiogram"), isOff),
+  ];
+}
+
 function modes(page) {
-  const options = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall shear stress"], ["sac_shear", "Shear stress, sac"]].map(([id, words]) => {
+  const options = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall shear stress"], ["sac_shear", "Shear stress, sac"], ["angiogram", "Angiogram"]].map(([id, words]) => {
     const button = make("button", { type: "button", ariaPressed: String((page.memory.mode || "streamlines") === id) }, [words]);
     button.addEventListener("click", () => {
       page.memory.mode = id;
@@ -402,5 +415,5 @@ function modes(page) {
     });
     return button;
   });
-  return make("div", { className: "tabs", role: "group", ariaLabel: "Show" }, options);
+  return make("div", { className: "tabs modes", role: "group", ariaLabel: "Show" }, options);
 }

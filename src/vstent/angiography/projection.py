@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.angiography.view import View
-from vstent.kernels.arrays import Floats
 from vstent.kernels.footprints import footprints
 
 
@@ -26,7 +25,7 @@ class Projector:
         return np.asarray(integrals, dtype=np.float32).reshape(self.view.rows, self.view.columns)
 
 
-def projector_of(view: View, points_mm: Floats, spacing_mm: Floats) -> Projector:
+def projector_of(view: View, points_mm: NDArray[np.floating[Any]], spacing_mm: NDArray[np.floating[Any]]) -> Projector:
     """Return the projector of grid cells: the footprints of cubes in a cone beam, as a sparse matrix.
 
     The sum over all pixels, times the area of a pixel, is the integral of the concentration over the volume, weighted
@@ -46,8 +45,9 @@ def projector_of(view: View, points_mm: Floats, spacing_mm: Floats) -> Projector
     """
     from scipy.sparse import csc_array
 
-    view.pixels_of(points_mm)  # refuses cells beside or behind the source
-    seen = np.ascontiguousarray((np.asarray(points_mm, dtype=np.float64) - view.isocenter_mm) @ view.axes.T)
+    centers_mm = np.asarray(points_mm, dtype=np.float64)
+    view.pixels_of(centers_mm)  # refuses cells beside or behind the source
+    seen = np.ascontiguousarray((centers_mm - view.isocenter_mm) @ view.axes.T)
     middle = 0.5 * (view.rows - 1), 0.5 * (view.columns - 1)
     geometry = np.array([view.pixel_mm, view.source_detector_mm, view.source_isocenter_mm, *middle])
     shape = np.array([view.rows, view.columns])

@@ -3,9 +3,10 @@
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vstent.errors import InputError
 from vstent.kernels.arrays import Floats, freeze
@@ -151,30 +152,39 @@ def angles_of(text: str) -> tuple[float, float]:
     return angles
 
 
-def fitted(points_mm: Floats, primary_rad: float, secondary_rad: float, *, pixel_mm: float = PIXEL_MM) -> View:
+def fitted(
+    points_mm: NDArray[np.floating[Any]],
+    angles_rad: tuple[float, float],
+    pixel_mm: float = PIXEL_MM,
+    source_detector_mm: float = SOURCE_DETECTOR_MM,
+    source_isocenter_mm: float = SOURCE_ISOCENTER_MM,
+) -> View:
     """Return a view whose isocenter is the middle of points and whose detector shows them all.
 
     Parameters
     ----------
     points_mm : (n, 3) points to show.
-    primary_rad, secondary_rad : direction of the C-arm.
+    angles_rad : primary and secondary angle of the C-arm.
     pixel_mm : edge of a detector pixel.
+    source_detector_mm : distance from source to detector.
+    source_isocenter_mm : distance from source to isocenter.
 
     Raises
     ------
     InputError
         The shadow of the points has more than 2048 pixels along a side.
     """
-    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
-    aim = View(primary_rad, secondary_rad, 0.5 * (low + high), 8, 8, pixel_mm)
-    pixels = aim.pixels_of(points_mm)[0] - 3.5
+    middle_mm = 0.5 * (points_mm.min(axis=0) + points_mm.max(axis=0))
+    distances_mm = pixel_mm, source_detector_mm, source_isocenter_mm
+    aim = View(*angles_rad, middle_mm, 8, 8, *distances_mm)
+    pixels = aim.pixels_of(np.asarray(points_mm, dtype=np.float64))[0] - 3.5
     rows, columns = (16 * int(np.ceil(MARGIN * 2 * half / 16)) for half in np.abs(pixels).max(axis=0))
     if max(rows, columns) > MAX_PIXELS:
         raise InputError(
             f"The vessel covers {max(rows, columns)} detector pixels of {pixel_mm:g} mm, more than {MAX_PIXELS}. "
             "Give a larger detector pixel."
         )
-    return View(primary_rad, secondary_rad, aim.isocenter_mm, max(rows, 16), max(columns, 16), pixel_mm)
+    return View(*angles_rad, middle_mm, max(rows, 16), max(columns, 16), *distances_mm)
 
 
 def _check_angles(primary_rad: float, secondary_rad: float) -> None:

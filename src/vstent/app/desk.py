@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Absent, Case, Conflict, Store, dependencies, failures, statuses
 from vstent.app.choices import DeviceChoice, Point, pulse_of
-from vstent.app.finished import REPORT, RUN, kept_flows, lost_steps
+from vstent.app.finished import REPORT, RUN, kept_flows, kept_histories, lost_steps
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.app.reopening import reopened, stem
 from vstent.errors import InputError, ReadError
@@ -118,6 +118,7 @@ class Desk:
             "has_pdf": (case.folder / "report.pdf").is_file(),
             "has_ranking": (case.folder / RANKING).is_file(),
             "has_flow": bool(kept_flows(case.folder)),
+            "has_angiogram": bool(kept_histories(case.folder)),
             "job": job.told() if job is not None and is_at_work else None,
         }
 

@@ -13,11 +13,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vstent.anatomy.morphology import Measures, morphology
+from vstent.angiography.history import History
+from vstent.angiography.view import angles_of
+from vstent.angiography.working_projection import working_projection
 from vstent.app import necks, sheets
 from vstent.app.cases import Case
 from vstent.app.choices import DeviceChoice, placing_of
 from vstent.app.cuts import cut
-from vstent.app.finished import kept_flows
+from vstent.app.films import films_message
+from vstent.app.finished import kept_flows, kept_histories
 from vstent.deployment.contour import planes
 from vstent.deployment.deploy import propose_landing
 from vstent.deployment.measure import measure
@@ -370,6 +374,38 @@ class Live:
             most = _peak(bare)
             of_scales = layers if moment is None or most is None else self._flow_layers(BARE, paths[BARE], most)
             return message(layers, scales_of(of_scales, self.anatomy), **_moments(bare, moment), panes=list(paths))
+
+    def films_message(self, direction: str, *, has_wires: bool = False, moment: int | None = None) -> bytes:
+        """Return the films of every flow along one direction.
+
+        Parameters
+        ----------
+        direction : C-arm direction in words; empty: the working projection.
+        has_wires : whether the wires of the devices are shown.
+        moment : number of the only frame to return; None: all frames.
+
+        Raises
+        ------
+        ReadError
+            The angiogram has not been computed.
+        """
+        with LOCK:
+            paths = kept_histories(self.case.folder)
+            if not paths:
+                raise ReadError("The angiogram has not been computed for these flows. Compute it in the step Flow.")
+            histories = {name: self._history(path) for name, path in paths.items()}
+            chosen = {choice.name: choice for choice in self.case.state.choices.devices if has_wires}
+            stents = {name: self.deployment(chosen[name]).stent for name in histories if name in chosen}
+            angles = angles_of(direction) if direction else self._working_projection()
+            return films_message(histories, angles, stents=stents, moment=moment)
+
+    def _history(self, path: Path) -> History:
+        """Return the stored contrast of a flow."""
+        return self.remembered(("contrast", path, path.stat().st_mtime_ns), lambda: load_data(path, History))
+
+    def _working_projection(self) -> tuple[float, float]:
+        """Return the angles of the proposed direction."""
+        return self.remembered(("direction", self.case.state.anatomy), lambda: working_projection(self.anatomy))
 
     def section(self, name: str | None, abscissa_mm: float) -> dict[str, Any]:
         """Return the section by a plane across the parent axis: curves in the plane, in mm, and diameters.

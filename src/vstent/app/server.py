@@ -375,6 +375,16 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
     def flow(case_id: str, moment: Annotated[int | None, Query(ge=0)] = None) -> Response:
         return Response(desk.live(desk.store.get(case_id)).flow_message(moment), media_type=BINARY)
 
+    @api.get("/api/cases/{case_id}/angiogram", summary="Films of every flow along a C-arm direction (binary)")
+    def angiogram(
+        case_id: str,
+        view: Annotated[str, Query(max_length=60)] = "",
+        wires: bool = False,
+        moment: Annotated[int | None, Query(ge=0)] = None,
+    ) -> Response:
+        found = desk.live(desk.store.get(case_id))
+        return Response(found.films_message(view, has_wires=wires, moment=moment), media_type=BINARY)
+
     @api.get("/api/waveform", summary="The waveforms that can be chosen: the published one, or the case's own")
     def waveform(case_id: str | None = None) -> dict[str, Any]:
         return desks.pulse(None if case_id is None else desk.store.get(case_id))

@@ -1,5 +1,6 @@
 """Present films: grey frames, films before and after side by side, key frames, and files for viewers."""
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,15 +9,27 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.angiography.film import Film, levels_of
+from vstent.angiography.film import Film, levels_of, wire_shadow
+from vstent.angiography.filming import FilmSettings, films_of, projectors_of, view_for
+from vstent.angiography.history import History
+from vstent.devices.stent import Stent
 from vstent.io.files import atomic
-from vstent.io.films import animation, write_frames
+from vstent.io.films import write_animation, write_frames
+from vstent.io.writers import write_json
 from vstent.io.xa_writer import BITS, XaHeader, write_xa
 from vstent.reporting.figures import Picture, png_of
 
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont
 
+FOLDER: Final = "angiogram"
+"""Subfolder of the case folder with the films."""
+ANIMATION: Final = "angiogram.webp"
+"""File with all films side by side."""
+KEY_FRAMES: Final = "key_frames.png"
+"""File with the picture of the key frames."""
+INDEX: Final = "films.json"
+"""File with title and caption of the key frames, and the titles of the films."""
 CAPTION_PX: Final = 22
 """Height of the line of text above a film."""
 GAP_PX: Final = 6
@@ -48,6 +61,28 @@ class Shown:
     def levels(self, window: float) -> Iterator[NDArray[np.float32]]:
         """Yield the grey levels (rows, columns) of every frame, 0 to 1."""
         return levels_of(self.film, window, wires=self.wires, vessel=self.vessel)
+
+
+def shown_of(
+    histories: Mapping[str, History], stents: Mapping[str, Stent], titles: Mapping[str, str], settings: FilmSettings
+) -> dict[str, Shown]:
+    """Film the contrast of every flow along one direction.
+
+    Parameters
+    ----------
+    histories : contrast by name of the flow, ``bare`` first.
+    stents : devices by name.
+    titles : titles of the films by name.
+    settings : how films are taken; without a direction they are frontal (`vstent.angiography.filming.aimed`).
+    """
+    view = view_for(histories, settings)
+    projectors = projectors_of(view, histories)
+    found = {}
+    for name, film in films_of(histories, projectors, settings).items():
+        wires = wire_shadow(view, stents[name]) if settings.has_wires and name in stents else None
+        vessel = projectors[name](np.ones(len(histories[name].points_mm))) if settings.has_vessel else None
+        found[name] = Shown(titles[name], film, wires, vessel)
+    return found
 
 
 def bytes_of(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -168,13 +203,38 @@ def write_films(
         write_frames(out / name, [bytes_of(frame) for frame in levels])
         write_xa(out / f"{name}.dcm", _stored(levels), header_of(one, window, number, dict(study or {})))
         written += [name, f"{name}.dcm"]
-    all_frames = beside(list(shown.values()), window)
-    step_s = 1.0 / next(iter(shown.values())).film.frame_rate_Hz
-    for path in (out / "angiogram.webp",):
-        with atomic(path) as partial:
-            partial.write_bytes(animation(all_frames, step_s))
-        written.append(path.name)
-    return written
+    films = list(shown.values())
+    picture = key_frames(films, window)
+    write_animation(out / ANIMATION, beside(films, window), 1.0 / films[0].film.frame_rate_Hz)
+    with atomic(out / KEY_FRAMES) as partial:
+        partial.write_bytes(picture.png)
+    write_json(
+        out / INDEX,
+        {"title": picture.title, "caption": picture.caption, "films": {n: o.title for n, o in shown.items()}},
+    )
+    return [*written, ANIMATION, KEY_FRAMES, INDEX]
+
+
+@dataclass(frozen=True, eq=False)
+class KeptFilms:
+    """Films of a case folder, as the report shows them."""
+
+    picture: Picture
+    """The key frames."""
+    animation: bytes
+    """All films side by side as an animated WebP; empty where it is too large for the report."""
+
+
+def kept_films(case: Path) -> KeptFilms | None:
+    """Return the films in the subfolder ``angiogram`` of a case folder; None where there are none."""
+    folder = case / FOLDER
+    try:
+        told = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+        picture = Picture("angiogram", told["title"], told["caption"], (folder / KEY_FRAMES).read_bytes())
+        film = (folder / ANIMATION).read_bytes()
+    except (OSError, ValueError, KeyError):
+        return None
+    return KeptFilms(picture, film if len(film) <= SMALL_BYTES else b"")
 
 
 def _stored(levels: Sequence[NDArray[np.float32]]) -> NDArray[np.uint16]:

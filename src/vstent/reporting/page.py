@@ -4,7 +4,7 @@ import base64
 import hashlib
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, Final
@@ -19,6 +19,7 @@ from vstent.flow.grade import QUALITY
 from vstent.reporting import bands
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
 from vstent.reporting.figures import Picture, pictures
+from vstent.reporting.films import KeptFilms
 from vstent.reporting.method import method_pictures
 from vstent.reporting.packing import pack
 from vstent.reporting.quality import OF_GRADES, Quality, qualities, unusable
@@ -97,6 +98,8 @@ class Contents:
     """Limits of the results, one sentence each."""
     provenance: list[tuple[str, list[tuple[str, str]]]]
     """Versions, input and settings: groups of (name, value) lines by title."""
+    film: bytes = b""
+    """Films of the contrast agent before and after, as an animated WebP; empty: none."""
 
     @property
     def devices(self) -> tuple[tuple[str, str], ...]:
@@ -154,6 +157,11 @@ def contents_of(case: "CaseResult") -> Contents:
     )
 
 
+def with_films(told: Contents, films: KeptFilms) -> Contents:
+    """Return the contents of a report with the key frames and the film of its angiogram."""
+    return replace(told, pictures=(*told.pictures, films.picture), film=films.animation)
+
+
 def limits_of(case: "CaseResult") -> tuple[str, ...]:
     """Return the limits of a result, one sentence each; those of the flow depend on its settings."""
     flow = case.provenance.get("settings", {}).get("flow")
@@ -189,6 +197,7 @@ def as_html(told: Contents) -> str:
         of_grades=OF_GRADES,
         summary=told.headlines,
         pictures=[_picture(picture) for picture in told.pictures],
+        film=base64.b64encode(told.film).decode("ascii"),
         vessel=told.vessel,
         openings=told.openings,
         stents=told.stents,

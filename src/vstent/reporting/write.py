@@ -1,12 +1,14 @@
 """Write the report of a case as HTML, and optionally as PDF."""
 
+import hashlib
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from vstent.io.files import atomic
 from vstent.io.writers import write_text
-from vstent.reporting.page import as_html, contents_of
+from vstent.reporting.films import kept_films
+from vstent.reporting.page import as_html, contents_of, with_films
 from vstent.reporting.pdf import as_pdf
 from vstent.reporting.plan_sheet import Planned, plan_pdf
 from vstent.study.folder import CACHE
@@ -50,11 +52,14 @@ def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False) -> 
     key = key_of(
         version("vstent"), case.metrics, case.notes, {k: v for k, v in case.provenance.items() if k != SECONDS}
     )
+    films = kept_films(out)
+    if films is not None:
+        key = key_of(key, hashlib.sha256(films.picture.png + films.animation).hexdigest())
     wanted = ["report.html"] + ["report.pdf"] * is_printed
     if all((out / name).is_file() for name in wanted) and _text(drawn) == key:
         return  # painting takes seconds, and would give the same pictures
     drawn.unlink(missing_ok=True)
-    told = contents_of(case)
+    told = contents_of(case) if films is None else with_films(contents_of(case), films)
     write_text(out / "report.html", as_html(told))
     if is_printed:
         with atomic(out / "report.pdf") as partial:

@@ -27,14 +27,19 @@ STENT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
 """Files of one device."""
 FIELD: Final = ("field.vtu", "wall.vtp")
 """Files of one flow."""
+ANGIOGRAM: Final = ("angiogram/*.*", "angiogram/*/frame_*.png")
+"""Files of the angiogram, as patterns."""
 SACS: Final = ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp")
 """Files of sacs and necks, as patterns."""
 OF_STUDY: Final = (
     *(METRICS, RUN, "report.html", "report.pdf", "plan.pdf", CRATE),
     *(f"stents/*/{name}" for name in STENT),
     *(f"flow/*/{name}" for name in FIELD),
+    *ANGIOGRAM,
 )
 """Files of devices, flows and reports, as patterns."""
+FOLDERS: Final = ("stents", "flow", "angiogram")
+"""Folders of the case folder that are removed when they are empty."""
 OF_ANATOMY: Final = ("morphology.json", "convergence.json")
 """Files that describe an anatomy alone."""
 RESULTS: Final = (
@@ -71,7 +76,12 @@ def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None
         file.unlink()
     for key in keys:
         shutil.rmtree(key.parent)
-    for folder in [*out.glob("stents/*/"), *out.glob("flow/*/"), out / "stents", out / "flow"]:
+    for folder in [
+        *out.glob("stents/*/"),
+        *out.glob("flow/*/"),
+        *out.glob("angiogram/*/"),
+        *map(out.joinpath, FOLDERS),
+    ]:
         with suppress(OSError):  # it does not exist, or is not empty
             folder.rmdir()
 

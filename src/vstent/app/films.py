@@ -1,0 +1,78 @@
+"""Films of the page: every flow along one C-arm direction, from the stored contrast."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from vstent.angiography.film import CM2_G_PER, ENERGY_KEV, Film, film_of, iodine_cm2_g, levels_of, wire_shadow
+from vstent.angiography.filming import FilmSettings, projectors_of, view_for
+from vstent.angiography.history import History
+from vstent.angiography.projection import Projector
+from vstent.devices.stent import Stent
+from vstent.reporting.packing import Packer
+
+PIXEL_MM: Final = 0.308
+"""Detector pixel of the page's films: two pixels of a flat panel, binned as in fluoroscopy."""
+QUICK_PIXEL_MM: Final = 0.616
+"""Detector pixel of the one frame that is drawn while the C-arm is turned."""
+LEVELS: Final = 255
+"""Largest grey level of the page's films."""
+
+
+def films_message(
+    histories: Mapping[str, History],
+    angles_rad: tuple[float, float],
+    *,
+    stents: Mapping[str, Stent],
+    moment: int | None = None,
+    **more: Any,
+) -> bytes:
+    """Return the films of all flows along one direction, as a message for the page.
+
+    Parameters
+    ----------
+    histories : contrast by name, ``bare`` first.
+    angles_rad : primary and secondary angle.
+    stents : devices whose wires are shown, by name.
+    moment : number of the only frame to return, with coarse pixels; None: all frames.
+    more : further entries of the manifest.
+    """
+    settings = FilmSettings(angles_rad, pixel_mm=PIXEL_MM if moment is None else QUICK_PIXEL_MM)
+    view = view_for(histories, settings)
+    packer, panes, times_s = Packer(), [], np.zeros(0)
+    projectors = projectors_of(view, histories)
+    window = max(_bound(projectors[name], history) for name, history in histories.items())
+    for name, history in histories.items():
+        film = _film(history, projectors[name], moment)
+        wires = wire_shadow(view, stents[name]) if name in stents else None
+        levels = np.stack([np.rint(LEVELS * one) for one in levels_of(film, window, wires=wires)]).astype(np.uint8)
+        panes.append({"id": name, "frames": packer.add(levels)})
+        times_s = history.time_s
+    manifest = {
+        "view": view.name,
+        "angles_deg": [round(float(np.degrees(angle)), 1) for angle in angles_rad],
+        "rows": view.rows,
+        "columns": view.columns,
+        "moment": moment,
+        "times_s": [round(float(time_s), 4) for time_s in times_s],
+        "panes": panes,
+    }
+    return packer.framed(manifest | more)
+
+
+def _bound(projector: Projector, history: History) -> float:
+    """Return the absorption where the longest ray through the vessel is filled with the largest concentration."""
+    most_mg_mL = float(history.value_mg_mL[int(history.stored.max(initial=0))])
+    length_mm = projector(np.ones(len(history.points_mm))).max()
+    return max(float(length_mm) * most_mg_mL * iodine_cm2_g(ENERGY_KEV) * CM2_G_PER, 1e-3)
+
+
+def _film(history: History, projector: Projector, moment: int | None) -> Film:
+    """Return the film of a history, or one frame of it."""
+    if moment is None:
+        step_s = float(np.diff(history.time_s).mean()) if len(history.time_s) > 1 else 1.0
+        return film_of(history.frames(), projector, frame_rate_Hz=1.0 / step_s)
+    at = min(moment, len(history.time_s) - 1)
+    frame = float(history.time_s[at]), history.value_mg_mL[history.stored[at]]
+    return film_of([frame], projector, frame_rate_Hz=1.0)
