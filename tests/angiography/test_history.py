@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vstent.angiography.history import History, recorded
+from vstent.angiography.history import History, Recorder
 from vstent.io.archive import load_data, save_data
 
 
@@ -12,22 +12,25 @@ def test_values_come_back_within_half_a_step():
     wanted = rng.uniform(0, 300, (5, 40)).astype(np.float32)
     buffer = np.zeros(40, np.float32)
 
-    def frames():
-        for k, row in enumerate(wanted):
-            buffer[:] = row
-            yield 0.1 * k, buffer
-
-    kept = recorded(frames(), rng.normal(size=(40, 3)), np.full(40, 0.2), 300.0)
+    recorder = Recorder(300.0, "key", begin_s=0.2)
+    take = recorder.watch(rng.normal(size=(40, 3)), np.full(40, 0.2))
+    for k, row in enumerate(wanted):
+        buffer[:] = row
+        take(0.1 * k, buffer)
+    kept = recorder.history()
+    wanted = wanted[2:]  # the injection starts at 0.2 s
     times, values = zip(*kept.frames(), strict=True)
-    assert np.allclose(times, 0.1 * np.arange(5))
+    assert np.allclose(times, 0.1 * np.arange(3))
     error = np.abs(np.array(values) - wanted)
     assert error.max() <= 300 / 255 * 1.001
     assert error[wanted < 3].max(initial=0) < 0.13  # finer near zero
 
 
 def test_values_beyond_the_scale_are_cut_and_the_file_gives_it_back(tmp_path):
-    kept = recorded([(0.0, np.array([-1.0, 400.0]))], np.zeros((2, 3)), np.ones(2), 300.0)
-    save_data(tmp_path / "history.npz", kept)
+    recorder = Recorder(300.0, "key")
+    recorder.watch(np.zeros((2, 3)), np.ones(2))(0.0, np.array([-1.0, 400.0]))
+    save_data(tmp_path / "history.npz", recorder.history())
     again = load_data(tmp_path / "history.npz", History)
     assert next(again.frames())[1] == pytest.approx([0, 300])
+    assert again.key == "key"
     assert not again.stored.flags.writeable

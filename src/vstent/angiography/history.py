@@ -1,6 +1,6 @@
 """Stored concentration over time, so that films along other views need no second transport."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -51,27 +51,46 @@ class History:
             yield float(time_s), self.value_mg_mL[stored]
 
 
-def recorded(
-    frames: Iterable[tuple[float, NDArray[Any]]],
-    points_mm: Floats,
-    spacing_mm: Floats,
-    most_mg_mL: float,
-    key: str = "",
-) -> History:
-    """Return the stored history of a concentration; values above `most_mg_mL` are stored as that.
+class Recorder:
+    """Stores the frames of a transport while it marches.
 
     Parameters
     ----------
-    frames : time in s and concentration (n,) in mg/mL; the arrays may be reused after each step.
-    points_mm : (n, 3) cell centers in LPS.
-    spacing_mm : (n,) edges of the cells.
-    most_mg_mL : largest concentration, that of the injected agent.
+    most_mg_mL : largest concentration; values above it are stored as that.
     key : digest of the injection and the times.
+    begin_s : time of the transport at which the injection starts: 0 s of the history; earlier frames are left out.
     """
-    times, stored = [], []
-    for time_s, values in frames:
-        share = np.clip(np.asarray(values, dtype=np.float32) / np.float32(most_mg_mL), 0.0, 1.0)
-        times.append(time_s)
-        stored.append(np.rint(STEPS * np.sqrt(share)).astype(np.uint8))
-    kept = np.stack(stored) if stored else np.zeros((0, len(points_mm)), np.uint8)
-    return History(points_mm.astype(np.float32), spacing_mm.astype(np.float32), np.array(times), kept, most_mg_mL, key)
+
+    def __init__(self, most_mg_mL: float, key: str = "", begin_s: float = 0.0) -> None:
+        self._most_mg_mL, self._key, self._begin_s = most_mg_mL, key, begin_s
+        self._cells: tuple[Floats, Floats] | None = None
+        self._times: list[float] = []
+        self._stored: list[NDArray[np.uint8]] = []
+
+    def watch(self, points_mm: Floats, spacing_mm: Floats) -> Callable[[float, NDArray[Any]], None]:
+        """Take the cell centers (n, 3) in LPS and the edges (n,); return the function that takes every frame."""
+        self._cells = points_mm, spacing_mm
+        return self.add
+
+    def add(self, time_s: float, values_mg_mL: NDArray[Any]) -> None:
+        """Store one frame (n,); the array may be reused afterwards."""
+        if time_s < self._begin_s - 1e-9:
+            return
+        share = np.clip(np.asarray(values_mg_mL, dtype=np.float32) / np.float32(self._most_mg_mL), 0.0, 1.0)
+        self._times.append(time_s - self._begin_s)
+        self._stored.append(np.rint(STEPS * np.sqrt(share)).astype(np.uint8))
+
+    def history(self) -> History:
+        """Return all frames so far.
+
+        Raises
+        ------
+        ValueError
+            There are no frames.
+        """
+        if self._cells is None or not self._stored:
+            raise ValueError("no frame has been stored")
+        points_mm, spacing_mm = (np.asarray(values, dtype=np.float32) for values in self._cells)
+        return History(
+            points_mm, spacing_mm, np.array(self._times), np.stack(self._stored), self._most_mg_mL, self._key
+        )

@@ -33,13 +33,10 @@ def kept_flows(folder: Path) -> dict[str, Path]:
 
 def kept_histories(folder: Path) -> dict[str, Path]:
     """Return the stored contrast of all flows of the last finished study by name; empty where one is missing."""
+    from vstent.study.folder import history_path
+
     paths = {name: history_path(path) for name, path in kept_flows(folder).items()}
     return paths if all(path.is_file() for path in paths.values()) else {}
-
-
-def history_path(flow: Path) -> Path:
-    """Return the file with the contrast that a flow carries, from the file with the flow."""
-    return flow.with_name("contrast" + flow.name.removeprefix("flow"))
 
 
 def lost_steps(folder: Path, state: State) -> set[str]:

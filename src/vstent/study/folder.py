@@ -37,6 +37,11 @@ def claiming(study: Study[Given, Found]) -> Study[Given, Found]:
     return alone
 
 
+def history_path(flow: Path) -> Path:
+    """Return the file with the contrast that a flow carries over time, from the file with the flow."""
+    return flow.with_name("contrast" + flow.name.removeprefix("flow"))
+
+
 @contextmanager
 def claimed(out: Path) -> Iterator[None]:
     """Reserve a case folder for this process.
