@@ -9,7 +9,17 @@ from PIL import Image
 
 from vstent.angiography.film import PAPER, Film
 from vstent.angiography.view import View, angles_of
-from vstent.reporting.films import CAPTION_PX, GAP_PX, Shown, beside, kept_films, key_frames, key_times_s, write_films
+from vstent.reporting.films import (
+    CAPTION_PX,
+    GAP_PX,
+    Density,
+    Shown,
+    beside,
+    kept_films,
+    key_frames,
+    key_times_s,
+    write_films,
+)
 
 VIEW = View(*angles_of("RAO 30 CRA 20"), np.zeros(3), 32, 48)
 
@@ -45,7 +55,7 @@ def test_films_side_by_side_keep_their_pixels_below_the_captions():
 
 def test_files_hold_the_same_grey(tmp_path):
     shown = {"bare": Shown("Before", film()), "silk": Shown("Silk", film(3.0))}
-    written = write_films(tmp_path, shown, 0.8)
+    written = write_films(tmp_path, shown)
     assert written == ["bare", "bare.dcm", "silk", "silk.dcm", "angiogram.webp", "key_frames.png", "films.json"]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(written)
     xa = pydicom.dcmread(tmp_path / "silk.dcm")
@@ -66,11 +76,12 @@ def test_files_hold_the_same_grey(tmp_path):
 
 def test_the_report_finds_the_films_of_a_case(tmp_path):
     assert kept_films(tmp_path) is None
-    shown = {"bare": Shown("Before", film())}
-    write_films(tmp_path / "angiogram", shown, 0.8)
+    shown, time_s = {"bare": Shown("Before", film())}, np.linspace(0, 1, 5)
+    write_films(tmp_path / "angiogram", shown, [Density("Before", time_s, 40 * time_s, 50 * time_s)])
     kept = kept_films(tmp_path)
     assert kept.animation == (tmp_path / "angiogram" / "angiogram.webp").read_bytes()
-    assert kept.picture.png == key_frames([*shown.values()], 0.8).png
+    assert [one.id for one in kept.pictures] == ["key_frames", "density"]
+    assert kept.pictures[0].png == key_frames([*shown.values()], shown["bare"].film.most).png
     (tmp_path / "angiogram" / "angiogram.webp").write_bytes(bytes(3_000_000))
     assert kept_films(tmp_path).animation == b""  # too large for the report
 

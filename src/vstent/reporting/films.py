@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.angiography.film import Film, levels_of, wire_shadow
+from vstent.angiography.film import Film, levels_of, window_of, wire_shadow
 from vstent.angiography.filming import FilmSettings, films_of, projectors_of, view_for
 from vstent.angiography.history import History
 from vstent.devices.stent import Stent
@@ -17,6 +17,7 @@ from vstent.io.files import atomic
 from vstent.io.films import write_animation, write_frames
 from vstent.io.writers import write_json
 from vstent.io.xa_writer import BITS, XaHeader, write_xa
+from vstent.kernels.arrays import Floats
 from vstent.reporting.figures import Picture, png_of
 
 if TYPE_CHECKING:
@@ -26,10 +27,10 @@ FOLDER: Final = "angiogram"
 """Subfolder of the case folder with the films."""
 ANIMATION: Final = "angiogram.webp"
 """File with all films side by side."""
-KEY_FRAMES: Final = "key_frames.png"
-"""File with the picture of the key frames."""
 INDEX: Final = "films.json"
-"""File with title and caption of the key frames, and the titles of the films."""
+"""File with title and caption of the pictures, and the titles of the films."""
+COLOURS: Final = ("#39474e", "#0072b2", "#d55e00", "#009e73", "#cc79a7")
+"""Colors of the flows, distinguishable with color vision deficiency (Okabe and Ito)."""
 CAPTION_PX: Final = 22
 """Height of the line of text above a film."""
 GAP_PX: Final = 6
@@ -173,13 +174,53 @@ def key_frames(shown: Sequence[Shown], window: float) -> Picture:
         f"Contrast agent along {shown[0].film.view.name}, at equal times: half of the largest amount in the picture "
         f"(early, late), the largest (peak), and {LATE_S:g} s later. {OF_FILM}"
     )
-    return Picture("angiogram", "Angiogram before and after", caption, png_of(figure))
+    return Picture("key_frames", "Angiogram before and after", caption, png_of(figure))
+
+
+@dataclass(frozen=True, eq=False)
+class Density:
+    """Contrast over time in one flow."""
+
+    title: str
+    """Name of the flow in pictures."""
+    time_s: Floats
+    """(t,) time since the start of the injection."""
+    sac_mg_mL: Floats
+    """(t,) mean iodine concentration in the sac."""
+    parent_mg_mL: Floats
+    """(t,) mean iodine concentration in the parent artery proximal to the neck."""
+
+
+def density_picture(densities: Sequence[Density]) -> Picture:
+    """Return the picture of the contrast in sac and parent artery over time.
+
+    Parameters
+    ----------
+    densities : the flow without a device first.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.2, 3.0), facecolor="white", layout="constrained")
+    axes = figure.subplots()
+    for one, color in zip(densities, COLOURS, strict=False):
+        axes.plot(one.time_s, one.sac_mg_mL, color=color, linewidth=1.6, label=f"{one.title}, sac")
+        axes.plot(one.time_s, one.parent_mg_mL, color=color, linewidth=0.9, linestyle=":", label="parent artery")
+    axes.set_xlabel("time since the start of the injection [s]", fontsize=8)
+    axes.set_ylabel("iodine [mg/mL]", fontsize=8)
+    axes.tick_params(labelsize=7.5)
+    axes.set_ylim(bottom=0.0)
+    axes.margins(x=0.0)
+    axes.legend(fontsize=7.5, frameon=False)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    caption = "Mean iodine concentration in the sac (solid) and in the parent artery proximal to the neck (dotted)."
+    return Picture("density", "Contrast in the sac over time", caption, png_of(figure))
 
 
 def write_films(
     out: Path,
     shown: Mapping[str, Shown],
-    window: float,
+    densities: Sequence[Density] = (),
     *,
     study: Mapping[str, Any] | None = None,
 ) -> list[str]:
@@ -189,7 +230,7 @@ def write_films(
     ----------
     out : the folder.
     shown : films by name, ``bare`` first.
-    window : absorption that is shown black.
+    densities : contrast over time, for the report.
     study : fields of patient and study for the DICOM files (`vstent.io.xa_writer.study_of`); None: none.
 
     Returns
@@ -197,30 +238,30 @@ def write_films(
     list of str
         Names of what was written, relative to `out`.
     """
+    films = list(shown.values())
+    window = window_of([one.film for one in films])
     written = []
     for number, (name, one) in enumerate(shown.items(), start=1):
         levels = list(one.levels(window))
         write_frames(out / name, [bytes_of(frame) for frame in levels])
         write_xa(out / f"{name}.dcm", _stored(levels), header_of(one, window, number, dict(study or {})))
         written += [name, f"{name}.dcm"]
-    films = list(shown.values())
-    picture = key_frames(films, window)
     write_animation(out / ANIMATION, beside(films, window), 1.0 / films[0].film.frame_rate_Hz)
-    with atomic(out / KEY_FRAMES) as partial:
-        partial.write_bytes(picture.png)
-    write_json(
-        out / INDEX,
-        {"title": picture.title, "caption": picture.caption, "films": {n: o.title for n, o in shown.items()}},
-    )
-    return [*written, ANIMATION, KEY_FRAMES, INDEX]
+    pictures = [key_frames(films, window), *([density_picture(densities)] if densities else [])]
+    for picture in pictures:
+        with atomic(out / f"{picture.id}.png") as partial:
+            partial.write_bytes(picture.png)
+    told = [{"id": one.id, "title": one.title, "caption": one.caption} for one in pictures]
+    write_json(out / INDEX, {"pictures": told, "films": {name: one.title for name, one in shown.items()}})
+    return [*written, ANIMATION, *(f"{picture.id}.png" for picture in pictures), INDEX]
 
 
 @dataclass(frozen=True, eq=False)
 class KeptFilms:
     """Films of a case folder, as the report shows them."""
 
-    picture: Picture
-    """The key frames."""
+    pictures: tuple[Picture, ...]
+    """The key frames, and contrast over time."""
     animation: bytes
     """All films side by side as an animated WebP; empty where it is too large for the report."""
 
@@ -229,12 +270,12 @@ def kept_films(case: Path) -> KeptFilms | None:
     """Return the films in the subfolder ``angiogram`` of a case folder; None where there are none."""
     folder = case / FOLDER
     try:
-        told = json.loads((folder / INDEX).read_text(encoding="utf-8"))
-        picture = Picture("angiogram", told["title"], told["caption"], (folder / KEY_FRAMES).read_bytes())
+        told = json.loads((folder / INDEX).read_text(encoding="utf-8"))["pictures"]
+        pictures = tuple(Picture(**one, png=(folder / f"{one['id']}.png").read_bytes()) for one in told)
         film = (folder / ANIMATION).read_bytes()
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError):
         return None
-    return KeptFilms(picture, film if len(film) <= SMALL_BYTES else b"")
+    return KeptFilms(pictures, film if len(film) <= SMALL_BYTES else b"")
 
 
 def _stored(levels: Sequence[NDArray[np.float32]]) -> NDArray[np.uint16]:

@@ -159,7 +159,7 @@ def contents_of(case: "CaseResult") -> Contents:
 
 def with_films(told: Contents, films: KeptFilms) -> Contents:
     """Return the contents of a report with the key frames and the film of its angiogram."""
-    return replace(told, pictures=(*told.pictures, films.picture), film=films.animation)
+    return replace(told, pictures=(*told.pictures, *films.pictures), film=films.animation)
 
 
 def limits_of(case: "CaseResult") -> tuple[str, ...]:

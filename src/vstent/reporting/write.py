@@ -54,7 +54,7 @@ def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False) -> 
     )
     films = kept_films(out)
     if films is not None:
-        key = key_of(key, hashlib.sha256(films.picture.png + films.animation).hexdigest())
+        key = key_of(key, hashlib.sha256(b"".join([*(one.png for one in films.pictures), films.animation])).hexdigest())
     wanted = ["report.html"] + ["report.pdf"] * is_printed
     if all((out / name).is_file() for name in wanted) and _text(drawn) == key:
         return  # painting takes seconds, and would give the same pictures
