@@ -1,10 +1,32 @@
 """A stored history gives back the concentration, and a reused buffer is copied."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from vstent.angiography.filming import projectors_of
 from vstent.angiography.history import History, Recorder
+from vstent.angiography.view import View
 from vstent.io.archive import load_data, save_data
+
+
+def flow(centers_mm: np.ndarray, spacing_mm: float) -> SimpleNamespace:
+    return SimpleNamespace(centers_mm=centers_mm, cell_size_mm=spacing_mm)
+
+
+def test_cells_have_the_value_of_their_block():
+    """Eight cells are marched as one, whose center is that of its blood; a cell far from all others holds nothing."""
+    cube = np.stack(np.meshgrid([0.0, 1], [0.0, 1], [0.0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    single, lost = np.array([[2.0, 0, 0], [2, 1, 1]]), np.array([[9.0, 9, 9]])
+    recorder = Recorder(flow(np.concatenate([cube, single, lost]), 1.0), 300.0)
+    recorder.watch(np.concatenate([cube.mean(axis=0)[None], single]), np.array([2.0, 1, 1]))(0.0, np.zeros(3))
+    kept = recorder.history()
+    assert kept.block.tolist() == [0] * 8 + [1, 2]
+    assert kept.points_mm.shape == (10, 3)
+    arm = View(0.0, 0.0, np.array([1.0, 0.5, 0.5]), 40, 40, 0.2)
+    image = projectors_of(arm, {"bare": kept})["bare"](np.array([1.0, 0.0, 0.0]))
+    assert image.sum() * 0.2**2 == pytest.approx(8 * arm.magnification**2, rel=2e-3)
 
 
 def test_values_come_back_within_half_a_step():
@@ -12,8 +34,9 @@ def test_values_come_back_within_half_a_step():
     wanted = rng.uniform(0, 300, (5, 40)).astype(np.float32)
     buffer = np.zeros(40, np.float32)
 
-    recorder = Recorder(300.0, "key", begin_s=0.2)
-    take = recorder.watch(rng.normal(size=(40, 3)), np.full(40, 0.2))
+    points = np.stack([np.arange(40.0), np.zeros(40), np.zeros(40)], axis=1)
+    recorder = Recorder(flow(points, 1.0), 300.0, "key", begin_s=0.2)
+    take = recorder.watch(points, np.ones(40))
     for k, row in enumerate(wanted):
         buffer[:] = row
         take(0.1 * k, buffer)
@@ -27,8 +50,9 @@ def test_values_come_back_within_half_a_step():
 
 
 def test_values_beyond_the_scale_are_cut_and_the_file_gives_it_back(tmp_path):
-    recorder = Recorder(300.0, "key")
-    recorder.watch(np.zeros((2, 3)), np.ones(2))(0.0, np.array([-1.0, 400.0]))
+    points = np.array([[0.0, 0, 0], [1, 0, 0]])
+    recorder = Recorder(flow(points, 1.0), 300.0, "key")
+    recorder.watch(points, np.ones(2))(0.0, np.array([-1.0, 400.0]))
     save_data(tmp_path / "history.npz", recorder.history())
     again = load_data(tmp_path / "history.npz", History)
     assert next(again.frames())[1] == pytest.approx([0, 300])

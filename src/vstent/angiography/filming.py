@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.sparse import csc_array
 
 from vstent.angiography.film import ENERGY_KEV, Film, check_frame_rate, film_of, iodine_cm2_g
 from vstent.angiography.history import History
@@ -73,14 +73,27 @@ def view_for(histories: Mapping[str, History], settings: FilmSettings) -> View:
 
 
 def projectors_of(view: View, histories: Mapping[str, History]) -> dict[str, Projector]:
-    """Return the projector of every flow; flows on equal cells share one."""
+    """Return the projector of every flow's stored values; flows on equal cells share one."""
     found: dict[str, Projector] = {}
-    made: list[tuple[NDArray[np.float32], Projector]] = []
+    made: list[tuple[History, Projector]] = []
     for name, history in histories.items():
-        same = [one for points_mm, one in made if np.array_equal(points_mm, history.points_mm)]
-        found[name] = same[0] if same else projector_of(view, history.points_mm, history.spacing_mm)
-        made.append((history.points_mm, found[name]))
+        same = [projector for one, projector in made if _has_equal_cells(one, history)]
+        found[name] = same[0] if same else _projector(view, history)
+        made.append((history, found[name]))
     return found
+
+
+def _projector(view: View, history: History) -> Projector:
+    """Return the projector of the stored values of a history: the footprints of all cells that share each."""
+    cells = projector_of(view, history.points_mm, np.full(len(history.points_mm), history.spacing_mm))
+    m, n = len(history.block), history.stored.shape[1]
+    shared = csc_array((np.ones(m, np.float32), (np.arange(m), history.block)), shape=(m, n))
+    return Projector(view, cells.matrix @ shared)
+
+
+def _has_equal_cells(one: History, other: History) -> bool:
+    """Return whether two histories are of the same cells in the same blocks."""
+    return np.array_equal(one.points_mm, other.points_mm) and np.array_equal(one.block, other.block)
 
 
 def films_of(

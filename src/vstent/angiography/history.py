@@ -7,24 +7,32 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from vstent.kernels.arrays import Floats, freeze
+from vstent.flow.case import FlowField
+from vstent.kernels.arrays import Floats, Ints, freeze
 
 STEPS: Final = 255
 """Largest stored value. Values are stored as the square root of the concentration, so that a faint washout keeps its
 shades: the error is at most 0.4 % of the largest concentration, and 0.04 % near zero."""
 
 
+FARTHEST: Final = 1.6
+"""Largest distance of a cell of the flow from the center of its block of cells, in cells; others hold no contrast."""
+
+
 @dataclass(frozen=True, eq=False)
 class History:
-    """Concentration on grid cells at the times of a film."""
+    """Concentration over time in the cells of a flow, of which several may share one value."""
 
     points_mm: NDArray[np.float32]
-    """(n, 3) cell centers in LPS."""
-    spacing_mm: NDArray[np.float32]
-    """(n,) edges of the cells."""
+    """(m, 3) centers in LPS of the cells of the flow."""
+    spacing_mm: float
+    """Grid spacing."""
+    block: Ints
+    """(m,) column of `stored` that holds the value of each cell."""
     time_s: Floats
-    """(f,) times."""
+    """(f,) times since the start of the injection."""
     stored: NDArray[np.uint8]
     """(f, n) square roots of the concentration, 0 to 255."""
     most_mg_mL: float
@@ -34,9 +42,9 @@ class History:
 
     def __post_init__(self) -> None:
         freeze(self, "points_mm", np.float32, (-1, 3))
-        freeze(self, "spacing_mm", np.float32, (len(self.points_mm),))
+        freeze(self, "block", np.int32, (len(self.points_mm),))
         freeze(self, "time_s", np.float64, (-1,))
-        if self.stored.shape != (len(self.time_s), len(self.points_mm)) or self.stored.dtype != np.uint8:
+        if self.stored.shape[:1] != self.time_s.shape or self.stored.ndim != 2 or self.stored.dtype != np.uint8:
             raise ValueError(f"stored has shape {self.stored.shape} and type {self.stored.dtype}")
         self.stored.flags.writeable = False  # not copied: it may take hundreds of MB
 
@@ -46,7 +54,7 @@ class History:
         return (self.most_mg_mL * (np.arange(STEPS + 1) / STEPS) ** 2).astype(np.float32)
 
     def frames(self) -> Iterator[tuple[float, NDArray[np.float32]]]:
-        """Yield time in s and concentration (n,) in mg/mL."""
+        """Yield time in s and concentration (n,) in mg/mL; cell k of the flow has the value `block[k]`."""
         for time_s, stored in zip(self.time_s, self.stored, strict=True):
             yield float(time_s), self.value_mg_mL[stored]
 
@@ -56,20 +64,21 @@ class Recorder:
 
     Parameters
     ----------
+    field : the flow that carries the contrast.
     most_mg_mL : largest concentration; values above it are stored as that.
     key : digest of the injection and the times.
     begin_s : time of the transport at which the injection starts: 0 s of the history; earlier frames are left out.
     """
 
-    def __init__(self, most_mg_mL: float, key: str = "", begin_s: float = 0.0) -> None:
-        self._most_mg_mL, self._key, self._begin_s = most_mg_mL, key, begin_s
-        self._cells: tuple[Floats, Floats] | None = None
+    def __init__(self, field: FlowField, most_mg_mL: float, key: str = "", begin_s: float = 0.0) -> None:
+        self._field, self._most_mg_mL, self._key, self._begin_s = field, most_mg_mL, key, begin_s
+        self._points_mm: Floats | None = None
         self._times: list[float] = []
         self._stored: list[NDArray[np.uint8]] = []
 
-    def watch(self, points_mm: Floats, spacing_mm: Floats) -> Callable[[float, NDArray[Any]], None]:
-        """Take the cell centers (n, 3) in LPS and the edges (n,); return the function that takes every frame."""
-        self._cells = points_mm, spacing_mm
+    def watch(self, points_mm: Floats, edge_mm: Floats) -> Callable[[float, NDArray[Any]], None]:
+        """Take the centers (n, 3) in LPS of the cells that are marched; return the function that takes every frame."""
+        self._points_mm = points_mm
         return self.add
 
     def add(self, time_s: float, values_mg_mL: NDArray[Any]) -> None:
@@ -81,16 +90,18 @@ class Recorder:
         self._stored.append(np.rint(STEPS * np.sqrt(share)).astype(np.uint8))
 
     def history(self) -> History:
-        """Return all frames so far.
+        """Return all frames so far; cells of the flow share the value of the marched cell that contains them.
 
         Raises
         ------
         ValueError
             There are no frames.
         """
-        if self._cells is None or not self._stored:
+        if self._points_mm is None or not self._stored:
             raise ValueError("no frame has been stored")
-        points_mm, spacing_mm = (np.asarray(values, dtype=np.float32) for values in self._cells)
-        return History(
-            points_mm, spacing_mm, np.array(self._times), np.stack(self._stored), self._most_mg_mL, self._key
-        )
+        spacing_mm, centers_mm = self._field.cell_size_mm, self._field.centers_mm
+        distance_mm, block = cKDTree(self._points_mm).query(centers_mm)
+        near = distance_mm < FARTHEST * spacing_mm
+        stored, times = np.stack(self._stored), np.array(self._times)
+        points_mm = centers_mm[near].astype(np.float32)
+        return History(points_mm, spacing_mm, np.asarray(block)[near], times, stored, self._most_mg_mL, self._key)

@@ -64,7 +64,7 @@ def films_message(
 def _bound(projector: Projector, history: History) -> float:
     """Return the absorption where the longest ray through the vessel is filled with the largest concentration."""
     most_mg_mL = float(history.value_mg_mL[int(history.stored.max(initial=0))])
-    length_mm = projector(np.ones(len(history.points_mm))).max()
+    length_mm = projector(np.ones(history.stored.shape[1])).max()
     return max(float(length_mm) * most_mg_mL * iodine_cm2_g(ENERGY_KEV) * CM2_G_PER, 1e-3)
 
 

@@ -81,7 +81,7 @@ def shown_of(
     found = {}
     for name, film in films_of(histories, projectors, settings).items():
         wires = wire_shadow(view, stents[name]) if settings.has_wires and name in stents else None
-        vessel = projectors[name](np.ones(len(histories[name].points_mm))) if settings.has_vessel else None
+        vessel = projectors[name](np.ones(histories[name].stored.shape[1])) if settings.has_vessel else None
         found[name] = Shown(titles[name], film, wires, vessel)
     return found
 
