@@ -147,19 +147,21 @@ class Desk:
             self._scans.pop(case.id, None)
 
     def start(self, case: Case, kind: str) -> None:
-        """Start a job of a kind: anatomy, rank or flow.
+        """Start a job of a kind: anatomy, rank, flow or angiogram.
 
         Raises
         ------
         ReadError
             There is no scan or surface, or it was moved.
         InputError
-            No device is chosen.
+            No device is chosen, or the flow of an angiogram is not up to date.
         """
         if not case.input.exists():
             raise ReadError(f"The scan of {case.state.name} has been moved from {case.input}. Put it back there.")
         if kind != "anatomy" and not case.state.choices.devices:
             raise InputError("No device is chosen. Choose one in the step Device.")
+        if kind == "angiogram" and statuses(case.state, "", lost_steps(case.folder, case.state))["flow"] != "done":
+            raise InputError("The flow is out of date or not computed, and contrast moves with it. Run the step Flow.")
         self.jobs.start(case, kind)
 
     def resume(self, case: Case) -> None:

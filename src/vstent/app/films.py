@@ -1,6 +1,8 @@
 """Films of the page: every flow along one C-arm direction, from the stored contrast."""
 
+import csv
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -16,8 +18,30 @@ PIXEL_MM: Final = 0.308
 """Detector pixel of the page's films: two pixels of a flat panel, binned as in fluoroscopy."""
 QUICK_PIXEL_MM: Final = 0.616
 """Detector pixel of the one frame that is drawn while the C-arm is turned."""
+REGIONS: Final = {"sac": "sac_iodine_mg_mL", "artery": "parent_artery_iodine_mg_mL"}
+"""Column of the table of curves by region."""
 LEVELS: Final = 255
 """Largest grey level of the page's films."""
+
+
+def kept_curves(folder: Path) -> list[dict[str, Any]]:
+    """Return the curves of the contrast in sac and parent artery of a case folder; empty where there are none."""
+    try:
+        with (folder / "angiogram" / "curves.csv").open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        return [
+            {
+                "name": name,
+                "region": region,
+                "unit": "Iodine, mg/mL",
+                "time_s": [float(row["time_s"]) for row in rows if row["flow"] == name],
+                "values": [float(row[column]) for row in rows if row["flow"] == name],
+            }
+            for name in dict.fromkeys(row["flow"] for row in rows)
+            for region, column in REGIONS.items()
+        ]
+    except (OSError, ValueError, KeyError):
+        return []
 
 
 def films_message(

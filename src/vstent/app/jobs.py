@@ -18,9 +18,10 @@ KINDS: Final = {
     "anatomy": ("image", "vessel", "sac"),
     "rank": ("device",),
     "flow": ("device", "deploy", "flow", "report"),
+    "angiogram": ("flow", "report"),
 }
 """Steps that each kind of job completes."""
-FIRST: Final = {"anatomy": "image", "rank": "device", "flow": "flow"}
+FIRST: Final = {"anatomy": "image", "rank": "device", "flow": "flow", "angiogram": "flow"}
 """Step that each kind of job shows before its first progress message."""
 STAGES: Final = {
     "scan": "image",
@@ -36,6 +37,8 @@ STAGES: Final = {
     "struts": "deploy",
     "plan": "flow",
     "flow": "flow",
+    "angiogram": "flow",
+    "film": "report",
     "measure": "report",
     "vary": "report",
     "report": "report",

@@ -20,7 +20,7 @@ from vstent.app import necks, sheets
 from vstent.app.cases import Case
 from vstent.app.choices import DeviceChoice, placing_of
 from vstent.app.cuts import cut
-from vstent.app.films import films_message
+from vstent.app.films import films_message, kept_curves
 from vstent.app.finished import kept_flows, kept_histories
 from vstent.deployment.contour import planes
 from vstent.deployment.deploy import propose_landing
@@ -397,7 +397,8 @@ class Live:
             chosen = {choice.name: choice for choice in self.case.state.choices.devices if has_wires}
             stents = {name: self.deployment(chosen[name]).stent for name in histories if name in chosen}
             angles = angles_of(direction) if direction else self._working_projection()
-            return films_message(histories, angles, stents=stents, moment=moment)
+            curves = kept_curves(self.case.folder) if moment is None else None
+            return films_message(histories, angles, stents=stents, moment=moment, curves=curves)
 
     def _history(self, path: Path) -> History:
         """Return the stored contrast of a flow."""

@@ -306,7 +306,7 @@ def _add_jobs(api: APIRouter, desk: Desk) -> None:
     """Add the routes of jobs and results."""
 
     @api.post("/api/cases/{case_id}/jobs/{kind}", status_code=202, summary="Start a long stage")
-    def start(case_id: str, kind: Literal["anatomy", "rank", "flow"]) -> dict[str, Any]:
+    def start(case_id: str, kind: Literal["anatomy", "rank", "flow", "angiogram"]) -> dict[str, Any]:
         found = desk.store.get(case_id)
         desk.start(found, kind)
         return desk.view(found)

@@ -19,6 +19,9 @@ from vstent.errors import VstentError
 from vstent.study.ledger import anatomy_key, hash_of
 from vstent.study.pipeline import run
 
+WINDOW_S: Final = 8.0
+"""Time that the angiogram of the page covers, in s: five seconds after the peak of the usual injection, and more."""
+
 
 def end_with_the_server() -> None:
     """Wait until the server has ended, then end this process and its children."""
@@ -64,6 +67,20 @@ def compute(case: Case) -> None:
     progress("report", 1.0, "")
 
 
+def carry_contrast(case: Case) -> None:
+    """Carry contrast through the flows, film it, and write the report again."""
+    from vstent.angiography.angiogram import AngiogramSettings
+    from vstent.angiography.filming import FilmSettings
+    from vstent.reporting.film_case import film_case, write_report_again
+    from vstent.study.contrast import angiograms
+    from vstent.study.films import Recording
+
+    recording = Recording(AngiogramSettings(window_s=WINDOW_S))
+    found = angiograms(case.folder, recording.settings, progress, record=recording)
+    film_case(case.folder, recording, found, FilmSettings(), progress)
+    write_report_again(case.folder, progress)
+
+
 def rank(case: Case) -> None:
     """Deploy and rank all sizes of the chosen devices."""
     from vstent.app.ranking import rank_sizes
@@ -71,7 +88,12 @@ def rank(case: Case) -> None:
     rank_sizes(case, progress)
 
 
-JOBS: Final[dict[str, Callable[[Case], None]]] = {"anatomy": find_anatomy, "rank": rank, "flow": compute}
+JOBS: Final[dict[str, Callable[[Case], None]]] = {
+    "anatomy": find_anatomy,
+    "rank": rank,
+    "flow": compute,
+    "angiogram": carry_contrast,
+}
 """Function of each kind of job."""
 
 

@@ -1,0 +1,87 @@
+"""Stored contrast of a case folder, from which films along any direction are made."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from vstent.angiography.angiogram import AngiogramSettings, Watch
+from vstent.angiography.history import History, Recorder
+from vstent.devices.catalogue import find_design
+from vstent.devices.stent import Stent
+from vstent.errors import ReadError
+from vstent.flow.case import FlowField
+from vstent.geometry.vessel import Anatomy
+from vstent.io.archive import load_data, save_data
+from vstent.study.folder import CACHE, history_path
+from vstent.study.ledger import ANATOMY, anatomy_key, key_of
+from vstent.study.provenance import RUN
+from vstent.study.repeat import UNTOLD, told_in
+from vstent.study.stages import deploy_one
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Stores the contrast of every flow while it is computed, and finds it again (`vstent.study.contrast.Record`).
+
+    Contrast that is stored for the same flow and injection is not recorded again.
+    """
+
+    settings: AngiogramSettings
+    """Settings of the angiograms."""
+    histories: dict[str, History] = field(default_factory=dict)
+    """Contrast by name of the flow; filled by the calls."""
+
+    @contextmanager
+    def __call__(self, name: str, flow: Path) -> Iterator[Watch | None]:
+        """Yield what watches the frames of a flow, or None where they are stored.
+
+        Parameters
+        ----------
+        name : name of the flow.
+        flow : its stored file.
+        """
+        path, key = history_path(flow), key_of(self.settings)
+        kept = _kept(path, key)
+        if kept is not None or not flow.is_file():
+            yield None
+        else:
+            carrier, bolus = load_data(flow, FlowField), self.settings.bolus
+            recorder = Recorder(carrier, bolus.inflow(carrier.inflow_mL_s)[1], key, bolus.begin_s)
+            yield recorder.watch
+            kept = recorder.history()
+            for former in path.parent.glob(f"contrast {name}-*.npz"):
+                former.unlink()
+            save_data(path, kept)
+        if kept is not None:
+            self.histories[name] = kept
+
+
+def _kept(path: Path, key: str) -> History | None:
+    """Return the stored contrast where it is that of an injection; None where there is none."""
+    with suppress(ReadError):
+        found = load_data(path, History)
+        return found if found.key == key else None
+    return None
+
+
+def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, Stent]]:
+    """Return the anatomy of a finished case folder, and its devices as its run deployed them, by name.
+
+    Parameters
+    ----------
+    out : the case folder.
+    names : devices to deploy.
+
+    Raises
+    ------
+    ReadError
+        The folder holds no finished run of this version.
+    """
+    try:
+        told, study = told_in(out / RUN)
+        key = anatomy_key(str(told["input"]["sha256"]), study)
+    except UNTOLD:
+        raise ReadError(f"{out} holds no finished run of this version: run the case again") from None
+    anatomy = load_data(out / CACHE / f"{ANATOMY}-{key}.npz", Anatomy)
+    return anatomy, {name: deploy_one(find_design(name), anatomy, study.placing(name)).stent for name in names}
