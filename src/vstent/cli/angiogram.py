@@ -1,10 +1,12 @@
 """`vstent angiogram`: carry contrast through the flows of a finished case."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vstent.cli import options
+from vstent.cli.filming import add_film, given_film, given_study
 
 if TYPE_CHECKING:
     from vstent.angiography.angiogram import AngiogramSettings
@@ -15,11 +17,13 @@ def add(commands: options.Commands) -> None:
     parser = options.add_command(
         commands,
         "angiogram",
-        "Carry contrast through the flows of a case, and measure how it fills and leaves the sac.",
-        "angiogram case --rate 3 --amount 4",
+        "Carry contrast through the flows of a case, film it, and measure how it fills and leaves the sac.",
+        'angiogram case --rate 3 --amount 4 --view "LAO 30 CRA 10"',
     )
     parser.add_argument("case", type=Path, help="case folder of `vstent run` with flows")
     add_injection(parser)
+    add_film(parser)
+    parser.add_argument("--no-report", action="store_true", help="leave the report as it is")
     parser.set_defaults(command=_angiogram)
 
 
@@ -86,13 +90,20 @@ def _angiogram(arguments: argparse.Namespace) -> int:
     import json
 
     from vstent.cli.console import Console, angiogram_table
+    from vstent.reporting.film_case import film_case, write_report_again
     from vstent.study.contrast import FOLDER, angiograms
+    from vstent.study.films import Recording
     from vstent.study.provenance import METRICS
 
+    film, study = given_film(arguments), given_study(arguments)
     settings = given_angiogram(arguments)
+    recording = Recording(replace(settings, frames_per_s=max(settings.frames_per_s, film.frame_rate_Hz)))
     console = Console()
     with console.live():
-        angiograms(arguments.case, settings, console.progress)
+        found = angiograms(arguments.case, recording.settings, console.progress, record=recording)
+        film_case(arguments.case, recording, found, film, console.progress, study)
+        if not arguments.no_report:
+            write_report_again(arguments.case, console.progress)
     console.print(angiogram_table(json.loads((arguments.case / METRICS).read_text(encoding="utf-8"))))
     console.print(f"Results in {arguments.case / FOLDER}. Research use only.")
     return 0

@@ -39,7 +39,9 @@ def add(commands: options.Commands) -> None:
         help="position of the device's middle along the parent artery, mm (default: proposed)",
     )
     add_study(parser)
-    parser.add_argument("--angiogram", action="store_true", help="also carry contrast through the flows (see below)")
+    parser.add_argument(
+        "--angiogram", action="store_true", help="also carry contrast through the flows and film it"
+    )
     add_injection(parser)
     add_pdf(parser)
     parser.add_argument(
@@ -100,6 +102,7 @@ def study(
     replaces : whether results of another input or of other settings are replaced.
     injected : settings of the angiograms; None: none are computed.
     """
+    from vstent.angiography.filming import FilmSettings
     from vstent.cli.console import (
         Console,
         angiogram_table,
@@ -107,14 +110,18 @@ def study(
         device_sentences,
         uncertainty_table,
     )
+    from vstent.reporting.film_case import film_case
     from vstent.study.contrast import add_angiograms
+    from vstent.study.films import Recording
     from vstent.study.pipeline import run
 
     console = Console()
     with console.live():
         case = run(path, out, settings, console.progress, replaces=replaces)
         if injected is not None:
-            add_angiograms(case, out, injected, console.progress)
+            recording = Recording(injected)
+            found = add_angiograms(case, out, injected, console.progress, record=recording)
+            film_case(out, recording, found, FilmSettings(), console.progress)
         console.progress("report", 0.0, "")
         from vstent.reporting.write import write_report
 

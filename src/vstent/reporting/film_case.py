@@ -11,6 +11,7 @@ from vstent.devices.design import BARE
 from vstent.reporting.films import FOLDER, Density, shown_of, write_films
 from vstent.reporting.write import write_report
 from vstent.study.films import Recording, stents_of
+from vstent.study.folder import claimed
 from vstent.study.pipeline import run
 from vstent.study.provenance import RUN
 from vstent.study.repeat import read_record
@@ -49,7 +50,8 @@ def film_case(
     shown = shown_of(histories, stents, titles, aimed(settings, anatomy))
     curves = {titles[name]: one.curves for name, one in found.items()}
     densities = [Density(title, one.time_s, one.sac_mg_mL, one.parent_mg_mL) for title, one in curves.items()]
-    write_films(out / FOLDER, shown, densities, study=study)
+    with claimed(out):
+        write_films(out / FOLDER, shown, densities, study=study)
     view = shown[BARE].film.view
     progress("film", 1.0, f"{view.name}, {view.columns} x {view.rows} pixels of {view.pixel_mm:g} mm.")
     return view.name

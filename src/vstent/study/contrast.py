@@ -76,8 +76,10 @@ def angiograms(
     return found
 
 
-def add_angiograms(case: CaseResult, out: Path, settings: AngiogramSettings, progress: Progress) -> None:
-    """Compute the angiograms of a finished study and add their measures to its metrics.
+def add_angiograms(
+    case: CaseResult, out: Path, settings: AngiogramSettings, progress: Progress, *, record: Record | None = None
+) -> dict[str, Angiogram]:
+    """Compute the angiograms of a finished study and add their measures to its metrics; return them by name.
 
     Parameters
     ----------
@@ -85,9 +87,11 @@ def add_angiograms(case: CaseResult, out: Path, settings: AngiogramSettings, pro
     out : its case folder.
     settings : settings of the angiograms.
     progress : called at every stage.
+    record : returns what watches the frames of a flow (see `Record`).
     """
-    found = angiograms(out, settings, progress)
+    found = angiograms(out, settings, progress, record=record)
     add_measures(case.metrics, {name: one.measures for name, one in found.items()})
+    return found
 
 
 def _study(out: Path) -> tuple[str, Settings]:
