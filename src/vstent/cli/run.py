@@ -39,9 +39,7 @@ def add(commands: options.Commands) -> None:
         help="position of the device's middle along the parent artery, mm (default: proposed)",
     )
     add_study(parser)
-    parser.add_argument(
-        "--angiogram", action="store_true", help="also carry contrast through the flows and film it"
-    )
+    parser.add_argument("--angiogram", action="store_true", help="also carry contrast through the flows and film it")
     add_injection(parser)
     add_pdf(parser)
     parser.add_argument(
