@@ -273,6 +273,11 @@ def run(*options: str) -> Maker:
     return make
 
 
+def film(*options: str) -> Maker:
+    """Film a folder that is no case."""
+    return lambda folder: ["angiogram", str(folder), *options]
+
+
 def inlets_all_over() -> list[str]:
     """Name every opening of the artery as an inlet."""
     return [f"--inlet={','.join(map(str, center_mm))}" for center_mm, _, _ in phantoms.demo_phantom().ends]
@@ -673,6 +678,10 @@ FAULTS: tuple[Fault, ...] = (
     Fault(OPTION, "point of two numbers", run("--at", "1,2"), INPUT, "2 numbers, not 3"),
     Fault(OPTION, "an inlet given twice", run("--inlet", "0,0,0", "--inlet", "0,1,0"), INPUT, "the same opening"),
     Fault(OPTION, "inlets wherever there is an opening", run(*inlets_all_over()), INPUT, "none is an outlet"),
+    Fault(OPTION, "C-arm angle that there is not", film("--view", "LAO 200"), INPUT, "angle is 200 degrees"),
+    Fault(OPTION, "C-arm direction of no words", film("--view", "left"), INPUT, "not a C-arm direction"),
+    Fault(OPTION, "X-ray source behind the detector", film("--source-isocenter", "1200"), INPUT, "distance is 1200 mm"),
+    Fault(OPTION, "film without a run", film("--view", "AP"), INPUT, "run"),
     Fault(OPTION, "device that does not exist", run("--device", "slik"), INPUT, "Did you mean silk"),
     Fault(OPTION, "size that is not made", run("--diameter", "17"), INPUT, "is not made in"),
     Fault(OPTION, "device beyond the artery", run("--center", "900"), INPUT, "is not on the parent artery"),

@@ -1,0 +1,70 @@
+"""Contrast is recorded once for a flow and an injection, and found again."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from vstent.angiography.angiogram import AngiogramSettings
+from vstent.errors import ReadError
+from vstent.study import films
+from vstent.study.films import Recording, stents_of
+from vstent.study.folder import history_path
+
+POINTS = np.stack([np.arange(6.0), np.zeros(6), np.zeros(6)], axis=1)
+
+
+@pytest.fixture
+def flow(tmp_path, monkeypatch):
+    """The file of a flow; reading it gives a flow on six cells."""
+    path = tmp_path / "flow silk-0123.npz"
+    path.write_bytes(b"a flow")
+    carrier = SimpleNamespace(centers_mm=POINTS, cell_size_mm=1.0, inflow_mL_s=4.0)
+    load = films.load_data
+    monkeypatch.setattr(films, "load_data", lambda file, kind: carrier if file == path else load(file, kind))
+    return path
+
+
+def record(recording, flow) -> bool:
+    """Record three frames; return whether frames were wanted."""
+    with recording("silk", flow) as watch:
+        if watch is not None:
+            take = watch(POINTS, np.ones(6))
+            for k in range(3):
+                take(0.1 * k, np.full(6, 75.0 * k))
+        return watch is not None
+
+
+def test_contrast_is_recorded_once_for_an_injection(flow):
+    first, again, other = (Recording(AngiogramSettings(window_s=window)) for window in (6.0, 6.0, 8.0))
+    (flow.parent / "contrast silk-of-an-earlier-flow.npz").write_bytes(b"")
+    assert record(first, flow)
+    assert not record(again, flow)
+    assert np.array_equal(again.histories["silk"].stored, first.histories["silk"].stored)
+    assert [path.name for path in flow.parent.glob("contrast*")] == [history_path(flow).name]
+    assert record(other, flow)
+    # 3 of 4 mL/s are agent of 300 mg/mL, so that 225 mg/mL enter.
+    assert other.histories["silk"].most_mg_mL == pytest.approx(225)
+    assert [values[0] for _, values in other.histories["silk"].frames()] == pytest.approx([0, 75, 150], abs=1)
+
+
+def test_what_is_recorded_is_kept_only_when_the_march_ends(flow):
+    class StoppedError(Exception):
+        pass
+
+    recording = Recording(AngiogramSettings())
+
+    def march():
+        with recording("silk", flow) as watch:
+            watch(POINTS, np.ones(6))(0.0, np.zeros(6))
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        march()
+    assert not history_path(flow).exists()
+    assert recording.histories == {}
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(ReadError, match="holds no finished run"):
+        stents_of(tmp_path, ())
