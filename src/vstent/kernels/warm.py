@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vstent.kernels import coverage, curves, medial, net, raster, sampling, tree, triangles, voxels
+from vstent.kernels import coverage, curves, footprints, medial, net, raster, sampling, tree, triangles, voxels
 
 
 def warm() -> None:
@@ -16,6 +16,8 @@ def warm() -> None:
     _paint()
     curves.parallel_frames(np.eye(3))
     curves.closed_lengths(nodes)
+    arm = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
+    footprints.footprints(np.zeros((1, 3)), np.ones(1), np.eye(3), arm, np.array([2, 2]))
     medial.widest_in_section(np.ones((1, 2)), np.ones((1, 2, 2)), 1.0, np.ones(1))
 
 

@@ -27,6 +27,8 @@ FORMATS: Final = {
     ".3mf": "model/3mf",
     ".png": "image/png",
     ".pdf": "application/pdf",
+    ".webp": "image/webp",
+    ".dcm": "application/dicom",
 }
 """Media type of a file by its suffix."""
 ABOUT: Final = {
@@ -47,6 +49,10 @@ ABOUT: Final = {
     "struts.stl": "Solids of the wires",
     "field.vtu": "Velocity and pressure",
     "wall.vtp": "Wall shear stress",
+    "angiogram.webp": "Films of the contrast agent before and after, side by side",
+    "key_frames.png": "Early, peak and late frame of every film",
+    "density.png": "Contrast in sac and parent artery over time",
+    "films.json": "Titles and captions of the films",
 }
 """Description of a file by its name."""
 
