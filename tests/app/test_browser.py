@@ -272,6 +272,7 @@ def whole_way(client, page, path):
     page.wait_for_selector(".step.done:nth-child(7)", timeout=1200 * SECOND)
     page.wait_for_selector(".card")
     assert page.locator(".viewer-pane").count() == 2
+    look_at_the_angiogram(page)
     step(page, "Report")
     with page.context.expect_page() as opened:
         page.get_by_role("link", name="Open the report").click()
@@ -284,6 +285,29 @@ def whole_way(client, page, path):
     assert client.get(f"{files}/report.pdf").content.startswith(b"%PDF")
     metrics = json.loads(client.get(f"{files}/metrics.json").text)
     assert metrics["stents"]["enterprise"]["flow"]["neck_inflow_mL_s"] > 0
+
+
+def look_at_the_angiogram(page):
+    """Compute it, play it, turn the C-arm by hand and by words."""
+    page.get_by_role("button", name="Angiogram", exact=True).click()
+    page.get_by_role("button", name="Compute the angiogram").click()
+    page.wait_for_selector(".film-canvas", timeout=1200 * SECOND)
+    assert page.locator(".film-canvas").count() == 2
+    assert page.locator(".curve").count() == 4
+    page.locator(".film-time input").fill("14")
+    assert page.locator(".film-clock").inner_text() == "0.93 s"
+    page.fill("#field-carm", "LAO 30 CRA 10")
+    page.keyboard.press("Tab")
+    shown = page.locator(".film-pane figcaption span").first
+    playwright.expect(shown).to_have_text("LAO 30 CRA 10")
+    box = page.locator(".films").bounding_box()
+    page.mouse.move(box["x"] + 200, box["y"] + 200)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 250, box["y"] + 225, steps=4)
+    page.mouse.up()
+    playwright.expect(shown).to_have_text("LAO 10 CRA 20")
+    page.get_by_role("button", name="▶ Play").click()
+    page.wait_for_function("() => document.querySelector('.film-time input').value > 20")
 
 
 @pytest.mark.validation

@@ -17,6 +17,7 @@ import report_case
 
 import vstent
 from vstent import phantoms
+from vstent.angiography.history import History
 from vstent.app import cuts, intake, ranking, sheets
 from vstent.app.cases import STEPS, Store, load
 from vstent.app.choices import DeviceChoice
@@ -28,15 +29,15 @@ from vstent.deployment.measure import measure
 from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Landing
 from vstent.errors import ReadError
-from vstent.flow.case import Blood, CarreauYasuda, FlowSettings, Phase, Waveform
+from vstent.flow.case import Blood, CarreauYasuda, FlowField, FlowSettings, Phase, Waveform
 from vstent.geometry.vessel import Anatomy
-from vstent.io.archive import load_data
+from vstent.io.archive import load_data, save_data
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
 from vstent.io.writers import write_stl
 from vstent.plan.uncertainty import Ranges
 from vstent.study.flow_store import FlowStore
-from vstent.study.folder import CACHE
+from vstent.study.folder import CACHE, history_path
 from vstent.study.ledger import Ledger, hash_of
 from vstent.study.repeat import settings_of
 from vstent.study.stages import flow_key
@@ -685,3 +686,38 @@ def test_the_first_requests_wait_for_one_thread_that_loads(tmp_path):
     given = [sys.executable, "-c", FIRST_REQUESTS, str(tmp_path)]
     found = subprocess.run(given, capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "{200} 1"
+
+
+def keep_contrast(folder):
+    """Keep contrast with every flow of a study, as an angiogram does."""
+    for path in kept_flows(folder).values():
+        carrier = load_data(path, FlowField)
+        stored = np.full((3, len(carrier.cells)), 200, np.uint8)
+        block = np.arange(len(carrier.cells))
+        history = History(carrier.centers_mm, carrier.cell_size_mm, block, np.arange(3) / 15, stored, 300.0)
+        save_data(history_path(path), history)
+
+
+def test_films_of_stored_contrast_come_along_any_direction(flown, tmp_path):
+    folder, _ = flown
+    with app_case.served(tmp_path / "cases", folder) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        assert not client.get(case).json()["has_angiogram"]
+        assert "Compute it in the step Flow" in client.get(f"{case}/angiogram").json()["detail"]
+        keep_contrast(folder)
+        assert client.get(case).json()["has_angiogram"]
+        told, data = app_case.opened(client.get(f"{case}/angiogram", params={"view": "RAO 20 CAU 5"}))
+        assert told["view"] == "RAO 20 CAU 5"
+        assert [pane["id"] for pane in told["panes"]] == ["bare", "silk"]
+        assert len(data) >= 2 * 3 * told["rows"] * told["columns"]
+        quick = client.get(f"{case}/angiogram", params={"view": "RAO 20", "moment": 1, "wires": True})
+        assert len(quick.content) < len(data)
+        assert app_case.opened(client.get(f"{case}/angiogram"))[0]["view"]  # the working projection
+        refused = client.get(f"{case}/angiogram", params={"view": "up"})
+        assert (refused.status_code, "not a C-arm direction" in refused.json()["detail"]) == (422, True)
+
+
+def test_an_angiogram_needs_a_flow_that_is_up_to_date(client, case):
+    refused = client.post(f"{case}/jobs/angiogram")
+    assert refused.status_code == 422
+    assert "Run the step Flow" in refused.json()["detail"]
