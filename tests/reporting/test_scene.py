@@ -194,7 +194,9 @@ def test_a_case_without_flow_and_a_healthy_artery_have_scenes():
 def test_sac_and_artery_differ_without_color_vision():
     """Deuteranopia (Machado, Oliveira and Fernandes 2009, severity 1): the two still differ in lightness."""
     seen = np.array([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])
-    colors = {layer.id: np.array(layer.colour) for layer in report_case.scene().layers if layer.id in ("sac", "landing")}
+    colors = {
+        layer.id: np.array(layer.colour) for layer in report_case.scene().layers if layer.id in ("sac", "landing")
+    }
     sac, artery = (np.clip(seen @ colors[name] ** 2.2, 0, 1) for name in ("sac", "landing"))
     luminance = np.array([0.2126, 0.7152, 0.0722])
     assert (luminance @ artery + 0.05) / (luminance @ sac + 0.05) > 4.5  # the ratio that text needs (WCAG 1.4.3)
