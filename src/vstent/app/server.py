@@ -122,6 +122,7 @@ def create(desk: Desk, *, token: str, hosts: tuple[str, ...]) -> Guard:
     _add_input(api, desk)
     _add_jobs(api, desk)
     _add_scenes(api, desk)
+    _add_flows(api, desk)
     _add_planning(api, desk)
     app.include_router(api)
     return Guard(app, token=token, hosts=hosts)
@@ -370,6 +371,10 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
     @api.get("/api/cases/{case_id}/section", summary="The section by a plane across the parent axis")
     def section(case_id: str, abscissa_mm: Finite, device: str | None = None) -> dict[str, Any]:
         return desk.live(desk.store.get(case_id)).section(device, abscissa_mm)
+
+
+def _add_flows(api: APIRouter, desk: Desk) -> None:
+    """Add the routes of computed flows and their films."""
 
     @api.get("/api/cases/{case_id}/flow", summary="Wall shear stress, streamlines and a cut, on one scale (binary)")
     def flow(case_id: str, moment: Annotated[int | None, Query(ge=0)] = None) -> Response:

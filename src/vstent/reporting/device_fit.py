@@ -1,11 +1,11 @@
 """Picture of a fitted device: measured and fitted values, and the residuals."""
 
-import io
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from vstent.devices.fit import Fitted, labels, predict
+from vstent.reporting.plots import png_of
 from vstent.units import MM_PER_UM
 
 if TYPE_CHECKING:
@@ -32,18 +32,14 @@ def picture(fitted: Fitted, title: str) -> bytes:
     title : str
         Name of the device.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=INCHES, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
     lengths, residuals = figure.subplots(1, 2, width_ratios=(3, 2))
     _lengths(lengths, fitted)
     _residuals(residuals, fitted)
     figure.suptitle(f"{title}: fit to {len(fitted.measurements)} measurements", fontsize=11)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150)
-    return buffer.getvalue()
+    return png_of(figure)
 
 
 def _lengths(axes: "Axes", fitted: Fitted) -> None:

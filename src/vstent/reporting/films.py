@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,9 @@ from vstent.io.films import write_animation, write_frames
 from vstent.io.writers import write_json
 from vstent.io.xa_writer import BITS, XaHeader, write_xa
 from vstent.kernels.arrays import Floats
-from vstent.reporting.figures import Picture, png_of
-
-if TYPE_CHECKING:
-    from PIL.ImageFont import FreeTypeFont
+from vstent.reporting.figures import Picture
+from vstent.reporting.lettering import font
+from vstent.reporting.plots import png_of
 
 FOLDER: Final = "angiogram"
 """Subfolder of the case folder with the films."""
@@ -33,6 +32,8 @@ COLOURS: Final = ("#39474e", "#0072b2", "#d55e00", "#009e73", "#cc79a7")
 """Colors of the flows, distinguishable with color vision deficiency (Okabe and Ito)."""
 CAPTION_PX: Final = 22
 """Height of the line of text above a film."""
+CAPTION_POINTS: Final = 5.8
+"""Size of the letters in that line, in points."""
 GAP_PX: Final = 6
 """Distance between films."""
 LATE_S: Final = 5.0
@@ -101,7 +102,6 @@ def beside(shown: Sequence[Shown], window: float) -> list[NDArray[np.uint8]]:
     """
     from PIL import Image, ImageDraw
 
-    font = _font(12)
     frames = []
     for k, levels in enumerate(zip(*(one.levels(window) for one in shown), strict=True)):
         rows = max(frame.shape[0] for frame in levels)
@@ -110,18 +110,10 @@ def beside(shown: Sequence[Shown], window: float) -> list[NDArray[np.uint8]]:
         for one, frame in zip(shown, levels, strict=True):
             sheet.paste(Image.fromarray(bytes_of(frame)), (left, CAPTION_PX))
             words = f"{one.title}   {one.film.view.name}   {one.film.time_s[k]:.2f} s"
-            pen.text((left + 4, 3), words, fill=30, font=font)
+            pen.text((left + 4, 3), words, fill=30, font=font(CAPTION_POINTS))
             left += frame.shape[1] + GAP_PX
         frames.append(np.asarray(sheet))
     return frames
-
-
-def _font(size: int) -> "FreeTypeFont":
-    """Return the font that matplotlib brings along."""
-    from matplotlib import get_data_path
-    from PIL import ImageFont
-
-    return ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
 
 
 def key_times_s(before: Film) -> tuple[tuple[str, float], ...]:
