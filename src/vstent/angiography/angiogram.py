@@ -22,12 +22,14 @@ from vstent.flow.simulation import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 
-FINE_MM: Final = 1.0
+FINE_MM: Final = 0.4
 """Distance from the sac, mm, within which the cells of the flow are kept; elsewhere blocks of eight are used."""
 REGION_MM: Final = 3.0
 """Distance from the sac, mm, within which its washout is followed; blood that gets farther does not come back."""
-BYTES_PER_CELL: Final = 900
+BYTES_PER_CELL: Final = 1200
 """Peak memory per cell of the flow, in bytes."""
+BYTES_PER_PHASE_AND_CELL: Final = 60
+"""Memory per stored phase of a pulsatile flow and cell, in bytes: three faces a cell, twice while blocks are formed."""
 MOST_WASHOUT_S: Final = 20.0
 """Longest washout that is marched, in s."""
 
@@ -108,6 +110,11 @@ class Injection:
         return self.transport.frames(1 / settings.frames_per_s, settings.bolus.begin_s + settings.window_s)
 
 
+def memory_bytes(field: FlowField) -> float:
+    """Return the peak memory of an angiogram in bytes, beyond that of the flow."""
+    return (BYTES_PER_CELL + BYTES_PER_PHASE_AND_CELL * len(field.phases)) * float(len(field.cells))
+
+
 def injection(case: FlowCase, field: FlowField, settings: AngiogramSettings) -> Injection:
     """Prepare an injection into a flow.
 
@@ -125,7 +132,7 @@ def injection(case: FlowCase, field: FlowField, settings: AngiogramSettings) -> 
     FlowError
         The flow does not fit in the free memory, or its flow rates cannot be balanced.
     """
-    need_bytes = BYTES_PER_CELL * len(field.cells)
+    need_bytes = memory_bytes(field)
     if need_bytes > free_memory_bytes():
         raise FlowError(
             f"an angiogram on {len(field.cells):,} cells needs {need_bytes / 1e9:.2g} GB of memory, more than is free: "
@@ -283,7 +290,8 @@ def _advice(ready: Injection, measures: dict[str, float], found: washouts.Washou
     widths = sorted({float(width) * grid.spacing_mm for width in np.unique(grid.width)})
     spacing = " and ".join(f"{width:.3g}" for width in widths)
     said = (
-        f"{len(grid.cells):,} cells of {spacing} mm; the flow rates were corrected by {grid.correction_fraction:.1%}."
+        f"{len(grid.cells):,} cells of {spacing} mm, fastest step {1e3 * ready.transport.fastest_s:.2g} ms; the flow "
+        f"rates were corrected by {grid.correction_fraction:.1%}."
     )
     if "washout_half_life_s" not in measures:
         said += (

@@ -71,9 +71,11 @@ class Transport:
         self.fastest_s = float(COURANT / total_per_s.max())
         self._level, self._face_level, self._total_per_s = level, np.sort(face_level), total_per_s
         self._mesh = _mesh(network, diffusivity_mm2_s * _conductance_mm(network))
-        self._state = np.zeros((n + network.openings, 6))
-        self._masses = np.zeros((len(network.left), 3))
-        self._flux, self._moves = network.flux_mm3_s[0].copy(), np.zeros((n, 3))
+        # Single precision halves the memory traffic; the mass that leaves one cell is still exactly that of the next.
+        self._state = np.zeros((n + network.openings, 6), dtype=np.float32)
+        self._masses = np.zeros((len(network.left), 2), dtype=np.float32)
+        self._through = np.zeros(len(network.left))
+        self._flux, self._moves = network.flux_mm3_s[0].copy(), np.zeros((n, 3), dtype=np.float32)
         advection.drift(self._mesh, self._flux, self._moves)
         if initial is not None:
             self._state[:n, advection.VALUE] = initial[self._order]
@@ -107,13 +109,13 @@ class Transport:
 
     def _inside(self) -> float:
         """Return the amount in all cells."""
-        return float(self._state[: len(self._order), advection.VALUE] @ self.network.volume_mm3)
+        return float(self._state[: len(self._order), advection.VALUE].astype(np.float64) @ self.network.volume_mm3)
 
     def balance(self) -> Balance:
         """Return what entered, left and is inside so far."""
         network = self.network
         faces, opening, sign = network.at_openings
-        out = np.bincount(opening, sign * self._masses[faces, 2], network.openings)
+        out = np.bincount(opening, sign * self._through[faces], network.openings)
         return Balance(
             self._began - float(out[: network.inlets].sum()), float(out[network.inlets :].sum()), self._inside()
         )
@@ -126,10 +128,10 @@ class Transport:
             advection.drift(self._mesh, self._flux, self._moves)
         if self._inflow is not None:
             first, last = self._inflow(start_s), self._inflow(start_s + step_s)
-            self._state[n : n + network.inlets, : advection.SLOPE] = first, (last - first) / step_s, start_s
+            self._state[n : n + network.inlets, : advection.TIME] = first, (last - first) / step_s
         base_s = step_s / (1 << int(self._level.max()))
-        moving = self._flux, self._moves
-        advection.march(self._mesh, steps, self._state, self._masses, *moving, start_s, base_s, self._upper)
+        held = self._state, self._masses, self._through
+        advection.march(self._mesh, steps, *held, self._flux, self._moves, base_s, self._upper)
 
     def _steps(self, base_s: float) -> advection.Steps:
         """Return the step lengths of all cells."""
@@ -141,7 +143,8 @@ class Transport:
         top = int(self._level.max()) + 1
         cell_end = np.bincount(self._level, minlength=top).cumsum()
         face_end = np.bincount(self._face_level, minlength=top).cumsum()
-        return advection.Steps(is_slower, cell_end, face_end, self._face_level, allowance)
+        level = self._face_level.astype(np.int8)
+        return advection.Steps(is_slower, cell_end, face_end, level, allowance.astype(np.float32))
 
 
 def _levels(network: Network, exchange_per_s: Floats) -> tuple[Ints, Ints, Ints, Floats]:
@@ -195,9 +198,15 @@ def _mesh(network: Network, exchange_mm3_s: Floats) -> advection.Mesh:
     weight = np.where(other < n, share, 0.0)
     first = np.searchsorted(cell, np.arange(n + 1)).astype(np.int32)
     face, beside = np.r_[f, f][order].astype(np.int32), other.astype(np.int32)
-    of_entries = face, beside, side.astype(np.int8), weight
+    of_entries = face, beside, side.astype(np.int8), weight.astype(np.float32)
     return advection.Mesh(
-        network.left, network.right, network.axis, first, *of_entries, network.volume_mm3, exchange_mm3_s
+        network.left,
+        network.right,
+        network.axis,
+        first,
+        *of_entries,
+        network.volume_mm3,
+        exchange_mm3_s.astype(np.float32),
     )
 
 

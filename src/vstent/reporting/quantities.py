@@ -16,6 +16,7 @@ UNITS: dict[str, tuple[str, float]] = {
     "kg_m3": ("kg/m³", 1.0),
     "mL_min": ("mL/min", 1.0),
     "mL_s": ("mL/s", 1.0),
+    "mg_mL": ("mg/mL", 1.0),
     "mm_s": ("mm/s", 1.0),
     "m_s": ("m/s", 1.0),
     "m2_s": ("m²/s", 1.0),

@@ -1,6 +1,7 @@
 """Angiograms of the flows of a case folder: computed from its stored flows, stored, and added to its metrics."""
 
 import json
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
@@ -133,12 +134,21 @@ def _one(
                 f"{out} holds no flow of {name}, and contrast moves with the flow: run the case again without --no-flow"
             )
         with ledger.stage(stage) as tell:
-            found = angiogram(
-                anatomy, field, settings, watch=watch, progress=lambda part: ledger.progress(stage, 0.99 * part, "")
-            )
+            found = angiogram(anatomy, field, settings, watch=watch, progress=_teller(ledger, stage))
             tell(found.advice)
         ledger.keep(stage, own, found)
         return found
+
+
+def _teller(ledger: Ledger, stage: str) -> Callable[[float], None]:
+    """Return a function that reports a finished fraction with the time that is left."""
+    began = time.monotonic()
+
+    def tell(part: float) -> None:
+        left_s = (time.monotonic() - began) * (1 - part) / max(part, 1e-3)
+        ledger.progress(stage, 0.99 * part, f"{left_s:.0f} s left" if part > 0 else "")
+
+    return tell
 
 
 def _write(out: Path, found: Mapping[str, Angiogram], settings: AngiogramSettings, keys: Mapping[str, str]) -> None:

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 from numba import njit, prange
 
 VALUE, RATE, TIME, SLOPE = 0, 1, 2, 3
-"""Columns of the state: concentration, predicted rate of change (1/s), time (s) and three differences across a cell."""
+"""Columns of the state: concentration, predicted rate of change (1/s), time since the start of the march (s), and three
+differences across a cell."""
 
 
 class Mesh(NamedTuple):
@@ -112,7 +113,16 @@ def _predict(mesh: Any, state: Any, moves: Any, count: int, now: float) -> None:
 
 @njit(cache=True, parallel=True)
 def _exchange(
-    mesh: Any, steps: Any, state: Any, masses: Any, flux: Any, count: int, now: float, base: float, upper: float
+    mesh: Any,
+    steps: Any,
+    state: Any,
+    masses: Any,
+    through: Any,
+    flux: Any,
+    count: int,
+    now: float,
+    base: float,
+    upper: float,
 ) -> None:
     """Move mass through the first `count` faces for one step of each."""
     left, right, axis, conductance, n = mesh.left, mesh.right, mesh.axis, mesh.conductance, len(mesh.volume)
@@ -133,7 +143,7 @@ def _exchange(
         if lower_cell < n and upper_cell < n:
             mass += conductance[f] * (state[lower_cell, VALUE] - state[upper_cell, VALUE]) * step
         else:
-            masses[f, 2] += mass
+            through[f] += mass
         masses[f, 0] = mass
         masses[f, 1] += mass
 
@@ -157,7 +167,7 @@ def _settle(mesh: Any, steps: Any, state: Any, masses: Any, count: int, now: flo
 
 @njit(cache=True)
 def march(
-    mesh: Any, steps: Any, state: Any, masses: Any, flux: Any, moves: Any, start: float, base: float, upper: float
+    mesh: Any, steps: Any, state: Any, masses: Any, through: Any, flux: Any, moves: Any, base: float, upper: float
 ) -> None:
     """Advance the concentration by one step of the slowest level.
 
@@ -169,29 +179,30 @@ def march(
         Time steps.
     state : (n + o, 6)
         Concentration and what belongs to it; openings follow the cells. Changed in place.
-    masses : (f, 3)
-        Mass moved to the upper side of every face: in its last step; that its slower cell has not taken yet; since
-        the start, for faces of openings only. Changed in place.
+    masses : (f, 2)
+        Mass moved to the upper side of every face in its last step, and that its slower cell has not taken yet.
+        Changed in place.
+    through : (f,)
+        Mass moved to the upper side of the faces of openings in all marches. Changed in place.
     flux : (f,)
         Flow rate to the upper side of every face, mm3/s; it balances in every cell.
     moves : (n, 3)
         Displacement of the blood, in cells per s (see `drift`).
-    start : float
-        Time at the start, s.
     base : float
         Base step, s.
     upper : float
         Largest concentration of the inflow and of the cells.
     """
     top = len(steps.cell_end) - 1
+    state[:, TIME] = 0.0
     for sub in range(1 << top):
-        now = start + sub * base
+        now = sub * base
         level = top
         while sub % (1 << level):
             level -= 1
         _predict(mesh, state, moves, steps.cell_end[level], now)
-        _exchange(mesh, steps, state, masses, flux, steps.face_end[level], now, base, upper)
+        _exchange(mesh, steps, state, masses, through, flux, steps.face_end[level], now, base, upper)
         level = top
         while (sub + 1) % (1 << level):
             level -= 1
-        _settle(mesh, steps, state, masses, steps.cell_end[level], start + (sub + 1) * base)
+        _settle(mesh, steps, state, masses, steps.cell_end[level], (sub + 1) * base)

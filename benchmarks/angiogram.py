@@ -1,0 +1,157 @@
+"""Validate the angiogram: fronts and dispersion in a tube, the age of blood that leaves a sac, grids, and cost.
+
+``python benchmarks/angiogram.py`` computes the dispersion in a tube and the flow in the demo's artery on four grids;
+``python benchmarks/angiogram.py CASE ...`` measures the ages in the stored flows of case folders.
+"""
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from vstent import phantoms
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.angiography import angiogram as angiograms
+from vstent.angiography.angiogram import AngiogramSettings
+from vstent.angiography.network import Network, network
+from vstent.angiography.transport import Transport
+from vstent.angiography.washout import wash_out
+from vstent.flow import sampling
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.indices import indices
+from vstent.flow.simulation import flow_case, simulate_case
+from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.io.archive import load_data
+from vstent.kernels import sampling as kernels
+from vstent.kernels.arrays import Floats
+from vstent.study.folder import CACHE
+
+GRIDS_MM = (0.28, 0.2, 0.14, 0.1)
+"""Grid spacings of the demo, mm."""
+WINDOW_S = 4.0
+"""Window of the injections on several grids, s."""
+
+
+def main() -> None:
+    """Print every table; the words of the command line are grid spacings of the demo, mm, or case folders."""
+    words = sys.argv[1:] or ["taylor", *map(str, GRIDS_MM)]
+    for word in words:
+        if word == "taylor":
+            print(f"Taylor dispersion in a round tube, found over exact: {taylor():.3f}", flush=True)
+        elif Path(word).is_dir():
+            folder = Path(word)
+            anatomy = load_data(next((folder / CACHE).glob("anatomy-*.npz")), Anatomy)
+            for path in sorted((folder / CACHE).glob("flow *.npz")):
+                name = path.stem.split("-")[0].removeprefix("flow ")
+                ages(f"{folder.name} {name}", flow_case(anatomy, None), load_data(path, FlowField))
+        else:
+            demo(float(word))
+
+
+def demo(spacing_mm: float) -> None:
+    """Compute the flow in the demo's artery on one grid, and report its ages and the times of an injection."""
+    surface = phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.25)
+    anatomy = restore(trace(Vessel(surface)))
+    case = flow_case(anatomy, None, FlowSettings(cell_size_mm=spacing_mm))
+    field = simulate_case(case)
+    ages(f"demo {spacing_mm:g} mm", case, field)
+    began, busy = time.perf_counter(), time.process_time()
+    ready = angiograms.injection(case, field, AngiogramSettings(window_s=WINDOW_S))
+    sac = angiograms._sac_cells(ready.network, case)
+    told = angiograms._curves(ready, anatomy, sac, None, lambda _: None).measures()
+    wall, cpu = time.perf_counter() - began, time.process_time() - busy
+    print(
+        f"{'':24} retention {told['contrast_retention_s']:.4f} s  half-life {told['washout_half_life_s']:.4f} s  "
+        f"mean transit {told['contrast_mean_transit_s']:.4f} s  balance "
+        f"{ready.transport.balance().error_fraction:.1e}  "
+        f"{wall:.0f} s ({cpu:.0f} s CPU)",
+        flush=True,
+    )
+
+
+def ages(name: str, case: FlowCase, field: FlowField) -> None:
+    """Print the ages of the blood in a sac and of the blood that leaves it."""
+    assert case.sac is not None
+    assert case.ostium is not None
+    began, busy = time.perf_counter(), time.process_time()
+    whole = network(case, field)
+    whole = whole.merged(angiograms._distance_mm(whole, case) > angiograms.FINE_MM)
+    region = angiograms._distance_mm(whole, case) <= angiograms.REGION_MM
+    near = whole.within(region)
+    sac = np.flatnonzero(np.isin(np.flatnonzero(region), angiograms._sac_cells(whole, case)))
+    found = wash_out(near, sac, end_s=angiograms.MOST_WASHOUT_S)
+    points_mm, area_mm2 = sampling.surface_samples(case.ostium, field.cell_size_mm)
+    points = (points_mm - field.origin_mm) / field.cell_size_mm
+    through = sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2)
+    at = kernels.interpolate(*_on_grid(field, near, found.age_s), points, False)[:, 0]
+    turnover_s = indices(field, case.sac, case.ostium)["turnover_time_s"]
+    leaving_s = -(through @ at) / np.maximum(through, 0).sum()
+    wall, cpu = time.perf_counter() - began, time.process_time() - busy
+    print(
+        f"{name:24} {len(field.cells):8,} cells  corrected {whole.correction_fraction:.2%}  volume / inflow "
+        f"{turnover_s:.4f} s  age on leaving {leaving_s:.4f} s ({leaving_s / turnover_s - 1:+.1%})  mean age "
+        f"{found.mean_age_s:.4f} s (extrapolated {found.tail_fraction:.1%})  {wall:.0f} s ({cpu:.0f} s CPU)",
+        flush=True,
+    )
+
+
+def _on_grid(field: FlowField, near: Network, age_s: Floats) -> tuple[np.ndarray, Floats]:
+    """Return the cell numbers on the grid of a flow, for the fine cells only, and the age (n, 1) there."""
+    fine = np.flatnonzero(near.width == 1)
+    index = np.full(field.index.shape, -1, dtype=np.int32)
+    index[tuple(near.cells[fine].T)] = np.arange(len(fine), dtype=np.int32)
+    return index, age_s[fine][:, None]
+
+
+def taylor(radius: float = 12.5, peclet: float = 10.0) -> float:
+    """Return the dispersion in a round tube over D (1 + Pe^2 / 48) (Aris 1956, Proc. R. Soc. A 235, 67)."""
+    net = tube(radius, round(24 * radius))
+    speed = net.flux_mm3_s[0][net.axis == 2].mean()
+    round_radius = np.sqrt(np.bincount(net.cells[:, 2])[0] / np.pi)
+    diffusivity = speed * round_radius / peclet
+    z = net.cells[:, 2].astype(float)
+    unit_s = round_radius**2 / diffusivity
+    march = Transport(net, diffusivity_mm2_s=diffusivity, initial=np.exp(-(((z - 4 * radius) / radius) ** 2)))
+    spreads = list(_spreads(march, z, 0.35 * unit_s, 1.05 * unit_s))
+    return float((spreads[-1] - spreads[-2]) / (0.7 * unit_s) / (diffusivity * (1 + peclet**2 / 48)))
+
+
+def _spreads(march: Transport, z: Floats, interval_s: float, end_s: float) -> Iterator[float]:
+    """Yield the variance of a concentration along z."""
+    for _, values in march.frames(interval_s, end_s):
+        yield float(np.average((z - np.average(z, weights=values)) ** 2, weights=values))
+
+
+def tube(radius: float, length: int) -> Network:
+    """Return a round tube along z with a parabolic flow of 1 cell per s on average."""
+    size = int(2 * radius) + 3
+    middle = (size - 1) / 2
+    x, y, _ = np.indices((size, size, length))
+    inside = np.hypot(x - middle, y - middle) < radius
+    cells = np.argwhere(inside)
+    index = np.full((size + 1, size + 1, length + 1), -1)
+    index[tuple(cells.T)] = np.arange(len(cells))
+    speed = 2 * (1 - ((cells[:, 0] - middle) ** 2 + (cells[:, 1] - middle) ** 2) / radius**2)
+    left, right, axes, flux = [], [], [], []
+    for axis in range(3):
+        beyond = index[tuple((cells + np.eye(3, dtype=int)[axis]).T)]
+        own = np.flatnonzero(beyond >= 0)
+        left.append(own)
+        right.append(beyond[own])
+        axes.append(np.full(len(own), axis))
+        flux.append(speed[own] if axis == 2 else np.zeros(len(own)))
+    n, first, last = len(cells), np.flatnonzero(cells[:, 2] == 0), np.flatnonzero(cells[:, 2] == length - 1)
+    left += [np.full(len(first), n), last]
+    right += [first, np.full(len(last), n + 1)]
+    axes += [np.full(len(first) + len(last), 2)]
+    flux += [speed[first], speed[last]]
+    faces = (np.concatenate(one) for one in (left, right, axes))
+    fixed = np.concatenate(flux)[None], np.zeros(1), np.inf, 2, 1, 0.0
+    return Network(cells, np.ones(n), 1.0, cells * 1.0, np.ones(n), *faces, *fixed)
+
+
+if __name__ == "__main__":
+    main()
