@@ -88,7 +88,8 @@ def ages(name: str, case: FlowCase, field: FlowField) -> None:
     through = sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2)
     at = kernels.interpolate(*_on_grid(field, near, found.age_s), points, False)[:, 0]
     turnover_s = indices(field, case.sac, case.ostium)["turnover_time_s"]
-    leaving_s = -(through @ at) / np.maximum(through, 0).sum()
+    inward, outward = np.maximum(through, 0), np.maximum(-through, 0)
+    leaving_s = outward @ at / outward.sum() - inward @ at / inward.sum()
     wall, cpu = time.perf_counter() - began, time.process_time() - busy
     print(
         f"{name:24} {len(field.cells):8,} cells  corrected {whole.correction_fraction:.2%}  volume / inflow "

@@ -27,6 +27,7 @@ from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 
 VERBS = (
+    "angiogram",
     "catalogue",
     "deploy",
     "find_design",

@@ -80,14 +80,21 @@ def test_the_network_of_a_flow_is_balanced_and_closed_at_the_wall(flown: tuple[P
 @pytest.mark.parametrize(
     ("words", "answer"),
     [
-        (["--window", "0.1", "--start", "0"], "no contrast reaches the sac within 0.1 s"),
+        (["--window", "0.2", "--curve", "late.csv"], "no contrast reaches the sac within 0.2 s"),
         (["--amount", "-1"], "amount"),
         (["--curve", "missing.csv"], "does not exist"),
     ],
 )
 def test_what_cannot_be_injected_is_answered_in_a_sentence(
-    flown: tuple[Path, list[str]], words: list[str], answer: str, capsys: pytest.CaptureFixture[str]
+    flown: tuple[Path, list[str]],
+    words: list[str],
+    answer: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("late.csv").write_text("time_s,iodine_mg_mL\n0,0\n5,0\n6,100\n")
     before = (flown[0] / "metrics.json").read_bytes()
     try:
         code = main(["angiogram", str(flown[0]), *words])
