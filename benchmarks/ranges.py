@@ -26,7 +26,8 @@ from vstent.devices.stent import Landing
 from vstent.errors import VstentError
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
-from vstent.plan.bands import INTERVAL, Band, bands, sobol_points, values_at
+from vstent.kernels.sobol import centered_points
+from vstent.plan.bands import INTERVAL, Band, bands, values_at
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 CASES = {"demo": "", "C0038": "aneurisk_C0038.vtp"}
@@ -66,7 +67,7 @@ def row(artery: Anatomy, design: Design) -> str:
     with_sizes_s = time.process_time() - began - alone_s
     ranges = uncertain(design)
     sampled = []
-    for point in sobol_points(len(ranges), SAMPLES):
+    for point in centered_points(len(ranges), SAMPLES):
         try:
             other, other_size = altered(design, size, values_at(ranges, point))
             sampled.append(measure(artery, deploy(other, artery, size=other_size, landing=landing)))

@@ -263,6 +263,11 @@ def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     row = next(row for row in told["measures"]["rows"] if row["key"] == "deployed_length_mm")
     assert float(row["cells"][0].split("\u202f")[0]) == pytest.approx(measures["deployed_length_mm"], rel=5e-3)
     assert row["meaning"]
+    sheet = client.post(f"{case}/bands", json={"device": device}).json()
+    lengths = next(row for row in sheet["rows"] if row[0] == "Deployed length")
+    low, value, high = (float(lengths[k].split("\u202f")[0]) for k in (2, 1, 3))
+    assert low < value < high
+    assert "Numbers of Silk: 2 cited" in sheet["sentence"]
     wires = next(layer for layer in told["layers"] if layer["id"] == "wires")
     coverage = app_case.numbers(wires["values"], data)
     assert coverage.mean() == pytest.approx(100 * measures["metal_coverage_fraction"], rel=0.05)

@@ -15,7 +15,8 @@ from vstent.devices.catalogue import catalogue, find_design, find_size
 from vstent.devices.ranges import MARGIN, altered, uncertain
 from vstent.devices.stent import Landing
 from vstent.errors import VstentError
-from vstent.plan.bands import BANDED, INTERVAL, SAMPLES, bands, length_band, sobol_points, values_at
+from vstent.kernels.sobol import centered_points
+from vstent.plan.bands import BANDED, INTERVAL, SAMPLES, bands, length_band, values_at
 from vstent.plan.rank import rank
 from vstent.reporting.bands import ends, how_sure, number_name, rows
 
@@ -37,7 +38,8 @@ def lying(radius_mm=RADIUS_MM):
 
 
 def altered_silks():
-    return [altered(SILK, SIZE, values_at(uncertain(SILK), at)) for at in sobol_points(len(uncertain(SILK)), SAMPLES)]
+    ranges = uncertain(SILK)
+    return [altered(SILK, SIZE, values_at(ranges, at)) for at in centered_points(len(ranges), SAMPLES)]
 
 
 def formula(design, size):
@@ -130,10 +132,10 @@ def test_the_proposed_size_has_a_band_in_an_artery_between_two_sizes():
 def test_a_ranking_states_the_band_of_every_suitable_length():
     ranking = rank(straight(), [replace(SILK, sizes=(SIZE,))])
     (only,) = ranking.candidates
-    if only.is_suitable:
-        assert only.measures["deployed_length_low_mm"] < only.measures["deployed_length_mm"]
-        assert only.measures["deployed_length_mm"] < only.measures["deployed_length_high_mm"]
-        assert only.measures["deployed_length_band_cause"] in {one.name for one in uncertain(SILK)}
+    assert only.is_suitable, only.reason
+    assert only.measures["deployed_length_low_mm"] < only.measures["deployed_length_mm"]
+    assert only.measures["deployed_length_mm"] < only.measures["deployed_length_high_mm"]
+    assert only.measures["deployed_length_band_cause"] in {one.name for one in uncertain(SILK)}
 
 
 @cache
@@ -144,7 +146,7 @@ def bent():
 def sampled(design, size, landing, count):
     """Results of full deployments of altered devices in the bend."""
     found = []
-    for point in sobol_points(len(uncertain(design)), count):
+    for point in centered_points(len(uncertain(design)), count):
         try:
             other, other_size = altered(design, size, values_at(uncertain(design), point))
             found.append(measure(bent(), deploy(other, bent(), size=other_size, landing=landing)))
@@ -166,9 +168,9 @@ def compared(key, count):
 
 
 def test_in_a_bend_the_band_of_the_length_is_that_of_full_deployments():
-    ratios = compared("lvis", 32)
-    # 32 deployments leave out a part of the ends that 128 samples have
-    assert ratios["deployed_length_mm"] == pytest.approx(1.0, abs=0.2)
+    ratios = compared("lvis", 16)
+    # 16 deployments leave out a part of the ends that 128 samples have
+    assert ratios["deployed_length_mm"] == pytest.approx(1.0, abs=0.25)
 
 
 @pytest.mark.validation
