@@ -1,5 +1,6 @@
 """Present films: grey frames, films before and after side by side, key frames, and files for viewers."""
 
+import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from vstent.io.writers import write_json
 from vstent.io.xa_writer import BITS, XaHeader, write_xa
 from vstent.kernels.arrays import Floats
 from vstent.reporting.figures import Picture
-from vstent.reporting.lettering import font
+from vstent.reporting.lettering import blank, font, put_title
 from vstent.reporting.plots import png_of
 
 FOLDER: Final = "angiogram"
@@ -34,6 +35,8 @@ CAPTION_PX: Final = 22
 """Height of the line of text above a film."""
 CAPTION_POINTS: Final = 5.8
 """Size of the letters in that line, in points."""
+LEAST_PX: Final = 320
+"""Least width of a key frame, for its title."""
 GAP_PX: Final = 6
 """Distance between films."""
 LATE_S: Final = 5.0
@@ -147,26 +150,27 @@ def key_frames(shown: Sequence[Shown], window: float) -> Picture:
     shown : the film without a device first.
     window : absorption that is shown black.
     """
-    from matplotlib.figure import Figure
+    from PIL import Image
 
     moments = key_times_s(shown[0].film)
     rows, columns = shown[0].film.absorption.shape[1:]
-    width = 10.2 / len(moments)
-    height = width * rows / columns
-    figure = Figure(figsize=(10.2, len(shown) * (height + 0.25)), facecolor="white")
-    grid = figure.subplots(len(shown), len(moments), squeeze=False)
-    figure.subplots_adjust(0, 0, 1, 1 - 0.25 / (len(shown) * (height + 0.25)), 0.02, 0.25 / height)
-    for one, line in zip(shown, grid, strict=True):
-        levels = list(one.levels(window))
-        for (name, time_s), axes in zip(moments, line, strict=True):
-            axes.set_axis_off()
-            axes.imshow(levels[one.film.at(time_s)], cmap="gray", vmin=0, vmax=1, interpolation="antialiased")
-            axes.set_title(f"{one.title}: {name}, {time_s:.1f} s", fontsize=7.5, loc="left", pad=3)
+    width = max(columns, LEAST_PX)
+    height = round(rows * width / columns)
+    picture = blank(len(moments) * (width + GAP_PX) - GAP_PX, len(shown) * (height + CAPTION_PX + GAP_PX) - GAP_PX)
+    for line, one in enumerate(shown):
+        levels, top = list(one.levels(window)), line * (height + CAPTION_PX + GAP_PX) + CAPTION_PX
+        for place, (name, time_s) in enumerate(moments):
+            frame = Image.fromarray(bytes_of(levels[one.film.at(time_s)])).resize((width, height))
+            picture.paste(frame, (place * (width + GAP_PX), top))
+            words = f"{one.title}: {name}, {time_s:.1f} s"
+            put_title(picture, words, place * (width + GAP_PX), top - 5)
     caption = (
         f"Contrast agent along {shown[0].film.view.name}, at equal times: half of the largest amount in the picture "
         f"(early, late), the largest (peak), and {LATE_S:g} s later. {OF_FILM}"
     )
-    return Picture("key_frames", "Angiogram before and after", caption, png_of(figure))
+    stream = io.BytesIO()
+    picture.save(stream, "PNG")
+    return Picture("key_frames", "Angiogram before and after", caption, stream.getvalue())
 
 
 @dataclass(frozen=True, eq=False)

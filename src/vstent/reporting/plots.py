@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def png_of(figure: "Figure") -> bytes:
-    """Return a figure as PNG, at the resolution of all pictures."""
+    """Return a figure as PNG, at the resolution of all pictures; equal figures give equal files."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
     return buffer.getvalue()
