@@ -31,6 +31,8 @@ from vstent.study.folder import CACHE
 
 GRIDS_MM = (0.28, 0.2, 0.14, 0.1)
 """Grid spacings of the demo, mm."""
+UPSTREAM_CELLS = 0.75
+"""Distance upstream of the ostium at which the age is taken, in cells."""
 WINDOW_S = 4.0
 """Window of the injections on several grids, s."""
 
@@ -86,7 +88,10 @@ def ages(name: str, case: FlowCase, field: FlowField) -> None:
     points_mm, area_mm2 = sampling.surface_samples(case.ostium, field.cell_size_mm)
     points = (points_mm - field.origin_mm) / field.cell_size_mm
     through = sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2)
-    at = kernels.interpolate(*_on_grid(field, near, found.age_s), points, False)[:, 0]
+    # The age is that of the blood upstream: on the other side it is mixed with fresh blood within a cell.
+    normals = area_mm2 / np.linalg.norm(area_mm2, axis=1, keepdims=True)
+    upstream = points - UPSTREAM_CELLS * np.sign(through)[:, None] * normals
+    at = kernels.interpolate(*_on_grid(field, near, found.age_s), upstream, False)[:, 0]
     turnover_s = indices(field, case.sac, case.ostium)["turnover_time_s"]
     inward, outward = np.maximum(through, 0), np.maximum(-through, 0)
     leaving_s = outward @ at / outward.sum() - inward @ at / inward.sum()

@@ -194,7 +194,7 @@ def angiogram(
     balance = ready.transport.balance()
     measures |= {"contrast_balance_error_fraction": balance.error_fraction}
     if case.sac is None:
-        return Angiogram(curves, np.zeros(0), np.zeros(0), measures, _advice(ready, measures, None))
+        return Angiogram(curves, np.zeros(0), np.zeros(0), measures, _advice(ready, field, measures, None))
     region = _distance_mm(ready.network, case) <= REGION_MM
     near, own = ready.network.within(region), np.flatnonzero(np.isin(np.flatnonzero(region), sac))
     found = washouts.wash_out(
@@ -205,7 +205,7 @@ def angiogram(
         told=lambda part: tell(share + (1 - share) * part),
     )
     measures |= _stay(found, near, own, case)
-    return Angiogram(curves, found.time_s, found.left_fraction, measures, _advice(ready, measures, found))
+    return Angiogram(curves, found.time_s, found.left_fraction, measures, _advice(ready, field, measures, found))
 
 
 def _curves(
@@ -284,14 +284,14 @@ def _parent_cells(grid: Network, anatomy: Anatomy, sac: Ints) -> Ints:
     return np.flatnonzero(inside)
 
 
-def _advice(ready: Injection, measures: dict[str, float], found: washouts.Washout | None) -> str:
+def _advice(ready: Injection, field: FlowField, measures: dict[str, float], found: washouts.Washout | None) -> str:
     """Return sentences on the grid and on what the window did not reach."""
     grid = ready.network
     widths = sorted({float(width) * grid.spacing_mm for width in np.unique(grid.width)})
     spacing = " and ".join(f"{width:.3g}" for width in widths)
     said = (
-        f"{len(grid.cells):,} cells of {spacing} mm, fastest step {1e3 * ready.transport.fastest_s:.2g} ms; the flow "
-        f"rates were corrected by {grid.correction_fraction:.1%}."
+        f"{len(grid.cells):,} cells of {spacing} mm, fastest step {1e3 * ready.transport.fastest_s:.2g} ms, memory "
+        f"{memory_bytes(field) / 1e9:.2g} GB; the flow rates were corrected by {grid.correction_fraction:.1%}."
     )
     if "washout_half_life_s" not in measures:
         said += (

@@ -9,7 +9,20 @@ from vstent.angiography.transport import Transport
 def warm() -> None:
     """March a frame through two cells; numba keeps the compiled code."""
     cells = np.array([[0, 0, 0], [0, 0, 1]])
-    faces = np.array([0, 1, 2]), np.array([1, 3, 0]), np.full(3, 2)
-    fixed = np.ones((1, 3)), np.zeros(1), np.inf, 2, 1, 0.0
-    two = Network(cells, np.ones(2), 1.0, cells * 1.0, np.ones(2), *faces, *fixed)
+    two = Network(
+        cells=cells,
+        width=np.ones(2, dtype=np.int32),
+        spacing_mm=1.0,
+        points_mm=cells.astype(np.float64),
+        volume_mm3=np.ones(2),
+        left=np.array([0, 1, 2]),
+        right=np.array([1, 3, 0]),
+        axis=np.full(3, 2),
+        flux_mm3_s=np.ones((1, 3)),
+        time_s=np.zeros(1),
+        period_s=np.inf,
+        openings=2,
+        inlets=1,
+        correction_fraction=0.0,
+    )
     list(Transport(two, inflow=lambda _: 1.0).frames(0.1, 0.1))

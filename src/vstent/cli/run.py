@@ -153,13 +153,13 @@ def _run(arguments: argparse.Namespace) -> int:
     if injected is not None and settings.flow is None:
         raise InputError("contrast moves with the flow: leave out --no-flow and --plan, or --angiogram.")
     if arguments.input.suffix == ".json":
-        return _again(arguments, settings)
+        return _again(arguments, settings, injected)
     given = {"is_printed": arguments.pdf, "replaces": arguments.replace, "injected": injected}
     case = study(arguments.input, arguments.out, settings, **given)
     return _finish(arguments, case)
 
 
-def _again(arguments: argparse.Namespace, given: "Settings") -> int:
+def _again(arguments: argparse.Namespace, given: "Settings", injected: "AngiogramSettings | None") -> int:
     """Repeat a run from its ``run.json`` and compare the results; return the exit code."""
     from vstent.cli.console import Console
     from vstent.study.repeat import agreement, read_record
@@ -175,7 +175,8 @@ def _again(arguments: argparse.Namespace, given: "Settings") -> int:
     console = Console()
     for difference in record.differences:
         console.say(f"Changed since: {difference}.")
-    case = study(record.input, arguments.out, record.settings, is_printed=arguments.pdf, replaces=arguments.replace)
+    asked = {"is_printed": arguments.pdf, "replaces": arguments.replace, "injected": injected}
+    case = study(record.input, arguments.out, record.settings, **asked)
     code = _finish(arguments, case)
     console.print(agreement(record.folder, arguments.out))
     return code
