@@ -219,8 +219,8 @@ def test_contrast_is_conserved_and_bounded(is_merged):
     march = Transport(fast, inflow=lambda t: float(t < 3) * 2.0, upper=2.0, diffusivity_mm2_s=0.01)
     for _, values in march.frames(0.5, 10.0):
         assert values.min() >= -1e-6
-        assert values.max() <= 2.0 + 1e-6
-        assert march.balance().error_fraction < 1e-9
+        assert values.max() <= 2.0 + 1e-5
+        assert march.balance().error_fraction < 1e-5  # single precision
 
 
 def test_merged_cells_carry_the_same_flow_and_volume():
