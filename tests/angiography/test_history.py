@@ -49,6 +49,16 @@ def test_values_come_back_within_half_a_step():
     assert error[wanted < 3].max(initial=0) < 0.13  # finer near zero
 
 
+def test_no_cell_of_a_wide_block_is_lost():
+    """Of a block of 4 x 4 x 4 cells at the wall only a corner and the far edge are blood."""
+    corner = np.array([[0.0, 0, 0], [3, 3, 0], [3, 3, 1], [3, 3, 2], [3, 3, 3]])
+    whole = np.stack(np.meshgrid(*3 * [np.arange(4.0, 8)], indexing="ij"), axis=-1).reshape(-1, 3)
+    recorder = Recorder(flow(np.concatenate([corner, whole]), 1.0), 300.0)
+    edges = np.cbrt([len(corner), len(whole)])
+    recorder.watch(np.stack([corner.mean(axis=0), whole.mean(axis=0)]), edges)(0.0, np.zeros(2))
+    assert len(recorder.history().points_mm) == 5 + 64
+
+
 def test_values_beyond_the_scale_are_cut_and_the_file_gives_it_back(tmp_path):
     points = np.array([[0.0, 0, 0], [1, 0, 0]])
     recorder = Recorder(flow(points, 1.0), 300.0, "key")

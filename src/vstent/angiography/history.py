@@ -17,8 +17,9 @@ STEPS: Final = 255
 shades: the error is at most 0.4 % of the largest concentration, and 0.04 % near zero."""
 
 
-FARTHEST: Final = 1.6
-"""Largest distance of a cell of the flow from the center of its block of cells, in cells; others hold no contrast."""
+FARTHEST: Final = 3**0.5
+"""Largest distance of a cell of the flow from the center of its block, in edges of the largest block: no cell of a
+block is farther from the center of its blood. Cells beyond it are not connected to the vessel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +74,13 @@ class Recorder:
     def __init__(self, field: FlowField, most_mg_mL: float, key: str = "", begin_s: float = 0.0) -> None:
         self._field, self._most_mg_mL, self._key, self._begin_s = field, most_mg_mL, key, begin_s
         self._points_mm: Floats | None = None
+        self._reach_mm = 0.0
         self._times: list[float] = []
         self._stored: list[NDArray[np.uint8]] = []
 
     def watch(self, points_mm: Floats, edge_mm: Floats) -> Callable[[float, NDArray[Any]], None]:
-        """Take the centers (n, 3) in LPS of the cells that are marched; return the function that takes every frame."""
-        self._points_mm = points_mm
+        """Take centers (n, 3) in LPS and edges (n,) of the marched cells; return the function that takes every frame."""
+        self._points_mm, self._reach_mm = points_mm, FARTHEST * float(edge_mm.max())
         return self.add
 
     def add(self, time_s: float, values_mg_mL: NDArray[Any]) -> None:
@@ -101,7 +103,7 @@ class Recorder:
             raise ValueError("no frame has been stored")
         spacing_mm, centers_mm = self._field.cell_size_mm, self._field.centers_mm
         distance_mm, block = cKDTree(self._points_mm).query(centers_mm)
-        near = distance_mm < FARTHEST * spacing_mm
+        near = distance_mm < self._reach_mm
         stored, times = np.stack(self._stored), np.array(self._times)
         points_mm = centers_mm[near].astype(np.float32)
         return History(points_mm, spacing_mm, np.asarray(block)[near], times, stored, self._most_mg_mL, self._key)
