@@ -79,7 +79,7 @@ class Recorder:
         self._stored: list[NDArray[np.uint8]] = []
 
     def watch(self, points_mm: Floats, edge_mm: Floats) -> Callable[[float, NDArray[Any]], None]:
-        """Take centers (n, 3) in LPS and edges (n,) of the marched cells; return the function that takes every frame."""
+        """Take centers (n, 3) in LPS and edges (n,) of the marched cells; return what takes every frame."""
         self._points_mm, self._reach_mm = points_mm, FARTHEST * float(edge_mm.max())
         return self.add
 
