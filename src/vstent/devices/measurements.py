@@ -85,7 +85,7 @@ def read_measurements(path: Path, design: Design) -> tuple[Measurement, ...]:
         CSV file with a header. Every row has the columns `LABEL`, and any of the others; empty cells are left out. A
         column ``length_error_mm`` holds the standard error of ``length_mm``, and likewise for the other quantities.
     design : Design
-        A device of the same family. It tells which counts and widths there are.
+        A device of the same family, with the same counts and widths.
 
     Returns
     -------

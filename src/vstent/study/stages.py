@@ -511,7 +511,7 @@ def band_all(
     anatomy : vessel, parent artery and sacs.
     deployments : deployments by device name.
     metrics : result of `measure_all`; every device gets the entry ``bands``.
-    settings : settings of the study, which tell whether a size was given.
+    settings : settings of the study, with the size if one was given.
     """
     for name, deployment in deployments.items():
         placing, design = settings.placing(name), deployment.stent.design
