@@ -115,6 +115,11 @@ def test_the_entry_of_a_fit_is_read_with_a_range_for_every_number(key):
     assert [one.name for one in design.ranges] == list(numbers(like))
     assert {size.label for size in design.sizes} == {size.label for size in like.sizes}
     assert design.angle_rad == pytest.approx(like.angle_rad, abs=1e-4)
+    for what in ("strands", "has_closed_ends", "joined_crowns", "crown_gap_um"):
+        assert getattr(design, what, None) == getattr(like, what, None)
+    same = {size.label: size.free_profile_mm for size in like.sizes}
+    for size in design.sizes:
+        assert np.array(size.free_profile_mm) == pytest.approx(np.array(same[size.label]), abs=1e-3)
     sure = {one.name: one.confidence for one in design.ranges}
     assert sure[MARGIN] == sure["cell_angle_rad" if like.kind == "laser_cut" else "braid_angle_rad"] == "derived"
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from vstent.devices.design import Design, Size
 from vstent.devices.fit import Fitted, fit, predict
-from vstent.devices.measurements import Measurement
+from vstent.devices.measurements import Measurement, fitted_names
 from vstent.devices.ranges import LENGTH, MARGIN, altered
 from vstent.errors import InputError
 from vstent.kernels.arrays import Floats
@@ -43,10 +43,10 @@ def measured(design: Design, rng: np.random.Generator | None) -> Bench:
     numbers = {
         one.name: one.value if rng is None else rng.uniform(one.low, one.high)
         for one in design.ranges
-        if not one.name.endswith(("count", "columns"))
+        if one.name in (*fitted_names(design), LENGTH) and not one.name.endswith(("count", "columns"))
     }
     true, true_size = altered(design, size, numbers)
-    counts = [one.name for one in design.ranges if one.name.endswith(("count", "columns"))]
+    counts = [name for name in fitted_names(design) if name.endswith(("count", "columns"))]
     places = [("length_mm", round(part * size.diameter_mm, 2)) for part in TUBES]
     places += [("length_mm", None), *2 * [("free_diameter_mm", None)]]
     places += [("angle_deg", None)] if design.kind == "laser_cut" else []

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from vstent.devices.design import Braid, Design, LaserCut
 from vstent.devices.fit import Fitted, labels
-from vstent.devices.ranges import LENGTH, MARGIN
+from vstent.devices.ranges import LENGTH, MARGIN, PROFILE
 
 ERRORS: Final = 2.0
 """Standard errors to either side of a fitted value in its range: 95 % of normal errors lie in it."""
@@ -46,7 +46,7 @@ def entry(fitted: Fitted, like: Design, name: str, *, source: str, has_all_sizes
     writer = _Writer(fitted, like, source)
     lines = ["[[device]]", *(f"{key} = {_text(value)}" for key, value in _head(fitted.design, like, name))]
     lines += writer.wires() if isinstance(fitted.design, Braid) else writer.struts()
-    lines += [writer.number(MARGIN), "sizes = [", *writer.sizes(has_all_sizes), "]"]
+    lines += [*writer.structures(), writer.number(MARGIN), "sizes = [", *writer.sizes(has_all_sizes), "]"]
     return "\n".join(lines) + "\n"
 
 
@@ -57,6 +57,8 @@ def _head(design: Design, like: Design, name: str) -> Iterator[tuple[str, str]]:
 
 def _text(value: Any) -> str:
     """Return a value as TOML."""
+    if isinstance(value, bool):
+        return str(value).lower()
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
     if isinstance(value, (list, tuple)):
@@ -147,6 +149,58 @@ class _Writer:
             found |= {ends[0]: round(value - ERRORS * error, 2), ends[1]: round(value + ERRORS * error, 2)}
             found |= {"source": self.source, "confidence": "derived", "reason": f"{REASON}; {count} wires"}
         return found
+
+    def structures(self) -> Iterator[str]:
+        """Yield the lines of strands, layers, flares, closed ends and free crowns, as the similar device has them."""
+        design = self.fitted.design
+        if isinstance(design, Braid):
+            yield from self._strands(design)
+            if design.has_closed_ends:
+                yield f"closed_ends = {_table({'value': True} | self._kept('closed_ends', '', ('', '')))}"
+        elif design.joined_crowns:
+            crowns = {"value": design.joined_crowns} | self._kept("joined_crowns", "", ("", ""))
+            yield f"joined_crowns = {_table(crowns)}"
+            yield self.number("crown_gap_um")
+        if self.like.sizes[0].free_profile_mm:
+            yield f"free_profile = {_table(self._profile())}"
+
+    def _strands(self, design: Braid) -> Iterator[str]:
+        """Yield the lines of the strands and of the outer layer of a braid."""
+        beside: list[str] = []
+        for strands in design.strands:
+            is_layer = strands.place == "outside"
+            name = "outer_layer" if is_layer else f"strand_{len(beside) + 1}" if beside else "strand"
+            fact, ends = "outer_layer" if is_layer else "strands", ("diameter_low_um", "diameter_high_um")
+            found = self._kept(fact, f"{name}_diameter_um", ends, len(beside)) | self._ends(
+                f"{name}_count", "count_{}", int
+            )
+            found |= {"count": strands.count, "diameter_um": strands.diameter_um}
+            if is_layer:
+                found |= {"beyond_mm": strands.beyond_mm} | self._ends(f"{name}_beyond_mm", "beyond_{}_mm", float)
+                yield f"outer_layer = {_table(found)}"
+            else:
+                beside.append(f"    {_table(found)},")
+        if beside:
+            yield from ("strands = [", *beside, "]")
+
+    def _ends(self, name: str, key: str, kind: type) -> dict[str, Any]:
+        """Return the ends of the range of a number of the similar device, under the keys that `key` makes."""
+        one = self.ranges.get(name)
+        return {} if one is None else {key.format("low"): kind(one.low), key.format("high"): kind(one.high)}
+
+    def _profile(self) -> dict[str, Any]:
+        """Return the free diameter along the similar device: flared ends by their distance, a taper by fractions."""
+        size, kept = self.like.sizes[0], self._kept("free_profile", PROFILE, ("", "wider_tolerance_mm"))
+        kept.pop("", None)
+        pairs = [(where, diameter_mm - size.free_diameter_mm) for where, diameter_mm in size.free_profile_mm]
+        by_place = {round(where, 6): round(wider, 6) for where, wider in pairs}
+        is_flare = all(by_place.get(round(1 - where, 6)) == wider for where, wider in by_place.items())
+        if not is_flare:
+            return {"fractions": list(by_place), "wider_mm": list(by_place.values())} | kept
+        beyond_mm = sum(2 * one.beyond_mm for one in getattr(self.like, "strands", ()))
+        near = {where: wider for where, wider in by_place.items() if where <= 0.5}
+        from_ends_mm = [round(where * (size.length_mm + beyond_mm), 4) for where in near]
+        return {"from_ends_mm": from_ends_mm, "wider_mm": list(near.values())} | kept
 
     def sizes(self, has_all: bool) -> Iterator[str]:
         """Yield the blocks of sizes."""

@@ -15,8 +15,8 @@ import numpy as np
 
 from vstent.devices.design import STEEP_RAD, Design, LaserCut, Size, angle_rad
 from vstent.devices.formulas import coverage_fraction, foreshortening_fraction, pore_density_per_mm2, row_spacing_mm
-from vstent.devices.measurements import Measurement
-from vstent.devices.ranges import LENGTH, MARGIN, altered, numbers
+from vstent.devices.measurements import Measurement, fitted_names
+from vstent.devices.ranges import LENGTH, MARGIN, altered
 from vstent.errors import DeviceError, InputError
 from vstent.kernels.arrays import Bools, Floats
 from vstent.units import MM_PER_UM
@@ -135,7 +135,8 @@ def _counts(measurements: tuple[Measurement, ...], like: Design) -> list[dict[st
                 raise InputError(
                     f"The measurements contradict each other: {one.name} is {found[one.name]:g} and {one.value:g}."
                 )
-    ends = {one.name: (one.low, one.high) for one in like.ranges if _is_count(one.name)}
+    tried = [name for name in fitted_names(like) if _is_count(name)]
+    ends = {one.name: (one.low, one.high) for one in like.ranges if one.name in tried}
     open_counts = {
         name: range(round(low), round(high) + 1, 2) for name, (low, high) in ends.items() if name not in found
     }
@@ -252,7 +253,7 @@ def _fitted(measurements: tuple[Measurement, ...], like: Design) -> Fitted:
     """Return the fit with the counts of a device."""
     from scipy.optimize import least_squares
 
-    names = tuple(name for name in numbers(like) if name != LENGTH and not _is_count(name))
+    names = tuple(name for name in fitted_names(like) if not _is_count(name))
     noted = tuple(one for one in measurements if not _is_count(one.name))
     problem = _Problem(like, names, labels(measurements), noted)
     prior = problem.prior

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from vstent.devices.design import Design, LaserCut
-from vstent.devices.ranges import LENGTH, MARGIN, numbers
+from vstent.devices.design import Design
+from vstent.devices.ranges import MARGIN, numbers
 from vstent.errors import InputError
 
 LABEL: Final = ("label_diameter_mm", "label_length_mm")
@@ -33,6 +33,8 @@ The errors are vstent's own: those of calipers on a soft braid, and of pictures 
 """
 DIRECT_ERROR_UM: Final = 2.0
 """Default standard error of a measured wire diameter, strut width or thickness, in um."""
+OF_MESH: Final = ("wire", "braid_angle", "n_columns", "strut", "cell_angle")
+"""Beginnings of the names of the numbers of a mesh."""
 TEMPLATE: Final = """\
 label_diameter_mm,label_length_mm,tube_diameter_mm,length_mm,free_diameter_mm,angle_deg,wire_count,wire_diameter_um,source
 4.0,20,,,4.27,,48,30,calipers and microscope
@@ -70,10 +72,14 @@ class Measurement:
         return f"row {self.row} ({self.name} {self.value:g}, {tube})"
 
 
+def fitted_names(design: Design) -> tuple[str, ...]:
+    """Return the numbers of a device that a fit concerns: mesh and free diameter, without further structures."""
+    return tuple(name for name in numbers(design) if name.startswith(OF_MESH) or name == MARGIN)
+
+
 def direct(design: Design) -> tuple[str, ...]:
     """Return the numbers of a device that are measured directly: counts, diameters and widths."""
-    angle = "cell_angle_rad" if isinstance(design, LaserCut) else "braid_angle_rad"
-    return tuple(name for name in numbers(design) if name not in (angle, MARGIN, LENGTH))
+    return tuple(name for name in fitted_names(design) if name != MARGIN and not name.endswith("_angle_rad"))
 
 
 def read_measurements(path: Path, design: Design) -> tuple[Measurement, ...]:
