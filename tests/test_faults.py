@@ -11,6 +11,7 @@ from faults import DONE, FAULTS, Fault, artery, play
 from vstent.io.writers import write_stl
 from vstent.study.pipeline import run
 from vstent.study.types import Settings
+from vstent.study.written import FINISHED
 
 KEPT = {"disk full", "kept stages that unpack to 16 GB"}
 """Faults after which the case folder holds what was finished before."""
@@ -82,6 +83,7 @@ def killed(moment: str, path: Path, out: Path, cell: str = "") -> int:
 def written(out: Path) -> dict[str, bytes]:
     """Return what lies in a case folder by now, times taken aside."""
     files = (path for path in out.rglob("*") if path.is_file() and path.name not in ("run.json", "lock"))
+    files = (path for path in files if path.suffix != FINISHED)
     untimed = (path for path in files if path.suffix != ".npz" and not path.with_suffix(".npz").exists())
     return {str(path.relative_to(out)): path.read_bytes() for path in untimed}
 

@@ -8,11 +8,14 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from vstent.io.writers import write_text
 from vstent.study.ledger import Ledger, key_of
 from vstent.study.repeat import UNTOLD
+
+FINISHED: Final = ".done"
+"""Suffix of the files in the cache folder that state what a stage has written, and when."""
 
 
 @cache
@@ -37,7 +40,7 @@ def write_once(
     names : names of the files.
     write : writes them and returns a sentence.
     """
-    mark = ledger.folder / f"{stage}.json"
+    mark = ledger.folder / f"{stage}{FINISHED}"
     kept = _read(mark)
     if kept.get("key") == key and kept.get("files") == _states(folder, names):
         ledger.seconds[stage] = kept["seconds"]
@@ -60,7 +63,7 @@ def compute_once(ledger: Ledger, stage: str, key: str, compute: Callable[[], dic
     key : key of everything that the values depend on.
     compute : computes them.
     """
-    mark = ledger.folder / f"{stage}.json"
+    mark = ledger.folder / f"{stage}{FINISHED}"
     kept = _read(mark)
     if kept.get("key") == key:
         ledger.seconds[stage] = kept["seconds"]
