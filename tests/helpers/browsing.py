@@ -18,6 +18,7 @@ needs_browser = pytest.mark.skipif(
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
 SECOND = 1000
+playwright.expect.set_options(timeout=60 * SECOND)  # a busy machine takes its time
 
 
 def browsing(client, width=1280, height=720, **options):

@@ -160,7 +160,7 @@ class Desk:
             raise ReadError(f"The scan of {case.state.name} has been moved from {case.input}. Put it back there.")
         if kind != "anatomy" and not case.state.choices.devices:
             raise InputError("No device is chosen. Choose one in the step Device.")
-        if kind == "angiogram" and statuses(case.state, "", lost_steps(case.folder, case.state))["flow"] != "done":
+        if kind == "angiogram" and not _has_flow(case):
             raise InputError("The flow is out of date or not computed, and contrast moves with it. Run the step Flow.")
         self.jobs.start(case, kind)
 
@@ -457,3 +457,9 @@ def _wants_grid(case: Case) -> bool:
 
     choices = case.state.choices
     return suffix(case.input) in RAW_SUFFIXES and (choices.shape is None or choices.spacing_mm is None)
+
+
+def _has_flow(case: Case) -> bool:
+    """Return whether the flows of a case are computed and up to date; a study without flow has none."""
+    steps = statuses(case.state, "", lost_steps(case.folder, case.state))
+    return case.state.choices.flow.is_wanted and steps["flow"] == "done"
