@@ -53,6 +53,7 @@ def test_the_page_keeps_its_manners(client):
         definitions_are_shown(page)
         step(page, "Flow")
         # The inflow that is proposed: 0.27 m/s through an inlet of 2 mm radius.
+        playwright.expect(page.locator("#field-inflow")).to_have_attribute("placeholder", re.compile(r"\d"))
         assert float(page.get_attribute("#field-inflow", "placeholder")) == pytest.approx(0.27 * 12.566, abs=0.01)
         assert 0.05 < float(page.get_attribute("#field-cell", "placeholder")) < 0.4
         find_again_where_it_is_offered(client, page)

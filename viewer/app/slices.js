@@ -256,7 +256,6 @@ export class Slices {
     if (isNew) this.rulers.push({});
     Object.assign(this.rulers.at(-1), { axis: view.axis, index: view.index, ends, mm });
     this.paint();
-    this.bar.renderTools();
   }
 
   clearRulers(count = this.rulers.length) {

@@ -34,7 +34,7 @@ export class Handling {
     const place = this.view.where(event);
     this.view.area.setPointerCapture(event.pointerId);
     if (event.button === 1) event.preventDefault();
-    this.hand = { kind: this.kind(event), place, begin: place, edges: [] };
+    this.hand = { kind: this.kind(event), place, begin: place, from: this.view.indexAt(place), edges: [] };
     if (this.hand.kind === "cross") this.cross(place);
     else if (this.hand.kind === "crop") this.hand.edges = this.view.cropEdge(place);
   }
@@ -55,6 +55,8 @@ export class Handling {
     if (!hand) return;
     const isClick = Math.hypot(hand.place[0] - hand.begin[0], hand.place[1] - hand.begin[1]) < 4;
     if (hand.kind === "seed" && isClick) this.slices.plant(this.view, this.view.indexAt(hand.place));
+    // The bar grows by the ruler's length: during the drag it would move the slices under the pointer.
+    if (hand.kind === "ruler" && hand.isBegun) this.slices.bar.renderTools();
     if (hand.kind === "crop" && hand.edges.length) this.slices.letCropGo();
   }
 
@@ -79,10 +81,10 @@ export class Handling {
   }
 
   ruler(place) {
-    const { begin, isBegun } = this.hand;
+    const { begin, from, isBegun } = this.hand;
     if (!isBegun && Math.hypot(place[0] - begin[0], place[1] - begin[1]) < 3) return;
     this.hand.isBegun = true;
-    this.slices.measure(this.view, [begin, place].map((one) => this.view.indexAt(one)), !isBegun);
+    this.slices.measure(this.view, [from, this.view.indexAt(place)], !isBegun);
   }
 
   crop(place) {
