@@ -140,7 +140,10 @@ def test_only_a_case_of_the_workspace_is_deleted(client, workspace, tmp_path_fac
     assert not (workspace / "analytic").exists()
 
 
-SIZES = [(1920, 1080), (1366, 768), (1024, 768), (768, 1024)]
+SIZES = [
+    (1024, 768),
+    *(pytest.param(size, marks=pytest.mark.validation) for size in [(1920, 1080), (1366, 768), (768, 1024)]),
+]
 OUTSIDE = """() => {
     const [w, h] = [innerWidth, innerHeight];
     const box = (name) => document.querySelector(name).getBoundingClientRect();
