@@ -96,7 +96,8 @@ def a_new_key_opens_the_page_where_it_was(client, page):
     step(page, "Deploy")
     playwright.expect(page.locator("dialog")).to_contain_text("The server has a new key")
     page.fill("#ask-field", f"http://localhost/?token={app_case.TOKEN}")
-    page.get_by_role("button", name="Open the page").click()
+    with page.expect_event("load"):
+        page.get_by_role("button", name="Open the page").click()
     heading(page, "Deploy")
     page.context.clear_cookies()
     page.goto(f"http://{client.base_url.netloc.decode()}/")
