@@ -21,13 +21,13 @@ from vstent.deployment.deploy import deploy, propose_size
 from vstent.deployment.measure import measure
 from vstent.devices.catalogue import catalogue
 from vstent.devices.design import Design
-from vstent.devices.ranges import altered, uncertain
+from vstent.devices.ranges import altered, uncertain, values_at
 from vstent.devices.stent import Landing
 from vstent.errors import VstentError
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.kernels.sobol import centered_points
-from vstent.plan.bands import INTERVAL, Band, bands, values_at
+from vstent.plan.bands import INTERVAL, Band, bands
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 CASES = {"demo": "", "C0038": "aneurisk_C0038.vtp"}

@@ -12,11 +12,11 @@ from vstent.deployment.deploy import deploy, propose_size
 from vstent.deployment.measure import measure
 from vstent.devices import formulas
 from vstent.devices.catalogue import catalogue, find_design, find_size
-from vstent.devices.ranges import MARGIN, altered, uncertain
+from vstent.devices.ranges import MARGIN, altered, uncertain, values_at
 from vstent.devices.stent import Landing
 from vstent.errors import VstentError
 from vstent.kernels.sobol import centered_points
-from vstent.plan.bands import BANDED, INTERVAL, SAMPLES, bands, length_band, values_at
+from vstent.plan.bands import BANDED, INTERVAL, SAMPLES, bands, length_band
 from vstent.plan.rank import rank
 from vstent.reporting.bands import ends, how_sure, number_name, rows
 

@@ -13,7 +13,7 @@ from vstent.anatomy.trace import trace
 from vstent.cli import main
 from vstent.deployment.deploy import deploy
 from vstent.devices import catalogue, formulas
-from vstent.devices.ranges import altered, uncertain
+from vstent.devices.ranges import altered, uncertain, values_at
 from vstent.devices.stent import Landing
 from vstent.errors import InputError
 from vstent.flow.case import FlowSettings
@@ -21,7 +21,6 @@ from vstent.geometry.vessel import Vessel
 from vstent.io.writers import write_stl
 from vstent.phantoms import demo_phantom, phantom_surface
 from vstent.plan import uncertainty
-from vstent.plan.bands import values_at
 from vstent.plan.shares import first_order_shares
 from vstent.plan.uncertainty import CAUSES, Ranges, vary
 from vstent.plan.widening import widened

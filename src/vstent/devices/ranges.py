@@ -1,7 +1,7 @@
 """Ranges of the numbers of a device: which are uncertain, which lack a range, and the device with other values."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -57,6 +57,14 @@ def without_range(design: Design) -> tuple[str, ...]:
     """Return the names of the numbers whose catalogue entry states no range."""
     known = {one.name for one in design.ranges}
     return tuple(name for name in numbers(design) if name not in known)
+
+
+def values_at(ranges: Sequence[Range], place: Iterable[float]) -> dict[str, float]:
+    """Return numbers by name at a place (d,) in their ranges: -1 is the low end, 1 the high end."""
+    return {
+        one.name: 0.5 * (one.low + one.high + (one.high - one.low) * float(at))
+        for one, at in zip(ranges, place, strict=True)
+    }
 
 
 def altered(design: Design, size: Size, values: Mapping[str, float]) -> tuple[Design, Size]:

@@ -16,7 +16,7 @@ import numpy as np
 from vstent.anatomy.morphology import Measures
 from vstent.deployment.deploy import APPOSED_GAP_MM, propose_size
 from vstent.devices.design import Design, LaserCut, Range, Size
-from vstent.devices.ranges import altered, altered_sizes, uncertain
+from vstent.devices.ranges import altered, altered_sizes, uncertain, values_at
 from vstent.devices.stent import Deployment
 from vstent.errors import DeviceError, LandingError
 from vstent.geometry.vessel import Anatomy
@@ -136,14 +136,6 @@ def length_band(anatomy: Anatomy, deployment: Deployment, measures: Measures) ->
     points = centered_points(len(ranges), FEW_SAMPLES)
     samples = _reduced(Reduced(anatomy, deployment), measures, _devices(deployment, ranges, points))
     return _band(points, samples[LENGTH], ranges)
-
-
-def values_at(ranges: tuple[Range, ...], point: Floats) -> dict[str, float]:
-    """Return the numbers at a point (d,) of their ranges, -1 to 1, by name."""
-    return {
-        one.name: 0.5 * (one.low + one.high + (one.high - one.low) * float(at))
-        for one, at in zip(ranges, point, strict=True)
-    }
 
 
 def _devices(deployment: Deployment, ranges: tuple[Range, ...], points: Floats) -> list[tuple[Design, Size]]:

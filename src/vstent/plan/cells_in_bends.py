@@ -14,7 +14,7 @@ from vstent.deployment.apposition import apposition
 from vstent.deployment.coverage import density
 from vstent.deployment.deploy import deploy
 from vstent.devices.design import LaserCut, Range
-from vstent.devices.ranges import altered
+from vstent.devices.ranges import altered, values_at
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import DeviceError, LandingError
 from vstent.geometry.vessel import Anatomy
@@ -76,7 +76,7 @@ def plane(anatomy: Anatomy, stent: Stent, measures: Measures, ranges: tuple[Rang
     designs, found = [stent.design], [measures]
     for place in PLACES:
         at = dict(zip(NUMBERS, place.tolist(), strict=True))
-        values = {one.name: 0.5 * (one.low + one.high + at[one.name] * (one.high - one.low)) for one in varied}
+        values = values_at(varied, (at[one.name] for one in varied))
         with suppress(DeviceError, LandingError):
             design, size = altered(stent.design, stent.size, values)
             deployed = deploy(design, anatomy, size=size, landing=landing)

@@ -12,7 +12,7 @@ import numpy as np
 from vstent.deployment.braid import march
 from vstent.deployment.sketch import bed, sketch
 from vstent.devices.design import Design, Range, Size
-from vstent.devices.ranges import LENGTH, MARGIN, altered
+from vstent.devices.ranges import LENGTH, MARGIN, altered, values_at
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import DeviceError, LandingError
 from vstent.geometry.vessel import Anatomy
@@ -60,7 +60,7 @@ def shortening(anatomy: Anatomy, stent: Stent, ranges: tuple[Range, ...], landin
     devices = [(stent.design, stent.size)]
     for place in PLACES:
         at = dict(zip(NUMBERS, place.tolist(), strict=True))
-        values = {one.name: 0.5 * (one.low + one.high + at[one.name] * (one.high - one.low)) for one in varied}
+        values = values_at(varied, (at[one.name] for one in varied))
         with suppress(DeviceError):
             devices.append(altered(stent.design, stent.size, values))
     center = _numbers(stent.design, stent.size)

@@ -18,7 +18,7 @@ import numpy as np
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
 from vstent.devices.design import Design, Range, Size
-from vstent.devices.ranges import altered, uncertain
+from vstent.devices.ranges import altered, uncertain, values_at
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, InputError, LandingError
 from vstent.flow.case import FlowSettings
@@ -28,7 +28,6 @@ from vstent.flow.simulation import Checkpoint, flow_case, simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats, freeze
 from vstent.kernels.sobol import centered_points
-from vstent.plan.bands import values_at
 from vstent.plan.shares import first_order_shares
 from vstent.plan.widening import widened
 
