@@ -30,7 +30,6 @@ from vstent.deployment.sketch import Bed, Sketch, bed, sketch
 from vstent.devices.catalogue import find_design
 from vstent.devices.design import BARE
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
-from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import InputError, ReadError, VstentError
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
@@ -40,7 +39,6 @@ from vstent.geometry.vessel import Anatomy, Opening
 from vstent.io.archive import load_data
 from vstent.kernels import clipping
 from vstent.kernels.arrays import Floats
-from vstent.plan.bands import bands
 from vstent.reporting import bands as words
 from vstent.reporting.packing import message
 from vstent.reporting.scene import (
@@ -57,7 +55,7 @@ from vstent.reporting.scene import (
     views_of,
 )
 from vstent.study.folder import CACHE
-from vstent.study.stages import deploy_one, size_of
+from vstent.study.stages import bands_of, deploy_one, size_of
 from vstent.study.types import Placing
 
 Colour = Literal["wall_gap", "coverage", "diameter"]
@@ -161,27 +159,35 @@ class Live:
                 return laid_inside(lay, propose_landing(wall.design, self.anatomy, wall.size))
             return lay(landing)
 
+    def _of_device(self, what: str, choice: DeviceChoice, find: Callable[[], Found]) -> Found:
+        """Return a cached result of a device in this anatomy; where there is none, compute and cache it."""
+        return self.remembered((what, self.case.state.anatomy, *choice.model_dump().values()), find)
+
     def deployment(self, choice: DeviceChoice) -> Deployment:
         """Return the deployed device."""
-        key = ("deployment", self.case.state.anatomy, *choice.model_dump().values())
-        return self.remembered(key, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice)))
+        return self._of_device(
+            "deployment", choice, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice))
+        )
 
     def measures(self, choice: DeviceChoice) -> Measures:
         """Return the measures of the deployed device."""
-        key = ("measures", self.case.state.anatomy, *choice.model_dump().values())
-        return self.remembered(key, lambda: measure(self.anatomy, self.deployment(choice)))
+        return self._of_device("measures", choice, lambda: measure(self.anatomy, self.deployment(choice)))
 
     def bands(self, choice: DeviceChoice) -> dict[str, Any]:
         """Return the bands of the deployed device and how sure it is, as in the metrics of a study."""
-        key = ("bands", self.case.state.anatomy, *choice.model_dump().values())
-        is_proposed = choice.diameter_mm is None and choice.length_mm is None
+        return self._of_device(
+            "bands",
+            choice,
+            lambda: bands_of(self.anatomy, self.deployment(choice), self.measures(choice), placing_of(choice)),
+        )
 
-        def find() -> dict[str, Any]:
-            deployment = self.deployment(choice)
-            found = bands(self.anatomy, deployment, self.measures(choice), is_proposed=is_proposed)
-            return found.metrics() | {"device": how_sure(deployment.stent.design)}
-
-        return self.remembered(key, find)
+    def _drawn(self, pane: str, choice: DeviceChoice, colour: Colour) -> list[MeshLayer | LineLayer]:
+        """Return wires and contour of the deployed device in a pane."""
+        deployment = self.deployment(choice)
+        stent = deployment.stent
+        measured = partial(self._of_device, "coverage", choice, partial(node_coverage, stent))
+        wires = _wires(pane, stent, deployment.wall_gap_mm, colour, measured)
+        return [wires, device_layers(pane, deployment, self.anatomy)[0]]
 
     def bands_sheet(self, choice: DeviceChoice) -> dict[str, Any]:
         """Return the bands of the deployed device as the page shows them."""
@@ -314,13 +320,9 @@ class Live:
         """
         with LOCK:
             deployment = self.deployment(choice)
-            stent, gap_mm = deployment.stent, deployment.wall_gap_mm
+            stent = deployment.stent
             self._show(stent)
-            key = (self.case.state.anatomy, *choice.model_dump().values())
-            measured = partial(self.remembered, ("coverage", *key), lambda: node_coverage(stent))
-            wires = _wires(choice.name, stent, gap_mm, colour, measured)
-            contour = device_layers(choice.name, deployment, self.anatomy)[0]
-            layers = [wires, contour]
+            layers = self._drawn(choice.name, choice, colour)
             center_mm = choice.center_mm if choice.center_mm is not None else _center_mm(stent)
             found = laid_inside(partial(sketch, self.bed(choice)), Landing(center_mm))
             return message(
@@ -344,12 +346,8 @@ class Live:
             layers: list[MeshLayer | LineLayer] = []
             told = []
             for number, choice in enumerate(choices):
-                deployment, pane = self.deployment(choice), f"compared {number}"
-                stent, key = deployment.stent, (self.case.state.anatomy, *choice.model_dump().values())
-                measured = partial(self.remembered, ("coverage", *key), partial(node_coverage, stent))
-                layers += [_wires(pane, stent, deployment.wall_gap_mm, colour, measured)]
-                layers += [device_layers(pane, deployment, self.anatomy)[0]]
-                title = device_title(deployment)
+                pane, title = f"compared {number}", device_title(self.deployment(choice))
+                layers += self._drawn(pane, choice, colour)
                 told.append({"pane": pane, "title": title, "measures": sheets.device(title, self.measures(choice))})
             return message(layers, scales_of(layers, self.anatomy), compared=told)
 

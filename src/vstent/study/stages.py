@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from vstent.anatomy.morphology import morphology
+from vstent.anatomy.morphology import Measures, morphology
 from vstent.anatomy.openings import opening_at
 from vstent.anatomy.repair import repair
 from vstent.anatomy.restore.restore import restore
@@ -514,10 +514,23 @@ def band_all(
     settings : settings of the study, with the size if one was given.
     """
     for name, deployment in deployments.items():
-        placing, design = settings.placing(name), deployment.stent.design
-        is_proposed = placing.diameter_mm is None and placing.length_mm is None
-        found = bands(anatomy, deployment, metrics["stents"][name]["deployment"], is_proposed=is_proposed)
-        metrics["stents"][name]["bands"] = found.metrics() | {"device": how_sure(design)}
+        stent = metrics["stents"][name]
+        stent["bands"] = bands_of(anatomy, deployment, stent["deployment"], settings.placing(name))
+
+
+def bands_of(anatomy: Anatomy, deployment: Deployment, measures: Measures, placing: Placing) -> dict[str, Any]:
+    """Return the bands that the ranges of its device give to a deployment, and how sure the device is, as metrics.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployment : the deployed device.
+    measures : its measures.
+    placing : size and position that were given; the band of the proposed size is added where no size was.
+    """
+    is_proposed = placing.diameter_mm is None and placing.length_mm is None
+    found = bands(anatomy, deployment, measures, is_proposed=is_proposed)
+    return found.metrics() | {"device": how_sure(deployment.stent.design)}
 
 
 def _quality(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> dict[str, Any]:
