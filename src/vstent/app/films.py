@@ -13,6 +13,7 @@ from vstent.angiography.history import History
 from vstent.angiography.projection import Projector
 from vstent.devices.stent import Stent
 from vstent.reporting.packing import Packer
+from vstent.study.contrast import CURVES, FOLDER
 
 PIXEL_MM: Final = 0.308
 """Detector pixel of the page's films: two pixels of a flat panel, binned as in fluoroscopy."""
@@ -27,7 +28,7 @@ LEVELS: Final = 255
 def kept_curves(folder: Path) -> list[dict[str, Any]]:
     """Return the curves of the contrast in sac and parent artery of a case folder; empty where there are none."""
     try:
-        with (folder / "angiogram" / "curves.csv").open(encoding="utf-8", newline="") as file:
+        with (folder / FOLDER / CURVES).open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
         return [
             {

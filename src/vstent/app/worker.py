@@ -72,12 +72,8 @@ def carry_contrast(case: Case) -> None:
     from vstent.angiography.angiogram import AngiogramSettings
     from vstent.angiography.filming import FilmSettings
     from vstent.reporting.film_case import film_case, write_report_again
-    from vstent.study.contrast import angiograms
-    from vstent.study.films import Recording
 
-    recording = Recording(AngiogramSettings(window_s=WINDOW_S))
-    found = angiograms(case.folder, recording.settings, progress, record=recording)
-    film_case(case.folder, recording, found, FilmSettings(), progress)
+    film_case(case.folder, AngiogramSettings(window_s=WINDOW_S), FilmSettings(), progress)
     write_report_again(case.folder, progress)
 
 

@@ -1,7 +1,6 @@
 """`vstent angiogram`: carry contrast through the flows of a finished case."""
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -91,17 +90,13 @@ def _angiogram(arguments: argparse.Namespace) -> int:
 
     from vstent.cli.console import Console, angiogram_table
     from vstent.reporting.film_case import film_case, write_report_again
-    from vstent.study.contrast import FOLDER, angiograms
-    from vstent.study.films import Recording
+    from vstent.study.contrast import FOLDER
     from vstent.study.provenance import METRICS
 
     film, study = given_film(arguments), given_study(arguments)
-    settings = given_angiogram(arguments)
-    recording = Recording(replace(settings, frames_per_s=max(settings.frames_per_s, film.frame_rate_Hz)))
-    console = Console()
+    settings, console = given_angiogram(arguments), Console()
     with console.live():
-        found = angiograms(arguments.case, recording.settings, console.progress, record=recording)
-        film_case(arguments.case, recording, found, film, console.progress, study)
+        film_case(arguments.case, settings, film, console.progress, study)
         if not arguments.no_report:
             write_report_again(arguments.case, console.progress)
     console.print(angiogram_table(json.loads((arguments.case / METRICS).read_text(encoding="utf-8"))))

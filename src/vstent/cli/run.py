@@ -12,7 +12,7 @@ from vstent.errors import InputError
 
 if TYPE_CHECKING:
     from vstent.angiography.angiogram import AngiogramSettings
-    from vstent.study.types import CaseResult, Settings
+    from vstent.study.types import CaseResult, Progress, Settings
 
 
 def add(commands: options.Commands) -> None:
@@ -100,7 +100,6 @@ def study(
     replaces : whether results of another input or of other settings are replaced.
     injected : settings of the angiograms; None: none are computed.
     """
-    from vstent.angiography.filming import FilmSettings
     from vstent.cli.console import (
         Console,
         angiogram_table,
@@ -108,18 +107,13 @@ def study(
         device_sentences,
         uncertainty_table,
     )
-    from vstent.reporting.film_case import film_case
-    from vstent.study.contrast import add_angiograms
-    from vstent.study.films import Recording
     from vstent.study.pipeline import run
 
     console = Console()
     with console.live():
         case = run(path, out, settings, console.progress, replaces=replaces)
         if injected is not None:
-            recording = Recording(injected)
-            found = add_angiograms(case, out, injected, console.progress, record=recording)
-            film_case(out, recording, found, FilmSettings(), console.progress)
+            _film(case, out, injected, console.progress)
         console.progress("report", 0.0, "")
         from vstent.reporting.write import write_report
 
@@ -136,6 +130,16 @@ def study(
         console.say(f"vstent: {name}: {sentence}")
     console.print(f"Results in {out}; open {out / 'report.html'}. Research use only.")
     return case
+
+
+def _film(case: "CaseResult", out: Path, injected: "AngiogramSettings", progress: "Progress") -> None:
+    """Carry contrast through the flows of a study and film it; add its measures to the metrics."""
+    from vstent.angiography.filming import FilmSettings
+    from vstent.reporting.film_case import film_case
+    from vstent.study.contrast import add_measures
+
+    found = film_case(out, injected, FilmSettings(), progress)
+    add_measures(case.metrics, {name: one.measures for name, one in found.items()})
 
 
 def _run(arguments: argparse.Namespace) -> int:

@@ -1,15 +1,17 @@
-"""Film a case folder whose contrast is stored, and put the films into its report."""
+"""Carry contrast through the flows of a case folder, film it, and put the films into the report."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from vstent.angiography.angiogram import Angiogram
+from vstent.angiography.angiogram import Angiogram, AngiogramSettings
 from vstent.angiography.filming import FilmSettings, aimed
 from vstent.devices.catalogue import find_design
 from vstent.devices.design import BARE
-from vstent.reporting.films import FOLDER, Density, shown_of, write_films
+from vstent.reporting.films import Density, shown_of, write_films
 from vstent.reporting.write import write_report
+from vstent.study.contrast import FOLDER, angiograms
 from vstent.study.films import Recording, stents_of
 from vstent.study.folder import claimed
 from vstent.study.pipeline import run
@@ -20,41 +22,50 @@ from vstent.study.types import Progress
 
 def film_case(
     out: Path,
-    recording: Recording,
-    found: Mapping[str, Angiogram],
-    settings: FilmSettings,
+    settings: AngiogramSettings,
+    film: FilmSettings,
     progress: Progress,
     study: Mapping[str, Any] | None = None,
-) -> str:
-    """Write the films of all flows into the subfolder ``angiogram`` of a case folder; return their direction in words.
+) -> dict[str, Angiogram]:
+    """Carry contrast through the flows of a case folder, and film it into the subfolder ``angiogram``.
 
     Parameters
     ----------
-    out : the case folder.
-    recording : contrast of every flow.
-    found : angiograms by name of the flow.
-    settings : how films are taken.
-    progress : called at the start and at the end.
+    out : the case folder of a finished run with flows.
+    settings : settings of the angiograms; as many frames are computed as the films need.
+    film : how films are taken.
+    progress : called at every stage.
     study : fields of patient and study for the DICOM files; None: none.
+
+    Returns
+    -------
+    dict
+        Angiograms by name of the flow, ``bare`` first.
 
     Raises
     ------
+    ReadError
+        The folder holds no finished run of this version.
     InputError
-        The vessel needs a larger detector than there are.
+        The run has no flow, the window is too short, or the vessel needs a larger detector than there are.
+    FlowError
+        A flow does not fit in the free memory.
     """
+    recording = Recording(replace(settings, frames_per_s=max(settings.frames_per_s, film.frame_rate_Hz)))
+    found = angiograms(out, recording.settings, progress, record=recording)
     progress("film", 0.0, "")
     devices = [name for name in found if name != BARE]
-    anatomy, stents = stents_of(out, devices if settings.has_wires else ())
+    anatomy, stents = stents_of(out, devices if film.has_wires else ())
     titles = {name: "Before" if name == BARE else find_design(name).name for name in found}
     histories = {name: recording.histories[name] for name in found}
-    shown = shown_of(histories, stents, titles, aimed(settings, anatomy))
+    shown = shown_of(histories, stents, titles, aimed(film, anatomy))
     curves = {titles[name]: one.curves for name, one in found.items()}
     densities = [Density(title, one.time_s, one.sac_mg_mL, one.parent_mg_mL) for title, one in curves.items()]
     with claimed(out):
         write_films(out / FOLDER, shown, densities, study=study)
     view = shown[BARE].film.view
     progress("film", 1.0, f"{view.name}, {view.columns} x {view.rows} pixels of {view.pixel_mm:g} mm.")
-    return view.name
+    return found
 
 
 def write_report_again(out: Path, progress: Progress) -> None:

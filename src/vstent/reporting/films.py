@@ -22,9 +22,8 @@ from vstent.kernels.arrays import Floats
 from vstent.reporting.figures import Picture
 from vstent.reporting.lettering import blank, font, put_title
 from vstent.reporting.plots import png_of
+from vstent.study.contrast import FOLDER
 
-FOLDER: Final = "angiogram"
-"""Subfolder of the case folder with the films."""
 ANIMATION: Final = "angiogram.webp"
 """File with all films side by side."""
 INDEX: Final = "films.json"

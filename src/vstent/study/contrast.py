@@ -22,7 +22,7 @@ from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of
 from vstent.study.provenance import METRICS, RUN
 from vstent.study.repeat import UNTOLD, told_in
 from vstent.study.stages import flow_key
-from vstent.study.types import CaseResult, Progress, Settings
+from vstent.study.types import Progress, Settings
 
 FOLDER: Final = "angiogram"
 """Subfolder of the case folder with the results."""
@@ -74,24 +74,6 @@ def angiograms(
             for name, key in _flow_keys(source, study).items()
         }
         _write(out, found, settings, _flow_keys(source, study))
-    return found
-
-
-def add_angiograms(
-    case: CaseResult, out: Path, settings: AngiogramSettings, progress: Progress, *, record: Record | None = None
-) -> dict[str, Angiogram]:
-    """Compute the angiograms of a finished study and add their measures to its metrics; return them by name.
-
-    Parameters
-    ----------
-    case : the study; its metrics are changed in place.
-    out : its case folder.
-    settings : settings of the angiograms.
-    progress : called at every stage.
-    record : returns what watches the frames of a flow (see `Record`).
-    """
-    found = angiograms(out, settings, progress, record=record)
-    add_measures(case.metrics, {name: one.measures for name, one in found.items()})
     return found
 
 
