@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.geometry.image import Image
+from vstent.io.dicom_header import put_instance, research_header
 
 CT_IMAGE_STORAGE: Final = "1.2.840.10008.5.1.4.1.1.2"
 """Storage class in which reconstructed rotational angiograms are commonly exported (DICOM UID)."""
-MOMENT: Final = ("20000101", "120000")
-"""Date and time of every synthetic series."""
 
 
 def write_dicom(image: Image, folder: Path, *, description: str = "3DRA of a phantom, research only") -> None:
@@ -75,38 +74,25 @@ def _decimal(value: float) -> str:
 
 def _dataset(digest: str, description: str) -> Any:
     """Return the header that all slices share, without geometry and pixels."""
-    from pydicom.dataset import Dataset, FileMetaDataset
-    from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+    from pydicom.uid import generate_uid
 
-    plane = Dataset()
-    plane.SOPClassUID = CT_IMAGE_STORAGE
-    plane.StudyInstanceUID = generate_uid(entropy_srcs=[digest, "study"])
-    plane.SeriesInstanceUID = generate_uid(entropy_srcs=[digest, "series"])
+    plane = research_header(CT_IMAGE_STORAGE, digest)
     plane.FrameOfReferenceUID = generate_uid(entropy_srcs=[digest, "frame"])
-    plane.file_meta = FileMetaDataset()
-    plane.file_meta.MediaStorageSOPClassUID = plane.SOPClassUID
-    plane.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
     plane.PatientName, plane.PatientID = "Phantom^vstent", "PHANTOM"
-    plane.PatientBirthDate = plane.PatientSex = plane.AccessionNumber = plane.ReferringPhysicianName = ""
-    plane.StudyID = plane.PositionReferenceIndicator = plane.Laterality = plane.PatientPosition = ""
+    plane.PositionReferenceIndicator = plane.PatientPosition = ""
     plane.PatientIdentityRemoved, plane.DeidentificationMethod = "YES", "synthetic: there is no patient"
     plane.ImageType = ["DERIVED", "SECONDARY", "AXIAL"]
-    plane.Modality, plane.Manufacturer, plane.BodyPartExamined = "CT", "vstent", "HEAD"
+    plane.Modality = "CT"
     plane.StudyDescription = plane.SeriesDescription = description
     plane.ImageComments = "Synthetic phantom, for research only"
-    plane.StudyDate = plane.SeriesDate = plane.AcquisitionDate = plane.ContentDate = MOMENT[0]
-    plane.StudyTime = plane.SeriesTime = plane.AcquisitionTime = plane.ContentTime = MOMENT[1]
-    plane.SeriesNumber, plane.AcquisitionNumber = 1, 1
+    plane.SeriesNumber = 1
     plane.KVP = None
     return plane
 
 
 def _number(plane: Any, digest: str, k: int) -> None:
     """Make a header that of slice `k`."""
-    from pydicom.uid import generate_uid
-
-    plane.SOPInstanceUID = generate_uid(entropy_srcs=[digest, "instance", str(k)])
-    plane.file_meta.MediaStorageSOPInstanceUID = plane.SOPInstanceUID
+    put_instance(plane, digest, "instance", str(k))
     plane.InstanceNumber = k + 1
 
 

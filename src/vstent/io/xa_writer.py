@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.errors import ReadError
+from vstent.io.dicom_header import put_instance, research_header
 from vstent.io.files import atomic, existing
 from vstent.kernels.arrays import Floats
 
 XA_IMAGE_STORAGE: Final = "1.2.840.10008.5.1.4.1.1.12.1"
 """Storage class of X-ray angiographic images (DICOM UID)."""
-MOMENT: Final = ("20000101", "120000")
-"""Date and time of a film that belongs to no examination."""
 BITS: Final = 12
 """Bits stored per pixel."""
 STUDY_FIELDS: Final = (
@@ -98,32 +97,18 @@ def write_xa(path: Path, pixels: NDArray[np.uint16], header: XaHeader) -> None:
 
 def _dataset(digest: str, header: XaHeader) -> Any:
     """Return patient, study, series, equipment and common fields."""
-    from pydicom.dataset import Dataset, FileMetaDataset
-    from pydicom.uid import ExplicitVRLittleEndian, generate_uid
-
-    film = Dataset()
-    film.SOPClassUID = XA_IMAGE_STORAGE
-    film.SOPInstanceUID = generate_uid(entropy_srcs=[digest, "instance"])
-    film.SeriesInstanceUID = generate_uid(entropy_srcs=[digest, "series"])
-    film.StudyInstanceUID = generate_uid(entropy_srcs=[digest, "study"])
-    film.file_meta = FileMetaDataset()
-    film.file_meta.MediaStorageSOPClassUID = film.SOPClassUID
-    film.file_meta.MediaStorageSOPInstanceUID = film.SOPInstanceUID
-    film.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    film = research_header(XA_IMAGE_STORAGE, digest)
+    put_instance(film, digest, "instance")
     film.PatientName, film.PatientID = "Research^vstent", "RESEARCH"
-    film.PatientBirthDate = film.PatientSex = film.AccessionNumber = film.ReferringPhysicianName = ""
-    film.StudyID, film.Laterality = "", ""
-    film.StudyDate, film.StudyTime = MOMENT
     for name, value in header.study.items():
         setattr(film, name, value)
     if not header.study:
         film.PatientIdentityRemoved, film.DeidentificationMethod = "YES", "computed: no field of a patient was read"
-    film.Modality, film.Manufacturer, film.BodyPartExamined = "XA", "vstent", "HEAD"
+    film.Modality = "XA"
     film.ManufacturerModelName = "vstent virtual angiogram, research only"
     film.SeriesDescription, film.SeriesNumber, film.InstanceNumber = header.series, header.number, 1
     film.SeriesDate = film.AcquisitionDate = film.ContentDate = film.StudyDate
     film.SeriesTime = film.AcquisitionTime = film.ContentTime = film.StudyTime
-    film.AcquisitionNumber = 1
     film.ImageType = ["DERIVED", "SECONDARY", "SINGLE PLANE"]
     film.DerivationDescription = header.derivation
     film.ImageComments = "Computed from a flow simulation, for research only"
