@@ -149,18 +149,26 @@ class Network:
         number = np.full(len(chosen) + self.openings, n, dtype=np.int64)
         number[: len(chosen)][chosen] = np.arange(n)
         kept = (number[self.left] < n) | (number[self.right] < n)
+        return replace(self.taken(chosen, kept, number), openings=1, inlets=0)
+
+    def taken(self, cells: Ints | Bools, faces: Ints | Bools, number: Ints) -> "Network":
+        """Return the network of some cells and faces, in the order in which they are chosen.
+
+        Parameters
+        ----------
+        cells, faces : which cells and faces, as indices or as masks.
+        number : (n + openings,) new number of every cell and opening.
+        """
         return replace(
             self,
-            cells=self.cells[chosen],
-            width=self.width[chosen],
-            points_mm=self.points_mm[chosen],
-            volume_mm3=self.volume_mm3[chosen],
-            left=number[self.left[kept]],
-            right=number[self.right[kept]],
-            axis=self.axis[kept],
-            flux_mm3_s=self.flux_mm3_s[:, kept],
-            openings=1,
-            inlets=0,
+            cells=self.cells[cells],
+            width=self.width[cells],
+            points_mm=self.points_mm[cells],
+            volume_mm3=self.volume_mm3[cells],
+            left=number[self.left[faces]],
+            right=number[self.right[faces]],
+            axis=self.axis[faces],
+            flux_mm3_s=self.flux_mm3_s[:, faces],
         )
 
 
