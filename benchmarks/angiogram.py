@@ -29,6 +29,9 @@ from vstent.kernels import sampling as kernels
 from vstent.kernels.arrays import Floats
 from vstent.study.folder import CACHE
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
+from cell_networks import tube
+
 GRIDS_MM = (0.28, 0.2, 0.14, 0.1)
 """Grid spacings of the demo, mm."""
 UPSTREAM_CELLS = 0.75
@@ -129,34 +132,6 @@ def _spreads(march: Transport, z: Floats, interval_s: float, end_s: float) -> It
     """Yield the variance of a concentration along z."""
     for _, values in march.frames(interval_s, end_s):
         yield float(np.average((z - np.average(z, weights=values)) ** 2, weights=values))
-
-
-def tube(radius: float, length: int) -> Network:
-    """Return a round tube along z with a parabolic flow of 1 cell per s on average."""
-    size = int(2 * radius) + 3
-    middle = (size - 1) / 2
-    x, y, _ = np.indices((size, size, length))
-    inside = np.hypot(x - middle, y - middle) < radius
-    cells = np.argwhere(inside)
-    index = np.full((size + 1, size + 1, length + 1), -1)
-    index[tuple(cells.T)] = np.arange(len(cells))
-    speed = 2 * (1 - ((cells[:, 0] - middle) ** 2 + (cells[:, 1] - middle) ** 2) / radius**2)
-    left, right, axes, flux = [], [], [], []
-    for axis in range(3):
-        beyond = index[tuple((cells + np.eye(3, dtype=int)[axis]).T)]
-        own = np.flatnonzero(beyond >= 0)
-        left.append(own)
-        right.append(beyond[own])
-        axes.append(np.full(len(own), axis))
-        flux.append(speed[own] if axis == 2 else np.zeros(len(own)))
-    n, first, last = len(cells), np.flatnonzero(cells[:, 2] == 0), np.flatnonzero(cells[:, 2] == length - 1)
-    left += [np.full(len(first), n), last]
-    right += [first, np.full(len(last), n + 1)]
-    axes += [np.full(len(first) + len(last), 2)]
-    flux += [speed[first], speed[last]]
-    faces = (np.concatenate(one) for one in (left, right, axes))
-    fixed = np.concatenate(flux)[None], np.zeros(1), np.inf, 2, 1, 0.0
-    return Network(cells, np.ones(n), 1.0, cells * 1.0, np.ones(n), *faces, *fixed)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from vstent.errors import InputError
 
 
 def slab() -> tuple[np.ndarray, View]:
-    """Return cells of 0.25 mm in a slab 2 mm thick along the beam, and a frontal view of its middle."""
+    """Return a slab 2 mm thick along the beam at a grid spacing of 0.25 mm, and a frontal view of its middle."""
     line = np.arange(-1.875, 2, 0.25)
     points = np.stack(np.meshgrid(line, line[np.abs(line) < 1], line, indexing="ij"), axis=-1).reshape(-1, 3)
     return points, View(0.0, 0.0, np.zeros(3), 16, 16, 0.154)

@@ -50,7 +50,7 @@ def test_an_angiogram_is_written_kept_and_not_computed_twice(
     assert main(["angiogram", str(case), "--window", "5"]) == 0
     said = capsys.readouterr()
     assert "Contrast retention" in said.out
-    assert "cells of 0.3 and 0.6 mm" in said.err
+    assert "cells, grid spacing 0.3 and 0.6 mm" in said.err
     measures = bare(case)
     assert before.items() <= measures.items()
     assert measures["contrast_balance_error_fraction"] < 1e-3

@@ -290,8 +290,9 @@ def _advice(ready: Injection, field: FlowField, measures: dict[str, float], foun
     widths = sorted({float(width) * grid.spacing_mm for width in np.unique(grid.width)})
     spacing = " and ".join(f"{width:.3g}" for width in widths)
     said = (
-        f"{len(grid.cells):,} cells of {spacing} mm, fastest step {1e3 * ready.transport.fastest_s:.2g} ms, memory "
-        f"{memory_bytes(field) / 1e9:.2g} GB; the flow rates were corrected by {grid.correction_fraction:.1%}."
+        f"{len(grid.cells):,} cells, grid spacing {spacing} mm, fastest step "
+        f"{1e3 * ready.transport.fastest_s:.2g} ms, memory {memory_bytes(field) / 1e9:.2g} GB; "
+        f"the flow rates were corrected by {grid.correction_fraction:.1%}."
     )
     if "washout_half_life_s" not in measures:
         said += (
