@@ -27,7 +27,7 @@ from vstent.errors import VstentError
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.kernels.sobol import centered_points
-from vstent.plan.bands import INTERVAL, Band, bands
+from vstent.plan.bands import Band, bands, interval
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 CASES = {"demo": "", "C0038": "aneurisk_C0038.vtp"}
@@ -73,15 +73,18 @@ def row(artery: Anatomy, design: Design) -> str:
             sampled.append(measure(artery, deploy(other, artery, size=other_size, landing=landing)))
         except VstentError:
             continue
-    cells = [_cell(found.get(key), [float(one[key]) for one in sampled if key in one]) for key in SHOWN]
+    cells = [
+        _cell(found.get(key), [float(one[key]) for one in sampled if key in one], float(measures.get(key, np.nan)))
+        for key in SHOWN
+    ]
     return f"| {design.name} {size.label} | {' | '.join(cells)} | {alone_s:.2f}, {with_sizes_s:.2f} |"
 
 
-def _cell(band: Band | None, values: list[float]) -> str:
+def _cell(band: Band | None, values: list[float], value: float) -> str:
     """Return the ratio of the widths and the largest distance of an end."""
     if band is None or not values:
         return ""
-    low, high = np.quantile(values, INTERVAL)
+    low, high = interval(np.array(values), value)
     width = high - low
     if width < NARROWEST:
         return "-" if band.high - band.low < NARROWEST else "wider"

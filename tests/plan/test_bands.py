@@ -16,7 +16,7 @@ from vstent.devices.ranges import MARGIN, altered, uncertain, values_at
 from vstent.devices.stent import Landing
 from vstent.errors import VstentError
 from vstent.kernels.sobol import centered_points
-from vstent.plan.bands import BANDED, INTERVAL, SAMPLES, bands, length_band
+from vstent.plan.bands import BANDED, INTERVAL, SAMPLES, bands, interval, length_band
 from vstent.plan.rank import rank
 from vstent.reporting.bands import ends, how_sure, number_name, rows
 
@@ -94,6 +94,15 @@ def test_a_braid_in_a_wide_artery_stands_off_by_half_of_what_its_free_diameter_l
     at = [one.low + share * (one.high - one.low) for share in reversed(INTERVAL)]
     wanted = [measures["max_wall_gap_mm"] - 0.5 * (value - one.value) for value in at]
     assert (gap.low, gap.high) == pytest.approx(wanted, abs=0.01)
+
+
+def test_a_band_contains_the_result_it_belongs_to():
+    samples = np.linspace(0.0, 1.0, 41)  # quantiles 0.025 and 0.975 are the second and the last but one
+    assert interval(samples, 0.5) == pytest.approx((0.025, 0.975))
+    assert interval(samples, -0.2) == pytest.approx((-0.2, 0.975))
+    assert interval(samples, 1.3) == pytest.approx((0.025, 1.3))
+    for name, band in bands(straight(), *lying()).results.items():
+        assert band.low <= lying()[1][name] <= band.high, name
 
 
 def test_a_device_without_ranges_has_no_bands_and_says_so():

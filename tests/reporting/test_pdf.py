@@ -10,7 +10,7 @@ import report_case
 
 from vstent.reporting.definitions import OF_PULSE
 from vstent.reporting.method import _bead_layer, _expansion, _unit_sphere
-from vstent.reporting.paper import WIDTH, Paper, wrapped
+from vstent.reporting.paper import LEFT, PAGE_IN, RIGHT, Paper, wrapped
 from vstent.reporting.pdf import as_pdf
 from vstent.reporting.scene import scene_of
 from vstent.reporting.thinning import some_frames, thin_frames
@@ -84,8 +84,9 @@ def test_lines_keep_inside_the_page():
         "MMMMM WWWW The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way. "
     )
     metrics, font = TextToPath(), FontProperties(family="DejaVu Sans", size=8.5)
-    for line in wrapped(words * 5, WIDTH, 8.5):
-        assert metrics.get_text_width_height_descent(line, font, ismath=False)[0] < 72 * WIDTH
+    width_in = PAGE_IN[0] - LEFT - RIGHT
+    for line in wrapped(words * 5, width_in, 8.5):
+        assert metrics.get_text_width_height_descent(line, font, ismath=False)[0] < 72 * width_in
 
 
 def test_pictures_tell_the_way_from_the_artery_to_the_flow(told):

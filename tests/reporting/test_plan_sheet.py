@@ -12,6 +12,7 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.deployment.measure import measure
 from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.plan.bands import bands
 from vstent.plan.rank import alternatives, rank
 from vstent.reporting.paper import Paper
 from vstent.reporting.plan_sheet import Planned, plan_pdf
@@ -31,21 +32,47 @@ def planned() -> tuple[Planned, bytes, str]:
     deployments = {name: vstent.deploy(vstent.find_design(name), anatomy()) for name in ("silk", "enterprise")}
     measures = {name: measure(anatomy(), one) for name, one in deployments.items()}
     case = Planned("Case 7", anatomy(), deployments, measures, "9f" * 32, "2026-11-26")
-    put, words = Paper._put, []
+    pdf, words, _ = printed(case)
+    return case, pdf, " ".join(" ".join(words).split()).replace("\u202f", " ")
+
+
+def printed(case: Planned) -> tuple[bytes, list[str], float]:
+    """The plan, all text on its pages (not on drafts), and the smallest size of it in points."""
+    put, papers = Paper._put, {}
 
     def noted(paper, x, y, text, size, **more):
-        words.append(text)
+        papers.setdefault(id(paper), (paper, []))[1].append((text, size * paper._scale))
         put(paper, x, y, text, size, **more)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Paper, "_put", noted)
         pdf = plan_pdf(case)
-    return case, pdf, " ".join(" ".join(words).split()).replace("\u202f", " ")
+    _, last = list(papers.values())[-1]
+    return pdf, [text for text, _ in last], min(size for _, size in last)
 
 
 def test_every_device_has_one_page(planned) -> None:
     _, pdf, _ = planned
     assert len(re.findall(rb"/MediaBox", pdf)) == 2
+
+
+def test_a_page_with_much_to_say_is_still_one_page_that_can_be_read(planned) -> None:
+    case, _, text = planned
+    note = "A long note says what is wrong, where it is in mm, and what the reader should do about it. " * 2
+    crowded = case._replace(anatomy=replace(case.anatomy, notes=(note, note, note)), bands=banded(case))
+    pdf, words, smallest_points = printed(crowded)
+    assert len(re.findall(rb"/MediaBox", pdf)) == 2
+    assert len(" ".join(words)) > 1.2 * len(text)
+    assert smallest_points > 5.2
+
+
+def banded(case: Planned) -> dict[str, dict[str, object]]:
+    """Bands of the devices of a case, as in the metrics of a study."""
+    return {
+        name: bands(anatomy(), deployment, case.measures[name], is_proposed=True).metrics()
+        | {"device": f"Numbers of {name}: 2 cited, 3 estimated."}
+        for name, deployment in case.deployments.items()
+    }
 
 
 def test_it_states_what_was_measured(planned) -> None:

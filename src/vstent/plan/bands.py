@@ -2,8 +2,8 @@
 
 Makers publish few numbers, so the catalogue states a range for each (`vstent.devices.ranges`). All numbers of a device
 are sampled together, each uniformly in its range and independently of the others. The band of a result contains 95 % of
-the samples. Full deployments of all samples would take a minute; a reduced model (`vstent.plan.reduced`) takes a
-fraction of a second. ``benchmarks/ranges.py`` compares the two.
+the samples and the result itself. Full deployments of all samples would take a minute; a reduced model
+(`vstent.plan.reduced`) takes a fraction of a second. ``benchmarks/ranges.py`` compares the two.
 """
 
 from collections.abc import Mapping
@@ -104,7 +104,9 @@ def bands(anatomy: Anatomy, deployment: Deployment, measures: Measures, *, is_pr
         return Bands({})
     points = centered_points(len(ranges), SAMPLES)
     samples = _samples(anatomy, deployment, measures, _devices(deployment, ranges, points))
-    results: dict[str, Band] = {name: _band(points, samples[name], ranges) for name in BANDED if name in samples}
+    results: dict[str, Band] = {
+        name: _band(points, samples[name], float(measures[name]), ranges) for name in BANDED if name in samples
+    }
     if not is_proposed:
         return Bands(results)
     order = np.argsort(samples[LENGTH])
@@ -135,7 +137,7 @@ def length_band(anatomy: Anatomy, deployment: Deployment, measures: Measures) ->
         return None
     points = centered_points(len(ranges), FEW_SAMPLES)
     samples = _reduced(Reduced(anatomy, deployment), measures, _devices(deployment, ranges, points))
-    return _band(points, samples[LENGTH], ranges)
+    return _band(points, samples[LENGTH], float(measures[LENGTH]), ranges)
 
 
 def _devices(deployment: Deployment, ranges: tuple[Range, ...], points: Floats) -> list[tuple[Design, Size]]:
@@ -190,12 +192,18 @@ def _moved(measures: Measures, nominal: Changed, other: Changed) -> dict[str, fl
     return found
 
 
-def _band(points: Floats, values: Floats, ranges: tuple[Range, ...]) -> Band:
+def interval(samples: Floats, value: float) -> tuple[float, float]:
+    """Return the ends of the shortest interval that contains the middle 95 % of samples (n,) and the value itself."""
+    low, high = np.quantile(samples, INTERVAL)
+    return min(float(low), value), max(float(high), value)
+
+
+def _band(points: Floats, values: Floats, value: float, ranges: tuple[Range, ...]) -> Band:
     """Return the band of one result from its samples."""
-    low, high = np.quantile(values, INTERVAL)
+    low, high = interval(values, value)
     shares = first_order_shares(points, values)
     named = zip((one.name for one in ranges), [] if shares is None else shares.tolist(), strict=False)
-    return Band(float(low), float(high), dict(sorted(((k, v) for k, v in named if v > 0), key=lambda kv: -kv[1])))
+    return Band(low, high, dict(sorted(((k, v) for k, v in named if v > 0), key=lambda kv: -kv[1])))
 
 
 def _proposed(design: Design, anatomy: Anatomy, values: Mapping[str, float]) -> Size | None:

@@ -5,6 +5,8 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 if TYPE_CHECKING:
     from vstent.reporting.figures import Picture
 
@@ -12,8 +14,6 @@ PAGE_IN: Final = (8.27, 11.69)
 """Width and height of an A4 page in inches."""
 LEFT, RIGHT, TOP, FOOT = 0.75, 0.75, 0.85, 0.80
 """Margins in inches."""
-WIDTH: Final = PAGE_IN[0] - LEFT - RIGHT
-"""Width of the text in inches."""
 INK, QUIET, ACCENT, LINE, WARN = "#16262e", "#54666f", "#0b6473", "#d7dfe3", "#8a4b08"
 """Colors of text, secondary text, headings, rules and the statement at the foot."""
 _CHARACTER: Final = 0.53
@@ -23,9 +23,15 @@ BADGE: Final = "Research use only. Not a medical device."
 
 
 class Paper:
-    """Pages that are filled from top to bottom."""
+    """Pages that are filled from top to bottom.
 
-    def __init__(self, name: str, kind: str = "report") -> None:
+    Parameters
+    ----------
+    name, kind : name of the case, and what the document is; both stand in its title.
+    scale : factor of everything on the pages; below 1 more fits on one. All inches below are before scaling.
+    """
+
+    def __init__(self, name: str, kind: str = "report", *, scale: float = 1.0) -> None:
         from matplotlib.backends.backend_pdf import PdfPages
 
         self._stream = io.BytesIO()
@@ -34,19 +40,36 @@ class Paper:
         self._name, self._number = name, 0
         self._figure: Any = None
         self._y = 0.0
+        self._scale = scale
         self.turn()
 
-    def turn(self) -> None:
-        """Begin a new page with its footer."""
+    @property
+    def count(self) -> int:
+        """Number of pages up to the current one."""
+        return self._number
+
+    @property
+    def _page(self) -> tuple[float, float]:
+        """Width and height of the page in inches before scaling."""
+        return PAGE_IN[0] / self._scale, PAGE_IN[1] / self._scale
+
+    @property
+    def _width(self) -> float:
+        """Width of the text in inches before scaling."""
+        return self._page[0] - LEFT - RIGHT
+
+    def turn(self, scale: float | None = None) -> None:
+        """Begin a new page with its footer; without `scale` it has the scale of the page before."""
         from matplotlib.figure import Figure
 
         self._close()
         self._number += 1
+        self._scale = scale or self._scale
         self._figure = Figure(figsize=PAGE_IN, facecolor="white")
-        self._y = PAGE_IN[1] - TOP
+        self._y = self._page[1] - TOP
         self._put(LEFT, 0.45, self._name, 7.5, color=QUIET)
-        self._put(PAGE_IN[0] / 2, 0.45, BADGE, 7.5, color=WARN, ha="center")
-        self._put(PAGE_IN[0] - RIGHT, 0.45, str(self._number), 7.5, color=QUIET, ha="right")
+        self._put(self._page[0] / 2, 0.45, BADGE, 7.5, color=WARN, ha="center")
+        self._put(self._page[0] - RIGHT, 0.45, str(self._number), 7.5, color=QUIET, ha="right")
 
     def _close(self) -> None:
         """Write the current page to the document."""
@@ -62,7 +85,8 @@ class Paper:
     def _put(self, x: float, y: float, words: str, size: float, **more: Any) -> None:
         """Write text at a position in inches from the lower left corner; `size` is in points."""
         more.setdefault("color", INK)
-        self._figure.text(x / PAGE_IN[0], y / PAGE_IN[1], words, fontsize=size, parse_math=False, **more)
+        width, height = self._page
+        self._figure.text(x / width, y / height, words, fontsize=self._scale * size, parse_math=False, **more)
 
     def room(self, inches: float) -> None:
         """Begin a new page unless this many inches are left on the current one."""
@@ -86,7 +110,7 @@ class Paper:
     def text(self, words: str, size: float = 8.5, *, color: str = INK, indent: float = 0.0) -> None:
         """Write a paragraph; `size` is in points, `indent` in inches."""
         step = 1.45 * size / 72
-        for line in wrapped(words, WIDTH - indent, size):
+        for line in wrapped(words, self._width - indent, size):
             self.room(step)
             self._y -= step
             self._put(LEFT + indent, self._y, line, size, color=color)
@@ -110,11 +134,11 @@ class Paper:
         """Write one row of a table, with a line above it."""
         size, step = 8.0, 0.155
         bold = 1.1 if weight == "bold" else 1.0
-        lines = [wrapped(cell, WIDTH * w - 0.12, size * bold) for cell, w in zip(cells, widths, strict=True)]
+        lines = [wrapped(cell, self._width * w - 0.12, size * bold) for cell, w in zip(cells, widths, strict=True)]
         self.room(step * max(map(len, lines)) + 0.05)
         self._rule()
         for i, found in enumerate(lines):
-            x = LEFT + WIDTH * (sum(widths[: i + 1]) if i else 0.0)
+            x = LEFT + self._width * (sum(widths[: i + 1]) if i else 0.0)
             for k, line in enumerate(found):
                 y = self._y - step * (k + 1)
                 self._put(x, y, line, size, color=color, weight=weight, ha="right" if i else "left")
@@ -124,23 +148,25 @@ class Paper:
         """Draw a horizontal line across the text."""
         from matplotlib.lines import Line2D
 
-        ends = [LEFT / PAGE_IN[0], 1 - RIGHT / PAGE_IN[0]]
-        height = [(self._y - 0.01) / PAGE_IN[1]] * 2
-        self._figure.add_artist(Line2D(ends, height, color=LINE, linewidth=0.5))
+        width, height = self._page
+        ends = [LEFT / width, 1 - RIGHT / width]
+        level = [(self._y - 0.01) / height] * 2
+        self._figure.add_artist(Line2D(ends, level, color=LINE, linewidth=0.5))
 
     def picture(self, picture: "Picture", most: float = 0.5) -> None:
         """Write a picture with title and caption, at most a fraction `most` of the page high."""
         from matplotlib.image import imread
 
         image = imread(io.BytesIO(picture.png))
-        height = WIDTH * image.shape[0] / image.shape[1]
-        scale = min(1.0, most * PAGE_IN[1] / height)
-        width, height = scale * WIDTH, scale * height
+        height = self._width * image.shape[0] / image.shape[1]
+        fit = min(1.0, most * self._page[1] / height)
+        width, height = fit * self._width, fit * height
         self.room(height + 1.15)
         self.heading(picture.title)
-        left = (LEFT + (WIDTH - width) / 2) / PAGE_IN[0]
+        left = LEFT + (self._width - width) / 2
         self._y -= height
-        axes = self._figure.add_axes((left, self._y / PAGE_IN[1], width / PAGE_IN[0], height / PAGE_IN[1]))
+        place = np.array([left, self._y, width, height]) / np.tile(self._page, 2)
+        axes = self._figure.add_axes(tuple(place))
         axes.imshow(image, interpolation="none")  # no resampling
         axes.set_axis_off()
         self.text(picture.caption, 8, color=QUIET)

@@ -27,6 +27,10 @@ HASH_DIGITS: Final = 16
 """Number of digits of the input's SHA-256 that are printed."""
 
 
+SCALES: Final = (1.0, 0.92, 0.84, 0.77, 0.7)
+"""Scales of a page, the largest first; the first at which all of it fits is used. Text has 8 points at scale 1."""
+
+
 class Planned(NamedTuple):
     """A case to plan."""
 
@@ -46,6 +50,17 @@ class Planned(NamedTuple):
     """Bands of every deployment, as in the metrics of a study; devices of earlier versions have none."""
 
 
+class _Page(NamedTuple):
+    """Page of one device."""
+
+    case: Planned
+    name: str
+    """Name of the device."""
+    picture: Picture
+    alternatives: Sequence[tuple[str, str, str]]
+    """Size, score and reason of other sizes."""
+
+
 def plan_pdf(case: Planned) -> bytes:
     """Return the plan of every device as PDF, one A4 page each.
 
@@ -56,23 +71,33 @@ def plan_pdf(case: Planned) -> bytes:
     from matplotlib import rc_context
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
-        paper = Paper(case.name, "plan")
-        for number, name in enumerate(case.deployments):
+        pages = [_Page(case, name, _picture(case, name), _alternative_rows(case, name)) for name in case.deployments]
+        scales = [next((scale for scale in SCALES if _fits(page, scale)), SCALES[-1]) for page in pages]
+        paper = Paper(case.name, "plan", scale=scales[0])
+        for number, (page, scale) in enumerate(zip(pages, scales, strict=True)):
             if number:
-                paper.turn()
-            _page(paper, case, name)
+                paper.turn(scale)
+            _write(paper, page)
         return paper.done()
 
 
-def _page(paper: Paper, case: Planned, name: str) -> None:
+def _fits(page: _Page, scale: float) -> bool:
+    """Whether one page at a scale holds all of it."""
+    draft = Paper(page.case.name, "plan", scale=scale)
+    _write(draft, page)
+    return draft.count == 1
+
+
+def _write(paper: Paper, page: _Page) -> None:
     """Write the page of one device."""
+    case, name = page.case, page.name
     deployment = case.deployments[name]
     metrics = {"deployment": case.measures[name], "bands": case.bands.get(name, {})}
     paper.title(f"{case.name}: {device_title(deployment)}")
     paper.text(
         f"Plan of {case.day}. Input SHA-256 {case.source[:HASH_DIGITS]}… Deployed length and fit are predictions."
     )
-    paper.picture(_picture(case, name), most=PICTURE_SHARE)
+    paper.picture(page.picture, most=PICTURE_SHARE)
     paper.heading("Device and landing")
     paper.table(_device_rows(case.anatomy, deployment, metrics), (0.62, 0.38))
     paper.text(how_sure(metrics), 8)
@@ -83,7 +108,7 @@ def _page(paper: Paper, case: Planned, name: str) -> None:
     if len(warnings) > 1 + MOST_NOTES:
         paper.text(f"{len(warnings) - 1 - MOST_NOTES} more notes are in the report.", 8, color=QUIET)
     paper.heading("Alternative sizes")
-    paper.table(_alternative_rows(case.anatomy, deployment), (0.17, 0.09, 0.74), head=("Size", "Score", "Reason"))
+    paper.table(page.alternatives, (0.17, 0.13, 0.70), head=("Size", "Score", "Reason"))
     paper.text("Blood flow is not part of this plan. Name, date, signature: ______________________________", 8.5)
 
 
@@ -157,9 +182,10 @@ def _length(anatomy: Anatomy, deployment: Deployment) -> str:
     return f"{stent.deployed_length_mm:.1f} mm ({lengths[0] + shift:.1f} to {lengths[-1] + shift:.1f} mm)"
 
 
-def _alternative_rows(anatomy: Anatomy, deployment: Deployment) -> Sequence[tuple[str, str, str]]:
-    """Return the two best neighboring sizes."""
-    found = alternatives(anatomy, deployment.stent.design, deployment.stent.size)
+def _alternative_rows(case: Planned, name: str) -> Sequence[tuple[str, str, str]]:
+    """Return the two best neighboring sizes of a device."""
+    stent = case.deployments[name].stent
+    found = alternatives(case.anatomy, stent.design, stent.size)
     return [_alternative(one) for one in found] or [("none fits", "", "")]
 
 
