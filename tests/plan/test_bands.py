@@ -96,6 +96,24 @@ def test_a_braid_in_a_wide_artery_stands_off_by_half_of_what_its_free_diameter_l
     assert (gap.low, gap.high) == pytest.approx(wanted, abs=0.01)
 
 
+def test_ends_of_an_outer_layer_do_not_move_the_mesh():
+    design = find_design("fred")
+    size = find_size(design, diameter_mm=4, length_mm=13)
+    (beyond,) = (one for one in design.ranges if one.name == "outer_layer_beyond_mm")
+    only = replace(design, ranges=(beyond,))
+    deployment = deploy(only, straight(), size=size, landing=Landing(MIDDLE_MM))
+    measures = measure(straight(), deployment)
+    found = bands(straight(), deployment, measures).results
+    for name in ("neck_to_proximal_end_mm", "neck_to_distal_end_mm", "mesh_length_mm"):
+        assert found[name].high - found[name].low < 1e-6, name
+    length = found["deployed_length_mm"]
+    spacing_mm = np.diff(deployment.stent.row_abscissa_mm).mean()
+    # The outer layer ends after so many rows of the label diameter; in the narrower artery rows are further apart.
+    longer = spacing_mm * formulas.grid(only, size).row_split / formulas.row_spacing_mm(only, size, size.diameter_mm)
+    wanted_mm = 2 * 0.95 * longer * (beyond.high - beyond.low)
+    assert length.high - length.low == pytest.approx(wanted_mm, abs=2 * spacing_mm)  # whole rows
+
+
 def test_a_band_contains_the_result_it_belongs_to():
     samples = np.linspace(0.0, 1.0, 41)  # quantiles 0.025 and 0.975 are the second and the last but one
     assert interval(samples, 0.5) == pytest.approx((0.025, 0.975))

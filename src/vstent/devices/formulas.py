@@ -74,6 +74,13 @@ def mesh_rows(design: Design, size: Size) -> tuple[int, int]:
     return bare, grid(design, size).lattice_rows - 1 - bare
 
 
+def mesh_nodes(design: Design, size: Size) -> tuple[int, int]:
+    """Return the first and the last row of nodes of the mesh; a dual-layer device has only its outer layer beyond."""
+    first, last = mesh_rows(design, size)
+    split = grid(design, size).row_split
+    return first * split, last * split
+
+
 def free_diameters_mm(design: Design, size: Size) -> np.ndarray:
     """Return the free diameter of every row of nodes (rows,), in mm."""
     rows = grid(design, size).rows

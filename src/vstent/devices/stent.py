@@ -7,7 +7,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from vstent.devices.design import Design, Size
-from vstent.devices.formulas import grid, mesh_rows
+from vstent.devices.formulas import mesh_nodes
 from vstent.errors import LandingError
 from vstent.geometry.surface import Surface
 from vstent.kernels import curves
@@ -111,9 +111,7 @@ class Stent:
     @cached_property
     def mesh_nodes(self) -> tuple[int, int]:
         """First and last row of nodes of the mesh. A dual-layer device has only its outer layer beyond them."""
-        first, last = mesh_rows(self.design, self.size)
-        split = grid(self.design, self.size).row_split
-        return first * split, last * split
+        return mesh_nodes(self.design, self.size)
 
     @property
     def mesh_abscissa_mm(self) -> tuple[float, float]:

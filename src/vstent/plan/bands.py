@@ -35,6 +35,7 @@ BANDED: Final[tuple[str, ...]] = (
     "distal_end_abscissa_mm",
     "neck_to_proximal_end_mm",
     "neck_to_distal_end_mm",
+    "mesh_length_mm",
     *NECK,
     *GAPS,
 )
@@ -177,9 +178,10 @@ def _moved(measures: Measures, nominal: Changed, other: Changed) -> dict[str, fl
         LENGTH: last_mm - first_mm,
         "proximal_end_abscissa_mm": first_mm,
         "distal_end_abscissa_mm": last_mm,
-        "neck_to_proximal_end_mm": -first_mm,
-        "neck_to_distal_end_mm": last_mm,
+        "neck_to_proximal_end_mm": nominal.mesh_first_mm - other.mesh_first_mm,
+        "neck_to_distal_end_mm": other.mesh_last_mm - nominal.mesh_last_mm,
     }
+    moves["mesh_length_mm"] = moves["neck_to_proximal_end_mm"] + moves["neck_to_distal_end_mm"]
     factors = {
         NECK[0]: other.coverage_fraction / nominal.coverage_fraction,
         NECK[1]: other.pore_density_per_mm2 / nominal.pore_density_per_mm2,

@@ -19,7 +19,7 @@ import numpy as np
 from vstent.deployment.braid import FREELY, Profile, expected_profile, march
 from vstent.deployment.coverage import is_over_neck, quad_areas_mm2
 from vstent.devices.design import Design, LaserCut, Size, piece_length_mm, widest_mm
-from vstent.devices.formulas import free_diameters_mm, grid
+from vstent.devices.formulas import free_diameters_mm, grid, mesh_nodes
 from vstent.devices.stent import Deployment, Landing
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints
@@ -36,6 +36,10 @@ class Changed(NamedTuple):
     """Arc length of the proximal end, in mm."""
     last_mm: float
     """Arc length of the distal end, in mm."""
+    mesh_first_mm: float
+    """Arc length of the proximal end of the mesh, in mm. A dual-layer device has only its outer layer beyond it."""
+    mesh_last_mm: float
+    """Arc length of the distal end of the mesh, in mm."""
     gap_mm: Floats
     """(nodes,) gaps to the patient's own wall, at the nodes of the deployed device, in mm."""
     coverage_fraction: float
@@ -92,13 +96,15 @@ class Reduced:
             Ends, gaps, coverage and pore density of the reduced model.
         """
         profile = self._profile(design, size)
-        ends_mm, at_mm = march(design, size, self.landing, profile)[[0, -1]], self.landing.abscissa_mm
+        places = [0, -1, *mesh_nodes(design, size)]
+        ends_mm, at_mm = march(design, size, self.landing, profile)[places], self.landing.abscissa_mm
         shorter = np.zeros(2) if self.shortening is None else self.shortening(design, size)
-        first_mm, last_mm = (ends_mm + shorter * (ends_mm - at_mm)).tolist()
+        first_mm, last_mm, mesh_first_mm, mesh_last_mm = ends_mm + np.tile(shorter, 2) * (ends_mm - at_mm)
         wider_mm = profile.at(self._rows_mm) - self._nominal.at(self._rows_mm)
         inward_mm = (design.wall_offset_um - self.deployment.stent.design.wall_offset_um) * MM_PER_UM
         gap_mm = np.maximum(self.deployment.wall_gap_mm - (0.5 * wider_mm + inward_mm)[:, None], 0.0)
-        return Changed(first_mm, last_mm, gap_mm[self._is_at_patient], *self._density(design, size, profile))
+        ends = (float(first_mm), float(last_mm), float(mesh_first_mm), float(mesh_last_mm))
+        return Changed(*ends, gap_mm[self._is_at_patient], *self._density(design, size, profile))
 
     @property
     def _rows_mm(self) -> Floats:
