@@ -16,7 +16,7 @@ from vstent.anatomy.trim import trim
 from vstent.deployment.coverage import coverage_fractions, quad_areas_mm2
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
-from vstent.devices import catalogue
+from vstent.devices import catalogue, formulas
 from vstent.devices.design import Size, angle_rad
 from vstent.devices.stent import Deployment, Landing
 from vstent.geometry.vessel import Anatomy, Vessel
@@ -29,6 +29,17 @@ from tubes import arc, line, tube
 DATA = Path(__file__).parents[2] / "shared" / "data"
 REAL = {"C0038": "aneurisk_C0038.vtp", "beta": "aneurisk_beta.vtp", "visc2011": "visc2011_metres.stl"}
 BEND_MM = 7.0
+LEAFLETS = (
+    ("lvis", 4.5, {3.0: 57.0, 3.5: 52.0, 4.0: 44.0, 4.5: 32.0}, "instructions for use"),
+    ("lvis_jr", 3.5, {2.5: 40.0, 3.0: 37.0, 3.5: 33.0}, "instructions for use"),
+    ("neuroform_atlas", 4.0, {3.0: 30.8, 3.5: 30.4, 4.0: 29.2}, "instructions for use"),
+    ("leo", 4.5, {4.5: 51.0, 5.4: 37.0}, "Balt catalogue 2020"),
+    ("leo_baby", 2.5, {2.5: 35.0, 3.2: 23.0}, "Balt catalogue 2020"),
+    ("silk_vista_baby", 2.75, {2.75: 26.5, 3.0: 18.5}, "Balt catalogue 2020"),
+    ("silk", 3.0, {3.0: 30.0, 3.5: 19.0}, "Balt catalogue 2020, Silk+"),
+    ("silk", 4.5, {4.5: 40.0, 5.0: 19.0}, "Balt catalogue 2020, Silk+"),
+)
+"""Device, label diameter, length in mm by diameter in mm, and where it is listed."""
 Row = tuple[str, str, str]
 """Source and what it measured, published value, value of vstent."""
 
@@ -92,12 +103,15 @@ def coils() -> list[Row]:
     rows = []
     for key, name, told, size in (
         ("enterprise", "Enterprise", "5 % (others up to 10 %)", size_of("enterprise", 4.5, 22)),
-        ("leo", "LEO", "14 %", size_of("leo", 4.5, 25)),
+        ("leo", "LEO", "14 %, the highest of four", size_of("leo", 4.5, 25)),
+        ("lvis", "LVIS", "below 14 %", size_of("lvis", 4.5, 23)),
     ):
         design = catalogue.find_design(key)
         artery, done = in_tube(key, size, 4.5 + 2 * design.wall_offset_um * MM_PER_UM)
         cover = 100 * float(measure(artery, done)["metal_coverage_fraction"])
-        rows.append((f"{name}: coverage (Cho et al. 2017, Neurointervention 12:31)", told, f"{cover:.1f} %"))
+        free = 100 * float(formulas.coverage_fraction(design, size, size.free_diameter_mm))
+        said = f"{cover:.1f} % at the label diameter, {free:.1f} % free"
+        rows.append((f"{name}: coverage (Cho et al. 2017, Neurointervention 12:31)", told, said))
     order = {}
     for key, size in (
         ("enterprise", size_of("enterprise", 4.5, 22)),
@@ -140,7 +154,7 @@ def bends() -> list[Row]:
     ]
     told = {}
     for key, size in (
-        ("lvis", size_of("lvis", 4.5, 25)),
+        ("lvis", size_of("lvis", 4.5, 23)),
         ("fred", size_of("fred", 4.5, 18)),
         ("pipeline", size_of("pipeline", 4.0, 20)),
     ):
@@ -162,6 +176,55 @@ def bends() -> list[Row]:
             f"outer {100 * told['pipeline'][0]:.0f} %, inner {100 * told['pipeline'][1]:.0f} %",
         )
     )
+    return rows
+
+
+def shortening() -> list[Row]:
+    """Lengths at several diameters, as makers list them, against those of the catalogue's angles."""
+    rows = []
+    for key, label_mm, published_mm, source in LEAFLETS:
+        design = catalogue.find_design(key)
+        size = catalogue.find_sizes(design, diameter_mm=label_mm)[0]
+        widths_mm = np.array(list(published_mm))
+        listed_mm = np.array(list(published_mm.values()))
+        spacing_mm = formulas.row_spacing_mm(design, size, widths_mm)
+        ours_mm = listed_mm[0] * spacing_mm / spacing_mm[0]
+        at = ", ".join(f"{one:g}" for one in widths_mm)
+        rows.append(
+            (
+                f"{design.name} {label_mm:g} mm: length in mm at {at} mm ({source})",
+                ", ".join(f"{one:g}" for one in listed_mm),
+                ", ".join(f"{one:.1f}" for one in ours_mm) + " from the first length on",
+            )
+        )
+    return rows
+
+
+def leaflets() -> list[Row]:
+    """Coverage, porosity and foreshortening that makers state."""
+    rows = []
+    for key, label_mm, told in (
+        ("lvis", 4.5, "23-27 % (free area 73-77 %)"),
+        ("lvis_jr", 3.5, "17 % (free area 83 %)"),
+        ("pipeline", 4.0, "approximately 30 %"),
+        ("derivo", 4.0, "35 % (porosity 65 %, 15 pores/mm²)"),
+    ):
+        design = catalogue.find_design(key)
+        size = catalogue.find_sizes(design, diameter_mm=label_mm)[0]
+        cover = 100 * float(formulas.coverage_fraction(design, size, label_mm))
+        pores = float(formulas.pore_density_per_mm2(design, size, label_mm))
+        rows.append(
+            (
+                f"{design.name}: coverage stated by the maker, label {label_mm:g} mm",
+                told,
+                f"{cover:.0f} %, {pores:.1f} pores/mm² at the label diameter",
+            )
+        )
+    for key, told in (("pipeline", "50-60 %"), ("fred", "up to 60 %")):
+        design = catalogue.find_design(key)
+        size = catalogue.find_sizes(design, diameter_mm=4.0)[0]
+        lost = 100 * (1 - float(np.cos(angle_rad(design, size, 4.0))))
+        rows.append((f"{design.name}: foreshortening from catheter to artery", told, f"{lost:.0f} % (label 4 mm)"))
     return rows
 
 
@@ -199,7 +262,15 @@ def lengths() -> list[Row]:
 def main() -> None:
     """Print the table."""
     print(".. list-table::\n   :header-rows: 1\n   :widths: 44 24 32\n")
-    rows = [("measured by others", "published", "vstent"), *pipeline(), *coils(), *bends(), *lengths()]
+    rows = [
+        ("measured by others", "published", "vstent"),
+        *pipeline(),
+        *coils(),
+        *bends(),
+        *leaflets(),
+        *shortening(),
+        *lengths(),
+    ]
     for row in rows:
         for k, cell in enumerate(row):
             print(f"   {'*' if k == 0 else ' '} - {cell}")

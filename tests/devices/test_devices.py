@@ -8,7 +8,7 @@ from vstent.cli import main
 from vstent.devices import catalogue, formulas, ranges
 from vstent.devices import design as device
 from vstent.devices import schema as device_schema
-from vstent.devices.design import Braid, LaserCut, Size, Strands
+from vstent.devices.design import Braid, LaserCut, Size, Strands, angle_rad
 from vstent.errors import DeviceError
 
 
@@ -183,6 +183,8 @@ def test_a_catalogue_entry_becomes_a_design():
         ),
         ("value = 1.0,", 'value = 1.0, low = 1.1, high = 1.2, reason = "why",', "does not contain the value 1"),
         ("diameter_um = 40,", "diameter_um = 40, diameter_low_um = 30,", "a range needs its low end"),
+        ("diameter_um = 40,", 'diameter_um = 40, diameter_source = "bench",', "and diameter_confidence go together"),
+        ("value = 0.1,", "value = 1.6,", "free_diameter_margin_mm"),
         ("lengths_mm = [10, 20],", "lengths_mm = [10, 20], length_tolerance_mm = 1,", "a range needs"),
         ("[[device]]", "[[device", "not valid TOML"),
     ],
@@ -229,6 +231,34 @@ joined_crowns = {{ value = ["10", "01"], {SOURCED} }}
 crown_gap_um = {{ value = 150, {SOURCED} }}
 free_profile = {{ fractions = [0.0, 1.0], wider_mm = [0.5, -0.5], {SOURCED} }}
 """
+
+
+def test_a_diameter_may_have_a_source_and_a_confidence_beside_those_of_its_count():
+    own = (
+        'diameter_um = 40, diameter_low_um = 35, diameter_high_um = 45, count_low = 12, count_high = 12, reason = "why"'
+    )
+    own += ', diameter_source = "bench", diameter_confidence = "derived"'
+    layer = STRUCTURES.replace(
+        "beyond_mm = 3.0", 'beyond_mm = 3.0, beyond_source = "leaflet", beyond_confidence = "cited"'
+    )
+    design = device_schema.parse(ENTRY.replace("diameter_um = 40", own) + layer)["x"]
+    told = {fact.name: (fact.source, fact.confidence) for fact in design.facts}
+    assert told["wires"] == ("here", "estimated")
+    assert told["wires_diameter_um"] == ("bench", "derived")
+    assert told["outer_layer_beyond_mm"] == ("leaflet", "cited")
+    assert {one.name: one.confidence for one in design.ranges} == {
+        "wire_count": "estimated",
+        "wire_diameter_um": "derived",
+    }
+
+
+def test_blocks_of_sizes_of_one_source_count_once():
+    block = '{ diameters_mm = [3, 4], lengths_mm = [10, 20], source = "here", confidence = "cited" }'
+    assert block in ENTRY
+    second, third = block.replace("[3, 4]", "[5]"), block.replace("[3, 4]", "[6]").replace("here", "there")
+    design = device_schema.parse(ENTRY.replace(block, f"{block}, {second}, {third}"))["x"]
+    assert [fact.source for fact in design.facts if fact.name == "sizes"] == ["here", "there"]
+    assert [size.diameter_mm for size in design.sizes] == [3, 3, 4, 4, 5, 5, 6, 6]
 
 
 def test_structures_are_read_with_their_sources_and_their_ranges_change_them():
@@ -340,19 +370,53 @@ def test_an_own_file_spoiled_later_is_named(own_folder):
         catalogue.catalogue()
 
 
+# Formula, label diameter, diameter in mm, and the published range.
 PUBLISHED = {
-    "pipeline": ("pore_density_per_mm2", 3.75, 12.5, 20.0),  # Babiker et al. 2015, J Med Devices 9
-    "leo": ("coverage_fraction", 4.5, 0.13, 0.15),  # Cho et al. 2017, Neurointervention 12:31: 14 %
-    "enterprise": ("coverage_fraction", 4.5, 0.05, 0.10),  # the same: 5 %, others up to 10 %
+    "pipeline": ("pore_density_per_mm2", 3.75, 3.75, 12.5, 20.0),  # Babiker et al. 2015, J Med Devices 9
+    "leo": ("coverage_fraction", 4.5, 5.4, 0.13, 0.15),  # Cho et al. 2017, Neurointervention 12:31: 14 %, free
+    "enterprise": ("coverage_fraction", 4.5, 4.5, 0.05, 0.10),  # the same: 5 %, others up to 10 %
 }
 
 
 @pytest.mark.parametrize("key", PUBLISHED)
 def test_what_a_device_derives_is_what_was_measured_on_it(key):
-    formula, diameter_mm, low, high = PUBLISHED[key]
+    formula, label_mm, diameter_mm, low, high = PUBLISHED[key]
     design = catalogue.find_design(key)
-    size = catalogue.find_size(design, diameter_mm=diameter_mm)
+    size = catalogue.find_size(design, diameter_mm=label_mm)
     assert low <= getattr(formulas, formula)(design, size, diameter_mm) <= high
+
+
+# Label, length in mm by diameter in mm, and how far the ratios of the device may differ: rounding to whole millimetres,
+# and one angle for all labels. Instructions for use (Atlas, LVIS, LVIS Jr) and Balt's catalogue of 2020.
+LENGTHS = [
+    ("neuroform_atlas", 4.0, {3.0: 30.8, 3.5: 30.4, 4.0: 29.2}, 0.03),
+    ("neuroform_atlas", 4.5, {4.0: 29.9, 4.5: 29.5}, 0.03),
+    ("lvis", 4.5, {3.0: 57.0, 3.5: 52.0, 4.0: 44.0, 4.5: 32.0}, 0.1),
+    ("lvis_jr", 3.5, {2.5: 40.0, 3.0: 37.0, 3.5: 33.0}, 0.05),
+    ("leo", 4.5, {4.5: 51.0, 5.4: 37.0}, 0.05),
+    ("leo_baby", 2.5, {2.5: 35.0, 3.2: 23.0}, 0.08),
+    ("silk_vista_baby", 2.75, {2.75: 26.5, 3.0: 18.5}, 0.05),
+]
+
+
+@pytest.mark.parametrize(("key", "label_mm", "published_mm", "within"), LENGTHS)
+def test_devices_foreshorten_as_their_makers_list_it(key, label_mm, published_mm, within):
+    design = catalogue.find_design(key)
+    size = catalogue.find_size(design, diameter_mm=label_mm)
+    spacing_mm = formulas.row_spacing_mm(design, size, np.array(list(published_mm)))
+    published = np.array(list(published_mm.values()))
+    assert spacing_mm / spacing_mm[0] == pytest.approx(published / published[0], rel=within)
+
+
+def test_flow_diverters_foreshorten_from_the_catheter_as_stated():
+    """The wires lie along the catheter: a device is cos(angle) times as long in an artery of its label diameter."""
+    left = {}
+    for key in ("pipeline", "fred"):
+        design = catalogue.find_design(key)
+        size = catalogue.find_size(design, diameter_mm=4.0)
+        left[key] = np.cos(float(angle_rad(design, size, size.diameter_mm)))
+    assert 0.4 <= left["pipeline"] <= 0.5  # 50-60 %
+    assert left["fred"] >= 0.4  # up to 60 %
 
 
 def test_the_catalogue_has_the_devices_in_use():

@@ -41,7 +41,8 @@ def test_stated_errors_cover_the_truth_of_200_specimens(design):
     apart, stated = draws(design, 200)
     covered = (np.abs(apart) < 1.96 * stated).mean(axis=0)
     rms = np.sqrt((apart**2).mean(axis=0))
-    assert np.degrees(rms[0]) < 1.0
+    # Lengths say less about a small angle, because a straight cell hardly shortens: Neuroform Atlas has 28 degrees.
+    assert np.degrees(rms[0]) < (1.0 if design.angle_rad > 0.55 else 1.2)
     assert rms[1] < 0.05
     assert (covered > 0.90).all()
     assert len(apart) >= 196
@@ -117,6 +118,9 @@ def test_the_entry_of_a_fit_is_read_with_a_range_for_every_number(key):
     assert design.angle_rad == pytest.approx(like.angle_rad, abs=1e-4)
     for what in ("strands", "has_closed_ends", "joined_crowns", "crown_gap_um"):
         assert getattr(design, what, None) == getattr(like, what, None)
+    own = {"strands_diameter_um", "outer_layer_diameter_um", "outer_layer_beyond_mm"}
+    told = [{one.name: one.confidence for one in each.facts if one.name in own} for each in (design, like)]
+    assert told[0] == told[1]
     same = {size.label: size.free_profile_mm for size in like.sizes}
     for size in design.sizes:
         assert np.array(size.free_profile_mm) == pytest.approx(np.array(same[size.label]), abs=1e-3)

@@ -16,7 +16,8 @@ SOURCE_DETECTOR_MM: Final = 1100.0
 SOURCE_ISOCENTER_MM: Final = 750.0
 """Default distance from the X-ray source to the isocenter, mm; units have 720 to 810."""
 PIXEL_MM: Final = 0.154
-"""Default edge of a detector pixel, mm: the usual flat panel (Cowen et al. 2008, Clin. Radiol. 63:1073)."""
+"""Default edge of a detector pixel, mm: the usual flat panel (Cowen et al. 2008, Clin. Radiol. 63:1073; not verified
+against the original)."""
 MAX_PIXELS: Final = 2048
 """Largest number of rows or columns of a detector."""
 MARGIN: Final = 1.12

@@ -147,8 +147,15 @@ class _Writer:
         if name in self.by_name:
             value, error = self.by_name[name]
             found |= {ends[0]: round(value - ERRORS * error, 2), ends[1]: round(value + ERRORS * error, 2)}
-            found |= {"source": self.source, "confidence": "derived", "reason": f"{REASON}; {count} wires"}
-        return found
+            return found | {"source": self.source, "confidence": "derived", "reason": f"{REASON}; {count} wires"}
+        return found | self._own("wires" if group == 0 else f"wires_{group + 1}", "diameter", "um")
+
+    def _own(self, fact: str, name: str, unit: str) -> dict[str, str]:
+        """Return source and confidence of a number, if the similar device has them beside those of its group."""
+        for one in self.like.facts:
+            if one.name == f"{fact}_{name}_{unit}":
+                return {f"{name}_source": f"{self.like.name}: {one.source}", f"{name}_confidence": one.confidence}
+        return {}
 
     def structures(self) -> Iterator[str]:
         """Yield the lines of strands, layers, flares, closed ends and free crowns, as the similar device has them."""
@@ -175,8 +182,10 @@ class _Writer:
                 f"{name}_count", "count_{}", int
             )
             found |= {"count": strands.count, "diameter_um": strands.diameter_um}
+            found |= self._own(fact if is_layer or not beside else f"{fact}_{len(beside) + 1}", "diameter", "um")
             if is_layer:
                 found |= {"beyond_mm": strands.beyond_mm} | self._ends(f"{name}_beyond_mm", "beyond_{}_mm", float)
+                found |= self._own(fact, "beyond", "mm")
                 yield f"outer_layer = {_table(found)}"
             else:
                 beside.append(f"    {_table(found)},")

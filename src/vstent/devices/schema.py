@@ -23,6 +23,8 @@ LARGEST_MM: Final = 200.0
 """Largest diameter or length of a size that the schema accepts, in mm."""
 MOST_SIZES: Final = 100
 """Largest number of diameters, or of lengths, in one block of sizes."""
+LARGEST_MARGIN_MM: Final = 1.5
+"""Largest difference between free diameter and label diameter that the schema accepts, in mm (LEO: up to 1.2)."""
 
 _Whole = Annotated[int, Field(gt=0, le=MOST_WIRES)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -36,6 +38,7 @@ def _in_um(width: float) -> float:
 
 
 _Width_um = Annotated[float, Field(gt=0, le=LARGEST_UM), AfterValidator(_in_um)]
+_Margin_mm = Annotated[float, Field(ge=-LARGEST_MARGIN_MM, le=LARGEST_MARGIN_MM)]
 _Lengths_mm = Annotated[list[Annotated[float, Field(gt=0, le=LARGEST_MM)]], Field(min_length=1, max_length=MOST_SIZES)]
 
 
@@ -53,10 +56,12 @@ class _Sourced(_Strict):
     reason: Annotated[str, Field(min_length=3)] | None = None
     """Tolerance or class from which the range follows."""
 
-    def _range(self, name: str, value: float, ends: tuple[float | None, float | None]) -> Iterator[Range]:
-        """Yield the range of one number, if it is stated."""
+    def _range(
+        self, name: str, value: float, ends: tuple[float | None, float | None], sure: Confidence | None = None
+    ) -> Iterator[Range]:
+        """Yield the range of one number, if it is stated, with a confidence of its own or that of the entry."""
         if ends[0] is not None and ends[1] is not None:
-            yield Range(name, value, ends[0], ends[1], self.reason or "", self.confidence)
+            yield Range(name, value, ends[0], ends[1], self.reason or "", sure or self.confidence)
 
     def _check_range(self, value: float, ends: tuple[float | None, float | None]) -> None:
         """Raise a ValueError if a range lacks an end or its reason, or does not contain the value."""
@@ -113,13 +118,13 @@ class _Count(_Ranged):
 class _Margin(_Ranged):
     """Free diameter minus label diameter, in mm."""
 
-    value: Annotated[float, Field(ge=-1, le=1)]
-    low: Annotated[float, Field(ge=-1, le=1)] | None = None
-    high: Annotated[float, Field(ge=-1, le=1)] | None = None
+    value: _Margin_mm
+    low: _Margin_mm | None = None
+    high: _Margin_mm | None = None
 
 
 class _Wires(_Sourced):
-    """Group of equal wires."""
+    """Group of equal wires; their diameter may have a source of its own, because makers publish the count alone."""
 
     count: _Whole
     count_low: _Whole | None = None
@@ -127,19 +132,28 @@ class _Wires(_Sourced):
     diameter_um: _Width_um
     diameter_low_um: _Width_um | None = None
     diameter_high_um: _Width_um | None = None
+    diameter_source: Annotated[str, Field(min_length=3)] | None = None
+    diameter_confidence: Confidence | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "_Wires":
-        """Return the entry, or raise a ValueError if a range is invalid."""
+        """Return the entry, or raise a ValueError if a range is invalid or a source lacks its confidence."""
         self._check_range(self.count, (self.count_low, self.count_high))
         self._check_range(self.diameter_um, (self.diameter_low_um, self.diameter_high_um))
+        _check_pair("diameter", self.diameter_source, self.diameter_confidence)
         return self
 
     def ranges(self, name: str) -> Iterator[Range]:
         """Yield the stated ranges of count and diameter of wires called `name`."""
         yield from self._range(f"{name}_count", self.count, (self.count_low, self.count_high))
         ends_um = self.diameter_low_um, self.diameter_high_um
-        yield from self._range(f"{name}_diameter_um", self.diameter_um, ends_um)
+        yield from self._range(f"{name}_diameter_um", self.diameter_um, ends_um, self.diameter_confidence)
+
+    def sources(self, name: str, number: int = 0) -> Iterator[Fact]:
+        """Yield the source of a group of `name`, counted from 0, and that of its diameter if it has its own."""
+        yield Fact(name, self.source, self.confidence)
+        if self.diameter_source is not None and self.diameter_confidence is not None:
+            yield Fact(f"{_nth(name, number)}_diameter_um", self.diameter_source, self.diameter_confidence)
 
 
 class _Layer(_Wires):
@@ -149,17 +163,27 @@ class _Layer(_Wires):
     """Length by which it is longer than the mesh at each end, at the label diameter, in mm."""
     beyond_low_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)] | None = None
     beyond_high_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)] | None = None
+    beyond_source: Annotated[str, Field(min_length=3)] | None = None
+    beyond_confidence: Confidence | None = None
 
     @model_validator(mode="after")
     def _check_beyond(self) -> "_Layer":
         """Return the entry, or raise a ValueError if the range of the length is invalid."""
         self._check_range(self.beyond_mm, (self.beyond_low_mm, self.beyond_high_mm))
+        _check_pair("beyond", self.beyond_source, self.beyond_confidence)
         return self
 
     def ranges(self, name: str) -> Iterator[Range]:
         """Yield the stated ranges of count, diameter and length of the layer."""
         yield from super().ranges(name)
-        yield from self._range(f"{name}_beyond_mm", self.beyond_mm, (self.beyond_low_mm, self.beyond_high_mm))
+        ends_mm = self.beyond_low_mm, self.beyond_high_mm
+        yield from self._range(f"{name}_beyond_mm", self.beyond_mm, ends_mm, self.beyond_confidence)
+
+    def sources(self, name: str, number: int = 0) -> Iterator[Fact]:
+        """Yield the sources of the layer, its diameter and its length."""
+        yield from super().sources(name, number)
+        if self.beyond_source is not None and self.beyond_confidence is not None:
+            yield Fact(f"{name}_beyond_mm", self.beyond_source, self.beyond_confidence)
 
 
 class _Flag(_Sourced):
@@ -276,10 +300,11 @@ class _Device(_Strict):
         return (*self.free_diameter_margin_mm.ranges("free_diameter_margin_mm"), *widest, *flare)
 
     def _shared_facts(self) -> tuple[Fact, ...]:
-        """Return the sources of the numbers that both families have."""
+        """Return the sources of the numbers that both families have; blocks of sizes of one source have one fact."""
+        blocks = {(block.source, block.confidence): block for block in self.sizes}
         return (
             _fact("free_diameter_margin_mm", self.free_diameter_margin_mm),
-            *(_fact("sizes", block) for block in self.sizes),
+            *(_fact("sizes", block) for block in blocks.values()),
             *([_fact("free_profile", self.free_profile)] if self.free_profile else []),
         )
 
@@ -306,7 +331,7 @@ class _Braid(_Device):
             braid_angle_rad=self.braid_angle_rad.value,
             sizes=self._sizes(),
             maker=self.maker,
-            facts=(*(_fact(name, one) for name, one in self._of_braid()), *self._shared_facts()),
+            facts=(*self._facts(), *self._shared_facts()),
             ranges=self._ranges(),
             strands=self._strands(),
             has_closed_ends=self.closed_ends is not None and self.closed_ends.value,
@@ -316,15 +341,17 @@ class _Braid(_Device):
         """Return the length of both ends of the device that the label does not count, in mm."""
         return 2 * self.outer_layer.beyond_mm if self.outer_layer else 0.0
 
-    def _of_braid(self) -> Iterator[tuple[str, _Sourced]]:
-        """Yield the numbers that only braids have, with the name of their fact."""
-        yield from (("wires", group) for group in self.wires)
-        yield "braid_angle_rad", self.braid_angle_rad
+    def _facts(self) -> Iterator[Fact]:
+        """Yield the sources of the numbers that only braids have."""
+        for number, group in enumerate(self.wires):
+            yield from group.sources("wires", number)
+        yield _fact("braid_angle_rad", self.braid_angle_rad)
         if self.outer_layer is not None:
-            yield "outer_layer", self.outer_layer
-        yield from (("strands", group) for group in self.strands)
+            yield from self.outer_layer.sources("outer_layer")
+        for number, group in enumerate(self.strands):
+            yield from group.sources("strands", number)
         if self.closed_ends is not None:
-            yield "closed_ends", self.closed_ends
+            yield _fact("closed_ends", self.closed_ends)
 
     def _strands(self) -> tuple[Strands, ...]:
         """Return the further wires of the braid."""
@@ -396,6 +423,12 @@ class _Catalogue(_Strict):
 def _fact(name: str, sourced: _Sourced) -> Fact:
     """Return the source of one number."""
     return Fact(name, sourced.source, sourced.confidence)
+
+
+def _check_pair(name: str, source: str | None, confidence: Confidence | None) -> None:
+    """Raise a ValueError if only one of source and confidence of a number is given."""
+    if (source is None) != (confidence is None):
+        raise ValueError(f"{name}_source and {name}_confidence go together")
 
 
 def _nth(name: str, number: int) -> str:

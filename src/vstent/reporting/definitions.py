@@ -333,7 +333,8 @@ INDICES_WITH_OCCLUSION: Final = (
     "Indices that studies associate with occlusion, not a prognosis:",
     "Volume of the sac with fast blood (8 cm/s or more; Beppu et al. 2020, AJNR 41:2107, 27 patients, divided by the "
     "volume of the dome).",
-    "Reduction of the mean sac velocity: by 35 % or more in Ouared et al. 2016, J. Neurointerv. Surg. 8:1288; a trend "
+    "Reduction of the mean sac velocity: by 35 % or more in Ouared et al. 2016, J. Neurointerv. Surg. 8:1288 (not "
+    "verified against the original); a trend "
     "only (p = 0.08) in Brina et al. 2019, AJNR 40:2117, 23 patients.",
 )
 """Sentences on flow metrics that studies associate with occlusion after flow diversion."""
