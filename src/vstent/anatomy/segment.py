@@ -150,7 +150,7 @@ def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[
     ----------
     Kittler, Illingworth and Foeglein 1985, Comput. Vis. Graph. Image Process. 30:125.
 
-    Hoogeveen, Bakker and Viergever 1998, Magn. Reson. Med. 40:751.
+    Hoogeveen, Bakker and Viergever 1998 (journal and page not verified).
     """
     first, profile = _first(image, at_mm)
     second = replace(first, threshold=profile.wall_level)

@@ -1,7 +1,8 @@
 """Classify a bulge as saccular aneurysm, branch stump, infundibulum, bleb or artifact.
 
 The classes and their criteria are vstent's own. An infundibulum is a funnel of at most 3 mm that is widest at its base
-(Saltzman 1959, Acta Radiol. 51:133). A stump is a tube. A saccular aneurysm is about as wide as it is high.
+(Saltzman 1959, Acta Radiol. 51; not verified against the original). A stump is a tube. A saccular aneurysm is about as
+wide as it is high.
 """
 
 from typing import Final
