@@ -159,11 +159,13 @@ def picture_size(page):
     """Width in pixels and resolution in dots per inch of the picture that the page saves, for one column."""
     from PIL import Image
 
-    page.locator(".export summary").click()
-    page.locator(".export-form select").nth(0).select_option("85")
-    page.locator(".export-form select").nth(1).select_option("150")
+    page.get_by_role("button", name="Save picture: 3-D view").click()
+    form = page.locator(".save-form")
+    form.locator("[data-key=format]").select_option("PNG")
+    form.locator("[data-key=dpi]").select_option("150")
+    form.locator("input").fill("85")
     with page.expect_download() as waited:
-        page.get_by_role("button", name="Save PNG").click()
+        form.get_by_role("button", name="Save", exact=True).click()
     image = Image.open(waited.value.path())
     colours = np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0)
     assert len(colours) > 500  # wires, wall and color bar, not an empty canvas

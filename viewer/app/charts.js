@@ -1,5 +1,6 @@
 // Small charts in SVG: the artery along its axis with the device in it, a section, a residual, a pulse.
 import { make, svg } from "../src/dom.js";
+import { chartButton } from "./exporting.js";
 
 const round = (x) => Math.round(10 * x) / 10;
 
@@ -26,6 +27,7 @@ export class AlongChart {
   constructor() {
     this.svg = svg("svg", { class: "chart", role: "img", "aria-label": "Diameter along the parent artery" });
     this.element = make("div", { className: "chart-box" }, [this.svg]);
+    this.element.append(chartButton("diameter along the artery", this.element, () => this.draw()));
     this.chosen = () => {};
     this.element.addEventListener("pointermove", (event) => this.move(event));
     new ResizeObserver(() => this.draw()).observe(this.element);
@@ -90,6 +92,7 @@ export class SectionChart {
     this.svg = svg("svg", { class: "section", viewBox: "-4 -4 8 8", role: "img", "aria-label": "Section across the artery" });
     this.words = make("dl", { className: "section-words" });
     this.element = make("div", { className: "section-box" }, [this.svg, this.words]);
+    this.element.append(chartButton("section", this.element));
   }
 
   show(section) {

@@ -1,102 +1,139 @@
-// The picture as a file: PNG of a chosen width and resolution, with titles, length bar and colour bars, for a paper.
-import { make } from "../src/dom.js";
+// A view as a file of a chosen size: PNG, or SVG with text, bars and charts as vectors and the 3-D view in it as a raster.
+import { make, svg } from "../src/dom.js";
+import { traced } from "./tracing.js";
 
-const WIDTHS = [[85, "85 mm (one column)"], [120, "120 mm"], [170, "170 mm (two columns)"]];
+/** Widths in mm that journals ask for. */
+const WIDTHS = [85, 120, 170];
 const RESOLUTIONS = [150, 300, 600];
 const MM_PER_INCH = 25.4;
 const MOST_PIXELS = 8192;
-const [INK, PAPER] = ["#16262e", "#ffffff"];
+/** Text of 12 pixels on the page is so high on paper, in points; journals ask for 6 to 8. */
+const LETTER_PT = 7;
+const PX_PER_MM = (12 / LETTER_PT) * (72 / MM_PER_INCH);
+const XLINK = "http://www.w3.org/1999/xlink";
 
-export class Exporting {
-  constructor(picture) {
-    this.picture = picture;
-    this.width = 170;
-    this.resolution = 300;
-    const choice = (label, values, key) => {
-      const box = make("select", {}, values.map(([value, words]) => make("option", { value, selected: value === this[key] }, [words])));
-      box.addEventListener("change", () => (this[key] = Number(box.value)));
-      return make("label", {}, [make("span", {}, [label]), box]);
+/** What was chosen last, for the next picture. */
+const chosen = { width: 170, dpi: 300, format: "PNG" };
+
+/**
+ * A button that saves a view.
+ * @param source {name, element, lay(): fit into the size that the element has now, words(): elements that are written as
+ *   vectors, rasters(scale): [[canvas, box]] with `scale` pixels per pixel of the page, ground: colour behind all, shape(wide): height for a width of one, where it is so many pixels wide}
+ */
+export function saveButton(source, words = "Save picture") {
+  const save = () => choose().then((isSure) => isSure && offer(source));
+  return make("button", { type: "button", className: "chip save", title: "Save as PNG or SVG", ariaLabel: `${words}: ${source.name}`, onClick: save }, [words === "Save picture" ? words : "⤓"]);
+}
+
+/** A small button that saves the drawings in an element; `lay()` draws them for its size. */
+export function chartButton(name, element, lay) {
+  return saveButton({ name, element, lay, words: () => [...element.querySelectorAll("svg, dl")] }, "Save");
+}
+
+/** Ask for size and format; the promise holds whether to save. */
+function choose() {
+  return new Promise((answered) => {
+    const field = (label, input) => make("label", {}, [make("span", {}, [label]), input]);
+    const select = (key, values, words) => {
+      const box = make("select", {}, values.map((value) => make("option", { value, selected: value === chosen[key] }, [words(value)])));
+      box.dataset.key = key;
+      return box;
     };
-    const save = make("button", { type: "button", className: "primary", onClick: () => this.save() }, ["Save PNG"]);
-    const form = make("div", { className: "export-form" }, [
-      choice("Width", WIDTHS, "width"),
-      choice("Resolution", RESOLUTIONS.map((dpi) => [dpi, `${dpi} dpi`]), "resolution"),
-      save,
+    const width = make("input", { type: "number", min: 20, max: 400, step: "any", required: true, value: chosen.width });
+    width.setAttribute("list", "save-widths");
+    const widths = make("datalist", { id: "save-widths" }, WIDTHS.map((mm) => make("option", { value: mm })));
+    const [format, dpi] = [select("format", ["PNG", "SVG"], (word) => word), select("dpi", RESOLUTIONS, (value) => `${value} dpi`)];
+    const form = make("form", { method: "dialog", className: "save-form" }, [
+      make("h2", { id: "save-title" }, ["Save picture"]),
+      field("Format", format),
+      field("Width, mm", width),
+      widths,
+      field("Resolution", dpi),
+      make("p", { className: "hint" }, [`Journals ask for 85 mm (one column) to 170 mm (two). Letters are about ${LETTER_PT} pt high at every width. In SVG text, bars and charts are vectors; the 3-D view is a picture of this resolution.`]),
+      make("div", { className: "ask-buttons" }, [
+        make("button", { type: "button", onClick: () => box.close("no") }, ["Cancel"]),
+        make("button", { type: "submit", className: "primary", value: "yes" }, ["Save"]),
+      ]),
     ]);
-    this.element = make("details", { className: "export" }, [make("summary", { className: "chip" }, ["Save picture"]), form]);
-  }
-
-  save() {
-    const bytes = this.png();
-    const link = make("a", { download: "vstent.png", href: URL.createObjectURL(new Blob([bytes], { type: "image/png" })) });
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-    this.element.open = false;
-  }
-
-  /** Bytes of the picture as it is seen, in the chosen size. */
-  png() {
-    const { picture } = this;
-    const [wide, high] = [picture.area.clientWidth, picture.area.clientHeight];
-    const scale = Math.min((this.width / MM_PER_INCH) * this.resolution, MOST_PIXELS) / wide;
-    const scales = picture.scalesShown();
-    const foot = scales.length ? 58 : 0;
-    const canvas = make("canvas", { width: Math.round(wide * scale), height: Math.round((high + foot) * scale) });
-    const paint = canvas.getContext("2d");
-    paint.fillStyle = PAPER;
-    paint.fillRect(0, 0, canvas.width, canvas.height);
-    picture.stage.photograph(scale, (scene) => paint.drawImage(scene, 0, 0, canvas.width, Math.round(high * scale)));
-    paint.scale(scale, scale);
-    for (const pane of picture.visiblePanes()) annotated(paint, pane);
-    scales.forEach((one, i) => bar(paint, one, (wide / scales.length) * (i + 0.5), high + 8, Math.min(260, wide / scales.length - 30)));
-    const bytes = Uint8Array.from(atob(canvas.toDataURL("image/png").split(",")[1]), (c) => c.charCodeAt(0));
-    return withResolution(bytes, (canvas.width / this.width) * 1000);
-  }
-}
-
-/** Title and length bar of a pane, where they are on the screen. */
-function annotated(paint, { element, title, note, length }) {
-  const [x, y, width, height] = [element.offsetLeft, element.offsetTop, element.offsetWidth, element.offsetHeight];
-  paint.fillStyle = INK;
-  paint.textAlign = "left";
-  paint.textBaseline = "top";
-  paint.font = "600 15px system-ui, sans-serif";
-  if (title) paint.fillText(title, x + 14, y + 12, width - 28);
-  paint.font = "12px system-ui, sans-serif";
-  if (note) paint.fillText(note, x + 14, y + 33, width - 28);
-  const long = parseFloat(length.style.width);
-  paint.fillRect(x + 14, y + height - 16, long, 2.5);
-  paint.textAlign = "center";
-  paint.textBaseline = "bottom";
-  paint.fillText(length.textContent, x + 14 + long / 2, y + height - 18);
-  paint.strokeStyle = "#d7dfe3";
-  paint.lineWidth = 1;
-  if (x > 0 || y > 0) paint.strokeRect(x, y, width, height);
-}
-
-/** A colour bar around x with its title and three numbers. */
-function bar(paint, scale, x, y, width) {
-  const texels = scale.texture.image.data;
-  const ramp = paint.createLinearGradient(x - width / 2, 0, x + width / 2, 0);
-  for (let i = 0; i <= 16; i++) {
-    const k = 4 * Math.min(16 * i, 255);
-    ramp.addColorStop(i / 16, `rgb(${texels.slice(k, k + 3)})`);
-  }
-  paint.fillStyle = ramp;
-  paint.fillRect(x - width / 2, y + 18, width, 10);
-  paint.fillStyle = INK;
-  paint.textBaseline = "top";
-  paint.textAlign = "center";
-  paint.font = "12px system-ui, sans-serif";
-  paint.fillText(`${scale.title}${scale.unit ? `, ${scale.unit}` : ""}`, x, y);
-  [scale.low, (scale.low + scale.high) / 2, scale.high].forEach((value, i) => {
-    paint.textAlign = ["left", "center", "right"][i];
-    paint.fillText(String(Number(value.toPrecision(3))), x + (i / 2 - 0.5) * width, y + 31);
+    const box = make("dialog", { className: "ask" }, [form]);
+    box.setAttribute("aria-labelledby", "save-title");
+    box.addEventListener("close", () => {
+      box.remove();
+      const isSure = box.returnValue === "yes";
+      if (isSure) Object.assign(chosen, { width: Number(width.value), dpi: Number(dpi.value), format: format.value });
+      answered(isSure);
+    });
+    document.body.append(box);
+    box.showModal();
   });
 }
 
+async function offer(source) {
+  const sheet = taken(source);
+  const blob = chosen.format === "SVG" ? vectors(sheet, `${chosen.width}mm`, `${(chosen.width * sheet.height) / sheet.width}mm`) : await pixels(sheet);
+  const link = make("a", { download: `vstent ${source.name}.${chosen.format.toLowerCase()}`, href: URL.createObjectURL(blob) });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
+
+/** A view laid out for the chosen width, and after that on the page as before: {width, height, scale, ground, rasters, parts}. */
+function taken({ element, lay = () => {}, words, rasters = () => [], ground = "#ffffff", shape = () => element.offsetHeight / element.offsetWidth }) {
+  const wide = Math.round(chosen.width * PX_PER_MM);
+  const scale = Math.min((chosen.width / MM_PER_INCH) * chosen.dpi, MOST_PIXELS) / wide;
+  const [before, high] = [element.style.cssText, Math.round(wide * shape(wide))];
+  element.classList.add("saving");
+  Object.assign(element.style, { width: `${wide}px`, height: `${high}px` });
+  try {
+    lay();
+    const box = element.getBoundingClientRect();
+    const found = rasters(scale).map(([canvas, place]) => ({ canvas, x: place.x - box.x, y: place.y - box.y, width: place.width, height: place.height }));
+    return { width: box.width, height: box.height, scale, ground, rasters: found, parts: words().flatMap((one) => traced(one, [box.x, box.y])) };
+  } finally {
+    element.classList.remove("saving");
+    element.style.cssText = before;
+    lay();
+  }
+}
+
+/** A copy of a canvas that may be drawn anew at once. */
+export function copied(canvas) {
+  const copy = make("canvas", { width: canvas.width, height: canvas.height });
+  copy.getContext("2d").drawImage(canvas, 0, 0);
+  return copy;
+}
+
+/** The file in SVG. */
+function vectors({ width, height, ground, rasters, parts }, wide, high) {
+  const images = rasters.map(({ canvas, ...place }) => {
+    const image = svg("image", { ...place, preserveAspectRatio: "none" });
+    image.setAttributeNS(XLINK, "xlink:href", canvas.toDataURL("image/png")); // every program reads this form
+    return image;
+  });
+  const paper = ground ? [svg("rect", { width, height, fill: ground })] : [];
+  const root = svg("svg", { width: wide, height: high, viewBox: `0 0 ${width} ${height}` }, [...paper, ...images, ...parts]);
+  return new Blob([new XMLSerializer().serializeToString(root)], { type: "image/svg+xml" });
+}
+
+/** The file in PNG: the rasters, and over them the vectors. */
+async function pixels(sheet) {
+  const [wide, high] = [sheet.width, sheet.height].map((length) => Math.round(length * sheet.scale));
+  const canvas = make("canvas", { width: wide, height: high });
+  const context = canvas.getContext("2d");
+  context.fillStyle = sheet.ground;
+  context.fillRect(0, 0, wide, high);
+  const { scale } = sheet;
+  for (const one of sheet.rasters) context.drawImage(one.canvas, one.x * scale, one.y * scale, one.width * scale, one.height * scale);
+  const image = new Image();
+  image.src = URL.createObjectURL(vectors({ ...sheet, rasters: [], ground: "" }, wide, high));
+  await image.decode();
+  context.drawImage(image, 0, 0, wide, high);
+  URL.revokeObjectURL(image.src);
+  const bytes = Uint8Array.from(atob(canvas.toDataURL("image/png").split(",")[1]), (c) => c.charCodeAt(0));
+  return new Blob([withResolution(bytes, (wide / chosen.width) * 1000)], { type: "image/png" });
+}
+
 /** A PNG with its pixels per metre, so that it has its size in a document (chunk pHYs after the header). */
-export function withResolution(bytes, perMetre) {
+function withResolution(bytes, perMetre) {
   const chunk = new Uint8Array(21);
   const view = new DataView(chunk.buffer);
   view.setUint32(0, 9);

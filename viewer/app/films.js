@@ -2,6 +2,7 @@
 import { integers } from "../src/decode.js";
 import { make } from "../src/dom.js";
 import { curvesChart } from "./charts.js";
+import { chartButton, copied, saveButton } from "./exporting.js";
 import { getBinary, Newest } from "./api.js";
 
 const DEGREES_PER_PX = 0.4;
@@ -12,6 +13,14 @@ const NAMED = [["", "Working"], ["AP", "Frontal"], ["LAO 90", "Lateral"]];
 export function inWords([primary, secondary]) {
   const words = (angle, names) => `${names[angle < 0 ? 1 : 0]} ${Math.abs(Math.round(angle))}`;
   return `${words(primary, ["LAO", "RAO"])} ${words(secondary, ["CRA", "CAU"])}`;
+}
+
+/** Where the picture of a canvas lies that keeps its shape in a box of another one. */
+function contained(canvas) {
+  const { x, y, width, height } = canvas.getBoundingClientRect();
+  const scale = Math.min(width / canvas.width, height / canvas.height);
+  const [w, h] = [scale * canvas.width, scale * canvas.height];
+  return { x: x + (width - w) / 2, y: y + (height - h) / 2, width: w, height: h };
 }
 
 export class Films {
@@ -28,7 +37,15 @@ export class Films {
     this.play = make("button", { type: "button", onClick: () => this.turn(!this.playing) }, ["▶ Play"]);
     this.clock = make("b", { className: "film-clock" });
     this.chart = make("div", { className: "chart-box" });
-    this.strip = [make("div", { className: "film-time" }, [this.play, this.slider, this.clock]), this.chart];
+    const save = saveButton({
+      name: "angiogram",
+      element: this.element,
+      ground: "#d1d1d1",
+      words: () => [...this.panes.querySelectorAll("figcaption")],
+      rasters: () => this.canvases.map((canvas) => [copied(canvas), contained(canvas)]),
+    });
+    this.saveChart = chartButton("contrast over time", this.chart, () => this.draw());
+    this.strip = [make("div", { className: "film-time" }, [this.play, this.slider, this.clock, save]), this.chart];
     this.newest = new Newest((answer) => this.take(answer), (problem) => host.failed(problem));
     this.listen();
     new ResizeObserver(() => this.draw()).observe(this.chart);
@@ -107,7 +124,7 @@ export class Films {
     const [width, height] = [this.chart.clientWidth, this.chart.clientHeight];
     if (!this.curves?.length || width < 60 || height < 50) return;
     const chosen = (time) => this.look(this.times.reduce((best, t, k) => (Math.abs(t - time) < Math.abs(this.times[best] - time) ? k : best), 0));
-    this.chart.replaceChildren(curvesChart(this.curves, this.times[this.moment], [width, height], (name) => this.host.title(name), chosen));
+    this.chart.replaceChildren(curvesChart(this.curves, this.times[this.moment], [width, height], (name) => this.host.title(name), chosen), this.saveChart);
   }
 
   /** Play, in real time. */

@@ -1,6 +1,7 @@
 // Live flow: a switch, numbers against the flow without a device, a chart of the last minute, streamlines in the picture.
 import { make, svg } from "../src/dom.js";
 import { drop, getBinary } from "./api.js";
+import { chartButton } from "./exporting.js";
 
 const EVERY_MS = 220;
 const NAMES = { neck_inflow_mL_s: ["Neck inflow", "mL/s", 1], sac_velocity_m_s: ["Mean sac velocity", "mm/s", 1000] };
@@ -15,7 +16,9 @@ export class Flowing {
     this.state = make("p", { className: "hint", role: "status" });
     this.cards = make("div", { className: "live-cards" });
     this.chart = svg("svg", { class: "live-chart", viewBox: "0 0 240 64", role: "img", "aria-label": "Change of the neck inflow over the last minute" });
-    this.body = make("div", { className: "live-body", hidden: true }, [this.state, this.cards, this.chart]);
+    const chart = make("div", { className: "live-chart-box" }, [this.chart]);
+    chart.append(chartButton("live flow", chart));
+    this.body = make("div", { className: "live-body", hidden: true }, [this.state, this.cards, chart]);
     this.element = make("div", { className: "live" }, [make("label", { htmlFor: "live-flow" }, [this.box, "Live blood flow (preview)"]), this.body]);
     document.addEventListener("visibilitychange", () => this.watch());
   }

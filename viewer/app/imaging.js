@@ -37,6 +37,7 @@ export class Imaging {
     page.scan = scan;
     this.slices = new Slices({
       path: () => page.path,
+      box: this.box,
       seeded: (point, isLumen) => (isLumen ? page.setSeed(point) : page.tell("There is no lumen at that point: click a bright one.")),
       cropped: (corners) => page.choose({ crop_mm: corners && corners.map((point) => point.map((x) => Number(x.toFixed(3)))) }),
       looked: () => page.picture.stage?.redraw(),

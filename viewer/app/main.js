@@ -4,6 +4,7 @@ import { drop, get, getBinary, Newest, post, put } from "./api.js";
 import { Axis } from "./axis.js";
 import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js";
 import { Deploying } from "./deploy.js";
+import { chartButton } from "./exporting.js";
 import { Films, inWords } from "./films.js";
 import { Flowing } from "./flowing.js";
 import { Imaging } from "./imaging.js";
@@ -477,7 +478,10 @@ class Page {
   flowStrip() {
     const { job } = this.view;
     if (this.isFilm && this.films.hasFilm) return this.films.strip;
-    return job?.kind === "flow" ? [residualChart(job.residual)] : [];
+    if (job?.kind !== "flow") return [];
+    const box = make("div", { className: "residual" }, [residualChart(job.residual)]);
+    box.append(chartButton("convergence", box));
+    return [box];
   }
 
   renderWork() {
@@ -554,7 +558,8 @@ class Page {
       draw();
       this.moments.ask(() => this.loadFlow());
     };
-    const draw = () => box.replaceChildren(pulseChart(this.pulse, this.view.choices.flow.is_pulsatile, this.times || [], this.moment, shown));
+    const save = chartButton("inlet waveform", box);
+    const draw = () => box.replaceChildren(save, pulseChart(this.pulse, this.view.choices.flow.is_pulsatile, this.times || [], this.moment, shown));
     if (this.pulse) draw();
     else get(`/api/waveform?case_id=${this.view.id}`).then((pulse) => ((this.pulse = pulse), draw())).catch((problem) => this.complain(problem));
     return box;

@@ -3,7 +3,7 @@ import { Raycaster, Vector2, Vector3 } from "three";
 import { make } from "../src/dom.js";
 import { annotate, annotations, colourBar } from "../src/furniture.js";
 import { Stage } from "../src/stage.js";
-import { Exporting } from "./exporting.js";
+import { copied, saveButton } from "./exporting.js";
 
 const VIEWS = { profile: ["Profile", "The neck in profile"], whole: ["Whole", "The whole vessel"], neck: ["Neck", "From the sac onto the neck"], frontal: ["Front", "From the front"], lateral: ["Left", "From the left"] };
 const NARROW = 900;
@@ -22,7 +22,14 @@ export class Picture {
       [this.canvas, this.grid, this.marks],
     );
     this.element = make("div", { className: "picture" }, [this.area, this.toolbar, this.bars]);
-    this.exporting = new Exporting(this);
+    this.save = saveButton({
+      name: "3-D view",
+      element: this.element,
+      shape: (wide) => this.area.clientHeight / this.area.clientWidth + this.foot / wide,
+      lay: () => this.layout(),
+      rasters: (scale) => this.photographed(scale),
+      words: () => this.written(),
+    });
     this.views = [];
     this.panes = [];
     this.switches = [];
@@ -119,7 +126,7 @@ export class Picture {
     const views = this.views.map(({ id }, i) =>
       make("button", { type: "button", className: "chip view", title: `${VIEWS[id][1]} (key ${i + 1})`, onClick: () => this.look(id) }, [VIEWS[id][0]]),
     );
-    const save = this.stage ? [this.exporting.element] : [];
+    const save = this.stage ? [this.save] : [];
     this.toolbar.replaceChildren(make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...save]));
     this.makeRoom();
   }
@@ -148,6 +155,25 @@ export class Picture {
     return Object.values(this.stage.scales).filter((scale) => used.has(scale.id));
   }
 
+  /** The scene as a canvas with `scale` pixels per pixel of the page, and where it lies. */
+  photographed(scale) {
+    let canvas;
+    this.stage.photograph(scale, (scene) => (canvas = copied(scene)));
+    return [[canvas, this.area.getBoundingClientRect()]];
+  }
+
+  /** What stands on the scene and is no control: titles, length bars, compasses, labels and colour bars. */
+  written() {
+    const labels = this.drawnMarks.filter(({ isLabel }) => isLabel).map(({ element }) => element);
+    const heads = this.visiblePanes().flatMap(({ element, length, compass }) => [element.querySelector(".viewer-title"), length, compass]);
+    return [...heads, ...labels, this.bars];
+  }
+
+  /** Height of the strip below a saved picture that holds its colour bars, in pixels. */
+  get foot() {
+    return this.bars.hidden ? 0 : this.bars.offsetHeight + 12;
+  }
+
   /** All panes, or the one that is shown alone. */
   visiblePanes() {
     return this.panes.filter(({ element }) => !element.hidden);
@@ -168,6 +194,7 @@ export class Picture {
 
   layout() {
     if (!this.stage || !this.panes.length) return;
+    this.element.style.setProperty("--foot", `${this.foot}px`);
     const [width, height] = [this.area.clientWidth, this.area.clientHeight];
     for (const { id, element, button } of this.panes) {
       element.hidden = Boolean(this.solo) && this.solo !== id;

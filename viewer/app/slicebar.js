@@ -1,5 +1,6 @@
 // The bar over the slices: tools, window presets, slab, outlines, and what is under the pointer.
 import { make } from "../src/dom.js";
+import { copied, saveButton } from "./exporting.js";
 import { LINES, SEED } from "./sliceview.js";
 
 const TOOLS = [
@@ -12,6 +13,8 @@ const TOOLS = [
 /** Windows of a CT by name: width and level in HU. */
 const CT = { "CT angiography": [700, 300], Brain: [80, 40], "Soft tissue": [350, 50], Bone: [2000, 500] };
 const SLABS = [[0, "Single slice"], [5, "MIP 5 mm"], [10, "MIP 10 mm"], [20, "MIP 20 mm"], [1000, "MIP, whole scan"]];
+/** Width of a picture, about 120 mm on paper, from which its slices lie beside each other. */
+const ROW_PX = 580;
 const minus = (x, digits) => x.toFixed(digits).replace("-", "−");
 
 export class SliceBar {
@@ -29,9 +32,34 @@ export class SliceBar {
     this.chips = make("div", { className: "slice-chips", role: "group", ariaLabel: "Outlines on the slices" });
     this.reading = make("output", { className: "slice-reading" });
     this.element = make("div", { className: "slice-bar" }, [
-      make("div", { className: "slice-row" }, [this.tools, this.extra, this.presets, this.words, this.invert, this.slab, reset]),
+      make("div", { className: "slice-row" }, [this.tools, this.extra, this.presets, this.words, this.invert, this.slab, reset, this.save()]),
       make("div", { className: "slice-row" }, [this.chips, this.reading]),
     ]);
+  }
+
+  /** The button that saves the slices that are shown, beside or, in a narrow picture, above each other. */
+  save() {
+    const { slices } = this;
+    const isRow = (wide) => wide >= ROW_PX;
+    return saveButton({
+      name: "slices",
+      get element() {
+        return slices.host.box;
+      },
+      ground: "#10171b",
+      shape: (wide) => {
+        const { visible } = slices;
+        slices.host.box.style.setProperty("--along", isRow(wide) ? "row" : "column");
+        return visible.length === 1 ? visible[0].box[1] / visible[0].box[0] : isRow(wide) ? 0.4 : 2.2;
+      },
+      lay: () => slices.paint(),
+      words: () => slices.visible.flatMap(({ area, label }) => [...area.querySelectorAll("span"), label]),
+      rasters: (scale) =>
+        slices.visible.map((view) => {
+          view.paint(scale);
+          return [copied(view.canvas), view.area.getBoundingClientRect()];
+        }),
+    });
   }
 
   show(scan) {

@@ -11,7 +11,7 @@ const KEPT = 90;
 const AHEAD = 2;
 
 export class Slices {
-  /** @param host {path, seeded(mm), cropped(corners or null), looked(mm), told(), device(), failed} */
+  /** @param host {path, box, seeded(mm), cropped(corners or null), looked(mm), told(), device(), failed} */
   constructor(host) {
     this.host = host;
     this.threshold = null;

@@ -29,7 +29,8 @@ export class SliceView {
     this.grow = make("button", { type: "button", className: "slice-grow", onClick: () => host.maximise(this) }, [
       svg("svg", { width: 14, height: 14, viewBox: "0 0 14 14", "aria-hidden": "true" }, [svg("path", { d: "M1 5V1h4M9 1h4v4M13 9v4H9M5 13H1V9", fill: "none", stroke: "currentColor", "stroke-width": 1.7 })]),
     ]);
-    this.area = make("div", { className: "slice-area", tabIndex: 0, role: "group" }, [this.canvas, ...this.letters]);
+    this.length = make("span", { className: "slice-length" });
+    this.area = make("div", { className: "slice-area", tabIndex: 0, role: "group" }, [this.canvas, ...this.letters, this.length]);
     this.element = make("div", { className: "slice" }, [this.area, this.label, this.grow, this.slider]);
     this.slider.addEventListener("input", () => host.turn(this, Number(this.slider.value)));
     this.plane = null;
@@ -185,9 +186,9 @@ export class SliceView {
     this.paint();
   }
 
-  paint() {
+  /** Paint with so many pixels of the canvas for one of the page. */
+  paint(ratio = Math.min(devicePixelRatio, 2)) {
     if (!this.plane || !this.scan) return;
-    const ratio = Math.min(devicePixelRatio, 2);
     const [width, height] = this.box;
     // The size is set only where it changes: setting it clears the canvas and is slow.
     if (this.canvas.width !== Math.round(width * ratio) || this.canvas.height !== Math.round(height * ratio)) {
@@ -209,7 +210,7 @@ export class SliceView {
     this.paintCross(context);
     this.paintSeed(context);
     this.paintRulers(context);
-    this.paintLength(context, height);
+    this.sayLength();
   }
 
   /** From column and row, counted at the corners of the voxels, to pixels of the page. */
@@ -357,22 +358,12 @@ export class SliceView {
   }
 
   /** A bar of a round length. */
-  paintLength(context, height) {
+  sayLength() {
     const { scale } = this;
     const mm = [100, 50, 20, 10, 5, 2, 1, 0.5].find((length) => length * scale < 110) || 0.5;
-    const [x, y] = [14, height - 12];
     this.element.dataset.bar = `${mm} mm ${(mm * scale).toFixed(1)} px`;
-    for (const [colour, width] of [["rgb(0 0 0 / 60%)", 4], ["#dfe8ec", 2]]) {
-      context.strokeStyle = colour;
-      context.lineWidth = width;
-      context.beginPath();
-      context.moveTo(x, y - 5);
-      context.lineTo(x, y);
-      context.lineTo(x + mm * scale, y);
-      context.lineTo(x + mm * scale, y - 5);
-      context.stroke();
-    }
-    word(context, `${mm} mm`, x + 5, y - 5, "#dfe8ec");
+    this.length.style.width = `${mm * scale}px`;
+    this.length.textContent = `${mm} mm`;
   }
 }
 
