@@ -11,6 +11,8 @@ import pytest
 from browsing import SECOND, browsing, needs_browser, playwright, step
 from test_image_step import analytic_case
 
+from vstent.angiography.view import axes_of
+
 pytestmark = needs_browser
 SVG = "{http://www.w3.org/2000/svg}"
 WIDTH_MM, DPI = 90, 150
@@ -85,6 +87,8 @@ def test_any_view_is_saved_as_png_and_as_svg(client):
         slices_are_saved(page)
         step(page, "Deploy")
         playwright.expect(page.locator(".handle.distal .handle-word")).to_contain_text("mm", timeout=120 * SECOND)
+        views_are_kept_and_turned_by_angles(client, page)
+        ranges_are_chosen(page)
         before = page.locator(".viewer-area").bounding_box()
         scene_is_saved(page)
         assert page.locator(".viewer-area").bounding_box() == before
@@ -120,13 +124,79 @@ def scene_is_saved(page):
     assert share == pytest.approx(on_page / page.locator(".viewer-area").bounding_box()["height"], rel=0.005)
 
 
+def arm(page):
+    """The C-arm angles that the page states, in degrees: positive LAO and CRA."""
+    side, primary, tilt, secondary = page.locator(".carm").input_value().split()
+    return np.array([int(primary) * (-1 if side == "RAO" else 1), int(secondary) * (-1 if tilt == "CAU" else 1)])
+
+
+def turn_arm(page, words, shown):
+    """Type angles, and wait until the view has glided there."""
+    page.fill(".carm", words)
+    page.keyboard.press("Enter")
+    playwright.expect(page.locator(".carm")).to_have_value(shown)
+
+
+def views_are_kept_and_turned_by_angles(client, page):
+    """Angles are those of the films; a view that is saved comes back, after a reload as well."""
+    page.get_by_role("button", name="Left", exact=True).click()
+    playwright.expect(page.locator(".carm")).to_have_value("LAO 90 CRA 0")
+    turn_arm(page, "RAO 20, CAU 15", "RAO 20 CAU 15")
+    page.wait_for_timeout(300)  # the last degree of the glide
+    page.locator(".viewer-area").focus()
+    page.keyboard.press("ArrowRight")  # 0.12 rad about the upward direction of the picture
+    right, _, toward = axes_of(*np.radians([-20, -15]))
+    x, y, z = np.cos(0.12) * toward - np.sin(0.12) * right
+    wanted = np.degrees([np.arctan2(x, -y), np.arcsin(z)])
+    playwright.expect(page.locator(".carm")).not_to_have_value("RAO 20 CAU 15")
+    np.testing.assert_allclose(arm(page), wanted, atol=0.51)
+    turned = page.locator(".carm").input_value()
+    page.get_by_role("button", name="Save this view").click()
+    page.fill("#ask-field", "Working")
+    page.get_by_role("button", name="Save view").click()
+    page.get_by_role("button", name="Working", exact=True).wait_for()
+    turn_arm(page, "AP", "LAO 0 CRA 0")
+    (view,) = client.get("/api/cases/analytic").json()["choices"]["views"]
+    np.testing.assert_allclose(np.reshape(view["axes"], (3, 3))[2], [x, y, z], atol=1e-6)
+    page.reload()
+    page.get_by_role("button", name="Working", exact=True).click()
+    playwright.expect(page.locator(".carm")).to_have_value(turned)
+    page.get_by_role("button", name="Forget the view Working").click()
+    playwright.expect(page.get_by_role("button", name="Working", exact=True)).to_have_count(0)
+    page.fill(".carm", "up")
+    page.keyboard.press("Enter")
+    playwright.expect(page.locator(".toast.problem")).to_contain_text("is not a C-arm direction")
+    page.get_by_role("button", name="Profile", exact=True).click()
+    page.wait_for_timeout(800)
+
+
+def ranges_are_chosen(page):
+    """A range of one's own is on the bar and in the colors; the computed one comes back."""
+    ticks = page.locator(".picture-bars .viewer-ticks span")
+    playwright.expect(ticks.last).to_be_visible()
+    computed = ticks.all_inner_texts()
+    before = pixels(page.screenshot())[0]
+    page.get_by_role("button", name="Range of Gap between device and wall").click()
+    page.locator(".save-form input").nth(0).fill("-1")
+    page.locator(".save-form input").nth(1).fill("1")
+    page.get_by_role("button", name="Use", exact=True).click()
+    playwright.expect(ticks.last).to_have_text("1")
+    assert ticks.first.inner_text() == "-1"
+    page.wait_for_timeout(300)
+    assert np.abs(pixels(page.screenshot())[0] - before).max() > 40
+    page.get_by_role("button", name="Range of Gap between device and wall").click()
+    page.get_by_role("button", name="As computed").click()
+    page.get_by_role("button", name="Use", exact=True).click()
+    playwright.expect(ticks.last).to_have_text(computed[-1])
+
+
 def charts_are_saved(page):
     """Diagrams are vectors throughout."""
     root = alike(page, "diameter along the artery")
     assert not list(root.iter(f"{SVG}image"))
     assert {"neck", "Diameter, mm"} < set(words(root))
     lines = [path for path in root.iter(f"{SVG}path") if path.get("stroke") == "rgb(11, 100, 115)"]
-    assert lines and all(path.get("fill") == "none" for path in lines)
+    assert {path.get("fill") for path in lines} == {"none"}
     root = alike(page, "section")
     assert not list(root.iter(f"{SVG}image"))
     assert {"Position", "Artery"} < set(words(root))

@@ -1,6 +1,7 @@
 // Films of the contrast agent before and after, in step: a slider, curves, and a C-arm that is turned by hand.
 import { integers } from "../src/decode.js";
 import { make } from "../src/dom.js";
+import { inWords } from "./carm.js";
 import { curvesChart } from "./charts.js";
 import { chartButton, copied, saveButton } from "./exporting.js";
 import { getBinary, Newest } from "./api.js";
@@ -8,12 +9,6 @@ import { getBinary, Newest } from "./api.js";
 const DEGREES_PER_PX = 0.4;
 const REACH = [180, 90];
 const NAMED = [["", "Working"], ["AP", "Frontal"], ["LAO 90", "Lateral"]];
-
-/** Angles in degrees, positive LAO and CRA, in words: ``LAO 30 CRA 10``. */
-export function inWords([primary, secondary]) {
-  const words = (angle, names) => `${names[angle < 0 ? 1 : 0]} ${Math.abs(Math.round(angle))}`;
-  return `${words(primary, ["LAO", "RAO"])} ${words(secondary, ["CRA", "CAU"])}`;
-}
 
 /** Where the picture of a canvas lies that keeps its shape in a box of another one. */
 function contained(canvas) {

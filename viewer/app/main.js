@@ -2,10 +2,11 @@
 import { make } from "../src/dom.js";
 import { drop, get, getBinary, Newest, post, put } from "./api.js";
 import { Axis } from "./axis.js";
+import { inWords } from "./carm.js";
 import { AlongChart, pulseChart, residualChart, SectionChart } from "./charts.js";
 import { Deploying } from "./deploy.js";
 import { chartButton } from "./exporting.js";
-import { Films, inWords } from "./films.js";
+import { Films } from "./films.js";
 import { Flowing } from "./flowing.js";
 import { Imaging } from "./imaging.js";
 import { SacLabel } from "./labels.js";
@@ -130,7 +131,11 @@ class Page {
 
   build() {
     this.frame?.remove();
-    this.picture = new Picture();
+    this.picture = new Picture({
+      complain: (problem) => this.complain(problem),
+      kept: () => this.view?.choices.views ?? [],
+      keep: (views) => this.choose({ views }),
+    });
     this.ranking = new Ranking(this);
     this.sacLabel = new SacLabel(this.picture);
     this.along = new AlongChart();

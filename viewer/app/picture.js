@@ -3,14 +3,19 @@ import { Raycaster, Vector2, Vector3 } from "three";
 import { make } from "../src/dom.js";
 import { annotate, annotations, colourBar } from "../src/furniture.js";
 import { Stage } from "../src/stage.js";
+import { anglesOf, axesOf, fromWords, inWords } from "./carm.js";
+import { ask } from "./dialogs.js";
 import { copied, saveButton } from "./exporting.js";
+import { askRange } from "./ranges.js";
 
 const VIEWS = { profile: ["Profile", "The neck in profile"], whole: ["Whole", "The whole vessel"], neck: ["Neck", "From the sac onto the neck"], frontal: ["Front", "From the front"], lateral: ["Left", "From the left"] };
 const NARROW = 900;
 const EMPTY = { scales: [], layers: [], views: [], fade: 2 };
 
 export class Picture {
-  constructor() {
+  /** @param host {complain(problem), kept(): views that were saved, keep(views)} */
+  constructor(host) {
+    this.host = host;
     this.canvas = make("canvas", { className: "viewer-canvas", ariaHidden: "true" });
     this.grid = make("div", { className: "viewer-panes" });
     this.marks = make("div", { className: "marks" });
@@ -30,6 +35,8 @@ export class Picture {
       rasters: (scale) => this.photographed(scale),
       words: () => this.written(),
     });
+    this.carm = make("input", { type: "text", className: "chip carm", size: 13, title: "Direction of the view as C-arm angles: type others", ariaLabel: "C-arm angles of the view" });
+    this.carm.addEventListener("change", () => this.turnArm());
     this.views = [];
     this.panes = [];
     this.switches = [];
@@ -126,9 +133,47 @@ export class Picture {
     const views = this.views.map(({ id }, i) =>
       make("button", { type: "button", className: "chip view", title: `${VIEWS[id][1]} (key ${i + 1})`, onClick: () => this.look(id) }, [VIEWS[id][0]]),
     );
+    const own = this.stage && this.views.length ? [...this.host.kept().map((view) => this.keptChip(view)), this.keepChip(), ...(this.stage.isOriented === false ? [] : [this.carm])] : [];
     const save = this.stage ? [this.save] : [];
-    this.toolbar.replaceChildren(make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...save]));
+    this.toolbar.replaceChildren(make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...own, ...save]));
     this.makeRoom();
+  }
+
+  /** A view that was saved: it is looked at again, or forgotten. */
+  keptChip({ name, axes, center_mm, distance_mm }) {
+    const look = () => {
+      this.lastLook = null;
+      this.stage.orbit.go({ axes, center: center_mm, distance: distance_mm });
+    };
+    const forget = () => this.host.keep(this.host.kept().filter((view) => view.name !== name));
+    return make("span", { className: "kept-view" }, [
+      make("button", { type: "button", className: "chip view", title: "Saved view", onClick: look }, [name]),
+      make("button", { type: "button", className: "chip", title: "Forget this view", ariaLabel: `Forget the view ${name}`, onClick: forget }, ["×"]),
+    ]);
+  }
+
+  /** The button that saves the view as it is, under a name. */
+  keepChip() {
+    const keep = async () => {
+      const { axes, center, distance } = this.stage.orbit.stand;
+      const kept = this.host.kept();
+      const name = await ask({ title: "Save this view", words: ["It is kept with the case, and offered beside the other views."], field: "Name", value: `View ${kept.length + 1}`, button: "Save view" });
+      if (name) this.host.keep([...kept.filter((view) => view.name !== name), { name: name.slice(0, 40), axes, center_mm: center, distance_mm: distance }]);
+    };
+    return make("button", { type: "button", className: "chip", title: "Save this view under a name", ariaLabel: "Save this view", onClick: keep }, ["+"]);
+  }
+
+  /** Turn to the C-arm angles that were typed. */
+  turnArm() {
+    try {
+      const { center, distance } = this.stage.orbit.stand;
+      this.stage.orbit.go({ axes: axesOf(fromWords(this.carm.value)), center, distance });
+      this.lastLook = null;
+    } catch (problem) {
+      this.host.complain(problem);
+    }
+    this.carm.blur();
+    this.stage.redraw();
   }
 
   /** Titles stand below the buttons, which may need a second line. */
@@ -140,8 +185,20 @@ export class Picture {
     if (!this.stage) return;
     this.stage.show([...this.shown]);
     const scales = this.scalesShown();
-    this.bars.replaceChildren(...scales.map(colourBar));
+    this.bars.replaceChildren(...scales.map((scale) => colourBar(scale, [this.rangeButton(scale)])));
     this.bars.hidden = !scales.length;
+  }
+
+  /** The button that changes the range of a scale. */
+  rangeButton(scale) {
+    const { stage } = this;
+    const change = async () => {
+      const fit = stage.extent((layer) => layer.scale === scale.id && this.shown.has(layer.id));
+      const range = await askRange(scale, fit);
+      if (range !== undefined) stage.setRange(scale.id, range);
+      this.apply();
+    };
+    return make("button", { type: "button", className: "link range", title: "Change the range of these colours", ariaLabel: `Range of ${scale.title}`, onClick: change }, [stage.ranges[scale.id] ? "range (own)" : "range"]);
   }
 
   /** The colour scales of what is seen. */
@@ -224,6 +281,7 @@ export class Picture {
 
   afterDrawing() {
     annotate(this.panes, this.stage, this.paneSize()[1]);
+    if (document.activeElement !== this.carm) this.carm.value = inWords(anglesOf(this.stage.orbit.stand.axes.slice(6)));
     this.placeMarks();
   }
 

@@ -7,7 +7,7 @@ const DRAWN = ["fill", "fill-opacity", "stroke", "stroke-opacity", "stroke-width
 const WIDTHS = ["stroke-width", "stroke-dasharray"];
 const CLEAR = "rgba(0, 0, 0, 0)";
 
-/** SVG elements of an element and all in it, in pixels from `origin` [x, y] of the page. */
+/** SVG elements of an element and all in it but buttons, in pixels from `origin` [x, y] of the page. */
 export function traced(element, origin) {
   const style = getComputedStyle(element);
   if (style.display === "none" || style.visibility === "hidden") return [];
@@ -15,7 +15,7 @@ export function traced(element, origin) {
   const parts = box(element, style, origin);
   for (const child of element.childNodes) {
     if (child.nodeType === Node.TEXT_NODE) parts.push(...words(child, style, origin));
-    else if (child.nodeType === Node.ELEMENT_NODE) parts.push(...traced(child, origin));
+    else if (child.nodeType === Node.ELEMENT_NODE && !(child instanceof HTMLButtonElement)) parts.push(...traced(child, origin));
   }
   return parts;
 }

@@ -9,14 +9,14 @@ export function gradient(scale) {
   return `linear-gradient(90deg, ${stops.join(", ")})`;
 }
 
-/** A scale with its quantity, unit and three numbers. */
-export function colourBar(scale) {
+/** A scale with its quantity, unit and three numbers; `more` stands behind the unit. */
+export function colourBar(scale, more = []) {
   const bar = make("i", { className: "viewer-ramp" });
   bar.style.background = gradient(scale);
   const middle = (scale.low + scale.high) / 2;
   const ticks = [scale.low, middle, scale.high].map((value) => make("span", {}, [String(Number(value.toPrecision(3)))]));
   return make("div", { className: "viewer-bar" }, [
-    make("span", { className: "viewer-quantity" }, [scale.title, make("em", {}, [` ${scale.unit}`])]),
+    make("span", { className: "viewer-quantity" }, [scale.title, make("em", {}, [` ${scale.unit}`]), ...more]),
     make("div", {}, [bar, make("div", { className: "viewer-ticks" }, ticks)]),
   ]);
 }

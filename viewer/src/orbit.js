@@ -46,13 +46,20 @@ export class Orbit {
 
   /** Look at a sphere from a direction given by the rows right, up, towards the eye; glide there. */
   look(axes, center, radius, aspect, glide = true) {
-    const matrix = new Matrix4().makeBasis(...[0, 3, 6].map((i) => new Vector3(...axes.slice(i, i + 3))));
     const half = (this.camera.fov * Math.PI) / 360;
-    const to = {
-      target: new Vector3(...center),
-      turned: new Quaternion().setFromRotationMatrix(matrix),
-      distance: radius / Math.sin(half) / Math.min(1, aspect),
-    };
+    this.go({ axes, center, distance: radius / Math.sin(half) / Math.min(1, aspect) }, glide);
+  }
+
+  /** How the camera stands: rows right, up, towards the eye; the point about which it turns; its distance from it. */
+  get stand() {
+    const { elements } = new Matrix4().makeRotationFromQuaternion(this.turned);
+    return { axes: [0, 1, 2].flatMap((k) => elements.slice(4 * k, 4 * k + 3)), center: this.target.toArray(), distance: this.distance };
+  }
+
+  /** Bring the camera to a stand. */
+  go({ axes, center, distance }, glide = true) {
+    const matrix = new Matrix4().makeBasis(...[0, 3, 6].map((i) => new Vector3(...axes.slice(i, i + 3))));
+    const to = { target: new Vector3(...center), turned: new Quaternion().setFromRotationMatrix(matrix), distance };
     if (glide && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.fly(to);
     else this.jump(to);
   }

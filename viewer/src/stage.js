@@ -20,6 +20,7 @@ export class Stage {
     this.drawn = () => {};
     this.orbit = new Orbit(this.camera, () => this.redraw());
     this.scales = {};
+    this.ranges = {};
     this.layers = [];
     this.panes = [];
     this.shown = new Set();
@@ -28,15 +29,40 @@ export class Stage {
 
   /** Add layers and their scales; a layer of the same name in the same pane is replaced. */
   put(manifest, buffer) {
-    for (const scale of manifest.scales)
-      this.scales[scale.id] = { ...scale, texture: paint.lookup(integers(buffer, scale.colours)) };
+    for (const scale of manifest.scales) {
+      const { id, low, high } = scale;
+      this.scales[id] = { ...scale, given: { low, high }, ...this.ranges[id], texture: paint.lookup(integers(buffer, scale.colours)) };
+    }
     for (const { id, pane } of manifest.layers) this.drop((layer) => layer.id === id && layer.pane === pane);
     for (const layer of manifest.layers) {
       const built = this.build(layer, buffer);
       this.layers.push(built);
       this.scene.add(built.object);
     }
+    for (const { id } of manifest.scales) this.span(id);
     this.redraw();
+  }
+
+  /** Colour by a range {low, high} of one's own; null: by the one that the messages state. */
+  setRange(id, range) {
+    this.ranges[id] = range;
+    Object.assign(this.scales[id], range ?? this.scales[id].given);
+    this.span(id);
+    this.redraw();
+  }
+
+  /** All layers of a scale have its range: what an earlier message brought as well. */
+  span(id) {
+    const { low, high } = this.scales[id];
+    for (const { object } of this.layers.filter(({ scale }) => scale === id)) object.traverse((part) => part.material?.uniforms.span.value.set(low, high));
+  }
+
+  /** Lowest and highest value of the layers that `isChosen`; null where there are none. */
+  extent(isChosen) {
+    let [low, high] = [Infinity, -Infinity];
+    for (const { object } of this.layers.filter(isChosen))
+      object.traverse((part) => part.geometry?.attributes.value?.array.forEach((value) => ([low, high] = [Math.min(low, value), Math.max(high, value)])));
+    return low < high ? { low, high } : null;
   }
 
   /** Take away the layers that `isChosen`. */

@@ -227,7 +227,7 @@ class Viewer {
   showBars() {
     const used = new Set(this.manifest.layers.filter((layer) => this.shown.has(layer.id)).map((layer) => layer.scale));
     const scales = Object.values(this.stage.scales).filter((scale) => used.has(scale.id));
-    this.bars.replaceChildren(...scales.map(colourBar));
+    this.bars.replaceChildren(...scales.map((scale) => colourBar(scale)));
   }
 
   look(id, glide = true) {

@@ -69,6 +69,25 @@ class FlowChoice(Strict):
         )
 
 
+Unit = Annotated[float, Field(ge=-1.001, le=1.001, allow_inf_nan=False)]
+"""A component of a unit vector."""
+Axes = Annotated[tuple[Unit, ...], Field(min_length=9, max_length=9)]
+"""Unit vectors to the right, up and toward the eye, one after the other."""
+
+
+class SavedView(Strict):
+    """Where the camera of the 3-D view stands."""
+
+    name: str = Field(min_length=1, max_length=40)
+    """Displayed name."""
+    axes: Axes
+    """Directions of the picture."""
+    center_mm: Point
+    """Point about which the view turns."""
+    distance_mm: Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
+    """Distance of the camera from it."""
+
+
 class Choices(Strict):
     """All choices of the user; missing values are proposed."""
 
@@ -106,6 +125,8 @@ class Choices(Strict):
     """Number of best sizes of a ranking that get a flow; None: none."""
     uncertainty_samples: Annotated[int, Field(ge=8, le=256)] | None = None
     """Number of deployments with uncertain inputs varied; None: none."""
+    views: Annotated[tuple[SavedView, ...], Field(max_length=12)] = ()
+    """Views that were saved; no result depends on them."""
 
     @field_validator("devices")
     @classmethod
