@@ -197,6 +197,7 @@ def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path,
     assert study["stents"]["silk"]["deployment"]["deployed_length_mm"] == pytest.approx(alone[key], rel=1e-5)
     page = (out / "cohort.html").read_text()
     assert last["sentence"] in page.replace("&#39;", "'")
+    assert re.findall(r'alt="(.*?)"', page) == ["silk in the artery of first"]  # the other case has no device
     assert main([*command, "--jobs", "2"]) == 0
     assert "0 cases to do" in capsys.readouterr().out
 

@@ -76,7 +76,7 @@ def test_ids_are_unique_and_every_anchor_leads_somewhere(page):
 
 def test_every_picture_has_words_for_those_who_cannot_see_it(page):
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
-    assert len(pictures) == 13
+    assert len(pictures) == 16
     assert all(len(attributes["alt"]) > 40 for attributes in pictures)
 
 

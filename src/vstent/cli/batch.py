@@ -40,7 +40,7 @@ def add(commands: options.Commands) -> None:
 def _batch(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     from vstent.cli.console import Console, cohort_table
-    from vstent.cohort.batch import collect, left_to_do, run_cohort, write_table
+    from vstent.cohort.batch import collect, left_to_do, pictures_of, run_cohort, write_table
     from vstent.cohort.cases import device_rows, find_cases
     from vstent.cohort.estimate import estimate
 
@@ -54,7 +54,7 @@ def _batch(arguments: argparse.Namespace) -> int:
         run_cohort(tasks, arguments.out, _crew(arguments, foreseen), _teller(console))
     rows = collect(cases, arguments.out)
     written = write_table(arguments.out, rows)
-    _report(arguments.out, rows)
+    _report(arguments.out, rows, pictures_of(rows, arguments.out))
     console.print(cohort_table(rows))
     console.print(f"Results in {', '.join(str(path) for path in [*written, arguments.out / 'cohort.html'])}.")
     if len(written) == 1:
@@ -89,9 +89,9 @@ def _seconds(rows: Sequence[dict[str, Any]]) -> str:
     return ", ".join(sorted({f"{row['case_s']:.0f} s" for row in rows if "case_s" in row}))
 
 
-def _report(out: Path, rows: Sequence[dict[str, Any]]) -> None:
+def _report(out: Path, rows: Sequence[dict[str, Any]], pictures: dict[tuple[str, str], bytes]) -> None:
     """Write the report of the cohort."""
     from vstent.io.writers import write_text
     from vstent.reporting.cohort import cohort_report
 
-    write_text(out / "cohort.html", cohort_report(out.resolve().name, rows))
+    write_text(out / "cohort.html", cohort_report(out.resolve().name, rows, pictures))

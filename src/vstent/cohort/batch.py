@@ -12,7 +12,7 @@ from typing import Final, Protocol
 
 from vstent.cohort.cases import Case
 from vstent.cohort.crews import AbstractCrew
-from vstent.cohort.work import LOST, Row, Task, read_row, write_row
+from vstent.cohort.work import LOST, Row, Task, picture_path, read_row, write_row
 from vstent.io.tables import write_parquet, write_rows
 
 CASES: Final = "cases"
@@ -81,6 +81,18 @@ def collect(cases: Sequence[Case], out: Path) -> list[Row]:
     """
     rows = [read_row(_folder(case, out), device, key) for case in cases for device, key in case.keys.items()]
     return [row for row in rows if row is not None]
+
+
+def pictures_of(rows: Sequence[Row], out: Path) -> dict[tuple[str, str], bytes]:
+    """Return the pictures that exist of cases with devices, as PNG by name of case and device.
+
+    Parameters
+    ----------
+    rows : rows of the cohort table.
+    out : output folder of the cohort.
+    """
+    paths = {(row["case"], row["device"]): picture_path(out / CASES / row["case"], row["device"]) for row in rows}
+    return {key: path.read_bytes() for key, path in paths.items() if path.is_file()}
 
 
 def write_table(out: Path, rows: Sequence[Row]) -> list[Path]:

@@ -12,7 +12,9 @@ from typing import Any, Final
 
 from vstent.cohort.cases import Case
 from vstent.errors import VstentError
+from vstent.io.files import atomic
 from vstent.io.writers import write_json, write_text
+from vstent.reporting.figures import patient_picture
 from vstent.study.pipeline import restore_vessel, run
 from vstent.study.types import Progress, Settings
 
@@ -61,6 +63,11 @@ def row_path(folder: Path, device: str) -> Path:
     return folder / f"{device}.json"
 
 
+def picture_path(folder: Path, device: str) -> Path:
+    """Return the file of the picture of a device in the folder of a case."""
+    return folder / f"{device}.png"
+
+
 def work(task: Task) -> None:
     """Run one case: deploy every missing device and write the rows.
 
@@ -103,6 +110,8 @@ def _rows(task: Task) -> dict[str, Row]:
         def with_device(watch: Progress, device: str = device, alone: Settings = alone) -> None:
             found = run(case.path, study, alone, watch, replaces=True)
             advice = found.deployments[device].advice
+            with atomic(picture_path(task.folder, device)) as partial:
+                partial.write_bytes(patient_picture(found.anatomy, found.deployments[device]))
             rows[device] = {"outcome": DONE, "stage": "", "sentence": advice} | flat_metrics(found.metrics, device)
 
         failed = _failure(task, with_device)

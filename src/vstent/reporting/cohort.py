@@ -1,13 +1,15 @@
 """Report of a cohort: counts of finished and failed cases, distributions of their metrics, and outliers."""
 
+import base64
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
-from vstent.reporting.page import asset
+from vstent.reporting.page import as_webp, asset
 from vstent.reporting.quantities import Quantity, format_value
 
 Row = Mapping[str, Any]
@@ -32,6 +34,10 @@ HEADLINES: Final = (
     "peak_memory_MB",
 )
 """Keys of the table columns that are drawn and searched for outliers; the end of each key is its unit."""
+UNDER_PICTURE: Final = ("deployment.deployed_length_mm", "deployment.neck_metal_coverage_fraction")
+"""Keys of the metrics that stand under the picture of a patient."""
+EMPTY: Final[Mapping[tuple[str, str], bytes]] = MappingProxyType({})
+"""No pictures."""
 OUTLYING: Final = 3.5
 """Absolute modified z-score above which a value is an outlier.
 
@@ -73,7 +79,7 @@ class Outlier(NamedTuple):
     """Modified z-score, signed."""
 
 
-def cohort_report(name: str, rows: Sequence[Row]) -> str:
+def cohort_report(name: str, rows: Sequence[Row], pictures: Mapping[tuple[str, str], bytes] = EMPTY) -> str:
     """Return the report of a cohort as the text of one HTML file.
 
     The file is self-contained: it loads nothing from a network.
@@ -82,6 +88,7 @@ def cohort_report(name: str, rows: Sequence[Row]) -> str:
     ----------
     name : name of the cohort.
     rows : one row per case and device, with ``case``, ``device``, ``outcome``, ``stage``, ``sentence`` and metrics.
+    pictures : pictures of the deployed devices as PNG, by case and device.
 
     Returns
     -------
@@ -97,6 +104,7 @@ def cohort_report(name: str, rows: Sequence[Row]) -> str:
         name=name,
         style=Markup(asset("report.css")),
         counts=[(device, *_counts(rows, device)) for device in devices],
+        patients=[(device, shown) for device in devices if (shown := _patients(rows, device, pictures))],
         n_cases=len({row["case"] for row in rows}),
         distributions=[
             (_name(key), [distribution(done, device, key) for device in devices if _values(done, device, key)])
@@ -107,6 +115,23 @@ def cohort_report(name: str, rows: Sequence[Row]) -> str:
         failures=[row for row in rows if row["outcome"] != "done"],
         limit=OUTLYING,
     )
+
+
+def _patients(
+    rows: Sequence[Row], device: str, pictures: Mapping[tuple[str, str], bytes]
+) -> list[tuple[str, str, str]]:
+    """Return case, caption and base64-encoded WebP of every picture of a device, in the order of the rows."""
+    found = [row for row in rows if row["device"] == device and (row["case"], device) in pictures]
+    return [
+        (str(row["case"]), _caption(row), base64.b64encode(as_webp(pictures[row["case"], device])).decode("ascii"))
+        for row in found
+    ]
+
+
+def _caption(row: Row) -> str:
+    """Return the values under the picture of a patient."""
+    shown = [(key, row[key]) for key in UNDER_PICTURE if _is_number(row.get(key))]
+    return ", ".join(f"{_name(key).lower()} {format_value(_leaf(key), float(value))}" for key, value in shown)
 
 
 def _counts(rows: Sequence[Row], device: str) -> tuple[int, int, int]:

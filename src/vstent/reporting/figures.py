@@ -6,10 +6,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from vstent.devices.design import BARE
+from vstent.devices.stent import Deployment
+from vstent.geometry.vessel import Anatomy
 from vstent.kernels import raster
 from vstent.kernels.arrays import Floats
 from vstent.reporting.lettering import blank, color_bar, length_bar, points_px, put, put_title
-from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View, view_of
+from vstent.reporting.scene import (
+    LineLayer,
+    MeshLayer,
+    Scene,
+    View,
+    anatomy_layers,
+    device_layers,
+    view_of,
+    views_of,
+)
 
 BACKGROUND = (0.965, 0.973, 0.978)
 """Background color: red, green and blue, 0 to 1."""
@@ -19,6 +30,8 @@ _LIGHT = np.array([-0.35, 0.50, 0.79])
 """Direction to the light in view axes (right, up, toward the eye), not normalized."""
 _SUPERSAMPLING = 2
 """Rendered pixels per picture pixel along each axis, averaged to smooth the edges."""
+PATIENT_PX = (420, 320)
+"""Width and height of the picture of one patient in a cohort, in pixels."""
 SEEN_GAP_MM = 0.1
 """Gap in mm from which a contour is shown from the side of its largest gap."""
 ABOVE = "Values above the scale have its last color."
@@ -70,12 +83,25 @@ def pictures(scene: Scene) -> list[Picture]:
     return found
 
 
-def overview(scene: Scene) -> bytes:
-    """Return one wide PNG that sums up a case: wires across the neck, and streamlines where a flow was computed."""
-    layers = ("lumen", "continued", "wires", "neck", "streamlines")
-    shots = [Shot(title, scene.pick(layers, pane), scene.view("profile")) for pane, title in scene.panes]
-    scales = {scale.id for scale in scene.scales}
-    return sheet(scene, shots, "speed" if "speed" in scales else "")
+def patient_picture(anatomy: Anatomy, deployment: Deployment) -> bytes:
+    """Return a small PNG of a device in the artery of a patient, in profile, for a grid of patients.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployment : the deployed device.
+    """
+    layers = [*anatomy_layers(anatomy), *device_layers("one", deployment, anatomy)]
+    shown = tuple(layer for layer in layers if layer.id in ("lumen", "continued", "wires", "neck"))
+    fade_mm = 1.2 * float(np.median(anatomy.section_radius_mm))
+    views = views_of(anatomy, {"one": deployment})
+    scene = Scene((), tuple(layers), (), views, anatomy.vessel.is_oriented, fade_mm)
+    picture = blank(*PATIENT_PX)
+    put(picture, draw(shown, scene, views[0], PATIENT_PX), (0, 0))
+    length_bar(picture, span_mm(views[0], PATIENT_PX), (0, 0), PATIENT_PX)
+    stream = io.BytesIO()
+    picture.save(stream, "PNG")
+    return stream.getvalue()
 
 
 def draw(layers: tuple[MeshLayer | LineLayer, ...], scene: Scene, view: View, size_px: tuple[int, int]) -> Floats:

@@ -1,7 +1,8 @@
 """Pictures of the steps to a deployed device, in the order of Zhong et al. 2016.
 
-They show the parent artery with the sac removed, the maximum inscribed spheres along its axis, the initial contour,
-its expansion, and the wires in the parent artery and in the patient's own artery.
+They show the devices outside an artery, the vessel before it is trimmed, the parent artery with the sac removed, the
+maximum inscribed spheres along its axis, the initial contour with its triangles, the rule for its nodes, its expansion,
+and the wires in the parent artery and in the patient's own artery.
 """
 
 from dataclasses import replace
@@ -12,11 +13,13 @@ import numpy as np
 from vstent.devices.design import BARE
 from vstent.devices.stent import Deployment, tube_faces
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy
+from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.kernels.arrays import Floats, Ints
 from vstent.reporting.figures import Picture, Shot, sheet
-from vstent.reporting.scene import LineLayer, MeshLayer, Scene, curves_layer, round_up
-from vstent.reporting.thinning import some_frames, thin_frames
+from vstent.reporting.freestanding import freestanding_picture
+from vstent.reporting.node_rule import node_rule_picture
+from vstent.reporting.scene import LineLayer, MeshLayer, Scene, curves_layer, round_up, view_of
+from vstent.reporting.thinning import some_frames, thin_frames, thin_surface
 from vstent.units import counted
 
 if TYPE_CHECKING:
@@ -26,12 +29,17 @@ SPHERE_STEP: Final = 0.9
 """Distance between drawn spheres as a fraction of their radius."""
 FRAMES: Final = 4
 """Number of contours drawn of an expansion."""
+MESH_MM: Final = 3.0
+"""Distance from the middle of the neck, in mm, within which the triangles of a contour are drawn."""
+LARGER: Final = 1.02
+"""Ratio of the wall's areas before and after trimming from which both are drawn."""
 RINGS: Final = 28
 """Largest number of rows of the initial contour that are drawn as lines."""
 _SPHERE: Final = (0.36, 0.55, 0.72)
 _STEEL: Final = (0.58, 0.63, 0.68)
 _INK: Final = (0.10, 0.17, 0.20)
-"""Colors of spheres, contours and lines: red, green and blue, 0 to 1."""
+_WALL: Final = (0.62, 0.68, 0.73)
+"""Colors of spheres, contours, lines and wall: red, green and blue, 0 to 1."""
 
 
 def method_pictures(case: "CaseResult", scene: Scene) -> list[Picture]:
@@ -42,12 +50,39 @@ def method_pictures(case: "CaseResult", scene: Scene) -> list[Picture]:
     case : the finished case.
     scene : its scene.
     """
-    found = [_restoration(scene), _spheres(case.anatomy, scene)]
+    found = [_trimming(case.whole, scene)] if case.whole is not None and _is_trimmed(case.whole, case.anatomy) else []
+    found += [_restoration(scene), _spheres(case.anatomy, scene)]
     if case.deployments:
-        found.append(_first_contours(case, scene))
+        stents = {title: case.deployments[name].stent for name, title in scene.panes[1:]}
+        found = [freestanding_picture(stents, scene, case.anatomy), *found]
+        found += [_first_contours(case, scene), _triangles(case, scene), node_rule_picture()]
         found += [_expansion(name, deployment, case.anatomy, scene) for name, deployment in case.deployments.items()]
         found.append(_fitted(scene))
     return found
+
+
+def _is_trimmed(whole: Vessel, anatomy: Anatomy) -> bool:
+    """Return whether a part of the vessel was removed that is worth a picture."""
+    return whole.lumen.areas_mm2.sum() > LARGER * anatomy.vessel.lumen.areas_mm2.sum()
+
+
+def _trimming(whole: Vessel, scene: Scene) -> Picture:
+    """Return the picture of the vessel before and after it is trimmed."""
+    surface, _ = thin_surface(whole.lumen, 60_000)
+    profile = scene.view("profile")
+    view = view_of("whole", profile.axes, surface.vertices_mm)
+    lumen = scene.pick(("lumen",), BARE)
+    untrimmed = MeshLayer("untrimmed", "", _WALL, "", np.zeros(0), surface)
+    shots = [
+        Shot("The vessel before it is trimmed", (untrimmed,), view),
+        Shot("The part that is kept", (replace(untrimmed, opacity=0.16), *_opaque(lumen)), view),
+        Shot("Enlarged", _opaque(lumen), profile),
+    ]
+    caption = (
+        "The vessel of the scan or surface before it is trimmed, and the part that is kept around the sac (Zhong et "
+        "al. 2016, fig. 5). Arteries are cut square to their centerlines."
+    )
+    return Picture("untrimmed", "The vessel before it is trimmed", caption, sheet(scene, shots, ""))
 
 
 def _restoration(scene: Scene) -> Picture:
@@ -117,6 +152,46 @@ def _first_contours(case: "CaseResult", scene: Scene) -> Picture:
         "the axis, each as wide as the maximum inscribed sphere. Some rows are drawn as lines."
     )
     return Picture("first", "The initial contour", caption, sheet(scene, shots, ""))
+
+
+def _triangles(case: "CaseResult", scene: Scene) -> Picture:
+    """Return the picture of the triangle mesh of each contour near the neck, before and after the expansion."""
+    profile, shots = scene.view("profile"), []
+    for name, title in scene.panes[1:]:
+        history_mm = case.deployments[name].history_mm
+        for words, nodes_mm in (("initial", history_mm[0]), ("deployed", history_mm[-1])):
+            middle = _middle_mm(case.anatomy)
+            near = np.linalg.norm(nodes_mm.mean(axis=1) - middle, axis=1) < MESH_MM
+            rows = nodes_mm[near] if near.sum() > 2 else nodes_mm
+            view = view_of("mesh", profile.axes, rows.reshape(-1, 3))
+            shots.append(Shot(f"{title}: {words}", (*_glass(scene), *mesh_layers(rows)), view))
+    caption = (
+        f"The triangles of the contour within {MESH_MM:g} mm of the neck, before the first iteration and deployed, in "
+        "the parent artery (glass; Zhong et al. 2016, fig. 6). Nodes are the corners of the triangles."
+    )
+    return Picture("mesh", "The triangle mesh of the contour", caption, sheet(scene, shots, ""))
+
+
+def _middle_mm(anatomy: Anatomy) -> Floats:
+    """Return the point (3,) of the axis at the middle of the neck, or without a sac of the artery."""
+    axis, sacs = anatomy.axis, anatomy.aneurysms
+    middle = 0.5 * (sacs[0].proximal_abscissa_mm + sacs[0].distal_abscissa_mm) if sacs else 0.5 * axis.length_mm
+    return axis.at(np.array([middle]))[0]
+
+
+def mesh_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
+    """Return a contour as a surface and the edges of its triangles as lines.
+
+    Parameters
+    ----------
+    nodes_mm : (rows, columns, 3) nodes.
+    """
+    rows, columns = nodes_mm.shape[:2]
+    surface = Surface(nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
+    corners = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
+    edges = np.unique(np.sort(corners, axis=1), axis=0)
+    lines = curves_layer("edges", list(surface.vertices_mm[edges]), 0.008, _INK)
+    return MeshLayer("mesh", "", _STEEL, "", np.zeros(0), surface), lines
 
 
 def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:

@@ -373,6 +373,7 @@ _SCALES = {
     "wall_gap": ("Gap between device and wall", "mm", "cividis", 0.1),
     "coverage": ("Metal coverage", "%", "viridis", 40.0),
     "diameter": ("Deployed diameter", "mm", "viridis", 1.0),
+    "wire_diameter": ("Diameter of wires, width of struts", "µm", "viridis", 1.0),
 }
 """Name of a scale: title, unit, color map, and the smallest upper end of the scale."""
 _OF_FLOW = ("speed", "shear", "sac_shear")

@@ -82,13 +82,26 @@ class Ledger:
         if not path.exists():
             return None
         self.progress(name, 0.0, "")
-        try:
-            result = load_data(path, kind)
-        except ReadError:
+        result = self.stored(name, key, kind)
+        if result is None:
             return None
         self.seconds |= _seconds_of(path)
         self.progress(name, 1.0, "already done")
         return result
+
+    def stored(self, name: str, key: str, kind: type[Kept]) -> Kept | None:
+        """Return the result stored under a key, without a report of it; None where it is missing or damaged.
+
+        Parameters
+        ----------
+        name : name of the result.
+        key : key of everything that it depends on.
+        kind : data class of the result.
+        """
+        try:
+            return load_data(self.folder / f"{name}-{key}.npz", kind)
+        except (ReadError, OSError):
+            return None
 
     def hold(self, name: str, key: str, result: Any) -> None:
         """Keep a result in memory until `settle` is called, because a later input may still prove unusable.

@@ -22,7 +22,7 @@ from vstent.study.contrast import add_measures, kept_measures
 from vstent.study.crate import NAME as CRATE
 from vstent.study.folder import CACHE, claiming
 from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
-from vstent.study.ledger import ANATOMY, Ledger, hash_of, key_of
+from vstent.study.ledger import ANATOMY, Ledger, hash_of, key_of, vessel_key
 from vstent.study.outputs import (
     STENT,
     take_away_measures,
@@ -112,7 +112,8 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
     notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
-    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, failures, notes)
+    whole = ledger.stored("vessel", vessel_key(source, settings), Vessel)
+    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, failures, notes, whole)
 
 
 def _measures(

@@ -5,7 +5,7 @@ from typing import Any, Literal, Protocol
 
 from vstent.devices.stent import Deployment
 from vstent.flow.case import FlowField, FlowSettings
-from vstent.geometry.vessel import Anatomy
+from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.plan.uncertainty import Ranges
 
 Point = tuple[float, float, float]
@@ -104,3 +104,5 @@ class CaseResult:
     """Reason why a device was not deployed or its flow not computed, by device name."""
     notes: tuple[str, ...]
     """Findings, assumptions and repairs, and the reliability of every flow, one sentence each."""
+    whole: Vessel | None = None
+    """The vessel before it was trimmed; None where it is not stored."""
