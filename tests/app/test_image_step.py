@@ -46,13 +46,28 @@ def ball_scan():
     return Image((200 * inside).astype(np.uint8).reshape(SHAPE), affine)
 
 
+TURN_DEG = 16.0
+"""Angle of the oblique scan against the patient."""
+
+
+def about_x(degrees):
+    """Rotation about the axis from the right to the left."""
+    angle = np.radians(degrees)
+    return np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+
+
 SIZES = [(1920, 1080), (1366, 768), (1024, 768)]
 
 
-def ball_case(workspace, name):
-    """A case of which only the scan is there."""
-    case = Store(workspace).create(name)
-    write_nifti(case.folder / "input" / "scan.nii.gz", ball_scan())
+def ball_case(workspace, name, turn=None):
+    """A case of which only the scan is there; its axes may be turned about its middle."""
+    case, image = Store(workspace).create(name), ball_scan()
+    if turn is not None:
+        affine = image.affine_mm.copy()
+        affine[:3, :3] = turn @ affine[:3, :3]
+        affine[:3, 3] = CENTER_MM - affine[:3, :3] @ ((np.array(SHAPE) - 1) / 2)
+        image = Image(image.voxels, affine)
+    write_nifti(case.folder / "input" / "scan.nii.gz", image)
     case.update(input="input/scan.nii.gz", source="ball")
 
 
@@ -83,6 +98,7 @@ def client(workspace):
     analytic_case(workspace)
     for width, _ in SIZES:
         ball_case(workspace, f"ball-{width}")
+    ball_case(workspace, "turned", about_x(TURN_DEG))
     with app_case.served(workspace) as client:
         yield client
 
@@ -285,3 +301,45 @@ def test_outlines_of_all_that_was_found_lie_on_the_slices(client):
         playwright.expect(pane_of(page, "Axial")).to_be_hidden()
         pane_of(page, "Coronal").get_by_role("button").click()
         playwright.expect(pane_of(page, "Axial")).to_be_visible()
+
+
+def test_an_oblique_scan_is_shown_along_the_patient_or_along_its_file(client):
+    """Anatomical planes move along the patient's axes; the slices of the file say by how much they are turned."""
+    with browsing(client, 1024, 768) as page:
+        page.locator(".recent-case", has_text="turned").click()
+        page.locator(".slice[data-bar]").nth(2).wait_for()
+        along = page.get_by_label("Direction of the slices")
+        assert along.input_value() == "patient"
+        labels = [words.split(" ")[0] for words in page.locator(".slice-label").all_inner_texts()]
+        assert sorted(labels) == ["Axial", "Coronal", "Sagittal"]
+        assert page.get_by_role("button", name="Crop").is_disabled()
+        axial = pane_of(page, "Axial")
+        moved_mm = moved(page, axial)
+        np.testing.assert_allclose(moved_mm, [0, 5, 0], atol=0.35)
+        ball_mm = CENTER_MM + about_x(TURN_DEG) @ OFFSET_MM
+        page.mouse.click(*on_slice(pane_of(page, "Coronal"), *in_plane("Coronal", ball_mm - CENTER_MM)))
+        # The ball is round in a true axial plane, and its middle is where the patient has it.
+        assert in_time(page, lambda: abs(middle_mm(axial)[1] - (ball_mm - CENTER_MM)[1]) < 0.6)
+        before = reading(page)[1]
+        along.select_option("file")
+        playwright.expect(page.locator(".slice-label", has_text="Oblique to axial by 16°")).to_be_visible()
+        assert page.locator(".slice-label", has_text="Sagittal").count() == 1  # the axis about which it is turned
+        np.testing.assert_allclose(reading(page)[1], before, atol=0.06)
+        moved_mm = moved(page, pane_of(page, "Oblique to axial"))
+        np.testing.assert_allclose(moved_mm, about_x(TURN_DEG) @ [0, 5, 0], atol=0.35)
+        assert page.get_by_role("button", name="Crop").is_enabled()
+
+
+def middle_mm(pane):
+    """Middle of what is bright on a slice, from the middle of the slice: to the right and down."""
+    box, scale = pane.locator(".slice-area").bounding_box(), pixels_per_mm(pane)
+    x, y = pane.locator("canvas").evaluate(MIDDLE_OF_WHITE)
+    return [x * box["width"] / scale, y * box["height"] / scale] if x is not None else [np.inf, np.inf]
+
+
+def moved(page, pane):
+    """Change of the position in LPS mm over 5 mm downwards on a slice."""
+    page.mouse.move(*on_slice(pane, 1, -2))
+    before = reading(page)[1]
+    page.mouse.move(*on_slice(pane, 1, 3))
+    return reading(page)[1] - before

@@ -115,3 +115,72 @@ def test_keys_change_with_the_crop_box_only_where_there_is_one():
 class _Answer:
     def __init__(self, content):
         self.content = content
+
+
+def turned_scan(degrees):
+    """A scan turned about the axis from right to left, whose intensities are linear in the position."""
+    angle = np.radians(degrees)
+    turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    affine = np.eye(4)
+    affine[:3, :3] = turn * SPACING_MM
+    affine[:3, 3] = [-20.0, 5.0, 40.0]
+    empty = Image(np.zeros(SHAPE, dtype=np.float32), affine)
+    places_mm = empty.to_mm(np.moveaxis(np.indices(SHAPE), 0, -1).reshape(-1, 3))
+    return Image((100 + places_mm @ SLOPE).reshape(SHAPE).astype(np.float32), affine)
+
+
+SLOPE = np.array([1.0, -2.0, 0.5])
+"""Change of the intensity per mm."""
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_anatomical_planes_of_an_oblique_scan_hold_its_intensities(axis):
+    """Interpolation is exact for a linear intensity; outside the scan there is its lowest value."""
+    image = turned_scan(16.0)
+    scan = Scan(image)
+    assert scan.told()["oblique_deg"] == pytest.approx([0.0, 16.0, 16.0], abs=1e-6)
+    grid = scan.upright
+    assert grid.spacing_mm.tolist() == pytest.approx(SPACING_MM.tolist())
+    index = grid.shape[axis] // 2
+    manifest, data = app_case.opened(_Answer(scan.slice(axis, index, is_upright=True)))
+    found = app_case.numbers(manifest["values"], data).reshape(manifest["height"], manifest["width"]).T
+    place = np.moveaxis(np.indices(found.shape), 0, -1).reshape(-1, 2)
+    places_mm = grid.affine_mm[:3, 3] + grid.spacing_mm * np.insert(place, axis, index, axis=1)
+    inside = image.to_index(places_mm)
+    is_in = ((inside >= 0) & (inside <= np.array(SHAPE) - 1)).all(axis=1)
+    step = (image.voxels.max() - image.voxels.min()) / 65535
+    assert is_in.mean() > 0.4
+    np.testing.assert_allclose(found.ravel()[is_in], (100 + places_mm @ SLOPE)[is_in], atol=step + 1e-4)
+    is_out = ((inside < -1) | (inside > SHAPE)).any(axis=1)
+    assert found.ravel()[is_out] == pytest.approx(float(image.voxels.min()), abs=float(step))
+    ends_mm = image.to_mm(np.array([[0.0, 0, 0], np.array(SHAPE) - 1.0]))
+    assert (grid.to_index(ends_mm) > -1e-9).all()
+    assert (grid.to_index(ends_mm) < np.array(grid.shape)).all()
+
+
+def test_a_slab_of_anatomical_planes_is_the_maximum_of_its_slices():
+    scan = Scan(turned_scan(16.0))
+
+    def values(index, slab):
+        manifest, data = app_case.opened(_Answer(scan.slice(2, index, slab, is_upright=True)))
+        return app_case.numbers(manifest["values"], data)
+
+    np.testing.assert_array_equal(values(15, 2), np.max([values(index, 0) for index in range(13, 18)], axis=0))
+
+
+def test_a_straight_scan_and_one_without_orientation_keep_their_slices():
+    assert Scan(turned_scan(0.3)).upright is None
+    assert Scan(replace(turned_scan(16.0), is_oriented=False)).upright is None
+    permuted = turned_scan(90.0)
+    assert Scan(permuted).upright is None
+
+
+def test_outlines_of_an_anatomical_plane_lie_in_it():
+    """The spherical sac gives circles about its center, at a place of the patient and not of the file."""
+    grid = Scan(turned_scan(16.0)).upright
+    sac = report_case.anatomy().aneurysms[0].sac
+    index = round(float(grid.to_index(report_case.SAC_CENTER[None])[0, 1]))
+    pieces = section(grid, sac, 1, index).reshape(-1, 2)
+    points_mm = grid.affine_mm[:3, 3] + grid.spacing_mm * np.insert(pieces, 1, index, axis=1)
+    radius_mm = np.linalg.norm(points_mm - report_case.SAC_CENTER, axis=1)
+    np.testing.assert_allclose(radius_mm, report_case.SAC_MM, atol=0.02)

@@ -104,20 +104,20 @@ export class Imaging {
   drawCross() {
     const { picture, scan } = this.page;
     if (!this.slices || !scan || !picture.stage || !picture.seen) return null; // the camera has no place yet
-    const { cross, isCropped, tool, cropBox, views } = this.slices;
+    const { cross, isCropped, tool, cropBox, views, scan: grid } = this.slices;
     const center = this.slices.crossMm;
     const [x, y] = picture.onScreen(center);
-    const seen = (index) => {
-      const [u, v] = picture.onScreen(toMm(scan.affine_mm, index));
+    const seen = (index, affine = grid.affine_mm) => {
+      const [u, v] = picture.onScreen(toMm(affine, index));
       return [u - x, v - y];
     };
     // What lies in the plane of the eye is seen nowhere.
     const line = ([[a, b], [c, d]], attributes) => ([a, b, c, d].every(Number.isFinite) ? svg("line", { x1: a, y1: b, x2: c, y2: d, ...attributes }) : svg("g"));
     const along = [0, 1, 2].map((axis) => {
-      const ends = [0, scan.shape[axis] - 1].map((place) => seen(cross.map((other, i) => (i === axis ? place : other))));
+      const ends = [0, grid.shape[axis] - 1].map((place) => seen(cross.map((other, i) => (i === axis ? place : other))));
       return line(ends, { stroke: views[axis].laid.colour, "stroke-width": 1.6, opacity: 0.75 });
     });
-    const corners = Array.from({ length: 8 }, (_, c) => seen([0, 1, 2].map((axis) => cropBox[(c >> axis) & 1][axis])));
+    const corners = Array.from({ length: 8 }, (_, c) => seen([0, 1, 2].map((axis) => cropBox[(c >> axis) & 1][axis]), scan.affine_mm));
     const box = isCropped || tool === "crop" ? EDGES.map(([a, b]) => line([corners[a], corners[b]], { stroke: "#16262e", "stroke-width": 1.2, "stroke-dasharray": "4 3" })) : [];
     this.lines.replaceChildren(...box, ...along, svg("circle", { r: 4, fill: "none", stroke: "#16262e", "stroke-width": 1.6 }));
     return center;

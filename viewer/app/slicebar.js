@@ -26,13 +26,19 @@ export class SliceBar {
     this.presets.addEventListener("change", () => this.choose(this.presets.value));
     this.slab = make("select", { ariaLabel: "Slab" }, SLABS.map(([mm, title]) => make("option", { value: mm }, [title])));
     this.slab.addEventListener("change", () => slices.setSlab(Number(this.slab.value)));
+    this.along = make("select", { ariaLabel: "Direction of the slices" }, [
+      make("option", { value: "patient" }, ["Patient axes"]),
+      make("option", { value: "file" }, ["File axes"]),
+    ]);
+    this.along.title = "This scan is oblique: anatomical planes, interpolated, or the slices of the file";
+    this.along.addEventListener("change", () => slices.stand(this.along.value === "patient"));
     this.words = make("span", { className: "slice-window" });
     this.invert = make("button", { type: "button", title: "Dark vessels on a bright ground", ariaPressed: "false", onClick: () => slices.setWindow({ isInverted: !slices.window.isInverted }) }, ["Invert"]);
     const reset = make("button", { type: "button", title: "Window, zoom and slab as at first", onClick: () => this.reset() }, ["Reset"]);
     this.chips = make("div", { className: "slice-chips", role: "group", ariaLabel: "Outlines on the slices" });
     this.reading = make("output", { className: "slice-reading" });
     this.element = make("div", { className: "slice-bar" }, [
-      make("div", { className: "slice-row" }, [this.tools, this.extra, this.presets, this.words, this.invert, this.slab, reset, this.save()]),
+      make("div", { className: "slice-row" }, [this.tools, this.extra, this.presets, this.words, this.invert, this.along, this.slab, reset, this.save()]),
       make("div", { className: "slice-row" }, [this.chips, this.reading]),
     ]);
   }
@@ -59,7 +65,7 @@ export class SliceBar {
           view.paint(scale);
           return [copied(view.canvas), view.area.getBoundingClientRect()];
         }),
-    });
+    }, "Save");
   }
 
   show(scan) {
@@ -67,6 +73,8 @@ export class SliceBar {
     this.windows = { Automatic: null, "Vessels": null, "Whole range": null, ...(isCt ? CT : {}) };
     this.presets.replaceChildren(make("option", { value: "" }, ["Window …"]), ...Object.keys(this.windows).map((name) => make("option", { value: name }, [name])));
     this.presets.value = "Automatic";
+    this.along.hidden = !scan.upright;
+    this.along.value = this.slices.isUpright ? "patient" : "file";
     this.renderTools();
     this.renderChips();
   }
@@ -104,6 +112,10 @@ export class SliceBar {
       ...TOOLS.map(([id, title, hint]) => {
         const button = make("button", { type: "button", title: hint, ariaPressed: String(slices.tool === id), onClick: () => slices.setTool(id) }, [title]);
         button.dataset.tool = id;
+        if (id === "crop" && slices.isUpright) {
+          button.disabled = true;
+          button.title = "The crop box lies along the axes of the file: choose them for the slices first";
+        }
         return button;
       }),
     );

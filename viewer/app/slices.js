@@ -36,12 +36,31 @@ export class Slices {
 
   /** Begin with a scan: its middle slices. */
   show(scan) {
-    this.scan = scan;
+    this.file = scan;
     this.isTurned = false;
+    this.isUpright = Boolean(scan.upright);
+    this.scan = this.isUpright ? { ...scan, ...scan.upright } : scan;
     this.resetWindow();
-    for (const view of this.views) view.show(scan);
-    this.bar.show(scan);
-    this.put(scan.shape.map((n) => Math.floor(n / 2)));
+    for (const view of this.views) view.show(this.scan);
+    this.bar.show(this.scan);
+    this.put(this.scan.shape.map((n) => Math.floor(n / 2)));
+  }
+
+  /** Lay the slices along the axes of the patient, or along those of the file. */
+  stand(isUpright) {
+    const [point, tool] = [this.crossMm, this.tool];
+    this.isUpright = isUpright;
+    this.scan = isUpright ? { ...this.file, ...this.file.upright } : this.file;
+    this.rulers = [];
+    for (const view of this.views) view.show(this.scan);
+    this.setSeed(this.seedMm);
+    this.put(toIndex(this.scan.affine_mm, point));
+    this.setTool(isUpright && tool === "crop" ? "cross" : tool);
+  }
+
+  /** Which grid the server is asked for. */
+  get asked() {
+    return this.isUpright ? "&upright=true" : "";
   }
 
   /** Show the slices through a point of the world, unless somebody has turned to others. */
@@ -109,7 +128,7 @@ export class Slices {
   }
 
   keyOf(view, index) {
-    return `${view.axis} ${index} ${this.slabOf(view)}`;
+    return `${view.axis} ${index} ${this.slabOf(view)} ${this.isUpright}`;
   }
 
   /** A slice from memory or from the server; those beside it follow while nothing else is wanted. */
@@ -118,7 +137,7 @@ export class Slices {
     const { scan } = this;
     let plane = this.kept.get(key);
     if (!plane) {
-      const { manifest, buffer } = await getBinary(`${this.host.path()}/image/slice?axis=${view.axis}&index=${index}&slab=${this.slabOf(view)}`);
+      const { manifest, buffer } = await getBinary(`${this.host.path()}/image/slice?axis=${view.axis}&index=${index}&slab=${this.slabOf(view)}${this.asked}`);
       plane = { width: manifest.width, height: manifest.height, values: integers(buffer, manifest.values) };
       if (scan !== this.scan) return null;
       this.keep(key, plane);
@@ -159,6 +178,10 @@ export class Slices {
     this.bar.renderChips();
   }
 
+  get outlineKey() {
+    return `${this.found} ${this.isUpright}`;
+  }
+
   reloadOutlines() {
     for (const view of this.views) {
       view.outlines = null;
@@ -168,17 +191,17 @@ export class Slices {
 
   loadOutlines(view) {
     if (!this.found) return;
-    const [index, { found, device }] = [view.index, this];
+    const [index, { outlineKey: found, device }] = [view.index, this];
     if (view.outlines?.index === index && view.outlines.found === found) return;
     const wires = device && this.on.wires ? `&device=${encodeURIComponent(device)}` : "";
     this.outlineLines[view.axis].ask(async () => {
       if (index !== view.index) return null;
-      return { view, index, found, answer: await getBinary(`${this.host.path()}/image/outlines?axis=${view.axis}&index=${index}${wires}`) };
+      return { view, index, found, answer: await getBinary(`${this.host.path()}/image/outlines?axis=${view.axis}&index=${index}${wires}${this.asked}`) };
     });
   }
 
   outlined({ view, index, found, answer: { manifest, buffer } }) {
-    if (found !== this.found) return;
+    if (found !== this.outlineKey) return;
     const outlines = { index, found };
     for (const [name, block] of Object.entries(manifest.segments)) outlines[name] = pathOf(numbers(buffer, block));
     if (manifest.wires) outlines.wires = numbers(buffer, manifest.wires);
@@ -240,6 +263,7 @@ export class Slices {
 
   /** The seed that is chosen, in LPS mm, or null. */
   setSeed(point) {
+    this.seedMm = point;
     this.seed = point && this.scan ? toIndex(this.scan.affine_mm, point) : null;
     this.paint();
   }
@@ -266,17 +290,17 @@ export class Slices {
 
   /** First and last voxel of the crop box. */
   get cropBox() {
-    return this.crop ?? [[0, 0, 0], this.scan.shape.map((n) => n - 1)];
+    return this.crop ?? [[0, 0, 0], this.file.shape.map((n) => n - 1)];
   }
 
   get isCropped() {
-    return this.crop !== null && this.crop.some((corner, end) => corner.some((place, axis) => place !== (end ? this.scan.shape[axis] - 1 : 0)));
+    return this.crop !== null && this.crop.some((corner, end) => corner.some((place, axis) => place !== (end ? this.file.shape[axis] - 1 : 0)));
   }
 
   /** The box that is chosen, as opposite corners in LPS mm, or null. */
   setCrop(corners) {
     if (!this.scan) return;
-    const found = corners?.map((corner) => toIndex(this.scan.affine_mm, corner).map(Math.round));
+    const found = corners?.map((corner) => toIndex(this.file.affine_mm, corner).map(Math.round));
     this.crop = found ? [0, 1].map((end) => found[0].map((_, axis) => Math[end ? "max" : "min"](found[0][axis], found[1][axis]))) : null;
     this.bar.renderTools();
     this.paint();
@@ -295,7 +319,7 @@ export class Slices {
 
   letCropGo() {
     this.bar.renderTools();
-    this.host.cropped(this.isCropped ? this.crop.map((corner) => toMm(this.scan.affine_mm, corner)) : null);
+    this.host.cropped(this.isCropped ? this.crop.map((corner) => toMm(this.file.affine_mm, corner)) : null);
   }
 
   // -- the views together ---------------------------------------------------------------------------------------------
@@ -319,6 +343,11 @@ export class Slices {
     this.host.alone(isAlone);
   }
 
+  /** Index in the file of an index of the slices. */
+  voxelAt(index) {
+    return this.isUpright ? toIndex(this.file.affine_mm, toMm(this.scan.affine_mm, index)) : index;
+  }
+
   /** What is under the pointer, or at the cross-hair. */
   point(view, index) {
     this.pointer = view && view.isInside(index) ? { view, index } : null;
@@ -329,6 +358,7 @@ export class Slices {
   get reading() {
     const view = this.pointer?.view ?? this.views.find(({ plane }) => plane) ?? this.views[0];
     const index = this.pointer?.index ?? this.cross;
-    return { index: index.map(Math.round), mm: toMm(this.scan.affine_mm, index), value: view.valueAt(index), isPointer: Boolean(this.pointer) };
+    const mm = toMm(this.scan.affine_mm, index);
+    return { index: this.voxelAt(index).map(Math.round), mm, value: view.valueAt(index), isPointer: Boolean(this.pointer) };
   }
 }

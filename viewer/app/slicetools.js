@@ -123,7 +123,7 @@ export class Handling {
     }[event.key];
     if (arrows[event.key]) this.nudge(arrows[event.key], event.shiftKey ? 5 : 1);
     else if (act) act();
-    else if (KEYS[event.key]) slices.setTool(KEYS[event.key]);
+    else if (KEYS[event.key] && !(KEYS[event.key] === "crop" && slices.isUpright)) slices.setTool(KEYS[event.key]);
     else return;
     event.preventDefault();
     event.stopPropagation();

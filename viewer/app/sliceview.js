@@ -134,6 +134,7 @@ export class SliceView {
   /** Intensity at an index, as the file states it; undefined outside and before the slice has come. */
   valueAt(index) {
     if (!this.plane || !this.isInside(index)) return undefined;
+    if (!this.host.voxelAt(index).every((place, axis) => place > -0.5 && place < this.host.file.shape[axis] - 0.5)) return undefined;
     const [column, row] = this.axes.map((axis) => Math.min(Math.max(Math.round(index[axis]), 0), this.scan.shape[axis] - 1));
     return this.scan.ends[0] + this.scan.step * this.plane.values[row * this.plane.width + column];
   }
@@ -336,7 +337,8 @@ export class SliceView {
   }
 
   paintCrop(context) {
-    if (!this.host.isCropped && this.host.tool !== "crop") return;
+    // The box lies along the axes of the file.
+    if (this.host.isUpright || (!this.host.isCropped && this.host.tool !== "crop")) return;
     const half = this.host.cropBox.map((corner, end) => corner.map((place) => place + (end ? 0.5 : -0.5)));
     const [[a, b], [c, d]] = half.map((corner) => this.onPage(corner));
     const [left, top, right, bottom] = [Math.min(a, c), Math.min(b, d), Math.max(a, c), Math.max(b, d)];

@@ -17,14 +17,16 @@ export function worldAxes(a) {
 }
 
 /** How the slice across an axis of the voxels is laid: its plane, and the axes and directions to the right and down. */
-export function laid({ affine_mm, is_oriented }, axis) {
+export function laid({ affine_mm, is_oriented, oblique_deg }, axis) {
   const across = worldAxes(affine_mm);
   const plane = PLANES[across[axis]];
   const [right, down] = [plane.right, plane.down].map(([world, wanted]) => {
     const voxels = across.indexOf(world);
     return { axis: voxels, sign: wanted * (affine_mm[4 * world + voxels] < 0 ? -1 : 1) };
   });
-  const words = is_oriented ? {} : { title: BARE[across[axis]], letters: ["", "", "", ""] };
+  const angle = Math.round(oblique_deg[axis]);
+  const oblique = angle ? { title: `Oblique to ${plane.title.toLowerCase()} by ${angle}°` } : {};
+  const words = is_oriented ? oblique : { title: BARE[across[axis]], letters: ["", "", "", ""] };
   return { ...plane, ...words, world: across[axis], right, down };
 }
 

@@ -245,7 +245,7 @@ class Desk:
                 self._scans[case.id] = (grid, crop), found
             return found
 
-    def outlines(self, case: Case, device: str | None, axis: int, index: int) -> bytes:
+    def outlines(self, case: Case, device: str | None, axis: int, index: int, *, is_upright: bool = False) -> bytes:
         """Return the outlines on a slice as a message for the page.
 
         Parameters
@@ -254,12 +254,13 @@ class Desk:
         device : chosen device whose wires are cut; None: none.
         axis : voxel axis across the slice.
         index : voxel index along that axis.
+        is_upright : whether the slice is an anatomical plane of an oblique scan.
         """
         from vstent.app.outlines import outlines
 
         live = self.live(case)
         stent = None if device is None else live.deployment(live.choice(device)).stent
-        return outlines(self.scan(case).image, live.anatomy, stent, axis, index)
+        return outlines(self.scan(case).grid(is_upright=is_upright), live.anatomy, stent, axis, index)
 
     def input_surface(self, case: Case) -> bytes:
         """Return the surface of the input as read, as a message for the page.

@@ -1,11 +1,10 @@
 """Outlines on a slice of the scan: where its plane cuts the surfaces and the wires that were found."""
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from vstent.devices.stent import Stent
-from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import clipping
@@ -13,7 +12,14 @@ from vstent.kernels.arrays import Floats
 from vstent.reporting.packing import Packer
 
 
-def outlines(image: Image, anatomy: Anatomy, stent: Stent | None, axis: int, index: int) -> bytes:
+class Gridded(Protocol):
+    """A grid of voxels."""
+
+    def to_index(self, points_mm: Floats) -> Floats:
+        """Return the fractional voxel indices (n, 3) of positions (n, 3) in LPS mm."""
+
+
+def outlines(image: Gridded, anatomy: Anatomy, stent: Stent | None, axis: int, index: int) -> bytes:
     """Return the exact sections of all surfaces and wires by the plane of a slice, as a message for the page.
 
     Positions are voxel indices (column, row) in the slice. Surfaces give segments, wires give the points where their
@@ -21,7 +27,7 @@ def outlines(image: Image, anatomy: Anatomy, stent: Stent | None, axis: int, ind
 
     Parameters
     ----------
-    image : the scan.
+    image : the scan, or another grid of its slices.
     anatomy : vessel, parent artery and sacs.
     stent : device with wires; None: none.
     axis : voxel axis across the slice: 0, 1 or 2.
@@ -49,12 +55,12 @@ def _surfaces(anatomy: Anatomy) -> dict[str, list[Surface]]:
     }
 
 
-def section(image: Image, surface: Surface, axis: int, index: int) -> Floats:
+def section(image: Gridded, surface: Surface, axis: int, index: int) -> Floats:
     """Return the segments (s, 2, 2) in which the plane of a slice cuts a surface, as voxel indices in the slice.
 
     Parameters
     ----------
-    image : the scan.
+    image : the scan, or another grid of its slices.
     surface : the surface.
     axis : voxel axis across the slice.
     index : voxel index along that axis.
@@ -64,12 +70,12 @@ def section(image: Image, surface: Surface, axis: int, index: int) -> Floats:
     return np.delete(found, axis, axis=2)
 
 
-def crossings(image: Image, stent: Stent, axis: int, index: int) -> Floats:
+def crossings(image: Gridded, stent: Stent, axis: int, index: int) -> Floats:
     """Return where wires cross the plane of a slice (n, 3): column, row and diameter of the wire in mm.
 
     Parameters
     ----------
-    image : the scan.
+    image : the scan, or another grid of its slices.
     stent : device with wires.
     axis : voxel axis across the slice.
     index : voxel index along that axis.

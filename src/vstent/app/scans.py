@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 
 from vstent.anatomy.segment import propose
+from vstent.app.planes import Grid, is_oblique, oblique_deg, reformatted, upright
 from vstent.errors import InputError
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
@@ -66,9 +67,32 @@ class Scan:
         """Threshold that a study would use."""
         return propose(self.part)[0].threshold
 
+    @cached_property
+    def upright(self) -> Grid | None:
+        """Grid along the axes of the patient; None where the file's slices are anatomical or have no orientation."""
+        return upright(self.image) if is_oblique(self.image) else None
+
+    def grid(self, *, is_upright: bool) -> Image | Grid:
+        """Return the grid of the slices: that of the file, or the one along the axes of the patient.
+
+        Parameters
+        ----------
+        is_upright : whether the slices are anatomical planes.
+        """
+        return self.upright if is_upright and self.upright is not None else self.image
+
     def told(self) -> dict[str, Any]:
         """Return shape, spacing, affine, range and quantiles of the intensity; nothing that takes long."""
+        turned = self.upright
         return {
+            "oblique_deg": oblique_deg(self.image).tolist(),
+            "upright": turned
+            and {
+                "shape": turned.shape,
+                "spacing_mm": turned.spacing_mm.tolist(),
+                "affine_mm": turned.affine_mm.ravel().tolist(),
+                "oblique_deg": [0.0, 0.0, 0.0],
+            },
             "shape": self.image.voxels.shape,
             "spacing_mm": self.image.spacing_mm.tolist(),
             "affine_mm": self.image.affine_mm.ravel().tolist(),
@@ -80,7 +104,7 @@ class Scan:
             "quantiles": self._quantiles,
         }
 
-    def slice(self, axis: int, index: int, slab: int = 0) -> bytes:
+    def slice(self, axis: int, index: int, slab: int = 0, *, is_upright: bool = False) -> bytes:
         """Return the quantized values of one slice, or the maximum of a slab, as a message for the page.
 
         Columns run fastest. All slices share the quantization that `told` states: intensity = low + step * integer.
@@ -90,19 +114,22 @@ class Scan:
         axis : voxel axis across the slice: 0, 1 or 2.
         index : voxel index along that axis.
         slab : number of slices on each side that the maximum includes.
+        is_upright : whether the slice is an anatomical plane of an oblique scan, interpolated between its voxels.
 
         Raises
         ------
         InputError
             There is no such slice.
         """
-        voxels = self.image.voxels
-        if not 0 <= index < voxels.shape[axis]:
-            raise InputError(f"The scan has no slice {index} in this direction; it has {voxels.shape[axis]}.")
-        first, last = max(index - slab, 0), min(index + slab + 1, voxels.shape[axis])
-        place = [slice(None)] * 3
-        place[axis] = slice(first, last)
-        plane = voxels[tuple(place)].max(axis=axis).T
+        grid = self.upright if is_upright else None
+        count = (self.image.voxels.shape if grid is None else grid.shape)[axis]
+        if not 0 <= index < count:
+            raise InputError(f"The scan has no slice {index} in this direction; it has {count}.")
+        first, last = max(index - slab, 0), min(index + slab + 1, count)
+        if grid is None:
+            plane = np.moveaxis(self.image.voxels, axis, 0)[first:last].max(axis=0).T
+        else:
+            plane = reformatted(self.image, grid, axis, first, last).T
         low, step = self._ends[0], self._step
         levels = np.rint((plane.astype(np.float64) - low) / step)
         is_narrow = self._ends[1] - low <= 255 * step

@@ -291,12 +291,16 @@ def _add_input(api: APIRouter, desk: Desk) -> None:
         return {"proposed_threshold": desk.scan(desk.store.get(case_id)).proposed_threshold}
 
     @api.get("/api/cases/{case_id}/image/slice", summary="One slice of the scan, or the maximum of a slab (binary)")
-    def one_slice(case_id: str, axis: Axis, index: int, slab: Annotated[int, Query(ge=0)] = 0) -> Response:
-        return Response(desk.scan(desk.store.get(case_id)).slice(axis, index, slab), media_type=BINARY)
+    def one_slice(
+        case_id: str, axis: Axis, index: int, slab: Annotated[int, Query(ge=0)] = 0, upright: bool = False
+    ) -> Response:
+        scan = desk.scan(desk.store.get(case_id))
+        return Response(scan.slice(axis, index, slab, is_upright=upright), media_type=BINARY)
 
     @api.get("/api/cases/{case_id}/image/outlines", summary="Sections of vessel, sac, neck and device (binary)")
-    def outlines(case_id: str, axis: Axis, index: int, device: str | None = None) -> Response:
-        return Response(desk.outlines(desk.store.get(case_id), device, axis, index), media_type=BINARY)
+    def outlines(case_id: str, axis: Axis, index: int, device: str | None = None, upright: bool = False) -> Response:
+        found = desk.store.get(case_id)
+        return Response(desk.outlines(found, device, axis, index, is_upright=upright), media_type=BINARY)
 
     @api.get("/api/cases/{case_id}/image/surface", summary="The surface at a threshold (binary)")
     def surface(case_id: str, threshold: Finite) -> Response:
