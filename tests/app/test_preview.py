@@ -66,6 +66,35 @@ def test_a_device_lowers_the_inflow_and_old_values_are_marked(preview: Preview, 
     assert told["history"][-1] == pytest.approx(told["reductions"]["neck_inflow_mL_s"], abs=2.0)
 
 
+def test_whoever_draws_a_device_does_not_wait_for_the_flow(preview: Preview, anatomy: Anatomy) -> None:
+    """Devices are larger than the buffer of the pipe; while the process does not read, only the newest is kept."""
+    stent = vstent.deploy(vstent.find_design("silk"), anatomy).stent
+    os.kill(preview._process.pid, signal.SIGSTOP)
+    try:
+        began = time.monotonic()
+        for _ in range(20):
+            preview.place(stent)
+            assert manifest(preview)["is_stale"]
+        assert time.monotonic() - began < 1.0
+    finally:
+        os.kill(preview._process.pid, signal.SIGCONT)
+    began = time.monotonic()
+    until(preview, lambda told: not told["is_stale"])
+    assert time.monotonic() - began < 30.0  # two devices at most are placed, not twenty
+
+
+def test_streamlines_that_the_page_has_are_not_sent_again(preview: Preview) -> None:
+    preview.place(preview._stent)
+    os.kill(preview._process.pid, signal.SIGSTOP)
+    try:
+        told = manifest(preview)
+        assert told["layers"]
+        raw = preview.message(told["drawn"])
+        assert json.loads(raw[4 : 4 + int.from_bytes(raw[:4], "little")])["layers"] == []
+    finally:
+        os.kill(preview._process.pid, signal.SIGCONT)
+
+
 def test_killed_it_begins_again_with_the_same_device(preview: Preview) -> None:
     before = manifest(preview)["reductions"]["neck_inflow_mL_s"]
     os.kill(preview._process.pid, signal.SIGKILL)

@@ -11,6 +11,7 @@ export class Flowing {
   constructor(host) {
     this.host = host;
     this.isOn = false;
+    this.drawn = 0; // number of the streamlines that are in the picture
     this.box = make("input", { type: "checkbox", id: "live-flow" });
     this.box.addEventListener("change", () => this.turn(this.box.checked));
     this.state = make("p", { className: "hint", role: "status" });
@@ -29,7 +30,7 @@ export class Flowing {
     this.body.hidden = !isOn;
     if (!isOn) {
       drop(`${this.host.path()}/preview`).catch(() => {});
-      this.host.picture.stage?.drop(({ id, pane }) => id === "streamlines" && pane === "");
+      this.forget();
     } else {
       this.say("Starting …");
       this.watch();
@@ -41,7 +42,13 @@ export class Flowing {
   set isWatched(value) {
     this.watched = value;
     if (value) this.watch();
-    else this.host.picture.stage?.drop(({ id, pane }) => id === "streamlines" && pane === "");
+    else this.forget();
+  }
+
+  /** Take the streamlines out of the picture. */
+  forget() {
+    this.drawn = 0;
+    this.host.picture.stage?.drop(({ id, pane }) => id === "streamlines" && pane === "");
   }
 
   async watch() {
@@ -50,7 +57,7 @@ export class Flowing {
     while (this.isOn && this.watched && !document.hidden) {
       const began = performance.now();
       try {
-        this.take(await getBinary(`${this.host.path()}/preview`));
+        this.take(await getBinary(`${this.host.path()}/preview?seen=${this.drawn}`));
       } catch (problem) {
         this.turn(false);
         this.host.failed(problem);
@@ -72,6 +79,7 @@ export class Flowing {
       return this.host.failed(new Error(manifest.error));
     }
     if (manifest.layers.length) this.host.picture.put({ manifest, buffer });
+    this.drawn = manifest.drawn;
     const { fraction, is_stale, is_settled, values, reductions, history, error_points } = manifest;
     this.element.classList.toggle("stale", is_stale);
     if (!("neck_inflow_mL_s" in reductions)) return this.say(`Computing the flow without a device: ${Math.round(100 * fraction)} %`);

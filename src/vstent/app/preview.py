@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from threading import Lock, Thread
+from threading import Condition, Lock, Thread
 from typing import Any, Final
 
 from vstent.devices.stent import Stent
@@ -57,6 +57,44 @@ class Said:
     """Streamlines through the neck; None: unchanged."""
 
 
+class _Post:
+    """Sends to the process from a thread of its own, of what waits only the newest.
+
+    A device is larger than the buffer of a pipe, so sending it takes until the process reads it. Whoever draws the
+    device must not wait for that.
+    """
+
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe, self._ready = pipe, Condition()
+        self._device: tuple[int, Stent] | None = None
+        self._is_asked = self._is_over = False
+        Thread(target=self._run, daemon=True).start()
+
+    def put(self, device: tuple[int, Stent] | None) -> None:
+        """Send a device with its number, or None as a request to go on, as soon as the process reads."""
+        with self._ready:
+            self._device, self._is_asked = device or self._device, True
+            self._ready.notify()
+
+    def end(self) -> None:
+        """Close the pipe."""
+        with self._ready:
+            self._is_over = True
+            self._ready.notify()
+
+    def _run(self) -> None:
+        """Send until the end, or until the process has ended."""
+        with suppress(BrokenPipeError, OSError):
+            while True:
+                with self._ready:
+                    self._ready.wait_for(lambda: self._is_asked or self._is_over)
+                    if self._is_over:
+                        break
+                    device, self._device, self._is_asked = self._device, None, False
+                self._pipe.send(device)
+        self._pipe.close()
+
+
 class Preview:
     """Live flow of one anatomy.
 
@@ -83,19 +121,22 @@ class Preview:
         """Start the process."""
         self._said, self._at_s = Said(), time.monotonic()
         self._lines: LineLayer | None = None
+        self._drawn = 0
         self._history: deque[float] = deque(maxlen=HISTORY)
         context = get_context("spawn")
         self._pipe, theirs = context.Pipe()
+        self._post = _Post(self._pipe)
         self._process = context.Process(target=work, args=(theirs, self.anatomy, self.settings), daemon=True)
         self._process.start()
         theirs.close()
         Thread(target=self._follow, args=(self._pipe,), daemon=True).start()
         if self._stent is not None:
-            self._send((self._serial, self._stent))
+            self._post.put((self._serial, self._stent))
 
     def _revive(self) -> None:
         """Start the process again where it had begun to step; else say that it ends at once."""
         if self._said.values:
+            self._post.end()
             self._begin()
         else:
             self._said = Said(
@@ -109,33 +150,35 @@ class Preview:
                 said = pipe.recv()
                 with self._lock:
                     self._said, self._at_s = said, time.monotonic()
-                    self._lines = said.lines or self._lines
+                    if said.lines is not None:
+                        self._lines, self._drawn = said.lines, self._drawn + 1
                     if "now_neck_inflow_mL_s" in said.values:
                         self._history.append(_reduction(said.values, "neck_inflow_mL_s"))
-
-    def _send(self, what: Any) -> None:
-        """Send something to the process; start it again where it was killed."""
-        with suppress(BrokenPipeError, OSError):
-            self._pipe.send(what)
 
     def place(self, stent: Stent) -> None:
         """Put a device into the flow in place of the last one."""
         self._serial += 1
         self._stent = stent
-        self._send((self._serial, stent))
+        self._post.put((self._serial, stent))
 
-    def message(self) -> bytes:
-        """Return the numbers and the streamlines as a message for the page; the process goes on for a while."""
+    def message(self, seen: int = 0) -> bytes:
+        """Return the numbers and new streamlines as a message for the page; the process goes on for a while.
+
+        Parameters
+        ----------
+        seen : number of the streamlines that the page has; they are not sent again. 0: none.
+        """
         if not self._process.is_alive() and not self._said.error:
             self._revive()
-        self._send(None)
+        self._post.put(None)
         with self._lock:
-            said, age_s, lines = self._said, time.monotonic() - self._at_s, self._lines
+            said, age_s, lines, drawn = self._said, time.monotonic() - self._at_s, self._lines, self._drawn
             history = list(self._history)
-        layers = [] if lines is None else [lines]
+        layers = [] if lines is None or drawn == seen else [lines]
         return message(
             layers,
             scales_of(layers, self.anatomy),
+            drawn=drawn,
             fraction=said.fraction,
             error=said.error,
             is_settled=said.is_settled,
@@ -149,7 +192,7 @@ class Preview:
     def stop(self) -> None:
         """End the process."""
         self._process.kill()
-        self._pipe.close()
+        self._post.end()
 
 
 _KEYS: Final = ("neck_inflow_mL_s", "sac_velocity_m_s")

@@ -403,8 +403,8 @@ def _add_planning(api: APIRouter, desk: Desk) -> None:
     """Add the routes of the live flow, of comparisons and of the plan."""
 
     @api.get("/api/cases/{case_id}/preview", summary="Live flow around the device that is drawn; starts it (binary)")
-    def preview(case_id: str) -> Response:
-        return Response(desk.preview(desk.store.get(case_id)).message(), media_type=BINARY)
+    def preview(case_id: str, seen: Annotated[int, Query(ge=0)] = 0) -> Response:
+        return Response(desk.preview(desk.store.get(case_id)).message(seen), media_type=BINARY)
 
     @api.delete("/api/cases/{case_id}/preview", summary="Stop the live flow")
     def end_preview(case_id: str) -> dict[str, Any]:
