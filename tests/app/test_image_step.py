@@ -306,8 +306,10 @@ def test_outlines_of_all_that_was_found_lie_on_the_slices(client):
 def test_an_oblique_scan_is_shown_along_the_patient_or_along_its_file(client):
     """Anatomical planes move along the patient's axes; the slices of the file say by how much they are turned."""
     with browsing(client, 1024, 768) as page:
+        page.route("**/image/surface?*", lambda _: None)  # it takes as long as it likes
         page.locator(".recent-case", has_text="turned").click()
         page.locator(".slice[data-bar]").nth(2).wait_for()
+        playwright.expect(page.locator(".viewer-length")).to_be_hidden()  # nothing is seen that it could measure
         along = page.get_by_label("Direction of the slices")
         assert along.input_value() == "patient"
         labels = [words.split(" ")[0] for words in page.locator(".slice-label").all_inner_texts()]

@@ -34,7 +34,8 @@ window.fetch = async (path, ...more) => {
 DRAGGED = """async () => {
   const handle = document.querySelector(".handle.distal");
   const { x, y } = handle.querySelector(".knob").getBoundingClientRect();
-  const send = (type, right) => handle.dispatchEvent(new PointerEvent(type, { bubbles: true, clientX: x + 13 + right, clientY: y + 13, pointerId: 1 }));
+  const event = (right) => ({ bubbles: true, clientX: x + 13 + right, clientY: y + 13, pointerId: 1 });
+  const send = (type, right) => handle.dispatchEvent(new PointerEvent(type, event(right)));
   const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
   handle.setPointerCapture = () => {};
   window.answers.length = 0;

@@ -51,7 +51,7 @@ class Page {
   async begin() {
     this.catalogue = await get("/api/catalogue").catch((problem) => this.complain(problem)) || [];
     if (!location.hash) {
-      const { opened } = await get("/api/cases");
+      const { opened } = await get("/api/cases").catch(() => ({})); // the list of cases asks again
       if (opened) history.replaceState(null, "", `#${opened}`);
     }
     this.route();

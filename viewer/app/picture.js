@@ -281,6 +281,8 @@ export class Picture {
 
   afterDrawing() {
     annotate(this.panes, this.stage, this.paneSize()[1]);
+    const isEmpty = !this.stage.layers.some(({ id }) => this.shown.has(id));
+    for (const { length, compass } of this.panes) for (const one of [length, compass]) one.toggleAttribute("hidden", isEmpty);
     if (document.activeElement !== this.carm) this.carm.value = inWords(anglesOf(this.stage.orbit.stand.axes.slice(6)));
     this.placeMarks();
   }

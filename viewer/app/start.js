@@ -3,6 +3,7 @@ import { make } from "../src/dom.js";
 import { drop as remove, get, post, put } from "./api.js";
 import { ask } from "./dialogs.js";
 
+const RETRY_MS = 3000;
 const KINDS = "DICOM folder or ZIP · NIfTI · NRRD · MHA · RAW · STL · VTP · VTK · OBJ · PLY";
 
 export function startPage(open, complain) {
@@ -40,7 +41,14 @@ export function startPage(open, complain) {
   });
   const list = make("div", { className: "recent" });
   const show = ({ cases }) => list.replaceChildren(...recent(cases, { open, show, complain }));
-  get("/api/cases").then(show).catch(complain);
+  const load = () =>
+    get("/api/cases")
+      .then(show)
+      .catch((problem) => {
+        complain(problem);
+        setTimeout(() => list.isConnected && load(), RETRY_MS);
+      });
+  load();
   const privacy = "Files stay on this machine. Of DICOM files only the image is kept, without name, date and number of the patient.";
   return make("main", { className: "start" }, [zone, make("p", { className: "hint" }, [privacy]), list]);
 }
@@ -53,9 +61,16 @@ function recent(cases, host) {
 
 const DATE = new Intl.DateTimeFormat(undefined, { dateStyle: "medium", timeStyle: "short" });
 
-function recentCase({ id, name, done, changed_s, has_picture }, { open, show, complain }) {
+/** What a case has: steps that are up to date, or results of earlier choices. */
+function progressWords(done, kept) {
+  const old = kept.filter((step) => !done.includes(step)).length;
+  if (!done.length && !old) return "no step done";
+  return `${done.length} of 7 steps done${old ? `, ${old} out of date` : ""}`;
+}
+
+function recentCase({ id, name, done, kept, changed_s, has_picture }, { open, show, complain }) {
   const picture = has_picture ? make("img", { src: `/api/cases/${encodeURIComponent(id)}/picture?${changed_s}`, alt: "", width: 320, height: 200 }) : make("i", { className: "no-picture" });
-  const words = make("span", {}, [`${done.length ? `${done.length} of 7 steps done` : "no step done"} · ${DATE.format(new Date(1000 * changed_s))}`]);
+  const words = make("span", {}, [`${progressWords(done, kept)} · ${DATE.format(new Date(1000 * changed_s))}`]);
   const rename = async () => {
     const given = await ask({ title: "Rename the case", words: [], field: "Name", value: name, button: "Rename" });
     if (given && given !== name) await put(`/api/cases/${encodeURIComponent(id)}/name`, { name: given.slice(0, 120) }).then(show).catch(complain);

@@ -67,17 +67,20 @@ class Desk:
         for case_id in self.store.ids():
             try:
                 case = self.store.get(case_id)
-                steps = statuses(case.state, "", lost_steps(case.folder, case.state))
-            except ReadError:
-                continue  # a folder of something else, or a damaged one
+                lost = lost_steps(case.folder, case.state)
+                changed_s = (case.folder / STATE).stat().st_mtime
+            except (ReadError, OSError):
+                continue  # a folder of something else, a damaged one, or one that is being deleted
+            steps = statuses(case.state, "", lost)
             done = [step for step in STEPS if steps[step] == "done"]
-            changed_s = (case.folder / STATE).stat().st_mtime
+            kept = [step for step in STEPS if step in case.state.done and step not in lost]
             has_picture = (case.folder / PICTURE).is_file()
             found.append(
                 {
                     "id": case_id,
                     "name": case.state.name,
                     "done": done,
+                    "kept": kept,
                     "changed_s": changed_s,
                     "has_picture": has_picture,
                 }

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from threading import Condition, Lock, Thread
-from typing import Any, Final
+from typing import Final
 
 from vstent.devices.stent import Stent
 from vstent.errors import InputError, VstentError
