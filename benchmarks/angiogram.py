@@ -16,7 +16,8 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.angiography import angiogram as angiograms
 from vstent.angiography.angiogram import AngiogramSettings
-from vstent.angiography.network import Network, network
+from vstent.angiography.grid import grid_of
+from vstent.angiography.network import Network
 from vstent.angiography.transport import Transport
 from vstent.angiography.washout import wash_out
 from vstent.flow import sampling
@@ -26,7 +27,7 @@ from vstent.flow.simulation import flow_case, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.archive import load_data
 from vstent.kernels import sampling as kernels
-from vstent.kernels.arrays import Floats
+from vstent.kernels.arrays import Floats, Ints
 from vstent.study.folder import CACHE
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
@@ -36,6 +37,8 @@ GRIDS_MM = (0.28, 0.2, 0.14, 0.1)
 """Grid spacings of the demo, mm."""
 UPSTREAM_CELLS = 0.75
 """Distance upstream of the ostium at which the age is taken, in cells."""
+BRANCH_CELLS = 3.0
+"""Distance from the ostium, in cells, beyond which blood leaves a sac through a branch."""
 WINDOW_S = 4.0
 """Window of the injections on several grids, s."""
 
@@ -65,8 +68,7 @@ def demo(spacing_mm: float) -> None:
     ages(f"demo {spacing_mm:g} mm", case, field)
     began, busy = time.perf_counter(), time.process_time()
     ready = angiograms.injection(case, field, AngiogramSettings(window_s=WINDOW_S))
-    sac = angiograms._sac_cells(ready.network, case)
-    told = angiograms._curves(ready, anatomy, sac, None, lambda _: None).measures()
+    told = angiograms._curves(ready, anatomy, None, lambda _: None).measures()
     wall, cpu = time.perf_counter() - began, time.process_time() - busy
     print(
         f"{'':24} retention {told['contrast_retention_s']:.4f} s  half-life {told['washout_half_life_s']:.4f} s  "
@@ -78,33 +80,60 @@ def demo(spacing_mm: float) -> None:
 
 
 def ages(name: str, case: FlowCase, field: FlowField) -> None:
-    """Print the ages of the blood in a sac and of the blood that leaves it."""
+    """Print the ages of the blood in a sac and of the blood that leaves it, through its neck or a branch."""
     assert case.sac is not None
     assert case.ostium is not None
     began, busy = time.perf_counter(), time.process_time()
-    whole = network(case, field)
-    whole = whole.merged(angiograms._distance_mm(whole, case) > angiograms.FINE_MM)
-    region = angiograms._distance_mm(whole, case) <= angiograms.REGION_MM
-    near = whole.within(region)
-    sac = np.flatnonzero(np.isin(np.flatnonzero(region), angiograms._sac_cells(whole, case)))
+    grid = grid_of(case, field, is_preview=False)
+    near, sac = grid.near
     found = wash_out(near, sac, end_s=angiograms.MOST_WASHOUT_S)
+    volume_mL = 1e-3 * abs(case.sac.volume_mm3)
+    balance, branch_mL_s, branch_mL = _passed(near, sac, found.age_s, case)
+    inflow_mL_s, leaving_mL = _at_ostium(case, field, near, found.age_s)
+    leaving = (leaving_mL + branch_mL) / volume_mL
+    told_s = indices(field, case.sac, case.ostium)["turnover_time_s"]
+    wall, cpu = time.perf_counter() - began, time.process_time() - busy
+    print(
+        f"{name:24} {len(field.cells):8,} cells  corrected {grid.network.correction_fraction:.2%}  volume / inflow "
+        f"{told_s:.4f} s, in the mean flow {volume_mL / inflow_mL_s:.4f} s  branch {branch_mL_s:.3f} of "
+        f"{inflow_mL_s:.3f} mL/s  age on leaving {leaving * volume_mL / inflow_mL_s:.4f} s ({leaving - 1:+.1%}; over "
+        f"the faces of its cells {balance - 1:+.2%})  mean age {found.mean_age_s:.4f} s (extrapolated "
+        f"{found.tail_fraction:.1%})  {wall:.0f} s ({cpu:.0f} s CPU)",
+        flush=True,
+    )
+
+
+def _passed(near: Network, sac: Ints, age_s: Floats, case: FlowCase) -> tuple[float, float, float]:
+    """Return the balance of ages over the cells of a sac, the flow rate of its branch in mL/s, and that times its age.
+
+    What leaves the cells of the sac is older than what enters them by their volume / inflow: the sum over their outer
+    faces of flow rate out times age is their volume.
+    """
+    assert case.ostium is not None
+    is_sac = np.zeros(len(near.cells) + near.openings, dtype=bool)
+    is_sac[sac] = True
+    crossing = is_sac[near.left] != is_sac[near.right]
+    left, right, flux = near.left[crossing], near.right[crossing], near.flux_mm3_s[0][crossing]
+    out_mL_s = 1e-3 * np.where(is_sac[left], flux, -flux)
+    from_cell = np.where(flux > 0, left, right)
+    age = np.r_[age_s, np.zeros(near.openings)][from_cell]
+    within = np.where(is_sac[left], left, right)
+    is_branch = case.ostium.closest(near.points_mm[within])[1] > BRANCH_CELLS * near.spacing_mm
+    branch_mL_s, branch_mL = out_mL_s[is_branch].sum(), out_mL_s[is_branch] @ age[is_branch]
+    return float(1e3 * out_mL_s @ age / near.volume_mm3[sac].sum()), float(branch_mL_s), float(branch_mL)
+
+
+def _at_ostium(case: FlowCase, field: FlowField, near: Network, age_s: Floats) -> tuple[float, float]:
+    """Return the inflow through the ostium in mL/s, and the net sum of flow rate out times age there in mL."""
+    assert case.ostium is not None
     points_mm, area_mm2 = sampling.surface_samples(case.ostium, field.cell_size_mm)
     points = (points_mm - field.origin_mm) / field.cell_size_mm
     through = sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2)
     # The age is that of the blood upstream: on the other side it is mixed with fresh blood within a cell.
     normals = area_mm2 / np.linalg.norm(area_mm2, axis=1, keepdims=True)
     upstream = points - UPSTREAM_CELLS * np.sign(through)[:, None] * normals
-    at = kernels.interpolate(*_on_grid(field, near, found.age_s), upstream, False)[:, 0]
-    turnover_s = indices(field, case.sac, case.ostium)["turnover_time_s"]
-    inward, outward = np.maximum(through, 0), np.maximum(-through, 0)
-    leaving_s = outward @ at / outward.sum() - inward @ at / inward.sum()
-    wall, cpu = time.perf_counter() - began, time.process_time() - busy
-    print(
-        f"{name:24} {len(field.cells):8,} cells  corrected {whole.correction_fraction:.2%}  volume / inflow "
-        f"{turnover_s:.4f} s  age on leaving {leaving_s:.4f} s ({leaving_s / turnover_s - 1:+.1%})  mean age "
-        f"{found.mean_age_s:.4f} s (extrapolated {found.tail_fraction:.1%})  {wall:.0f} s ({cpu:.0f} s CPU)",
-        flush=True,
-    )
+    at = kernels.interpolate(*_on_grid(field, near, age_s), upstream, False)[:, 0]
+    return float(np.maximum(through, 0).sum()), float(-through @ at)
 
 
 def _on_grid(field: FlowField, near: Network, age_s: Floats) -> tuple[np.ndarray, Floats]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from cell_networks import network, tube
 
+from vstent.angiography import transport
 from vstent.angiography.transport import Transport
 from vstent.angiography.washout import wash_out
 
@@ -175,6 +176,24 @@ def test_contrast_is_conserved_and_bounded(is_merged):
         assert values.min() >= -1e-6
         assert values.max() <= 2.0 + 1e-5
         assert march.balance().error_fraction < 1e-5  # single precision
+
+
+def test_cells_that_hold_nothing_are_skipped_without_a_trace(monkeypatch):
+    net = cavity(8)[0]
+    fast = replace(net, flux_mm3_s=net.flux_mm3_s * 40.0)
+
+    def marched():
+        march = Transport(fast, inflow=lambda t: 2.0 * float(t < 1), upper=2.0, diffusivity_mm2_s=0.01)
+        for _, values in march.frames(0.5, 6.0):
+            yield values, march._held.is_full.mean(), march.balance().error_fraction
+
+    skipping = list(marched())
+    monkeypatch.setattr(transport, "EMPTY", -1.0)
+    for (values, full, error), (wanted, every, _) in zip(skipping, marched(), strict=True):
+        assert values == pytest.approx(wanted, abs=2 * 2e-5)
+        assert full <= every
+        assert error < 1e-5
+    assert min(full for _, full, _ in skipping) < 0.8
 
 
 def test_merged_cells_carry_the_same_flow_and_volume():

@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 from vstent.angiography import washout as washouts
 from vstent.angiography.bolus import Bolus
 from vstent.angiography.curves import Curves
-from vstent.angiography.network import Network, network
+from vstent.angiography.grid import Grid, grid_of
+from vstent.angiography.network import Network
 from vstent.angiography.transport import Frame, Transport
 from vstent.errors import FlowError, InputError
-from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.indices import on_sac
 from vstent.flow.memory import free_memory_bytes
@@ -22,10 +22,6 @@ from vstent.flow.simulation import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 
-FINE_MM: Final = 0.4
-"""Distance from the sac, mm, within which the cells of the flow are kept; elsewhere blocks of eight are used."""
-REGION_MM: Final = 3.0
-"""Distance from the sac, mm, within which its washout is followed; blood that gets farther does not come back."""
 BYTES_PER_CELL: Final = 1200
 """Peak memory per cell of the flow, in bytes."""
 BYTES_PER_PHASE_AND_CELL: Final = 60
@@ -87,7 +83,7 @@ class Angiogram:
 class Injection:
     """An injection into a flow, ready to be marched: the grid and its frames."""
 
-    network: Network
+    grid: Grid
     """Cells and flow rates."""
     transport: Transport
     """The concentration."""
@@ -97,12 +93,12 @@ class Injection:
     @property
     def points_mm(self) -> Floats:
         """Cell centers (n, 3), LPS."""
-        return self.network.points_mm
+        return self.grid.network.points_mm
 
     @property
     def spacing_mm(self) -> Floats:
         """Edge (n,) of a cube with the volume of each cell."""
-        return self.network.edge_mm
+        return self.grid.network.edge_mm
 
     def frames(self) -> Iterator[Frame]:
         """March once, and yield time in s since the start of the waveform and iodine in mg/mL (n,) of every frame."""
@@ -138,14 +134,10 @@ def injection(case: FlowCase, field: FlowField, settings: AngiogramSettings) -> 
             f"an angiogram on {len(field.cells):,} cells needs {need_bytes / 1e9:.2g} GB of memory, more than is free: "
             "compute the flow with a wider grid spacing"
         )
-    whole = network(case, field)
-    if settings.is_preview:
-        whole = whole.merged(np.ones(len(whole.cells), dtype=bool))
-    if case.sac is not None:
-        whole = whole.merged(_distance_mm(whole, case) > FINE_MM)
+    grid = grid_of(case, field, is_preview=settings.is_preview)
     inflow, most = settings.bolus.inflow(field.inflow_mL_s)
-    march = Transport(whole, diffusivity_mm2_s=settings.diffusivity_mm2_s, inflow=inflow, upper=most)
-    return Injection(whole, march, settings)
+    march = Transport(grid.network, diffusivity_mm2_s=settings.diffusivity_mm2_s, inflow=inflow, upper=most)
+    return Injection(grid, march, settings)
 
 
 def angiogram(
@@ -182,9 +174,8 @@ def angiogram(
     case = flow_case(anatomy, None)
     tell = progress or (lambda _: None)
     ready = injection(case, field, settings)
-    sac = _sac_cells(ready.network, case)
     share = 1.0 if case.sac is None else 0.6
-    curves = _curves(ready, anatomy, sac, watch, lambda part: tell(share * part))
+    curves = _curves(ready, anatomy, watch, lambda part: tell(share * part))
     measures = curves.measures()
     if not measures:
         raise InputError(
@@ -195,8 +186,7 @@ def angiogram(
     measures |= {"contrast_balance_error_fraction": balance.error_fraction}
     if case.sac is None:
         return Angiogram(curves, np.zeros(0), np.zeros(0), measures, _advice(ready, field, measures, None))
-    region = _distance_mm(ready.network, case) <= REGION_MM
-    near, own = ready.network.within(region), np.flatnonzero(np.isin(np.flatnonzero(region), sac))
+    near, own = ready.grid.near
     found = washouts.wash_out(
         near,
         own,
@@ -208,12 +198,10 @@ def angiogram(
     return Angiogram(curves, found.time_s, found.left_fraction, measures, _advice(ready, field, measures, found))
 
 
-def _curves(
-    ready: Injection, anatomy: Anatomy, sac: Ints, watch: Watch | None, tell: Callable[[float], None]
-) -> Curves:
+def _curves(ready: Injection, anatomy: Anatomy, watch: Watch | None, tell: Callable[[float], None]) -> Curves:
     """Return the curves of an injection; `watch` sees every frame."""
-    volume = ready.network.volume_mm3
-    parts = sac, _parent_cells(ready.network, anatomy, sac)
+    volume = ready.grid.network.volume_mm3
+    parts = ready.grid.sac, _parent_cells(ready.grid, anatomy)
     weights = [volume[part] / volume[part].sum() for part in parts]
     show = None if watch is None else watch(ready.points_mm, ready.spacing_mm)
     rows, bolus = [], ready.settings.bolus
@@ -246,29 +234,7 @@ def _stay(found: washouts.Washout, near: Network, own: Ints, case: FlowCase) -> 
     return result
 
 
-def _distance_mm(grid: Network, case: FlowCase) -> Floats:
-    """Return the distance (n,) of the cells from the sac, 0 inside."""
-    assert case.sac is not None
-    distance = case.sac.closest(grid.points_mm)[1]
-    distance[_sac_cells(grid, case)] = 0.0
-    return distance
-
-
-def _sac_cells(grid: Network, case: FlowCase) -> Ints:
-    """Return the cells in the sac, or all cells where there is none."""
-    if case.sac is None:
-        return np.arange(len(grid.cells))
-    fine = int(grid.width.min())
-    is_fine = grid.width == fine
-    at_mm = grid.spacing_mm * (grid.cells[is_fine] + 0.5 * (fine - 1))  # the grid's own centers, in its own frame
-    shift_mm = np.median(grid.points_mm[is_fine] - at_mm, axis=0)
-    found = sampling.cells_inside(case.sac, at_mm + shift_mm, fine * grid.spacing_mm)
-    if len(found) == 0:
-        raise FlowError("no cell of the flow lies in the sac: compute the flow with a finer grid spacing")
-    return np.flatnonzero(is_fine)[found]
-
-
-def _parent_cells(grid: Network, anatomy: Anatomy, sac: Ints) -> Ints:
+def _parent_cells(grid: Grid, anatomy: Anatomy) -> Ints:
     """Return the cells of the parent artery over one diameter proximal to the neck, or next to the inlet."""
     axis = anatomy.axis
     end_mm = anatomy.aneurysms[0].proximal_abscissa_mm if anatomy.aneurysms else 0.5 * axis.length_mm
@@ -278,15 +244,15 @@ def _parent_cells(grid: Network, anatomy: Anatomy, sac: Ints) -> Ints:
     last_mm = max(end_mm - 0.5 * diameter_mm, first_mm + 0.5 * diameter_mm)
     chosen = (axis.abscissa_mm >= first_mm) & (axis.abscissa_mm <= last_mm)
     line, radius_mm = axis.points_mm[chosen], axis.inscribed_radius_mm[chosen]
-    distance_mm, nearest = cKDTree(line).query(grid.points_mm)
+    distance_mm, nearest = cKDTree(line).query(grid.network.points_mm)
     inside: Bools = distance_mm < 0.8 * radius_mm[nearest]
-    inside[sac] &= not anatomy.aneurysms
+    inside[grid.sac] &= not anatomy.aneurysms
     return np.flatnonzero(inside)
 
 
 def _advice(ready: Injection, field: FlowField, measures: dict[str, float], found: washouts.Washout | None) -> str:
     """Return sentences on the grid and on what the window did not reach."""
-    grid = ready.network
+    grid = ready.grid.network
     widths = sorted({float(width) * grid.spacing_mm for width in np.unique(grid.width)})
     spacing = " and ".join(f"{width:.3g}" for width in widths)
     said = (

@@ -8,7 +8,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from vstent.errors import FlowError
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Floats, Ints, unique_rows
 
 COARSEST: Final = 1500
 """Number of unknowns that are solved directly."""
@@ -30,8 +30,8 @@ class _Level:
         if self.is_last:
             self.factor = splu(csr_matrix(matrix + 1e-9 * diags(np.ones(len(cells)))).tocsc())
             return
-        coarse, label = np.unique(cells // 2, axis=0, return_inverse=True)
-        of_coarse = csr_matrix((np.ones(len(cells)), (np.arange(len(cells)), label.ravel())))
+        coarse, label = unique_rows(cells // 2)
+        of_coarse = csr_matrix((np.ones(len(cells)), (np.arange(len(cells)), label)))
         self.spread = of_coarse
         self.gather = csr_matrix(of_coarse.T)
         # Constants on blocks make the coarse matrix twice too stiff, because its cells are twice as far apart.

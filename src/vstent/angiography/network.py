@@ -13,7 +13,7 @@ from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow.case import FlowCase, FlowField
 from vstent.geometry.surface import Surface
-from vstent.kernels.arrays import Bools, Floats, Ints, freeze
+from vstent.kernels.arrays import Bools, Floats, Ints, freeze, unique_rows
 
 MM3_PER_ML: Final = 1e3
 """Cubic millimeters in a milliliter."""
@@ -116,14 +116,13 @@ class Network:
         Cells of a block that is not chosen as a whole stay as they are.
         """
         n, wide = len(self.cells), 2 * self.width[:, None]
-        corner = np.where(chosen[:, None], self.cells // wide * wide, self.cells)
-        block, of_block = np.unique(np.c_[self.cells // wide * wide, wide], axis=0, return_inverse=True)
+        block, of_block = unique_rows(np.c_[self.cells // wide * wide, wide])
         stays = np.zeros(len(block), dtype=bool)
-        stays[of_block.ravel()[~chosen]] = True
-        whole = ~stays[of_block.ravel()]
-        corner = np.where(whole[:, None], corner, self.cells)
-        found, label = np.unique(np.c_[corner, np.where(whole, wide[:, 0], self.width)], axis=0, return_inverse=True)
-        count, label = len(found), np.r_[label.ravel(), len(found) + np.arange(self.openings)]
+        stays[of_block[~chosen]] = True
+        whole = ~stays[of_block]
+        corner = np.where(whole[:, None], self.cells // wide * wide, self.cells)
+        found, label = unique_rows(np.c_[corner, np.where(whole, wide[:, 0], self.width)])
+        count, label = len(found), np.r_[label, len(found) + np.arange(self.openings)]
         left, right = label[self.left].astype(np.int64), label[self.right].astype(np.int64)
         between = left != right
         key = (left[between] * (count + self.openings) + right[between]) * 3 + self.axis[between]
