@@ -232,6 +232,10 @@ def test_units_are_the_longest_ending(key, expected):
 def test_changes():
     assert format_change(0.4, 0.26).replace("\u202f", " ") == "−35 %"
     assert format_change(2.0, 2.1).replace("\u202f", " ") == "+5.0 %"
+    assert format_change(0.056, 39.92, "unexchanged_after_2s_volume_mm3") == "+39.9\u202fmm³"
+    assert format_change(0.0, -39.92, "unexchanged_after_2s_volume_mm3") == "−39.9\u202fmm³"
+    assert format_change(4.0, 39.92, "unexchanged_after_2s_volume_mm3") == "+898\u202f%"
+    assert format_change(0.0, 0.0, "unexchanged_after_2s_volume_mm3") == "–"
     assert format_change(0.0, 1.0) == format_change(1.0, math.nan) == format_change(None, 1.0) == "–"
 
 

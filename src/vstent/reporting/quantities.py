@@ -56,6 +56,8 @@ NOTHING = 1e-9
 """Magnitude below which a value is shown as 0, because only rounding errors are that small."""
 RATIO = "_ratio"
 """Suffix of the key of a ratio: value with the device over value without it."""
+MOST_RATIO = 10.0
+"""Largest ratio of values that is shown as a percentage; above it the first value is near zero."""
 OPENING = re.compile(r"(inlet|outlet)_(\d+)_(\w+)")
 """Pattern of the key of a metric of one of several inlets or outlets."""
 ERRORS = ("unsettled_fraction",)
@@ -208,7 +210,8 @@ def format_number(value: float) -> str:
 def format_change(before: Any, after: Any, key: str = "") -> str:
     """Return a relative change in percent, such as ``−35 %``; a dash where it is undefined.
 
-    The change of a percentage is a difference in percentage points, such as ``+1.2 points``.
+    The change of a percentage is a difference in percentage points, such as ``+1.2 points``. The change from zero, or to
+    more than ten times the value, is a difference with the unit of the key, such as ``+39.8 mm³``.
 
     Parameters
     ----------
@@ -219,6 +222,8 @@ def format_change(before: Any, after: Any, key: str = "") -> str:
         return "–"
     if unit_of(key) == "%":
         return f"{100 * (after - before):+.2g}\u202fpoints".replace("-", "−")
+    if abs(after) > MOST_RATIO * abs(before):
+        return f"{'+' if after > before else ''}{format_value(key, after - before)}".replace("-", "−") if key else "–"
     if before == 0:
         return "–"
     percent = 100 * (after / before - 1)
