@@ -88,7 +88,7 @@ def ages(name: str, case: FlowCase, field: FlowField) -> None:
     near, sac = grid.near
     found = wash_out(near, sac, end_s=angiograms.MOST_WASHOUT_S)
     volume_mL = 1e-3 * abs(case.sac.volume_mm3)
-    balance, branch_mL_s, branch_mL = _passed(near, sac, found.age_s, case)
+    branch_mL_s, branch_mL = _through_branch(near, sac, found.age_s, case)
     inflow_mL_s, leaving_mL = _at_ostium(case, field, near, found.age_s)
     leaving = (leaving_mL + branch_mL) / volume_mL
     told_s = indices(field, case.sac, case.ostium)["turnover_time_s"]
@@ -96,31 +96,25 @@ def ages(name: str, case: FlowCase, field: FlowField) -> None:
     print(
         f"{name:24} {len(field.cells):8,} cells  corrected {grid.network.correction_fraction:.2%}  volume / inflow "
         f"{told_s:.4f} s, in the mean flow {volume_mL / inflow_mL_s:.4f} s  branch {branch_mL_s:.3f} of "
-        f"{inflow_mL_s:.3f} mL/s  age on leaving {leaving * volume_mL / inflow_mL_s:.4f} s ({leaving - 1:+.1%}; over "
-        f"the faces of its cells {balance - 1:+.2%})  mean age {found.mean_age_s:.4f} s (extrapolated "
+        f"{inflow_mL_s:.3f} mL/s  age on leaving {leaving * volume_mL / inflow_mL_s:.4f} s ({leaving - 1:+.1%})  "
+        f"mean age {found.mean_age_s:.4f} s (extrapolated "
         f"{found.tail_fraction:.1%})  {wall:.0f} s ({cpu:.0f} s CPU)",
         flush=True,
     )
 
 
-def _passed(near: Network, sac: Ints, age_s: Floats, case: FlowCase) -> tuple[float, float, float]:
-    """Return the balance of ages over the cells of a sac, the flow rate of its branch in mL/s, and that times its age.
-
-    What leaves the cells of the sac is older than what enters them by their volume / inflow: the sum over their outer
-    faces of flow rate out times age is their volume.
-    """
+def _through_branch(near: Network, sac: Ints, age_s: Floats, case: FlowCase) -> tuple[float, float]:
+    """Return the flow rate through the branches that leave a sac, in mL/s, and its sum with the age, in mL."""
     assert case.ostium is not None
     is_sac = np.zeros(len(near.cells) + near.openings, dtype=bool)
     is_sac[sac] = True
     crossing = is_sac[near.left] != is_sac[near.right]
     left, right, flux = near.left[crossing], near.right[crossing], near.flux_mm3_s[0][crossing]
-    out_mL_s = 1e-3 * np.where(is_sac[left], flux, -flux)
-    from_cell = np.where(flux > 0, left, right)
-    age = np.r_[age_s, np.zeros(near.openings)][from_cell]
     within = np.where(is_sac[left], left, right)
     is_branch = case.ostium.closest(near.points_mm[within])[1] > BRANCH_CELLS * near.spacing_mm
-    branch_mL_s, branch_mL = out_mL_s[is_branch].sum(), out_mL_s[is_branch] @ age[is_branch]
-    return float(1e3 * out_mL_s @ age / near.volume_mm3[sac].sum()), float(branch_mL_s), float(branch_mL)
+    out_mL_s = 1e-3 * np.where(is_sac[left], flux, -flux)[is_branch]
+    age = np.r_[age_s, np.zeros(near.openings)][np.where(flux > 0, left, right)[is_branch]]
+    return float(out_mL_s.sum()), float(out_mL_s @ age)
 
 
 def _at_ostium(case: FlowCase, field: FlowField, near: Network, age_s: Floats) -> tuple[float, float]:

@@ -59,6 +59,23 @@ class Curves:
         return found
 
 
+def retention_s(curves: Curves) -> tuple[float, bool] | None:
+    """Return the retention, and whether it is only the least that it can be; None where there is none.
+
+    The sac may keep more than half of its peak to the end of the curve; the retention is then at least the time from
+    there to the end.
+
+    Parameters
+    ----------
+    curves : Curves
+        The curves.
+    """
+    parent_s, sac_s = (_falls_s(curves.time_s, one) for one in (curves.parent_mg_mL, curves.sac_mg_mL))
+    if parent_s is None or curves.sac_mg_mL.max() <= 0:
+        return None
+    return (float(curves.time_s[-1]) if sac_s is None else sac_s) - parent_s, sac_s is None
+
+
 def _rises_s(time_s: Floats, values: Floats) -> float:
     """Return when a curve first reaches a tenth of its peak."""
     level = ARRIVED * values.max()

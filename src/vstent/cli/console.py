@@ -179,6 +179,7 @@ RANKING_COLUMNS: Final = (
 FLOW_COLUMNS: Final = (
     ("neck inflow", "neck_inflow_change_fraction", "{:+.0%}"),
     ("sac velocity", "sac_velocity_change_fraction", "{:+.0%}"),
+    ("retention", "contrast_retention_change_fraction", "{:+.0%}"),
     ("±", "flow_uncertainty_fraction", "{:.1%}"),
     ("flow", "flow_grade", "{}"),
 )
@@ -194,7 +195,9 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
     shown : number of candidates to show.
     """
     has_flow = any("flow_grade" in candidate.measures for candidate in ranking.candidates)
-    columns = RANKING_COLUMNS + FLOW_COLUMNS * has_flow
+    columns = RANKING_COLUMNS + tuple(
+        one for one in FLOW_COLUMNS * has_flow if any(one[1] in candidate.measures for candidate in ranking.candidates)
+    )
     table = Table("", "device and size", "shift", "score", *(title for title, _, _ in columns))
     for number, candidate in _shown(ranking, shown):
         values = [(candidate.measures.get(key), form) for _, key, form in columns]

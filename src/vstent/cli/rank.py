@@ -41,6 +41,11 @@ def add(commands: options.Commands) -> None:
         metavar="N",
         help="compute the flow with the N best sizes, the best of each device among them (default: none)",
     )
+    ranking.add_argument(
+        "--retention",
+        action="store_true",
+        help="carry contrast through these flows too; the time that it stays in the sac counts in their scores",
+    )
     options.add_jobs(ranking)
     options.add_flow(parser)
     parser.set_defaults(command=_rank)
@@ -50,12 +55,15 @@ def _rank(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     from vstent.cli.console import Console, ranking_reasons, ranking_table
     from vstent.devices.catalogue import find_design
+    from vstent.errors import InputError
     from vstent.plan.criteria import default_criteria, read_criteria
     from vstent.plan.rank import rank
     from vstent.study.outputs import write_ranking
     from vstent.study.pipeline import restore_vessel
     from vstent.study.types import Settings
 
+    if arguments.retention and not arguments.flow_count:
+        raise InputError("Contrast moves with a flow. Give --flow N with --retention.")
     designs = [find_design(name) for name in options.given_devices(arguments)]
     criteria = read_criteria(arguments.criteria) if arguments.criteria else default_criteria()
     console = Console()
@@ -92,6 +100,7 @@ def _with_flows(arguments: argparse.Namespace, anatomy: "Anatomy", ranking: "Ran
         ranking,
         settings,
         arguments.flow_count,
+        has_contrast=arguments.retention,
         stored=FlowStore(arguments.out, anatomy, settings),
         progress=lambda done, total, name: console.progress("rank by flow", done / total, f"{done} of {total}: {name}"),
     )

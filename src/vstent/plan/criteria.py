@@ -52,8 +52,10 @@ MEASURES: Final = (
     "landing_length_mm",
     "longest_landing_mm",
     "end_to_branch_mm",
+    "contrast_retention_change_fraction",
 )
-"""Measures for criteria, from `vstent.deployment.measure.measure` and `vstent.plan.rank.landing_measures`."""
+"""Measures for criteria, from `vstent.deployment.measure.measure` and `vstent.plan.rank.landing_measures`; the last one
+from `vstent.plan.rank_flow.rank_flows`."""
 
 
 class _Strict(BaseModel):

@@ -1,6 +1,6 @@
 """Rank devices: every size is deployed, measured and graded, and the ranking gives a reason for each score."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeVar
@@ -158,7 +158,7 @@ def rank(
         graded.append(replace(candidate, is_proposed=is_proposed))
         if progress is not None:
             progress(len(graded), len(tasks))
-    return Ranking(tuple(sorted(graded, key=lambda candidate: order_of(_row(0, candidate)))), criteria)
+    return Ranking(ordered(graded), criteria)
 
 
 def alternatives(anatomy: Anatomy, design: Design, size: Size, *, count: int = 2) -> tuple[Candidate, ...]:
@@ -212,15 +212,33 @@ def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) 
         return Candidate(design, size, shift_mm, {}, {}, 0.0, False, str(error))
     measures = measure(anatomy, deployment)
     measures |= landing_measures(anatomy, measures)
-    asked = [item for item in criteria.of(design) if item.key in measures]
-    grades = {item.key: item.grade(float(measures[item.key])) for item in asked}
+    found = regraded(Candidate(design, size, shift_mm, measures, {}, 0.0, False, ""), criteria)
+    if not found.is_suitable:
+        return found
+    return replace(found, measures=measures | _length_band(anatomy, deployment, measures))
+
+
+def regraded(candidate: Candidate, criteria: Criteria) -> Candidate:
+    """Return a candidate with the grades, the score and the reason of its measures.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        A candidate with measures.
+    criteria : Criteria
+        Criteria for grading; those whose measure it lacks are left out.
+    """
+    asked = [item for item in criteria.of(candidate.design) if item.key in candidate.measures]
+    grades = {item.key: item.grade(float(candidate.measures[item.key])) for item in asked}
     weight = sum(item.weight for item in asked)
     score = sum(item.weight * grades[item.key] for item in asked) / weight if weight else 0.0
-    is_suitable = all(grades.values())
-    if is_suitable:
-        measures |= _length_band(anatomy, deployment, measures)
-    reason = _reason(asked, grades, measures)
-    return Candidate(design, size, shift_mm, measures, grades, score, is_suitable, reason)
+    reason = _reason(asked, grades, candidate.measures)
+    return replace(candidate, grades=grades, score=score, is_suitable=all(grades.values()), reason=reason)
+
+
+def ordered(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
+    """Return candidates, the best first (see `order_of`)."""
+    return tuple(sorted(candidates, key=lambda candidate: order_of(_row(0, candidate))))
 
 
 def _length_band(anatomy: Anatomy, deployment: Deployment, measures: Measures) -> Measures:

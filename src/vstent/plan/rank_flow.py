@@ -1,10 +1,12 @@
-"""Rank by flow: the best sizes by geometry get a flow, and its reductions join the ranking."""
+"""Rank by flow: the best sizes by geometry get a flow, and its reductions and its retention join the ranking."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Final, Protocol
 
 from vstent.anatomy.morphology import Measures
+from vstent.angiography.angiogram import AngiogramSettings, angiogram
+from vstent.angiography.curves import retention_s
 from vstent.deployment.deploy import deploy, propose_landing
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import FlowError, InputError
@@ -13,7 +15,8 @@ from vstent.flow.grade import NOT_USABLE, grade
 from vstent.flow.indices import indices
 from vstent.flow.simulation import flow_case, simulate_case
 from vstent.geometry.vessel import Anatomy
-from vstent.plan.rank import Candidate, Ranking
+from vstent.plan.criteria import Criteria
+from vstent.plan.rank import Candidate, Ranking, ordered, regraded
 
 REDUCED: Final = {
     "neck_inflow_mL_s": "neck_inflow_change_fraction",
@@ -21,6 +24,12 @@ REDUCED: Final = {
     "mean_sac_wss_Pa": "sac_wss_change_fraction",
 }
 """Index of a flow, and the measure of its change against the flow without a device."""
+
+
+RETENTION: Final = "contrast_retention_change_fraction"
+"""Measure of the change of the retention of contrast in the sac against the flow without a device."""
+CONTRAST: Final = AngiogramSettings(window_s=10.0, is_preview=True)
+"""Angiogram that measures the retention: with the default injection, on a grid twice as coarse."""
 
 
 class Stored(Protocol):
@@ -39,6 +48,7 @@ def rank_flows(
     settings: FlowSettings,
     count: int,
     *,
+    has_contrast: bool = False,
     stored: Stored | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Ranking:
@@ -54,6 +64,8 @@ def rank_flows(
         Settings of the flows.
     count : int
         Number of candidates that get a flow.
+    has_contrast : bool, optional
+        Whether contrast is carried through the flows, and its retention in the sac counts in the scores.
     stored : Stored, optional
         Finished results by candidate; those that are there are not computed again, and new ones are added.
     progress : callable, optional
@@ -63,7 +75,8 @@ def rank_flows(
     -------
     Ranking
         The same candidates in the same order; those with a flow have its changes, its uncertainty and its grade among
-        their measures, and a sentence on it among their reasons.
+        their measures, and a sentence on it among their reasons. With contrast, those with a retention have new scores
+        and are ordered among the places that they have.
 
     Raises
     ------
@@ -78,19 +91,35 @@ def rank_flows(
     if not chosen:
         raise InputError("No size is suitable, so there is no flow to compute. Choose another device.")
     found: Stored = {} if stored is None else stored
-    unfinished = [one for one in chosen if found.get(one) is None]
+    unfinished = [one for one in chosen if not _is_finished(found.get(one), has_contrast)]
     bare: FlowField | None = None
     results: dict[Candidate | None, Mapping[str, Any]] = {}
+    criteria = ranking.criteria if has_contrast else None
     for done, candidate in enumerate([None, *chosen]):
         if progress is not None:
             progress(done, 1 + len(chosen), "no device" if candidate is None else candidate.label)
         result = found.get(candidate)
-        if result is None or (candidate is None and unfinished):
-            bare, result = _computed(anatomy, candidate, settings, bare)
+        if result is None or candidate in unfinished or (candidate is None and unfinished):
+            bare, result = _computed(anatomy, candidate, settings, bare, has_contrast)
             found[candidate] = result
         results[candidate] = result
-    told = (_with_flow(one, results[None], results[one]) if one in results else one for one in ranking.candidates)
-    return replace(ranking, candidates=tuple(told))
+    told = [
+        _with_flow(one, results[None], results[one], criteria) if one in results else one for one in ranking.candidates
+    ]
+    return replace(ranking, candidates=tuple(_by_retention(told)))
+
+
+def _is_finished(result: Mapping[str, Any] | None, has_contrast: bool) -> bool:
+    """Return whether a result holds what is asked for."""
+    return result is not None and ("error" in result or not has_contrast or "contrast" in result)
+
+
+def _by_retention(candidates: list[Candidate]) -> list[Candidate]:
+    """Return candidates of which those with a retention are ordered among the places that they have."""
+    places = [place for place, one in enumerate(candidates) if RETENTION in one.measures]
+    for place, one in zip(places, ordered(candidates[place] for place in places), strict=True):
+        candidates[place] = one
+    return candidates
 
 
 def chosen_of(ranking: Ranking, count: int) -> list[Candidate]:
@@ -103,7 +132,11 @@ def chosen_of(ranking: Ranking, count: int) -> list[Candidate]:
 
 
 def _computed(
-    anatomy: Anatomy, candidate: Candidate | None, settings: FlowSettings, bare: FlowField | None
+    anatomy: Anatomy,
+    candidate: Candidate | None,
+    settings: FlowSettings,
+    bare: FlowField | None,
+    has_contrast: bool,
 ) -> tuple[FlowField | None, Mapping[str, Any]]:
     """Return the flow without a device, and what is kept of the flow with a candidate or without one."""
     case = flow_case(anatomy, None if candidate is None else _stent(anatomy, candidate), settings)
@@ -115,8 +148,21 @@ def _computed(
         return bare, {"error": str(error)}
     values = indices(field, case.sac, case.ostium)
     kept = {key: values[key] for key in REDUCED} | {"unsettled_fraction": field.unsettled_fraction}
-    level = grade(case, field, values).level
-    return (field if candidate is None else bare), kept | {"grade": level}
+    kept["grade"] = grade(case, field, values).level
+    if has_contrast:
+        kept["contrast"] = _contrast(anatomy, field)
+    return (field if candidate is None else bare), kept
+
+
+def _contrast(anatomy: Anatomy, field: FlowField) -> dict[str, Any]:
+    """Return the retention of contrast in a flow, and whether it is only the least that it can be; or an error."""
+    try:
+        found = retention_s(angiogram(anatomy, field, CONTRAST).curves)
+    except (FlowError, InputError) as error:
+        return {"error": str(error)}
+    if found is None:
+        return {"error": f"the parent artery keeps contrast for more than {CONTRAST.window_s:g} s"}
+    return {"retention_s": found[0], "is_least": found[1]}
 
 
 def _stent(anatomy: Anatomy, candidate: Candidate) -> Stent:
@@ -126,8 +172,13 @@ def _stent(anatomy: Anatomy, candidate: Candidate) -> Stent:
     return deploy(design, anatomy, size=size, landing=landing).stent
 
 
-def _with_flow(candidate: Candidate, bare: Mapping[str, Any], flow: Mapping[str, Any]) -> Candidate:
-    """Return a candidate with the changes of its flow among its measures and reasons."""
+def _with_flow(
+    candidate: Candidate, bare: Mapping[str, Any], flow: Mapping[str, Any], criteria: Criteria | None
+) -> Candidate:
+    """Return a candidate with the changes of its flow among its measures and reasons.
+
+    With criteria the retention of contrast counts in its score.
+    """
     if "error" in flow:
         return replace(candidate, reason=f"{candidate.reason} Flow not computed: {flow['error']}")
     found: Measures = {"flow_grade": flow["grade"], "flow_uncertainty_fraction": flow["unsettled_fraction"]}
@@ -136,4 +187,21 @@ def _with_flow(candidate: Candidate, bare: Mapping[str, Any], flow: Mapping[str,
     found |= {name: flow[key] / bare[key] - 1 for key, name in REDUCED.items() if bare[key]}
     inflow, velocity = (float(found[REDUCED[key]]) for key in ("neck_inflow_mL_s", "mean_sac_velocity_m_s"))
     words = f"Flow ({flow['grade']}): neck inflow {inflow:+.0%}, sac velocity {velocity:+.0%}."
+    if criteria is not None:
+        change, said = _retained(bare["contrast"], flow["contrast"])
+        words = f"{words} {said}"
+        if change is not None:
+            candidate = regraded(replace(candidate, measures=candidate.measures | {RETENTION: change}), criteria)
     return replace(candidate, measures=candidate.measures | found, reason=f"{candidate.reason} {words}")
+
+
+def _retained(bare: Mapping[str, Any], flow: Mapping[str, Any]) -> tuple[float | None, str]:
+    """Return the change of the retention of contrast and a sentence on it; None where it is not known."""
+    for one in (bare, flow):
+        if "error" in one:
+            return None, f"Contrast: {one['error']}."
+    if bare["is_least"] or bare["retention_s"] <= 0:
+        return None, "Contrast: its retention without a device is not known."
+    change = flow["retention_s"] / bare["retention_s"] - 1
+    least = "at least " if flow["is_least"] else ""
+    return change, f"Contrast stays {least}{flow['retention_s']:.2f} s, without a device {bare['retention_s']:.2f} s."

@@ -210,8 +210,8 @@ def format_number(value: float) -> str:
 def format_change(before: Any, after: Any, key: str = "") -> str:
     """Return a relative change in percent, such as ``−35 %``; a dash where it is undefined.
 
-    The change of a percentage is a difference in percentage points, such as ``+1.2 points``. The change from zero, or to
-    more than ten times the value, is a difference with the unit of the key, such as ``+39.8 mm³``.
+    The change of a percentage is a difference in percentage points, such as ``+1.2 points``. The change from zero, or
+    to more than ten times the value, is a difference with the unit of the key, such as ``+39.8 mm³``.
 
     Parameters
     ----------
