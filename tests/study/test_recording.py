@@ -7,27 +7,24 @@ import pytest
 
 from vstent.angiography.angiogram import AngiogramSettings
 from vstent.errors import ReadError
-from vstent.study import films
 from vstent.study.films import Recording, stents_of
 from vstent.study.folder import history_path
 
 POINTS = np.stack([np.arange(6.0), np.zeros(6), np.zeros(6)], axis=1)
 
 
+CARRIER = SimpleNamespace(centers_mm=POINTS, cell_size_mm=1.0, inflow_mL_s=4.0)
+
+
 @pytest.fixture
-def flow(tmp_path, monkeypatch):
-    """The file of a flow; reading it gives a flow on six cells."""
-    path = tmp_path / "flow silk-0123.npz"
-    path.write_bytes(b"a flow")
-    carrier = SimpleNamespace(centers_mm=POINTS, cell_size_mm=1.0, inflow_mL_s=4.0)
-    load = films.load_data
-    monkeypatch.setattr(films, "load_data", lambda file, kind: carrier if file == path else load(file, kind))
-    return path
+def flow(tmp_path):
+    """The file of a flow."""
+    return tmp_path / "flow silk-0123.npz"
 
 
 def record(recording, flow) -> bool:
     """Record three frames; return whether frames were wanted."""
-    with recording("silk", flow) as watch:
+    with recording("silk", flow, lambda: CARRIER) as watch:
         if watch is not None:
             take = watch(POINTS, np.ones(6))
             for k in range(3):
@@ -55,7 +52,7 @@ def test_what_is_recorded_is_kept_only_when_the_march_ends(flow):
     recording = Recording(AngiogramSettings())
 
     def march():
-        with recording("silk", flow) as watch:
+        with recording("silk", flow, lambda: CARRIER) as watch:
             watch(POINTS, np.ones(6))(0.0, np.zeros(6))
             raise StoppedError
 
@@ -65,6 +62,13 @@ def test_what_is_recorded_is_kept_only_when_the_march_ends(flow):
     assert recording.histories == {}
 
 
+def test_where_there_is_no_flow_nothing_is_recorded(flow):
+    recording = Recording(AngiogramSettings())
+    with recording("silk", flow, lambda: None) as watch:
+        assert watch is None
+    assert recording.histories == {}
+
+
 def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(ReadError, match="holds no finished run"):
+    with pytest.raises(ReadError, match="not a case folder with a finished run"):
         stents_of(tmp_path, ())

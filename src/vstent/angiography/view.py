@@ -79,11 +79,6 @@ class View:
         return axes_of(self.primary_rad, self.secondary_rad)
 
     @property
-    def source_mm(self) -> Floats:
-        """(3,) position of the source."""
-        return self.isocenter_mm - self.source_isocenter_mm * self.axes[2]
-
-    @property
     def magnification(self) -> float:
         """Magnification at the isocenter."""
         return self.source_detector_mm / self.source_isocenter_mm

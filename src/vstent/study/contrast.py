@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,8 +20,8 @@ from vstent.io.tables import write_rows
 from vstent.io.writers import write_json
 from vstent.study.folder import CACHE, claimed
 from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of
-from vstent.study.provenance import METRICS, RUN
-from vstent.study.repeat import UNTOLD, told_in
+from vstent.study.provenance import METRICS
+from vstent.study.repeat import UNTOLD, finished_run
 from vstent.study.stages import flow_key
 from vstent.study.types import Progress, Settings
 
@@ -31,8 +32,9 @@ CURVES: Final = "curves.csv"
 NUMBERS: Final = "angiogram.json"
 """File with settings, measures and advice of all flows."""
 
-Record = Callable[[str, Path], AbstractContextManager[Watch | None]]
-"""Takes the name of a flow and its stored file; its context yields what watches the frames, or None."""
+Record = Callable[[str, Path, Callable[[], FlowField | None]], AbstractContextManager[Watch | None]]
+"""Takes the name of a flow, its stored file and what reads it (None where there is none); its context yields what
+watches the frames, or None."""
 
 
 def angiograms(
@@ -63,7 +65,7 @@ def angiograms(
     FlowError
         A flow does not fit in the free memory.
     """
-    source, study = _study(out)
+    source, study = finished_run(out)
     with claimed(out):
         ledger = Ledger(out / CACHE, progress)
         anatomy = ledger.recall(ANATOMY, anatomy_key(source, study), Anatomy)
@@ -75,17 +77,6 @@ def angiograms(
         }
         _write(out, found, settings, _flow_keys(source, study))
     return found
-
-
-def _study(out: Path) -> tuple[str, Settings]:
-    """Return the SHA-256 of the input and the settings of the run of a case folder."""
-    if not (out / RUN).is_file():
-        raise ReadError(f"{out} is not a case folder with a finished run: run `vstent run` with this --out first")
-    try:
-        told, study = told_in(out / RUN)
-        return str(told["input"]["sha256"]), study
-    except UNTOLD:
-        raise ReadError(f"{out / RUN} is from another version: run the case again") from None
 
 
 def _flow_keys(source: str, study: Settings) -> dict[str, str]:
@@ -106,11 +97,12 @@ def _one(
     """Return the angiogram of one flow, stored or computed."""
     stored = ledger.folder / f"flow {name}-{key}.npz"
     stage, own = f"angiogram {name}", key_of(key, settings)
-    with nullcontext() if record is None else record(name, stored) as watch:
+    carrier = cache(lambda: ledger.recall(f"flow {name}", key, FlowField))
+    with nullcontext() if record is None else record(name, stored, carrier) as watch:
         found = None if watch else ledger.recall(stage, own, Angiogram)
         if found is not None:
             return found
-        field = ledger.recall(f"flow {name}", key, FlowField)
+        field = carrier()
         if field is None:
             raise InputError(
                 f"{out} holds no flow of {name}, and contrast moves with the flow: run the case again without --no-flow"

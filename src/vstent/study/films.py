@@ -1,6 +1,6 @@
 """Stored contrast of a case folder, from which films along any direction are made."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,8 +15,7 @@ from vstent.geometry.vessel import Anatomy
 from vstent.io.archive import load_data, save_data
 from vstent.study.folder import CACHE, history_path
 from vstent.study.ledger import ANATOMY, anatomy_key, key_of
-from vstent.study.provenance import RUN
-from vstent.study.repeat import UNTOLD, told_in
+from vstent.study.repeat import finished_run
 from vstent.study.stages import deploy_one
 
 
@@ -33,20 +32,22 @@ class Recording:
     """Contrast by name of the flow; filled by the calls."""
 
     @contextmanager
-    def __call__(self, name: str, flow: Path) -> Iterator[Watch | None]:
+    def __call__(self, name: str, flow: Path, carrier_of: Callable[[], FlowField | None]) -> Iterator[Watch | None]:
         """Yield what watches the frames of a flow, or None where they are stored.
 
         Parameters
         ----------
         name : name of the flow.
         flow : its stored file.
+        carrier_of : returns the flow, None where there is none.
         """
         path, key = history_path(flow), key_of(self.settings)
         kept = _kept(path, key)
-        if kept is not None or not flow.is_file():
+        carrier = carrier_of() if kept is None else None
+        if carrier is None:
             yield None
         else:
-            carrier, bolus = load_data(flow, FlowField), self.settings.bolus
+            bolus = self.settings.bolus
             recorder = Recorder(carrier, bolus.inflow(carrier.inflow_mL_s)[1], key, bolus.begin_s)
             yield recorder.watch
             kept = recorder.history()
@@ -78,10 +79,6 @@ def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, Stent
     ReadError
         The folder holds no finished run of this version.
     """
-    try:
-        told, study = told_in(out / RUN)
-        key = anatomy_key(str(told["input"]["sha256"]), study)
-    except UNTOLD:
-        raise ReadError(f"{out} holds no finished run of this version: run the case again") from None
-    anatomy = load_data(out / CACHE / f"{ANATOMY}-{key}.npz", Anatomy)
+    source, study = finished_run(out)
+    anatomy = load_data(out / CACHE / f"{ANATOMY}-{anatomy_key(source, study)}.npz", Anatomy)
     return anatomy, {name: deploy_one(find_design(name), anatomy, study.placing(name)).stent for name in names}

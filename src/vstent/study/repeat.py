@@ -107,6 +107,27 @@ def told_in(run: Path) -> tuple[dict[str, Any], Settings]:
     return told, settings_of(told["settings"])
 
 
+def finished_run(out: Path) -> tuple[str, Settings]:
+    """Return the SHA-256 of the input and the settings of the run of a case folder.
+
+    Parameters
+    ----------
+    out : the case folder.
+
+    Raises
+    ------
+    ReadError
+        The folder holds no finished run of this version.
+    """
+    if not (out / RUN).is_file():
+        raise ReadError(f"{out} is not a case folder with a finished run: run `vstent run` with this --out first")
+    try:
+        told, study = told_in(out / RUN)
+        return str(told["input"]["sha256"]), study
+    except UNTOLD:
+        raise ReadError(f"{out / RUN} is from another version: run the case again") from None
+
+
 def settings_of(told: Mapping[str, Any]) -> Settings:
     """Return the settings stated by a ``run.json``.
 
