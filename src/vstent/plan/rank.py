@@ -212,13 +212,13 @@ def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) 
         return Candidate(design, size, shift_mm, {}, {}, 0.0, False, str(error))
     measures = measure(anatomy, deployment)
     measures |= landing_measures(anatomy, measures)
-    found = regraded(Candidate(design, size, shift_mm, measures, {}, 0.0, False, ""), criteria)
+    found = graded_anew(Candidate(design, size, shift_mm, measures, {}, 0.0, False, ""), criteria)
     if not found.is_suitable:
         return found
     return replace(found, measures=measures | _length_band(anatomy, deployment, measures))
 
 
-def regraded(candidate: Candidate, criteria: Criteria) -> Candidate:
+def graded_anew(candidate: Candidate, criteria: Criteria) -> Candidate:
     """Return a candidate with the grades, the score and the reason of its measures.
 
     Parameters

@@ -16,7 +16,7 @@ from vstent.flow.indices import indices
 from vstent.flow.simulation import flow_case, simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.plan.criteria import Criteria
-from vstent.plan.rank import Candidate, Ranking, ordered, regraded
+from vstent.plan.rank import Candidate, Ranking, graded_anew, ordered
 
 REDUCED: Final = {
     "neck_inflow_mL_s": "neck_inflow_change_fraction",
@@ -147,7 +147,7 @@ def _computed(
             raise
         return bare, {"error": str(error)}
     values = indices(field, case.sac, case.ostium)
-    kept = {key: values[key] for key in REDUCED} | {"unsettled_fraction": field.unsettled_fraction}
+    kept: dict[str, Any] = {key: values[key] for key in REDUCED} | {"unsettled_fraction": field.unsettled_fraction}
     kept["grade"] = grade(case, field, values).level
     if has_contrast:
         kept["contrast"] = _contrast(anatomy, field)
@@ -191,7 +191,7 @@ def _with_flow(
         change, said = _retained(bare["contrast"], flow["contrast"])
         words = f"{words} {said}"
         if change is not None:
-            candidate = regraded(replace(candidate, measures=candidate.measures | {RETENTION: change}), criteria)
+            candidate = graded_anew(replace(candidate, measures=candidate.measures | {RETENTION: change}), criteria)
     return replace(candidate, measures=candidate.measures | found, reason=f"{candidate.reason} {words}")
 
 
