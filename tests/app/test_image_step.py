@@ -327,8 +327,9 @@ def test_an_oblique_scan_is_shown_along_the_patient_or_along_its_file(client):
         playwright.expect(page.locator(".slice-label", has_text="Oblique to axial by 16°")).to_be_visible()
         assert page.locator(".slice-label", has_text="Sagittal").count() == 1  # the axis about which it is turned
         np.testing.assert_allclose(reading(page)[1], before, atol=0.06)
-        moved_mm = moved(page, pane_of(page, "Oblique to axial"))
-        np.testing.assert_allclose(moved_mm, about_x(TURN_DEG) @ [0, 5, 0], atol=0.6)  # whole pixels
+        oblique, wanted_mm = pane_of(page, "Oblique to axial"), about_x(TURN_DEG) @ [0, 5, 0]
+        # The first movements may fall before the slices are laid anew.
+        assert in_time(page, lambda: np.allclose(moved(page, oblique), wanted_mm, rtol=0, atol=0.35))
         assert page.get_by_role("button", name="Crop").is_enabled()
 
 

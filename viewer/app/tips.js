@@ -12,7 +12,7 @@ export function listenForTips(root) {
   const find = (event) => taken(event.target instanceof Element ? event.target.closest("[title], [data-tip]") : null);
   document.addEventListener("pointerover", (event) => {
     const found = find(event);
-    if (found === owner) return;
+    if (found === owner || (!found && isHeld())) return;
     hide();
     if (found && event.pointerType !== "touch") timer = setTimeout(() => show(found), REST_MS);
   });
@@ -30,7 +30,12 @@ export function listenForTips(root) {
     else show(found);
   });
   document.addEventListener("keydown", (event) => event.key === "Escape" && hide());
-  document.addEventListener("scroll", hide, { capture: true, passive: true });
+  document.addEventListener("scroll", () => (isHeld() ? place() : hide()), { capture: true, passive: true });
+}
+
+/** Whether the tip belongs to what has the focus: bringing that into view scrolls, and moves other things below the pointer. */
+function isHeld() {
+  return Boolean(owner?.contains(document.activeElement));
 }
 
 /** The element with its title taken over. */
@@ -51,7 +56,12 @@ function show(element) {
   element.setAttribute("aria-describedby", "tip");
   tip.textContent = element.dataset.tip;
   tip.hidden = false;
-  const box = element.getBoundingClientRect();
+  place();
+}
+
+/** Put the tip below its element, or above it where there is no room. */
+function place() {
+  const box = owner.getBoundingClientRect();
   const [width, height] = [tip.offsetWidth, tip.offsetHeight];
   const top = box.bottom + 8 + height > innerHeight ? box.top - height - 8 : box.bottom + 8;
   tip.style.left = `${Math.max(8, Math.min(box.left, innerWidth - width - 8))}px`;
