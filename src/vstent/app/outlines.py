@@ -1,10 +1,12 @@
 """Outlines on a slice of the scan: where its plane cuts the surfaces and the wires that were found."""
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
+from vstent.app.planes import Grid
 from vstent.devices.stent import Stent
+from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import clipping
@@ -12,14 +14,7 @@ from vstent.kernels.arrays import Floats
 from vstent.reporting.packing import Packer
 
 
-class Gridded(Protocol):
-    """A grid of voxels."""
-
-    def to_index(self, points_mm: Floats) -> Floats:
-        """Return the fractional voxel indices (n, 3) of positions (n, 3) in LPS mm."""
-
-
-def outlines(image: Gridded, anatomy: Anatomy, stent: Stent | None, axis: int, index: int) -> bytes:
+def outlines(image: Image | Grid, anatomy: Anatomy, stent: Stent | None, axis: int, index: int) -> bytes:
     """Return the exact sections of all surfaces and wires by the plane of a slice, as a message for the page.
 
     Positions are voxel indices (column, row) in the slice. Surfaces give segments, wires give the points where their
@@ -55,7 +50,7 @@ def _surfaces(anatomy: Anatomy) -> dict[str, list[Surface]]:
     }
 
 
-def section(image: Gridded, surface: Surface, axis: int, index: int) -> Floats:
+def section(image: Image | Grid, surface: Surface, axis: int, index: int) -> Floats:
     """Return the segments (s, 2, 2) in which the plane of a slice cuts a surface, as voxel indices in the slice.
 
     Parameters
@@ -70,7 +65,7 @@ def section(image: Gridded, surface: Surface, axis: int, index: int) -> Floats:
     return np.delete(found, axis, axis=2)
 
 
-def crossings(image: Gridded, stent: Stent, axis: int, index: int) -> Floats:
+def crossings(image: Image | Grid, stent: Stent, axis: int, index: int) -> Floats:
     """Return where wires cross the plane of a slice (n, 3): column, row and diameter of the wire in mm.
 
     Parameters

@@ -84,7 +84,7 @@ class _Post:
 
     def _run(self) -> None:
         """Send until the end, or until the process has ended."""
-        with suppress(BrokenPipeError, OSError):
+        with suppress(OSError):
             while True:
                 with self._ready:
                     self._ready.wait_for(lambda: self._is_asked or self._is_over)

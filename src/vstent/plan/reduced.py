@@ -99,12 +99,13 @@ class Reduced:
         places = [0, -1, *mesh_nodes(design, size)]
         ends_mm, at_mm = march(design, size, self.landing, profile)[places], self.landing.abscissa_mm
         shorter = np.zeros(2) if self.shortening is None else self.shortening(design, size)
-        first_mm, last_mm, mesh_first_mm, mesh_last_mm = ends_mm + np.tile(shorter, 2) * (ends_mm - at_mm)
+        ends_mm = ends_mm + np.tile(shorter, 2) * (ends_mm - at_mm)
         wider_mm = profile.at(self._rows_mm) - self._nominal.at(self._rows_mm)
         inward_mm = (design.wall_offset_um - self.deployment.stent.design.wall_offset_um) * MM_PER_UM
         gap_mm = np.maximum(self.deployment.wall_gap_mm - (0.5 * wider_mm + inward_mm)[:, None], 0.0)
-        ends = (float(first_mm), float(last_mm), float(mesh_first_mm), float(mesh_last_mm))
-        return Changed(*ends, gap_mm[self._is_at_patient], *self._density(design, size, profile))
+        first_mm, last_mm, mesh_first_mm, mesh_last_mm = ends_mm.tolist()
+        at_patient_mm, density = gap_mm[self._is_at_patient], self._density(design, size, profile)
+        return Changed(first_mm, last_mm, mesh_first_mm, mesh_last_mm, at_patient_mm, *density)
 
     @property
     def _rows_mm(self) -> Floats:

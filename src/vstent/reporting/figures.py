@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,16 +12,10 @@ from vstent.geometry.vessel import Anatomy
 from vstent.kernels import raster
 from vstent.kernels.arrays import Floats
 from vstent.reporting.lettering import blank, color_bar, length_bar, points_px, put, put_title
-from vstent.reporting.scene import (
-    LineLayer,
-    MeshLayer,
-    Scene,
-    View,
-    anatomy_layers,
-    device_layers,
-    view_of,
-    views_of,
-)
+from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View, scene_of, view_of
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 BACKGROUND = (0.965, 0.973, 0.978)
 """Background color: red, green and blue, 0 to 1."""
@@ -91,17 +86,11 @@ def patient_picture(anatomy: Anatomy, deployment: Deployment) -> bytes:
     anatomy : vessel, parent artery and sacs.
     deployment : the deployed device.
     """
-    layers = [*anatomy_layers(anatomy), *device_layers("one", deployment, anatomy)]
-    shown = tuple(layer for layer in layers if layer.id in ("lumen", "continued", "wires", "neck"))
-    fade_mm = 1.2 * float(np.median(anatomy.section_radius_mm))
-    views = views_of(anatomy, {"one": deployment})
-    scene = Scene((), tuple(layers), (), views, anatomy.vessel.is_oriented, fade_mm)
-    picture = blank(*PATIENT_PX)
-    put(picture, draw(shown, scene, views[0], PATIENT_PX), (0, 0))
-    length_bar(picture, span_mm(views[0], PATIENT_PX), (0, 0), PATIENT_PX)
-    stream = io.BytesIO()
-    picture.save(stream, "PNG")
-    return stream.getvalue()
+    scene = scene_of(anatomy, {"one": deployment}, {})
+    view, picture = scene.views[0], blank(*PATIENT_PX)
+    put(picture, draw(scene.pick(("lumen", "continued", "wires", "neck"), "one"), scene, view, PATIENT_PX), (0, 0))
+    length_bar(picture, span_mm(view, PATIENT_PX), (0, 0), PATIENT_PX)
+    return _png(picture)
 
 
 def draw(layers: tuple[MeshLayer | LineLayer, ...], scene: Scene, view: View, size_px: tuple[int, int]) -> Floats:
@@ -312,6 +301,11 @@ def sheet(scene: Scene, shots: list[Shot], scale: str) -> bytes:
     if scale:
         chosen = scene.scale(scale)
         color_bar(picture, chosen.colours, (chosen.low, chosen.high), f"{chosen.title} [{chosen.unit}]")
+    return _png(picture)
+
+
+def _png(picture: "Image") -> bytes:
+    """Return a picture as PNG, without metadata, so that equal pictures give equal bytes."""
     stream = io.BytesIO()
-    picture.save(stream, "PNG")  # without metadata, so that equal pictures give equal bytes
+    picture.save(stream, "PNG")
     return stream.getvalue()
