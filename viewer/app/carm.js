@@ -2,7 +2,8 @@
 
 const NAMED = { AP: [0, 0], PA: [0, 0], FRONTAL: [0, 0], LATERAL: [90, 0] };
 const SIGNS = { LAO: [1, 0], RAO: [-1, 0], CRA: [0, 1], CAU: [0, -1] };
-const REACH = [180, 90];
+/** Largest angles in degrees, LAO or RAO and CRA or CAU. */
+export const REACH = [180, 90];
 const RADIAN = Math.PI / 180;
 
 /** Angles in degrees in words: ``LAO 30 CRA 10``. */

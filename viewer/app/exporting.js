@@ -1,5 +1,6 @@
 // A view as a file of a chosen size: PNG, or SVG with text, bars and charts as vectors and the 3-D view in it as a raster.
 import { make, svg } from "../src/dom.js";
+import { cancelButton, shown } from "./dialogs.js";
 import { traced } from "./tracing.js";
 
 /** Widths in mm that journals ask for. */
@@ -31,41 +32,29 @@ export function chartButton(name, element, lay) {
 }
 
 /** Ask for size and format; the promise holds whether to save. */
-function choose() {
-  return new Promise((answered) => {
-    const field = (label, input) => make("label", {}, [make("span", {}, [label]), input]);
-    const select = (key, values, words) => {
-      const box = make("select", {}, values.map((value) => make("option", { value, selected: value === chosen[key] }, [words(value)])));
-      box.dataset.key = key;
-      return box;
-    };
-    const width = make("input", { type: "number", min: 20, max: 400, step: "any", required: true, value: chosen.width });
-    width.setAttribute("list", "save-widths");
-    const widths = make("datalist", { id: "save-widths" }, WIDTHS.map((mm) => make("option", { value: mm })));
-    const [format, dpi] = [select("format", ["PNG", "SVG"], (word) => word), select("dpi", RESOLUTIONS, (value) => `${value} dpi`)];
-    const form = make("form", { method: "dialog", className: "save-form" }, [
-      make("h2", { id: "save-title" }, ["Save picture"]),
-      field("Format", format),
-      field("Width, mm", width),
-      widths,
-      field("Resolution", dpi),
-      make("p", { className: "hint" }, [`Journals ask for 85 mm (one column) to 170 mm (two). Letters are about ${LETTER_PT} pt high at every width. In SVG text, bars and charts are vectors; the 3-D view is a picture of this resolution.`]),
-      make("div", { className: "ask-buttons" }, [
-        make("button", { type: "button", onClick: () => box.close("no") }, ["Cancel"]),
-        make("button", { type: "submit", className: "primary", value: "yes" }, ["Save"]),
-      ]),
-    ]);
-    const box = make("dialog", { className: "ask" }, [form]);
-    box.setAttribute("aria-labelledby", "save-title");
-    box.addEventListener("close", () => {
-      box.remove();
-      const isSure = box.returnValue === "yes";
-      if (isSure) Object.assign(chosen, { width: Number(width.value), dpi: Number(dpi.value), format: format.value });
-      answered(isSure);
-    });
-    document.body.append(box);
-    box.showModal();
-  });
+async function choose() {
+  const field = (label, input) => make("label", {}, [make("span", {}, [label]), input]);
+  const select = (key, values, words) => {
+    const box = make("select", {}, values.map((value) => make("option", { value, selected: value === chosen[key] }, [words(value)])));
+    box.dataset.key = key;
+    return box;
+  };
+  const width = make("input", { type: "number", min: 20, max: 400, step: "any", required: true, value: chosen.width });
+  width.setAttribute("list", "save-widths");
+  const widths = make("datalist", { id: "save-widths" }, WIDTHS.map((mm) => make("option", { value: mm })));
+  const [format, dpi] = [select("format", ["PNG", "SVG"], (word) => word), select("dpi", RESOLUTIONS, (value) => `${value} dpi`)];
+  const form = make("form", { method: "dialog", className: "save-form" }, [
+    make("h2", { id: "save-title" }, ["Save picture"]),
+    field("Format", format),
+    field("Width, mm", width),
+    widths,
+    field("Resolution", dpi),
+    make("p", { className: "hint" }, [`Journals ask for 85 mm (one column) to 170 mm (two). Letters are about ${LETTER_PT} pt high at every width. In SVG text, bars and charts are vectors; the 3-D view is a picture of this resolution.`]),
+    make("div", { className: "ask-buttons" }, [cancelButton(), make("button", { type: "submit", className: "primary", value: "yes" }, ["Save"])]),
+  ]);
+  const isSure = await shown(form, "save-title");
+  if (isSure) Object.assign(chosen, { width: Number(width.value), dpi: Number(dpi.value), format: format.value });
+  return isSure;
 }
 
 async function offer(source) {

@@ -1,13 +1,12 @@
 // Films of the contrast agent before and after, in step: a slider, curves, and a C-arm that is turned by hand.
 import { integers } from "../src/decode.js";
 import { make } from "../src/dom.js";
-import { inWords } from "./carm.js";
+import { inWords, REACH } from "./carm.js";
 import { curvesChart } from "./charts.js";
 import { chartButton, copied, saveButton } from "./exporting.js";
 import { getBinary, Newest } from "./api.js";
 
 const DEGREES_PER_PX = 0.4;
-const REACH = [180, 90];
 const NAMED = [["", "Working"], ["AP", "Frontal"], ["LAO 90", "Lateral"]];
 
 /** Where the picture of a canvas lies that keeps its shape in a box of another one. */
