@@ -107,17 +107,17 @@ def study(
         device_sentences,
         uncertainty_table,
     )
+    from vstent.reporting.drawing import Drawing
+    from vstent.reporting.write import write_report
     from vstent.study.pipeline import run
 
     console = Console()
-    with console.live():
-        case = run(path, out, settings, console.progress, replaces=replaces)
+    with console.live(), Drawing() as drawing:
+        case = run(path, out, settings, console.progress, replaces=replaces, before_measures=drawing.begin)
         if injected is not None:
             _film(case, out, injected, console.progress)
         console.progress("report", 0.0, "")
-        from vstent.reporting.write import write_report
-
-        write_report(case, out, is_printed=is_printed)
+        write_report(case, out, is_printed=is_printed, drawing=drawing)
         console.progress("report", 1.0, str(out / "report.html"))
     console.print(comparison_table(case.metrics))
     for sentence in device_sentences(case.metrics):

@@ -35,7 +35,7 @@ def _paint() -> None:
     """Paint a triangle and a wire with the kernels that draw a report's pictures."""
     screen, faces = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]), np.array([[0, 1, 2]], dtype=np.int32)
     faces.setflags(write=False)
-    depth, image, sums = np.full((2, 2), np.inf), np.zeros((2, 2, 3)), np.zeros((2, 2, 4))
+    depth, image, sums = (np.zeros(shape, np.float32) for shape in ((2, 2), (2, 2, 3), (2, 2, 4)))
     raster.paint_triangles(screen, screen, faces, depth, image)
     raster.paint_wires(screen, np.array([0, 3], dtype=np.int32), np.ones(1), 1.0, screen, depth, image)
     raster.veil_triangles(screen, screen, np.ones(1), faces, depth, sums, depth)

@@ -4,8 +4,9 @@ They show the parent artery with the sac removed, the maximum inscribed spheres 
 its expansion, and the wires in the parent artery and in the patient's own artery.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -14,13 +15,10 @@ from vstent.devices.stent import Deployment, tube_faces
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats, Ints
-from vstent.reporting.figures import Picture, Shot, sheet
+from vstent.reporting.figures import Plate, Shot
 from vstent.reporting.scene import LineLayer, MeshLayer, Scene, curves_layer, round_up
 from vstent.reporting.thinning import some_frames, thin_frames
 from vstent.units import counted
-
-if TYPE_CHECKING:
-    from vstent.study.types import CaseResult
 
 SPHERE_STEP: Final = 0.9
 """Distance between drawn spheres as a fraction of their radius."""
@@ -34,23 +32,24 @@ _INK: Final = (0.10, 0.17, 0.20)
 """Colors of spheres, contours and lines: red, green and blue, 0 to 1."""
 
 
-def method_pictures(case: "CaseResult", scene: Scene) -> list[Picture]:
-    """Return the pictures of the steps from the patient's artery to the deployed devices, in that order.
+def method_plates(anatomy: Anatomy, deployments: Mapping[str, Deployment], scene: Scene) -> list[Plate]:
+    """Return the pictures of the steps from the patient's artery to the deployed devices, in that order, to be drawn.
 
     Parameters
     ----------
-    case : the finished case.
-    scene : its scene.
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployed devices by name.
+    scene : the scene of the case.
     """
-    found = [_restoration(scene), _spheres(case.anatomy, scene)]
-    if case.deployments:
-        found.append(_first_contours(case, scene))
-        found += [_expansion(name, deployment, case.anatomy, scene) for name, deployment in case.deployments.items()]
+    found = [_restoration(scene), _spheres(anatomy, scene)]
+    if deployments:
+        found.append(_first_contours(deployments, scene))
+        found += [_expansion(name, deployment, anatomy, scene) for name, deployment in deployments.items()]
         found.append(_fitted(scene))
     return found
 
 
-def _restoration(scene: Scene) -> Picture:
+def _restoration(scene: Scene) -> Plate:
     """Return the picture of the removal of the sac."""
     profile = scene.view("profile")
     lumen, landing = scene.pick(("lumen",), BARE), scene.pick(("continued", "landing"), BARE)
@@ -64,10 +63,10 @@ def _restoration(scene: Scene) -> Picture:
         "The wall as found; the sac (red), cut off along its neck (red line); and the parent artery with sac "
         "and side branches closed, against which a device expands."
     )
-    return Picture("restoration", "From the patient's artery to the parent artery", caption, sheet(scene, shots, ""))
+    return Plate("restoration", "From the patient's artery to the parent artery", caption, scene, shots)
 
 
-def _spheres(anatomy: Anatomy, scene: Scene) -> Picture:
+def _spheres(anatomy: Anatomy, scene: Scene) -> Plate:
     """Return the picture of the axis and its maximum inscribed spheres."""
     spheres = _bead_layer(anatomy)
     shots = [
@@ -78,7 +77,7 @@ def _spheres(anatomy: Anatomy, scene: Scene) -> Picture:
         "The axis of the parent artery (blue line) with its maximum inscribed spheres, which set the diameter "
         "of the initial contour."
     )
-    return Picture("spheres", "Centerline and maximum inscribed spheres", caption, sheet(scene, shots, ""))
+    return Plate("spheres", "Centerline and maximum inscribed spheres", caption, scene, shots)
 
 
 def _bead_layer(anatomy: Anatomy) -> MeshLayer:
@@ -106,17 +105,17 @@ def _unit_sphere(rows: int = 17, columns: int = 32) -> tuple[Floats, Ints]:
     return points.reshape(-1, 3), tube_faces(rows, columns)[:, ::-1]
 
 
-def _first_contours(case: "CaseResult", scene: Scene) -> Picture:
+def _first_contours(deployments: Mapping[str, Deployment], scene: Scene) -> Plate:
     """Return the picture of the contour of each device before the first iteration."""
     shots = []
     for name, title in scene.panes[1:]:
-        layers = (*scene.pick(("axis",), BARE), *_contour_layers(case.deployments[name].history_mm[0]))
+        layers = (*scene.pick(("axis",), BARE), *_contour_layers(deployments[name].history_mm[0]))
         shots.append(Shot(title, (*_glass(scene), *layers), scene.view("profile")))
     caption = (
         "The contour before the first iteration, in the parent artery (glass): rows of nodes on planes across "
         "the axis, each as wide as the maximum inscribed sphere. Some rows are drawn as lines."
     )
-    return Picture("first", "The initial contour", caption, sheet(scene, shots, ""))
+    return Plate("first", "The initial contour", caption, scene, shots)
 
 
 def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
@@ -128,7 +127,7 @@ def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
     return MeshLayer("first", "", _STEEL, "", np.zeros(0), surface), curves_layer("rings", rings, 0.02, _INK)
 
 
-def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene) -> Picture:
+def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene) -> Plate:
     """Return the picture of the expansion of one device, colored by the gap to the wall."""
     frames_mm, gaps_mm = thin_frames(deployment, anatomy.landing_surface, FRAMES)
     contour = next(layer for layer in scene.pick(("contour",), name) if isinstance(layer, MeshLayer))
@@ -152,10 +151,10 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
         "Expansion of the active contour to the wall of the parent artery (glass) in "
         f"{counted(len(deployment.history_mm) - 1, 'iteration')}, colored by the remaining gap."
     )
-    return Picture(f"expansion-{name}", title, caption, sheet(shown, shots, "wall_gap"))
+    return Plate(f"expansion-{name}", title, caption, shown, shots, "wall_gap")
 
 
-def _fitted(scene: Scene) -> Picture:
+def _fitted(scene: Scene) -> Plate:
     """Return the picture of the wires in the parent artery and in the patient's own artery."""
     profile = scene.view("profile")
     shots = [
@@ -169,7 +168,7 @@ def _fitted(scene: Scene) -> Picture:
         )
     ]
     caption = "The wires on the expanded contour, and in the patient's own artery with its sac (neck: red line)."
-    return Picture("fitted", "The deployed devices", caption, sheet(scene, shots, ""))
+    return Plate("fitted", "The deployed devices", caption, scene, shots)
 
 
 def _glass(scene: Scene) -> tuple[MeshLayer | LineLayer, ...]:
