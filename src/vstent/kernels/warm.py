@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vstent.kernels import coverage, curves, footprints, medial, net, raster, sampling, tree, triangles, voxels
+from vstent.kernels import coverage, curves, digits, footprints, medial, net, raster, sampling, tree, triangles, voxels
 
 
 def warm() -> None:
@@ -18,6 +18,7 @@ def warm() -> None:
     curves.closed_lengths(nodes)
     arm = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
     footprints.footprints(np.zeros((1, 3)), np.ones(1), np.eye(3), arm, np.array([2, 2]))
+    digits.text_rows(["", ""], arm[None].astype(np.int64)[:, :1], 0)
     medial.widest_in_section(np.ones((1, 2)), np.ones((1, 2, 2)), 1.0, np.ones(1))
 
 
