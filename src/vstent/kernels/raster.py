@@ -125,7 +125,7 @@ def veil_triangles(
         area = _edge(p, q, r[0], r[1])
         if area == 0.0:
             continue
-        # The edge functions are linear along a row. Local copies spare loads, because the sums might share their memory.
+        # Edge functions are linear along a row. Local copies spare loads: the sums might share their memory.
         share = 1.0 / area
         z_a, z_b, z_c = p[2], q[2], r[2]
         alpha_a, alpha_b, alpha_c = alphas[i], alphas[j], alphas[k]

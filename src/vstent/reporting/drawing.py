@@ -53,9 +53,7 @@ class Drawing:
         """Drop the pictures that are not begun."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def begin(
-        self, anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]
-    ) -> Scene:
+    def begin(self, anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]) -> Scene:
         """Begin to draw all pictures of a case, unless this has been done; return its scene.
 
         Parameters

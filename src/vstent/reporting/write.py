@@ -40,9 +40,7 @@ def write_plan(case: "CaseResult", out: Path, day: str) -> None:
         partial.write_bytes(plan_pdf(planned))
 
 
-def write_report(
-    case: "CaseResult", out: Path, *, is_printed: bool = False, drawing: Drawing | None = None
-) -> None:
+def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False, drawing: Drawing | None = None) -> None:
     """Write ``report.html`` into a case folder, and optionally ``report.pdf``, unless they are there for these results.
 
     Parameters
@@ -58,7 +56,8 @@ def write_report(
     )
     films = kept_films(out)
     if films is not None:
-        key = key_of(key, hashlib.sha256(b"".join([*(one.image.tobytes() for one in films.pictures), films.animation])).hexdigest())
+        shown = b"".join([*(one.image.tobytes() for one in films.pictures), films.animation])
+        key = key_of(key, hashlib.sha256(shown).hexdigest())
     wanted = ["report.html"] + ["report.pdf"] * is_printed
     if all((out / name).is_file() for name in wanted) and _text(drawn) == key:
         return  # painting takes seconds, and would give the same pictures
