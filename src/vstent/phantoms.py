@@ -23,6 +23,10 @@ from vstent.kernels.isosurface import isosurface
 
 AXIS_STEP_MM: Final = 0.04
 """Distance between the points of an axis, in mm."""
+BLOCK: Final = 4
+"""Edge of the blocks of samples of which only those near the wall are computed, in samples."""
+STEEPEST: Final = 1.2
+"""Upper bound on the gradient of the implicit function; it is 1 except near an ellipsoid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +182,7 @@ class Phantom:
         points = _points([np.arange(a, b, step) for a, b in zip(low, high, strict=True)])
         depth = np.min([sac.implicit_mm(points)[0] for sac in self.sacs], axis=0)
         inside = np.clip(0.5 - depth / step, 0.0, 1.0)
+        points, inside = points[inside > 0], inside[inside > 0]
         beyond = tube_implicit_mm(self.parent, points)[0]
         volume = float((inside * np.clip(0.5 + beyond / step, 0.0, 1.0)).sum() * step**3)
         layer = inside * np.clip(1.0 - np.abs(beyond) / step, 0.0, 1.0) / step  # a hat of unit area across the wall
@@ -469,15 +474,15 @@ def _cut_ends(phantom: Phantom, surface: Surface, edge_mm: float) -> Surface:
 def _sample(phantom: Phantom, ticks: list[Floats], band_mm: float) -> Floats:
     """Return the implicit function on a grid (i, j, k), exact within `band_mm` of the wall and elsewhere right in sign.
 
-    Blocks of 6 x 6 x 6 samples that the wall cannot reach have the value at their center.
+    Blocks of samples that are all farther from the wall have the value at their center.
     """
-    size = 6
+    size = BLOCK
     shape = np.array([len(t) for t in ticks])
     middles = [t[np.minimum(np.arange(size // 2, len(t) + size // 2, size), len(t) - 1)] for t in ticks]
     coarse = phantom.implicit_mm(_points(middles))[0].reshape([len(m) for m in middles])
     field = coarse.repeat(size, 0).repeat(size, 1).repeat(size, 2)[: shape[0], : shape[1], : shape[2]]
-    reach = 1.2 * float(np.linalg.norm([size * (t[1] - t[0]) for t in ticks])) + band_mm
-    index = np.nonzero(np.abs(field) < reach)
+    farthest_mm = size // 2 * float(np.linalg.norm([t[1] - t[0] for t in ticks]))
+    index = np.nonzero(np.abs(field) < STEEPEST * farthest_mm + band_mm)
     field[index] = phantom.implicit_mm(np.stack([t[i] for t, i in zip(ticks, index, strict=True)], axis=-1))[0]
     return field
 
@@ -538,7 +543,7 @@ def scan(phantom: Phantom, rng: Generator, *, scanner: Scanner = Scanner()) -> I
     low, high = _field_of_view(phantom, scanner.margin_mm)
     pad = int(np.ceil(4 * scanner.blur_mm / h))
     ticks = [np.arange(a + h / 2 - pad * h, b + pad * h, h) for a, b in zip(low, high, strict=True)]
-    field = _sample(phantom, ticks, band_mm=2 * h)
+    field = _sample(phantom, ticks, band_mm=3 * h)  # the gradient of a voxel near the wall reaches one voxel farther
     filled = gaussian_filter(_coverage(field, h).astype(np.float32), scanner.blur_mm / h)
     tissue = _normalised(gaussian_filter(rng.standard_normal(field.shape, dtype=np.float32), 3.0 / h))
     grain = _normalised(gaussian_filter(rng.standard_normal(field.shape, dtype=np.float32), 0.5))

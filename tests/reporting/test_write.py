@@ -15,7 +15,7 @@ def painted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The names of the cases that were painted."""
     names: list[str] = []
 
-    def contents(case):
+    def contents(case, drawing):
         names.append(case.name)
         return report_case.contents()
 

@@ -51,6 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _done(arguments: argparse.Namespace) -> int:
     """Run a command and return the exit code."""
     try:
+        if "answered" in arguments and arguments.answered(arguments):
+            return 0
         if arguments.command.__module__ in (app.__name__, devices.__name__):  # they need no kernels to start
             return int(arguments.command(arguments))
         from vstent.kernels.first_use import telling

@@ -65,6 +65,8 @@ class Console:
         self._status: Status | None = None
         self._began: dict[str, float] = {}
         self._told = time.monotonic()
+        self.printed = ""
+        """Everything printed on standard output."""
 
     @contextmanager
     def live(self) -> Iterator[None]:
@@ -101,6 +103,9 @@ class Console:
     def print(self, item: Any) -> None:
         """Print a line or a table on standard output."""
         self._out.print(item)
+        with self._out.capture() as again:
+            self._out.print(item)
+        self.printed += again.get()
 
 
 def comparison_table(metrics: Mapping[str, Any]) -> Table:

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from vstent.cli import options, run
+from vstent.cli import finished, options, run
 
 
 def add(commands: options.Commands) -> None:
@@ -22,7 +22,7 @@ def add(commands: options.Commands) -> None:
     )
     run.add_study(parser)
     run.add_pdf(parser)
-    parser.set_defaults(command=_demo)
+    parser.set_defaults(command=_demo, answered=finished.answered)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
@@ -31,6 +31,10 @@ def _demo(arguments: argparse.Namespace) -> int:
     from vstent.study.demo import truth, write_scan
 
     scan, settings = write_scan(arguments.out / "scan"), run.given_study(arguments)
-    case = run.study(scan, arguments.out, settings, is_printed=arguments.pdf, replaces=arguments.replace)
-    Console().print(truth_table(truth(case)))
-    return 1 if case.failures else 0
+    console, asked = Console(), {"is_printed": arguments.pdf, "replaces": arguments.replace}
+    case = run.study(scan, arguments.out, settings, console, **asked)
+    console.print(truth_table(truth(case)))
+    if case.failures:
+        return 1
+    finished.remember(arguments, scan, console.printed)
+    return 0

@@ -6,12 +6,13 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vstent.cli import options
+from vstent.cli import finished, options
 from vstent.cli.angiogram import add_injection, given_angiogram
 from vstent.errors import InputError
 
 if TYPE_CHECKING:
     from vstent.angiography.angiogram import AngiogramSettings
+    from vstent.cli.console import Console
     from vstent.study.types import CaseResult, Progress, Settings
 
 
@@ -49,7 +50,7 @@ def add(commands: options.Commands) -> None:
     parser.add_argument(
         "--input", dest="moved_to", type=Path, metavar="PATH", help="present place of the input of a run.json to repeat"
     )
-    parser.set_defaults(command=_run)
+    parser.set_defaults(command=_run, answered=finished.answered)
 
 
 def add_study(parser: argparse.ArgumentParser) -> None:
@@ -84,6 +85,7 @@ def study(
     path: Path,
     out: Path,
     settings: "Settings",
+    console: "Console",
     *,
     is_printed: bool,
     replaces: bool,
@@ -96,28 +98,27 @@ def study(
     path : a scan or a surface.
     out : the case folder.
     settings : settings of the study.
+    console : prints progress and tables.
     is_printed : whether the report is also written as PDF.
     replaces : whether results of another input or of other settings are replaced.
     injected : settings of the angiograms; None: none are computed.
     """
     from vstent.cli.console import (
-        Console,
         angiogram_table,
         comparison_table,
         device_sentences,
         uncertainty_table,
     )
+    from vstent.reporting.drawing import Drawing
+    from vstent.reporting.write import write_report
     from vstent.study.pipeline import run
 
-    console = Console()
-    with console.live():
-        case = run(path, out, settings, console.progress, replaces=replaces)
+    with console.live(), Drawing() as drawing:
+        case = run(path, out, settings, console.progress, replaces=replaces, before_measures=drawing.begin)
         if injected is not None:
             _film(case, out, injected, console.progress)
         console.progress("report", 0.0, "")
-        from vstent.reporting.write import write_report
-
-        write_report(case, out, is_printed=is_printed)
+        write_report(case, out, is_printed=is_printed, drawing=drawing)
         console.progress("report", 1.0, str(out / "report.html"))
     console.print(comparison_table(case.metrics))
     for sentence in device_sentences(case.metrics):
@@ -144,6 +145,8 @@ def _film(case: "CaseResult", out: Path, injected: "AngiogramSettings", progress
 
 def _run(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
+    from vstent.cli.console import Console
+
     settings = given_study(
         arguments,
         **options.given_geometry(arguments),
@@ -159,8 +162,12 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.input.suffix == ".json":
         return _again(arguments, settings, injected)
     given = {"is_printed": arguments.pdf, "replaces": arguments.replace, "injected": injected}
-    case = study(arguments.input, arguments.out, settings, **given)
-    return _finish(arguments, case)
+    console = Console()
+    case = study(arguments.input, arguments.out, settings, console, **given)
+    code = _finish(arguments, case)
+    if code == 0:
+        finished.remember(arguments, arguments.input, console.printed)
+    return code
 
 
 def _again(arguments: argparse.Namespace, given: "Settings", injected: "AngiogramSettings | None") -> int:
@@ -180,7 +187,7 @@ def _again(arguments: argparse.Namespace, given: "Settings", injected: "Angiogra
     for difference in record.differences:
         console.say(f"Changed since: {difference}.")
     asked = {"is_printed": arguments.pdf, "replaces": arguments.replace, "injected": injected}
-    case = study(record.input, arguments.out, record.settings, **asked)
+    case = study(record.input, arguments.out, record.settings, console, **asked)
     code = _finish(arguments, case)
     console.print(agreement(record.folder, arguments.out))
     return code

@@ -84,7 +84,7 @@ def collect(cases: Sequence[Case], out: Path) -> list[Row]:
 
 
 def pictures_of(rows: Sequence[Row], out: Path) -> dict[tuple[str, str], bytes]:
-    """Return the pictures that exist of cases with devices, as PNG by name of case and device.
+    """Return the pictures that exist of cases with devices, as WebP by name of case and device.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ def row_path(folder: Path, device: str) -> Path:
 
 def picture_path(folder: Path, device: str) -> Path:
     """Return the file of the picture of a device in the folder of a case."""
-    return folder / f"{device}.png"
+    return folder / f"{device}.webp"
 
 
 def work(task: Task) -> None:
@@ -111,7 +111,7 @@ def _rows(task: Task) -> dict[str, Row]:
             found = run(case.path, study, alone, watch, replaces=True)
             advice = found.deployments[device].advice
             with atomic(picture_path(task.folder, device)) as partial:
-                partial.write_bytes(patient_picture(found.anatomy, found.deployments[device]))
+                partial.write_bytes(patient_picture(found.anatomy, found.deployments[device]).webp)
             rows[device] = {"outcome": DONE, "stage": "", "sentence": advice} | flat_metrics(found.metrics, device)
 
         failed = _failure(task, with_device)

@@ -13,7 +13,7 @@ from numba import njit
 from vstent.kernels.arrays import Floats, Ints
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def paint_triangles(screen: Floats, colours: Floats, faces: Ints, depth: Floats, image: Floats) -> None:
     """Paint opaque triangles; the nearer one is visible.
 
@@ -52,7 +52,7 @@ def paint_triangles(screen: Floats, colours: Floats, faces: Ints, depth: Floats,
                         image[y, x, ch] = a * colours[i, ch] + b * colours[j, ch] + c * colours[k, ch]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def paint_wires(
     screen: Floats, starts: Ints, radius: Floats, pixel: float, colours: Floats, depth: Floats, image: Floats
 ) -> None:
@@ -97,7 +97,7 @@ def paint_wires(
                             image[y, x, ch] = colour * (0.45 + 0.55 * bulge)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def veil_triangles(
     screen: Floats, colours: Floats, alphas: Floats, faces: Ints, depth: Floats, sums: Floats, clear: Floats
 ) -> None:
@@ -121,28 +121,48 @@ def veil_triangles(
     height, width = depth.shape
     for f in range(len(faces)):
         i, j, k = _turned(screen, faces[f, 0], faces[f, 1], faces[f, 2])
-        area = _edge(screen[i], screen[j], screen[k, 0], screen[k, 1])
-        x0, x1, y0, y1 = _box(screen[i], screen[j], screen[k], 0.0, width, height)
+        p, q, r = screen[i], screen[j], screen[k]
+        area = _edge(p, q, r[0], r[1])
+        if area == 0.0:
+            continue
+        # Edge functions are linear along a row. Local copies spare loads: the sums might share their memory.
+        share = 1.0 / area
+        z_a, z_b, z_c = p[2], q[2], r[2]
+        alpha_a, alpha_b, alpha_c = alphas[i], alphas[j], alphas[k]
+        (red_a, green_a, blue_a), (red_b, green_b, blue_b) = _channels(colours, i), _channels(colours, j)
+        red_c, green_c, blue_c = _channels(colours, k)
+        a_step, b_step, c_step = q[1] - r[1], r[1] - p[1], p[1] - q[1]
+        has_a, has_b, has_c = _holds(0.0, q, r), _holds(0.0, r, p), _holds(0.0, p, q)
+        x0, x1, y0, y1 = _box(p, q, r, 0.0, width, height)
         for y in range(y0, y1):
+            a0, b0, c0 = _edge(q, r, 0.5, y + 0.5), _edge(r, p, 0.5, y + 0.5), _edge(p, q, 0.5, y + 0.5)
+            is_in = False
             for x in range(x0, x1):
-                a = _edge(screen[j], screen[k], x + 0.5, y + 0.5)
-                b = _edge(screen[k], screen[i], x + 0.5, y + 0.5)
-                c = _edge(screen[i], screen[j], x + 0.5, y + 0.5)
+                a, b, c = a0 + x * a_step, b0 + x * b_step, c0 + x * c_step
                 if not (
-                    _holds(a, screen[j], screen[k])
-                    and _holds(b, screen[k], screen[i])
-                    and _holds(c, screen[i], screen[j])
+                    (a > 0.0 or (a == 0.0 and has_a))
+                    and (b > 0.0 or (b == 0.0 and has_b))
+                    and (c > 0.0 or (c == 0.0 and has_c))
                 ):
+                    if is_in:
+                        break
                     continue
-                a, b, c = a / area, b / area, c / area
-                if a * screen[i, 2] + b * screen[j, 2] + c * screen[k, 2] > depth[y, x]:
+                is_in = True
+                a, b, c = a * share, b * share, c * share
+                if a * z_a + b * z_b + c * z_c > depth[y, x]:
                     continue
-                alpha = a * alphas[i] + b * alphas[j] + c * alphas[k]
-                for ch in range(3):
-                    colour = a * colours[i, ch] + b * colours[j, ch] + c * colours[k, ch]
-                    sums[y, x, ch] += alpha * colour
+                alpha = a * alpha_a + b * alpha_b + c * alpha_c
+                sums[y, x, 0] += alpha * (a * red_a + b * red_b + c * red_c)
+                sums[y, x, 1] += alpha * (a * green_a + b * green_b + c * green_c)
+                sums[y, x, 2] += alpha * (a * blue_a + b * blue_b + c * blue_c)
                 sums[y, x, 3] += alpha
                 clear[y, x] *= 1.0 - alpha
+
+
+@njit(cache=True, inline="always")
+def _channels(colours: Floats, i: int) -> tuple[float, float, float]:
+    """Return red, green and blue of a vertex."""
+    return colours[i, 0], colours[i, 1], colours[i, 2]
 
 
 @njit(cache=True, inline="always")
@@ -175,7 +195,7 @@ def _box(p: Floats, q: Floats, r: Floats, margin: float, width: int, height: int
     return max(x0, 0), min(x1, width), max(y0, 0), min(y1, height)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def resolve(image: Floats, sums: Floats, clear: Floats, supersampling: int) -> Floats:
     """Blend the translucent layers over the opaque image and average blocks of pixels.
 

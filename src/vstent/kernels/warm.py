@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vstent.kernels import coverage, curves, footprints, medial, net, raster, sampling, tree, triangles, voxels
+from vstent.kernels import coverage, curves, digits, footprints, medial, net, raster, sampling, tree, triangles, voxels
 
 
 def warm() -> None:
@@ -18,6 +18,7 @@ def warm() -> None:
     curves.closed_lengths(nodes)
     arm = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
     footprints.footprints(np.zeros((1, 3)), np.ones(1), np.eye(3), arm, np.array([2, 2]))
+    digits.text_rows(["", ""], arm[None].astype(np.int64)[:, :1], 0)
     medial.widest_in_section(np.ones((1, 2)), np.ones((1, 2, 2)), 1.0, np.ones(1))
 
 
@@ -35,7 +36,7 @@ def _paint() -> None:
     """Paint a triangle and a wire with the kernels that draw a report's pictures."""
     screen, faces = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]), np.array([[0, 1, 2]], dtype=np.int32)
     faces.setflags(write=False)
-    depth, image, sums = np.full((2, 2), np.inf), np.zeros((2, 2, 3)), np.zeros((2, 2, 4))
+    depth, image, sums = (np.zeros(shape, np.float32) for shape in ((2, 2), (2, 2, 3), (2, 2, 4)))
     raster.paint_triangles(screen, screen, faces, depth, image)
     raster.paint_wires(screen, np.array([0, 3], dtype=np.int32), np.ones(1), 1.0, screen, depth, image)
     raster.veil_triangles(screen, screen, np.ones(1), faces, depth, sums, depth)

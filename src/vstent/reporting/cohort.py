@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from vstent.reporting.page import as_webp, asset
+from vstent.reporting.page import asset
 from vstent.reporting.quantities import Quantity, format_value
 
 Row = Mapping[str, Any]
@@ -88,7 +88,7 @@ def cohort_report(name: str, rows: Sequence[Row], pictures: Mapping[tuple[str, s
     ----------
     name : name of the cohort.
     rows : one row per case and device, with ``case``, ``device``, ``outcome``, ``stage``, ``sentence`` and metrics.
-    pictures : pictures of the deployed devices as PNG, by case and device.
+    pictures : pictures of the deployed devices as WebP, by case and device.
 
     Returns
     -------
@@ -123,7 +123,7 @@ def _patients(
     """Return case, caption and base64-encoded WebP of every picture of a device, in the order of the rows."""
     found = [row for row in rows if row["device"] == device and (row["case"], device) in pictures]
     return [
-        (str(row["case"]), _caption(row), base64.b64encode(as_webp(pictures[row["case"], device])).decode("ascii"))
+        (str(row["case"]), _caption(row), base64.b64encode(pictures[row["case"], device]).decode("ascii"))
         for row in found
     ]
 

@@ -2,9 +2,9 @@
 
 import io
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vstent.devices.design import BARE
 from vstent.devices.stent import Deployment
@@ -13,9 +13,6 @@ from vstent.kernels import raster
 from vstent.kernels.arrays import Floats
 from vstent.reporting.lettering import blank, color_bar, length_bar, points_px, put, put_title
 from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View, scene_of, view_of
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 BACKGROUND = (0.965, 0.973, 0.978)
 """Background color: red, green and blue, 0 to 1."""
@@ -29,6 +26,10 @@ PATIENT_PX = (420, 320)
 """Width and height of the picture of one patient in a cohort, in pixels."""
 SEEN_GAP_MM = 0.1
 """Gap in mm from which a contour is shown from the side of its largest gap."""
+WEBP_QUALITY = 90
+"""Quality of the pictures in the HTML report, 0 to 100, as defined by Pillow's WebP writer."""
+WEBP_METHOD = 2
+"""Effort of that writer, 0 to 6: higher efforts take longer and make slightly smaller files."""
 ABOVE = "Values above the scale have its last color."
 """Caption sentence on values above a color scale."""
 
@@ -43,8 +44,49 @@ class Picture:
     """Title, one line."""
     caption: str
     """Caption: what the picture shows and what its colors mean."""
-    png: bytes
-    """The picture as PNG."""
+    image: NDArray[np.uint8]
+    """(height, width, 3) red, green and blue."""
+
+    @property
+    def png(self) -> bytes:
+        """The picture as PNG, without metadata, so that equal pictures give equal bytes."""
+        return _encoded(self.image, "PNG")
+
+    @property
+    def webp(self) -> bytes:
+        """The picture as WebP: about a fifth of the bytes of the PNG without a visible difference."""
+        return _encoded(self.image, "WEBP", quality=WEBP_QUALITY, method=WEBP_METHOD)
+
+
+def _encoded(image: NDArray[np.uint8], kind: str, **options: int) -> bytes:
+    """Return an image as a file of this kind."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+@dataclass(frozen=True, eq=False)
+class Plate:
+    """A picture to be drawn."""
+
+    id: str
+    """Name of what it shows."""
+    title: str
+    """Title, one line."""
+    caption: str
+    """Caption."""
+    scene: Scene
+    """Scene that holds the color scales."""
+    shots: list["Shot"]
+    """Panels of the picture."""
+    scale: str = ""
+    """Name of the scale of the color bar; empty: no color bar."""
+
+    def drawn(self) -> Picture:
+        """Return the picture."""
+        return Picture(self.id, self.title, self.caption, sheet(self.scene, self.shots, self.scale))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +101,8 @@ class Shot:
     """View from which they are drawn."""
 
 
-def pictures(scene: Scene) -> list[Picture]:
-    """Return the pictures of a scene.
+def plates(scene: Scene) -> list[Plate]:
+    """Return the pictures of a scene, to be drawn.
 
     The anatomy is always shown; contour, coverage and wires where there is a device; streamlines and wall shear stress
     where a flow was computed.
@@ -78,8 +120,8 @@ def pictures(scene: Scene) -> list[Picture]:
     return found
 
 
-def patient_picture(anatomy: Anatomy, deployment: Deployment) -> bytes:
-    """Return a small PNG of a device in the artery of a patient, in profile, for a grid of patients.
+def patient_picture(anatomy: Anatomy, deployment: Deployment) -> Picture:
+    """Return a small picture of a device in the artery of a patient, in profile, for a grid of patients.
 
     Parameters
     ----------
@@ -90,7 +132,20 @@ def patient_picture(anatomy: Anatomy, deployment: Deployment) -> bytes:
     view, picture = scene.views[0], blank(*PATIENT_PX)
     put(picture, draw(scene.pick(("lumen", "continued", "wires", "neck"), "one"), scene, view, PATIENT_PX), (0, 0))
     length_bar(picture, span_mm(view, PATIENT_PX), (0, 0), PATIENT_PX)
-    return _png(picture)
+    return Picture("patient", "", "", np.asarray(picture))
+
+
+def pictures(scene: Scene) -> list[Picture]:
+    """Return the pictures of a scene."""
+    return [plate.drawn() for plate in plates(scene)]
+
+
+def overview(scene: Scene) -> bytes:
+    """Return one wide PNG that sums up a case: wires across the neck, and streamlines where a flow was computed."""
+    layers = ("lumen", "continued", "wires", "neck", "streamlines")
+    shots = [Shot(title, scene.pick(layers, pane), scene.view("profile")) for pane, title in scene.panes]
+    scales = {scale.id for scale in scene.scales}
+    return Plate("overview", "", "", scene, shots, "speed" if "speed" in scales else "").drawn().png
 
 
 def draw(layers: tuple[MeshLayer | LineLayer, ...], scene: Scene, view: View, size_px: tuple[int, int]) -> Floats:
@@ -113,9 +168,9 @@ def draw(layers: tuple[MeshLayer | LineLayer, ...], scene: Scene, view: View, si
     """
     width, height = (n * _SUPERSAMPLING for n in size_px)
     pixel = span_mm(view, size_px) / width
-    image = np.broadcast_to(np.array(BACKGROUND), (height, width, 3)).copy()
-    depth = np.full((height, width), np.inf)
-    sums, clear = np.zeros((height, width, 4)), np.ones((height, width))
+    image = np.full((height, width, 3), BACKGROUND, np.float32)
+    depth = np.full((height, width), np.inf, np.float32)
+    sums, clear = np.zeros((height, width, 4), np.float32), np.ones((height, width), np.float32)
     for layer in sorted(layers, key=_is_translucent):
         points = layer.points_mm if isinstance(layer, LineLayer) else layer.surface.vertices_mm
         screen = _to_screen(points, view, pixel, (width, height))
@@ -180,16 +235,16 @@ def _alphas(opacity: float, normals: Floats) -> Floats:
     return opacity + (1.0 - opacity) * 0.75 * (1.0 - np.abs(normals[:, 2])) ** 3
 
 
-def _anatomy(scene: Scene) -> Picture:
+def _anatomy(scene: Scene) -> Plate:
     """Return the picture of vessel, parent artery, sac and neck from three sides."""
     ids = ("lumen", "continued", "landing", "sac", "neck")
     titles = {"profile": "In profile", "frontal": "Frontal", "lateral": "From the left"}
     shots = [Shot(title, scene.pick(ids, BARE), scene.view(view)) for view, title in titles.items()]
     caption = "The patient's lumen (glass), the restored parent artery (sand), the sac (red) and the neck (red line)."
-    return Picture("anatomy", "The artery and its sac", caption, sheet(scene, shots, ""))
+    return Plate("anatomy", "The artery and its sac", caption, scene, shots)
 
 
-def _contour(scene: Scene) -> Picture:
+def _contour(scene: Scene) -> Plate:
     """Return the picture of the deployed contours, colored by their gap to the wall."""
     ids = ("lumen", "continued", "contour", "neck")
     shots = []
@@ -204,7 +259,7 @@ def _contour(scene: Scene) -> Picture:
         "The deployed contour in the lumen, colored by its gap to the wall of the parent artery and seen from the side "
         "where the gap is largest."
     )
-    return Picture("contour", "Position of the devices", caption, sheet(scene, shots, "wall_gap"))
+    return Plate("contour", "Position of the devices", caption, scene, shots, "wall_gap")
 
 
 def gap_view(contour: MeshLayer, profile: View) -> View:
@@ -226,7 +281,7 @@ def gap_view(contour: MeshLayer, profile: View) -> View:
     return view_of("gap", np.stack([np.cross(up, toward), up, toward]), contour.surface.vertices_mm)
 
 
-def _coverage(scene: Scene) -> Picture:
+def _coverage(scene: Scene) -> Plate:
     """Return the picture of the metal coverage of each device."""
     ids = ("lumen", "continued", "coverage", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
@@ -234,10 +289,10 @@ def _coverage(scene: Scene) -> Picture:
         "Metal coverage: fraction of the contour covered by metal, measured on the wires and averaged over a "
         "few pores; higher on the inside of a bend, lower on its outside."
     )
-    return Picture("coverage", "Metal coverage of the wall", caption, sheet(scene, shots, "coverage"))
+    return Plate("coverage", "Metal coverage of the wall", caption, scene, shots, "coverage")
 
 
-def _wires(scene: Scene) -> Picture:
+def _wires(scene: Scene) -> Plate:
     """Return the picture of the wires in profile and seen from the sac."""
     looks = {
         "profile": ("in profile", ("lumen", "continued", "wires", "neck")),
@@ -252,34 +307,34 @@ def _wires(scene: Scene) -> Picture:
     caption = (
         "The wires and the neck (red line), seen from the sac with its wall removed; wires on the far side are paler."
     )
-    return Picture("wires", "Wires across the neck", caption, sheet(scene, shots, ""))
+    return Plate("wires", "Wires across the neck", caption, scene, shots)
 
 
-def _streamlines(scene: Scene) -> Picture:
+def _streamlines(scene: Scene) -> Plate:
     """Return the picture of the streamlines without and with each device."""
     ids = ("lumen", "streamlines", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes]
     caption = f"Streamlines through artery and sac, colored by speed on one scale. {ABOVE}"
-    return Picture("streamlines", "Blood flow before and after", caption, sheet(scene, shots, "speed"))
+    return Plate("streamlines", "Blood flow before and after", caption, scene, shots, "speed")
 
 
-def _shear(scene: Scene) -> Picture:
+def _shear(scene: Scene) -> Plate:
     """Return the picture of the wall shear stress without and with each device."""
     shots = [Shot(title, scene.pick(("shear", "neck"), pane), scene.view("profile")) for pane, title in scene.panes]
     caption = f"Wall shear stress on the lumen, on one scale. {ABOVE}"
-    return Picture("shear", "Wall shear stress before and after", caption, sheet(scene, shots, "shear"))
+    return Plate("shear", "Wall shear stress before and after", caption, scene, shots, "shear")
 
 
-def _sac_shear(scene: Scene) -> Picture:
+def _sac_shear(scene: Scene) -> Plate:
     """Return the picture of the sac's wall shear stress on its own scale, without and with each device."""
     ids = ("sac_shear", "neck")
     shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes]
     caption = f"Wall shear stress of the sac alone, on the scale of the sac without a device. {ABOVE}"
-    return Picture("sac_shear", "Wall shear stress of the sac", caption, sheet(scene, shots, "sac_shear"))
+    return Plate("sac_shear", "Wall shear stress of the sac", caption, scene, shots, "sac_shear")
 
 
-def sheet(scene: Scene, shots: list[Shot], scale: str) -> bytes:
-    """Return a PNG of panels side by side, each with a length bar, over one common color bar.
+def sheet(scene: Scene, shots: list[Shot], scale: str) -> NDArray[np.uint8]:
+    """Return an image (height, width, 3) of panels side by side, each with a length bar, over one common color bar.
 
     Parameters
     ----------
@@ -301,11 +356,4 @@ def sheet(scene: Scene, shots: list[Shot], scale: str) -> bytes:
     if scale:
         chosen = scene.scale(scale)
         color_bar(picture, chosen.colours, (chosen.low, chosen.high), f"{chosen.title} [{chosen.unit}]")
-    return _png(picture)
-
-
-def _png(picture: "Image") -> bytes:
-    """Return a picture as PNG, without metadata, so that equal pictures give equal bytes."""
-    stream = io.BytesIO()
-    picture.save(stream, "PNG")
-    return stream.getvalue()
+    return np.asarray(picture)

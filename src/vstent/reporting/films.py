@@ -1,6 +1,5 @@
 """Present films: grey frames, films before and after side by side, key frames, and files for viewers."""
 
-import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from vstent.io.xa_writer import BITS, XaHeader, write_xa
 from vstent.kernels.arrays import Floats
 from vstent.reporting.figures import Picture
 from vstent.reporting.lettering import blank, font, put_title
-from vstent.reporting.plots import png_of
+from vstent.reporting.plots import image_of
 from vstent.study.contrast import FOLDER
 
 ANIMATION: Final = "angiogram.webp"
@@ -167,9 +166,7 @@ def key_frames(shown: Sequence[Shown], window: float) -> Picture:
         f"Contrast agent along {shown[0].film.view.name}, at equal times: half of the largest amount in the picture "
         f"(early, late), the largest (peak), and {LATE_S:g} s later. {OF_FILM}"
     )
-    stream = io.BytesIO()
-    picture.save(stream, "PNG")
-    return Picture("key_frames", "Angiogram before and after", caption, stream.getvalue())
+    return Picture("key_frames", "Angiogram before and after", caption, np.asarray(picture))
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +206,7 @@ def density_picture(densities: Sequence[Density]) -> Picture:
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     caption = "Mean iodine concentration in the sac (solid) and in the parent artery proximal to the neck (dotted)."
-    return Picture("density", "Contrast in the sac over time", caption, png_of(figure))
+    return Picture("density", "Contrast in the sac over time", caption, image_of(figure))
 
 
 def write_films(
@@ -261,12 +258,20 @@ class KeptFilms:
     """All films side by side as an animated WebP; empty where it is too large for the report."""
 
 
+def _image(file: Path) -> NDArray[np.uint8]:
+    """Return a stored picture (height, width, 3)."""
+    from PIL import Image
+
+    with Image.open(file) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
 def kept_films(case: Path) -> KeptFilms | None:
     """Return the films in the subfolder ``angiogram`` of a case folder; None where there are none."""
     folder = case / FOLDER
     try:
         told = json.loads((folder / INDEX).read_text(encoding="utf-8"))["pictures"]
-        pictures = tuple(Picture(**one, png=(folder / f"{one['id']}.png").read_bytes()) for one in told)
+        pictures = tuple(Picture(**one, image=_image(folder / f"{one['id']}.png")) for one in told)
         film = (folder / ANIMATION).read_bytes()
     except (OSError, ValueError, KeyError, TypeError):
         return None

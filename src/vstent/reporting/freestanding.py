@@ -11,7 +11,7 @@ from vstent.devices.design import Design, Size, widest_mm
 from vstent.devices.stent import Landing, Stent, tube_faces
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Centerline, Opening, Vessel
-from vstent.reporting.figures import Picture, Shot, sheet
+from vstent.reporting.figures import Plate, Shot
 from vstent.reporting.scene import LineLayer, Scene, scales_of, view_of
 
 ROOM: Final = 1.4
@@ -24,8 +24,8 @@ TILT: Final = 0.25
 """Angle in rad by which the device is turned toward the eye, so that its lumen is seen."""
 
 
-def freestanding_picture(stents: Mapping[str, Stent], scene: Scene, anatomy: Anatomy) -> Picture:
-    """Return the picture of devices outside an artery.
+def freestanding_plate(stents: Mapping[str, Stent], scene: Scene, anatomy: Anatomy) -> Plate:
+    """Return the picture of devices outside an artery, to be drawn.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def freestanding_picture(stents: Mapping[str, Stent], scene: Scene, anatomy: Ana
         "their struts (Zhong et al. 2016, fig. 1)."
     )
     shown = replace(scene, scales=scales_of(layers, anatomy))
-    return Picture("free", "The devices outside an artery", caption, sheet(shown, shots, "wire_diameter"))
+    return Plate("free", "The devices outside an artery", caption, shown, shots, "wire_diameter")
 
 
 def free_device(design: Design, size: Size) -> Stent:

@@ -5,8 +5,9 @@ maximum inscribed spheres along its axis, the initial contour with its triangles
 and the wires in the parent artery and in the patient's own artery.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -15,15 +16,12 @@ from vstent.devices.stent import Deployment, tube_faces
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.kernels.arrays import Floats, Ints
-from vstent.reporting.figures import Picture, Shot, sheet
-from vstent.reporting.freestanding import freestanding_picture
-from vstent.reporting.node_rule import node_rule_picture
+from vstent.reporting.figures import Plate, Shot
+from vstent.reporting.freestanding import freestanding_plate
+from vstent.reporting.node_rule import NodeRule
 from vstent.reporting.scene import LineLayer, MeshLayer, Scene, curves_layer, round_up, view_of
 from vstent.reporting.thinning import some_frames, thin_frames, thin_surface
 from vstent.units import counted
-
-if TYPE_CHECKING:
-    from vstent.study.types import CaseResult
 
 SPHERE_STEP: Final = 0.9
 """Distance between drawn spheres as a fraction of their radius."""
@@ -42,21 +40,27 @@ _WALL: Final = (0.62, 0.68, 0.73)
 """Colors of spheres, contours, lines and wall: red, green and blue, 0 to 1."""
 
 
-def method_pictures(case: "CaseResult", scene: Scene) -> list[Picture]:
-    """Return the pictures of the steps from the patient's artery to the deployed devices, in that order.
+def method_plates(
+    anatomy: Anatomy, deployments: Mapping[str, Deployment], scene: Scene, whole: Vessel | None = None
+) -> list[Plate | NodeRule]:
+    """Return the pictures of the steps from the patient's artery to the deployed devices, in that order, to be drawn.
 
     Parameters
     ----------
-    case : the finished case.
-    scene : its scene.
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployed devices by name.
+    scene : the scene of the case.
+    whole : the vessel before it was trimmed; None: it is not shown.
     """
-    found = [_trimming(case.whole, scene)] if case.whole is not None and _is_trimmed(case.whole, case.anatomy) else []
-    found += [_restoration(scene), _spheres(case.anatomy, scene)]
-    if case.deployments:
-        stents = {title: case.deployments[name].stent for name, title in scene.panes[1:]}
-        found = [freestanding_picture(stents, scene, case.anatomy), *found]
-        found += [_first_contours(case, scene), _triangles(case, scene), node_rule_picture()]
-        found += [_expansion(name, deployment, case.anatomy, scene) for name, deployment in case.deployments.items()]
+    found: list[Plate | NodeRule] = []
+    if whole is not None and _is_trimmed(whole, anatomy):
+        found.append(_trimming(whole, scene))
+    found += [_restoration(scene), _spheres(anatomy, scene)]
+    if deployments:
+        stents = {title: deployments[name].stent for name, title in scene.panes[1:]}
+        found = [freestanding_plate(stents, scene, anatomy), *found]
+        found += [_first_contours(deployments, scene), _triangles(anatomy, deployments, scene), NodeRule()]
+        found += [_expansion(name, deployment, anatomy, scene) for name, deployment in deployments.items()]
         found.append(_fitted(scene))
     return found
 
@@ -66,7 +70,7 @@ def _is_trimmed(whole: Vessel, anatomy: Anatomy) -> bool:
     return whole.lumen.areas_mm2.sum() > LARGER * anatomy.vessel.lumen.areas_mm2.sum()
 
 
-def _trimming(whole: Vessel, scene: Scene) -> Picture:
+def _trimming(whole: Vessel, scene: Scene) -> Plate:
     """Return the picture of the vessel before and after it is trimmed."""
     surface, _ = thin_surface(whole.lumen, 60_000)
     profile = scene.view("profile")
@@ -82,10 +86,10 @@ def _trimming(whole: Vessel, scene: Scene) -> Picture:
         "The vessel of the scan or surface before it is trimmed, and the part that is kept around the sac (Zhong et "
         "al. 2016, fig. 5). Arteries are cut square to their centerlines."
     )
-    return Picture("untrimmed", "The vessel before it is trimmed", caption, sheet(scene, shots, ""))
+    return Plate("untrimmed", "The vessel before it is trimmed", caption, scene, shots)
 
 
-def _restoration(scene: Scene) -> Picture:
+def _restoration(scene: Scene) -> Plate:
     """Return the picture of the removal of the sac."""
     profile = scene.view("profile")
     lumen, landing = scene.pick(("lumen",), BARE), scene.pick(("continued", "landing"), BARE)
@@ -99,10 +103,10 @@ def _restoration(scene: Scene) -> Picture:
         "The wall as found; the sac (red), cut off along its neck (red line); and the parent artery with sac "
         "and side branches closed, against which a device expands."
     )
-    return Picture("restoration", "From the patient's artery to the parent artery", caption, sheet(scene, shots, ""))
+    return Plate("restoration", "From the patient's artery to the parent artery", caption, scene, shots)
 
 
-def _spheres(anatomy: Anatomy, scene: Scene) -> Picture:
+def _spheres(anatomy: Anatomy, scene: Scene) -> Plate:
     """Return the picture of the axis and its maximum inscribed spheres."""
     spheres = _bead_layer(anatomy)
     shots = [
@@ -113,7 +117,7 @@ def _spheres(anatomy: Anatomy, scene: Scene) -> Picture:
         "The axis of the parent artery (blue line) with its maximum inscribed spheres, which set the diameter "
         "of the initial contour."
     )
-    return Picture("spheres", "Centerline and maximum inscribed spheres", caption, sheet(scene, shots, ""))
+    return Plate("spheres", "Centerline and maximum inscribed spheres", caption, scene, shots)
 
 
 def _bead_layer(anatomy: Anatomy) -> MeshLayer:
@@ -141,26 +145,26 @@ def _unit_sphere(rows: int = 17, columns: int = 32) -> tuple[Floats, Ints]:
     return points.reshape(-1, 3), tube_faces(rows, columns)[:, ::-1]
 
 
-def _first_contours(case: "CaseResult", scene: Scene) -> Picture:
+def _first_contours(deployments: Mapping[str, Deployment], scene: Scene) -> Plate:
     """Return the picture of the contour of each device before the first iteration."""
     shots = []
     for name, title in scene.panes[1:]:
-        layers = (*scene.pick(("axis",), BARE), *_contour_layers(case.deployments[name].history_mm[0]))
+        layers = (*scene.pick(("axis",), BARE), *_contour_layers(deployments[name].history_mm[0]))
         shots.append(Shot(title, (*_glass(scene), *layers), scene.view("profile")))
     caption = (
         "The contour before the first iteration, in the parent artery (glass): rows of nodes on planes across "
         "the axis, each as wide as the maximum inscribed sphere. Some rows are drawn as lines."
     )
-    return Picture("first", "The initial contour", caption, sheet(scene, shots, ""))
+    return Plate("first", "The initial contour", caption, scene, shots)
 
 
-def _triangles(case: "CaseResult", scene: Scene) -> Picture:
+def _triangles(anatomy: Anatomy, deployments: Mapping[str, Deployment], scene: Scene) -> Plate:
     """Return the picture of the triangle mesh of each contour near the neck, before and after the expansion."""
     profile, shots = scene.view("profile"), []
     for name, title in scene.panes[1:]:
-        history_mm = case.deployments[name].history_mm
+        history_mm = deployments[name].history_mm
         for words, nodes_mm in (("initial", history_mm[0]), ("deployed", history_mm[-1])):
-            middle = _middle_mm(case.anatomy)
+            middle = _middle_mm(anatomy)
             near = np.linalg.norm(nodes_mm.mean(axis=1) - middle, axis=1) < MESH_MM
             rows = nodes_mm[near] if near.sum() > 2 else nodes_mm
             view = view_of("mesh", profile.axes, rows.reshape(-1, 3))
@@ -169,7 +173,7 @@ def _triangles(case: "CaseResult", scene: Scene) -> Picture:
         f"The triangles of the contour within {MESH_MM:g} mm of the neck, before the first iteration and deployed, in "
         "the parent artery (glass; Zhong et al. 2016, fig. 6). Nodes are the corners of the triangles."
     )
-    return Picture("mesh", "The triangle mesh of the contour", caption, sheet(scene, shots, ""))
+    return Plate("mesh", "The triangle mesh of the contour", caption, scene, shots)
 
 
 def _middle_mm(anatomy: Anatomy) -> Floats:
@@ -203,7 +207,7 @@ def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
     return MeshLayer("first", "", _STEEL, "", np.zeros(0), surface), curves_layer("rings", rings, 0.02, _INK)
 
 
-def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene) -> Picture:
+def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene) -> Plate:
     """Return the picture of the expansion of one device, colored by the gap to the wall."""
     frames_mm, gaps_mm = thin_frames(deployment, anatomy.landing_surface, FRAMES)
     contour = next(layer for layer in scene.pick(("contour",), name) if isinstance(layer, MeshLayer))
@@ -227,10 +231,10 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
         "Expansion of the active contour to the wall of the parent artery (glass) in "
         f"{counted(len(deployment.history_mm) - 1, 'iteration')}, colored by the remaining gap."
     )
-    return Picture(f"expansion-{name}", title, caption, sheet(shown, shots, "wall_gap"))
+    return Plate(f"expansion-{name}", title, caption, shown, shots, "wall_gap")
 
 
-def _fitted(scene: Scene) -> Picture:
+def _fitted(scene: Scene) -> Plate:
     """Return the picture of the wires in the parent artery and in the patient's own artery."""
     profile = scene.view("profile")
     shots = [
@@ -244,7 +248,7 @@ def _fitted(scene: Scene) -> Picture:
         )
     ]
     caption = "The wires on the expanded contour, and in the patient's own artery with its sac (neck: red line)."
-    return Picture("fitted", "The deployed devices", caption, sheet(scene, shots, ""))
+    return Plate("fitted", "The deployed devices", caption, scene, shots)
 
 
 def _glass(scene: Scene) -> tuple[MeshLayer | LineLayer, ...]:

@@ -1,14 +1,14 @@
 """Drawing of the rule by which a node of the contour moves or terminates (Zhong et al. 2016, fig. 8, eq. 6 and 7)."""
 
-import io
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from vstent.kernels.arrays import Floats
 from vstent.reporting.figures import Picture
-from vstent.reporting.lettering import DPI
 from vstent.reporting.paper import ACCENT, INK, QUIET, WARN
+from vstent.reporting.plots import image_of
 
 RADIUS: Final = 10.0
 """Radius of the drawn wall; lengths are in units of the drawing."""
@@ -26,25 +26,30 @@ NODES: Final = (
 """Title, condition, and distance of the drawn node from the center as a fraction of the radius."""
 
 
-def node_rule_picture() -> Picture:
-    """Return the drawing of the three cases of the rule."""
-    from matplotlib.figure import Figure
+CAPTION: Final = (
+    "The rule for a node in each iteration (Zhong et al. 2016, fig. 8): the wall (dark line), its band of one wire "
+    "width dd (shaded), the center of the node's row (cross), the node (open circle), and where it is put (full "
+    "circle) at the distance dd from the nearest point of the wall. A node that continues is moved by the forces. "
+    "Drawing, not to scale."
+)
+"""Caption of the drawing."""
 
-    figure = Figure(figsize=(10.4, 3.4), dpi=DPI, facecolor="white")
-    for axes, (title, condition, distance) in zip(figure.subplots(1, 3), NODES, strict=True):
-        _draw(axes, distance)
-        axes.set_title(f"Node {title}", fontsize=9, color=INK, loc="left")
-        axes.text(0.0, -0.02, condition, transform=axes.transAxes, fontsize=7.5, color=QUIET, va="top")
-    figure.subplots_adjust(left=0.01, right=0.99, top=0.93, bottom=0.13, wspace=0.05)
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", metadata={"Software": None})
-    caption = (
-        "The rule for a node in each iteration (Zhong et al. 2016, fig. 8): the wall (dark line), its band of one wire "
-        "width dd (shaded), the center of the node's row (cross), the node (open circle), and where it is put (full "
-        "circle) at the distance dd from the nearest point of the wall. A node that continues is moved by the forces. "
-        "Drawing, not to scale."
-    )
-    return Picture("rule", "The rule for a node of the contour", caption, stream.getvalue())
+
+@dataclass(frozen=True)
+class NodeRule:
+    """The drawing of the three cases of the rule, to be drawn."""
+
+    def drawn(self) -> Picture:
+        """Return the drawing."""
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(10.4, 3.4), facecolor="white")
+        for axes, (title, condition, distance) in zip(figure.subplots(1, 3), NODES, strict=True):
+            _draw(axes, distance)
+            axes.set_title(f"Node {title}", fontsize=9, color=INK, loc="left")
+            axes.text(0.0, -0.02, condition, transform=axes.transAxes, fontsize=7.5, color=QUIET, va="top")
+        figure.subplots_adjust(left=0.01, right=0.99, top=0.93, bottom=0.13, wspace=0.05)
+        return Picture("rule", "The rule for a node of the contour", CAPTION, image_of(figure))
 
 
 def placed(node: Floats) -> Floats:

@@ -2,7 +2,6 @@
 
 import base64
 import hashlib
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
@@ -18,9 +17,9 @@ from vstent.flow.case import LATTICE, OPENFOAM
 from vstent.flow.grade import QUALITY
 from vstent.reporting import bands
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
-from vstent.reporting.figures import Picture, pictures
+from vstent.reporting.drawing import Drawing, in_threads
+from vstent.reporting.figures import Picture
 from vstent.reporting.films import KeptFilms
-from vstent.reporting.method import method_pictures
 from vstent.reporting.packing import pack
 from vstent.reporting.quality import OF_GRADES, Quality, qualities, unusable
 from vstent.reporting.quantities import (
@@ -32,14 +31,12 @@ from vstent.reporting.quantities import (
     opening_rows,
     unit_of,
 )
-from vstent.reporting.scene import Scene, device_title, scene_of
+from vstent.reporting.scene import Scene, device_title
 from vstent.reporting.uncertainty import Varied, uncertainty_of
 
 if TYPE_CHECKING:
     from vstent.study.types import CaseResult
 
-WEBP_QUALITY: Final = 90
-"""Quality of the pictures in the HTML report, 0 to 100, as defined by Pillow's WebP writer."""
 OF_CONTOUR: Final = (
     "The contour is the active contour of Zhong et al. 2016 with a rigid wall: forces between artery and "
     "device are not computed."
@@ -138,15 +135,22 @@ class Contents:
         return sorted(found, key=lambda pair: pair[0].name.casefold())
 
 
-def contents_of(case: "CaseResult") -> Contents:
-    """Return the contents of the report of a case, with all pictures rendered."""
-    scene, metrics = scene_of(case.anatomy, case.deployments, case.fields), case.metrics
-    before, *after = pictures(scene)
+def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
+    """Return the contents of the report of a case, with all pictures rendered.
+
+    Parameters
+    ----------
+    case : the finished case.
+    drawing : its pictures, if they are being drawn already.
+    """
+    with drawing or Drawing() as drawn:
+        scene, metrics = drawn.begin(case.anatomy, case.deployments, case.fields, case.whole), case.metrics
+        pictures = drawn.pictures()
     return Contents(
         name=case.name,
         metrics=metrics,
         scene=scene,
-        pictures=(before, *method_pictures(case, scene), *after),
+        pictures=pictures,
         changes=compare(metrics, unusable(metrics)),
         stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
         openings=opening_rows(case.anatomy.vessel.openings),
@@ -196,7 +200,7 @@ def as_html(told: Contents) -> str:
         qualities=told.qualities,
         of_grades=OF_GRADES,
         summary=told.headlines,
-        pictures=[_picture(picture) for picture in told.pictures],
+        pictures=in_threads(_picture, told.pictures),
         film=base64.b64encode(told.film).decode("ascii"),
         vessel=told.vessel,
         openings=told.openings,
@@ -247,16 +251,7 @@ def _sections(told: Contents) -> list[tuple[str, str]]:
 def _picture(picture: Picture) -> dict[str, str]:
     """Return id, title, caption and base64-encoded WebP of a picture."""
     words = {"id": picture.id, "title": picture.title, "caption": picture.caption}
-    return {**words, "base64": base64.b64encode(as_webp(picture.png)).decode("ascii")}
-
-
-def as_webp(png: bytes) -> bytes:
-    """Return a PNG converted to WebP: about a fifth of the bytes without a visible difference."""
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.open(io.BytesIO(png)).convert("RGB").save(stream, "WEBP", quality=WEBP_QUALITY, method=4)
-    return stream.getvalue()
+    return {**words, "base64": base64.b64encode(picture.webp).decode("ascii")}
 
 
 def _pane_notes(headlines: list[Change]) -> dict[str, str]:

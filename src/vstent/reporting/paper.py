@@ -155,9 +155,7 @@ class Paper:
 
     def picture(self, picture: "Picture", most: float = 0.5) -> None:
         """Write a picture with title and caption, at most a fraction `most` of the page high."""
-        from matplotlib.image import imread
-
-        image = imread(io.BytesIO(picture.png))
+        image = picture.image
         height = self._width * image.shape[0] / image.shape[1]
         fit = min(1.0, most * self._page[1] / height)
         width, height = fit * self._width, fit * height

@@ -14,7 +14,7 @@ from vstent.errors import LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.plan.rank import Candidate, alternatives
 from vstent.reporting.bands import ends, how_sure
-from vstent.reporting.figures import Picture, Shot, sheet
+from vstent.reporting.figures import Picture, Plate, Shot
 from vstent.reporting.paper import QUIET, Paper
 from vstent.reporting.quantities import format_value
 from vstent.reporting.scene import device_title, scene_of
@@ -125,7 +125,7 @@ def _picture(case: Planned, name: str) -> Picture:
         if any(one.id == view for one in scene.views)
     ]
     caption = "The device in the patient's artery; the red line is the neck."
-    return Picture("plan", "Position", caption, sheet(scene, shots, ""))
+    return Plate("plan", "Position", caption, scene, shots).drawn()
 
 
 def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:

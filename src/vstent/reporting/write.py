@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from vstent.io.files import atomic
 from vstent.io.writers import write_text
+from vstent.reporting.drawing import Drawing
 from vstent.reporting.films import kept_films
 from vstent.reporting.page import as_html, contents_of, with_films
 from vstent.reporting.pdf import as_pdf
@@ -39,7 +40,7 @@ def write_plan(case: "CaseResult", out: Path, day: str) -> None:
         partial.write_bytes(plan_pdf(planned))
 
 
-def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False) -> None:
+def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False, drawing: Drawing | None = None) -> None:
     """Write ``report.html`` into a case folder, and optionally ``report.pdf``, unless they are there for these results.
 
     Parameters
@@ -47,6 +48,7 @@ def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False) -> 
     case : the finished case.
     out : its case folder.
     is_printed : whether to write the PDF too.
+    drawing : the pictures of the case, if they are being drawn already.
     """
     drawn = out / CACHE / DRAWN
     key = key_of(
@@ -54,12 +56,14 @@ def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False) -> 
     )
     films = kept_films(out)
     if films is not None:
-        key = key_of(key, hashlib.sha256(b"".join([*(one.png for one in films.pictures), films.animation])).hexdigest())
+        shown = b"".join([*(one.image.tobytes() for one in films.pictures), films.animation])
+        key = key_of(key, hashlib.sha256(shown).hexdigest())
     wanted = ["report.html"] + ["report.pdf"] * is_printed
     if all((out / name).is_file() for name in wanted) and _text(drawn) == key:
         return  # painting takes seconds, and would give the same pictures
     drawn.unlink(missing_ok=True)
-    told = contents_of(case) if films is None else with_films(contents_of(case), films)
+    told = contents_of(case, drawing)
+    told = told if films is None else with_films(told, films)
     write_text(out / "report.html", as_html(told))
     if is_printed:
         with atomic(out / "report.pdf") as partial:

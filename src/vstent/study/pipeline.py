@@ -5,7 +5,7 @@ no files. After that each finished stage is stored in the folder under a key of 
 same study reads it instead of computing it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -50,9 +50,20 @@ from vstent.study.stages import (
 from vstent.study.types import CaseResult, Progress, Settings
 from vstent.study.written import code_key, compute_once, write_once
 
+BeforeMeasures = Callable[[Anatomy, Mapping[str, Deployment], Mapping[str, FlowField], Vessel | None], object]
+"""Takes anatomy, deployments, flows, and the vessel before it was trimmed (None: not stored)."""
+
 
 @claiming
-def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False) -> CaseResult:
+def run(
+    path: Path,
+    out: Path,
+    settings: Settings,
+    progress: Progress,
+    *,
+    replaces: bool = False,
+    before_measures: BeforeMeasures | None = None,
+) -> CaseResult:
     """Run one study and write its folder; a study that was stopped there resumes.
 
     Results of the same input and settings in the folder are kept, and new devices are added to them. A device that does
@@ -65,6 +76,8 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
     settings : settings of the study; missing values are proposed.
     progress : called at every stage.
     replaces : whether results of another input or of other settings are replaced.
+    before_measures : called with anatomy, deployments, flows and untrimmed vessel before their measures are computed,
+        unless these are stored; None: nothing is called.
 
     Returns
     -------
@@ -103,7 +116,14 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
     fields, unflown = compute_flows(out, anatomy, deployments, settings, ledger, source)
     failures |= unflown
     varied = vary_all(anatomy, deployments, settings, ledger, source)
-    measures = partial(_measures, anatomy, deployments, fields, settings, varied, failures)
+
+    whole = ledger.stored("vessel", vessel_key(source, settings), Vessel)
+
+    def measures() -> dict[str, Any]:
+        if before_measures is not None:
+            before_measures(anatomy, deployments, fields, whole)
+        return _measures(anatomy, deployments, fields, settings, varied, failures)
+
     metrics = compute_once(ledger, "measure", key_of(code_key(), told, failures), measures)
     add_measures(metrics, kept_measures(out, source, settings) if fields else {})
     writers.write_json(out / METRICS, metrics)
@@ -112,7 +132,6 @@ def run(path: Path, out: Path, settings: Settings, progress: Progress, *, replac
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
     notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
-    whole = ledger.stored("vessel", vessel_key(source, settings), Vessel)
     return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, failures, notes, whole)
 
 

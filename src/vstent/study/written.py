@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+from vstent.io.states import program_states, states_of
 from vstent.io.writers import write_text
 from vstent.study.ledger import Ledger, key_of
 from vstent.study.repeat import UNTOLD
@@ -21,9 +22,7 @@ FINISHED: Final = ".done"
 @cache
 def code_key() -> str:
     """Return a digest of the sizes and dates of the program's files."""
-    root = Path(__file__).parents[1]
-    files = sorted(root.rglob("*.py")) + sorted(root.rglob("*.toml"))
-    return key_of([[str(file.relative_to(root)), file.stat().st_size, file.stat().st_mtime_ns] for file in files])
+    return key_of(program_states())
 
 
 def write_once(
@@ -42,14 +41,14 @@ def write_once(
     """
     mark = ledger.folder / f"{stage}{FINISHED}"
     kept = _read(mark)
-    if kept.get("key") == key and kept.get("files") == _states(folder, names):
+    if kept.get("key") == key and kept.get("files") == states_of(folder, names):
         ledger.seconds[stage] = kept["seconds"]
         ledger.progress(stage, 1.0, "already done")
         return
     mark.unlink(missing_ok=True)
     with ledger.stage(stage) as tell:
         tell(write())
-    told = {"key": key, "seconds": ledger.seconds[stage], "files": _states(folder, names)}
+    told = {"key": key, "seconds": ledger.seconds[stage], "files": states_of(folder, names)}
     write_text(mark, json.dumps(told))
 
 
@@ -81,16 +80,3 @@ def _read(mark: Path) -> dict[str, Any]:
         kept = json.loads(mark.read_text(encoding="utf-8"))
         return kept if isinstance(kept, dict) and "seconds" in kept else {}
     return {}
-
-
-def _states(folder: Path, names: Iterable[str]) -> dict[str, list[int] | None]:
-    """Return size and date of files by name; None for one that is missing."""
-    return {name: _state(folder / name) for name in names}
-
-
-def _state(file: Path) -> list[int] | None:
-    """Return size and date of a file; None where it is missing."""
-    with suppress(OSError):
-        found = file.stat()
-        return [found.st_size, found.st_mtime_ns]
-    return None

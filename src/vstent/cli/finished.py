@@ -1,0 +1,96 @@
+"""Answer a command at once where nothing has changed since it was last finished.
+
+A finished command leaves a record in the cache of its case folder: its arguments, the state of the program, of the
+input and of every file of the folder, and what it printed. If all of these are the same, the next call of the same
+command prints that again. This needs no import of the computations, which takes longer than everything else here.
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.io.files import atomic
+from vstent.io.states import State, program_states, state_of
+
+CACHE: Final = ".vstent"
+"""Subfolder of the case folder with finished stages (as in `vstent.study.folder`, which imports the computations)."""
+RECORD: Final = "finished.json"
+"""File in that folder with the record."""
+LOCK: Final = "lock"
+"""File in that folder while a process uses the case folder, or has been killed."""
+DEPENDENT: Final = ("gpu", "angiogram", "plan", "ro_crate")
+"""Options that depend on the machine or the day, or write files of their own: such commands run in full."""
+OF_TERMINAL: Final = ("COLUMNS", "TERM", "COLORTERM", "NO_COLOR", "FORCE_COLOR")
+"""Environment variables that change how tables are printed."""
+
+
+def answered(arguments: argparse.Namespace) -> bool:
+    """Print what a command printed when it was finished, if nothing has changed; return whether it was printed."""
+    cache = arguments.out / CACHE
+    try:
+        kept = json.loads((cache / RECORD).read_text(encoding="utf-8"))
+        is_same = kept["command"] == _command(arguments) and not (cache / LOCK).exists()
+        if not is_same or any(state_of(Path(file)) != state for file, state in kept["files"].items()):
+            return False
+        print("vstent: nothing has changed since this command was finished.", file=sys.stderr)
+        print(kept["printed"], end="")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
+    return True
+
+
+def remember(arguments: argparse.Namespace, source: Path, printed: str) -> None:
+    """Store the record of a command that is finished.
+
+    Parameters
+    ----------
+    arguments : parsed options.
+    source : the scan or surface.
+    printed : what the command has printed.
+    """
+    from vstent.io.images import files_of
+    from vstent.plugins import plugins
+
+    if any(getattr(arguments, name, False) for name in DEPENDENT):
+        return
+    if plugins("vstent.devices") or plugins("vstent.engines") or plugins("vstent.walls"):
+        return  # their code may change too
+    record = arguments.out / CACHE / RECORD
+    inputs = source.rglob("*") if source.is_dir() else files_of(source)
+    found = {*inputs, *arguments.out.rglob("*"), *_files_in(vars(arguments).values())}
+    states = {str(file.resolve()): state_of(file) for file in sorted(found - {record}) if file.is_file()}
+    with atomic(record) as partial:
+        partial.write_text(json.dumps({"command": _command(arguments), "files": states, "printed": printed}))
+
+
+def _command(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return everything but files that the output of a command depends on, as plain values."""
+    given = {name: str(value) for name, value in vars(arguments).items() if not callable(value)}
+    packages = [place for place in sys.path if place.endswith("-packages")]
+    programs: dict[str, State] = program_states() | {place: state_of(Path(place)) for place in packages}
+    return {"given": given, "folder": os.getcwd(), "programs": programs, "python": sys.version, "terminal": _terminal()}
+
+
+def _terminal() -> list[Any]:
+    """Return the properties of the terminal that change how tables are printed."""
+    sizes: list[Any] = [os.environ.get(name) for name in OF_TERMINAL]
+    for number in (0, 1, 2):
+        with suppress(OSError):
+            sizes.append([number, os.get_terminal_size(number).columns])
+    return [*sizes, sys.stdout.isatty()]
+
+
+def _files_in(values: Iterable[Any]) -> Iterator[Path]:
+    """Yield the files that values, or the items of lists and tuples among them, name."""
+    for value in values:
+        if isinstance(value, (list, tuple)):
+            yield from _files_in(value)
+        elif isinstance(value, (str, Path)):
+            with suppress(OSError, ValueError):
+                if Path(value).is_file():
+                    yield Path(value)
