@@ -23,6 +23,10 @@ REDUCED: Final = {
 """Index of a flow, and the measure of its change against the flow without a device."""
 
 
+COVERAGE: Final = "neck_metal_coverage_fraction"
+"""Measure by which similar devices are found."""
+
+
 class Stored(Protocol):
     """Results of finished flows by candidate, None for the flow without a device; a dict will do."""
 
@@ -43,6 +47,10 @@ def rank_flows(
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Ranking:
     """Compute the flow with the best candidates of a ranking, the best of every device among them.
+
+    Every flow starts from the nearest one computed in the same call: the one whose device covers the neck by the most
+    similar fraction with metal (0 without a device). The start changes a result within its uncertainty only, so that an
+    interrupted ranking, whose flows start from others, gives the same numbers within that.
 
     Parameters
     ----------
@@ -79,15 +87,14 @@ def rank_flows(
         raise InputError("No size is suitable, so there is no flow to compute. Choose another device.")
     found: Stored = {} if stored is None else stored
     unfinished = [one for one in chosen if found.get(one) is None]
-    bare: FlowField | None = None
+    flows = _Flows(anatomy, settings)
     results: dict[Candidate | None, Mapping[str, Any]] = {}
     for done, candidate in enumerate([None, *chosen]):
         if progress is not None:
             progress(done, 1 + len(chosen), "no device" if candidate is None else candidate.label)
         result = found.get(candidate)
         if result is None or (candidate is None and unfinished):
-            bare, result = _computed(anatomy, candidate, settings, bare)
-            found[candidate] = result
+            found[candidate] = result = flows.computed(candidate)
         results[candidate] = result
     told = (_with_flow(one, results[None], results[one]) if one in results else one for one in ranking.candidates)
     return replace(ranking, candidates=tuple(told))
@@ -102,21 +109,42 @@ def chosen_of(ranking: Ranking, count: int) -> list[Candidate]:
     return [*best.values(), *others[: max(0, count - len(best))]]
 
 
-def _computed(
-    anatomy: Anatomy, candidate: Candidate | None, settings: FlowSettings, bare: FlowField | None
-) -> tuple[FlowField | None, Mapping[str, Any]]:
-    """Return the flow without a device, and what is kept of the flow with a candidate or without one."""
-    case = flow_case(anatomy, None if candidate is None else _stent(anatomy, candidate), settings)
-    try:
-        field = simulate_case(case, start=bare)
-    except FlowError as error:
+class _Flows:
+    """Flows in one vessel, each started from the nearest one."""
+
+    def __init__(self, anatomy: Anatomy, settings: FlowSettings) -> None:
+        self.anatomy, self.settings = anatomy, settings
+        self._bare: FlowField | None = None
+        self._done: list[tuple[float, FlowField]] = []
+
+    def computed(self, candidate: Candidate | None) -> Mapping[str, Any]:
+        """Compute the flow with a candidate, or without a device, and return what is kept of it."""
+        case = flow_case(self.anatomy, None if candidate is None else _stent(self.anatomy, candidate), self.settings)
+        covered = _coverage(candidate)
+        try:
+            field = simulate_case(case, start=self._bare, similar=self._nearest(covered))
+        except FlowError as error:
+            if candidate is None:
+                raise
+            return {"error": str(error)}
         if candidate is None:
-            raise
-        return bare, {"error": str(error)}
-    values = indices(field, case.sac, case.ostium)
-    kept = {key: values[key] for key in REDUCED} | {"unsettled_fraction": field.unsettled_fraction}
-    level = grade(case, field, values).level
-    return (field if candidate is None else bare), kept | {"grade": level}
+            self._bare = field
+        else:
+            self._done.append((covered, field))
+        values = indices(field, case.sac, case.ostium)
+        kept = {key: values[key] for key in REDUCED} | {"unsettled_fraction": field.unsettled_fraction}
+        return kept | {"grade": grade(case, field, values).level}
+
+    def _nearest(self, coverage: float) -> FlowField | None:
+        """Return the flow with the most similar device; None if no device is nearer."""
+        nearest = min(self._done, key=lambda one: abs(one[0] - coverage), default=(0.0, None))
+        return nearest[1] if abs(nearest[0] - coverage) < coverage else None
+
+
+def _coverage(candidate: Candidate | None) -> float:
+    """Return the metal coverage of the neck, 0 without a device or where the device misses the neck."""
+    found = 0.0 if candidate is None else float(candidate.measures.get(COVERAGE) or 0.0)
+    return found if found == found else 0.0
 
 
 def _stent(anatomy: Anatomy, candidate: Candidate) -> Stent:
