@@ -26,8 +26,8 @@ REDUCED: Final = {
 COVERAGE: Final = "neck_metal_coverage_fraction"
 """Measure by which similar devices are found."""
 SIMILAR: Final = 0.1
-"""Largest relative difference of the coverage of similar devices. Begun from Pipeline, which covers the neck of the demo
-a fifth more, Enterprise stops 1 to 4 % from where it stops when begun without a device (0.3 mm)."""
+"""Largest relative difference of the coverage of similar devices. Begun from Pipeline, which covers the neck of the
+demo a fifth more, Enterprise stops 1 to 4 % from where it stops when begun without a device (0.3 mm)."""
 
 
 class Stored(Protocol):
