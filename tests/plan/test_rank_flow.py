@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import pytest
 
@@ -100,6 +101,27 @@ def test_changes_are_those_of_flows_of_their_own_and_an_interrupted_ranking_goes
         assert f"neck inflow {ratio - 1:+.0%}" in words
     else:
         assert words.endswith("Flow: not usable.")
+
+
+def test_a_flow_starts_from_that_of_the_most_similar_coverage(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[object] = []
+
+    def noting(case, *, start=None, similar=None):
+        begun.append(similar)
+        return fields[len(begun) - 1]
+
+    one = chosen_of(ranking(), 1)[0]
+    covered = (0.30, 0.08, 0.32, 0.12, float("nan"))
+    fields = [SimpleNamespace(unsettled_fraction=0.0) for _ in range(1 + len(covered))]
+    monkeypatch.setattr(rank_flow, "simulate_case", noting)
+    monkeypatch.setattr(rank_flow, "indices", lambda *_: dict.fromkeys(rank_flow.REDUCED, 1.0))
+    monkeypatch.setattr(rank_flow, "grade", lambda *_: SimpleNamespace(level="good"))
+    flows = rank_flow._Flows(anatomy(), SETTINGS)
+    flows.computed(None)
+    for fraction in covered:
+        flows.computed(replace(one, measures=one.measures | {rank_flow.COVERAGE: fraction}))
+    # only 0.32 and 0.30 are similar; the last device misses the neck
+    assert begun == [None, None, None, fields[1], None, None]
 
 
 def test_a_flow_of_a_device_whose_numbers_changed_is_not_found(tmp_path) -> None:

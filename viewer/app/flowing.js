@@ -82,14 +82,14 @@ export class Flowing {
     this.drawn = manifest.drawn;
     const { fraction, is_stale, is_settled, values, reductions, history, error_points } = manifest;
     this.element.classList.toggle("stale", is_stale);
-    if (!("neck_inflow_mL_s" in reductions)) return this.say(`Computing the flow without a device: ${Math.round(100 * fraction)} %`);
-    const moving = is_stale ? "The device has moved: new values follow." : is_settled ? "Steady." : "The flow is adapting to the device.";
-    this.say(`${moving} Grid spacing ${values.grid_spacing_mm.toFixed(2)} mm; differs from the full computation by up to ${error_points.toFixed(0)} percentage points.`);
+    if (!("neck_inflow_mL_s" in reductions)) return this.say(fraction < 1 ? `Computing the flow in the artery: ${Math.round(100 * fraction)} %` : "The flow develops: first numbers follow.");
+    const moving = is_stale ? "The device has moved: new values follow." : is_settled ? "Steady." : "The flow is adapting to the device and is averaged: ± falls with time.";
+    this.say(`${moving} Grid spacing ${values.grid_spacing_mm.toFixed(2)} mm; ± contains the difference from the full computation.`);
     this.cards.replaceChildren(
       ...Object.entries(NAMES).map(([key, [name, unit, factor]]) =>
         make("div", { className: "card" }, [
           make("span", { className: "term" }, [name]),
-          make("b", {}, [`${reductions[key] > 0 ? "+" : "−"}${Math.abs(reductions[key]).toFixed(0)} %`]),
+          make("b", {}, [`${reductions[key] > 0 ? "+" : "−"}${Math.abs(reductions[key]).toFixed(0)}${key in error_points ? ` ± ${Math.ceil(error_points[key])}` : ""} %`]),
           make("small", {}, [`${(factor * values[`now_${key}`]).toPrecision(3)} ${unit}, without a device ${(factor * values[`bare_${key}`]).toPrecision(3)}`]),
         ]),
       ),

@@ -35,8 +35,11 @@ HISTORY: Final = 240
 """Number of readings that the chart shows."""
 LINES: Final = 70
 """Number of streamlines through the neck."""
-ERROR_POINTS: Final = 6.0
-"""Error band of the reductions in percentage points; the largest error measured is 4 (`benchmarks/live.py`)."""
+ERROR_POINTS: Final = 8.0
+"""Largest difference of a reduction from that of a full computation, once it is averaged long enough, in percentage
+points; the largest one measured is 6 (`benchmarks/live.py`)."""
+SHOWN_POINTS: Final = 30.0
+"""Uncertainty of the averages in percentage points above which a reduction is shown without a band."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +51,10 @@ class Said:
     fraction: float = 0.0
     """Part of the flow without a device that is computed."""
     values: dict[str, float] = field(default_factory=dict)
-    """Neck inflow (mL/s) and sac velocity (m/s), without a device and now, and the steps per second."""
+    """Neck inflow (mL/s) and sac velocity (m/s), without a device and now, and the steps per second; empty as long as
+    they are not known well enough to be shown."""
+    points: dict[str, float] = field(default_factory=dict)
+    """Uncertainty of the averages behind every reduction, in percentage points, where it is known."""
     is_settled: bool = False
     """Whether the last readings agree."""
     error: str = ""
@@ -186,7 +192,7 @@ class Preview:
             values=said.values,
             reductions={key: _reduction(said.values, key) for key in _KEYS if f"now_{key}" in said.values},
             history=history,
-            error_points=ERROR_POINTS,
+            error_points={key: ERROR_POINTS + points for key, points in said.points.items()},
         )
 
     def stop(self) -> None:
@@ -258,6 +264,11 @@ class _Worker:
     def _say(self, steps_per_s: float) -> None:
         """Send the present numbers, and from time to time streamlines."""
         bare, now = self.live.bare, self.live.read()
+        if 100 * max(bare.error.values()) > SHOWN_POINTS:
+            self.pipe.send(Said(self.serial, 1.0))
+            return
+        points = {key: self.live.change(key)[1] for key in _KEYS}
+        points = {key: value for key, value in points.items() if value < SHOWN_POINTS}
         values = {
             "bare_neck_inflow_mL_s": bare.neck_inflow_mL_s,
             "bare_sac_velocity_m_s": bare.sac_velocity_m_s,
@@ -273,4 +284,4 @@ class _Worker:
             flow, self.drawn_s = self.live.field(), time.monotonic()
             seeds_mm = neck_seeds_mm(flow, self.anatomy.aneurysms[0].neck, LINES)
             lines = stream_layer("", flow, seeds_mm)
-        self.pipe.send(Said(self.serial, 1.0, values, now.is_settled, "", lines))
+        self.pipe.send(Said(self.serial, 1.0, values, points, now.is_settled, "", lines))

@@ -121,6 +121,7 @@ def simulate_case(
     case: FlowCase,
     *,
     start: FlowField | None = None,
+    similar: FlowField | None = None,
     folder: Path | None = None,
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
@@ -133,6 +134,8 @@ def simulate_case(
         The flow to compute.
     start : FlowField, optional
         Flow in the same vessel without a stent, to start from.
+    similar : FlowField, optional
+        Flow in the same vessel with a similar stent, to start from instead; no first guess is then computed.
     folder : Path, optional
         Folder for the files of an engine that works with files, also used to resume; None: they are deleted.
     progress : callable, optional
@@ -146,7 +149,7 @@ def simulate_case(
         The vessel cannot be discretized, or the computation diverges.
     """
     with nullcontext(folder) if folder is not None else TemporaryDirectory(prefix="vstent-") as own:
-        return _Runs(engine_class(case.settings), Path(own), progress, checkpoint).answer(case, start)
+        return _Runs(engine_class(case.settings), Path(own), progress, checkpoint, similar).answer(case, start)
 
 
 def foretell_cost(case: FlowCase) -> str:
@@ -206,13 +209,16 @@ class _Runs:
     folder: Path
     progress: OnProgress | None
     checkpoint: Checkpoint | None
+    similar: FlowField | None = None
+    """Flow with a similar stent, from which the whole vessel starts."""
 
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
         """Compute a flow, from a coarse-grid guess unless a saved run is resumed or the coarse grid is too coarse."""
         cell_size_mm = default_cell_size_mm(case)
         if case.settings.close_up:
             return self._close_up(case, start, cell_size_mm)
-        progress = self._part(_coarse_runs(self.engine, case, start) * COARSE_SHARE, 1.0)
+        runs = 0 if self.similar is not None else _coarse_runs(self.engine, case, start)
+        progress = self._part(runs * COARSE_SHARE, 1.0)
         engine = self.engine(cell_size_mm, self.folder)
         return self._run(
             engine, case, lambda: self._guess(case, start, cell_size_mm), progress, self._bookmark("answer")
@@ -236,6 +242,8 @@ class _Runs:
         flow without a device is scaled by the ratio of speeds with and without the screen; otherwise it would exceed
         the flow itself in a sac nearly at rest.
         """
+        if self.similar is not None:
+            return self.similar
         if self.engine.coarsening is None:
             return start
         coarse_mm = self.engine.coarsening * cell_size_mm

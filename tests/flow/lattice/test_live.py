@@ -18,10 +18,13 @@ from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.live import (
     CELLS_ACROSS_NECK,
     CELLS_ACROSS_PARENT,
+    KNOWN,
     LiveFlow,
+    Stepping,
+    average,
     preview_spacing_mm,
 )
-from vstent.flow.lattice.state import State
+from vstent.flow.lattice.stepping import twin
 from vstent.flow.screen import screen
 from vstent.flow.simulation import flow_case
 from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
@@ -79,8 +82,10 @@ def alone(live: LiveFlow, one: Screen | None) -> tuple[float, float]:
 
 
 def test_the_flow_without_a_device_is_that_of_a_run(live: LiveFlow) -> None:
-    found = live.bare.neck_inflow_mL_s, live.bare.sac_velocity_m_s
-    np.testing.assert_allclose(found, alone(live, None), rtol=0.03)
+    live.place(None)
+    np.testing.assert_allclose(settled(live), alone(live, None), rtol=0.03)
+    assert live.bare == live.read()
+    assert live.change("neck_inflow_mL_s") == (0.0, 0.0)
 
 
 def test_an_exchanged_device_comes_to_its_own_flow(live: LiveFlow) -> None:
@@ -88,6 +93,54 @@ def test_an_exchanged_device_comes_to_its_own_flow(live: LiveFlow) -> None:
     for one in (sparse, dense, None, dense):
         live.place(one)
         np.testing.assert_allclose(settled(live), alone(live, one), rtol=0.03)
+
+
+def test_both_flows_step_until_the_one_without_a_device_is_known(live: LiveFlow) -> None:
+    live.place(None)
+    live.place(screens()[0])
+    assert max(live.bare.error.values()) < KNOWN
+    without = [one.copy() for one in live._bare.readings]
+    live.advance(0.0)
+    np.testing.assert_array_equal(live._bare.readings, without)
+    live._bare.readings.clear()
+    populations = live.state.populations.copy()
+    live.advance(0.0)
+    assert len(live._bare.readings) == 1
+    assert not np.array_equal(live.state.populations, populations)
+
+
+def test_a_change_lies_within_its_band_while_the_flow_adapts(live: LiveFlow) -> None:
+    live.place(None)
+    settled(live)
+    live.place(screens()[0])
+    course = []
+    for _ in range(150):
+        live.advance(0.0)
+        course.append(live.change("neck_inflow_mL_s"))
+    end, error = course[-1]
+    assert error < 3.0
+    assert sum(np.isfinite(one[1]) for one in course) > 100
+    assert all(abs(percent - end) <= points + error for percent, points in course)
+
+
+def test_an_average_lies_within_its_uncertainty_of_the_limit() -> None:
+    steps, rng = np.arange(200), np.random.default_rng(4)
+    for rate in (0.8, 0.95, 0.98):
+        decaying = 1 + 0.5 * rate**steps
+        for n in range(3, len(steps)):
+            mean, error = average(decaying[:n])
+            assert abs(mean - 1) <= error * mean + 1e-12, (rate, n)
+    missed = 0
+    for _ in range(200):
+        noise = rng.normal(size=300)
+        noisy = 1 + 0.1 * np.convolve(noise, 0.7 ** np.arange(20), "valid")
+        mean, error = average(noisy)
+        missed += abs(mean - 1) > error * mean
+    assert missed <= 20
+
+
+def test_few_readings_say_nothing() -> None:
+    assert average(np.linspace(1.0, 2.0, 8)) == (1.5, np.inf)
 
 
 def test_an_exchange_changes_the_screen_and_nothing_else(live: LiveFlow) -> None:
@@ -100,15 +153,12 @@ def test_an_exchange_changes_the_screen_and_nothing_else(live: LiveFlow) -> None
     assert len(live.state.screen.cell) == 0
 
 
-def test_a_flow_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminate = LatticeBoltzmann.terminate
-
-    def diverging(engine: LatticeBoltzmann, state: State) -> float | None:
-        return terminate(engine, state) if engine.outer is None else float("nan")
-
-    monkeypatch.setattr(LatticeBoltzmann, "terminate", diverging)
+def test_a_flow_that_diverges_says_so(live: LiveFlow) -> None:
+    lost = Stepping(twin(live.state), 2)
+    lost.state.populations[:] = np.nan
     with pytest.raises(DivergenceError):
-        LiveFlow(case())
+        lost.advance()
+    assert np.isfinite(live.state.populations).all()
 
 
 def test_the_grid_is_as_coarse_as_neck_and_artery_allow() -> None:

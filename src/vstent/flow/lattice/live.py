@@ -1,8 +1,9 @@
-"""Live flow: a lattice that never stops, in which the screen of a device is exchanged while the blood flows on.
+"""Live flow: two lattices that never stop, one without a device and one whose screen is exchanged while blood flows.
 
 The sac and a piece of the artery are computed on a fine grid, inside the flow of the whole vessel on a coarse grid
-(`close_up`). The coarse flow is computed once, without a device: a device changes the flow of the artery far less than
-that of the neck.
+(`close_up`). The coarse flow is computed once, without a device, until the blood of the vessel has been exchanged: a
+device changes the flow of the artery far less than that of the neck. Both lattices then step in turn. Every value is
+known at any time with an uncertainty, which falls while the flow develops and its averages grow longer.
 """
 
 from collections import deque
@@ -14,38 +15,138 @@ from typing import Final
 import numpy as np
 
 from vstent.flow.case import FlowCase, FlowField, Screen
-from vstent.flow.domain import default_cell_size_mm
-from vstent.flow.engines import run, stepped
+from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
+from vstent.flow.engines import DivergenceError, Outcome, stepped
 from vstent.flow.lattice.close_up import WIDTH
 from vstent.flow.lattice.engine import LatticeBoltzmann
-from vstent.flow.lattice.screen import build_screen
-from vstent.flow.lattice.state import NECK_INFLOW, State
-from vstent.flow.lattice.stepping import advance, monitored, snapshot
+from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
+from vstent.flow.lattice.stepping import advance, exchange, monitored, snapshot, twin
+from vstent.flow.lattice.trouble import trouble
+from vstent.flow.stopping import SURE, fraction_left, standard_error
 from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
 from vstent.kernels.arrays import Floats
+from vstent.units import M3_PER_ML, M_PER_MM
 
 CELLS_ACROSS_NECK: Final = 28.0
 """Number of cells across the neck: with 20 the reductions of the demo are 12 points too small, with 28 within 2."""
 CELLS_ACROSS_PARENT: Final = 18.0
 """Number of cells across the parent artery."""
 TOLERANCE: Final = 0.02
-"""Residual below which the flow without a device counts as converged in a preview."""
-READING_S: Final = 0.05
-"""Interval of readings in flow time, in units of the sac's turnover time without a device."""
-AVERAGED: Final = 8
-"""Number of readings whose mean is shown."""
+"""Residual below which the coarse flow counts as converged, and uncertainty below which a value counts as steady."""
+KNOWN: Final = 0.01
+"""Uncertainty of the flow without a device below which only the flow with the device is continued."""
+LATEST: Final = 8
+"""Number of readings that are averaged in a flow that converges."""
+CAUTION: Final = 2.5
+"""Factor on the estimated remaining change: slow modes of the sac make it up to 2.5 times too small (T)."""
+WINDOWS: Final = 4
+"""Number of averaging windows that are compared, each half as long as the one before."""
+LEAST_IN_THIRD: Final = 3
+"""Least number of readings in a third of the course, from which its range is used."""
+DRIFT: Final = 0.4
+"""Largest shift between the means of the last two thirds, over their range, of a flow that does not drift."""
+RANGES: Final = 2.0
+"""Uncertainty of the mean of a few readings, in ranges. With these numbers no change of the neck inflow or of the sac
+velocity lay outside its band in eight flows (demo, arc, T, C0038; Silk, Enterprise), at no reading."""
+KEPT: Final = 4096
+"""Number of readings that are kept."""
+READINGS_PER_CHECK: Final = 4
+"""Number of readings between two checks of the lattice: blood moves an eighth of an inlet diameter between readings."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What a live flow shows: means over the last readings."""
+    """What is known of a flow: averages, and how far they may be from those of an unlimited run on the same grid."""
 
     neck_inflow_mL_s: float
     """Neck inflow."""
     sac_velocity_m_s: float
     """Mean speed in the sac."""
-    is_settled: bool
-    """Whether the last readings agree within the tolerance of a preview."""
+    error: dict[str, float]
+    """Uncertainty of both values by their names, as a fraction; inf with too few readings."""
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether both values are known to within the tolerance of a preview."""
+        return max(self.error.values()) < TOLERANCE
+
+
+class Stepping:
+    """A lattice and the values read from it since its device was placed.
+
+    Parameters
+    ----------
+    state : State
+        The lattice.
+    reading_steps : int
+        Even number of time steps between two readings.
+    """
+
+    def __init__(self, state: State, reading_steps: int) -> None:
+        self.state, self.reading_steps = state, reading_steps
+        self.readings: deque[Floats] = deque(maxlen=KEPT)
+
+    def advance(self) -> None:
+        """Make the time steps up to the next reading.
+
+        Raises
+        ------
+        DivergenceError
+            The flow diverges.
+        """
+        advance(self.state, self.reading_steps)
+        self.state.since_check = 0
+        now = snapshot(self.state)
+        if now.is_lost:
+            raise DivergenceError(trouble(self.state))
+        self.readings.append(self._values(now))
+
+    def _values(self, now: Snapshot) -> Floats:
+        """Return neck inflow and mean speed in the sac."""
+        return monitored(self.state, now)[[NECK_INFLOW, 0]]
+
+    def place(self, case: FlowCase) -> None:
+        """Exchange the device for that of a case; the flow goes on from where it is."""
+        exchange(self.state, case)
+        self.readings.clear()
+
+    def read(self) -> Reading:
+        """Return the averages of neck inflow and sac velocity."""
+        values = np.array(self.readings or [self._values(snapshot(self.state))])
+        (inflow, inflow_error), (velocity, velocity_error) = (average(column) for column in values.T)
+        return Reading(inflow, velocity, {"neck_inflow_mL_s": inflow_error, "sac_velocity_m_s": velocity_error})
+
+
+def average(values: Floats) -> tuple[float, float]:
+    """Return the average of the last values that is known best, and its uncertainty as a fraction.
+
+    Of a flow that converges the last `LATEST` values count, and `CAUTION` times the change that is still expected. Of
+    one that oscillates the window counts whose standard error, times `SURE`, is smallest, or before that the last two
+    thirds and `RANGES` times their range, unless they drift. The smallest of these uncertainties is returned; inf with
+    too few values.
+
+    Parameters
+    ----------
+    values : (n,) float
+        Values at equal intervals of time.
+    """
+    late = float(values[-LATEST:].mean())
+    # A change passes through zero where a value turns: the worst estimate of the last third counts.
+    agreeing = {round(len(values) * part) for part in (0.7, 0.8, 0.9, 1.0)}
+    left = CAUTION * max(fraction_left(values[:n, None]) for n in agreeing)
+    lengths = {max(1, len(values) >> halvings) for halvings in range(WINDOWS)}
+    means = ((float(values[-n:].mean()), SURE * standard_error(values[-n:, None])) for n in lengths)
+    return min([(late, left), *means, _by_range(values)], key=lambda one: one[1])
+
+
+def _by_range(values: Floats) -> tuple[float, float]:
+    """Return the mean of the last two thirds and `RANGES` times their range, as a fraction; inf where they drift."""
+    before, last = np.array_split(values[len(values) // 3 :], 2)
+    both = np.concatenate([before, last])
+    spread, mean = float(np.ptp(both)), float(both.mean())
+    if len(last) < LEAST_IN_THIRD or abs(last.mean() - before.mean()) > DRIFT * spread:
+        return mean, float("inf")
+    return mean, RANGES * spread / max(abs(mean), 1e-12)
 
 
 class LiveFlow:
@@ -56,7 +157,7 @@ class LiveFlow:
     case : FlowCase
         The flow case without a device; it must have a sac and an ostium.
     told : callable, optional
-        Called with the fraction that is done while the flow without a device is computed.
+        Called with the fraction that is done while the flow of the artery is computed.
 
     Raises
     ------
@@ -68,65 +169,79 @@ class LiveFlow:
         self.case = replace(case, settings=replace(case.settings, waveform=None, close_up=False, tolerance=TOLERANCE))
         self.cell_size_mm = preview_spacing_mm(self.case)
         self.outer = self._around(told)
-        self._engine = LatticeBoltzmann(self.cell_size_mm, None, self.outer)
-        self.state: State = self._engine.init(self.case, self.outer)
-        self._readings: deque[Floats] = deque(maxlen=AVERAGED)
-        self._converge(told)
-        self.bare = self.read()
+        state = LatticeBoltzmann(self.cell_size_mm, None, self.outer).init(self.case, self.outer)
+        self._bare = Stepping(state, 2 * max(1, round(0.5 * state.steps_per_check / READINGS_PER_CHECK)))
+        self._shown = self._bare
 
     def _around(self, told: Callable[[float], None] | None) -> FlowField:
-        """Return the flow of the whole vessel on the coarse grid."""
-        progress = None if told is None else (lambda now: told(0.4 * now.fraction))
+        """Return the flow of the whole vessel on the coarse grid once its blood has been exchanged."""
         # Oscillations at the neck would need most of the steps, and the fine grid computes the neck.
-        around = replace(self.case, ostium=None)
-        return run(LatticeBoltzmann(WIDTH * self.cell_size_mm), around, progress=progress)
-
-    def _converge(self, told: Callable[[float], None] | None) -> None:
-        """Advance the flow without a device until it has converged or its steps are used up."""
-        limit = self._engine.max_checks(self.state)
-        for check in range(limit):
-            left = None
-            while left is None:  # between checks
-                self.state, left = stepped(self._engine, self.state)
-            self._readings.append(self.state.history[-1])
+        case = replace(self.case, ostium=None)
+        engine = LatticeBoltzmann(WIDTH * self.cell_size_mm)
+        state, left = engine.init(case, None), None
+        exchange_s = extended_volume_mm3(case.vessel) * M_PER_MM**3 / (case.inflow_mL_s * M3_PER_ML)
+        while state.time_s < exchange_s and not (left is not None and left < TOLERANCE):
+            state, left = stepped(engine, state)
             if told is not None:
-                told(0.4 + 0.6 * (check + 1) / limit)
-            if left < TOLERANCE:
-                return
+                told(min(state.time_s / exchange_s, 1.0))
+        while left is None:
+            state, left = stepped(engine, state)
+        return engine.result(state, Outcome(left < TOLERANCE, (left,), 0.0, 0.0))
 
     def place(self, screen: Screen | None) -> None:
-        """Exchange the device; None removes it. The flow goes on from where it is."""
-        case = replace(self.case, screen=screen)
-        state = self.state
-        entries = build_screen(case, state.domain, state.addressing, state.scales)
-        state.case, state.screen, state.built = case, entries, (state.built[0], entries)
-        self._readings.clear()
+        """Exchange the device; None removes it.
+
+        The flow with a device goes on from where it is; the first one goes on from the flow without a device.
+        """
+        if screen is None:
+            self._shown = self._bare
+            return
+        if self._shown is self._bare:
+            self._shown = Stepping(twin(self._bare.state), self._bare.reading_steps)
+        self._shown.place(replace(self.case, screen=screen))
 
     def advance(self, seconds: float) -> int:
         """Make time steps for about a wall-clock time, take one reading at least, and return the number of steps."""
         began, done = perf_counter(), 0
         while not done or perf_counter() - began < seconds:
-            advance(self.state, self.steps_per_reading)
-            self.state.since_check = 0
-            self._readings.append(monitored(self.state, snapshot(self.state)))
-            done += self.steps_per_reading
+            for one in self._unknown:
+                one.advance()
+                done += one.reading_steps
         return done
 
     @property
-    def steps_per_reading(self) -> int:
-        """Even number of time steps between two readings."""
-        sac = self.case.sac
-        assert sac is not None
-        turnover_s = abs(sac.volume_mm3) * 1e-3 / max(self.bare.neck_inflow_mL_s, 1e-9)
-        return 2 * max(1, round(0.5 * READING_S * turnover_s / self.state.scales.step_s))
+    def _unknown(self) -> tuple[Stepping, ...]:
+        """The flow that is shown, and the one without a device as long as it is not known well."""
+        is_known = bool(self._bare.readings) and max(self._bare.read().error.values()) < KNOWN
+        return (self._shown,) if is_known or self._shown is self._bare else (self._bare, self._shown)
+
+    @property
+    def state(self) -> State:
+        """The lattice of the flow that is shown."""
+        return self._shown.state
+
+    @property
+    def bare(self) -> Reading:
+        """What is known of the flow without a device."""
+        return self._bare.read()
 
     def read(self) -> Reading:
-        """Return the means of the last readings."""
-        found = np.array(self._readings)
-        mean = found.mean(axis=0)
-        spread = np.ptp(found[:, [0, NECK_INFLOW]], axis=0) / np.maximum(np.abs(mean[[0, NECK_INFLOW]]), 1e-12)
-        settled = len(found) == AVERAGED and bool((spread < TOLERANCE).all())
-        return Reading(float(mean[NECK_INFLOW]), float(mean[0]), settled)
+        """Return what is known of the flow that is shown."""
+        return self._shown.read()
+
+    def change(self, name: str) -> tuple[float, float]:
+        """Return the change of a value against the flow without a device, in percent, and its uncertainty in points.
+
+        Parameters
+        ----------
+        name : str
+            ``neck_inflow_mL_s`` or ``sac_velocity_m_s``.
+        """
+        if self._shown is self._bare:
+            return 0.0, 0.0
+        now, bare = self.read(), self.bare
+        ratio = getattr(now, name) / max(getattr(bare, name), 1e-12)
+        return 100 * (ratio - 1), 100 * ratio * (now.error[name] + bare.error[name])
 
     def field(self) -> FlowField:
         """Return the present flow in the refined region, for streamlines: only its velocity is meaningful."""

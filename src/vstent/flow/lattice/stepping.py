@@ -124,6 +124,33 @@ def _begin_from(state: State, start: FlowField) -> None:
         links.openings[k, 2] = d3q19.moments(state.populations, state.addressing.stride, at_inlet)[:, 0].mean()
 
 
+def exchange(state: State, case: FlowCase) -> None:
+    """Exchange the screen of a run for that of a case; the flow does not change."""
+    if state.device is not None:
+        state.device.fetch(state)
+        state.device = None
+    entries = build_screen(case, state.domain, state.addressing, state.scales)
+    state.case, state.screen, state.built = case, entries, (state.built[0], entries)
+
+
+def twin(state: State) -> State:
+    """Return a second run with the same flow, which goes its own way."""
+    if state.device is not None:
+        state.device.fetch(state)
+    links = replace(state.links, source=state.links.source.copy(), openings=state.links.openings.copy())
+    refill = replace(state.refill, lost=state.refill.lost.copy(), refill=state.refill.refill.copy())
+    return replace(
+        state,
+        built=(links, state.screen),
+        links=links,
+        refill=refill,
+        populations=state.populations.copy(),
+        snapshots=state.snapshots.copy(),
+        history=list(state.history),
+        device=None,
+    )
+
+
 def step(state: State) -> None:
     """Make time steps for a few seconds, at most up to the next check, and record the flow at a check."""
     began = perf_counter()
