@@ -184,7 +184,7 @@ def _measured_rate(on_gpu: bool) -> float:
     if on_gpu:
         from vstent.flow.lattice.on_gpu import seconds_of_update
 
-        return stride / seconds_of_update(f, address, length, relaxation, nothing)
+        return stride / seconds_of_update(address[:, 0], length, stride, relaxation)
     rows = np.arange(0, BLOCK_ROWS + 1, BLOCK_BAND, dtype=np.int32)
     bands = np.column_stack([rows, np.zeros((len(rows), 4), np.int32)])
     shares = d3q19.share(length, nothing[0], bands, numba.get_num_threads())

@@ -3,6 +3,7 @@
 from collections import deque
 from dataclasses import replace
 from time import perf_counter
+from typing import Final
 
 import numba
 import numpy as np
@@ -29,8 +30,10 @@ from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, OnDevice, Probe, 
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
-SLICE_UPDATES = 2e8
+SLICE_UPDATES: Final = 2e8
 """Number of cell updates between two looks at the clock: a few seconds on one core."""
+GPU_SLICE_UPDATES: Final = 2e9
+"""The same on a GPU: some tenths of a second."""
 
 
 def build(
@@ -147,12 +150,13 @@ def _keep_pace(state: State) -> None:
     last, following = (int(state.pace[(len(state.history) + k) % len(state.pace)]) for k in (-1, 0))
     if last == following:
         return
-    if state.device is not None:
-        state.device.fetch(state)
-        state.device = None
     before, stretch = state.scales.relaxation_steps, last / following
     take_pace(state)
     stress, a = stretch * state.scales.relaxation_steps / before, state.addressing
+    if state.device is not None:
+        with told():
+            state.device.rescale(state, stretch, stress)
+        return
     d3q19.rescale(state.populations, a.stride, a.place, state.links.address, np.float32(stretch), np.float32(stress))
     state.links.openings[:, d3q19.OWN_DENSITIES] *= stretch**2
     _settle(state, 1.0)
@@ -168,7 +172,8 @@ def take_pace(state: State) -> None:
 
 def _slice_steps(state: State) -> int:
     """Return the even number of time steps between two looks at the clock."""
-    return 2 * max(1, round(SLICE_UPDATES / len(state.domain.cells) / 2))
+    updates = GPU_SLICE_UPDATES if state.case.settings.device_gpu else SLICE_UPDATES
+    return 2 * max(1, round(updates / len(state.domain.cells) / 2))
 
 
 def advance(state: State, steps: int) -> None:
@@ -250,13 +255,12 @@ def _settle(state: State, part: float) -> None:
 
 def snapshot(state: State) -> Snapshot:
     """Return the present flow; in a screen the velocity includes half of its force."""
-    moment, outflow = _read_here(state) if state.device is None else state.device.read()
-    velocity = np.ascontiguousarray(moment[:, 1:])
+    density, velocity, outflow = _read_here(state) if state.device is None else state.device.read()
     cells = state.screen.cell
     if len(cells):
         times = _relaxation_times(state, cells)
         velocity[cells] = d3q19.resisted(velocity[cells], state.screen.entry, times, np.float32(ODD_RATE))
-    return Snapshot(state.scales, velocity, moment[:, 0], outflow)
+    return Snapshot(state.scales, velocity, density, outflow)
 
 
 def _relaxation_times(state: State, cells: Ints) -> NDArray[np.float32]:
@@ -265,18 +269,18 @@ def _relaxation_times(state: State, cells: Ints) -> NDArray[np.float32]:
     if law[0] == 0:
         return np.full(len(cells), time)
     if state.device is not None:
-        state.device.fetch(state)
+        return state.device.read_times()
     a = state.addressing
     return np.asarray(d3q19.relaxation_times(state.populations, a.stride, a.place[cells], time, law))
 
 
-def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
-    """Return density deviation and momentum (n, 4) of every cell, and the flow rate (k,) out of every end."""
+def _read_here(state: State) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
+    """Return density deviation (n,) and momentum (n, 3) of every cell, and the flow rate (k,) out of every end."""
     f, links = state.populations, state.links
     moment = d3q19.moments(f, state.addressing.stride, state.addressing.place).astype(np.float32)
     ends = range(len(links.start) - 1)
     outflow = [d3q19.outflow(f, links.address[links.start[k] : links.start[k + 1]]) for k in ends]
-    return moment, np.array(outflow)
+    return moment[:, 0], np.ascontiguousarray(moment[:, 1:]), np.array(outflow)
 
 
 def monitored(state: State, now: Snapshot) -> Floats:
