@@ -3,7 +3,8 @@
 from collections import deque
 from dataclasses import replace
 from time import perf_counter
-from typing import Final
+from typing import Final, TypeAlias
+from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
@@ -20,6 +21,7 @@ from vstent.flow.lattice.kernels.warm import keep_flow
 from vstent.flow.lattice.scales import ODD_RATE, Scales
 from vstent.flow.lattice.screen import build_screen
 from vstent.flow.lattice.setup import (
+    Addressing,
     address,
     build_bands,
     build_links,
@@ -27,6 +29,7 @@ from vstent.flow.lattice.setup import (
     thickest,
 )
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, OnDevice, Probe, Snapshot, State
+from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
@@ -34,6 +37,11 @@ SLICE_UPDATES: Final = 2e8
 """Number of cell updates between two looks at the clock: a few seconds on one core."""
 GPU_SLICE_UPDATES: Final = 2e9
 """The same on a GPU: some tenths of a second."""
+
+Grid: TypeAlias = tuple[domains.Domain, NDArray[np.float32], Addressing]
+"""A domain, the largest grid Reynolds number of its cells, and its memory layout."""
+_GRIDS: WeakKeyDictionary[Vessel, dict[float, Grid]] = WeakKeyDictionary()
+"""Grids of whole vessels by grid spacing, as long as the vessel exists."""
 
 
 def build(
@@ -69,12 +77,7 @@ def build(
         require_gpu()
     keep_flow()
     scales = Scales(cell_size_mm * M_PER_MM, check_s / int(pace[0]), case.blood)
-    if close_up is None:
-        domain = domains.build(case.vessel, cell_size_mm)
-    else:
-        domain = close_ups.build(case, cell_size_mm, close_up)
-    limit = thickest(case, domain)
-    addressing = address(domain, limit)
+    domain, limit, addressing = _grid(case, cell_size_mm, close_up)
     links = build_links(case, domain, addressing, scales, close_up)
     screen = build_screen(case, domain, addressing, scales)
     state = State(
@@ -98,6 +101,22 @@ def build(
     if start is not None:
         _begin_from(state, start)
     return state
+
+
+def _grid(case: FlowCase, cell_size_mm: float, close_up: CloseUp | None) -> Grid:
+    """Return the grid of a case; that of a whole vessel is the same for all its flows and is built once."""
+    if close_up is not None:
+        return _numbered(case, close_ups.build(case, cell_size_mm, close_up))
+    built = _GRIDS.setdefault(case.vessel, {})
+    if cell_size_mm not in built:
+        built[cell_size_mm] = _numbered(case, domains.build(case.vessel, cell_size_mm))
+    return built[cell_size_mm]
+
+
+def _numbered(case: FlowCase, domain: domains.Domain) -> Grid:
+    """Return a domain with the largest grid Reynolds number of its cells and its memory layout."""
+    limit = thickest(case, domain)
+    return domain, limit, address(domain, limit)
 
 
 def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
