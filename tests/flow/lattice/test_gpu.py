@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import re
 import subprocess
 import sys
 import types
@@ -125,7 +126,7 @@ def test_a_gpu_makes_the_steps_that_a_processor_makes(tmp_path: Path, monkeypatc
     state = everything()
     stepping.advance(state, 2 * SETTLED_PAIRS)
     (tmp_path / "state").write_bytes(pickle.dumps(state))
-    simulated = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1"}
+    simulated = os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}
     command = [sys.executable, "-W", "error", "-c", ON_GPU, str(tmp_path / "state"), str(tmp_path / "found.npz")]
     ran = subprocess.run(command, env=simulated, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
@@ -216,6 +217,29 @@ def test_a_driver_that_does_not_record_is_no_error_of_the_run(failing: str, monk
     )
     assert begun
     assert ended == (failing != "cuStreamBeginCapture")
+
+
+def benchmark(*words: str, **environment: str) -> str:
+    script = Path(__file__).parents[3] / "benchmarks" / "gpu.py"
+    command = [sys.executable, "-W", "error", str(script), *words]
+    ran = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def test_the_benchmark_runs_through_on_the_simulator() -> None:
+    said = benchmark("--tiny", NUMBA_ENABLE_CUDASIM="1")
+    for part in ("| even_step |", "| drive |", "launched one by one", "whole flows", "bytes per cell", "Measured in"):
+        assert part in said
+    goals = said[said.index("| goal") :]
+    assert "| two runs, bit for bit | same | same | yes |" in goals
+    assert re.search(r"against the processor \| 0\.001 \| \d\.\de-\d\d \| yes \|", goals)
+    assert goals.count("not measured") == 5
+
+
+def test_the_benchmark_says_why_it_measures_nothing() -> None:
+    if gpus.gpu_name() == "none":
+        assert benchmark("--tiny").startswith("Not measured: the flow cannot be computed on a GPU, because")
 
 
 ASKED = FlowSettings(cell_size_mm=0.2, device_gpu=True)

@@ -57,7 +57,7 @@ class Device:
     def __init__(self, state: State) -> None:
         """Copy all arrays that the time steps need to the GPU."""
         a, links, packed = state.addressing, state.links, pack(state)
-        self._packed, self._cells, self._stream = packed, len(packed.code), cuda.stream()
+        self._packed, self._cells, self.stream = packed, len(packed.code), cuda.stream()
         self._populations, self._clock = put(state.populations), put(np.array([0, 1], np.int32))
         self._link, self._refill = put(packed.link), put(_refill(state, packed))
         self._of_cells = put(packed.code), put(packed.rows), put(state.limit), a.stride
@@ -86,15 +86,13 @@ class Device:
         return "as a CUDA graph" if self._replay else "one by one"
 
     @property
-    def kernels(self) -> tuple[Launch, ...]:
-        """Return the kernels of a pair of time steps in their order, and the two that update the walls."""
-        drive, even_step, swap, odd_step = self._steps
-        return drive, even_step, swap, odd_step, swap, *self._settle
-
-    @property
     def nbytes(self) -> int:
         """Return the memory of the run on the GPU, in bytes."""
-        known = {id(array): array for launch in (*self.kernels, *self._read) for array in _arrays(launch.arguments)}
+        known = {
+            id(array): array
+            for launch in (*self._steps, *self._settle, *self._read)
+            for array in _arrays(launch.arguments)
+        }
         return sum(array.nbytes for array in (*known.values(), self._through))
 
     def _kernels_of_pair(self, state: State) -> tuple[Launch, Launch, Launch, Launch]:
@@ -145,14 +143,14 @@ class Device:
             self._impose(rows)
             for pairs in plan(first_pair + first, len(rows)):
                 self._make(pairs)
-            self._stream.synchronize()
+            self.stream.synchronize()
             first += len(rows)
             if self._replay is None:  # kernels are loaded now
                 self._replay = self._recorded()
 
     def _impose(self, rows: Floats) -> None:
         """Copy the boundary values of the next pairs of steps to the GPU; populations are at home before the first."""
-        whole = np.zeros(self._imposed.shape)
+        whole = np.repeat(rows[-1:], PAIRS, axis=0)
         whole[: len(rows)] = rows
         self._imposed.copy_to_device(whole)
         self._clock.copy_to_device(np.array([0, 1], np.int32))
@@ -160,9 +158,9 @@ class Device:
     def _recorded(self) -> dict[Pairs, Any]:
         """Return functions that replay each sequence of pairs; empty where they cannot be recorded."""
         try:
-            return {pairs: recorded(partial(self._launch_all, pairs), self._stream) for pairs in Pairs}
+            return {pairs: recorded(partial(self._make, pairs), self.stream) for pairs in Pairs}
         except NotRecordedError:
-            self._stream = cuda.stream()
+            self.stream = cuda.stream()
             return {}
 
     def _make(self, pairs: Pairs) -> None:
@@ -170,37 +168,42 @@ class Device:
         if self._replay:
             self._replay[pairs]()
         else:
-            self._launch_all(pairs)
+            self._launch_all(self.launches(pairs))
 
-    def _launch_all(self, pairs: Pairs) -> None:
-        """Launch the kernels of pairs of time steps."""
+    def launches(self, pairs: Pairs) -> Iterator[tuple[Launch, tuple[Any, ...]]]:
+        """Yield the kernels of pairs of time steps in their order, with their further arguments."""
         if pairs is Pairs.ROUND:
-            self._launch_all(Pairs.SETTLED)
-            for _ in range(DEFER_PAIRS - 1):
-                self._launch_all(Pairs.PLAIN)
+            for one in (Pairs.SETTLED, *(DEFER_PAIRS - 1) * (Pairs.PLAIN,)):
+                yield from self.launches(one)
             return
         drive, even_step, swap, odd_step = self._steps
-        for launch in (drive, even_step, swap):
-            launch(self._stream)
-        odd_step(self._stream, int(pairs is not Pairs.PLAIN))
-        swap(self._stream)
+        last = odd_step, (int(pairs is not Pairs.PLAIN),)
+        yield from ((drive, ()), (even_step, ()), (swap, ()), last, (swap, ()))
         if pairs is not Pairs.PLAIN:
-            self._update_walls(DEFER_PART if pairs is Pairs.SETTLED else 0.0)
+            yield from self._updates_of_walls(DEFER_PART if pairs is Pairs.SETTLED else 0.0)
 
-    def _update_walls(self, part: float) -> None:
-        """Bring populations home and update walls with the under-relaxation factor `part`; 0 leaves the walls."""
+    def _updates_of_walls(self, part: float) -> Iterator[tuple[Launch, tuple[Any, ...]]]:
+        """Yield the kernels that bring populations home and update walls, with their under-relaxation factor.
+
+        The factor 0 leaves the walls as they are.
+        """
         for launch in self._settle:
-            launch(self._stream, np.float32(part))
+            yield launch, (np.float32(part),)
+
+    def _launch_all(self, launches: Iterator[tuple[Launch, tuple[Any, ...]]]) -> None:
+        """Launch kernels one by one."""
+        for launch, further in launches:
+            launch(self.stream, *further)
 
     def rescale(self, state: State, stretch: float, stress: float) -> None:
         """Take links and screen of `state`, and convert populations to its time step (see `state.OnDevice`)."""
         factor, f = np.float32(stretch), self._populations
         everywhere = f, self._of_cells, self._walls
         of_links = f, self._address, self._through
-        Launch(kernels.sent, len(state.links.address), of_links)(self._stream)
-        Launch(kernels.rescale, self._cells, everywhere)(self._stream, factor, np.float32(stress))
-        Launch(kernels.resend, len(state.links.address), of_links)(self._stream, factor)
-        self._stream.synchronize()
+        Launch(kernels.sent, len(state.links.address), of_links)(self.stream)
+        Launch(kernels.rescale, self._cells, everywhere)(self.stream, factor, np.float32(stress))
+        Launch(kernels.resend, len(state.links.address), of_links)(self.stream, factor)
+        self.stream.synchronize()
         openings = self._openings.copy_to_host()
         openings[:, d3q19.OWN_DENSITIES] *= stretch**2
         for there, here in (
@@ -212,24 +215,24 @@ class Device:
         ):
             if here.size:
                 there.copy_to_device(np.ascontiguousarray(here))
-        self._update_walls(1.0)
+        self._launch_all(self._updates_of_walls(1.0))
 
     def read(self) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
         """Return density deviation (n,), momentum (n, 3), and the flow rate (k,) out of every end."""
         for launch in self._read:
-            launch(self._stream)
-        self._stream.synchronize()
+            launch(self.stream)
+        self.stream.synchronize()
         return self._density.copy_to_host(), self._velocity.copy_to_host(), self._outflow.copy_to_host()
 
     def read_times(self) -> NDArray[np.float32]:
         """Return the relaxation times (e,) of shear-thinning blood in the cells of the screen."""
-        self._read_times(self._stream)
-        self._stream.synchronize()
+        self._read_times(self.stream)
+        self.stream.synchronize()
         return np.asarray(self._times.copy_to_host())
 
     def fetch(self, state: State) -> None:
         """Copy the arrays that the time steps change back to `state`."""
-        self._stream.synchronize()
+        self.stream.synchronize()
         state.populations[:] = self._populations.copy_to_host()
         state.links.openings[:] = self._openings.copy_to_host()
         state.links.source[:] = self._link.copy_to_host()[self._packed.slot, 1]

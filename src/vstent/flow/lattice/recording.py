@@ -86,7 +86,7 @@ def recorded(launches: Callable[[], None], stream: Any) -> Callable[[], None]:
     def replay() -> None:
         _checked(driver.cuGraphLaunch(graph_exec, handle))
 
-    weakref.finalize(replay, driver.cuGraphExecDestroy, graph_exec)
+    weakref.finalize(replay, driver.cuGraphExecDestroy, graph_exec).atexit = False
     return replay
 
 

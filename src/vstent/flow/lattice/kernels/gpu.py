@@ -13,11 +13,13 @@ the CPU has it after every odd step. After `defer` the populations are *at home*
 Import it only where a GPU is requested (`vstent.flow.lattice.gpu`).
 """
 
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
-from numba import cuda, njit
+from numba import config, cuda, njit
 
+from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.kernels.collision import (
     collided,
     collided_screened,
@@ -26,20 +28,10 @@ from vstent.flow.lattice.kernels.collision import (
     stress_size,
     thinned,
 )
-from vstent.flow.lattice.kernels.d3q19 import (
-    INFLOW,
-    OPPOSITE,
-    OUTFLOW,
-    balance_group,
-    between,
-    deferred,
-    inflow_speed,
-    outlet_density,
-    outlet_source,
-)
+from vstent.flow.lattice.kernels.d3q19 import INFLOW, OPPOSITE, OUTFLOW
 
-THREADS: Final = 128
-"""Number of threads per block; a power of 2."""
+THREADS: Final = 8 if config.ENABLE_CUDASIM else 128
+"""Number of threads per block; a power of 2. Numba simulates each by a thread of the processor, which is slow."""
 COLUMN: Final = np.array([0, 1, 2, 3, 4, 0, 0, 5, 6, 7, 8, 1, 2, 1, 2, 3, 4, 3, 4], np.int32)
 """(19,) column of a segment's row of places that holds the neighbour in each direction (see `packing.Packed.rows`)."""
 SHIFT: Final = np.array([0, 0, 0, 0, 0, 1, -1, 0, 0, 0, 0, 1, -1, -1, 1, 1, -1, -1, 1], np.int32)
@@ -50,19 +42,34 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _U, _WHOLE = np.uint64, np.uint32
 
 
-@njit(forceinline=True)
+def _of_arrays(function: Any) -> Any:
+    """Return a function of arrays for use in a kernel: numba's simulator cannot pass its arrays to compiled code."""
+    return getattr(function, "py_func", function) if config.ENABLE_CUDASIM else function
+
+
+def _inlined(function: Callable[..., Any]) -> Any:
+    """Return a function that is compiled into the kernels that call it."""
+    return function if config.ENABLE_CUDASIM else njit(forceinline=True)(function)
+
+
+_balance_group, _between, _deferred = (_of_arrays(one) for one in (d3q19.balance_group, d3q19.between, d3q19.deferred))
+_inflow_speed, _outlet_density = _of_arrays(d3q19.inflow_speed), _of_arrays(d3q19.outlet_density)
+_outlet_source = _of_arrays(d3q19.outlet_source)
+
+
+@_inlined
 def load(f: Any, address: int) -> Any:
     """Return the population at an address; every kernel reads populations here."""
     return f[_U(address)]
 
 
-@njit(forceinline=True)
+@_inlined
 def store(f: Any, address: int, population: Any) -> None:
     """Write the population at an address; every kernel writes populations here."""
     f[_U(address)] = population
 
 
-@njit(forceinline=True)
+@_inlined
 def _cell(cell: int, cells: Any, special: Any) -> tuple[int, int, int, int, int, int, int]:
     """Return segment, link masks (all, near, ends), first link, screen entry and number of a special cell.
 
@@ -75,20 +82,20 @@ def _cell(cell: int, cells: Any, special: Any) -> tuple[int, int, int, int, int,
     return special[0, w], special[1, w], special[2, w], special[3, w], special[4, w], special[5, w], w
 
 
-@njit(forceinline=True)
+@_inlined
 def _neighbour(q: int, rows: Any, s: int, cell: int) -> int:
     """Return the storage place of the neighbour in direction `q` of a cell of segment `s`."""
     place: int = rows[s, COLUMN[q]] + cell + SHIFT[q]
     return place
 
 
-@njit(forceinline=True)
+@_inlined
 def _own(q: int, stride: int, place: int) -> Any:
     """Return the address of population `q` of a cell at home; addresses have 32 bits."""
     return _WHOLE(q * stride + place)
 
 
-@njit(forceinline=True)
+@_inlined
 def _away(q: int, stride: int, rows: Any, s: int, cell: int, links: int) -> Any:
     """Return the address of population `q` of a cell in an odd step: at the neighbour, or at home behind a link."""
     p = OPPOSITE[q]
@@ -97,7 +104,7 @@ def _away(q: int, stride: int, rows: Any, s: int, cell: int, links: int) -> Any:
     return _WHOLE(p * stride + _neighbour(p, rows, s, cell))
 
 
-@njit(forceinline=True)
+@_inlined
 def _homes(stride: int, place: int) -> tuple[Any, ...]:
     """Return the addresses (19) of a cell's populations in an even step."""
     return (
@@ -123,7 +130,7 @@ def _homes(stride: int, place: int) -> tuple[Any, ...]:
     )
 
 
-@njit(forceinline=True)
+@_inlined
 def _aways(stride: int, rows: Any, s: int, cell: int, links: int) -> tuple[Any, ...]:
     """Return the addresses (19) of a cell's populations in an odd step."""
     return (
@@ -149,7 +156,7 @@ def _aways(stride: int, rows: Any, s: int, cell: int, links: int) -> tuple[Any, 
     )
 
 
-@njit(forceinline=True)
+@_inlined
 def _loaded(f: Any, at: tuple[int, ...]) -> tuple[Any, ...]:
     """Return the populations (19) at addresses (19)."""
     return (
@@ -175,7 +182,7 @@ def _loaded(f: Any, at: tuple[int, ...]) -> tuple[Any, ...]:
     )
 
 
-@njit(forceinline=True)
+@_inlined
 def _stored(f: Any, at: tuple[int, ...], new: tuple[Any, ...]) -> None:
     """Write populations (19) to addresses (19)."""
     store(f, at[0], new[0])
@@ -199,7 +206,7 @@ def _stored(f: Any, at: tuple[int, ...], new: tuple[Any, ...]) -> None:
     store(f, at[18], new[18])
 
 
-@njit(forceinline=True)
+@_inlined
 def _stored_away(f: Any, stride: int, rows: Any, s: int, cell: int, links: int, new: tuple[Any, ...]) -> None:
     """Write populations (19) to the addresses of an odd step.
 
@@ -226,13 +233,13 @@ def _stored_away(f: Any, stride: int, rows: Any, s: int, cell: int, links: int, 
     store(f, _away(18, stride, rows, s, cell, links), new[18])
 
 
-@njit(forceinline=True)
+@_inlined
 def _number(q: int, links: int, first: int) -> int:
     """Return the number of a cell's link in direction `q`; its links are numbered by direction from `first` on."""
     return first + cuda.popc(links & ((1 << q) - 1))
 
 
-@njit(forceinline=True)
+@_inlined
 def _returned(q: int, sent: Any, beside: Any, which: int, links: int, first: int, link: Any) -> Any:
     """Return what the link in direction `q` returns for the population sent, or `sent` where it is not in `which`."""
     if not which & (1 << q):
@@ -242,7 +249,7 @@ def _returned(q: int, sent: Any, beside: Any, which: int, links: int, first: int
     return weight * sent + (_ONE - abs(weight)) * beside + link[n, 1]
 
 
-@njit(forceinline=True)
+@_inlined
 def _returned_pair(q: int, a: Any, b: Any, which: int, links: int, first: int, link: Any) -> tuple[Any, Any]:
     """Return populations `q` and `q` + 1 after the links of this pair of opposite directions (see `_reflected`)."""
     return (
@@ -251,7 +258,7 @@ def _returned_pair(q: int, a: Any, b: Any, which: int, links: int, first: int, l
     )
 
 
-@njit(forceinline=True)
+@_inlined
 def _reflected(f: tuple[Any, ...], which: int, links: int, first: int, link: Any) -> tuple[Any, ...]:
     """Return the populations (19) of a cell after the links in the mask `which`.
 
@@ -271,7 +278,7 @@ def _reflected(f: tuple[Any, ...], which: int, links: int, first: int, link: Any
     )
 
 
-@njit(forceinline=True)
+@_inlined
 def _present(f: Any, cell: int, cells: Any, walls: Any, clock: Any) -> tuple[Any, ...]:
     """Return the populations (19) of a cell between two pairs of steps, whether they are at home or not."""
     s, links, near, _, first, _, _ = _cell(cell, cells, walls[0])
@@ -281,7 +288,7 @@ def _present(f: Any, cell: int, cells: Any, walls: Any, clock: Any) -> tuple[Any
     return held
 
 
-@njit(forceinline=True)
+@_inlined
 def _collided(held: tuple[Any, ...], limit: Any, number: Any, e: int, screen: Any) -> tuple[Any, ...]:
     """Return the collided populations (19), each in the place of its opposite; `e` is the screen entry or -1."""
     time, odd_rate = number[0], number[5]
@@ -297,7 +304,7 @@ def _collided(held: tuple[Any, ...], limit: Any, number: Any, e: int, screen: An
     return relaxed(held, even, odd, half_kept)
 
 
-@njit(forceinline=True)
+@_inlined
 def _left(new: tuple[Any, ...], far: int, links: int, first: int, w: int, walls: Any) -> tuple[Any, ...]:
     """Return the populations (19) to be stored: after the links in the mask `far`, with the refill of special cells."""
     if far:
@@ -308,7 +315,7 @@ def _left(new: tuple[Any, ...], far: int, links: int, first: int, w: int, walls:
     return rest, *new[1:]
 
 
-@njit(forceinline=True)
+@_inlined
 def _velocity(f: tuple[Any, ...]) -> tuple[float, float, float]:
     """Return the momentum (3) of populations (19) in double precision."""
     d1, d2, d3 = float(f[1]) - float(f[2]), float(f[3]) - float(f[4]), float(f[5]) - float(f[6])
@@ -317,7 +324,7 @@ def _velocity(f: tuple[Any, ...]) -> tuple[float, float, float]:
     return d1 + d4 + d5 + d6 + d7, d2 + d4 - d5 + d8 + d9, d3 + d6 - d7 + d8 - d9
 
 
-@njit(forceinline=True)
+@_inlined
 def _density(f: tuple[Any, ...]) -> float:
     """Return the density deviation of populations (19) in double precision."""
     total = float(f[0])
@@ -326,7 +333,7 @@ def _density(f: tuple[Any, ...]) -> float:
     return total
 
 
-@njit(forceinline=True)
+@_inlined
 def _open(held: tuple[Any, ...], ends: int, links: int, first: int, link: Any, opening: Any) -> None:
     """Set the sources of a cell's links in the mask `ends` (see `d3q19.drive`)."""
     of_link, of_end, shape, openings, answer, imposed, clock = opening
@@ -339,11 +346,11 @@ def _open(held: tuple[Any, ...], ends: int, links: int, first: int, link: Any, o
             n = _number(q, links, first)
             end = of_link[n]
             k = of_end[end]
-            linear, squared = between(shape, end, moment)
+            linear, squared = _between(shape, end, moment)
             if openings[k, 0] == INFLOW:
                 link[n, 1] = (linear + squared * answer[k]) * answer[k]
             else:
-                link[n, 1] = outlet_source(velocity, q, openings[k], answer[k] + linear)
+                link[n, 1] = _outlet_source(velocity, q, openings[k], answer[k] + linear)
 
 
 @cuda.jit(cache=True)
@@ -411,14 +418,14 @@ def odd_step(f: Any, cells: Any, walls: Any, screen: Any, number: Any, clock: An
     _stored_away(f, stride, rows, s, cell, links, _left(new, links & ~near, links, first, w, walls))
 
 
-@njit(forceinline=True)
+@_inlined
 def _send_one(f: Any, q: int, population: Any, which: int, stride: int, rows: Any, s: int, cell: int) -> None:
     """Write what is sent along the link in direction `q` to its mailbox, if it is in the mask `which`."""
     if which & (1 << q):
         store(f, q * stride + _neighbour(q, rows, s, cell), population)
 
 
-@njit(forceinline=True)
+@_inlined
 def _send(f: Any, new: tuple[Any, ...], which: int, stride: int, rows: Any, s: int, cell: int) -> None:
     """Write what is sent along the links in the mask `which` to their mailboxes."""
     _send_one(f, 1, new[2], which, stride, rows, s, cell)
@@ -477,7 +484,7 @@ def defer(f: Any, address: Any, correction: Any, slots: Any, lost: Any, clock: A
             weight = link[n, 0]
             store(f, home, weight * sent + (_ONE - abs(weight)) * load(f, address[k, 2]) + link[n, 1])
     lost[k] = sent - load(f, home)
-    link[n, 1] += part * (deferred(k, f, address, correction) - link[n, 1])
+    link[n, 1] += part * (_deferred(k, f, address, correction) - link[n, 1])
 
 
 @cuda.jit(cache=True)
@@ -490,7 +497,7 @@ def balance(lost: Any, groups: Any, refill: Any, clock: Any, part: float) -> Non
     if g == 0:
         clock[AT_HOME] = 1
     if g + 1 < groups[0].size:
-        balance_group(g, lost, groups, refill, part)
+        _balance_group(g, lost, groups, refill, part)
 
 
 @cuda.jit(cache=True)
@@ -539,14 +546,14 @@ def rescale(f: Any, cells: Any, walls: Any, stretch: float, stress: float) -> No
         _stored(f, at, _unswapped(new))
 
 
-@njit(forceinline=True)
+@_inlined
 def _unswapped(new: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return populations (19) that are in the places of their opposites in their own places."""
     first = new[0], new[2], new[1], new[4], new[3], new[6], new[5], new[8], new[7], new[10], new[9]
     return *first, new[12], new[11], new[14], new[13], new[16], new[15], new[18], new[17]
 
 
-@njit(forceinline=True)
+@_inlined
 def _sum(parts: Any, t: int) -> float:
     """Return the sum of a value of each of a block's threads, in fixed order; every thread must call it."""
     cuda.syncthreads()
@@ -561,7 +568,7 @@ def _sum(parts: Any, t: int) -> float:
     return total
 
 
-@njit(forceinline=True)
+@_inlined
 def _of_opening(f: Any, cell: int, k: int, cells: Any, walls: Any, ends: Any, clock: Any, is_flow: bool) -> float:
     """Return a cell's part of the flow rate out of opening `k`, or of the sum of density over its links."""
     of_link, of_end = ends
@@ -652,8 +659,8 @@ def drive(f: Any, cells: Any, walls: Any, opening: Any, blocks: Any, end_cell: A
         done[k] = 0
         openings[k, 1] = imposed[clock[NOW], k]
         if kind == INFLOW:
-            answer[k] = inflow_speed(openings[k], total / count[k])
+            answer[k] = _inflow_speed(openings[k], total / count[k])
         elif kind == OUTFLOW:
-            answer[k] = outlet_density(openings[k], total)
+            answer[k] = _outlet_density(openings[k], total)
         else:
             answer[k] = openings[k, 1]
