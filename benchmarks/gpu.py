@@ -80,7 +80,7 @@ class Extent:
     """Settings of whole flows."""
 
 
-TINY = Extent((0.4,), 1, Pairs.SETTLED, 1.0, 1, 1 << 9, FlowSettings(cell_size_mm=0.4, max_steps=4, inflow_mL_s=0.3))
+TINY = Extent((0.4,), 1, Pairs.CORRECTED, 1.0, 1, 1 << 9, FlowSettings(cell_size_mm=0.4, max_steps=4, inflow_mL_s=0.3))
 
 
 def is_simulated() -> bool:

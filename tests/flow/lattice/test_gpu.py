@@ -149,10 +149,10 @@ def test_sequences_make_every_pair_once_and_end_at_home(first_pair: int, count: 
     made: list[Pairs] = []
     for pairs in plan(first_pair, count):
         is_round = pairs is Pairs.ROUND
-        made += [Pairs.SETTLED] + 7 * [Pairs.PLAIN] if is_round else [pairs]
-    assert [pair is Pairs.SETTLED for pair in made] == due
+        made += [Pairs.CORRECTED] + 7 * [Pairs.PLAIN] if is_round else [pairs]
+    assert [pair is Pairs.CORRECTED for pair in made] == due
     assert [pair is Pairs.LAST for pair in made[:-1]] == (count - 1) * [False]
-    assert made[-1] is (Pairs.SETTLED if due[-1] else Pairs.LAST)
+    assert made[-1] is (Pairs.CORRECTED if due[-1] else Pairs.LAST)
 
 
 class Driver:

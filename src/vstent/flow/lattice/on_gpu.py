@@ -173,14 +173,14 @@ class Device:
     def launches(self, pairs: Pairs) -> Iterator[tuple[Launch, tuple[Any, ...]]]:
         """Yield the kernels of pairs of time steps in their order, with their further arguments."""
         if pairs is Pairs.ROUND:
-            for one in (Pairs.SETTLED, *(DEFER_PAIRS - 1) * (Pairs.PLAIN,)):
+            for one in (Pairs.CORRECTED, *(DEFER_PAIRS - 1) * (Pairs.PLAIN,)):
                 yield from self.launches(one)
             return
         drive, even_step, swap, odd_step = self._steps
         last = odd_step, (int(pairs is not Pairs.PLAIN),)
         yield from ((drive, ()), (even_step, ()), (swap, ()), last, (swap, ()))
         if pairs is not Pairs.PLAIN:
-            yield from self._updates_of_walls(DEFER_PART if pairs is Pairs.SETTLED else 0.0)
+            yield from self._updates_of_walls(DEFER_PART if pairs is Pairs.CORRECTED else 0.0)
 
     def _updates_of_walls(self, part: float) -> Iterator[tuple[Launch, tuple[Any, ...]]]:
         """Yield the kernels that bring populations home and update walls, with their under-relaxation factor.

@@ -20,10 +20,10 @@ class Pairs(Enum):
     """One pair; populations near walls are not at home afterwards (see `kernels`)."""
     LAST = 2
     """One pair, after which populations are at home."""
-    SETTLED = 3
+    CORRECTED = 3
     """One pair, after which walls are updated; populations are then at home."""
     ROUND = 4
-    """`DEFER_PAIRS` pairs, of which the first is `SETTLED` and the others are `PLAIN`."""
+    """`DEFER_PAIRS` pairs, of which the first is `CORRECTED` and the others are `PLAIN`."""
 
 
 def plan(first_pair: int, count: int) -> Iterator[Pairs]:
@@ -32,7 +32,7 @@ def plan(first_pair: int, count: int) -> Iterator[Pairs]:
     Parameters
     ----------
     first_pair : int
-        Number of the first pair since the last check; every `DEFER_PAIRS`-th pair is `SETTLED`.
+        Number of the first pair since the last check; every `DEFER_PAIRS`-th pair is `CORRECTED`.
     count : int
         Number of pairs.
     """
@@ -43,7 +43,7 @@ def plan(first_pair: int, count: int) -> Iterator[Pairs]:
             yield Pairs.ROUND
             pair += DEFER_PAIRS
             continue
-        yield Pairs.SETTLED if is_due else Pairs.LAST if pair + 1 == end else Pairs.PLAIN
+        yield Pairs.CORRECTED if is_due else Pairs.LAST if pair + 1 == end else Pairs.PLAIN
         pair += 1
 
 
