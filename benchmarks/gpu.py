@@ -1,104 +1,349 @@
-"""Print how fast the embedded engine steps on a GPU beside its memory's bandwidth, and on this machine's processor.
+"""Measure the flow on a GPU and compare it with the goals; less than five minutes on an NVIDIA H100.
 
-Usage: python benchmarks/gpu.py [CELL_MM ...]
+Usage: python benchmarks/gpu.py [SURFACE]
 
-A tube as in benchmarks/flow.py. Besides: by how much the two velocities differ after the same steps.
+SURFACE is an artery with an aneurysm, in mm; without it the demo is used. Every goal holds for AneuriskWeb C0038. The
+script prints, for a Silk at grid spacings of 0.4, 0.2 and 0.1 mm, the time of every kernel on the GPU (between events)
+and on the host, the rate of cell updates, its share of the memory's bandwidth, and the memory; then the agreement of
+the demo with the processor and of two runs with each other; then the run time of whole flows; and at last one line for
+every goal.
+
+With ``--tiny`` every part runs on a short tube, also on numba's simulator (``NUMBA_ENABLE_CUDASIM=1``); its
+figures have no meaning.
 """
 
+import argparse
 import sys
 import time
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
+import numba
 import numpy as np
+from numba import cuda
 
+import vstent
 from vstent import phantoms
+from vstent.anatomy.repair import repair
+from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
 from vstent.errors import FlowError
-from vstent.flow.case import FlowCase, FlowSettings
+from vstent.flow import domain
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.engines import Progress
+from vstent.flow.indices import indices
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.gpu import gpu_name, require_gpu
-from vstent.flow.lattice.state import State
-from vstent.flow.lattice.stepping import advance
-from vstent.geometry.vessel import Vessel
+from vstent.flow.lattice.recording import Pairs
+from vstent.flow.lattice.state import DEFER_PAIRS, State
+from vstent.flow.lattice.stepping import advance, snapshot
+from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.waveform import OLDER_ADULT_ICA
+from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.io.surfaces import read_surface
 
-STEPS, ROUNDS = 200, 5
 BYTES_PER_UPDATE = 19 * 4 * 2
 """Read and write every population once, in place."""
-BANDWIDTH_BYTES = 1 << 28
+RATE_GOALS = {0.1: 10.0, 0.2: 6.0, 0.4: 1.5}
+"""Billion cell updates per second at each grid spacing in mm (NVIDIA H100, C0038 with Silk)."""
+STEADY_GOAL_S, CYCLES_GOAL_S, AGREEMENT_GOAL = 45.0, 75.0, 1e-3
+"""Run time of three steady flows and of two cycles at 0.1 mm; relative difference from the processor."""
+PATIENCE = 1.5
+"""A whole flow is stopped when it has taken this many times its goal."""
+WHOLE = FlowSettings(cell_size_mm=0.1)
+"""Settings of whole flows."""
 
 
-def bandwidth_GB_s() -> float:
-    """Bytes read and written in place per second on the GPU, the best of eight."""
-    from numba import cuda
+class StoppedError(Exception):
+    """A flow took too long; the message says how far it came."""
 
-    @cuda.jit
-    def scale(values: np.ndarray) -> None:
-        i = cuda.grid(1)
-        if i < values.size:
-            values[i] *= np.float32(1.0001)
 
-    values = cuda.to_device(np.ones(BANDWIDTH_BYTES // 4, dtype=np.float32))
+@dataclass(frozen=True)
+class Extent:
+    """How much is measured."""
+
+    spacings_mm: tuple[float, ...] = (0.4, 0.2, 0.1)
+    rounds: int = 20
+    """Number of times that the kernels of `pairs` are timed."""
+    pairs: Pairs = Pairs.ROUND
+    """Pairs of steps whose kernels are timed."""
+    updates: float = 2e9
+    """Cell updates of one measurement of the rate."""
+    repeats: int = 5
+    """Measurements of the rate and of the bandwidth, of which the fastest counts."""
+    bandwidth_bytes: int = 1 << 28
+    settings: FlowSettings = WHOLE
+    """Settings of whole flows."""
+
+
+TINY = Extent((0.4,), 1, Pairs.CORRECTED, 1.0, 1, 1 << 9, FlowSettings(cell_size_mm=0.4, max_steps=4, inflow_mL_s=0.3))
+
+
+def is_simulated() -> bool:
+    return bool(numba.config.ENABLE_CUDASIM)
+
+
+class Clock:
+    """Events of the GPU on a stream; the host's clock where the GPU is simulated."""
+
+    def __init__(self, stream: object) -> None:
+        self.stream = stream
+
+    def now(self) -> object:
+        if is_simulated():
+            return time.perf_counter()
+        event = cuda.event()
+        event.record(self.stream)
+        return event
+
+    def between_us(self, begin: object, end: object) -> float:
+        if is_simulated():
+            return 1e6 * (end - begin)
+        return 1e3 * cuda.event_elapsed_time(begin, end)
+
+
+@cuda.jit
+def scale(source: np.ndarray, target: np.ndarray) -> None:
+    i = cuda.grid(1)
+    if i < source.size:
+        target[i] = source[i] * np.float32(1.0001)
+
+
+def bandwidth_GB_s(extent: Extent, *, in_place: bool) -> float:
+    """Bytes read and written per second on the GPU, in place or from one array to another; the best of several."""
+    n_bytes = extent.bandwidth_bytes
+    source = cuda.to_device(np.ones(n_bytes // 4, dtype=np.float32))
+    target = source if in_place else cuda.to_device(np.ones(n_bytes // 4, dtype=np.float32))
     times = []
-    for _ in range(9):  # the first compiles
+    for _ in range(1 + extent.repeats):  # the first compiles
         began = time.perf_counter()
-        scale[-(-values.size // 256), 256](values)
+        scale[-(-source.size // 256), 256](source, target)
         cuda.synchronize()
         times.append(time.perf_counter() - began)
-    return 2 * BANDWIDTH_BYTES / min(times) / 1e9
+    return 2 * n_bytes / min(times) / 1e9
 
 
-def state_of(case: FlowCase, cell_mm: float, *, on_gpu: bool) -> State:
-    settings = replace(case.settings, device_gpu=on_gpu)
-    return LatticeBoltzmann(cell_mm).init(replace(case, settings=settings), None)
+def state_of(case: FlowCase, spacing_mm: float, *, on_gpu: bool) -> State:
+    settings = replace(case.settings, device_gpu=on_gpu, cell_size_mm=spacing_mm)
+    return LatticeBoltzmann(spacing_mm).init(replace(case, settings=settings), None)
 
 
-def rate(state: State, steps: int) -> float:
-    """Updates per second, the best of some rounds, after one that compiles."""
-    advance(state, steps)
-    times = []
-    for _ in range(ROUNDS):
+def kernel_times(state: State, rounds: int, pairs: Pairs) -> dict[str, tuple[int, float, float]]:
+    """Launches per round, and mean times in us on the GPU and on the host, of every kernel, launched one by one."""
+    device = state.device
+    launches = [one for _ in range(rounds) for one in device.launches(pairs) if one[0].threads]
+    clock, found = Clock(device.stream), {}
+    device.stream.synchronize()
+    for launch, further in launches:
+        begin, began = clock.now(), time.perf_counter()
+        launch(device.stream, *further)
+        host_s = time.perf_counter() - began
+        found.setdefault(launch.name, []).append((begin, clock.now(), host_s))
+    device.stream.synchronize()
+    return {
+        name: (
+            len(marks) // rounds,
+            float(np.mean([clock.between_us(begin, end) for begin, end, _ in marks])),
+            1e6 * float(np.mean([host_s for *_, host_s in marks])),
+        )
+        for name, marks in found.items()
+    }
+
+
+def rate(state: State, extent: Extent) -> float:
+    """Cell updates per second of the time steps as a run makes them, the best of several."""
+    cells = len(state.domain.cells)
+    steps, times = 2 * max(1, round(extent.updates / cells / 2)), []
+    for _ in range(extent.repeats):
         began = time.perf_counter()
         advance(state, steps)
         times.append(time.perf_counter() - began)
-    return len(state.domain.cells) * steps / min(times)
+    return cells * steps / min(times)
 
 
-def difference(case: FlowCase, cell_mm: float) -> float:
-    """Largest difference of a momentum, over the largest momentum, after the same steps."""
-    gpu, here = (state_of(case, cell_mm, on_gpu=on_gpu) for on_gpu in (True, False))
-    for state in (gpu, here):
-        advance(state, STEPS)
-    found, wanted = gpu.device.read()[0], _moments(here)
-    return float(np.abs(found - wanted)[:, 1:].max() / np.abs(wanted[:, 1:]).max())
+def spacing_table(case: FlowCase, spacing_mm: float, extent: Extent, in_place_GB_s: float) -> float:
+    """Print what a grid takes; return billion updates per second."""
+    state = state_of(case, spacing_mm, on_gpu=True)
+    began = time.perf_counter()
+    advance(state, 4)  # compiles, loads and records
+    first_s = time.perf_counter() - began
+    updates_per_s = rate(state, extent)
+    began = time.perf_counter()
+    snapshot(state)
+    read_s, cells = time.perf_counter() - began, len(state.domain.cells)
+    of_run, step_us = state.device, 1e6 * cells / updates_per_s
+    share = updates_per_s * BYTES_PER_UPDATE / in_place_GB_s / 1e9
+    print(f"\nGrid spacing {spacing_mm} mm: {cells:,} cells, {len(state.links.address):,} links")
+    print(f"- on the GPU: {of_run.nbytes / 1e6:.0f} MB, {of_run.nbytes / cells:.0f} bytes per cell")
+    print(f"- launched {of_run.how}: {step_us:.1f} us per step, {updates_per_s / 1e9:.3g} billion updates/s")
+    print(f"- share of the bandwidth in place: {share:.0%}")
+    print(f"- first steps: {first_s:.1f} s; reading back: {1e3 * read_s:.1f} ms\n")
+    steps = 2 * DEFER_PAIRS if extent.pairs is Pairs.ROUND else 2
+    print(f"| kernel | launches in {steps} steps | GPU us | host us |\n|---|---|---|---|")
+    for name, (count, gpu_us, host_us) in kernel_times(state, extent.rounds, extent.pairs).items():
+        print(f"| {name} | {count} | {gpu_us:.1f} | {host_us:.1f} |", flush=True)
+    return updates_per_s / 1e9
 
 
-def _moments(state: State) -> np.ndarray:
-    from vstent.flow.lattice.kernels import d3q19
+@contextmanager
+def stopped_after(seconds: float) -> Iterator[Callable[[Progress], None]]:
+    """Give a progress callback that ends a flow after some seconds."""
+    began = time.perf_counter()
 
-    return d3q19.moments(state.populations, state.addressing.stride, state.addressing.place)
+    def tell(now: Progress) -> None:
+        if time.perf_counter() - began > seconds:
+            raise StoppedError(f"stopped after {seconds:.0f} s, {now.fraction:.0%} of the last flow done")
+
+    yield tell
 
 
-def main(cells_mm: list[float]) -> int:
+def timed(name: str, goal_s: float, compute: Callable[[Callable[[Progress], None]], tuple[FlowField, ...]]) -> float:
+    """Print and return the run time of whole flows; infinity when they were stopped."""
+    began = time.perf_counter()
+    try:
+        with stopped_after(PATIENCE * goal_s) as tell:
+            fields = compute(tell)
+    except StoppedError as stopped:
+        print(f"| {name} | {stopped} | | |", flush=True)
+        return float("inf")
+    seconds = time.perf_counter() - began
+    steps, loops = sum(field.steps for field in fields), [field.updates_per_s / 1e9 for field in fields]
+    print(f"| {name} | {seconds:.1f} s | {steps:,} | {', '.join(f'{loop:.2f}' for loop in loops)} |", flush=True)
+    return seconds
+
+
+def whole_flows(cases: list[FlowCase], settings: FlowSettings) -> tuple[float, float]:
+    """Print the run time of three steady flows and of two cycles, setup included; return both."""
+    on_gpu = replace(settings, device_gpu=True)
+    print("\n| whole flows | run time | steps on the finest grid | billion updates/s |\n|---|---|---|---|")
+
+    def steady(tell: Callable[[Progress], None]) -> tuple[FlowField, ...]:
+        fields: list[FlowField] = []
+        for case in cases:
+            start = fields[0] if fields else None
+            fields.append(simulate_case(replace(case, settings=on_gpu), start=start, progress=tell))
+        return tuple(fields)
+
+    def cycles(tell: Callable[[Progress], None]) -> tuple[FlowField, ...]:
+        pulse = replace(on_gpu, waveform=OLDER_ADULT_ICA, max_cycles=2, max_steps=settings.max_steps)
+        return (simulate_case(replace(cases[0], settings=pulse), progress=tell),)
+
+    three = timed(f"{len(cases)} steady flows", STEADY_GOAL_S, steady)
+    return three, timed("two cycles, bare", CYCLES_GOAL_S, cycles) if settings is WHOLE else float("nan")
+
+
+def measures(field: FlowField, case: FlowCase) -> np.ndarray:
+    """Neck inflow, sac velocity and wall shear stress of the sac; of a vessel without a sac, means over the vessel."""
+    if case.sac is None:
+        return np.array(
+            [np.linalg.norm(values, axis=1).mean() for values in (field.velocity_m_s, field.wall_shear_stress_Pa)]
+        )
+    found = indices(field, case.sac, case.ostium)
+    return np.array([found[name] for name in ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")])
+
+
+def agreement(case: FlowCase, settings: FlowSettings) -> tuple[float, bool]:
+    """Print and return the largest relative difference from the processor, and whether two runs have the same bits."""
+    gpu, again, here = (
+        simulate_case(replace(case, settings=replace(settings, device_gpu=on_gpu))) for on_gpu in (True, True, False)
+    )
+    wanted, found = measures(here, case), measures(gpu, case)
+    same = all(
+        getattr(gpu, name).tobytes() == getattr(again, name).tobytes()
+        for name in ("velocity_m_s", "pressure_Pa", "wall_shear_stress_Pa", "residual")
+    )
+    difference = float(np.abs(found / wanted - 1).max())
+    print(f"\nAgreement at {settings.cell_size_mm} mm (inflow, velocity, stress): processor {wanted}, GPU {found}")
+    print(
+        f"Largest difference {difference:.1e}; two runs on the GPU: {'same' if same else 'different'} bits", flush=True
+    )
+    return difference, same
+
+
+def goals(rates: dict[float, float], three_s: float, cycles_s: float, difference: float, *, same: bool) -> None:
+    """Print a line for every goal."""
+    print("\n| goal (NVIDIA H100, C0038) | wanted | measured | reached |\n|---|---|---|---|")
+    for spacing_mm, goal in RATE_GOALS.items():
+        found = rates.get(spacing_mm, float("nan"))
+        line(f"Silk, {spacing_mm} mm, billion updates/s", f"{goal:g}", f"{found:.3g}", reached=found >= goal)
+    line(
+        "bare, Silk, Enterprise, steady, 0.1 mm, s",
+        f"{STEADY_GOAL_S:g}",
+        f"{three_s:.1f}",
+        reached=three_s <= STEADY_GOAL_S,
+    )
+    line("two cycles, bare, 0.1 mm, s", f"{CYCLES_GOAL_S:g}", f"{cycles_s:.1f}", reached=cycles_s <= CYCLES_GOAL_S)
+    agrees = difference <= AGREEMENT_GOAL
+    line("demo with Silk against the processor", f"{AGREEMENT_GOAL:g}", f"{difference:.1e}", reached=agrees)
+    line("two runs, bit for bit", "same", "same" if same else "different", reached=same)
+
+
+def line(goal: str, wanted: str, measured: str, *, reached: bool) -> None:
+    said = "not measured" if measured == "nan" else "yes" if reached else "no"
+    print(f"| {goal} | {wanted} | {measured} | {said} |")
+
+
+def anatomy_of(surface: Path | None) -> Anatomy:
+    if surface is None:
+        return restore(trim(trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))))
+    lumen, _ = repair(read_surface(surface)[0])
+    return restore(trim(trace(Vessel(lumen))))
+
+
+def cases_of(anatomy: Anatomy, settings: FlowSettings) -> list[FlowCase]:
+    """The flow bare, with Silk and with Enterprise."""
+    stents = [None, *(vstent.deploy(vstent.find_design(name), anatomy).stent for name in ("silk", "enterprise"))]
+    return [flow_case(anatomy, stent, settings) for stent in stents]
+
+
+def tiny_cases(settings: FlowSettings) -> list[FlowCase]:
+    domain.MIN_CELLS = 50  # the simulator is slow
+    tube = phantoms.phantom_surface(phantoms.tube(length_mm=2.4, radius_mm=0.8))
+    return [FlowCase(trace(Vessel(tube)), settings=settings)]
+
+
+def about() -> str:
+    """Versions of what takes part."""
+    names = []
+    for package in ("numba", "numba-cuda", "cuda-core", "cuda-bindings", "numpy"):
+        try:
+            names.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            names.append(f"no {package}")
+    return ", ".join(names)
+
+
+def main(words: list[str]) -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("surface", nargs="?", type=Path)
+    parser.add_argument("--tiny", action="store_true")
+    asked = parser.parse_args(words)
     try:
         require_gpu()
     except FlowError as error:
         print(f"Not measured: {error}.")
         return 0
-    vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=30.0, radius_mm=2.0))))
-    case = FlowCase(vessel, settings=FlowSettings(inflow_mL_s=0.5))
-    limit = bandwidth_GB_s() * 1e9 / BYTES_PER_UPDATE
-    print(f"{gpu_name()}: {limit * BYTES_PER_UPDATE / 1e9:.0f} GB/s, or {limit / 1e6:.0f} million updates/s\n")
-    print("| cells | million updates/s on the GPU | of its bandwidth | on the processor | difference |")
-    print("|---|---|---|---|---|")
-    for cell_mm in cells_mm:
-        gpu = state_of(case, cell_mm, on_gpu=True)
-        on_gpu, here = rate(gpu, STEPS), rate(state_of(case, cell_mm, on_gpu=False), STEPS // 10)
-        print(
-            f"| {len(gpu.domain.cells)} | {on_gpu / 1e6:.0f} | {100 * on_gpu / limit:.0f} % | {here / 1e6:.0f} "
-            f"| {difference(case, cell_mm):.1e} |"
-        )
+    extent = TINY if asked.tiny else Extent()
+    began = time.perf_counter()
+    print(f"{gpu_name()}; {about()}")
+    in_place, copy = (bandwidth_GB_s(extent, in_place=in_place) for in_place in (True, False))
+    print(f"Bandwidth in place {in_place:.3g} GB/s, copying {copy:.3g} GB/s")
+    cases = tiny_cases(extent.settings) if asked.tiny else cases_of(anatomy_of(asked.surface), extent.settings)
+    with_silk = cases[min(1, len(cases) - 1)]
+    rates = {mm: spacing_table(with_silk, mm, extent, in_place) for mm in extent.spacings_mm}
+    demo = with_silk if asked.tiny or asked.surface is None else cases_of(anatomy_of(None), extent.settings)[1]
+    difference, same = agreement(demo, extent.settings)
+    three_s, cycles_s = whole_flows(cases, extent.settings)
+    if asked.tiny:  # its rates and times are not those of the goals
+        rates, three_s, cycles_s = {}, float("nan"), float("nan")
+    goals(rates, three_s, cycles_s, difference, same=same)
+    print(f"\nMeasured in {time.perf_counter() - began:.0f} s.")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main([float(word) for word in sys.argv[1:]] or [0.2, 0.1]))
+    sys.exit(main(sys.argv[1:]))

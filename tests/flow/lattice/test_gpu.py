@@ -3,8 +3,11 @@
 import json
 import os
 import pickle
+import re
 import subprocess
 import sys
+import types
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,8 +26,10 @@ from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
+from vstent.flow.lattice.recording import NotRecordedError, Pairs, plan, recorded
 from vstent.flow.lattice.setup import build_bands
 from vstent.flow.simulation import engine_class, foretell_cost, simulate_case
+from vstent.kernels.directions import VELOCITIES
 from vstent.study import repeat
 from vstent.study.provenance import machine, provenance
 from vstent.study.types import Settings
@@ -43,15 +48,21 @@ import numpy as np
 from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.stepping import _read_here, advance, step
 
-state = pickle.loads(Path(sys.argv[1]).read_bytes())
+state, twin = (pickle.loads(Path(sys.argv[1]).read_bytes()) for _ in range(2))
 assert "vstent.flow.lattice.kernels.gpu" not in sys.modules  # who did not ask for a GPU does not load what it takes
-state.case = replace(state.case, settings=replace(state.case.settings, device_gpu=True))
+for one in (state, twin):
+    one.case = replace(state.case, settings=replace(state.case.settings, device_gpu=True))
+    advance(one, 4)
+for (name, one), other in zip(pack(state).items(), pack(twin).values()):
+    assert name == "loop_seconds" or one.tobytes() == other.tobytes()  # sums do not depend on the order of threads
 step(state)
+assert state.device.how == "one by one"
 saved = pack(state)
-assert state.device is None  # the next steps are longer: what is there was fetched
+assert state.device is not None  # the next steps are longer: it has converted what it holds
 advance(state, 0)
 saved_again = pack(state)
-np.testing.assert_array_equal(state.device.read()[0], _read_here(state)[0])
+for found, wanted in zip(state.device.read()[:2], _read_here(state)[:2]):
+    np.testing.assert_array_equal(found, wanted)
 for name in saved:
     np.testing.assert_array_equal(saved_again[name], saved[name])
 np.savez(sys.argv[2], **saved)
@@ -66,10 +77,20 @@ def screen() -> Screen:
     return Screen(points, normals, 0.01 * one, 300 * one, 150 * one, 0.5 * one, one, one)
 
 
+def septa_away_from_links(state: lattice_state.State) -> tuple[np.ndarray, np.ndarray]:
+    """Some septa, across z, where neither population that they exchange concerns a link."""
+    a, domain_, q = state.addressing, state.domain, 5
+    ahead = domain_.index[tuple((domain_.cells + VELOCITIES[q]).T)]
+    pairs = np.stack([d3q19.OPPOSITE[q] * a.stride + a.place, q * a.stride + a.place[ahead]])
+    cell = np.flatnonzero((ahead >= 0) & ~np.isin(pairs, state.links.address).any(axis=0))[::4]
+    assert len(cell) > 1
+    return pairs[:, cell].astype(np.int32), cell
+
+
 def everything() -> lattice_state.State:
     """A run with all that kernels know: pulse, moments, screen, thinning, thickened blood, each kind of opening, septa.
 
-    The outlet's links are shared by a pressure and an outflow; populations are swapped at places of no meaning.
+    The outlet's links are shared by a pressure and an outflow.
     """
     settings = FlowSettings(
         inflow_mL_s=0.3,
@@ -90,12 +111,11 @@ def everything() -> lattice_state.State:
     course = 0.1 * swing[:, None] * np.abs(wanted).max() * [1.0, 0.0, 1.0]
     shape = swing[:, None, None] * links.shape
     state.links = replace(links, openings=openings, start=start, wanted=wanted, course=course, shape=shape)
-    somewhere = np.arange(0, len(a.place), 40)
-    septa = np.stack([3 * a.stride + a.place[somewhere], 4 * a.stride + a.place[somewhere]])
-    state.addressing = replace(a, septa=septa, septum_cell=somewhere)
+    septa, cell = septa_away_from_links(state)
+    state.addressing = replace(a, septa=septa, septum_cell=cell)
     state.bands = build_bands(state.domain, state.addressing, state.links)
     state.limit[::2] = 1.0
-    state.pace = np.array([2 * SETTLED_PAIRS + 4, 2 * SETTLED_PAIRS + 2])
+    state.pace = np.array([2 * SETTLED_PAIRS + 20, 2 * SETTLED_PAIRS + 18])
     state.check_s = state.scales.step_s * int(state.pace[0])
     state.built = state.links, state.screen
     return state
@@ -106,7 +126,7 @@ def test_a_gpu_makes_the_steps_that_a_processor_makes(tmp_path: Path, monkeypatc
     state = everything()
     stepping.advance(state, 2 * SETTLED_PAIRS)
     (tmp_path / "state").write_bytes(pickle.dumps(state))
-    simulated = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1"}
+    simulated = os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}
     command = [sys.executable, "-W", "error", "-c", ON_GPU, str(tmp_path / "state"), str(tmp_path / "found.npz")]
     ran = subprocess.run(command, env=simulated, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
@@ -120,6 +140,106 @@ def test_a_gpu_makes_the_steps_that_a_processor_makes(tmp_path: Path, monkeypatc
     for name in wanted.keys() - {"loop_seconds"}:
         most = np.abs(wanted[name]).max(initial=0.0)
         np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=ROUNDING * most, err_msg=name)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 100])
+@pytest.mark.parametrize("first_pair", [0, 1, 7, 8, 13])
+def test_sequences_make_every_pair_once_and_end_at_home(first_pair: int, count: int) -> None:
+    due = [pair % lattice_state.DEFER_PAIRS == 0 for pair in range(first_pair, first_pair + count)]
+    made: list[Pairs] = []
+    for pairs in plan(first_pair, count):
+        is_round = pairs is Pairs.ROUND
+        made += [Pairs.CORRECTED] + 7 * [Pairs.PLAIN] if is_round else [pairs]
+    assert [pair is Pairs.CORRECTED for pair in made] == due
+    assert [pair is Pairs.LAST for pair in made[:-1]] == (count - 1) * [False]
+    assert made[-1] is (Pairs.CORRECTED if due[-1] else Pairs.LAST)
+
+
+class Driver:
+    """Stands for the functions of CUDA's driver that record and replay; it counts, and fails where it is told to."""
+
+    CUstream = staticmethod(int)
+
+    class CUstreamCaptureMode:
+        CU_STREAM_CAPTURE_MODE_RELAXED = 2
+
+    def __init__(self, failing: str = "") -> None:
+        self.failing, self.calls = failing, []
+
+    def __getattr__(self, name: str) -> object:
+        def call(*arguments: object) -> tuple[object, ...]:
+            self.calls.append((name, *arguments))
+            values = {"cuStreamEndCapture": ("graph",), "cuGraphInstantiate": ("program",)}.get(name, ())
+            return 901 if name == self.failing else 0, *values
+
+        return call
+
+
+def record(driver: Driver, monkeypatch: pytest.MonkeyPatch, launches: Callable[[], None]) -> Callable[[], None]:
+    module = types.ModuleType("cuda.bindings")
+    module.driver = driver
+    monkeypatch.setitem(sys.modules, "cuda", types.ModuleType("cuda"))
+    monkeypatch.setitem(sys.modules, "cuda.bindings", module)
+    return recorded(launches, types.SimpleNamespace(handle=7))
+
+
+def test_launches_are_recorded_once_and_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
+    driver = Driver()
+    replay = record(driver, monkeypatch, lambda: driver.calls.append("kernels"))
+    names = [call if isinstance(call, str) else call[0] for call in driver.calls]
+    assert names == [
+        "cuStreamBeginCapture",
+        "kernels",
+        "cuStreamEndCapture",
+        "cuGraphInstantiate",
+        "cuGraphDestroy",
+    ]
+    del driver.calls[:]
+    for _ in range(2):
+        replay()
+    assert driver.calls == 2 * [("cuGraphLaunch", "program", 7)]
+    del replay
+    assert driver.calls[-1] == ("cuGraphExecDestroy", "program")
+
+
+@pytest.mark.parametrize("failing", ["cuStreamBeginCapture", "cuStreamEndCapture", "cuGraphInstantiate", "kernels"])
+def test_a_driver_that_does_not_record_is_no_error_of_the_run(failing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    driver = Driver(failing)
+
+    def launches() -> None:
+        if failing == "kernels":
+            raise RuntimeError("not permitted while a stream is recorded")
+
+    with pytest.raises(NotRecordedError):
+        record(driver, monkeypatch, launches)
+    begun, ended = (
+        any(call[0] == name for call in driver.calls) for name in ("cuStreamBeginCapture", "cuStreamEndCapture")
+    )
+    assert begun
+    assert ended == (failing != "cuStreamBeginCapture")
+
+
+def benchmark(*words: str, **environment: str) -> str:
+    script = Path(__file__).parents[3] / "benchmarks" / "gpu.py"
+    command = [sys.executable, "-W", "error", str(script), *words]
+    ran = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def test_the_benchmark_runs_through_on_the_simulator() -> None:
+    said = benchmark("--tiny", NUMBA_ENABLE_CUDASIM="1")
+    for part in ("| even_step |", "| drive |", "launched one by one", "whole flows", "bytes per cell", "Measured in"):
+        assert part in said
+    goals = said[said.index("| goal") :]
+    assert "| two runs, bit for bit | same | same | yes |" in goals
+    assert re.search(r"against the processor \| 0\.001 \| \d\.\de-\d\d \| yes \|", goals)
+    assert goals.count("not measured") == 5
+
+
+def test_the_benchmark_says_why_it_measures_nothing() -> None:
+    if gpus.gpu_name() == "none":
+        assert benchmark("--tiny").startswith("Not measured: the flow cannot be computed on a GPU, because")
 
 
 ASKED = FlowSettings(cell_size_mm=0.2, device_gpu=True)

@@ -14,6 +14,7 @@ from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.collision import collided, relaxed, squared_reach
 from vstent.flow.lattice.scales import ODD_RATE as VESSEL_ODD_RATE
 from vstent.flow.lattice.setup import address, build_bands, build_links, thickest
+from vstent.flow.lattice.stepping import advance
 from vstent.flow.lattice.walls import parabolic_weights
 from vstent.geometry.vessel import Vessel
 from vstent.kernels import directions, sampling, voxels
@@ -108,6 +109,22 @@ def test_a_band_is_done_when_all_that_it_needs_is(threads):
         d3q19.update(f, cells, back, bands, shares)
         found.append(f)
     np.testing.assert_array_equal(*found)
+
+
+def test_flows_of_a_vessel_share_its_grid_and_not_their_populations():
+    vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=8.0, radius_mm=2.0))))
+    first, second, other = (
+        LatticeBoltzmann(spacing_mm).init(FlowCase(one, settings=FlowSettings(inflow_mL_s=0.5)), None)
+        for one, spacing_mm in ((vessel, 0.3), (vessel, 0.3), (vessel, 0.25))
+    )
+    assert second.domain is first.domain
+    assert second.addressing is first.addressing
+    assert other.domain is not first.domain
+    untouched = [second.populations.copy(), second.links.source.copy(), second.refill.refill.copy()]
+    advance(first, 20)
+    assert first.populations.any()
+    for array, before in zip((second.populations, second.links.source, second.refill.refill), untouched, strict=True):
+        np.testing.assert_array_equal(array, before)
 
 
 def test_whole_vectors_reach_into_no_other_layer():

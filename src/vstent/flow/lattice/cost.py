@@ -32,7 +32,7 @@ MOST_CELLS = 1e8
 """Maximum number of cells whose 19 populations can be addressed with 32 bits, cells beside the wall included (2^31 / 19
 storage places)."""
 GPU_BYTES_PER_CELL = 320
-"""GPU memory in bytes per cell of blood (sum of the arrays: 302 on 31,000 cells of the demo, 214 on 169,000)."""
+"""GPU memory in bytes per cell of blood (sum of the arrays: 218 on 28,000 cells of a tube)."""
 BYTES_AT_LEAST = 4.5e8
 """Memory in bytes of the program itself, its compiled kernels and one surface."""
 WHOLE_OVER_BLOCK = 3.5
@@ -184,7 +184,7 @@ def _measured_rate(on_gpu: bool) -> float:
     if on_gpu:
         from vstent.flow.lattice.on_gpu import seconds_of_update
 
-        return stride / seconds_of_update(f, address, length, relaxation, nothing)
+        return stride / seconds_of_update(address[:, 0], length, stride, relaxation)
     rows = np.arange(0, BLOCK_ROWS + 1, BLOCK_BAND, dtype=np.int32)
     bands = np.column_stack([rows, np.zeros((len(rows), 4), np.int32)])
     shares = d3q19.share(length, nothing[0], bands, numba.get_num_threads())

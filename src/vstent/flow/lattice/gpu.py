@@ -76,8 +76,10 @@ def gpu_name() -> str:
         require_gpu()
     except FlowError:
         return "none"
-    from numba import cuda
+    from numba import config, cuda
 
+    if config.ENABLE_CUDASIM:
+        return "a GPU simulated by numba"
     name = cuda.get_current_device().name
     return name.decode() if isinstance(name, bytes) else str(name)
 

@@ -112,7 +112,7 @@ def field_of(
         blood=state.case.blood,
         is_converged=outcome.is_converged,
         unsettled_fraction=left,
-        advice=advice + _of_the_grid(state, flow, phases),
+        advice=advice + _of_the_gpu(state) + _of_the_grid(state, flow, phases),
         residual=np.array(outcome.residual),
         steps=state.steps,
         seconds=outcome.seconds,
@@ -122,6 +122,11 @@ def field_of(
         neck_inflow_mL_s=flow.neck_inflow_mL_s,
     )
     return field if state.close_up is None else close_ups.assembled(state.close_up, field)
+
+
+def _of_the_gpu(state: State) -> str:
+    """Return a sentence on how a GPU was used; nothing where none was."""
+    return "" if state.device is None else f" Time steps were launched on the GPU {state.device.how}."
 
 
 def _of_the_grid(state: State, flow: Reading, phases: tuple[Phase, ...]) -> str:

@@ -122,8 +122,26 @@ class OnDevice(Protocol):
             Number of the first pair, counted from the last check.
         """
 
-    def read(self) -> tuple[NDArray[np.float32], Floats]:
-        """Return density deviation and momentum (n, 4) of every cell, and the flow rate (k,) out of every end."""
+    def read(self) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
+        """Return density deviation (n,) and momentum (n, 3) of every cell, and the flow rate (k,) out of every end."""
+
+    def read_times(self) -> NDArray[np.float32]:
+        """Return the relaxation times (e,) of shear-thinning blood in the cells of the screen."""
+
+    def rescale(self, state: "State", stretch: float, stress: float) -> None:
+        """Take links and screen of `state`, and convert populations to its time step.
+
+        Parameters
+        ----------
+        state : State
+            The run, with links and screen of the new time step.
+        stretch, stress
+            As in `d3q19.rescale`.
+        """
+
+    @property
+    def how(self) -> str:
+        """Return in words how the host launches the time steps."""
 
     def fetch(self, state: "State") -> None:
         """Copy the arrays that the time steps change back to `state`."""

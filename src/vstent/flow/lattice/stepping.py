@@ -3,6 +3,8 @@
 from collections import deque
 from dataclasses import replace
 from time import perf_counter
+from typing import Final, TypeAlias
+from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
@@ -19,6 +21,7 @@ from vstent.flow.lattice.kernels.warm import keep_flow
 from vstent.flow.lattice.scales import ODD_RATE, Scales
 from vstent.flow.lattice.screen import build_screen
 from vstent.flow.lattice.setup import (
+    Addressing,
     address,
     build_bands,
     build_links,
@@ -26,11 +29,19 @@ from vstent.flow.lattice.setup import (
     thickest,
 )
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, OnDevice, Probe, Snapshot, State
+from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
-SLICE_UPDATES = 2e8
+SLICE_UPDATES: Final = 2e8
 """Number of cell updates between two looks at the clock: a few seconds on one core."""
+GPU_SLICE_UPDATES: Final = 2e9
+"""The same on a GPU: some tenths of a second."""
+
+Grid: TypeAlias = tuple[domains.Domain, NDArray[np.float32], Addressing]
+"""A domain, the largest grid Reynolds number of its cells, and its memory layout."""
+_GRIDS: WeakKeyDictionary[Vessel, dict[float, Grid]] = WeakKeyDictionary()
+"""Grids of whole vessels by grid spacing, as long as the vessel exists."""
 
 
 def build(
@@ -66,12 +77,7 @@ def build(
         require_gpu()
     keep_flow()
     scales = Scales(cell_size_mm * M_PER_MM, check_s / int(pace[0]), case.blood)
-    if close_up is None:
-        domain = domains.build(case.vessel, cell_size_mm)
-    else:
-        domain = close_ups.build(case, cell_size_mm, close_up)
-    limit = thickest(case, domain)
-    addressing = address(domain, limit)
+    domain, limit, addressing = _grid(case, cell_size_mm, close_up)
     links = build_links(case, domain, addressing, scales, close_up)
     screen = build_screen(case, domain, addressing, scales)
     state = State(
@@ -95,6 +101,22 @@ def build(
     if start is not None:
         _begin_from(state, start)
     return state
+
+
+def _grid(case: FlowCase, cell_size_mm: float, close_up: CloseUp | None) -> Grid:
+    """Return the grid of a case; that of a whole vessel is the same for all its flows and is built once."""
+    if close_up is not None:
+        return _numbered(case, close_ups.build(case, cell_size_mm, close_up))
+    built = _GRIDS.setdefault(case.vessel, {})
+    if cell_size_mm not in built:
+        built[cell_size_mm] = _numbered(case, domains.build(case.vessel, cell_size_mm))
+    return built[cell_size_mm]
+
+
+def _numbered(case: FlowCase, domain: domains.Domain) -> Grid:
+    """Return a domain with the largest grid Reynolds number of its cells and its memory layout."""
+    limit = thickest(case, domain)
+    return domain, limit, address(domain, limit)
 
 
 def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
@@ -174,12 +196,13 @@ def _keep_pace(state: State) -> None:
     last, following = (int(state.pace[(len(state.history) + k) % len(state.pace)]) for k in (-1, 0))
     if last == following:
         return
-    if state.device is not None:
-        state.device.fetch(state)
-        state.device = None
     before, stretch = state.scales.relaxation_steps, last / following
     take_pace(state)
     stress, a = stretch * state.scales.relaxation_steps / before, state.addressing
+    if state.device is not None:
+        with told():
+            state.device.rescale(state, stretch, stress)
+        return
     d3q19.rescale(state.populations, a.stride, a.place, state.links.address, np.float32(stretch), np.float32(stress))
     state.links.openings[:, d3q19.OWN_DENSITIES] *= stretch**2
     _settle(state, 1.0)
@@ -195,7 +218,8 @@ def take_pace(state: State) -> None:
 
 def _slice_steps(state: State) -> int:
     """Return the even number of time steps between two looks at the clock."""
-    return 2 * max(1, round(SLICE_UPDATES / len(state.domain.cells) / 2))
+    updates = GPU_SLICE_UPDATES if state.case.settings.device_gpu else SLICE_UPDATES
+    return 2 * max(1, round(updates / len(state.domain.cells) / 2))
 
 
 def advance(state: State, steps: int) -> None:
@@ -277,13 +301,12 @@ def _settle(state: State, part: float) -> None:
 
 def snapshot(state: State) -> Snapshot:
     """Return the present flow; in a screen the velocity includes half of its force."""
-    moment, outflow = _read_here(state) if state.device is None else state.device.read()
-    velocity = np.ascontiguousarray(moment[:, 1:])
+    density, velocity, outflow = _read_here(state) if state.device is None else state.device.read()
     cells = state.screen.cell
     if len(cells):
         times = _relaxation_times(state, cells)
         velocity[cells] = d3q19.resisted(velocity[cells], state.screen.entry, times, np.float32(ODD_RATE))
-    return Snapshot(state.scales, velocity, moment[:, 0], outflow)
+    return Snapshot(state.scales, velocity, density, outflow)
 
 
 def _relaxation_times(state: State, cells: Ints) -> NDArray[np.float32]:
@@ -292,18 +315,18 @@ def _relaxation_times(state: State, cells: Ints) -> NDArray[np.float32]:
     if law[0] == 0:
         return np.full(len(cells), time)
     if state.device is not None:
-        state.device.fetch(state)
+        return state.device.read_times()
     a = state.addressing
     return np.asarray(d3q19.relaxation_times(state.populations, a.stride, a.place[cells], time, law))
 
 
-def _read_here(state: State) -> tuple[NDArray[np.float32], Floats]:
-    """Return density deviation and momentum (n, 4) of every cell, and the flow rate (k,) out of every end."""
+def _read_here(state: State) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
+    """Return density deviation (n,) and momentum (n, 3) of every cell, and the flow rate (k,) out of every end."""
     f, links = state.populations, state.links
     moment = d3q19.moments(f, state.addressing.stride, state.addressing.place).astype(np.float32)
     ends = range(len(links.start) - 1)
     outflow = [d3q19.outflow(f, links.address[links.start[k] : links.start[k + 1]]) for k in ends]
-    return moment, np.array(outflow)
+    return moment[:, 0], np.ascontiguousarray(moment[:, 1:]), np.array(outflow)
 
 
 def monitored(state: State, now: Snapshot) -> Floats:

@@ -391,14 +391,19 @@ def paths(address: Ints, weight: Floats) -> tuple[Ints, NDArray[np.float32]]:
 
 
 @njit(cache=True, fastmath=True, forceinline=True)
-def defer_link(k: int, f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
-    """Apply `defer` to link `k`."""
+def deferred(k: int, f: Any, address: Any, correction: Any) -> Any:
+    """Return the source of link `k` with which it interpolates at higher order (see `defer`)."""
     a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
     e, g = _U(address[k, 5]), _U(address[k, 4])
-    lost[k] = f[a] - f[_U(address[k, 0])]
     wanted = correction[k, 0] * f[a] + correction[k, 1] * f[b] + correction[k, 2] * f[c]
-    wanted += correction[k, 3] * f[e] + correction[k, 4] * f[g]
-    source[k] += part * (wanted - source[k])
+    return wanted + correction[k, 3] * f[e] + correction[k, 4] * f[g]
+
+
+@njit(cache=True, fastmath=True, forceinline=True)
+def defer_link(k: int, f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
+    """Apply `defer` to link `k`."""
+    lost[k] = f[_U(address[k, 3])] - f[_U(address[k, 0])]
+    source[k] += part * (deferred(k, f, address, correction) - source[k])
 
 
 @njit(cache=True, parallel=True, fastmath=True)

@@ -1,0 +1,117 @@
+"""Pairs of time steps that a GPU makes as a whole, recorded once as CUDA graphs.
+
+The host then launches a graph instead of every kernel.
+"""
+
+import weakref
+from collections.abc import Callable, Iterator
+from enum import Enum
+from typing import Any
+
+from numba import config
+
+from vstent.flow.lattice.state import DEFER_PAIRS
+
+
+class Pairs(Enum):
+    """Sequences of pairs of time steps that are launched as a whole."""
+
+    PLAIN = 1
+    """One pair; populations near walls are not at home afterwards (see `kernels`)."""
+    LAST = 2
+    """One pair, after which populations are at home."""
+    CORRECTED = 3
+    """One pair, after which walls are updated; populations are then at home."""
+    ROUND = 4
+    """`DEFER_PAIRS` pairs, of which the first is `CORRECTED` and the others are `PLAIN`."""
+
+
+def plan(first_pair: int, count: int) -> Iterator[Pairs]:
+    """Yield the sequences that make up `count` pairs of steps; populations are at home after the last.
+
+    Parameters
+    ----------
+    first_pair : int
+        Number of the first pair since the last check; every `DEFER_PAIRS`-th pair is `CORRECTED`.
+    count : int
+        Number of pairs.
+    """
+    pair, end = first_pair, first_pair + count
+    while pair < end:
+        is_due = pair % DEFER_PAIRS == 0
+        if is_due and end - pair > DEFER_PAIRS:
+            yield Pairs.ROUND
+            pair += DEFER_PAIRS
+            continue
+        yield Pairs.CORRECTED if is_due else Pairs.LAST if pair + 1 == end else Pairs.PLAIN
+        pair += 1
+
+
+class NotRecordedError(Exception):
+    """Kernel launches cannot be recorded with this driver or these packages."""
+
+
+def recorded(launches: Callable[[], None], stream: Any) -> Callable[[], None]:
+    """Return a function that replays what `launches` launches on a stream.
+
+    Parameters
+    ----------
+    launches : callable
+        Launches kernels on `stream` and nothing else. All must have been loaded before.
+    stream : numba.cuda stream
+        The stream. The replay is queued there.
+
+    Raises
+    ------
+    NotRecordedError
+        When recording is not possible; the stream must not be used again.
+
+    References
+    ----------
+    CUDA driver API, "Graph Management": cuStreamBeginCapture, cuGraphInstantiate, cuGraphLaunch.
+    """
+    if config.ENABLE_CUDASIM:
+        raise NotRecordedError("numba simulates the GPU")
+    try:
+        from cuda.bindings import driver
+    except ImportError as error:
+        raise NotRecordedError(f"cuda.bindings cannot be imported: {error}") from error
+    handle = driver.CUstream(int(stream.handle))
+    graph = _captured(driver, launches, handle)
+    try:
+        (graph_exec,) = _checked(driver.cuGraphInstantiate(graph, 0))
+    finally:
+        driver.cuGraphDestroy(graph)
+
+    def replay() -> None:
+        _checked(driver.cuGraphLaunch(graph_exec, handle))
+
+    weakref.finalize(replay, driver.cuGraphExecDestroy, graph_exec).atexit = False
+    return replay
+
+
+def _captured(driver: Any, launches: Callable[[], None], handle: Any) -> Any:
+    """Return the graph of the kernels launched on a stream."""
+    # The collector may free an array of another flow meanwhile: only a relaxed capture allows that.
+    _checked(driver.cuStreamBeginCapture(handle, driver.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_RELAXED))
+    try:
+        launches()
+    except Exception as error:  # driver, compiler and numba each have their own exception classes
+        driver.cuStreamEndCapture(handle)
+        raise NotRecordedError(f"a kernel could not be launched: {error}") from error
+    (graph,) = _checked(driver.cuStreamEndCapture(handle))
+    return graph
+
+
+def _checked(result: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return the values of a call of CUDA's driver.
+
+    Raises
+    ------
+    NotRecordedError
+        When the call has failed.
+    """
+    code, *values = result
+    if int(code) != 0:
+        raise NotRecordedError(f"the driver returned {code}")
+    return tuple(values)
