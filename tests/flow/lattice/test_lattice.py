@@ -129,6 +129,9 @@ def test_flows_of_a_vessel_share_its_grid_and_not_their_populations():
 
 def test_whole_vectors_reach_into_no_other_layer():
     """Beyond a segment they write again what they have read there, while another thread may be at the next layer."""
+
+
+def test_layers_share_no_line_of_the_cache():
     arc = phantoms.torus_arc(bend_radius_mm=5.0, angle_rad=1.0, radius_mm=2.0)
     case = FlowCase(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), settings=FlowSettings(inflow_mL_s=3.0))
     state = LatticeBoltzmann(0.3).init(case, None)
@@ -140,6 +143,24 @@ def test_whole_vectors_reach_into_no_other_layer():
     assert len(first) > 20
     assert (first[1:] - last[:-1]).min() == lanes.COUNT + 1
     assert a.stride - last[-1] >= lanes.COUNT
+
+
+def test_what_lies_beyond_a_segment_has_no_effect_and_stays():
+    """Fast blood there makes the vector take the branch that raises the viscosity."""
+    cells, stride, rng = 5, 3 * lanes.COUNT, np.random.default_rng(0)
+    slow = 1e-3 * rng.normal(size=(19, stride)).astype(np.float32)
+    fast = slow.copy()
+    fast[:, cells:] = rng.normal(size=(19, stride - cells))
+    relaxation = np.float32(0.52), np.zeros(4, np.float32), np.full(1, 75.0, np.float32), np.float32(ODD_RATE)
+    address = stride * np.arange(19, dtype=np.int32)[None, None]
+    of_cells = address, np.full(1, cells, np.int32), relaxation, d3q19.no_screen(1)
+    found = []
+    for f in (slow, fast):
+        stored = np.r_[f.ravel(), np.zeros(lanes.COUNT, np.float32)]
+        d3q19.update(stored, of_cells, d3q19.NO_LINKS, *d3q19.undivided(1))
+        found.append(stored[: -lanes.COUNT].reshape(19, stride))
+    np.testing.assert_array_equal(found[0][:, :cells], found[1][:, :cells])
+    np.testing.assert_array_equal(found[1][:, cells:], fast[:, cells:])
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 7])

@@ -168,8 +168,7 @@ def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
     inside[tuple(cells.T)] = True
     stored = voxels.dilate(inside, directions.VELOCITIES[1:])
     number = np.full(inside.shape, -1, dtype=np.int32)
-    # A vector write rewrites values beyond its segment unchanged. The padding between layers keeps it from touching
-    # values that another thread may be changing.
+    # The padding between layers keeps two threads from writing to the same line of the cache.
     number[stored] = np.arange(stored.sum()) + lanes.COUNT * np.nonzero(stored)[0]
     count = int(number.max()) + lanes.COUNT
     stride = count + (OFF_PAGE - count) % PAGE

@@ -6,7 +6,7 @@ Every number may be a float32 or `vstent.flow.lattice.kernels.lanes`. Population
 The collision is regularised: of the even (symmetric) part only the stress is kept (Latt and Chopard 2006, Math. Comput.
 Simul. 72:165, eq. 12), without its trace, which only carries sound. The odd (antisymmetric) part has its own relaxation
 rate (Ginzburg, Verhaeghe and d'Humieres 2008, Commun. Comput. Phys. 3, 427), which is raised in fast flow
-(`_stable_rate`). The equilibrium is that of incompressible flow (He and Luo 1997, J. Stat. Phys. 88, 927, eq. 20): the
+(`_relaxation`). The equilibrium is that of incompressible flow (He and Luo 1997, J. Stat. Phys. 88, 927, eq. 20): the
 steady state is free of divergence at any lattice speed.
 
 D3Q19 lacks two kinds of moments. Without them a round jet bends towards the diagonals of the grid. They are replaced as
@@ -23,14 +23,14 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from vstent.flow.lattice.kernels.lanes import larger, root
+from vstent.flow.lattice.kernels.lanes import any_positive, larger, root
 
-_THIRD, _AXIS, _DIAGONAL = np.float32(1 / 3), np.float32(1 / 18), np.float32(1 / 36)
+_THIRD, _DIAGONAL = np.float32(1 / 3), np.float32(1 / 36)
 _ZERO, _HALF, _ONE, _TWO, _THREE, _FOUR, _SIX, _EIGHT = (
     np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 )
-_THREE_HALVES, _QUARTER, _EIGHTH, _TWELFTH, _TWENTY_FOURTH, _TINY = (
-    np.float32(x) for x in (3 / 2, 1 / 4, 1 / 8, 1 / 12, 1 / 24, 1e-12)
+_THREE_HALVES, _QUARTER, _EIGHTH, _TWELFTH, _SIXTEENTH, _TWENTY_FOURTH, _FORTY_EIGHTH, _TINY = (
+    np.float32(x) for x in (3 / 2, 1 / 4, 1 / 8, 1 / 12, 1 / 16, 1 / 24, 1 / 48, 1e-12)
 )
 
 
@@ -43,9 +43,10 @@ def moments_of(f: Any) -> tuple[Any, Any, Any]:
     d1, d2, d3 = f[1] - f[2], f[3] - f[4], f[5] - f[6]
     d4, d5, d6 = f[7] - f[8], f[9] - f[10], f[11] - f[12]
     d7, d8, d9 = f[13] - f[14], f[15] - f[16], f[17] - f[18]
-    density = f[0] + s1 + s2 + s3 + s4 + s5 + s6 + s7 + s8 + s9
-    momentum = d1 + d4 + d5 + d6 + d7, d2 + d4 - d5 + d8 + d9, d3 + d6 - d7 + d8 - d9
-    diagonal = s1 + s4 + s5 + s6 + s7, s2 + s4 + s5 + s8 + s9, s3 + s6 + s7 + s8 + s9
+    s45, s67, s89 = s4 + s5, s6 + s7, s8 + s9
+    diagonal = s1 + (s45 + s67), s2 + (s45 + s89), s3 + (s67 + s89)
+    density = diagonal[0] + ((f[0] + s89) + (s2 + s3))
+    momentum = d1 + ((d4 + d5) + (d6 + d7)), d2 + ((d4 - d5) + (d8 + d9)), d3 + ((d6 - d7) + (d8 - d9))
     return density, momentum, (*diagonal, s4 - s5, s6 - s7, s8 - s9)
 
 
@@ -91,7 +92,7 @@ def _third(u: Any, n: Any, part: Any) -> tuple[Any, ...]:
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _even(density: Any, u: Any, flux: Any) -> tuple[Any, ...]:
+def _even(density: Any, u: Any, flux: Any, trace: Any) -> tuple[Any, ...]:
     """Return the even parts (10) after collision: the rest population and half the sum of each of the nine pairs.
 
     Parameters
@@ -102,24 +103,29 @@ def _even(density: Any, u: Any, flux: Any) -> tuple[Any, ...]:
         Velocity (3).
     flux
         Second moments after collision (6).
+    trace
+        Sum of the first three of them.
     """
-    xx, yy, zz, xy, xz, yz = flux
-    isotropic = density - _THREE_HALVES * (xx + yy + zz)
-    wx, wy, wz = _THREE_HALVES * u[0] * u[0], _THREE_HALVES * u[1] * u[1], _THREE_HALVES * u[2] * u[2]
-    pxy = _DIAGONAL * (isotropic + wz) + _EIGHTH * (xx + yy)
-    pxz = _DIAGONAL * (isotropic + wy) + _EIGHTH * (xx + zz)
-    pyz = _DIAGONAL * (isotropic + wx) + _EIGHTH * (yy + zz)
+    xx, yy, zz, xy, xz, yz = _times(_EIGHTH, flux)
+    wx, wy, wz = u[0] * u[0], u[1] * u[1], u[2] * u[2]
+    squared = wx + wy + wz
+    # The pair along an axis is twice (a - b), the four pairs across it a + b: most operations serve both.
+    share = _DIAGONAL * density + _FORTY_EIGHTH * (trace - squared)
+    ax, ay, az = share + _TWENTY_FOURTH * wx, share + _TWENTY_FOURTH * wy, share + _TWENTY_FOURTH * wz
+    common = _SIXTEENTH * trace + _FORTY_EIGHTH * squared
+    bx, by, bz = common - xx, common - yy, common - zz
+    pyz, pxz, pxy = ax + bx, ay + by, az + bz
     return (
-        _THIRD * (isotropic + _THIRD * (wx + wy + wz)),
-        _AXIS * (isotropic - wy - wz) + _QUARTER * xx,
-        _AXIS * (isotropic - wx - wz) + _QUARTER * yy,
-        _AXIS * (isotropic - wx - wy) + _QUARTER * zz,
-        pxy + _QUARTER * xy,
-        pxy - _QUARTER * xy,
-        pxz + _QUARTER * xz,
-        pxz - _QUARTER * xz,
-        pyz + _QUARTER * yz,
-        pyz - _QUARTER * yz,
+        _THIRD * (density - _THREE_HALVES * trace + _HALF * squared),
+        _TWO * (ax - bx),
+        _TWO * (ay - by),
+        _TWO * (az - bz),
+        pxy + _TWO * xy,
+        pxy - _TWO * xy,
+        pxz + _TWO * xz,
+        pxz - _TWO * xz,
+        pyz + _TWO * yz,
+        pyz - _TWO * yz,
     )
 
 
@@ -136,16 +142,17 @@ def _odd(momentum: Any, third: Any) -> tuple[Any, ...]:
     """
     x, y, z = _TWELFTH * momentum[0], _TWELFTH * momentum[1], _TWELFTH * momentum[2]
     xyy, xzz, xxy, yzz, xxz, yyz = third
+    xy, xz, yx, yz, zx, zy = x + xyy, x + xzz, y + xxy, y + yzz, z + xxz, z + yyz
     return (
-        _TWO * (x - (xyy + xzz)),
-        _TWO * (y - (xxy + yzz)),
-        _TWO * (z - (xxz + yyz)),
-        (x + y) + (xyy + xxy),
-        (x - y) + (xyy - xxy),
-        (x + z) + (xzz + xxz),
-        (x - z) + (xzz - xxz),
-        (y + z) + (yzz + yyz),
-        (y - z) + (yzz - yyz),
+        _HALF * momentum[0] - _TWO * (xy + xz),
+        _HALF * momentum[1] - _TWO * (yx + yz),
+        _HALF * momentum[2] - _TWO * (zx + zy),
+        xy + yx,
+        xy - yx,
+        xz + zx,
+        xz - zx,
+        yz + zy,
+        yz - zy,
     )
 
 
@@ -182,24 +189,31 @@ def relaxed(f: Any, even: Any, odd: Any, half_kept: Any) -> tuple[Any, ...]:
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _stable_rate(squared: Any, time: Any, odd_rate: Any) -> Any:
-    """Return the relaxation rate of the odd part: `odd_rate`, or a higher one where fast flow needs it for stability.
+def _relaxation(squared: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any]:
+    """Return the relaxation time of the stress and the relaxation rate of the odd part.
+
+    They are `time` and `odd_rate`, or higher ones where fast flow needs them for stability. Few cells do. The square
+    root and the division are skipped where no cell does, because all later operations would wait for them.
 
     Waves on a uniform flow grow when the squared speed times (1 / rate - 1/2) exceeds about twice the viscosity: an
     eigenvalue of collision and streaming then exceeds 1 (von Neumann analysis with rates from 0.7 to 1.7, first along
     the grid axes). Three quarters of this limit are allowed; nothing then grows up to a speed of 0.2.
     """
-    slow = _ONE / odd_rate
-    excess = larger((slow - _HALF) * squared - _HALF * (time - _HALF), _ZERO)
-    return squared / (slow * squared - excess)
+    steep, slow, even = _THREE / limit, _ONE / odd_rate, time - _HALF
+    rate = odd_rate + _ZERO * time  # of the type of `time`, for both branches
+    if any_positive(larger(steep * steep * squared - even * even, (slow - _HALF) * squared - _HALF * even)):
+        time = larger(time, _HALF + steep * root(squared))
+        excess = larger((slow - _HALF) * squared - _HALF * (time - _HALF), _ZERO)
+        rate = odd_rate + odd_rate * excess / (slow * squared - excess + _TINY)
+    return time, rate
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _kept_and_rate(u: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any]:
     """Return the fraction of the stress that is kept, and the relaxation rate of the odd part."""
-    squared = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + _TINY
-    time = larger(time, _HALF + _THREE / limit * root(squared))
-    return _ONE - _ONE / time, _stable_rate(squared, time, odd_rate)
+    squared = u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
+    time, rate = _relaxation(squared, time, limit, odd_rate)
+    return _ONE - _ONE / time, rate
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -361,7 +375,8 @@ def collided(f: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any, An
     n = departure(flux, u)
     momentum = rate * u[0], rate * u[1], rate * u[2]
     third = _third(u, n, keep - (_ONE - rate))
-    return _even(density, u, _plus_square(_times(keep, n), u)), _odd(momentum, third), _HALF * (_ONE - rate)
+    squared = u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
+    return _even(density, u, _plus_square(_times(keep, n), u), squared), _odd(momentum, third), _HALF * (_ONE - rate)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -402,7 +417,9 @@ def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any,
         rate * y + half_odd * force[1],
         rate * z + half_odd * force[2],
     )
-    return _even(density, u, pushed), _odd(momentum, _third(u, n, keep - (_ONE - rate))), _HALF * (_ONE - rate)
+    trace = pushed[0] + pushed[1] + pushed[2]
+    odd = _odd(momentum, _third(u, n, keep - (_ONE - rate)))
+    return _even(density, u, pushed, trace), odd, _HALF * (_ONE - rate)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -431,5 +448,6 @@ def rescaled(f: Any, stretch: Any, stress: Any) -> tuple[Any, ...]:
     faster = stretch * u[0], stretch * u[1], stretch * u[2]
     added = (_ONE - stretch) * faster[0], (_ONE - stretch) * faster[1], (_ONE - stretch) * faster[2]
     zero = u[0] - u[0]
-    even = _even(stretch * stretch * density, faster, _plus_square(held, faster))
+    squared = faster[0] * faster[0] + faster[1] * faster[1] + faster[2] * faster[2]
+    even = _even(stretch * stretch * density, faster, _plus_square(held, faster), squared)
     return relaxed(f, even, _odd(added, (zero, zero, zero, zero, zero, zero)), _HALF * stretch * stretch)

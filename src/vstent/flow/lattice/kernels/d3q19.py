@@ -34,7 +34,7 @@ from vstent.flow.lattice.kernels.collision import (
     stress_size,
     thinned,
 )
-from vstent.flow.lattice.kernels.lanes import COUNT, gather, load, starts, store, upto
+from vstent.flow.lattice.kernels.lanes import COUNT, fetch, gather, load, starts, store
 from vstent.kernels.arrays import Floats, Ints
 from vstent.kernels.directions import VELOCITIES
 
@@ -65,6 +65,8 @@ _ROOT_THREE: Final = float(np.sqrt(3.0))
 _U = np.uint64
 _WIDE = SEGMENT + COUNT
 """Length of a work array for one segment and a vector beyond it."""
+_AHEAD: Final = 4 * COUNT
+"""Distance, in cells, at which populations are loaded into the cache ahead of their collision."""
 _KINDS: Final = 3
 """Number of stages of a step. Stage 0: cells collide. Stage 1: links return what the cells of their band and of the
 adjacent bands have sent. Stage 2: septa exchange populations that the links of their band and the next have read."""
@@ -90,46 +92,41 @@ def even_part(q: int, density: float, ux: float, uy: float, uz: float) -> float:
 def _thin(f: Any, start: Any, n: int, time: float, law: Any, times: Any) -> None:
     """Write the relaxation times of a segment of n cells of shear-thinning blood, from the stress they hold."""
     for k in range(0, n, COUNT):
-        store(times, k, stress_size(gather(f, start, k)))
+        store(times, k, stress_size(gather(f, start, k)), COUNT)
     for k in range(n):
         times[k] = thinned(times[k], time, law)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _relax_pair(pair: int, f: Any, start: Any, k: int, cells: int, parts: Any) -> None:
+def _relax_pair(pair: int, f: Any, start: Any, k: int, cells: int, old: Any, parts: Any) -> None:
     """Relax the populations of a pair of opposite directions (see `_relax`)."""
-    here, opposite = start[2 * pair - 1] + k, start[2 * pair] + k
-    a, b = load(f, here), load(f, opposite)
-    new_a, new_b = relaxed_pair(a, b, parts[0][pair], parts[1][pair - 1], parts[2])
-    store(f, here, upto(cells, new_a, a))
-    store(f, opposite, upto(cells, new_b, b))
+    new_a, new_b = relaxed_pair(old[2 * pair - 1], old[2 * pair], parts[0][pair], parts[1][pair - 1], parts[2])
+    store(f, start[2 * pair - 1] + k, new_a, cells)
+    store(f, start[2 * pair] + k, new_b, cells)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def _relax(f: Any, start: Any, k: int, cells: int, parts: Any) -> None:
-    """Relax the cells of a segment from `k` on, a vector but no more than `cells`, with the parts from `collided`.
-
-    Populations are read a second time, pair by pair. They are still in the cache, and the registers of a processor
-    cannot hold all old and new ones.
-    """
-    _relax_pair(1, f, start, k, cells, parts)
-    _relax_pair(2, f, start, k, cells, parts)
-    _relax_pair(3, f, start, k, cells, parts)
-    _relax_pair(4, f, start, k, cells, parts)
-    _relax_pair(5, f, start, k, cells, parts)
-    _relax_pair(6, f, start, k, cells, parts)
-    _relax_pair(7, f, start, k, cells, parts)
-    _relax_pair(8, f, start, k, cells, parts)
-    _relax_pair(9, f, start, k, cells, parts)
-    store(f, start[0] + k, upto(cells, parts[0][0], load(f, start[0] + k)))
+def _relax(f: Any, start: Any, k: int, cells: int, old: Any, parts: Any) -> None:
+    """Relax the cells of a segment from `k` on, a vector but no more than `cells`, with the parts from `collided`."""
+    _relax_pair(1, f, start, k, cells, old, parts)
+    _relax_pair(2, f, start, k, cells, old, parts)
+    _relax_pair(3, f, start, k, cells, old, parts)
+    _relax_pair(4, f, start, k, cells, old, parts)
+    _relax_pair(5, f, start, k, cells, old, parts)
+    _relax_pair(6, f, start, k, cells, old, parts)
+    _relax_pair(7, f, start, k, cells, old, parts)
+    _relax_pair(8, f, start, k, cells, old, parts)
+    _relax_pair(9, f, start, k, cells, old, parts)
+    store(f, start[0] + k, parts[0][0], cells)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _collide(f: Any, start: Any, k: int, cells: int, settings: Any) -> None:
     """Collide the cells of a segment from `k` on, a vector but no more than `cells`."""
     times, limit, odd_rate = settings
-    parts = collided(gather(f, start, k), load(times, k), limit, odd_rate)
-    _relax(f, start, k, cells, parts)
+    old = gather(f, start, k)
+    fetch(f, start, k + _AHEAD)
+    _relax(f, start, k, cells, old, collided(old, load(times, k), limit, odd_rate))
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -139,8 +136,8 @@ def _collide_screened(f: Any, start: Any, k: int, cells: int, settings: Any, res
     normal = load(resistance, k), load(resistance, k + _WIDE), load(resistance, k + 2 * _WIDE)
     linear = load(resistance, k + 3 * _WIDE), load(resistance, k + 4 * _WIDE)
     entry = *linear, load(resistance, k + 5 * _WIDE), load(resistance, k + 6 * _WIDE)
-    parts = collided_screened(gather(f, start, k), load(times, k), limit, odd_rate, normal, entry)
-    _relax(f, start, k, cells, parts)
+    old = gather(f, start, k)
+    _relax(f, start, k, cells, old, collided_screened(old, load(times, k), limit, odd_rate, normal, entry))
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -253,8 +250,7 @@ def update(f: Any, cells: Any, links: Any, bands: Any, shares: Any) -> None:
     Parameters
     ----------
     f : (19 * stride + COUNT,) float32
-        Populations, changed in place. Up to COUNT - 1 values beyond a segment may be read and rewritten unchanged; the
-        layout leaves as many unused places between two bands.
+        Populations, changed in place. Up to COUNT - 1 values beyond a segment may be read; they have no effect.
     cells : tuple
         - (steps, segments, 19) int32: address of the first population of each segment and direction, in an even step
           its own, in an odd step its neighbours'.
@@ -468,16 +464,23 @@ def balance(lost: Any, groups: Any, refill: Any, part: float) -> None:
         balance_group(g, lost, groups, refill, part)
 
 
+@njit(cache=True, forceinline=True)
+def _read_cell(f: Any, stride: int, place: int, moment: Any) -> None:
+    """Write density deviation and momentum (4,) at a storage place; populations must be at home."""
+    moment[:] = 0.0
+    for q in range(19):
+        population = float(f[q * stride + place])
+        moment[0] += population
+        for axis in range(3):
+            moment[1 + axis] += VELOCITIES[q, axis] * population
+
+
 @njit(cache=True, parallel=True)
 def moments(f: Any, stride: int, places: Any) -> Any:
     """Return density deviation and momentum (n, 4) at storage `places` (n,); populations must be at home."""
     result = np.zeros((len(places), 4))
     for i in prange(len(places)):
-        for q in range(19):
-            population = float(f[q * stride + places[i]])
-            result[i, 0] += population
-            for axis in range(3):
-                result[i, 1 + axis] += VELOCITIES[q, axis] * population
+        _read_cell(f, stride, places[i], result[i])
     return result
 
 
@@ -612,16 +615,27 @@ def between(shape: Any, n: int, moment: Any) -> tuple[float, float]:
     return first[0] + part * (second[0] - first[0]), first[1] + part * (second[1] - first[1])
 
 
+@njit(cache=True, parallel=True)
+def _at_ends(f: Any, stride: int, start: Any, places: Any) -> Any:
+    """Return density deviation and momentum (l, 4) of cells, in the row of the first link of a cell at its opening."""
+    result = np.zeros((len(places), 4))
+    for n in prange(len(places)):
+        if n == 0 or places[n] != places[n - 1]:  # links of a cell are consecutive
+            _read_cell(f, stride, places[n], result[n])
+    for first in start:
+        if first < len(places):
+            _read_cell(f, stride, places[first], result[first])
+    return result
+
+
 @njit(cache=True)
-def _density(f: Any, stride: int, places: Any) -> float:
-    """Return the density deviation at `places`, averaged over the links they belong to."""
-    total, held = 0.0, 0.0
+def _mean_density(held: Any, places: Any) -> float:
+    """Return the density deviation at `places`, averaged over the links they belong to (see `_at_ends`)."""
+    total, density = 0.0, 0.0
     for n in range(len(places)):
         if n == 0 or places[n] != places[n - 1]:
-            held = 0.0
-            for q in range(19):
-                held += f[q * stride + places[n]]
-        total += held
+            density = held[n, 0]
+        total += density
     return total / len(places)
 
 
@@ -672,10 +686,11 @@ def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: A
     Ginzburg, Verhaeghe and d'Humieres 2008, Commun. Comput. Phys. 3, 427, sec. 5.2: anti-bounce-back.
     """
     start, address, place, direction, shape = links
+    held = _at_ends(f, stride, start, place)
     for k in range(len(openings)):
         opening, first, last = openings[k], start[k], start[k + 1]
         if opening[0] == INFLOW:
-            speed = inflow_speed(opening, _density(f, stride, place[first:last]))
+            speed = inflow_speed(opening, _mean_density(held[first:last], place[first:last]))
             for n in range(first, last):
                 linear, squared = between(shape, n, moment)
                 source[n] = (linear + squared * speed) * speed
@@ -685,6 +700,6 @@ def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: A
             density = outlet_density(opening, outflow(f, address[first:last]))
         velocity = 0.0, 0.0, 0.0
         for n in range(first, last):
-            if n == first or place[n] != place[n - 1]:  # links of a cell are consecutive
-                velocity = velocity_at(f, stride, place[n])
+            if n == first or place[n] != place[n - 1]:
+                velocity = held[n, 1], held[n, 2], held[n, 3]
             source[n] = outlet_source(velocity, direction[n], opening, density + between(shape, n, moment)[0])

@@ -20,6 +20,8 @@ COUNT: Final = 16 if get_host_cpu_features().get("avx512f") else 8
 """Number of values in one Lanes."""
 _FLOAT: Final = ir.FloatType()
 _WHOLE: Final = ir.IntType(32)
+_FLAG: Final = ir.IntType(1)
+_BYTES: Final = ir.IntType(8).as_pointer()
 _VECTOR: Final = ir.VectorType(_FLOAT, COUNT)
 _FAST: Final = ("fast",)
 
@@ -147,15 +149,35 @@ def _root_chosen(a: Any) -> Any:
 
 
 @intrinsic
-def upto(_: Any, count: Any, a: Any, b: Any) -> Any:
-    """Return Lanes that are a in the first `count` places and b in the others."""
+def _any_positive(_: Any, a: Any) -> Any:
+    """Return whether any of the Lanes is positive."""
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        places = ir.Constant(ir.VectorType(_WHOLE, COUNT), list(range(COUNT)))
-        counts = _everywhere(builder, builder.trunc(arguments[0], _WHOLE))
-        return builder.select(builder.icmp_signed("<", places, counts), arguments[1], arguments[2])
+        flags = builder.fcmp_ordered(">", arguments[0], ir.Constant(_VECTOR, [0.0] * COUNT))
+        found = builder.icmp_unsigned("!=", builder.bitcast(flags, ir.IntType(COUNT)), ir.IntType(COUNT)(0))
+        kind = ir.FunctionType(_FLAG, [_FLAG, _FLAG])
+        expect = cgutils.get_or_insert_function(builder.module, kind, "llvm.expect.i1")
+        return builder.call(expect, [found, _FLAG(0)])
 
-    return LANES(types.intp, a, b), generate
+    return types.boolean(a), generate
+
+
+def any_positive(a: Any) -> Any:
+    """Return whether any of the Lanes is positive, or whether a float32 is; machine code expects that none is."""
+    return a > 0
+
+
+@overload(any_positive)
+def _any_positive_chosen(a: Any) -> Any:
+    """Return the implementation of `any_positive` for Lanes or for a number."""
+
+    def of_lanes(a: Any) -> Any:
+        return _any_positive(a)
+
+    def of_number(a: Any) -> Any:
+        return a > 0
+
+    return of_lanes if a == LANES else of_number
 
 
 def _at(context: Any, builder: Any, array: Any, value: Any, place: Any) -> Any:
@@ -211,11 +233,31 @@ def gather(_: Any, array: Any, starts: Any, offset: Any) -> Any:
 
 
 @intrinsic
-def store(_: Any, array: Any, place: Any, lanes: Any) -> Any:
-    """Write Lanes to a float32 array (n,) from a place on."""
+def fetch(_: Any, array: Any, starts: Any, offset: Any) -> Any:
+    """Ask the processor to load what `gather` will read at this offset; it may lie outside the array."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        builder.store(arguments[2], _at(context, builder, signature.args[0], *arguments[:2]), align=4)
+        kind = ir.FunctionType(ir.VoidType(), [_BYTES, _WHOLE, _WHOLE, _WHOLE])
+        prefetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        for run in _runs(context, builder, signature, arguments):
+            builder.call(prefetch, [builder.bitcast(run, _BYTES), _WHOLE(0), _WHOLE(3), _WHOLE(1)])
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, lanes), generate
+    return types.void(array, starts, types.intp), generate
+
+
+@intrinsic
+def store(_: Any, array: Any, place: Any, lanes: Any, count: Any) -> Any:
+    """Write the first `count` Lanes to a float32 array (n,) from a place on; at most `COUNT` are written."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        to = _at(context, builder, signature.args[0], *arguments[:2])
+        places = ir.Constant(ir.VectorType(_WHOLE, COUNT), list(range(COUNT)))
+        written = builder.icmp_signed("<", places, _everywhere(builder, builder.trunc(arguments[3], _WHOLE)))
+        kind = ir.FunctionType(ir.VoidType(), [_VECTOR, to.type, _WHOLE, written.type])
+        name = f"llvm.masked.store.v{COUNT}f32.p0v{COUNT}f32"
+        masked = cgutils.get_or_insert_function(builder.module, kind, name)
+        builder.call(masked, [arguments[2], to, _WHOLE(4), written])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, lanes, types.intp), generate
