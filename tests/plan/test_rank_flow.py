@@ -116,7 +116,7 @@ def test_a_flow_starts_from_that_of_the_most_similar_coverage(monkeypatch: pytes
     monkeypatch.setattr(rank_flow, "simulate_case", noting)
     monkeypatch.setattr(rank_flow, "indices", lambda *_: dict.fromkeys(rank_flow.REDUCED, 1.0))
     monkeypatch.setattr(rank_flow, "grade", lambda *_: SimpleNamespace(level="good"))
-    flows = rank_flow._Flows(anatomy(), SETTINGS)
+    flows = rank_flow._Flows(anatomy(), SETTINGS, has_contrast=False)
     flows.computed(None)
     for fraction in covered:
         flows.computed(replace(one, measures=one.measures | {rank_flow.COVERAGE: fraction}))

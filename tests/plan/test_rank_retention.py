@@ -67,11 +67,11 @@ def test_without_a_retention_without_a_device_the_scores_stay(bare, said):
 def test_a_flow_kept_without_contrast_is_computed_again(monkeypatch):
     computed = []
 
-    def compute(anatomy, one, settings, bare, has_contrast):
+    def compute(flows, one):
         computed.append(one)
-        return bare, flow(0.7)
+        return flow(0.7)
 
-    monkeypatch.setattr(rank_flow, "_computed", compute)
+    monkeypatch.setattr(rank_flow._Flows, "computed", compute)
     bare, short = flow(0.5), flow(0.6)
     del short["contrast"]
     ranked({None: bare, FIRST: flow(0.6), SECOND: short}, has_contrast=True)
