@@ -4,9 +4,9 @@ Usage: python benchmarks/gpu.py [SURFACE]
 
 SURFACE is an artery with an aneurysm, in mm; without it the demo is used. Every goal holds for AneuriskWeb C0038. The
 script prints, for a Silk at grid spacings of 0.4, 0.2 and 0.1 mm, the time of every kernel on the GPU (between events)
-and on the host, the rate of cell updates, its share of the memory's bandwidth, and the memory; then the agreement of
-the demo with the processor and of two runs with each other; then the run time of whole flows; and at last one line for
-every goal.
+and on the host, the rate of cell updates, its share of the memory's bandwidth, and the memory; then the run time of
+whole flows; then the agreement of the demo with the processor and of two runs with each other; and at last one line for
+every goal. A part that fails is reported, and the others go on. No flow continues after 285 s.
 
 With ``--tiny`` every part runs on a short tube, also on numba's simulator (``NUMBA_ENABLE_CUDASIM=1``); its
 figures have no meaning.
@@ -15,11 +15,14 @@ figures have no meaning.
 import argparse
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TypeVar
 
 import numba
 import numpy as np
@@ -52,6 +55,10 @@ RATE_GOALS = {0.1: 10.0, 0.2: 6.0, 0.4: 1.5}
 """Billion cell updates per second at each grid spacing in mm (NVIDIA H100, C0038 with Silk)."""
 STEADY_GOAL_S, CYCLES_GOAL_S, AGREEMENT_GOAL = 45.0, 75.0, 1e-3
 """Run time of three steady flows and of two cycles at 0.1 mm; relative difference from the processor."""
+BEGAN, LIMIT_S = time.perf_counter(), 285.0
+"""Start of the script, and the time after which no flow continues."""
+NAN = float("nan")
+Part = TypeVar("Part")
 PATIENCE = 1.5
 """A whole flow is stopped when it has taken this many times its goal."""
 WHOLE = FlowSettings(cell_size_mm=0.1)
@@ -78,6 +85,18 @@ class Extent:
     bandwidth_bytes: int = 1 << 28
     settings: FlowSettings = WHOLE
     """Settings of whole flows."""
+
+
+@dataclass
+class Found:
+    """What was measured for the goals; nan or None where a part failed."""
+
+    rates: dict[float, float] = field(default_factory=dict)
+    """Billion cell updates per second at each grid spacing in mm."""
+    steady_s: float = NAN
+    cycles_s: float = NAN
+    difference: float = NAN
+    same: bool | None = None
 
 
 TINY = Extent((0.4,), 1, Pairs.CORRECTED, 1.0, 1, 1 << 9, FlowSettings(cell_size_mm=0.4, max_steps=4, inflow_mL_s=0.3))
@@ -189,6 +208,11 @@ def spacing_table(case: FlowCase, spacing_mm: float, extent: Extent, in_place_GB
     return updates_per_s / 1e9
 
 
+def left_s() -> float:
+    """Time left for flows, in s."""
+    return float("inf") if is_simulated() else max(0.0, LIMIT_S - (time.perf_counter() - BEGAN))
+
+
 @contextmanager
 def stopped_after(seconds: float) -> Iterator[Callable[[Progress], None]]:
     """Give a progress callback that ends a flow after some seconds."""
@@ -205,19 +229,19 @@ def timed(name: str, goal_s: float, compute: Callable[[Callable[[Progress], None
     """Print and return the run time of whole flows; infinity when they were stopped."""
     began = time.perf_counter()
     try:
-        with stopped_after(PATIENCE * goal_s) as tell:
+        with stopped_after(min(PATIENCE * goal_s, left_s())) as tell:
             fields = compute(tell)
     except StoppedError as stopped:
         print(f"| {name} | {stopped} | | |", flush=True)
         return float("inf")
     seconds = time.perf_counter() - began
-    steps, loops = sum(field.steps for field in fields), [field.updates_per_s / 1e9 for field in fields]
+    steps, loops = sum(one.steps for one in fields), [one.updates_per_s / 1e9 for one in fields]
     print(f"| {name} | {seconds:.1f} s | {steps:,} | {', '.join(f'{loop:.2f}' for loop in loops)} |", flush=True)
     return seconds
 
 
-def whole_flows(cases: list[FlowCase], settings: FlowSettings) -> tuple[float, float]:
-    """Print the run time of three steady flows and of two cycles, setup included; return both."""
+def steady_flows(cases: list[FlowCase], settings: FlowSettings) -> float:
+    """Print and return the run time of steady flows, set-up included."""
     on_gpu = replace(settings, device_gpu=True)
     print("\n| whole flows | run time | steps on the finest grid | billion updates/s |\n|---|---|---|---|")
 
@@ -228,12 +252,17 @@ def whole_flows(cases: list[FlowCase], settings: FlowSettings) -> tuple[float, f
             fields.append(simulate_case(replace(case, settings=on_gpu), start=start, progress=tell))
         return tuple(fields)
 
-    def cycles(tell: Callable[[Progress], None]) -> tuple[FlowField, ...]:
-        pulse = replace(on_gpu, waveform=OLDER_ADULT_ICA, max_cycles=2, max_steps=settings.max_steps)
-        return (simulate_case(replace(cases[0], settings=pulse), progress=tell),)
+    return timed(f"{len(cases)} steady flows", STEADY_GOAL_S, steady)
 
-    three = timed(f"{len(cases)} steady flows", STEADY_GOAL_S, steady)
-    return three, timed("two cycles, bare", CYCLES_GOAL_S, cycles) if settings is WHOLE else float("nan")
+
+def two_cycles(case: FlowCase, settings: FlowSettings) -> float:
+    """Print and return the run time of two cycles, set-up included."""
+    pulse = replace(settings, device_gpu=True, waveform=OLDER_ADULT_ICA, max_cycles=2)
+    return timed(
+        "two cycles, bare",
+        CYCLES_GOAL_S,
+        lambda tell: (simulate_case(replace(case, settings=pulse), progress=tell),),
+    )
 
 
 def measures(field: FlowField, case: FlowCase) -> np.ndarray:
@@ -248,9 +277,11 @@ def measures(field: FlowField, case: FlowCase) -> np.ndarray:
 
 def agreement(case: FlowCase, settings: FlowSettings) -> tuple[float, bool]:
     """Print and return the largest relative difference from the processor, and whether two runs have the same bits."""
-    gpu, again, here = (
-        simulate_case(replace(case, settings=replace(settings, device_gpu=on_gpu))) for on_gpu in (True, True, False)
-    )
+    with stopped_after(left_s()) as tell:
+        gpu, again, here = (
+            simulate_case(replace(case, settings=replace(settings, device_gpu=on_gpu)), progress=tell)
+            for on_gpu in (True, True, False)
+        )
     wanted, found = measures(here, case), measures(gpu, case)
     same = all(
         getattr(gpu, name).tobytes() == getattr(again, name).tobytes()
@@ -264,22 +295,21 @@ def agreement(case: FlowCase, settings: FlowSettings) -> tuple[float, bool]:
     return difference, same
 
 
-def goals(rates: dict[float, float], three_s: float, cycles_s: float, difference: float, *, same: bool) -> None:
+def goals(found: Found) -> None:
     """Print a line for every goal."""
     print("\n| goal (NVIDIA H100, C0038) | wanted | measured | reached |\n|---|---|---|---|")
     for spacing_mm, goal in RATE_GOALS.items():
-        found = rates.get(spacing_mm, float("nan"))
-        line(f"Silk, {spacing_mm} mm, billion updates/s", f"{goal:g}", f"{found:.3g}", reached=found >= goal)
-    line(
-        "bare, Silk, Enterprise, steady, 0.1 mm, s",
-        f"{STEADY_GOAL_S:g}",
-        f"{three_s:.1f}",
-        reached=three_s <= STEADY_GOAL_S,
-    )
-    line("two cycles, bare, 0.1 mm, s", f"{CYCLES_GOAL_S:g}", f"{cycles_s:.1f}", reached=cycles_s <= CYCLES_GOAL_S)
-    agrees = difference <= AGREEMENT_GOAL
-    line("demo with Silk against the processor", f"{AGREEMENT_GOAL:g}", f"{difference:.1e}", reached=agrees)
-    line("two runs, bit for bit", "same", "same" if same else "different", reached=same)
+        rate = found.rates.get(spacing_mm, NAN)
+        line(f"Silk, {spacing_mm} mm, billion updates/s", f"{goal:g}", f"{rate:.3g}", reached=rate >= goal)
+    for name, goal, seconds in (
+        ("bare, Silk, Enterprise, steady, 0.1 mm, s", STEADY_GOAL_S, found.steady_s),
+        ("two cycles, bare, 0.1 mm, s", CYCLES_GOAL_S, found.cycles_s),
+    ):
+        line(name, f"{goal:g}", f"{seconds:.1f}", reached=seconds <= goal)
+    agrees = found.difference <= AGREEMENT_GOAL
+    line("demo with Silk against the processor", f"{AGREEMENT_GOAL:g}", f"{found.difference:.1e}", reached=agrees)
+    bits = "nan" if found.same is None else "same" if found.same else "different"
+    line("two runs, bit for bit", "same", bits, reached=bool(found.same))
 
 
 def line(goal: str, wanted: str, measured: str, *, reached: bool) -> None:
@@ -327,22 +357,60 @@ def main(words: list[str]) -> int:
     except FlowError as error:
         print(f"Not measured: {error}.")
         return 0
-    extent = TINY if asked.tiny else Extent()
     began = time.perf_counter()
     print(f"{gpu_name()}; {about()}")
-    in_place, copy = (bandwidth_GB_s(extent, in_place=in_place) for in_place in (True, False))
-    print(f"Bandwidth in place {in_place:.3g} GB/s, copying {copy:.3g} GB/s")
-    cases = tiny_cases(extent.settings) if asked.tiny else cases_of(anatomy_of(asked.surface), extent.settings)
-    with_silk = cases[min(1, len(cases) - 1)]
-    rates = {mm: spacing_table(with_silk, mm, extent, in_place) for mm in extent.spacings_mm}
-    demo = with_silk if asked.tiny or asked.surface is None else cases_of(anatomy_of(None), extent.settings)[1]
-    difference, same = agreement(demo, extent.settings)
-    three_s, cycles_s = whole_flows(cases, extent.settings)
-    if asked.tiny:  # its rates and times are not those of the goals
-        rates, three_s, cycles_s = {}, float("nan"), float("nan")
-    goals(rates, three_s, cycles_s, difference, same=same)
+    goals(measured(asked.surface, TINY if asked.tiny else Extent()))
     print(f"\nMeasured in {time.perf_counter() - began:.0f} s.")
     return 0
+
+
+def part(name: str, compute: Callable[[], Part], otherwise: Part) -> Part:
+    """The result of a part; if it fails, this is printed and the others go on."""
+    try:
+        return compute()
+    except Exception as error:  # noqa: BLE001 each part fails for itself, whatever the reason
+        words = next(iter(str(error).splitlines()), "")
+        print(f"\nFailed: {name}: {type(error).__name__}: {words}", flush=True)
+        traceback.print_exc()
+        return otherwise
+
+
+def bandwidths(extent: Extent) -> float:
+    """Print the bandwidths; return the one in place, in GB/s."""
+    in_place, copy = (bandwidth_GB_s(extent, in_place=in_place) for in_place in (True, False))
+    print(f"Bandwidth in place {in_place:.3g} GB/s, copying {copy:.3g} GB/s")
+    return in_place
+
+
+def measured(surface: Path | None, extent: Extent) -> Found:
+    """Measure and print every part."""
+    is_tiny, settings, found = extent is TINY, extent.settings, Found()
+    in_place = part("bandwidth", lambda: bandwidths(extent), NAN)
+    cases = part(
+        "artery and devices",
+        lambda: tiny_cases(settings) if is_tiny else cases_of(anatomy_of(surface), settings),
+        [],
+    )
+    if not cases:
+        return found
+    with_silk = cases[min(1, len(cases) - 1)]
+    for mm in extent.spacings_mm:
+        of_spacing = partial(spacing_table, with_silk, mm, extent, in_place)
+        found.rates[mm] = part(f"kernels at {mm} mm", of_spacing, NAN)
+    steady_s = part("steady flows", lambda: steady_flows(cases, settings), NAN)
+    if is_tiny:  # its rates and times are not those of the goals
+        found.rates.clear()
+    else:
+        found.steady_s = steady_s
+        found.cycles_s = part("two cycles", lambda: two_cycles(cases[0], settings), NAN)
+    found.difference, found.same = part(
+        "agreement with the processor",
+        lambda: agreement(
+            with_silk if is_tiny or surface is None else cases_of(anatomy_of(None), settings)[1], settings
+        ),
+        (NAN, None),
+    )
+    return found
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import json
 import os
 import pickle
 import re
+import runpy
 import subprocess
 import sys
 import types
@@ -56,7 +57,7 @@ for one in (state, twin):
 for (name, one), other in zip(pack(state).items(), pack(twin).values()):
     assert name == "loop_seconds" or one.tobytes() == other.tobytes()  # sums do not depend on the order of threads
 step(state)
-assert state.device.how == "one by one"
+assert state.device.how == "one by one, because numba simulates the GPU"
 saved = pack(state)
 assert state.device is not None  # the next steps are longer: it has converted what it holds
 advance(state, 0)
@@ -235,6 +236,18 @@ def test_the_benchmark_runs_through_on_the_simulator() -> None:
     assert "| two runs, bit for bit | same | same | yes |" in goals
     assert re.search(r"against the processor \| 0\.001 \| \d\.\de-\d\d \| yes \|", goals)
     assert goals.count("not measured") == 5
+
+
+def test_a_part_of_the_benchmark_that_fails_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    script = runpy.run_path(str(Path(__file__).parents[3] / "benchmarks" / "gpu.py"))
+
+    def fails() -> float:
+        raise RuntimeError("CUDA_ERROR_LAUNCH_FAILED\nand more")
+
+    assert script["part"]("whole flows", fails, 7.0) == 7.0
+    assert "Failed: whole flows: RuntimeError: CUDA_ERROR_LAUNCH_FAILED\n" in capsys.readouterr().out
+    script["goals"](script["Found"]())
+    assert capsys.readouterr().out.count("not measured") == 7
 
 
 def test_the_benchmark_says_why_it_measures_nothing() -> None:

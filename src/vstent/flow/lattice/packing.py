@@ -1,7 +1,8 @@
 """Arrays of a run as the kernels of a GPU read them (`vstent.flow.lattice.kernels.gpu`): by cell, links packed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,21 @@ from vstent.flow.lattice.setup import Addressing, Links
 from vstent.flow.lattice.state import State
 from vstent.kernels.arrays import Ints
 
+LINE: Final = 32
+"""Number of entries of 32 bits in a line of the GPU's memory."""
 IN_PLANE: Final = (1, 2, 3, 4, 7, 8, 9, 10)
 """Directions without a component along z: those of the columns of `Packed.rows` after the first."""
+
+
+def joined(tables: Sequence[NDArray[Any]], dtype: type) -> tuple[NDArray[Any], list[slice]]:
+    """Return tables in one array, and where each is; every table begins on a line of the GPU's memory."""
+    lengths = np.array([-(-table.size // LINE) * LINE for table in tables])
+    starts = np.cumsum(lengths) - lengths
+    places = [slice(int(start), int(start) + table.size) for start, table in zip(starts, tables, strict=True)]
+    whole: NDArray[Any] = np.zeros(max(1, int(lengths.sum())), dtype)
+    for place, table in zip(places, tables, strict=True):
+        whole[place] = table.ravel()
+    return whole, places
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,5 +113,5 @@ def _checked(result: tuple[Any, ...]) -> tuple[Any, ...]:
     """
     code, *values = result
     if int(code) != 0:
-        raise NotRecordedError(f"the driver returned {code}")
+        raise NotRecordedError(f"the CUDA driver returned {getattr(code, 'name', code)}")
     return tuple(values)

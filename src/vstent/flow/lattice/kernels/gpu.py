@@ -37,7 +37,16 @@ COLUMN: Final = np.array([0, 1, 2, 3, 4, 0, 0, 5, 6, 7, 8, 1, 2, 1, 2, 3, 4, 3, 
 SHIFT: Final = np.array([0, 0, 0, 0, 0, 1, -1, 0, 0, 0, 0, 1, -1, -1, 1, 1, -1, -1, 1], np.int32)
 """(19,) number of places from there to the neighbour: neighbours along z are adjacent."""
 NOW, AT_HOME = 0, 1
-"""Entries of the device's clock: the row of the boundary values that applies, and whether populations are at home."""
+"""Entries of the clock, with which the integers begin: the row of the boundary values that applies, and whether
+populations are at home."""
+SPECIAL, SPECIALS, LINK, REFILL, END_OF_LINK, OPENING_OF_END, OPENINGS, ANSWER, IMPOSED = range(2, 11)
+"""Entries with the place where a table begins (see `even_step`), or the number of special cells or openings."""
+BLOCKS, END_CELL, FIRST_BLOCK, COUNT, DONE, PARTS = range(11, 17)
+"""Further places, for `drive`."""
+HEAD: Final = 32
+"""Number of these entries, and of the numbers before the limits; `packing.LINE` is the same."""
+OPENING: Final = 9
+"""Number of values per opening in `Links.openings`."""
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _U, _WHOLE = np.uint64, np.uint32
 
@@ -64,28 +73,51 @@ def load(f: Any, address: int) -> Any:
 
 
 @_inlined
+def _integer(integers: Any, at: int) -> Any:
+    """Return an entry of the integers."""
+    return integers[_U(at)]
+
+
+@_inlined
 def store(f: Any, address: int, population: Any) -> None:
     """Write the population at an address; every kernel writes populations here."""
     f[_U(address)] = population
 
 
 @_inlined
-def _cell(cell: int, cells: Any, special: Any) -> tuple[int, int, int, int, int, int, int]:
+def _cell(cell: int, integers: Any, code_at: int) -> tuple[int, int, int, int, int, int, int]:
     """Return segment, link masks (all, near, ends), first link, screen entry and number of a special cell.
 
-    A cell without links and screen has no links, entry -1 and number -1.
+    Links and entry are given by their places among the singles. A cell without them has no links, entry -1 and
+    number -1.
     """
-    code = cells[0][cell]
+    code = _integer(integers, code_at + cell)
     if code >= 0:
         return code, 0, 0, 0, 0, -1, -1
     w = -1 - code
-    return special[0, w], special[1, w], special[2, w], special[3, w], special[4, w], special[5, w], w
+    at, m = integers[SPECIAL] + w, integers[SPECIALS]
+    return (
+        _integer(integers, at),
+        _integer(integers, at + m),
+        _integer(integers, at + 2 * m),
+        _integer(integers, at + 3 * m),
+        _integer(integers, at + 4 * m),
+        _integer(integers, at + 5 * m),
+        w,
+    )
 
 
 @_inlined
-def _neighbour(q: int, rows: Any, s: int, cell: int) -> int:
+def _place(integers: Any, s: int, cell: int) -> int:
+    """Return the storage place of a cell of segment `s`."""
+    place: int = _integer(integers, HEAD + 9 * s) + cell
+    return place
+
+
+@_inlined
+def _neighbour(q: int, integers: Any, s: int, cell: int) -> int:
     """Return the storage place of the neighbour in direction `q` of a cell of segment `s`."""
-    place: int = rows[s, COLUMN[q]] + cell + SHIFT[q]
+    place: int = _integer(integers, HEAD + 9 * s + COLUMN[q]) + cell + SHIFT[q]
     return place
 
 
@@ -96,12 +128,12 @@ def _own(q: int, stride: int, place: int) -> Any:
 
 
 @_inlined
-def _away(q: int, stride: int, rows: Any, s: int, cell: int, links: int) -> Any:
+def _away(q: int, stride: int, integers: Any, s: int, cell: int, links: int) -> Any:
     """Return the address of population `q` of a cell in an odd step: at the neighbour, or at home behind a link."""
     p = OPPOSITE[q]
     if links & (1 << p):
-        return _own(q, stride, rows[s, 0] + cell)
-    return _WHOLE(p * stride + _neighbour(p, rows, s, cell))
+        return _own(q, stride, _place(integers, s, cell))
+    return _WHOLE(p * stride + _neighbour(p, integers, s, cell))
 
 
 @_inlined
@@ -131,28 +163,28 @@ def _homes(stride: int, place: int) -> tuple[Any, ...]:
 
 
 @_inlined
-def _aways(stride: int, rows: Any, s: int, cell: int, links: int) -> tuple[Any, ...]:
+def _aways(stride: int, integers: Any, s: int, cell: int, links: int) -> tuple[Any, ...]:
     """Return the addresses (19) of a cell's populations in an odd step."""
     return (
-        _own(0, stride, rows[s, 0] + cell),
-        _away(1, stride, rows, s, cell, links),
-        _away(2, stride, rows, s, cell, links),
-        _away(3, stride, rows, s, cell, links),
-        _away(4, stride, rows, s, cell, links),
-        _away(5, stride, rows, s, cell, links),
-        _away(6, stride, rows, s, cell, links),
-        _away(7, stride, rows, s, cell, links),
-        _away(8, stride, rows, s, cell, links),
-        _away(9, stride, rows, s, cell, links),
-        _away(10, stride, rows, s, cell, links),
-        _away(11, stride, rows, s, cell, links),
-        _away(12, stride, rows, s, cell, links),
-        _away(13, stride, rows, s, cell, links),
-        _away(14, stride, rows, s, cell, links),
-        _away(15, stride, rows, s, cell, links),
-        _away(16, stride, rows, s, cell, links),
-        _away(17, stride, rows, s, cell, links),
-        _away(18, stride, rows, s, cell, links),
+        _own(0, stride, _place(integers, s, cell)),
+        _away(1, stride, integers, s, cell, links),
+        _away(2, stride, integers, s, cell, links),
+        _away(3, stride, integers, s, cell, links),
+        _away(4, stride, integers, s, cell, links),
+        _away(5, stride, integers, s, cell, links),
+        _away(6, stride, integers, s, cell, links),
+        _away(7, stride, integers, s, cell, links),
+        _away(8, stride, integers, s, cell, links),
+        _away(9, stride, integers, s, cell, links),
+        _away(10, stride, integers, s, cell, links),
+        _away(11, stride, integers, s, cell, links),
+        _away(12, stride, integers, s, cell, links),
+        _away(13, stride, integers, s, cell, links),
+        _away(14, stride, integers, s, cell, links),
+        _away(15, stride, integers, s, cell, links),
+        _away(16, stride, integers, s, cell, links),
+        _away(17, stride, integers, s, cell, links),
+        _away(18, stride, integers, s, cell, links),
     )
 
 
@@ -207,111 +239,116 @@ def _stored(f: Any, at: tuple[int, ...], new: tuple[Any, ...]) -> None:
 
 
 @_inlined
-def _stored_away(f: Any, stride: int, rows: Any, s: int, cell: int, links: int, new: tuple[Any, ...]) -> None:
+def _stored_away(f: Any, stride: int, integers: Any, s: int, cell: int, links: int, new: tuple[Any, ...]) -> None:
     """Write populations (19) to the addresses of an odd step.
 
     Addresses are computed again, because registers that hold them would be too few for the collision.
     """
-    store(f, _own(0, stride, rows[s, 0] + cell), new[0])
-    store(f, _away(1, stride, rows, s, cell, links), new[1])
-    store(f, _away(2, stride, rows, s, cell, links), new[2])
-    store(f, _away(3, stride, rows, s, cell, links), new[3])
-    store(f, _away(4, stride, rows, s, cell, links), new[4])
-    store(f, _away(5, stride, rows, s, cell, links), new[5])
-    store(f, _away(6, stride, rows, s, cell, links), new[6])
-    store(f, _away(7, stride, rows, s, cell, links), new[7])
-    store(f, _away(8, stride, rows, s, cell, links), new[8])
-    store(f, _away(9, stride, rows, s, cell, links), new[9])
-    store(f, _away(10, stride, rows, s, cell, links), new[10])
-    store(f, _away(11, stride, rows, s, cell, links), new[11])
-    store(f, _away(12, stride, rows, s, cell, links), new[12])
-    store(f, _away(13, stride, rows, s, cell, links), new[13])
-    store(f, _away(14, stride, rows, s, cell, links), new[14])
-    store(f, _away(15, stride, rows, s, cell, links), new[15])
-    store(f, _away(16, stride, rows, s, cell, links), new[16])
-    store(f, _away(17, stride, rows, s, cell, links), new[17])
-    store(f, _away(18, stride, rows, s, cell, links), new[18])
+    store(f, _own(0, stride, _place(integers, s, cell)), new[0])
+    store(f, _away(1, stride, integers, s, cell, links), new[1])
+    store(f, _away(2, stride, integers, s, cell, links), new[2])
+    store(f, _away(3, stride, integers, s, cell, links), new[3])
+    store(f, _away(4, stride, integers, s, cell, links), new[4])
+    store(f, _away(5, stride, integers, s, cell, links), new[5])
+    store(f, _away(6, stride, integers, s, cell, links), new[6])
+    store(f, _away(7, stride, integers, s, cell, links), new[7])
+    store(f, _away(8, stride, integers, s, cell, links), new[8])
+    store(f, _away(9, stride, integers, s, cell, links), new[9])
+    store(f, _away(10, stride, integers, s, cell, links), new[10])
+    store(f, _away(11, stride, integers, s, cell, links), new[11])
+    store(f, _away(12, stride, integers, s, cell, links), new[12])
+    store(f, _away(13, stride, integers, s, cell, links), new[13])
+    store(f, _away(14, stride, integers, s, cell, links), new[14])
+    store(f, _away(15, stride, integers, s, cell, links), new[15])
+    store(f, _away(16, stride, integers, s, cell, links), new[16])
+    store(f, _away(17, stride, integers, s, cell, links), new[17])
+    store(f, _away(18, stride, integers, s, cell, links), new[18])
 
 
 @_inlined
-def _number(q: int, links: int, first: int) -> int:
-    """Return the number of a cell's link in direction `q`; its links are numbered by direction from `first` on."""
-    return first + cuda.popc(links & ((1 << q) - 1))
+def _link(q: int, links: int, first: int) -> int:
+    """Return where the weight of a cell's link in direction `q` is, before its source; `first`: that of the first."""
+    return first + 2 * cuda.popc(links & ((1 << q) - 1))
 
 
 @_inlined
-def _returned(q: int, sent: Any, beside: Any, which: int, links: int, first: int, link: Any) -> Any:
+def _returned(q: int, sent: Any, beside: Any, which: int, links: int, first: int, singles: Any) -> Any:
     """Return what the link in direction `q` returns for the population sent, or `sent` where it is not in `which`."""
     if not which & (1 << q):
         return sent
-    n = _number(q, links, first)
-    weight = link[n, 0]
-    return weight * sent + (_ONE - abs(weight)) * beside + link[n, 1]
+    n = _link(q, links, first)
+    weight = singles[_U(n)]
+    return weight * sent + (_ONE - abs(weight)) * beside + singles[_U(n + 1)]
 
 
 @_inlined
-def _returned_pair(q: int, a: Any, b: Any, which: int, links: int, first: int, link: Any) -> tuple[Any, Any]:
+def _returned_pair(q: int, a: Any, b: Any, which: int, links: int, first: int, singles: Any) -> tuple[Any, Any]:
     """Return populations `q` and `q` + 1 after the links of this pair of opposite directions (see `_reflected`)."""
     return (
-        _returned(q + 1, a, b, which, links, first, link),
-        _returned(q, b, a, which, links, first, link),
+        _returned(q + 1, a, b, which, links, first, singles),
+        _returned(q, b, a, which, links, first, singles),
     )
 
 
 @_inlined
-def _reflected(f: tuple[Any, ...], which: int, links: int, first: int, link: Any) -> tuple[Any, ...]:
+def _reflected(f: tuple[Any, ...], which: int, links: int, first: int, singles: Any) -> tuple[Any, ...]:
     """Return the populations (19) of a cell after the links in the mask `which`.
 
     What was sent along a link is in the place of the opposite direction.
     """
     return (
         f[0],
-        *_returned_pair(1, f[1], f[2], which, links, first, link),
-        *_returned_pair(3, f[3], f[4], which, links, first, link),
-        *_returned_pair(5, f[5], f[6], which, links, first, link),
-        *_returned_pair(7, f[7], f[8], which, links, first, link),
-        *_returned_pair(9, f[9], f[10], which, links, first, link),
-        *_returned_pair(11, f[11], f[12], which, links, first, link),
-        *_returned_pair(13, f[13], f[14], which, links, first, link),
-        *_returned_pair(15, f[15], f[16], which, links, first, link),
-        *_returned_pair(17, f[17], f[18], which, links, first, link),
+        *_returned_pair(1, f[1], f[2], which, links, first, singles),
+        *_returned_pair(3, f[3], f[4], which, links, first, singles),
+        *_returned_pair(5, f[5], f[6], which, links, first, singles),
+        *_returned_pair(7, f[7], f[8], which, links, first, singles),
+        *_returned_pair(9, f[9], f[10], which, links, first, singles),
+        *_returned_pair(11, f[11], f[12], which, links, first, singles),
+        *_returned_pair(13, f[13], f[14], which, links, first, singles),
+        *_returned_pair(15, f[15], f[16], which, links, first, singles),
+        *_returned_pair(17, f[17], f[18], which, links, first, singles),
     )
 
 
 @_inlined
-def _present(f: Any, cell: int, cells: Any, walls: Any, clock: Any) -> tuple[Any, ...]:
+def _present(f: Any, integers: Any, singles: Any, stride: int, code_at: int, cell: int) -> tuple[Any, ...]:
     """Return the populations (19) of a cell between two pairs of steps, whether they are at home or not."""
-    s, links, near, _, first, _, _ = _cell(cell, cells, walls[0])
-    held = _loaded(f, _homes(cells[3], cells[1][s, 0] + cell))
-    if near and not clock[AT_HOME]:
-        held = _reflected(held, near, links, first, walls[1])
+    s, links, near, _, first, _, _ = _cell(cell, integers, code_at)
+    held = _loaded(f, _homes(stride, _place(integers, s, cell)))
+    if near and not integers[AT_HOME]:
+        held = _reflected(held, near, links, first, singles)
     return held
 
 
 @_inlined
-def _collided(held: tuple[Any, ...], limit: Any, number: Any, e: int, screen: Any) -> tuple[Any, ...]:
-    """Return the collided populations (19), each in the place of its opposite; `e` is the screen entry or -1."""
-    time, odd_rate = number[0], number[5]
-    law = number[1], number[2], number[3], number[4]
+def _collided(held: tuple[Any, ...], singles: Any, s: int, e: int) -> tuple[Any, ...]:
+    """Return the collided populations (19) of a cell of segment `s`, each in the place of its opposite.
+
+    `e` is the place of its screen entry, or -1.
+    """
+    time, odd_rate, limit = singles[0], singles[5], singles[_U(HEAD + s)]
+    law = singles[1], singles[2], singles[3], singles[4]
     if law[0] > _ZERO:
         time = thinned(stress_size(held), time, law)
     if e < 0:
         even, odd, half_kept = collided(held, time, limit, odd_rate)
     else:
-        normal = screen[e, 0], screen[e, 1], screen[e, 2]
-        entry = screen[e, 3], screen[e, 4], screen[e, 5], screen[e, 6]
+        normal = singles[e], singles[e + 1], singles[e + 2]
+        entry = singles[e + 3], singles[e + 4], singles[e + 5], singles[e + 6]
         even, odd, half_kept = collided_screened(held, time, limit, odd_rate, normal, entry)
     return relaxed(held, even, odd, half_kept)
 
 
 @_inlined
-def _left(new: tuple[Any, ...], far: int, links: int, first: int, w: int, walls: Any) -> tuple[Any, ...]:
+def _left(
+    new: tuple[Any, ...], far: int, links: int, first: int, w: int, integers: Any, singles: Any
+) -> tuple[Any, ...]:
     """Return the populations (19) to be stored: after the links in the mask `far`, with the refill of special cells."""
     if far:
-        new = _reflected(new, far, links, first, walls[1])
+        new = _reflected(new, far, links, first, singles)
     rest = new[0]
     if w >= 0:
-        rest += walls[2][w]
+        rest += singles[_U(integers[REFILL] + w)]
     return rest, *new[1:]
 
 
@@ -334,118 +371,134 @@ def _density(f: tuple[Any, ...]) -> float:
 
 
 @_inlined
-def _open(held: tuple[Any, ...], ends: int, links: int, first: int, link: Any, opening: Any) -> None:
+def _open(
+    held: tuple[Any, ...], ends: int, links: int, first: int, integers: Any, singles: Any, doubles: Any, shape: Any
+) -> None:
     """Set the sources of a cell's links in the mask `ends` (see `d3q19.drive`)."""
-    of_link, of_end, shape, openings, answer, imposed, clock = opening
     velocity = _velocity(held)
-    row = clock[NOW]
-    k_end = answer.size
-    moment = imposed[row, k_end], imposed[row, k_end + 1], imposed[row, k_end + 2]
+    openings, answer = integers[OPENINGS], integers[ANSWER]
+    now = integers[IMPOSED] + integers[NOW] * (openings + 3) + openings
+    moment = doubles[now], doubles[now + 1], doubles[now + 2]
     for q in range(1, 19):
         if ends & (1 << q):
-            n = _number(q, links, first)
-            end = of_link[n]
-            k = of_end[end]
+            n = _link(q, links, first)
+            end = _end(n, integers)
+            k = integers[integers[OPENING_OF_END] + end]
             linear, squared = _between(shape, end, moment)
-            if openings[k, 0] == INFLOW:
-                link[n, 1] = (linear + squared * answer[k]) * answer[k]
+            if doubles[OPENING * k] == INFLOW:
+                singles[n + 1] = (linear + squared * doubles[answer + k]) * doubles[answer + k]
             else:
-                link[n, 1] = _outlet_source(velocity, q, openings[k], answer[k] + linear)
+                opening = doubles[OPENING * k : OPENING * (k + 1)]
+                singles[n + 1] = _outlet_source(velocity, q, opening, doubles[answer + k] + linear)
+
+
+@_inlined
+def _end(n: int, integers: Any) -> int:
+    """Return the number, among the links of the ends, of the link at a place of the singles."""
+    end: int = integers[integers[END_OF_LINK] + ((n - integers[LINK]) >> 1)]
+    return end
 
 
 @cuda.jit(cache=True)
-def even_step(f: Any, cells: Any, walls: Any, screen: Any, number: Any, opening: Any) -> None:
+def even_step(
+    f: Any, integers: Any, singles: Any, doubles: Any, shape: Any, stride: int, cells: int, code_at: int
+) -> None:
     """Make an even step: every cell collides and stores its populations at home, each in the place of its opposite.
+
+    A launch takes the host some microseconds for every array, so tables share one array of each type.
 
     Parameters
     ----------
     f : (19 * stride,) float32
         Populations, changed in place.
-    cells : tuple
-        `Packed.code`, `Packed.rows`, `Packed.limit` and the stride.
-    walls : tuple
-        `Packed.special`, `Packed.link` and `Packed.refill`.
-    screen : (e, d3q19.ENTRY) float32
-        Screen entries (see `collision.resist`).
-    number : (6,) float32
+    integers : (:,) int32
+        `HEAD` entries (see `NOW`, `SPECIAL`), `Packed.rows`, and in places that these entries and `code_at` tell:
+        `Packed.code`, `Packed.special` with the places of link and screen entry, `Packed.end_of_link`,
+        `Packed.opening_of_end`, and the tables of `drive`.
+    singles : (:,) float32
         Relaxation time at high shear rate, Carreau-Yasuda law (4), relaxation rate of the odd part (see
-        `d3q19.update`).
-    opening : tuple
-        `Packed.end_of_link`, `Packed.opening_of_end`, `Links.shape`, `Links.openings`, the answer (k,) of every opening
-        from `drive`, its boundary values (rows, k + 3), and the clock.
+        `d3q19.update`); from `HEAD` on the limits (s,); then `Packed.link`, the refill of special cells, and screen
+        entries (see `collision.resist`).
+    doubles : (:,) float64
+        `Links.openings`; the answer (k,) of every opening from `drive`; the sums of its blocks; the boundary values
+        (rows, k + 3).
+    shape : (m, o, 2) float64
+        `Links.shape`.
+    stride, cells, code_at : int
+        Distance between two populations of a cell, number of cells, and where their codes begin.
     """
     cell = cuda.grid(1)
-    if cell >= cells[0].size:
+    if cell >= cells:
         return
-    s, links, near, ends, first, e, w = _cell(cell, cells, walls[0])
-    at = _homes(cells[3], cells[1][s, 0] + cell)
+    s, links, near, ends, first, e, w = _cell(cell, integers, code_at)
+    at = _homes(stride, _place(integers, s, cell))
     held = _loaded(f, at)
-    if near and not opening[6][AT_HOME]:
-        held = _reflected(held, near, links, first, walls[1])
+    if near and not integers[AT_HOME]:
+        held = _reflected(held, near, links, first, singles)
     if ends:
-        _open(held, ends, links, first, walls[1], opening)
-    new = _collided(held, cells[2][s], number, e, screen)
-    _stored(f, at, _left(new, links & ~near, links, first, w, walls))
+        _open(held, ends, links, first, integers, singles, doubles, shape)
+    new = _collided(held, singles, s, e)
+    _stored(f, at, _left(new, links & ~near, links, first, w, integers, singles))
 
 
 @cuda.jit(cache=True)
-def odd_step(f: Any, cells: Any, walls: Any, screen: Any, number: Any, clock: Any, keep: int) -> None:
+def odd_step(f: Any, integers: Any, singles: Any, stride: int, cells: int, code_at: int, keep: int) -> None:
     """Make an odd step: every cell reads what its neighbours have sent, collides, and stores it in the same places.
+
+    The clock moves to the next pair of steps.
 
     Parameters
     ----------
-    f, cells, walls, screen, number
+    f, integers, singles, stride, cells, code_at
         As in `even_step`.
-    clock : (2,) int32
-        Moved to the next pair of steps.
     keep : int
         Whether what is sent along links is also written to the mailboxes: 0 at the openings only, 1 everywhere.
     """
     cell = cuda.grid(1)
     if cell == 0:
-        clock[NOW] += 1
-        clock[AT_HOME] = 0
-    if cell >= cells[0].size:
+        integers[NOW] += 1
+        integers[AT_HOME] = 0
+    if cell >= cells:
         return
-    s, links, near, ends, first, e, w = _cell(cell, cells, walls[0])
-    stride, rows = cells[3], cells[1]
-    held = _loaded(f, _aways(stride, rows, s, cell, links))
+    s, links, near, ends, first, e, w = _cell(cell, integers, code_at)
+    held = _loaded(f, _aways(stride, integers, s, cell, links))
     if near:
-        held = _reflected(held, near, links, first, walls[1])
-    new = _collided(held, cells[2][s], number, e, screen)
+        held = _reflected(held, near, links, first, singles)
+    new = _collided(held, singles, s, e)
     if links:
-        _send(f, new, links if keep else ends, stride, rows, s, cell)
-    _stored_away(f, stride, rows, s, cell, links, _left(new, links & ~near, links, first, w, walls))
+        _send(f, new, links if keep else ends, stride, integers, s, cell)
+    left = _left(new, links & ~near, links, first, w, integers, singles)
+    _stored_away(f, stride, integers, s, cell, links, left)
 
 
 @_inlined
-def _send_one(f: Any, q: int, population: Any, which: int, stride: int, rows: Any, s: int, cell: int) -> None:
+def _send_one(f: Any, q: int, population: Any, which: int, stride: int, integers: Any, s: int, cell: int) -> None:
     """Write what is sent along the link in direction `q` to its mailbox, if it is in the mask `which`."""
     if which & (1 << q):
-        store(f, q * stride + _neighbour(q, rows, s, cell), population)
+        store(f, q * stride + _neighbour(q, integers, s, cell), population)
 
 
 @_inlined
-def _send(f: Any, new: tuple[Any, ...], which: int, stride: int, rows: Any, s: int, cell: int) -> None:
+def _send(f: Any, new: tuple[Any, ...], which: int, stride: int, integers: Any, s: int, cell: int) -> None:
     """Write what is sent along the links in the mask `which` to their mailboxes."""
-    _send_one(f, 1, new[2], which, stride, rows, s, cell)
-    _send_one(f, 2, new[1], which, stride, rows, s, cell)
-    _send_one(f, 3, new[4], which, stride, rows, s, cell)
-    _send_one(f, 4, new[3], which, stride, rows, s, cell)
-    _send_one(f, 5, new[6], which, stride, rows, s, cell)
-    _send_one(f, 6, new[5], which, stride, rows, s, cell)
-    _send_one(f, 7, new[8], which, stride, rows, s, cell)
-    _send_one(f, 8, new[7], which, stride, rows, s, cell)
-    _send_one(f, 9, new[10], which, stride, rows, s, cell)
-    _send_one(f, 10, new[9], which, stride, rows, s, cell)
-    _send_one(f, 11, new[12], which, stride, rows, s, cell)
-    _send_one(f, 12, new[11], which, stride, rows, s, cell)
-    _send_one(f, 13, new[14], which, stride, rows, s, cell)
-    _send_one(f, 14, new[13], which, stride, rows, s, cell)
-    _send_one(f, 15, new[16], which, stride, rows, s, cell)
-    _send_one(f, 16, new[15], which, stride, rows, s, cell)
-    _send_one(f, 17, new[18], which, stride, rows, s, cell)
-    _send_one(f, 18, new[17], which, stride, rows, s, cell)
+    _send_one(f, 1, new[2], which, stride, integers, s, cell)
+    _send_one(f, 2, new[1], which, stride, integers, s, cell)
+    _send_one(f, 3, new[4], which, stride, integers, s, cell)
+    _send_one(f, 4, new[3], which, stride, integers, s, cell)
+    _send_one(f, 5, new[6], which, stride, integers, s, cell)
+    _send_one(f, 6, new[5], which, stride, integers, s, cell)
+    _send_one(f, 7, new[8], which, stride, integers, s, cell)
+    _send_one(f, 8, new[7], which, stride, integers, s, cell)
+    _send_one(f, 9, new[10], which, stride, integers, s, cell)
+    _send_one(f, 10, new[9], which, stride, integers, s, cell)
+    _send_one(f, 11, new[12], which, stride, integers, s, cell)
+    _send_one(f, 12, new[11], which, stride, integers, s, cell)
+    _send_one(f, 13, new[14], which, stride, integers, s, cell)
+    _send_one(f, 14, new[13], which, stride, integers, s, cell)
+    _send_one(f, 15, new[16], which, stride, integers, s, cell)
+    _send_one(f, 16, new[15], which, stride, integers, s, cell)
+    _send_one(f, 17, new[18], which, stride, integers, s, cell)
+    _send_one(f, 18, new[17], which, stride, integers, s, cell)
 
 
 @cuda.jit(cache=True)
@@ -459,7 +512,9 @@ def swap(f: Any, pairs: Any) -> None:
 
 
 @cuda.jit(cache=True)
-def defer(f: Any, address: Any, correction: Any, slots: Any, lost: Any, clock: Any, part: float) -> None:
+def defer(
+    f: Any, integers: Any, singles: Any, address: Any, correction: Any, slot: Any, lost: Any, part: float
+) -> None:
     """Bring the populations of wall links home, and move their sources towards higher-order interpolation.
 
     The last odd step must have kept them. Where `part` is 0 the sources stay as they are.
@@ -468,55 +523,55 @@ def defer(f: Any, address: Any, correction: Any, slots: Any, lost: Any, clock: A
     ----------
     f, address, correction, lost, part
         As in `d3q19.defer`.
-    slots : tuple
-        (links,) int32 number of each link in `Packed.link`, or -1 minus this number for a near link; `Packed.link`.
-    clock : (2,) int32
-        As in `odd_step`.
+    integers, singles
+        As in `even_step`.
+    slot : (links,) int32
+        Number of each link in `Packed.link`, or -1 minus this number for a near link.
     """
     k = cuda.grid(1)
-    slot, link = slots
     if k >= slot.size:
         return
-    n, home, sent = slot[k], address[k, 0], load(f, address[k, 3])
-    if n < 0:
-        n = -1 - n
-        if not clock[AT_HOME]:
-            weight = link[n, 0]
-            store(f, home, weight * sent + (_ONE - abs(weight)) * load(f, address[k, 2]) + link[n, 1])
+    number, home, sent = slot[k], address[k, 0], load(f, address[k, 3])
+    is_near = number < 0
+    n = integers[LINK] + 2 * (-1 - number if is_near else number)
+    if is_near and not integers[AT_HOME]:
+        weight = singles[n]
+        store(f, home, weight * sent + (_ONE - abs(weight)) * load(f, address[k, 2]) + singles[n + 1])
     lost[k] = sent - load(f, home)
-    link[n, 1] += part * (_deferred(k, f, address, correction) - link[n, 1])
+    singles[n + 1] += part * (_deferred(k, f, address, correction) - singles[n + 1])
 
 
 @cuda.jit(cache=True)
-def balance(lost: Any, groups: Any, refill: Any, clock: Any, part: float) -> None:
+def balance(lost: Any, groups: Any, refill: Any, integers: Any, part: float) -> None:
     """Move the refill towards the mass lost at the walls, one thread per group of wall cells (see `d3q19.balance`).
 
-    It follows `defer`; populations are at home from here on.
+    It follows `defer`; populations are at home from here on, which the clock in `integers` keeps.
     """
     g = cuda.grid(1)
     if g == 0:
-        clock[AT_HOME] = 1
+        integers[AT_HOME] = 1
     if g + 1 < groups[0].size:
         _balance_group(g, lost, groups, refill, part)
 
 
 @cuda.jit(cache=True)
-def moments(f: Any, cells: Any, walls: Any, clock: Any, density: Any, velocity: Any) -> None:
+def moments(f: Any, integers: Any, singles: Any, stride: int, code_at: int, density: Any, velocity: Any) -> None:
     """Write density deviation (n,) and momentum (n, 3) of every cell."""
     cell = cuda.grid(1)
     if cell < density.size:
-        held = _present(f, cell, cells, walls, clock)
+        held = _present(f, integers, singles, stride, code_at, cell)
         density[cell] = _density(held)
         velocity[cell, 0], velocity[cell, 1], velocity[cell, 2] = _velocity(held)
 
 
 @cuda.jit(cache=True)
-def times(f: Any, cells: Any, walls: Any, clock: Any, cell: Any, number: Any, result: Any) -> None:
+def times(f: Any, integers: Any, singles: Any, stride: int, code_at: int, cell: Any, result: Any) -> None:
     """Write relaxation times (e,) of shear-thinning blood in cells (e,) (see `d3q19.relaxation_times`)."""
     e = cuda.grid(1)
     if e < result.size:
-        law = number[1], number[2], number[3], number[4]
-        result[e] = thinned(stress_size(_present(f, cell[e], cells, walls, clock)), number[0], law)
+        law = singles[1], singles[2], singles[3], singles[4]
+        held = _present(f, integers, singles, stride, code_at, cell[e])
+        result[e] = thinned(stress_size(held), singles[0], law)
 
 
 @cuda.jit(cache=True)
@@ -536,12 +591,11 @@ def resend(f: Any, address: Any, through: Any, stretch: float) -> None:
 
 
 @cuda.jit(cache=True)
-def rescale(f: Any, cells: Any, walls: Any, stretch: float, stress: float) -> None:
+def rescale(f: Any, integers: Any, stride: int, cells: int, code_at: int, stretch: float, stress: float) -> None:
     """Convert the populations to time steps `stretch` times as long; they must be at home (see `d3q19.rescale`)."""
     cell = cuda.grid(1)
-    if cell < cells[0].size:
-        s = _cell(cell, cells, walls[0])[0]
-        at = _homes(cells[3], cells[1][s, 0] + cell)
+    if cell < cells:
+        at = _homes(stride, _place(integers, _cell(cell, integers, code_at)[0], cell))
         new = rescaled(_loaded(f, at), stretch, stress)
         _stored(f, at, _unswapped(new))
 
@@ -569,19 +623,20 @@ def _sum(parts: Any, t: int) -> float:
 
 
 @_inlined
-def _of_opening(f: Any, cell: int, k: int, cells: Any, walls: Any, ends: Any, clock: Any, is_flow: bool) -> float:
+def _of_opening(
+    f: Any, integers: Any, singles: Any, stride: int, code_at: int, cell: int, k: int, is_flow: bool
+) -> float:
     """Return a cell's part of the flow rate out of opening `k`, or of the sum of density over its links."""
-    of_link, of_end = ends
-    s, links, _, mask, first, _, _ = _cell(cell, cells, walls[0])
-    stride, rows = cells[3], cells[1]
+    s, links, _, mask, first, _, _ = _cell(cell, integers, code_at)
+    opening_at = integers[OPENING_OF_END]
     density, total = 0.0, 0.0
     if not is_flow:
-        density = _density(_present(f, cell, cells, walls, clock))
+        density = _density(_present(f, integers, singles, stride, code_at, cell))
     for q in range(1, 19):
-        if mask & (1 << q) and of_end[of_link[_number(q, links, first)]] == k:
+        if mask & (1 << q) and integers[opening_at + _end(_link(q, links, first), integers)] == k:
             if is_flow:
-                out = load(f, q * stride + _neighbour(q, rows, s, cell))
-                back = load(f, _own(OPPOSITE[q], stride, rows[s, 0] + cell))
+                out = load(f, q * stride + _neighbour(q, integers, s, cell))
+                back = load(f, _own(OPPOSITE[q], stride, _place(integers, s, cell)))
                 total += float(out) - float(back)
             else:
                 total += density
@@ -589,15 +644,15 @@ def _of_opening(f: Any, cell: int, k: int, cells: Any, walls: Any, ends: Any, cl
 
 
 @cuda.jit(cache=True)
-def outflow(f: Any, cells: Any, walls: Any, clock: Any, ends: Any, end_cell: Any, start: Any, result: Any) -> None:
+def outflow(
+    f: Any, integers: Any, singles: Any, stride: int, code_at: int, end_cell: Any, start: Any, result: Any
+) -> None:
     """Write the flow rate (k,) out of every opening, one block each (see `d3q19.outflow`).
 
     Parameters
     ----------
-    f, cells, walls, clock
-        As in `odd_step`.
-    ends : tuple
-        `Packed.end_of_link` and `Packed.opening_of_end`.
+    f, integers, singles, stride, code_at
+        As in `even_step`.
     end_cell, start
         `Packed.end_cell` and `Packed.end_cell_start`.
     """
@@ -605,7 +660,7 @@ def outflow(f: Any, cells: Any, walls: Any, clock: Any, ends: Any, end_cell: Any
     parts = cuda.shared.array(THREADS, np.float64)
     total = 0.0
     for i in range(start[k] + t, start[k + 1], THREADS):
-        total += _of_opening(f, end_cell[i], k, cells, walls, ends, clock, True)
+        total += _of_opening(f, integers, singles, stride, code_at, end_cell[i], k, True)
     parts[t] = total
     total = _sum(parts, t)
     if t == 0:
@@ -613,7 +668,7 @@ def outflow(f: Any, cells: Any, walls: Any, clock: Any, ends: Any, end_cell: Any
 
 
 @cuda.jit(cache=True)
-def drive(f: Any, cells: Any, walls: Any, opening: Any, blocks: Any, end_cell: Any, sums: Any) -> None:
+def drive(f: Any, integers: Any, singles: Any, doubles: Any, stride: int, code_at: int) -> None:
     """Set the speed or density of every opening during the next two steps (see `d3q19.drive`).
 
     Every block sums over some cells of one opening. The last block of an opening that is done adds these sums, always
@@ -621,46 +676,48 @@ def drive(f: Any, cells: Any, walls: Any, opening: Any, blocks: Any, end_cell: A
 
     Parameters
     ----------
-    f, cells, walls, opening
-        As in `even_step`.
-    blocks : (b, 3) int32
-        `Packed.blocks`.
-    end_cell : (j,) int32
-        `Packed.end_cell`.
-    sums : tuple
-        (b,) sum of every block; (k,) int32 number of blocks done, 0 before and after; (k + 1,) first block of every
-        opening; (k,) number of links of every opening.
+    f, integers, singles, doubles, stride, code_at
+        As in `even_step`. Further integers: `Packed.blocks` (b, 3), `Packed.end_cell` (j,), the first block (k + 1,)
+        and the number of links (k,) of every opening, and the number of its blocks done (k,), 0 before and after.
     """
-    of_link, of_end, _, openings, answer, imposed, clock = opening
-    part, done, first_block, count = sums
     b, t = cuda.blockIdx.x, cuda.threadIdx.x
-    k, i = blocks[b, 0], blocks[b, 1] + t
-    kind = openings[k, 0]
+    block = integers[BLOCKS] + 3 * b
+    k, i, end = integers[block], integers[block + 1] + t, integers[block + 2]
+    first, last = integers[integers[FIRST_BLOCK] + k], integers[integers[FIRST_BLOCK] + k + 1]
+    kind, part = doubles[OPENING * k], integers[PARTS]
     parts, is_last = cuda.shared.array(THREADS, np.float64), cuda.shared.array(1, np.int32)
     total = 0.0
-    if i < blocks[b, 2] and kind in (INFLOW, OUTFLOW):
-        total = _of_opening(f, end_cell[i], k, cells, walls, (of_link, of_end), clock, kind == OUTFLOW)
+    if i < end and kind in (INFLOW, OUTFLOW):
+        cell = integers[integers[END_CELL] + i]
+        total = _of_opening(f, integers, singles, stride, code_at, cell, k, kind == OUTFLOW)
     parts[t] = total
     total = _sum(parts, t)
     if t == 0:
-        part[b] = total
+        doubles[part + b] = total
         cuda.threadfence()
-        is_last[0] = cuda.atomic.add(done, k, 1) == first_block[k + 1] - first_block[k] - 1
+        is_last[0] = cuda.atomic.add(integers, integers[DONE] + k, 1) == last - first - 1
     cuda.syncthreads()
     if not is_last[0]:
         return
     cuda.threadfence()
     total = 0.0
-    for other in range(first_block[k] + t, first_block[k + 1], THREADS):
-        total += part[other]
+    for other in range(first + t, last, THREADS):
+        total += doubles[part + other]
     parts[t] = total
     total = _sum(parts, t)
     if t == 0:
-        done[k] = 0
-        openings[k, 1] = imposed[clock[NOW], k]
-        if kind == INFLOW:
-            answer[k] = _inflow_speed(openings[k], total / count[k])
-        elif kind == OUTFLOW:
-            answer[k] = _outlet_density(openings[k], total)
-        else:
-            answer[k] = openings[k, 1]
+        integers[integers[DONE] + k] = 0
+        _answered(k, total, integers, doubles)
+
+
+@_inlined
+def _answered(k: int, total: float, integers: Any, doubles: Any) -> None:
+    """Write the answer of opening `k` to the flow rate out of it or the sum of density over its links."""
+    opening, answer = doubles[OPENING * k : OPENING * (k + 1)], integers[ANSWER] + k
+    opening[1] = doubles[integers[IMPOSED] + integers[NOW] * (integers[OPENINGS] + 3) + k]
+    if opening[0] == INFLOW:
+        doubles[answer] = _inflow_speed(opening, total / integers[integers[COUNT] + k])
+    elif opening[0] == OUTFLOW:
+        doubles[answer] = _outlet_density(opening, total)
+    else:
+        doubles[answer] = opening[1]
