@@ -1,4 +1,4 @@
-"""Advice on a deployment: where the device lies, what to do if it does not fit, and a neck on a fork."""
+"""Advice on a deployment: where the device lies, what to do if it does not fit, crumpled cells, a neck on a fork."""
 
 from functools import lru_cache
 from math import inf
@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from vstent.anatomy.landing_zones import neck_points_mm, neck_span_mm
+from vstent.deployment.crumpling import crumpling, place_of_narrowest
 from vstent.deployment.method import Course
 from vstent.deployment.sizing import (
     APPOSED_GAP_MM,
@@ -27,6 +28,9 @@ SHORT_MM: Final = 0.1
 
 OFF_MM: Final = 0.5
 """Distance from the parent artery, in mm, beyond which a neck also opens into another branch."""
+
+BRAIDED: Final = "Choose a braided device."
+"""Remedy for a device whose struts cannot follow a bend."""
 
 
 class Gaps(NamedTuple):
@@ -55,9 +59,12 @@ def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
     Returns
     -------
     str
-        One sentence, and a second one if the neck is on a fork.
+        One sentence, and further ones if cells are crumpled, if the device lies beyond the patient's artery and if the
+        neck is on a fork.
     """
-    return f"{_lies(anatomy, stent, course, gaps)}{_beyond_patient(anatomy, stent)}{_of_fork(anatomy)}"
+    lies = _lies(anatomy, stent, course, gaps)
+    crumpled = _crumpled(anatomy, stent, remedy="" if lies.endswith(BRAIDED) else _remedy_of_crumpling(stent))
+    return f"{lies}{crumpled}{_beyond_patient(anatomy, stent)}{_of_fork(anatomy)}"
 
 
 def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
@@ -79,6 +86,22 @@ def _lies(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
         return f"{lies}; {1 - loose:.0%} of it is apposed."
     off = f"{loose:.0%} of it is not apposed, with gaps up to {gap_mm[is_at_patient].max():.2f} mm"
     return f"{lies}, and {off}: {_remedy(anatomy, stent, gap_mm, is_loose)}"
+
+
+def _crumpled(anatomy: Anatomy, stent: Stent, remedy: str) -> str:
+    """Return a sentence on crumpled cells that starts with a space and ends with a remedy, or an empty string."""
+    found = crumpling(anatomy, stent)
+    if found is None or not found.crumpled_count:
+        return ""
+    count, total = found.crumpled_count, found.cells_count
+    cells = f"{count} of its {total} cells {'is' if count == 1 else 'are'} crumpled"
+    width = f"{max(found.narrowest_fraction, 0.0):.0%} of the width in a straight artery"
+    return f" {cells}, the narrowest to {width}, {place_of_narrowest(anatomy, found)}.{remedy}"
+
+
+def _remedy_of_crumpling(stent: Stent) -> str:
+    """Return what to do about crumpled cells, as a sentence that starts with a space."""
+    return f" {BRAIDED}" if isinstance(stent.design, LaserCut) else " Move it along the artery."
 
 
 def _beyond_patient(anatomy: Anatomy, stent: Stent) -> str:
@@ -152,10 +175,7 @@ def _remedy(anatomy: Anatomy, stent: Stent, gap_mm: Floats, is_loose: Bools) -> 
     free_mm = stent.size.free_diameter_mm
     could_open = stent.row_diameter_mm + 2 * gap_mm.mean(axis=1) < free_diameters_mm(stent.design, stent.size)
     if isinstance(stent.design, LaserCut) and is_loose[could_open].sum() > 0.5 * is_loose.sum():
-        return (
-            "its struts keep their length, and the way around the outside of the bend is longer. Choose a "
-            "braided device."
-        )
+        return f"its struts keep their length, and the way around the outside of the bend is longer. {BRAIDED}"
     its = f"its free diameter is {free_mm:.2f} mm"
     wider = [size for size in stent.design.sizes if size.diameter_mm > stent.size.diameter_mm]
     if not wider:

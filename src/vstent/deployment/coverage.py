@@ -13,7 +13,7 @@ from vstent.devices.stent import Stent
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves, triangles
-from vstent.kernels.arrays import Bools, Floats
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM
 
 NECK_TOLERANCE_MM: Final = 0.02
@@ -35,6 +35,15 @@ def coverage_fractions(stent: Stent) -> Floats:
     radius_mm = 0.5 * stent.wire_diameter_um[stent.point_wires[here]] * MM_PER_UM
     points_mm = stent.wire_points_mm
     return covered_fractions(stent.nodes_mm, points_mm[here], points_mm[here + 1], radius_mm, SAMPLES_PER_QUAD)
+
+
+def pore_places(stent: Stent) -> tuple[Ints, Ints]:
+    """Return the lattice rows and columns (p,) at which the whole pores of the mesh have their middle."""
+    shape = grid(stent.design, stent.size)
+    row, column = np.meshgrid(np.arange(1, shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
+    first, last = mesh_rows(stent.design, stent.size)
+    is_pore = ((row + column) % 2 == 1) & (row > first) & (row < last)
+    return row[is_pore], column[is_pore]
 
 
 def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats, Floats]:
@@ -65,14 +74,12 @@ def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats, Floats]:
     cell_mm2 = cells.sum(axis=(1, 3))
     pairs = cell_mm2 + np.roll(cell_mm2, 1, axis=1)
     area_mm2 = 0.5 * (pairs[:-1] + pairs[1:])
-    row, column = np.meshgrid(np.arange(1, shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
-    first, last = mesh_rows(stent.design, stent.size)
-    is_pore = ((row + column) % 2 == 1) & (row > first) & (row < last)
-    number = np.ones(is_pore.shape)
+    row, column = pore_places(stent)
+    number = np.ones(area_mm2.shape)
     if isinstance(stent.design, LaserCut):
         is_free = free_crowns(stent.design, shape)[1:-1]
         number -= 0.5 * (np.roll(is_free, 1, axis=1).astype(float) + np.roll(is_free, -1, axis=1))
-    return area_mm2[is_pore], lattice_mm[1:-1][is_pore], number[is_pore]
+    return area_mm2[row - 1, column], lattice_mm[row, column], number[row - 1, column]
 
 
 def density(anatomy: Anatomy, stent: Stent) -> Measures:

@@ -1,4 +1,4 @@
-"""Measure a deployed device: position, apposition, coverage, wire stretch and covered branches."""
+"""Measure a deployed device: position, apposition, coverage, wire stretch, crumpled cells and covered branches."""
 
 from functools import lru_cache
 
@@ -9,6 +9,7 @@ from vstent.anatomy.morphology import Measures
 from vstent.deployment.apposition import apposition
 from vstent.deployment.coverage import density
 from vstent.deployment.crowns import free_crowns
+from vstent.deployment.crumpling import crumpling_measures
 from vstent.deployment.sizing import oversizing_fraction
 from vstent.devices.design import LaserCut, piece_length_mm
 from vstent.devices.formulas import grid
@@ -45,6 +46,7 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
         | apposition(anatomy, deployment)
         | density(anatomy, deployment.stent)
         | _stretch(deployment.stent)
+        | crumpling_measures(anatomy, deployment.stent)
         | _free_crowns(anatomy, deployment.stent)
         | _branches(anatomy, deployment.stent)
         | {

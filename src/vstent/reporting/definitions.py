@@ -193,6 +193,22 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "p95_wire_stretch_fraction": Definition(
         "Wire stretch, 95 %", "95 % of the wires between crossings change their length by less than this."
     ),
+    "min_cell_width_fraction": Definition(
+        "Cell width, smallest",
+        "Smallest width of a cell around the artery, seen from the axis, relative to the same cell in a straight artery "
+        "of the same diameter; 0 if it is closed or on edge, negative if it is turned over.",
+    ),
+    "narrowest_cell_abscissa_mm": Definition("Narrowest cell", "Position of the narrowest cell along the parent axis."),
+    "narrowest_cell_angle_rad": Definition(
+        "Narrowest cell, angle to the inside of the bend",
+        "Angle around the axis between the narrowest cell and the inner side of the bend: 0 inside, 180° outside.",
+    ),
+    "crumpled_cells_count": Definition(
+        "Crumpled cells", "Number of cells narrower than a quarter of their width in a straight artery."
+    ),
+    "crumpled_cells_fraction": Definition(
+        "Crumpled cells, fraction", "Fraction of the cells narrower than a quarter of their width in a straight artery."
+    ),
     "free_crowns_count": Definition(
         "Free crowns", "Number of crowns of an open-cell device that are joined to no other."
     ),

@@ -1,0 +1,198 @@
+"""Crumpled cells: cells that are drawn shut or stand on edge, so that little of them is open to the wall.
+
+Struts do not stretch. On the outer side of a bend, cells are drawn out along the artery and narrow around it. Where
+the bend is too tight, single cells close or turn on edge while their neighbours open wide. Cells that are short along
+the artery, as on the inner side of a bend, are not crumpled: there the device is dense but even.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from vstent.anatomy.landing_zones import neck_span_mm
+from vstent.anatomy.morphology import Measures
+from vstent.deployment.contour import planes
+from vstent.deployment.coverage import pore_places
+from vstent.devices.formulas import grid
+from vstent.devices.stent import Stent
+from vstent.geometry.vessel import Anatomy, Centerline
+from vstent.kernels import curves
+from vstent.kernels.arrays import Floats
+
+CRUMPLED_FRACTION: Final = 0.25
+"""Width of a cell, relative to a straight artery, below which it is crumpled, without unit.
+
+In bends of one plane with a radius of 3 mm and more, in a round artery of 3.8 mm, no cell of a device of the catalogue
+that was tried is narrower (``tests/deployment/test_crumpling.py``).
+"""
+BENT: Final = 0.1
+"""Product of curvature and diameter above which an artery has an inner and an outer side, without unit."""
+BESIDE: Final = 0.5
+"""Largest cosine of the angle between a cell and the plane of the bend at which it is on neither side of the bend."""
+
+
+class Cells(NamedTuple):
+    """Cells of a device, one for every whole pore of a lattice whose crowns are all joined."""
+
+    width_fraction: Floats
+    """(k,) width seen from the axis, relative to a straight artery of the same diameter; negative if turned over."""
+    abscissa_mm: Floats
+    """(k,) arc length on the parent axis, in mm."""
+    inward: Floats
+    """(k,) cosine of the angle to the inner side of the bend: 1 on the inner side, -1 on the outer side, 0 without a
+    bend."""
+
+
+def cells(stent: Stent, axis: Centerline) -> Cells:
+    """Compute how wide the cells of a device are, seen from the axis of the artery.
+
+    Parameters
+    ----------
+    stent : Stent
+        The deployed device.
+    axis : Centerline
+        The parent axis.
+
+    Returns
+    -------
+    Cells
+        Width and place of every cell; empty where the device has no whole cell.
+
+    Notes
+    -----
+    A cell has a proximal and a distal corner, h apart, and two corners at its sides. Its vector area is A, half the
+    cross product of its diagonals. With n the unit vector from the axis through its middle, the width seen from the
+    axis is 2 A.n / |h|. In a straight artery of diameter D it is D sin(2 pi / N), N being the number of wires or of
+    struts around. Where crowns are free, both halves of a cell have tips of their own at its sides.
+    """
+    shape = grid(stent.design, stent.size)
+    joints_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
+    lower_mm = upper_mm = joints_mm  # tips of the ring below and of the ring above
+    if stent.crown_shift_mm.size:
+        lower_mm, upper_mm = joints_mm + stent.crown_shift_mm
+    row, column = pore_places(stent)
+    left, right = (column - 1) % shape.lattice_columns, (column + 1) % shape.lattice_columns
+    low_mm, high_mm = upper_mm[row - 1, column], lower_mm[row + 1, column]
+    halves_mm = [(ring[row, left], ring[row, right]) for ring in (lower_mm, upper_mm)]
+    (left_mm, right_mm), (left_above_mm, right_above_mm) = halves_mm
+    up_mm = 0.5 * (left_mm + right_mm) - low_mm, high_mm - 0.5 * (left_above_mm + right_above_mm)
+    area2_mm2 = np.cross(right_mm - left_mm, up_mm[0]) + np.cross(right_above_mm - left_above_mm, up_mm[1])
+    middle_mm = 0.25 * (low_mm + high_mm + 0.5 * (left_mm + right_mm + left_above_mm + right_above_mm))
+    abscissa_mm, outward, inward = _around(middle_mm, axis, float(stent.row_diameter_mm.mean()))
+    width_mm = np.einsum("kj,kj->k", area2_mm2, outward) / curves.lengths(up_mm[0] + up_mm[1])
+    diameter_mm = stent.row_diameter_mm[:: shape.row_split][row]
+    straight_mm = diameter_mm * np.sin(2 * np.pi / shape.lattice_columns)
+    return Cells(width_mm / straight_mm, abscissa_mm, inward)
+
+
+def _around(points_mm: Floats, axis: Centerline, diameter_mm: float) -> tuple[Floats, Floats, Floats]:
+    """Return arc lengths (k,) in mm of points (k, 3), unit vectors (k, 3) from the axis, and cosines to the inside."""
+    abscissa_mm = axis.nearest_abscissa_mm(points_mm)
+    across = planes(axis)
+    normal = across.at(abscissa_mm)[1][:, 0]
+    from_axis_mm = points_mm - axis.at(abscissa_mm)
+    from_axis_mm = from_axis_mm - np.einsum("kj,kj->k", from_axis_mm, normal)[:, None] * normal
+    outward = from_axis_mm / curves.lengths(from_axis_mm)[:, None]
+    turning = np.gradient(across.frames[:, 0], across.abscissa_mm, axis=0)
+    toward = curves.interpolate(across.abscissa_mm, turning, abscissa_mm)
+    curvature_per_mm = curves.lengths(toward)
+    is_bent = curvature_per_mm * diameter_mm > BENT
+    cosine = np.einsum("kj,kj->k", outward, toward) / np.where(is_bent, curvature_per_mm, 1.0)
+    return abscissa_mm, outward, np.where(is_bent, cosine, 0.0)
+
+
+class Crumpling(NamedTuple):
+    """How strongly the cells of a device are crumpled, and where."""
+
+    narrowest_fraction: float
+    """Smallest width of a cell, relative to a straight artery; negative if it is turned over."""
+    abscissa_mm: float
+    """Arc length of the narrowest cell on the parent axis, in mm."""
+    inward: float
+    """Cosine of the angle to the inner side of the bend: 1 on the inner side, -1 on the outer side, 0 without a bend."""
+    crumpled_count: int
+    """Number of crumpled cells."""
+    cells_count: int
+    """Number of cells."""
+
+
+def crumpling(anatomy: Anatomy, stent: Stent) -> Crumpling | None:
+    """Find the narrowest cell of a device, and count the crumpled ones.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    stent : Stent
+        The deployed device.
+
+    Returns
+    -------
+    Crumpling or None
+        The narrowest cell and the number of crumpled cells; None where the device has no whole cell.
+    """
+    found = cells(stent, anatomy.axis)
+    if not len(found.width_fraction):
+        return None
+    worst = int(found.width_fraction.argmin())
+    return Crumpling(
+        float(found.width_fraction[worst]),
+        float(found.abscissa_mm[worst]),
+        float(found.inward[worst]),
+        int((found.width_fraction < CRUMPLED_FRACTION).sum()),
+        len(found.width_fraction),
+    )
+
+
+def crumpling_measures(anatomy: Anatomy, stent: Stent) -> Measures:
+    """Return the smallest width of a cell, its place, and the number and fraction of crumpled cells; empty if none.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    stent : Stent
+        The deployed device.
+    """
+    found = crumpling(anatomy, stent)
+    if found is None:
+        return {}
+    measures: Measures = {
+        "min_cell_width_fraction": found.narrowest_fraction,
+        "narrowest_cell_abscissa_mm": found.abscissa_mm,
+        "crumpled_cells_count": float(found.crumpled_count),
+        "crumpled_cells_fraction": found.crumpled_count / found.cells_count,
+    }
+    if found.inward:
+        measures["narrowest_cell_angle_rad"] = float(np.arccos(np.clip(found.inward, -1.0, 1.0)))
+    return measures
+
+
+def place_of_narrowest(anatomy: Anatomy, found: Crumpling) -> str:
+    """Say where the narrowest cell lies: its distance from the nearer end of the neck, and the side of the bend.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The artery.
+    found : Crumpling
+        The narrowest cell.
+    """
+    side = _side(found.inward)
+    if not anatomy.aneurysms:
+        return f"at {found.abscissa_mm:.1f} mm along the parent artery{side}"
+    beyond_mm = {
+        end: found.abscissa_mm - at_mm for end, at_mm in zip(("proximal", "distal"), neck_span_mm(anatomy), strict=True)
+    }
+    end = min(beyond_mm, key=lambda name: abs(beyond_mm[name]))
+    way = "proximal" if beyond_mm[end] < 0 else "distal"
+    return f"{abs(beyond_mm[end]):.1f} mm {way} to the {end} end of the neck{side}"
+
+
+def _side(inward: float) -> str:
+    """Return a clause on the side of the bend for a cosine to its inner side; empty where the artery is straight."""
+    if inward == 0.0:
+        return ""
+    if abs(inward) < BESIDE:
+        return ", between the inner and the outer side of the bend"
+    return f", on the {'inner' if inward > 0 else 'outer'} side of the bend"
