@@ -1,8 +1,9 @@
 """Crumpled cells: cells that are drawn shut or stand on edge, so that little of them is open to the wall.
 
 Struts do not stretch. On the outer side of a bend, cells are drawn out along the artery and narrow around it. Where
-the bend is too tight, single cells close or turn on edge while their neighbours open wide. Cells that are short along
-the artery, as on the inner side of a bend, are not crumpled: there the device is dense but even.
+two tight bends follow each other in different directions, as in a siphon, single cells close or turn on edge while
+their neighbours open wide. Cells that are short along the artery, as on the inner side of a bend, are not crumpled:
+there the device is dense but even.
 """
 
 from typing import Final, NamedTuple
@@ -22,8 +23,8 @@ from vstent.kernels.arrays import Floats
 CRUMPLED_FRACTION: Final = 0.25
 """Width of a cell, relative to a straight artery, below which it is crumpled, without unit.
 
-In bends of one plane with a radius of 3 mm and more, in a round artery of 3.8 mm, no cell of a device of the catalogue
-that was tried is narrower (``tests/deployment/test_crumpling.py``).
+In a bend in one direction, with a radius of 3 mm or more, no cell of the devices tried is narrower (round artery 3.8 mm
+wide, turns of 90 and 180 degrees).
 """
 BENT: Final = 0.1
 """Product of curvature and diameter above which an artery has an inner and an outer side, without unit."""
@@ -109,7 +110,7 @@ class Crumpling(NamedTuple):
     abscissa_mm: float
     """Arc length of the narrowest cell on the parent axis, in mm."""
     inward: float
-    """Cosine of the angle to the inner side of the bend: 1 on the inner side, -1 on the outer side, 0 without a bend."""
+    """Cosine of the angle from the narrowest cell to the inner side of the bend; 0 without a bend."""
     crumpled_count: int
     """Number of crumpled cells."""
     cells_count: int

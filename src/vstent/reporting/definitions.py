@@ -195,8 +195,8 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     ),
     "min_cell_width_fraction": Definition(
         "Cell width, smallest",
-        "Smallest width of a cell around the artery, seen from the axis, relative to the same cell in a straight artery "
-        "of the same diameter; 0 if it is closed or on edge, negative if it is turned over.",
+        "Smallest width of a cell around the artery, seen from the axis, relative to the same cell in a straight "
+        "artery of the same diameter; 0 if it is closed or on edge, negative if it is turned over.",
     ),
     "narrowest_cell_abscissa_mm": Definition("Narrowest cell", "Position of the narrowest cell along the parent axis."),
     "narrowest_cell_angle_rad": Definition(
