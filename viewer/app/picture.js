@@ -7,6 +7,7 @@ import { anglesOf, axesOf, fromWords, inWords } from "./carm.js";
 import { ask } from "./dialogs.js";
 import { copied, saveButton } from "./exporting.js";
 import { askRange } from "./ranges.js";
+import { keeping, redraw } from "./redraw.js";
 
 const VIEWS = { profile: ["Profile", "The neck in profile"], whole: ["Whole", "The whole vessel"], neck: ["Neck", "From the sac onto the neck"], frontal: ["Front", "From the front"], lateral: ["Left", "From the left"] };
 const NARROW = 900;
@@ -135,7 +136,7 @@ export class Picture {
     );
     const own = this.stage && this.views.length ? [...this.host.kept().map((view) => this.keptChip(view)), this.keepChip(), ...(this.stage.isOriented === false ? [] : [this.carm])] : [];
     const save = this.stage ? [this.save] : [];
-    this.toolbar.replaceChildren(make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...own, ...save]));
+    redraw(this.toolbar, make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...own, ...save]));
     this.makeRoom();
   }
 
@@ -185,7 +186,7 @@ export class Picture {
     if (!this.stage) return;
     this.stage.show([...this.shown]);
     const scales = this.scalesShown();
-    this.bars.replaceChildren(...scales.map((scale) => colourBar(scale, [this.rangeButton(scale)])));
+    redraw(this.bars, ...scales.map((scale) => colourBar(scale, [this.rangeButton(scale)])));
     this.bars.hidden = !scales.length;
   }
 
@@ -291,12 +292,14 @@ export class Picture {
   setMarks(marks) {
     this.drawnMarks = marks;
     const elements = marks.map(({ element }) => element);
-    for (const gone of [...this.marks.children].filter((element) => !elements.includes(element))) gone.remove();
-    // One that stays is not taken out even for a moment: in hand it would be let go, in use it would lose the focus.
-    let next = this.marks.firstChild;
-    for (const element of elements)
-      if (element === next) next = next.nextSibling;
-      else this.marks.insertBefore(element, next);
+    keeping(this.marks, () => {
+      for (const gone of [...this.marks.children].filter((element) => !elements.includes(element))) gone.remove();
+      // One that stays is not taken out even for a moment: in hand it would be let go.
+      let next = this.marks.firstChild;
+      for (const element of elements)
+        if (element === next) next = next.nextSibling;
+        else this.marks.insertBefore(element, next);
+    });
     if (this.stage) this.placeMarks();
     this.stage?.redraw();
   }
