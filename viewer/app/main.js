@@ -136,6 +136,7 @@ class Page {
       complain: (problem) => this.complain(problem),
       kept: () => this.view?.choices.views ?? [],
       keep: (views) => this.choose({ views }),
+      keepRanges: (ranges) => this.choose({ ranges }),
     });
     this.ranking = new Ranking(this);
     this.sacLabel = new SacLabel(this.picture);
@@ -199,6 +200,7 @@ class Page {
     this.view = view;
     document.title = `${view.name} · vstent`;
     this.caseName.textContent = view.name;
+    if (before?.id !== view.id || JSON.stringify(before.choices.ranges) !== JSON.stringify(view.choices.ranges)) this.picture.setRanges(view.choices.ranges);
     this.undoButton.disabled = !view.can_undo;
     this.redoButton.disabled = !view.can_redo;
     this.renderSteps();

@@ -14,7 +14,7 @@ const NARROW = 900;
 const EMPTY = { scales: [], layers: [], views: [], fade: 2 };
 
 export class Picture {
-  /** @param host {complain(problem), kept(): views that were saved, keep(views)} */
+  /** @param host {complain(problem), kept(): views that were saved, keep(views), keepRanges(ranges)} */
   constructor(host) {
     this.host = host;
     this.canvas = make("canvas", { className: "viewer-canvas", ariaHidden: "true" });
@@ -45,6 +45,7 @@ export class Picture {
     this.drawnMarks = [];
     this.moved = null;
     this.clicked = null;
+    this.ranges = [];
     try {
       this.stage = new Stage(this.canvas, EMPTY, new ArrayBuffer(0));
     } catch (problem) {
@@ -190,14 +191,26 @@ export class Picture {
     this.bars.hidden = !scales.length;
   }
 
+  /** Color by these ranges, [{scale, low, high}], and every other scale as it was computed. */
+  setRanges(ranges) {
+    if (!this.stage || JSON.stringify(ranges) === JSON.stringify(this.ranges)) return;
+    const gone = this.ranges.map(({ scale }) => [scale, null]);
+    this.ranges = ranges;
+    const given = new Map([...gone, ...ranges.map(({ scale, low, high }) => [scale, { low, high }])]);
+    for (const [id, range] of given) this.stage.setRange(id, range);
+    this.apply();
+  }
+
   /** The button that changes the range of a scale. */
   rangeButton(scale) {
     const { stage } = this;
     const change = async () => {
       const fit = stage.extent((layer) => layer.scale === scale.id && this.shown.has(layer.id));
       const range = await askRange(scale, fit);
-      if (range !== undefined) stage.setRange(scale.id, range);
-      this.apply();
+      if (range === undefined) return;
+      const others = this.ranges.filter((one) => one.scale !== scale.id);
+      this.setRanges(range ? [...others, { scale: scale.id, ...range }] : others);
+      this.host.keepRanges(this.ranges);
     };
     return make("button", { type: "button", className: "link range", title: "Change the range of these colours", ariaLabel: `Range of ${scale.title}`, onClick: change }, [stage.ranges[scale.id] ? "range (own)" : "range"]);
   }
