@@ -51,24 +51,24 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         page.wait_for_selector(".step.done:nth-child(3)")
         step(page, "Vessel")
         page.wait_for_selector(".opening b")
-        assert page.locator(".opening-row.inlet").count() == 1
-        assert drawn(page, page.locator(".viewer-area").bounding_box()) > 0.05
+        playwright.expect(page.locator(".opening-row.inlet")).to_have_count(1)
+        assert in_time(page, lambda: drawn(page, page.locator(".viewer-area").bounding_box()) > 0.05)
         trim_and_draw_the_neck(client, page)
         step(page, "Deploy")
         page.wait_for_selector(".sheet .row")
         before = place_of(page, "distal")
-        assert ramps_are_true(page, 1)  # gap to the wall, whose title is wider than its ramp
+        assert in_time(page, lambda: ramps_are_true(page, 1))  # gap to the wall, whose title is wider than its ramp
         drag(page, ".handle.distal .knob", -60, 0)
         page.wait_for_selector(".step.done:nth-child(5)")
         page.wait_for_function("() => !document.querySelector('button[aria-label=Undo]').disabled")
+        assert in_time(page, lambda: abs(place_of(page, "distal") - before) > 0.5)
         after = place_of(page, "distal")
-        assert abs(after - before) > 0.5
         view = client.get(f"/api/cases/{client.get('/api/cases').json()['cases'][0]['id']}").json()
         assert view["choices"]["devices"][0]["center_mm"] is not None
         # What was done is there after the page has been loaded anew.
         page.reload()
         page.wait_for_selector(".sheet .row")
-        assert place_of(page, "distal") == pytest.approx(after, abs=0.11)
+        assert in_time(page, lambda: place_of(page, "distal") == pytest.approx(after, abs=0.11))
         page.keyboard.press("Control+z")
         page.wait_for_function("() => document.querySelector('button[aria-label=Undo]').disabled")
 
@@ -105,7 +105,7 @@ def test_the_blood_follows_a_device_that_is_dragged(artery, tmp_path):
         over_neck = inflow_percent(page)
         assert over_neck < -15
         assert page.locator(".chip", has_text="Live flow").get_attribute("aria-pressed") == "true"
-        assert ramps_are_true(page, 2)  # gap to the wall, speed
+        assert in_time(page, lambda: ramps_are_true(page, 2))  # gap to the wall, speed
         drag(page, ".handle.distal .knob", -60, 0)
         assert page.locator(".live.stale").count() == 1
         page.locator(".handle.distal").focus()
@@ -129,14 +129,14 @@ def test_sizes_are_sorted_compared_and_saved_as_a_picture(artery, tmp_path):
         playwright.expect(page.locator(".work")).to_be_hidden(timeout=120 * SECOND)
         found = client.get(f"/api/cases/{client.get('/api/cases').json()['cases'][0]['id']}/ranking").json()["rows"]
         page.get_by_role("button", name="Length", exact=True).click()
+        playwright.expect(page.locator("th[aria-sort=ascending]")).to_have_text("Length ↑")
         lengths = [float(words.split()[0]) for words in rows.locator("td:nth-child(6)").all_inner_texts()]
         assert lengths == sorted(lengths)
-        assert page.locator("th[aria-sort=ascending]").count() == 1
         page.get_by_label("suitable only").check()
-        assert rows.count() == sum(row["is_suitable"] for row in found)
+        playwright.expect(rows).to_have_count(sum(row["is_suitable"] for row in found))
         page.get_by_label("suitable only").uncheck()
         page.get_by_label("best of each device").check()
-        assert rows.count() == 1
+        playwright.expect(rows).to_have_count(1)
         page.get_by_label("best of each device").uncheck()
         for k in range(4):
             page.locator("td.compare input").nth(k).check()
@@ -145,8 +145,8 @@ def test_sizes_are_sorted_compared_and_saved_as_a_picture(artery, tmp_path):
         playwright.expect(panes).to_have_count(4)
         tops = {round(panes.nth(k).bounding_box()["y"]) for k in range(4)}
         assert len(tops) == 2  # two rows of two
-        assert page.locator(".sheet.columns-4 .row.head b").count() == 4
-        assert drawn(page, panes.nth(3).bounding_box()) > 0.05
+        playwright.expect(page.locator(".sheet.columns-4 .row.head b")).to_have_count(4)
+        assert in_time(page, lambda: drawn(page, panes.nth(3).bounding_box()) > 0.05)
         panes.nth(3).locator(".viewer-solo").click()
         assert [panes.nth(k).is_visible() for k in range(4)] == [False, False, False, True]
         panes.nth(3).locator(".viewer-solo").click()
@@ -178,6 +178,7 @@ def test_a_tick_lets_blood_enter_by_an_opening_as_well(artery, tmp_path):
         page.wait_for_selector(".step.done:nth-child(3)")
         step(page, "Vessel")
         boxes, rows = page.locator(".brings input"), page.locator(".opening-row")
+        boxes.nth(2).wait_for()
         assert [boxes.nth(k).is_checked() for k in range(3)] == [True, False, False]
         assert boxes.nth(0).is_disabled()
         boxes.nth(2).check()
@@ -185,14 +186,14 @@ def test_a_tick_lets_blood_enter_by_an_opening_as_well(artery, tmp_path):
         page.get_by_role("heading", name="Sac and parent").wait_for()
         step(page, "Vessel")
         playwright.expect(rows.nth(1)).to_contain_text("Inlet 2", timeout=120 * SECOND)
-        assert [boxes.nth(k).is_checked() for k in range(3)] == [True, True, False]
+        assert in_time(page, lambda: [boxes.nth(k).is_checked() for k in range(3)] == [True, True, False])
         playwright.expect(page.locator(".given")).to_contain_text("; ")
         view = client.get(f"/api/cases/{client.get('/api/cases').json()['cases'][0]['id']}").json()
         ends_mm = [phantoms.demo_phantom().ends[k][0] for k in (0, 2)]
         np.testing.assert_allclose(view["choices"]["inlet_mm"], ends_mm, atol=0.05)
         boxes.nth(1).uncheck()
         playwright.expect(page.locator(".given")).not_to_contain_text("; ")
-        assert boxes.nth(1).is_checked() is False
+        playwright.expect(boxes.nth(1)).not_to_be_checked()
 
 
 def chosen(client):
@@ -259,7 +260,7 @@ def whole_way(client, page, path):
         step(page, title)
         page.wait_for_selector(".step[aria-current=step]:has-text('" + title + "')")
         playwright.expect(page.locator(".right .sheet")).to_contain_text("mm³")
-        assert drawn(page, page.locator(".viewer-area").bounding_box()) > 0.05
+        assert in_time(page, lambda: drawn(page, page.locator(".viewer-area").bounding_box()) > 0.05)
     step(page, "Device")
     page.locator("[data-key=device-silk]").uncheck()
     page.wait_for_selector("[data-key=device-silk]:not(:checked)")
@@ -273,7 +274,7 @@ def whole_way(client, page, path):
     page.get_by_role("button", name="Run the flow").click()
     page.wait_for_selector(".step.done:nth-child(7)", timeout=1200 * SECOND)
     page.wait_for_selector(".card")
-    assert page.locator(".viewer-pane").count() == 2
+    playwright.expect(page.locator(".viewer-pane")).to_have_count(2)
     look_at_the_angiogram(page)
     step(page, "Report")
     with page.context.expect_page() as opened:
@@ -294,10 +295,10 @@ def look_at_the_angiogram(page):
     page.get_by_role("button", name="Angiogram", exact=True).click()
     page.get_by_role("button", name="Compute the angiogram").click()
     page.wait_for_selector(".film-canvas", timeout=1200 * SECOND)
-    assert page.locator(".film-canvas").count() == 2
-    assert page.locator(".curve").count() == 4
+    playwright.expect(page.locator(".film-canvas")).to_have_count(2)
+    playwright.expect(page.locator(".curve")).to_have_count(4)
     page.locator(".film-time input").fill("14")
-    assert page.locator(".film-clock").inner_text() == "0.93 s"
+    playwright.expect(page.locator(".film-clock")).to_have_text("0.93 s")
     page.fill("#field-carm", "LAO 30 CRA 10")
     page.keyboard.press("Tab")
     shown = page.locator(".film-pane figcaption span").first

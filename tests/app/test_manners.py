@@ -50,7 +50,7 @@ def test_the_page_keeps_its_manners(client):
         assert page.locator("#field-outlet option").first.inner_text() == "outlet 1 (proposed)"
         page.go_back()
         heading(page, "Vessel")
-        definitions_are_shown(page)
+        definitions_are_shown(client, page)
         step(page, "Flow")
         # The inflow that is proposed: 0.27 m/s through an inlet of 2 mm radius.
         playwright.expect(page.locator("#field-inflow")).to_have_attribute("placeholder", re.compile(r"\d"))
@@ -61,30 +61,76 @@ def test_the_page_keeps_its_manners(client):
         cases_are_renamed_and_deleted(client, page)
 
 
-def definitions_are_shown(page):
-    """By keys and by touch, and read as a description."""
-    term = page.locator(".term.defined").first
+def definitions_are_shown(client, page):
+    """By keys and by touch, and read as a description; a redraw takes neither the definition nor the focus away."""
+    page.locator(".sheet .term.defined").first.wait_for()
     tip = page.locator(".tip")
-    page.keyboard.press("Tab")
-
-    def is_described():
-        term.focus()  # the numbers are drawn anew while they come
-        return term.get_attribute("aria-describedby") == "tip"
-
-    assert in_time(page, is_described)
-    # Bringing a term into view scrolls, and moves other things below the pointer; its definition stays.
-    page.evaluate("""() => {
-        document.activeElement.parentElement.dispatchEvent(new Event("scroll", { bubbles: true }));
-        document.body.dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
+    page.keyboard.press("Tab")  # from here on the focus is seen
+    name = page.evaluate("""() => {
+        const term = document.querySelector(".sheet .term.defined");
+        term.focus();
+        return term.textContent;
     }""")
-    assert term.get_attribute("aria-describedby") == "tip"
-    playwright.expect(tip).to_be_visible()
-    assert len(tip.inner_text()) > 20
+    described = page.locator(".term:focus")
+    playwright.expect(described).to_have_text(name)
+    playwright.expect(described).to_have_attribute("aria-describedby", "tip")
+    # Bringing a term into view scrolls, and moves other things below the pointer; its definition stays.
+    assert (
+        page.evaluate("""() => {
+        const term = document.activeElement;
+        term.parentElement.dispatchEvent(new Event("scroll", { bubbles: true }));
+        document.body.dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
+        return term.getAttribute("aria-describedby");
+    }""")
+        == "tip"
+    )
+    page.evaluate(WATCHED)
+    meaning = tip.inner_text()
+    assert len(meaning) > 20
+    redrawn(client, page)
+    playwright.expect(described).to_have_text(name)
+    playwright.expect(described).to_have_attribute("aria-describedby", "tip")
+    assert set(page.evaluate("shown")) == {meaning}
     page.keyboard.press("Escape")
     playwright.expect(tip).to_be_hidden()
-    term.click()
+    for place in (".step[data-key=vessel]", ".panel .next", ".picture-tools .chip.view >> nth=0"):
+        words = page.locator(place).inner_text()
+        page.locator(place).focus()
+        redrawn(client, page)
+        playwright.expect(page.locator(":focus")).to_have_text(words, use_inner_text=True)
+    page.keyboard.press("Escape")
+    page.locator(".sheet .term.defined").first.click()
     playwright.expect(tip).to_be_visible()
     page.keyboard.press("Escape")
+
+
+WATCHED = """() => {
+    window.shown = [];
+    const look = () => {
+        shown.push(document.querySelector(".tip:not([hidden])")?.textContent);
+        requestAnimationFrame(look);
+    };
+    look();
+}"""
+"""Notes the definition that every frame shows."""
+
+
+def redrawn(client, page):
+    """Draw every part anew, by a view that another window saves."""
+    page.evaluate("document.querySelector('.numbers').firstChild.isOld = true")
+    case = client.get("/api/cases/analytic").json()
+    views = case["choices"]["views"]
+    view = {
+        "name": f"Another {len(views)}",
+        "axes": [1, 0, 0, 0, 1, 0, 0, 0, 1],
+        "center_mm": [0, 0, 0],
+        "distance_mm": 9,
+    }
+    choices = {**case["choices"], "views": [*views, view]}
+    client.put(
+        "/api/cases/analytic/choices", json={"revision": case["revision"], "choices": choices}
+    ).raise_for_status()
+    assert in_time(page, lambda: page.evaluate("!document.querySelector('.numbers').firstChild.isOld"))
 
 
 def find_again_where_it_is_offered(client, page):

@@ -48,14 +48,22 @@ DRAGGED = """async () => {
 """Drags one end to and fro for six seconds."""
 
 
-def test_a_drag_does_not_wait_for_the_live_flow(tmp_path, record_property):
-    """The answer takes at most 60 ms more with the live flow, also where the browser draws without a GPU."""
+@pytest.fixture(params=["demo", "C0038"])
+def artery(request, tmp_path):
+    """Surface of the demo phantom, and of a real carotid."""
+    if request.param == "C0038":
+        return request.getfixturevalue("shared_data") / "aneurisk_C0038.vtp"
     path = tmp_path / "phantom.stl"
     write_stl(path, app_case.phantom_surface())
+    return path
+
+
+def test_a_drag_does_not_wait_for_the_live_flow(artery, tmp_path, record_property):
+    """The answer takes at most 60 ms more with the live flow, also where the browser draws without a GPU."""
     with app_case.served(tmp_path / "cases") as client, browsing(client, 1366, 768) as page:
         page.add_init_script(TIMED)
         page.reload()
-        drop(page, path)
+        drop(page, artery)
         page.wait_for_selector(".step.done:nth-child(3)")
         step(page, "Deploy")
         word = page.locator(".handle.distal .handle-word")

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import app_case
 import numpy as np
 import pytest
-from browsing import SECOND, browsing, needs_browser, playwright, step
+from browsing import SECOND, browsing, in_time, needs_browser, playwright, step
 from test_image_step import analytic_case
 
 from vstent.angiography.view import axes_of
@@ -88,7 +88,7 @@ def test_any_view_is_saved_as_png_and_as_svg(client):
         step(page, "Deploy")
         playwright.expect(page.locator(".handle.distal .handle-word")).to_contain_text("mm", timeout=120 * SECOND)
         views_are_kept_and_turned_by_angles(client, page)
-        ranges_are_chosen(page)
+        ranges_are_chosen(client, page)
         before = page.locator(".viewer-area").bounding_box()
         scene_is_saved(page)
         assert page.locator(".viewer-area").bounding_box() == before
@@ -170,8 +170,8 @@ def views_are_kept_and_turned_by_angles(client, page):
     page.wait_for_timeout(800)
 
 
-def ranges_are_chosen(page):
-    """A range of one's own is on the bar and in the colors; the computed one comes back."""
+def ranges_are_chosen(client, page):
+    """A range of one's own is on the bar and in the colors, after a reload as well; the computed one comes back."""
     ticks = page.locator(".picture-bars .viewer-ticks span")
     playwright.expect(ticks.last).to_be_visible()
     computed = ticks.all_inner_texts()
@@ -181,13 +181,19 @@ def ranges_are_chosen(page):
     page.locator(".save-form input").nth(1).fill("1")
     page.get_by_role("button", name="Use", exact=True).click()
     playwright.expect(ticks.last).to_have_text("1")
-    assert ticks.first.inner_text() == "-1"
-    page.wait_for_timeout(300)
-    assert np.abs(pixels(page.screenshot())[0] - before).max() > 40
+    playwright.expect(ticks.first).to_have_text("-1")
+    assert in_time(page, lambda: np.abs(pixels(page.screenshot())[0] - before).max() > 40)
+    kept = {"scale": "wall_gap", "low": -1.0, "high": 1.0}
+    assert in_time(page, lambda: client.get("/api/cases/analytic").json()["choices"]["ranges"] == [kept])
+    page.reload()
+    playwright.expect(ticks.last).to_have_text("1")
+    playwright.expect(ticks.first).to_have_text("-1")
+    playwright.expect(page.locator(".link.range")).to_have_text("range (own)")
     page.get_by_role("button", name="Range of Gap between device and wall").click()
     page.get_by_role("button", name="As computed").click()
     page.get_by_role("button", name="Use", exact=True).click()
     playwright.expect(ticks.last).to_have_text(computed[-1])
+    assert in_time(page, lambda: client.get("/api/cases/analytic").json()["choices"]["ranges"] == [])
 
 
 def charts_are_saved(page):

@@ -30,7 +30,7 @@ export class Comparing {
     const key = this.keyOf(row);
     const isTicked = this.rows.some((one) => this.keyOf(one) === key);
     const box = make("input", { type: "checkbox", checked: isTicked, disabled: !isTicked && this.rows.length >= MOST, ariaLabel: `Compare ${words}` });
-    box.dataset.sort = `compare ${key}`;
+    box.dataset.key = `compare ${key}`;
     box.addEventListener("change", () => {
       this.rows = box.checked ? [...this.rows, row] : this.rows.filter((one) => this.keyOf(one) !== key);
       if (this.isOn && this.rows.length) this.ask();

@@ -15,6 +15,7 @@ import { bandWords, changeSheet, neckWords, placeWords, plainSheet, qualitySheet
 import { panels, placeOf, spokenRole } from "./panels.js";
 import { Picture } from "./picture.js";
 import { Ranking } from "./ranking.js";
+import { redraw } from "./redraw.js";
 import { startPage } from "./start.js";
 import { listenForTips } from "./tips.js";
 import { Trimming } from "./trimming.js";
@@ -135,6 +136,7 @@ class Page {
       complain: (problem) => this.complain(problem),
       kept: () => this.view?.choices.views ?? [],
       keep: (views) => this.choose({ views }),
+      keepRanges: (ranges) => this.choose({ ranges }),
     });
     this.ranking = new Ranking(this);
     this.sacLabel = new SacLabel(this.picture);
@@ -198,6 +200,7 @@ class Page {
     this.view = view;
     document.title = `${view.name} · vstent`;
     this.caseName.textContent = view.name;
+    if (before?.id !== view.id || JSON.stringify(before.choices.ranges) !== JSON.stringify(view.choices.ranges)) this.picture.setRanges(view.choices.ranges);
     this.undoButton.disabled = !view.can_undo;
     this.redoButton.disabled = !view.can_redo;
     this.renderSteps();
@@ -319,7 +322,8 @@ class Page {
   // -- what is drawn anew when something has changed ----------------------------------------------------------------
 
   renderSteps() {
-    this.stepper.replaceChildren(
+    redraw(
+      this.stepper,
       ...STEPS.map(([name, title], i) => {
         const status = this.view.steps[name];
         const button = make(
@@ -327,6 +331,7 @@ class Page {
           { type: "button", className: `step ${status}`, title: `${title}: ${WORDS[status]}`, ariaCurrent: name === this.step ? "step" : "false", onClick: () => this.go(name) },
           [make("span", { className: "sign" }, [SIGNS[status] || (status === "running" ? "" : String(i + 1))]), make("span", {}, [title])],
         );
+        button.dataset.key = name;
         return button;
       }),
     );
@@ -348,9 +353,7 @@ class Page {
   render() {
     if (!this.view) return;
     this.frame.dataset.step = this.step;
-    const focus = document.activeElement?.dataset?.key;
-    this.panel.replaceChildren(...panels[this.step](this));
-    if (focus) this.panel.querySelector(`[data-key="${focus}"]`)?.focus();
+    redraw(this.panel, ...panels[this.step](this));
     this.renderScene();
     this.renderStrip();
     this.renderNumbers();
@@ -465,7 +468,7 @@ class Page {
     }[this.step]?.() || [];
     this.frame.classList.toggle("with-strip", parts.length > 0);
     if (parts.length && ["deploy", "device"].includes(this.step) && this.strip.firstChild === parts[0]) return;
-    this.strip.replaceChildren(...parts);
+    redraw(this.strip, ...parts);
   }
 
   /** Whether the films are shown in place of the 3-D picture. */
@@ -499,15 +502,15 @@ class Page {
     const stop = make("button", { type: "button", onClick: () => drop(`${this.path}/jobs`).catch((problem) => this.complain(problem)) }, ["Cancel"]);
     const done = job.finished.map(({ stage }) => this.spoken(stage));
     const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "The work continues when this tab is closed."]);
-    this.work.replaceChildren(words, make("div", { className: "bar", role: "progressbar", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
+    redraw(this.work, words, make("div", { className: "bar", role: "progressbar", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
   }
 
   renderNumbers() {
-    const head = (title) =>
-      make("div", { className: "numbers-head" }, [
-        make("h2", {}, [title]),
-        make("button", { type: "button", className: "link", onClick: () => ((this.isWhole = !this.isWhole), this.renderNumbers()) }, [this.isWhole ? "Fewer" : "All"]),
-      ]);
+    const head = (title) => {
+      const more = make("button", { type: "button", className: "link", onClick: () => ((this.isWhole = !this.isWhole), this.renderNumbers()) }, [this.isWhole ? "Fewer" : "All"]);
+      more.dataset.key = `whole ${title}`;
+      return make("div", { className: "numbers-head" }, [make("h2", {}, [title]), more]);
+    };
     const parts = [];
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
@@ -523,7 +526,7 @@ class Page {
     if (this.sheets?.anatomy?.length && !(flow && ["flow", "report"].includes(this.step))) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));
     if (!parts.length) parts.push(make("h2", {}, ["Numbers"]), make("p", { className: "hint" }, ["Metrics appear here when a step is finished, each with its unit and definition."]));
     else parts.push(make("p", { className: "hint" }, ["Rest on a name, or touch it, to see its definition."]));
-    this.numbers.replaceChildren(...parts);
+    redraw(this.numbers, ...parts);
   }
 
   toldDevice(name, manifest, isWhole) {
@@ -544,7 +547,8 @@ class Page {
   /** The bands of the device that lies still; null while it is dragged. */
   toldBands(sheet) {
     this.bands = sheet;
-    this.panel.querySelector(".bands")?.replaceChildren(...bandWords(sheet));
+    const bands = this.panel.querySelector(".bands");
+    if (bands) redraw(bands, ...bandWords(sheet));
   }
 
   /** A stage of a job in words: ``flow silk``. */

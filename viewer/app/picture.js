@@ -7,13 +7,14 @@ import { anglesOf, axesOf, fromWords, inWords } from "./carm.js";
 import { ask } from "./dialogs.js";
 import { copied, saveButton } from "./exporting.js";
 import { askRange } from "./ranges.js";
+import { keeping, redraw } from "./redraw.js";
 
 const VIEWS = { profile: ["Profile", "The neck in profile"], whole: ["Whole", "The whole vessel"], neck: ["Neck", "From the sac onto the neck"], frontal: ["Front", "From the front"], lateral: ["Left", "From the left"] };
 const NARROW = 900;
 const EMPTY = { scales: [], layers: [], views: [], fade: 2 };
 
 export class Picture {
-  /** @param host {complain(problem), kept(): views that were saved, keep(views)} */
+  /** @param host {complain(problem), kept(): views that were saved, keep(views), keepRanges(ranges)} */
   constructor(host) {
     this.host = host;
     this.canvas = make("canvas", { className: "viewer-canvas", ariaHidden: "true" });
@@ -44,6 +45,7 @@ export class Picture {
     this.drawnMarks = [];
     this.moved = null;
     this.clicked = null;
+    this.ranges = [];
     try {
       this.stage = new Stage(this.canvas, EMPTY, new ArrayBuffer(0));
     } catch (problem) {
@@ -135,7 +137,7 @@ export class Picture {
     );
     const own = this.stage && this.views.length ? [...this.host.kept().map((view) => this.keptChip(view)), this.keepChip(), ...(this.stage.isOriented === false ? [] : [this.carm])] : [];
     const save = this.stage ? [this.save] : [];
-    this.toolbar.replaceChildren(make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...own, ...save]));
+    redraw(this.toolbar, make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...own, ...save]));
     this.makeRoom();
   }
 
@@ -185,8 +187,18 @@ export class Picture {
     if (!this.stage) return;
     this.stage.show([...this.shown]);
     const scales = this.scalesShown();
-    this.bars.replaceChildren(...scales.map((scale) => colourBar(scale, [this.rangeButton(scale)])));
+    redraw(this.bars, ...scales.map((scale) => colourBar(scale, [this.rangeButton(scale)])));
     this.bars.hidden = !scales.length;
+  }
+
+  /** Color by these ranges, [{scale, low, high}], and every other scale as it was computed. */
+  setRanges(ranges) {
+    if (!this.stage || JSON.stringify(ranges) === JSON.stringify(this.ranges)) return;
+    const gone = this.ranges.map(({ scale }) => [scale, null]);
+    this.ranges = ranges;
+    const given = new Map([...gone, ...ranges.map(({ scale, low, high }) => [scale, { low, high }])]);
+    for (const [id, range] of given) this.stage.setRange(id, range);
+    this.apply();
   }
 
   /** The button that changes the range of a scale. */
@@ -195,8 +207,10 @@ export class Picture {
     const change = async () => {
       const fit = stage.extent((layer) => layer.scale === scale.id && this.shown.has(layer.id));
       const range = await askRange(scale, fit);
-      if (range !== undefined) stage.setRange(scale.id, range);
-      this.apply();
+      if (range === undefined) return;
+      const others = this.ranges.filter((one) => one.scale !== scale.id);
+      this.setRanges(range ? [...others, { scale: scale.id, ...range }] : others);
+      this.host.keepRanges(this.ranges);
     };
     return make("button", { type: "button", className: "link range", title: "Change the range of these colours", ariaLabel: `Range of ${scale.title}`, onClick: change }, [stage.ranges[scale.id] ? "range (own)" : "range"]);
   }
@@ -291,12 +305,14 @@ export class Picture {
   setMarks(marks) {
     this.drawnMarks = marks;
     const elements = marks.map(({ element }) => element);
-    for (const gone of [...this.marks.children].filter((element) => !elements.includes(element))) gone.remove();
-    // One that stays is not taken out even for a moment: in hand it would be let go, in use it would lose the focus.
-    let next = this.marks.firstChild;
-    for (const element of elements)
-      if (element === next) next = next.nextSibling;
-      else this.marks.insertBefore(element, next);
+    keeping(this.marks, () => {
+      for (const gone of [...this.marks.children].filter((element) => !elements.includes(element))) gone.remove();
+      // One that stays is not taken out even for a moment: in hand it would be let go.
+      let next = this.marks.firstChild;
+      for (const element of elements)
+        if (element === next) next = next.nextSibling;
+        else this.marks.insertBefore(element, next);
+    });
     if (this.stage) this.placeMarks();
     this.stage?.redraw();
   }

@@ -2,6 +2,7 @@
 import { make } from "../src/dom.js";
 import { get } from "./api.js";
 import { Comparing } from "./comparing.js";
+import { redraw } from "./redraw.js";
 
 const percent = (v) => `${(100 * v).toFixed(0)} %`;
 const change = (v) => `${v > 0 ? "+" : v < 0 ? "−" : ""}${Math.abs(100 * v).toFixed(0)} %`;
@@ -58,7 +59,6 @@ export class Ranking {
     if (!rows.length) return this.box.replaceChildren(make("p", { className: "hint" }, ["The sizes are being deployed …"]));
     const scroll = this.box.querySelector(".ranking-scroll");
     const at = scroll ? [scroll.scrollLeft, scroll.scrollTop] : [0, 0];
-    const focus = document.activeElement?.dataset?.sort;
     const shown = this.shown();
     const suits = rows.filter((row) => row.is_suitable).length;
     const head = make("div", { className: "ranking-head" }, [
@@ -71,12 +71,10 @@ export class Ranking {
     const body = shown.slice(0, MOST_ROWS).map((row) => this.line(row));
     const table = make("table", {}, [make("thead", {}, [make("tr", {}, [make("th", { scope: "col" }, ["Compare"]), ...this.columns().map((column) => this.heading(column))])]), make("tbody", {}, body)]);
     const said = this.columns().map(([, title, meaning]) => make("div", {}, [make("dt", {}, [title]), make("dd", {}, [meaning])]));
-    const explained = make("details", { className: "explained", open: this.isExplained }, [make("summary", {}, ["What the columns mean"]), make("dl", {}, said)]);
-    explained.addEventListener("toggle", () => (this.isExplained = explained.open));
+    const explained = make("details", { className: "explained" }, [make("summary", {}, ["What the columns mean"]), make("dl", {}, said)]);
     const next = make("div", { className: "ranking-scroll", tabIndex: 0, role: "region", ariaLabel: "Ranking of all sizes" }, [table, explained]);
-    this.box.replaceChildren(head, next);
+    redraw(this.box, head, next);
     [next.scrollLeft, next.scrollTop] = at;
-    if (focus) this.box.querySelector(`[data-sort="${focus}"]`)?.focus();
   }
 
   columns() {
@@ -107,7 +105,7 @@ export class Ranking {
   filters() {
     const tick = (name, words) => {
       const box = make("input", { type: "checkbox", checked: this[name] });
-      box.dataset.sort = name;
+      box.dataset.key = name;
       box.addEventListener("change", () => {
         this[name] = box.checked;
         this.draw();
@@ -116,7 +114,7 @@ export class Ranking {
     };
     const options = [["", "all devices"], ...Object.entries(this.found.names)];
     const select = make("select", { ariaLabel: "Device" }, options.map(([key, name]) => make("option", { value: key, selected: key === this.device }, [name])));
-    select.dataset.sort = "filter";
+    select.dataset.key = "filter";
     select.addEventListener("change", () => {
       this.device = select.value;
       this.draw();
@@ -131,7 +129,7 @@ export class Ranking {
       this.sort = [key, sorted === key ? -way : key === "score" ? -1 : 1];
       this.draw();
     } }, [title + sign]);
-    button.dataset.sort = key;
+    button.dataset.key = key;
     const head = make("th", { scope: "col" }, [button]);
     head.setAttribute("aria-sort", sorted === key ? (way > 0 ? "ascending" : "descending") : "none");
     return head;

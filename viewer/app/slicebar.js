@@ -1,6 +1,7 @@
 // The bar over the slices: tools, window presets, slab, outlines, and what is under the pointer.
 import { make } from "../src/dom.js";
 import { copied, saveButton } from "./exporting.js";
+import { redraw } from "./redraw.js";
 import { LINES, SEED } from "./sliceview.js";
 
 const TOOLS = [
@@ -107,11 +108,10 @@ export class SliceBar {
 
   renderTools() {
     const { slices } = this;
-    const focus = this.tools.contains(document.activeElement) ? document.activeElement.dataset.tool : null;
-    this.tools.replaceChildren(
+    redraw(
+      this.tools,
       ...TOOLS.map(([id, title, hint]) => {
         const button = make("button", { type: "button", title: hint, ariaPressed: String(slices.tool === id), onClick: () => slices.setTool(id) }, [title]);
-        button.dataset.tool = id;
         if (id === "crop" && slices.isUpright) {
           button.disabled = true;
           button.title = "The crop box lies along the axes of the file: choose them for the slices first";
@@ -119,11 +119,10 @@ export class SliceBar {
         return button;
       }),
     );
-    if (focus) this.tools.querySelector(`[data-tool="${focus}"]`)?.focus();
     const extra = [];
     if (slices.rulers.length) extra.push(`${slices.rulers.at(-1).mm.toFixed(1)} mm`, this.small("Remove rulers", () => slices.clearRulers()));
     if (slices.scan && slices.isCropped) extra.push(this.small("Whole scan", () => (slices.setCrop(null), slices.letCropGo())));
-    this.extra.replaceChildren(...extra);
+    redraw(this.extra, ...extra);
   }
 
   small(title, act) {
@@ -134,24 +133,19 @@ export class SliceBar {
     const { slices } = this;
     const found = Boolean(slices.found);
     const has = { threshold: slices.threshold !== null, lumen: found, parent: found, sac: found && slices.hasSac, neck: found && slices.hasSac, wires: found && Boolean(slices.device) };
-    const focus = this.chips.contains(document.activeElement) ? document.activeElement.dataset.line : null;
-    this.chips.replaceChildren(
-      ...Object.entries(LINES)
-        .filter(([name]) => has[name])
-        .map(([name, { title, colour, dash, width }]) => {
-          const swatch = make("i", { className: name === "wires" ? "swatch wires" : "swatch" });
-          swatch.style.borderTop = `${Math.round(width + 0.6)}px ${dash.length ? (dash[0] > 4 ? "dashed" : "dotted") : "solid"} ${colour}`;
-          const button = make("button", { type: "button", className: "slice-chip", ariaPressed: String(slices.on[name]), onClick: () => slices.toggle(name) }, [swatch, title]);
-          button.dataset.line = name;
-          return button;
-        }),
-    );
+    const chips = Object.entries(LINES)
+      .filter(([name]) => has[name])
+      .map(([name, { title, colour, dash, width }]) => {
+        const swatch = make("i", { className: name === "wires" ? "swatch wires" : "swatch" });
+        swatch.style.borderTop = `${Math.round(width + 0.6)}px ${dash.length ? (dash[0] > 4 ? "dashed" : "dotted") : "solid"} ${colour}`;
+        return make("button", { type: "button", className: "slice-chip", ariaPressed: String(slices.on[name]), onClick: () => slices.toggle(name) }, [swatch, title]);
+      });
     if (slices.seed) {
       const dot = make("i", { className: "swatch seed" });
       dot.style.borderColor = SEED;
-      this.chips.append(make("button", { type: "button", className: "slice-chip", title: "Turn the slices to the seed", onClick: () => slices.put(slices.seed) }, [dot, "Seed"]));
+      chips.push(make("button", { type: "button", className: "slice-chip", title: "Turn the slices to the seed", onClick: () => slices.put(slices.seed) }, [dot, "Seed"]));
     }
-    if (focus) this.chips.querySelector(`[data-line="${focus}"]`)?.focus();
+    redraw(this.chips, ...chips);
   }
 
   /** Value and position under the pointer, or at the cross-hair. */

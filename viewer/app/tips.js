@@ -10,9 +10,13 @@ let timer;
 export function listenForTips(root) {
   root.append(tip);
   const find = (event) => taken(event.target instanceof Element ? event.target.closest("[title], [data-tip]") : null);
+  // The page moves and changes below a pointer that rests: that takes no definition away from what has the focus.
+  const pointer = { x: NaN, y: NaN };
+  document.addEventListener("pointermove", ({ clientX, clientY }) => Object.assign(pointer, { x: clientX, y: clientY }), { passive: true });
   document.addEventListener("pointerover", (event) => {
     const found = find(event);
-    if (found === owner || (!found && isHeld())) return;
+    const rests = event.clientX === pointer.x && event.clientY === pointer.y;
+    if (found === owner || ((!found || rests) && isHeld())) return;
     hide();
     if (found && event.pointerType !== "touch") timer = setTimeout(() => show(found), REST_MS);
   });
@@ -46,6 +50,15 @@ function taken(element) {
     element.removeAttribute("title");
   }
   return element;
+}
+
+/** The element whose definition is shown, or null. */
+export const tipOwner = () => owner;
+
+/** Show the definition of the element that was drawn in place of the tip's owner; without one the tip goes. */
+export function giveTip(element) {
+  if (element?.isConnected && taken(element).dataset.tip) show(element);
+  else hide();
 }
 
 function show(element) {

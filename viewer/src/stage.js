@@ -46,6 +46,7 @@ export class Stage {
   /** Colour by a range {low, high} of one's own; null: by the one that the messages state. */
   setRange(id, range) {
     this.ranges[id] = range;
+    if (!this.scales[id]) return; // it comes with its layer
     Object.assign(this.scales[id], range ?? this.scales[id].given);
     this.span(id);
     this.redraw();

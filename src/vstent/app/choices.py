@@ -1,9 +1,9 @@
 """The user's choices as the page and the REST interface state them, and their conversion to settings of a study."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 if (
     TYPE_CHECKING
@@ -88,6 +88,24 @@ class SavedView(Strict):
     """Distance of the camera from it."""
 
 
+class ColourRange(Strict):
+    """Range of a color scale that was chosen in place of the computed one."""
+
+    scale: str = Field(min_length=1, max_length=60)
+    """Key of the scale."""
+    low: Annotated[float, Field(allow_inf_nan=False)]
+    """Value of the first color, in the unit of the scale."""
+    high: Annotated[float, Field(allow_inf_nan=False)]
+    """Value of the last color."""
+
+    @model_validator(mode="after")
+    def _is_ascending(self) -> Self:
+        """Return the range; ValueError is raised where its ends are not in order."""
+        if not self.low < self.high:
+            raise ValueError("the highest value of a color range must be above the lowest")
+        return self
+
+
 class Choices(Strict):
     """All choices of the user; missing values are proposed."""
 
@@ -127,6 +145,8 @@ class Choices(Strict):
     """Number of deployments with uncertain inputs varied; None: none."""
     views: Annotated[tuple[SavedView, ...], Field(max_length=12)] = ()
     """Views that were saved; no result depends on them."""
+    ranges: Annotated[tuple[ColourRange, ...], Field(max_length=40)] = ()
+    """Ranges of color scales that were chosen; no result depends on them."""
 
     @field_validator("devices")
     @classmethod
