@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
@@ -26,7 +27,6 @@ from vstent.flow.indices import indices
 from vstent.flow.simulation import flow_case, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.archive import load_data
-from vstent.kernels import sampling as kernels
 from vstent.kernels.arrays import Floats, Ints
 from vstent.study.folder import CACHE
 
@@ -35,8 +35,8 @@ from cell_networks import tube
 
 GRIDS_MM = (0.28, 0.2, 0.14, 0.1)
 """Grid spacings of the demo, mm."""
-UPSTREAM_CELLS = 0.75
-"""Distance upstream of the ostium at which the age is taken, in cells."""
+SAMPLE_CELLS = 0.5
+"""Distance between samples of the ostium, in cells."""
 BRANCH_CELLS = 3.0
 """Distance from the ostium, in cells, beyond which blood leaves a sac through a branch."""
 WINDOW_S = 4.0
@@ -53,6 +53,8 @@ def main() -> None:
             folder = Path(word)
             anatomy = load_data(next((folder / CACHE).glob("anatomy-*.npz")), Anatomy)
             for path in sorted((folder / CACHE).glob("flow *.npz")):
+                if path.stem.endswith(".running"):
+                    continue
                 name = path.stem.split("-")[0].removeprefix("flow ")
                 ages(f"{folder.name} {name}", flow_case(anatomy, None), load_data(path, FlowField))
         else:
@@ -87,55 +89,65 @@ def ages(name: str, case: FlowCase, field: FlowField) -> None:
     grid = grid_of(case, field, is_preview=False)
     near, sac = grid.near
     found = wash_out(near, sac, end_s=angiograms.MOST_WASHOUT_S)
-    volume_mL = 1e-3 * abs(case.sac.volume_mm3)
-    branch_mL_s, branch_mL = _through_branch(near, sac, found.age_s, case)
-    inflow_mL_s, leaving_mL = _at_ostium(case, field, near, found.age_s)
-    leaving = (leaving_mL + branch_mL) / volume_mL
+    volume_mm3 = abs(case.sac.volume_mm3)
+    branch_mm3_s, branch_mm3 = (
+        _through_branch(near, sac, values, case) for values in (near.flux_mm3_s[0], found.moved_mm3)
+    )
+    inflow_mm3_s = 1e3 * _inflow_mL_s(case, field)
+    carried_mm3_s = float(np.maximum(_at_ostium(case, field, near, near.flux_mm3_s[0]), 0).sum())
+    # What is still in the sac at the end leaves it later.
+    leaving_mm3 = (
+        branch_mm3 - _at_ostium(case, field, near, found.moved_mm3).sum() + found.left_fraction[-1] * volume_mm3
+    )
     told_s = indices(field, case.sac, case.ostium)["turnover_time_s"]
     wall, cpu = time.perf_counter() - began, time.process_time() - busy
     print(
         f"{name:24} {len(field.cells):8,} cells  corrected {grid.network.correction_fraction:.2%}  volume / inflow "
-        f"{told_s:.4f} s, in the mean flow {volume_mL / inflow_mL_s:.4f} s  branch {branch_mL_s:.3f} of "
-        f"{inflow_mL_s:.3f} mL/s  age on leaving {leaving * volume_mL / inflow_mL_s:.4f} s ({leaving - 1:+.1%})  "
+        f"{told_s:.4f} s, in the mean flow {volume_mm3 / inflow_mm3_s:.4f} s  branch {1e-3 * branch_mm3_s:.3f} of "
+        f"{1e-3 * inflow_mm3_s:.3f} mL/s ({carried_mm3_s / inflow_mm3_s - 1:+.1%} in the transport)  age on leaving "
+        f"{leaving_mm3 / inflow_mm3_s:.4f} s ({leaving_mm3 / volume_mm3 - 1:+.1%})  "
         f"mean age {found.mean_age_s:.4f} s (extrapolated "
         f"{found.tail_fraction:.1%})  {wall:.0f} s ({cpu:.0f} s CPU)",
         flush=True,
     )
 
 
-def _through_branch(near: Network, sac: Ints, age_s: Floats, case: FlowCase) -> tuple[float, float]:
-    """Return the flow rate through the branches that leave a sac, in mL/s, and its sum with the age, in mL."""
+def _through_branch(near: Network, sac: Ints, through: Floats, case: FlowCase) -> float:
+    """Return the sum of a quantity (f,) that passes the faces, over the branches that leave a sac."""
     assert case.ostium is not None
     is_sac = np.zeros(len(near.cells) + near.openings, dtype=bool)
     is_sac[sac] = True
-    crossing = is_sac[near.left] != is_sac[near.right]
-    left, right, flux = near.left[crossing], near.right[crossing], near.flux_mm3_s[0][crossing]
-    within = np.where(is_sac[left], left, right)
+    crossing = np.flatnonzero(is_sac[near.left] != is_sac[near.right])
+    leaves = is_sac[near.left[crossing]]
+    within = np.where(leaves, near.left[crossing], near.right[crossing])
     is_branch = case.ostium.closest(near.points_mm[within])[1] > BRANCH_CELLS * near.spacing_mm
-    out_mL_s = 1e-3 * np.where(is_sac[left], flux, -flux)[is_branch]
-    age = np.r_[age_s, np.zeros(near.openings)][np.where(flux > 0, left, right)[is_branch]]
-    return float(out_mL_s.sum()), float(out_mL_s @ age)
+    return float(np.where(leaves, through[crossing], -through[crossing])[is_branch].sum())
 
 
-def _at_ostium(case: FlowCase, field: FlowField, near: Network, age_s: Floats) -> tuple[float, float]:
-    """Return the inflow through the ostium in mL/s, and the net sum of flow rate out times age there in mL."""
+def _inflow_mL_s(case: FlowCase, field: FlowField) -> float:
+    """Return the inflow through the ostium in the velocity of a flow."""
     assert case.ostium is not None
     points_mm, area_mm2 = sampling.surface_samples(case.ostium, field.cell_size_mm)
     points = (points_mm - field.origin_mm) / field.cell_size_mm
-    through = sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2)
-    # The age is that of the blood upstream: on the other side it is mixed with fresh blood within a cell.
-    normals = area_mm2 / np.linalg.norm(area_mm2, axis=1, keepdims=True)
-    upstream = points - UPSTREAM_CELLS * np.sign(through)[:, None] * normals
-    at = kernels.interpolate(*_on_grid(field, near, age_s), upstream, False)[:, 0]
-    return float(np.maximum(through, 0).sum()), float(-through @ at)
+    return sampling.inflow_mL_s(sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2))
 
 
-def _on_grid(field: FlowField, near: Network, age_s: Floats) -> tuple[np.ndarray, Floats]:
-    """Return the cell numbers on the grid of a flow, for the fine cells only, and the age (n, 1) there."""
-    fine = np.flatnonzero(near.width == 1)
-    index = np.full(field.index.shape, -1, dtype=np.int32)
-    index[tuple(near.cells[fine].T)] = np.arange(len(fine), dtype=np.int32)
-    return index, age_s[fine][:, None]
+def _at_ostium(case: FlowCase, field: FlowField, near: Network, through: Floats) -> Floats:
+    """Return what passes samples (p,) of the ostium into the sac, of a quantity (f,) that passes the faces.
+
+    Per area it is linear between the centers of the faces across one axis, and 0 on faces at a wall.
+    """
+    assert case.ostium is not None
+    points_mm, area_mm2 = sampling.surface_samples(case.ostium, SAMPLE_CELLS * field.cell_size_mm)
+    points = (points_mm - field.origin_mm) / field.cell_size_mm
+    found = np.zeros(len(points))
+    for axis, step in enumerate(np.eye(3, dtype=np.int64)):
+        low = near.left[near.axis == axis]
+        fine = (low < len(near.cells)) & (near.width[np.minimum(low, len(near.cells) - 1)] == 1)
+        per_mm2 = np.zeros(field.index.shape)
+        per_mm2[tuple(near.cells[low[fine]].T)] = through[near.axis == axis][fine] / field.cell_size_mm**2
+        found += area_mm2[:, axis] * map_coordinates(per_mm2, (points - 0.5 * step).T, order=1)
+    return found
 
 
 def taylor(radius: float = 12.5, peclet: float = 10.0) -> float:

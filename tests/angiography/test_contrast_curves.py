@@ -12,7 +12,7 @@ from vstent.errors import InputError
 def test_all_iodine_injected_enters(shape):
     flow_mL_s = 4.0
     bolus = Bolus(iodine_mg_mL=320, amount_mL=3, rate_mL_s=2, start_s=0.4, shape=shape)
-    inflow, most = bolus.inflow(flow_mL_s)
+    inflow, most = bolus.inflow([flow_mL_s])
     times = np.linspace(0, 30, 12_001)
     values = np.array([inflow(time) for time in times])
     assert flow_mL_s * np.trapezoid(values, times) == pytest.approx(320 * 3, rel=1e-3)
@@ -20,12 +20,26 @@ def test_all_iodine_injected_enters(shape):
     assert values[times < 0.4].max() == 0
 
 
+@pytest.mark.parametrize("shape", ["constant", "gamma"])
+def test_all_iodine_injected_enters_a_pulse(shape):
+    """The blood of diastole carries more of it than that of systole, and the start within the cycle does not matter."""
+    cycle = np.arange(20) / 20
+    pulse = 4 + 1.9 * np.sin(2 * np.pi * cycle)
+    for start_s in (0.0, 0.3):
+        bolus = Bolus(iodine_mg_mL=320, amount_mL=3, rate_mL_s=2, start_s=start_s, shape=shape)
+        inflow, most = bolus.inflow(pulse, cycle, 1.0)
+        times = np.linspace(0, 12, 3_001)
+        values = np.array([inflow(time) for time in times])
+        assert np.trapezoid(values * np.interp(times, cycle, pulse, period=1.0), times) == pytest.approx(960, rel=1e-3)
+        assert values.max() <= most
+
+
 def test_blood_holds_no_more_iodine_than_the_agent():
-    assert Bolus(rate_mL_s=9.0).inflow(4.0)[1] == 300.0
+    assert Bolus(rate_mL_s=9.0).inflow([4.0])[1] == 300.0
 
 
 def test_a_curve_is_linear_between_its_points_and_zero_beyond():
-    inflow, most = Bolus(curve=((0.5, 0.0), (1.0, 80.0), (2.0, 0.0))).inflow(4.0)
+    inflow, most = Bolus(curve=((0.5, 0.0), (1.0, 80.0), (2.0, 0.0))).inflow([4.0])
     assert most == 80.0
     assert [inflow(time) for time in (0.4, 0.75, 1.0, 1.5, 2.5)] == [0.0, 40.0, 80.0, 40.0, 0.0]
 

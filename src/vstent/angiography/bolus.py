@@ -1,6 +1,6 @@
 """The injection: concentration of iodine in the blood that enters the vessel, over time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import exp, gamma
 from typing import Final, Literal
@@ -13,14 +13,16 @@ GAMMA_EXPONENT: Final = 3.0
 """Exponent of the gamma-variate curve (Thompson et al. 1964, Circ. Res. 14, 502, fit 1.5 to 5 to dilution curves)."""
 RAMP_S: Final = 0.05
 """Time in which a constant injection rises and falls, in s."""
+SMALLEST_ML_S: Final = 1e-6
+"""Smallest flow rate with which the agent mixes; an inlet without inflow holds the pure agent."""
 
 
 @dataclass(frozen=True)
 class Bolus:
     """An injection of contrast agent into the parent artery, mixed with the blood of the inlet.
 
-    The blood that enters carries iodine_mg_mL times rate / flow rate of the inlets, at most iodine_mg_mL. The flow
-    itself does not change.
+    The blood that enters carries iodine_mg_mL times rate / flow rate of the inlets at that moment, at most
+    iodine_mg_mL. The flow itself does not change.
     """
 
     iodine_mg_mL: float = 300.0
@@ -69,38 +71,49 @@ class Bolus:
         """Time at which contrast starts to enter."""
         return self.curve[0][0] if self.curve else self.start_s
 
-    def inflow(self, flow_mL_s: float) -> tuple[Callable[[float], float], float]:
+    def inflow(
+        self, flow_mL_s: Sequence[float], time_s: Sequence[float] = (0.0,), period_s: float | None = None
+    ) -> tuple[Callable[[float], float], float]:
         """Return the iodine concentration of the entering blood in mg/mL as a function of time in s, and its maximum.
 
         Parameters
         ----------
-        flow_mL_s : float
-            Mean flow rate through the inlets.
+        flow_mL_s : (p,)
+            Flow rate through the inlets; several values of a cycle are linear in between.
+        time_s : (p,)
+            Their times.
+        period_s : float, optional
+            Length of the cycle; none for a steady flow.
         """
         if self.curve:
             times, values = np.array(self.curve, dtype=np.float64).T
             return (lambda time_s: float(np.interp(time_s, times, values, left=0.0, right=0.0))), float(values.max())
-        mixed = self.iodine_mg_mL * min(self.rate_mL_s / flow_mL_s, 1.0)
-        return (self._gamma if self.shape == "gamma" else self._constant)(mixed)
+        rate, top_mL_s = self._gamma() if self.shape == "gamma" else self._constant()
 
-    def _constant(self, mixed_mg_mL: float) -> tuple[Callable[[float], float], float]:
-        """Return a trapezoid whose integral is that of the constant rate."""
+        def at(now_s: float) -> float:
+            through_mL_s = float(np.interp(now_s, time_s, flow_mL_s, period=period_s))
+            return self.iodine_mg_mL * min(rate(now_s) / max(through_mL_s, SMALLEST_ML_S), 1.0)
+
+        return at, self.iodine_mg_mL * min(top_mL_s / max(min(flow_mL_s), SMALLEST_ML_S), 1.0)
+
+    def _constant(self) -> tuple[Callable[[float], float], float]:
+        """Return the rate in mL/s of a trapezoid whose integral is that of the constant rate, and its maximum."""
         end_s = self.start_s + self.duration_s
         ramp_s = min(RAMP_S, 0.5 * self.duration_s)
         times = [self.start_s, self.start_s + ramp_s, end_s, end_s + ramp_s]
 
-        def at(time_s: float) -> float:
-            return mixed_mg_mL * float(np.interp(time_s, times, [0.0, 1.0, 1.0, 0.0]))
+        def at(now_s: float) -> float:
+            return self.rate_mL_s * float(np.interp(now_s, times, [0.0, 1.0, 1.0, 0.0]))
 
-        return at, mixed_mg_mL
+        return at, self.rate_mL_s
 
-    def _gamma(self, mixed_mg_mL: float) -> tuple[Callable[[float], float], float]:
-        """Return a gamma-variate curve with the integral of the constant rate."""
+    def _gamma(self) -> tuple[Callable[[float], float], float]:
+        """Return the rate in mL/s of a gamma-variate curve with the integral of the constant rate, and its maximum."""
         a, peak_s = GAMMA_EXPONENT, self.duration_s
-        top_mg_mL = mixed_mg_mL * a ** (a + 1) / (exp(a) * gamma(a + 1))
+        top_mL_s = self.rate_mL_s * a ** (a + 1) / (exp(a) * gamma(a + 1))
 
-        def at(time_s: float) -> float:
-            x = max(time_s - self.start_s, 0.0) / peak_s
-            return float(top_mg_mL * x**a * exp(a * (1 - x)))
+        def at(now_s: float) -> float:
+            x = max(now_s - self.start_s, 0.0) / peak_s
+            return float(top_mL_s * x**a * exp(a * (1 - x)))
 
-        return at, top_mg_mL
+        return at, top_mL_s

@@ -23,6 +23,8 @@ class Layout:
     """Cells and flow rates in that order."""
     order: Ints
     """(n,) number of each cell in the network as given."""
+    faces: Ints
+    """(f,) number of each face in the network as given."""
     level: Ints
     """(n,) level of each cell: the power of two by which its step exceeds the base step."""
     outflow_per_s: Floats
@@ -68,7 +70,7 @@ def layout(network: Network, diffusivity_mm2_s: float) -> Layout:
     network = network.taken(order, faces, number)
     level = level[order]
     connections = _mesh(network, exchange_mm3_s[faces]), _groups(network, level)
-    return Layout(network, order, level, outflow_per_s[order], total_per_s[order], *connections)
+    return Layout(network, order, faces, level, outflow_per_s[order], total_per_s[order], *connections)
 
 
 def _levels(network: Network, total_per_s: Floats) -> Ints:

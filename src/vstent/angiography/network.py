@@ -288,7 +288,7 @@ def _balanced(
         axis=np.r_[axis, mouths.axis],
         flux_mm3_s=np.array(rows),
         time_s=np.array([phase.time_s for phase in field.phases] or [0.0]),
-        period_s=_period_s(field),
+        period_s=period_s(field),
         openings=n_openings,
         inlets=len(case.vessel.inlets),
         correction_fraction=float(np.sqrt(change / size)),
@@ -301,7 +301,7 @@ def _reached(outlets_mL_s: Floats, mouths: _Mouths, n_inlets: int) -> Floats:
     return np.where(is_there, outlets_mL_s, 0.0)
 
 
-def _period_s(field: FlowField) -> float:
+def period_s(field: FlowField) -> float:
     """Return the length of the cycle of a pulsatile flow, inf for a steady one."""
     if len(field.phases) < 2:
         return float("inf")

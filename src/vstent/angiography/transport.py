@@ -67,7 +67,7 @@ class Transport:
     ) -> None:
         n = len(network.cells)
         self._laid = layout(network, diffusivity_mm2_s)
-        self.network, self._inflow, self._upper = self._laid.network, inflow, upper
+        self.network, self._inflow, self.upper = self._laid.network, inflow, upper
         self.fastest_s = float(COURANT / self._laid.total_per_s.max())
         groups = len(self._laid.groups.level)
         # Single precision halves the memory traffic; the mass that leaves one cell is still exactly that of the next.
@@ -117,6 +117,12 @@ class Transport:
         values = self._held.state[: len(self._laid.order), advection.VALUE]
         return float(values.astype(np.float64) @ self.network.volume_mm3)
 
+    def moved(self) -> Floats:
+        """Return the amount (f,) that passed every face to its upper side so far, in the order as given."""
+        found = np.zeros(len(self._laid.faces))
+        found[self._laid.faces] = self._held.through
+        return found
+
     def balance(self) -> Balance:
         """Return what entered, left and is inside so far."""
         network = self.network
@@ -138,7 +144,7 @@ class Transport:
             self._held.state[n : n + network.inlets, : advection.TIME] = first, (last - first) / step_s
             entering = max(first, last)
         self._held.is_full[-1] = entering > 0
-        base_s, limits = step_s / (1 << laid.top), np.array([self._upper, EMPTY * self._upper], np.float32)
+        base_s, limits = step_s / (1 << laid.top), np.array([self.upper, EMPTY * self.upper], np.float32)
         advection.march(laid.mesh, laid.groups, self._held, self._flux, self._moves, base_s, *limits)
 
 

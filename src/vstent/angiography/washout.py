@@ -32,6 +32,8 @@ class Washout:
     """For each of `MOMENTS_S` that was reached, the fraction (n,) of that blood in every cell of the sac."""
     age_s: Floats
     """(n,) mean time that the blood in each cell of the region has spent in the sac."""
+    moved_mm3: Floats
+    """(f,) volume of that blood that passed every face, to its upper side; in a steady flow, flow rate times age."""
     tail_fraction: float
     """Part of the mean age that is extrapolated from the last times."""
 
@@ -39,6 +41,7 @@ class Washout:
         freeze(self, "time_s", np.float64, (-1,))
         freeze(self, "left_fraction", np.float64, (len(self.time_s),))
         freeze(self, "age_s", np.float64, (-1,))
+        freeze(self, "moved_mm3", np.float64, (-1,))
 
     @property
     def mean_age_s(self) -> float:
@@ -93,7 +96,7 @@ def wash_out(
     age += decay_s * last
     tail = decay_s * left[-1]
     tail_fraction = tail / (float(np.trapezoid(left, times)) + tail)
-    return Washout(np.array(times), np.array(left), tuple(stayed), age, tail_fraction)
+    return Washout(np.array(times), np.array(left), tuple(stayed), age, march.moved(), tail_fraction)
 
 
 def _decay_s(times: Floats, left: Floats) -> float:

@@ -27,6 +27,7 @@ ROWS: Final = (
 )
 """Rows of the comparison of flows: title and key of the index."""
 CONTRAST_ROWS: Final = (
+    "contrast_preview_error_fraction",
     "contrast_arrival_s",
     "contrast_peak_s",
     "contrast_peak_fraction",

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any, Final, Protocol
 
 from vstent.anatomy.morphology import Measures
-from vstent.angiography.angiogram import AngiogramSettings, angiogram
+from vstent.angiography.angiogram import PREVIEW_ERROR, AngiogramSettings, angiogram
 from vstent.angiography.curves import retention_s
 from vstent.deployment.deploy import deploy, propose_landing
 from vstent.devices.stent import Landing, Stent
@@ -230,4 +230,5 @@ def _retained(bare: Mapping[str, Any], flow: Mapping[str, Any]) -> tuple[float |
         return None, "Contrast: its retention without a device is not known."
     change = flow["retention_s"] / bare["retention_s"] - 1
     least = "at least " if flow["is_least"] else ""
-    return change, f"Contrast stays {least}{flow['retention_s']:.2f} s, without a device {bare['retention_s']:.2f} s."
+    words = f"{least}{flow['retention_s']:.2f} s, without a device {bare['retention_s']:.2f} s"
+    return change, f"Contrast stays {words} (preview, error up to {PREVIEW_ERROR:.0%} on the demo)."

@@ -60,6 +60,8 @@ MOST_RATIO = 10.0
 """Largest ratio of values that is shown as a percentage; above it the first value is near zero."""
 OPENING = re.compile(r"(inlet|outlet)_(\d+)_(\w+)")
 """Pattern of the key of a metric of one of several inlets or outlets."""
+PREVIEW = "contrast_preview_error_fraction"
+"""Key of the error of a preview. It is listed with the numbers that it concerns, without a change."""
 ERRORS = ("unsettled_fraction",)
 """Suffixes of keys that state the reliability of a result; their change with a device means nothing."""
 
@@ -126,7 +128,7 @@ class Change(NamedTuple):
 
     def of(self, name: str) -> str:
         """Return the change with a device: relative, or in percentage points for a percentage; a dash where hidden."""
-        if name in self.hidden:
+        if name in self.hidden or self.before.key == PREVIEW:
             return "–"
         return format_change(self.before.value, self.after[name].value, self.before.key)
 

@@ -129,10 +129,12 @@ def _write(out: Path, found: Mapping[str, Angiogram], settings: AngiogramSetting
     """Write the curves, the numbers, and the metrics with the numbers added."""
     folder = out / FOLDER
     folder.mkdir(exist_ok=True)
+    former = _former_keys(folder / NUMBERS)
     write_rows(folder / CURVES, list(_rows(found)))
     flows = {name: {"flow": keys[name], "measures": one.measures, "advice": one.advice} for name, one in found.items()}
     write_json(folder / NUMBERS, {"settings": asdict(settings), "flows": flows, "research_use_only": True})
     metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
+    _drop(metrics, former)
     add_measures(metrics, {name: one.measures for name, one in found.items()})
     write_json(out / METRICS, metrics)
 
@@ -148,6 +150,26 @@ def _rows(found: Mapping[str, Angiogram]) -> Iterator[dict[str, Any]]:
                 "sac_iodine_mg_mL": float(sac),
                 "parent_artery_iodine_mg_mL": float(parent),
             }
+
+
+def _former_keys(path: Path) -> set[str]:
+    """Return the keys of all measures of the angiograms that a case folder holds; empty where it holds none."""
+    try:
+        flows = json.loads(path.read_text(encoding="utf-8"))["flows"]
+        return {key for one in flows.values() for key in one["measures"]}
+    except UNTOLD:
+        return set()
+
+
+def _drop(metrics: dict[str, Any], keys: set[str]) -> None:
+    """Remove measures of earlier angiograms from nested metrics: a new one need not have all of them."""
+    stents = metrics["stents"].values()
+    for part in (metrics.get(BARE, {}), *(stent.get("flow", {}) for stent in stents)):
+        for key in keys & part.keys():
+            del part[key]
+    for stent in stents:
+        for key in {f"{key}_ratio" for key in keys} & stent.get("ratios", {}).keys():
+            del stent["ratios"][key]
 
 
 def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, float]]) -> None:

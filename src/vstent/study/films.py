@@ -5,7 +5,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vstent.angiography.angiogram import AngiogramSettings, Watch
+from vstent.angiography.angiogram import AngiogramSettings, Watch, entering
 from vstent.angiography.history import History, Recorder
 from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Stent
@@ -48,7 +48,7 @@ class Recording:
             yield None
         else:
             bolus = self.settings.bolus
-            recorder = Recorder(carrier, bolus.inflow(carrier.inflow_mL_s)[1], key, bolus.begin_s)
+            recorder = Recorder(carrier, entering(bolus, carrier)[1], key, bolus.begin_s)
             yield recorder.watch
             kept = recorder.history()
             for former in path.parent.glob(f"contrast {name}-*.npz"):

@@ -87,7 +87,7 @@ class Held(NamedTuple):
     gains: Any
     """(e,) mass that came through the face of every entry and that the cell has not taken yet."""
     through: Any
-    """(f,) mass moved to the upper side of the faces of openings in all marches."""
+    """(f,) mass moved to the upper side of every face in all marches."""
     is_full: Any
     """(g + 1,) whether a group holds any contrast; last, whether any enters."""
     moved: Any
@@ -217,8 +217,7 @@ def _exchange(mesh: Any, groups: Any, held: Any, flux: Any, count: int, substep:
                 mass = rate * here * step
                 if lower_cell < n and upper_cell < n:
                     mass += conductance[f] * (state[lower_cell, VALUE] - state[upper_cell, VALUE]) * step
-                else:
-                    through[f] += mass
+                through[f] += mass
                 if lower_cell < n:
                     gains[mesh.lower_entry[f]] -= mass
                 if upper_cell < n:
