@@ -1,5 +1,6 @@
 """A finished command answers at once, and runs in full as soon as anything that it depends on has changed."""
 
+import json
 import os
 import subprocess
 import sys
@@ -14,39 +15,82 @@ from vstent.study import folder
 PRINTED = "Neck inflow  −51 %\n"
 
 
+TOLD = {"input": {"sha256": "1"}, "seconds": {"trace": 1.0}}
+
+
 @pytest.fixture
-def command(tmp_path: Path) -> Namespace:
-    """A finished command on a scan of two files, with a waveform in a file."""
-    case, scan = tmp_path / "case", tmp_path / "scan"
-    for file in (scan / "IM1.dcm", scan / "IM2.dcm", case / "report.html", case / finished.CACHE / "anatomy.npz"):
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Namespace:
+    """A command on a scan of two files, with a waveform in a file and a device of the user's own."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    case, scan, devices = tmp_path / "case", tmp_path / "scan", tmp_path / "config" / "vstent" / "devices"
+    own = case / "report.html", case / finished.CACHE / "anatomy.npz"
+    for file in (scan / "IM1.dcm", scan / "IM2.dcm", devices / "mine.toml", *own):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("content")
+    (case / "run.json").write_text(json.dumps(TOLD | {"seconds": {"trace": 2.0}}))
     (tmp_path / "flow.csv").write_text("0,1")
-    given = Namespace(out=case, input=scan, device=["silk"], pulsatile=str(tmp_path / "flow.csv"), command=print)
-    finished.remember(given, scan, PRINTED)
-    return given
+    return Namespace(out=case, input=scan, device=["silk"], pulsatile=str(tmp_path / "flow.csv"), command=print)
 
 
-def test_what_was_printed_is_printed_again(command: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture
+def done(command: Namespace) -> Namespace:
+    """The same command, finished."""
+    finished.remember(command, finished.begun(command, command.input), TOLD, PRINTED)
+    return command
+
+
+def test_what_was_printed_is_printed_again(done: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
     assert finished.CACHE == folder.CACHE
     for _ in range(2):
-        assert finished.answered(command)
+        assert finished.answered(done)
         assert capsys.readouterr().out == PRINTED
 
 
-@pytest.mark.parametrize(
-    "name", ["scan/IM2.dcm", "case/report.html", "case/.vstent/anatomy.npz", "flow.csv", "case/.vstent/finished.json"]
+FILES = (
+    "scan/IM2.dcm",
+    "case/report.html",
+    "case/.vstent/anatomy.npz",
+    "flow.csv",
+    "config/vstent/devices/mine.toml",
+    "case/.vstent/finished.json",
 )
+
+
+@pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("is_deleted", [True, False])
-def test_a_changed_file_is_noticed(command: Namespace, tmp_path: Path, name: str, is_deleted: bool) -> None:
+def test_a_changed_file_is_noticed(done: Namespace, tmp_path: Path, name: str, is_deleted: bool) -> None:
     file = tmp_path / name
     file.unlink() if is_deleted else file.write_text("another")
+    assert not finished.answered(done)
+
+
+@pytest.mark.parametrize("name", ["scan/IM3.dcm", "config/vstent/devices/other.toml"])
+def test_a_new_file_is_noticed(done: Namespace, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("content")
+    assert not finished.answered(done)
+
+
+@pytest.mark.parametrize("name", ["scan/IM2.dcm", "flow.csv", "config/vstent/devices/mine.toml"])
+def test_a_file_that_changes_while_the_command_runs_is_noticed(command: Namespace, tmp_path: Path, name: str) -> None:
+    before = finished.begun(command, command.input)
+    (tmp_path / name).write_text("another")
+    finished.remember(command, before, TOLD, PRINTED)
     assert not finished.answered(command)
 
 
+def test_a_folder_that_another_process_uses_or_has_changed_is_not_remembered(command: Namespace) -> None:
+    before, record = finished.begun(command, command.input), command.out / finished.CACHE / finished.RECORD
+    with folder.claimed(command.out):
+        finished.remember(command, before, TOLD, PRINTED)
+    assert not record.exists()
+    finished.remember(command, before, TOLD | {"input": {"sha256": "2"}}, PRINTED)
+    assert not record.exists()
+
+
 def test_another_command_program_terminal_or_process_is_noticed(
-    command: Namespace, monkeypatch: pytest.MonkeyPatch
+    done: Namespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    command = done
     assert not finished.answered(Namespace(**vars(command) | {"device": ["silk", "lvis"]}))
     with monkeypatch.context() as patch:
         patch.setattr(finished, "program_states", lambda: {"vstent.py": [1, 2]})
@@ -60,8 +104,8 @@ def test_another_command_program_terminal_or_process_is_noticed(
 
 @pytest.mark.parametrize("option", finished.DEPENDENT)
 def test_a_command_that_depends_on_more_is_not_remembered(command: Namespace, option: str) -> None:
-    (command.out / finished.CACHE / finished.RECORD).unlink()
-    finished.remember(Namespace(**vars(command) | {option: True}), command.input, PRINTED)
+    asked = Namespace(**vars(command) | {option: True})
+    finished.remember(asked, finished.begun(asked, asked.input), TOLD, PRINTED)
     assert not (command.out / finished.CACHE / finished.RECORD).exists()
 
 

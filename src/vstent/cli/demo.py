@@ -31,10 +31,11 @@ def _demo(arguments: argparse.Namespace) -> int:
     from vstent.study.demo import truth, write_scan
 
     scan, settings = write_scan(arguments.out / "scan"), run.given_study(arguments)
+    before = finished.begun(arguments, scan)
     console, asked = Console(), {"is_printed": arguments.pdf, "replaces": arguments.replace}
     case = run.study(scan, arguments.out, settings, console, **asked)
     console.print(truth_table(truth(case)))
     if case.failures:
         return 1
-    finished.remember(arguments, scan, console.printed)
+    finished.remember(arguments, before, case.provenance, console.printed)
     return 0

@@ -9,10 +9,10 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from vstent.io.files import atomic
 from vstent.io.states import State, program_states, state_of
@@ -27,6 +27,17 @@ DEPENDENT: Final = ("gpu", "angiogram", "plan", "ro_crate")
 """Options that depend on the machine or the day, or write files of their own: such commands run in full."""
 OF_TERMINAL: Final = ("COLUMNS", "TERM", "COLORTERM", "NO_COLOR", "FORCE_COLOR")
 """Environment variables that change how tables are printed."""
+OF_CATALOGUE: Final = ("HOME", "XDG_CONFIG_HOME", "APPDATA")
+"""Environment variables that say where the user's devices are."""
+
+
+class Begun(NamedTuple):
+    """What the output of a command depends on, as it was before the command ran."""
+
+    command: dict[str, Any]
+    """Arguments, program and terminal."""
+    states: dict[str, State]
+    """States of the input, of files given as options, and of the user's devices, by path."""
 
 
 def answered(arguments: argparse.Namespace) -> bool:
@@ -44,28 +55,68 @@ def answered(arguments: argparse.Namespace) -> bool:
     return True
 
 
-def remember(arguments: argparse.Namespace, source: Path, printed: str) -> None:
-    """Store the record of a command that is finished.
+def begun(arguments: argparse.Namespace, source: Path) -> Begun:
+    """Return what the output of a command depends on, before the command runs.
 
     Parameters
     ----------
     arguments : parsed options.
     source : the scan or surface.
+    """
+    from vstent.devices.catalogue import user_folder
+
+    devices = user_folder()
+    found = {*_inputs(source), *_files_in(vars(arguments).values()), devices, *devices.glob("*.toml")}
+    return Begun(_command(arguments), _states(found))
+
+
+def remember(arguments: argparse.Namespace, before: Begun, told: Mapping[str, Any], printed: str) -> None:
+    """Store the record of a command that is finished.
+
+    No record is stored where another process uses the folder, or has changed it since, or where it cannot be written.
+
+    Parameters
+    ----------
+    arguments : parsed options.
+    before : what its output depends on.
+    told : provenance of its results.
     printed : what the command has printed.
     """
-    from vstent.io.images import files_of
+    from vstent.errors import FolderError
     from vstent.plugins import plugins
+    from vstent.study.folder import claimed
+    from vstent.study.repeat import SECONDS, is_of_another
 
     if any(getattr(arguments, name, False) for name in DEPENDENT):
         return
     if plugins("vstent.devices") or plugins("vstent.engines") or plugins("vstent.walls"):
         return  # their code may change too
-    record = arguments.out / CACHE / RECORD
-    inputs = source.rglob("*") if source.is_dir() else files_of(source)
-    found = {*inputs, *arguments.out.rglob("*"), *_files_in(vars(arguments).values())}
-    states = {str(file.resolve()): state_of(file) for file in sorted(found - {record}) if file.is_file()}
-    with atomic(record) as partial:
-        partial.write_text(json.dumps({"command": _command(arguments), "files": states, "printed": printed}))
+    cache = arguments.out / CACHE
+    with suppress(OSError, FolderError), claimed(arguments.out):
+        if is_of_another(arguments.out, {key: told[key] for key in told if key != SECONDS}):
+            return
+        own = {file for file in arguments.out.rglob("*") if file.is_file()} - {cache / RECORD, cache / LOCK}
+        record = {"command": before.command, "files": _states(own) | before.states, "printed": printed}
+        with atomic(cache / RECORD) as partial:
+            partial.write_text(json.dumps(record))
+
+
+def _inputs(source: Path) -> set[Path]:
+    """Return the files of the input, and the folders to which further ones might be added."""
+    from vstent.errors import VstentError
+    from vstent.io.dicom import is_dicom
+    from vstent.io.images import files_of
+
+    with suppress(OSError, VstentError):  # the study states what is wrong with an input
+        if source.is_dir():
+            return {source, *source.rglob("*")}
+        return {*files_of(source), *([source.parent] if is_dicom(source) else [])}
+    return {source}
+
+
+def _states(files: Iterable[Path]) -> dict[str, State]:
+    """Return the states of files and folders by their full path."""
+    return {str(file.resolve()): state_of(file) for file in sorted(files)}
 
 
 def _command(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -73,7 +124,14 @@ def _command(arguments: argparse.Namespace) -> dict[str, Any]:
     given = {name: str(value) for name, value in vars(arguments).items() if not callable(value)}
     packages = [place for place in sys.path if place.endswith("-packages")]
     programs: dict[str, State] = program_states() | {place: state_of(Path(place)) for place in packages}
-    return {"given": given, "folder": os.getcwd(), "programs": programs, "python": sys.version, "terminal": _terminal()}
+    return {
+        "given": given,
+        "folder": os.getcwd(),
+        "programs": programs,
+        "python": sys.version,
+        "terminal": _terminal(),
+        "catalogue": [os.environ.get(name) for name in OF_CATALOGUE],
+    }
 
 
 def _terminal() -> list[Any]:

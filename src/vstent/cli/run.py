@@ -162,11 +162,11 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.input.suffix == ".json":
         return _again(arguments, settings, injected)
     given = {"is_printed": arguments.pdf, "replaces": arguments.replace, "injected": injected}
-    console = Console()
+    console, before = Console(), finished.begun(arguments, arguments.input)
     case = study(arguments.input, arguments.out, settings, console, **given)
     code = _finish(arguments, case)
     if code == 0:
-        finished.remember(arguments, arguments.input, console.printed)
+        finished.remember(arguments, before, case.provenance, console.printed)
     return code
 
 
