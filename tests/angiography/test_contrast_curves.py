@@ -34,8 +34,22 @@ def test_all_iodine_injected_enters_a_pulse(shape):
         assert values.max() <= most
 
 
-def test_blood_holds_no_more_iodine_than_the_agent():
-    assert Bolus(rate_mL_s=9.0).inflow([4.0])[1] == 300.0
+@pytest.mark.parametrize("rate_mL_s", [3.0, 9.0])
+def test_agent_that_the_flow_cannot_carry_enters_later(rate_mL_s):
+    """In diastole the flow is slower than the injection: the blood there is pure agent, and nothing is lost."""
+    cycle = np.arange(20) / 20
+    pulse = 3.7 + 1.9 * np.sin(2 * np.pi * cycle)
+    inflow, most = Bolus(iodine_mg_mL=300, amount_mL=3, rate_mL_s=rate_mL_s).inflow(pulse, cycle, 1.0)
+    times = np.linspace(0, 5, 5_001)
+    values = np.array([inflow(time) for time in times])
+    assert np.trapezoid(values * np.interp(times, cycle, pulse, period=1.0), times) == pytest.approx(900, rel=2e-3)
+    assert values.max() == most == 300
+
+
+def test_a_faster_injection_than_the_flow_is_pure_agent_for_amount_over_flow():
+    inflow, most = Bolus(amount_mL=3.0, rate_mL_s=9.0).inflow([4.0])
+    assert most == 300.0
+    assert [inflow(time) for time in (0.1, 0.7, 0.77)] == pytest.approx([300.0, 300.0, 0.0])
 
 
 def test_a_curve_is_linear_between_its_points_and_zero_beyond():

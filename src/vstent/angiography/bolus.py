@@ -15,6 +15,14 @@ RAMP_S: Final = 0.05
 """Time in which a constant injection rises and falls, in s."""
 SMALLEST_ML_S: Final = 1e-6
 """Smallest flow rate with which the agent mixes; an inlet without inflow holds the pure agent."""
+WAITING_STEP_S: Final = 0.002
+"""Time step for agent that waits at the inlet."""
+LONGEST_S: Final = 60.0
+"""Time after which agent that still waits is left out."""
+
+
+Rate = Callable[[float], float]
+"""Rate in mL/s as a function of time in s."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +30,8 @@ class Bolus:
     """An injection of contrast agent into the parent artery, mixed with the blood of the inlet.
 
     The blood that enters carries iodine_mg_mL times rate / flow rate of the inlets at that moment, at most
-    iodine_mg_mL. The flow itself does not change.
+    iodine_mg_mL. Agent that the flow of the moment cannot carry waits at the inlet and enters next. The flow itself
+    does not change.
     """
 
     iodine_mg_mL: float = 300.0
@@ -90,13 +99,29 @@ class Bolus:
             return (lambda time_s: float(np.interp(time_s, times, values, left=0.0, right=0.0))), float(values.max())
         rate, top_mL_s = self._gamma() if self.shape == "gamma" else self._constant()
 
-        def at(now_s: float) -> float:
-            through_mL_s = float(np.interp(now_s, time_s, flow_mL_s, period=period_s))
-            return self.iodine_mg_mL * min(rate(now_s) / max(through_mL_s, SMALLEST_ML_S), 1.0)
+        def through(now_s: float) -> float:
+            return max(float(np.interp(now_s, time_s, flow_mL_s, period=period_s)), SMALLEST_ML_S)
 
-        return at, self.iodine_mg_mL * min(top_mL_s / max(min(flow_mL_s), SMALLEST_ML_S), 1.0)
+        least_mL_s = max(min(flow_mL_s), SMALLEST_ML_S)
+        enters = self._waiting(rate, through) if top_mL_s > least_mL_s else rate
+        most = self.iodine_mg_mL * min(top_mL_s / least_mL_s, 1.0)
+        return lambda now_s: min(self.iodine_mg_mL * enters(now_s) / through(now_s), most), most
 
-    def _constant(self) -> tuple[Callable[[float], float], float]:
+    def _waiting(self, rate: Rate, through: Rate) -> Rate:
+        """Return the rate in mL/s at which agent enters if what the flow cannot carry at once enters next."""
+        times, entering, waiting_mL, now_s = [self.start_s], [0.0], 0.0, self.start_s + 0.5 * WAITING_STEP_S
+        while waiting_mL > 0 or rate(now_s) > 0:
+            if now_s > self.start_s + LONGEST_S:
+                break
+            waiting_mL += rate(now_s) * WAITING_STEP_S
+            enters_mL = min(through(now_s) * WAITING_STEP_S, waiting_mL)
+            waiting_mL -= enters_mL
+            times.append(now_s)
+            entering.append(enters_mL / WAITING_STEP_S)
+            now_s += WAITING_STEP_S
+        return lambda now_s: float(np.interp(now_s, times, entering, left=0.0, right=0.0))
+
+    def _constant(self) -> tuple[Rate, float]:
         """Return the rate in mL/s of a trapezoid whose integral is that of the constant rate, and its maximum."""
         end_s = self.start_s + self.duration_s
         ramp_s = min(RAMP_S, 0.5 * self.duration_s)
@@ -107,7 +132,7 @@ class Bolus:
 
         return at, self.rate_mL_s
 
-    def _gamma(self) -> tuple[Callable[[float], float], float]:
+    def _gamma(self) -> tuple[Rate, float]:
         """Return the rate in mL/s of a gamma-variate curve with the integral of the constant rate, and its maximum."""
         a, peak_s = GAMMA_EXPONENT, self.duration_s
         top_mL_s = self.rate_mL_s * a ** (a + 1) / (exp(a) * gamma(a + 1))

@@ -19,7 +19,7 @@ from vstent.geometry.vessel import Anatomy
 from vstent.io.tables import write_rows
 from vstent.io.writers import write_json
 from vstent.study.folder import CACHE, claimed
-from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of
+from vstent.study.ledger import ANATOMY, CONTRAST_VERSION, Ledger, anatomy_key, key_of
 from vstent.study.provenance import METRICS
 from vstent.study.repeat import UNTOLD, finished_run
 from vstent.study.stages import flow_key
@@ -96,7 +96,7 @@ def _one(
 ) -> Angiogram:
     """Return the angiogram of one flow, stored or computed."""
     stored = ledger.folder / f"flow {name}-{key}.npz"
-    stage, own = f"angiogram {name}", key_of(key, settings)
+    stage, own = f"angiogram {name}", key_of(CONTRAST_VERSION, key, settings)
     carrier = cache(lambda: ledger.recall(f"flow {name}", key, FlowField))
     with nullcontext() if record is None else record(name, stored, carrier) as watch:
         found = None if watch else ledger.recall(stage, own, Angiogram)

@@ -14,7 +14,7 @@ from vstent.flow.case import FlowField
 from vstent.geometry.vessel import Anatomy
 from vstent.io.archive import load_data, save_data
 from vstent.study.folder import CACHE, history_path
-from vstent.study.ledger import ANATOMY, anatomy_key, key_of
+from vstent.study.ledger import ANATOMY, CONTRAST_VERSION, anatomy_key, key_of
 from vstent.study.repeat import finished_run
 from vstent.study.stages import deploy_one
 
@@ -41,7 +41,7 @@ class Recording:
         flow : its stored file.
         carrier_of : returns the flow, None where there is none.
         """
-        path, key = history_path(flow), key_of(self.settings)
+        path, key = history_path(flow), key_of(CONTRAST_VERSION, self.settings)
         kept = _kept(path, key)
         carrier = carrier_of() if kept is None else None
         if carrier is None:

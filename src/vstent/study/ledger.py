@@ -24,6 +24,8 @@ RESULTS_VERSION: Final = "0.1.0"
 DEPLOYMENT_VERSION: Final = "0.2.0"
 """Version of the deployment: it changes when deployed devices change, so that what was computed with them is computed
 again; anatomies and flows without a device are kept."""
+CONTRAST_VERSION: Final = "0.2.0"
+"""Version of the angiogram: it changes only when its results change."""
 KEY_DIGITS: Final = 16
 """Number of digits of a key."""
 ANATOMY: Final = "anatomy"
