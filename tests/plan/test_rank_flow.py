@@ -116,12 +116,13 @@ def test_a_flow_starts_from_that_of_the_most_similar_coverage(monkeypatch: pytes
     monkeypatch.setattr(rank_flow, "simulate_case", noting)
     monkeypatch.setattr(rank_flow, "indices", lambda *_: dict.fromkeys(rank_flow.REDUCED, 1.0))
     monkeypatch.setattr(rank_flow, "grade", lambda *_: SimpleNamespace(level="good"))
-    flows = rank_flow._Flows(anatomy(), SETTINGS, has_contrast=False)
+    flows = rank_flow._Flows(anatomy(), SETTINGS, has_contrast=False, coming=list(covered))
     flows.computed(None)
     for fraction in covered:
         flows.computed(replace(one, measures=one.measures | {rank_flow.COVERAGE: fraction}))
     # only 0.32 and 0.30 are similar; the last device misses the neck
     assert begun == [None, None, None, fields[1], None, None]
+    assert not flows._done  # no flow is kept from which none starts
 
 
 def test_a_flow_of_a_device_whose_numbers_changed_is_not_found(tmp_path) -> None:

@@ -33,8 +33,9 @@ CONTRAST: Final = AngiogramSettings(window_s=10.0, is_preview=True)
 COVERAGE: Final = "neck_metal_coverage_fraction"
 """Measure by which similar devices are found."""
 SIMILAR: Final = 0.1
-"""Largest relative difference of the coverage of similar devices. Begun from Pipeline, which covers the neck of the
-demo a fifth more, Enterprise stops 1 to 4 % from where it stops when begun without a device (0.3 mm)."""
+"""Largest relative difference of the coverage of the neck by devices that count as similar. Beyond it the start
+matters: a flow with Enterprise that starts from one with Pipeline ends 1 to 4 % from the one that starts without a
+device (demo, grid spacing 0.3 mm)."""
 
 
 class Stored(Protocol):
@@ -101,7 +102,7 @@ def rank_flows(
         raise InputError("No size is suitable, so there is no flow to compute. Choose another device.")
     found: Stored = {} if stored is None else stored
     unfinished = [one for one in chosen if not _is_finished(found.get(one), has_contrast)]
-    flows = _Flows(anatomy, settings, has_contrast)
+    flows = _Flows(anatomy, settings, has_contrast, [_coverage(one) for one in unfinished])
     results: dict[Candidate | None, Mapping[str, Any]] = {}
     criteria = ranking.criteria if has_contrast else None
     for done, candidate in enumerate([None, *chosen]):
@@ -140,10 +141,19 @@ def chosen_of(ranking: Ranking, count: int) -> list[Candidate]:
 
 
 class _Flows:
-    """Flows in one vessel, each started from the nearest one."""
+    """Flows in one vessel, each started from the nearest one. Flows from which none of the others starts are dropped.
 
-    def __init__(self, anatomy: Anatomy, settings: FlowSettings, has_contrast: bool) -> None:
+    Parameters
+    ----------
+    anatomy : the artery.
+    settings : settings of the flows.
+    has_contrast : whether the retention of contrast is measured.
+    coming : coverages of the neck by the devices, in the order in which they are computed.
+    """
+
+    def __init__(self, anatomy: Anatomy, settings: FlowSettings, has_contrast: bool, coming: list[float]) -> None:
         self.anatomy, self.settings, self.has_contrast = anatomy, settings, has_contrast
+        self._coming = coming
         self._bare: FlowField | None = None
         self._done: list[tuple[float, FlowField]] = []
 
@@ -151,6 +161,8 @@ class _Flows:
         """Compute the flow with a candidate, or without a device, and return what is kept of it."""
         case = flow_case(self.anatomy, None if candidate is None else _stent(self.anatomy, candidate), self.settings)
         covered = _coverage(candidate)
+        if candidate is not None:
+            self._coming = self._coming[1:]
         try:
             field = simulate_case(case, start=self._bare, similar=self._nearest(covered))
         except FlowError as error:
@@ -161,6 +173,7 @@ class _Flows:
             self._bare = field
         else:
             self._done.append((covered, field))
+            self._done = [one for one in self._done if any(_is_similar(one[0], other) for other in self._coming)]
         values = indices(field, case.sac, case.ostium)
         kept: dict[str, Any] = {key: values[key] for key in REDUCED} | {"unsettled_fraction": field.unsettled_fraction}
         kept["grade"] = grade(case, field, values).level
@@ -171,7 +184,12 @@ class _Flows:
     def _nearest(self, coverage: float) -> FlowField | None:
         """Return the flow with the most similar device; None if none is similar."""
         nearest = min(self._done, key=lambda one: abs(one[0] - coverage), default=(0.0, None))
-        return nearest[1] if abs(nearest[0] - coverage) < SIMILAR * coverage else None
+        return nearest[1] if _is_similar(nearest[0], coverage) else None
+
+
+def _is_similar(coverage: float, other: float) -> bool:
+    """Return whether a flow with this coverage is a start for that with another one."""
+    return abs(coverage - other) < SIMILAR * other
 
 
 def _coverage(candidate: Candidate | None) -> float:
