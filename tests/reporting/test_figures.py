@@ -142,7 +142,7 @@ def test_far_wires_are_paler_than_near_ones():
 def test_pictures_of_a_case_are_pngs_with_colour():
     from matplotlib.image import imread
 
-    found = figures.pictures(report_case.scene())
+    found = [plate.drawn() for plate in figures.plates(report_case.scene())]
     assert [picture.id for picture in found] == [
         "anatomy",
         "contour",

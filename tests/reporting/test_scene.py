@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import report_case
 
-from vstent.reporting.figures import pictures
+from vstent.reporting.figures import plates
 from vstent.reporting.packing import pack
 from vstent.reporting.scene import LineLayer, flow_layers, round_up, scales_of, scene_of
 from vstent.reporting.thinning import thin_frames, thin_lines, thin_surface
@@ -90,7 +90,7 @@ def test_scales_of_the_flow_are_as_wide_as_what_is_about_the_sac_before():
 
 
 def test_pictures_of_the_flow_say_what_is_done_with_what_is_above_their_scale():
-    words = {picture.id: picture.caption for picture in pictures(report_case.scene())}
+    words = {picture.id: picture.caption for picture in plates(report_case.scene())}
     assert all("Values above the scale have its last color." in words[name] for name in ("streamlines", "shear"))
 
 

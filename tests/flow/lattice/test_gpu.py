@@ -113,7 +113,7 @@ def everything() -> lattice_state.State:
     shape = swing[:, None, None] * links.shape
     state.links = replace(links, openings=openings, start=start, wanted=wanted, course=course, shape=shape)
     septa, cell = septa_away_from_links(state)
-    state.addressing = replace(a, septa=septa, septum_cell=cell)
+    state.addressing = replace(a, septa=np.ascontiguousarray(septa), septum_cell=cell)
     state.bands = build_bands(state.domain, state.addressing, state.links)
     state.limit[::2] = 1.0
     state.pace = np.array([2 * SETTLED_PAIRS + 20, 2 * SETTLED_PAIRS + 18])
