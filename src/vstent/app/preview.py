@@ -141,7 +141,7 @@ class Preview:
 
     def _revive(self) -> None:
         """Start the process again where it had begun to step; else say that it ends at once."""
-        if self._said.values:
+        if self._said.fraction >= 1.0:
             self._post.end()
             self._begin()
         else:

@@ -39,7 +39,7 @@ def _paint() -> None:
     depth, image, sums = (np.zeros(shape, np.float32) for shape in ((2, 2), (2, 2, 3), (2, 2, 4)))
     raster.paint_triangles(screen, screen, faces, depth, image)
     raster.paint_wires(screen, np.array([0, 3], dtype=np.int32), np.ones(1), 1.0, screen, depth, image)
-    raster.veil_triangles(screen, screen, np.ones(1), faces, depth, sums, depth)
+    raster.veil_triangles(screen, screen, np.ones(3), faces, depth, sums, depth)
     raster.resolve(image, sums, depth, 1)
 
 

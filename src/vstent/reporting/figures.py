@@ -135,11 +135,6 @@ def patient_picture(anatomy: Anatomy, deployment: Deployment) -> Picture:
     return Picture("patient", "", "", np.asarray(picture))
 
 
-def pictures(scene: Scene) -> list[Picture]:
-    """Return the pictures of a scene."""
-    return [plate.drawn() for plate in plates(scene)]
-
-
 def overview(scene: Scene) -> bytes:
     """Return one wide PNG that sums up a case: wires across the neck, and streamlines where a flow was computed."""
     layers = ("lumen", "continued", "wires", "neck", "streamlines")

@@ -106,7 +106,7 @@ class Stepping:
         return monitored(self.state, now)[[NECK_INFLOW, 0]]
 
     def place(self, case: FlowCase) -> None:
-        """Exchange the device for that of a case; the flow goes on from where it is."""
+        """Exchange the device for that of a case; the flow continues from its present state."""
         exchange(self.state, case)
         self.readings.clear()
 
@@ -191,7 +191,7 @@ class LiveFlow:
     def place(self, screen: Screen | None) -> None:
         """Exchange the device; None removes it.
 
-        The flow with a device goes on from where it is; the first one goes on from the flow without a device.
+        The flow with a device continues from its present state; the first one continues from the flow without a device.
         """
         if screen is None:
             self._shown = self._bare

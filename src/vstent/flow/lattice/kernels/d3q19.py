@@ -550,18 +550,6 @@ def resisted(velocity: Any, entries: Any, times: Any, odd_rate: float) -> Any:
     return result
 
 
-@njit(cache=True, inline="always")
-def velocity_at(f: Any, stride: int, place: int) -> tuple[float, float, float]:
-    """Return the momentum (3) of the populations of a storage place; populations must be at home."""
-    ux = uy = uz = 0.0
-    for q in range(1, 19):
-        population = f[q * stride + place]
-        ux += VELOCITIES[q, 0] * population
-        uy += VELOCITIES[q, 1] * population
-        uz += VELOCITIES[q, 2] * population
-    return ux, uy, uz
-
-
 @njit(cache=True, forceinline=True)
 def inflow_speed(opening: Any, density: float) -> float:
     """Return the speed of an inflow whose mean density is given, so that sound can leave.
