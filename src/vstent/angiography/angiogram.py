@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vstent.angiography import washout as washouts
-from vstent.angiography.bolus import Bolus
+from vstent.angiography.bolus import Bolus, OverTime
 from vstent.angiography.curves import Curves
 from vstent.angiography.grid import Grid, grid_of
 from vstent.angiography.network import Network, period_s
@@ -118,7 +118,7 @@ def memory_bytes(field: FlowField) -> float:
     return (BYTES_PER_CELL + BYTES_PER_PHASE_AND_CELL * len(field.phases)) * float(len(field.cells))
 
 
-def entering(bolus: Bolus, field: FlowField) -> tuple[Callable[[float], float], float]:
+def entering(bolus: Bolus, field: FlowField) -> tuple[OverTime, float]:
     """Return the iodine concentration in mg/mL of the blood that enters a flow, over time in s, and its maximum.
 
     Parameters

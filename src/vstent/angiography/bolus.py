@@ -21,8 +21,8 @@ LONGEST_S: Final = 60.0
 """Time after which agent that still waits is left out."""
 
 
-Rate = Callable[[float], float]
-"""Rate in mL/s as a function of time in s."""
+OverTime = Callable[[float], float]
+"""A rate in mL/s or a concentration in mg/mL as a function of time in s."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Bolus:
 
     def inflow(
         self, flow_mL_s: Sequence[float], time_s: Sequence[float] = (0.0,), period_s: float | None = None
-    ) -> tuple[Callable[[float], float], float]:
+    ) -> tuple[OverTime, float]:
         """Return the iodine concentration of the entering blood in mg/mL as a function of time in s, and its maximum.
 
         Parameters
@@ -107,12 +107,10 @@ class Bolus:
         most = self.iodine_mg_mL * min(top_mL_s / least_mL_s, 1.0)
         return lambda now_s: min(self.iodine_mg_mL * enters(now_s) / through(now_s), most), most
 
-    def _waiting(self, rate: Rate, through: Rate) -> Rate:
+    def _waiting(self, rate: OverTime, through: OverTime) -> OverTime:
         """Return the rate in mL/s at which agent enters if what the flow cannot carry at once enters next."""
         times, entering, waiting_mL, now_s = [self.start_s], [0.0], 0.0, self.start_s + 0.5 * WAITING_STEP_S
-        while waiting_mL > 0 or rate(now_s) > 0:
-            if now_s > self.start_s + LONGEST_S:
-                break
+        while now_s <= self.start_s + LONGEST_S and (waiting_mL > 0 or rate(now_s) > 0):
             waiting_mL += rate(now_s) * WAITING_STEP_S
             enters_mL = min(through(now_s) * WAITING_STEP_S, waiting_mL)
             waiting_mL -= enters_mL
@@ -121,7 +119,7 @@ class Bolus:
             now_s += WAITING_STEP_S
         return lambda now_s: float(np.interp(now_s, times, entering, left=0.0, right=0.0))
 
-    def _constant(self) -> tuple[Rate, float]:
+    def _constant(self) -> tuple[OverTime, float]:
         """Return the rate in mL/s of a trapezoid whose integral is that of the constant rate, and its maximum."""
         end_s = self.start_s + self.duration_s
         ramp_s = min(RAMP_S, 0.5 * self.duration_s)
@@ -132,7 +130,7 @@ class Bolus:
 
         return at, self.rate_mL_s
 
-    def _gamma(self) -> tuple[Rate, float]:
+    def _gamma(self) -> tuple[OverTime, float]:
         """Return the rate in mL/s of a gamma-variate curve with the integral of the constant rate, and its maximum."""
         a, peak_s = GAMMA_EXPONENT, self.duration_s
         top_mL_s = self.rate_mL_s * a ** (a + 1) / (exp(a) * gamma(a + 1))

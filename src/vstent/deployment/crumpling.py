@@ -6,6 +6,7 @@ their neighbours open wide. Cells that are short along the artery, as on the inn
 there the device is dense but even.
 """
 
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -117,6 +118,7 @@ class Crumpling(NamedTuple):
     """Number of cells."""
 
 
+@lru_cache(maxsize=8)  # a deployment is advised on and measured
 def crumpling(anatomy: Anatomy, stent: Stent) -> Crumpling | None:
     """Find the narrowest cell of a device, and count the crumpled ones.
 

@@ -14,8 +14,6 @@ MOST_CHARACTERS = 22
 def text_rows(words: list[str], numbers: Ints, decimals: int) -> bytes:
     """Return one line of text per row of numbers, without a line break at the end.
 
-    Formatting them in Python takes fifty times as long.
-
     Parameters
     ----------
     words : k + 1 texts

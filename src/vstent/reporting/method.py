@@ -161,11 +161,11 @@ def _first_contours(deployments: Mapping[str, Deployment], scene: Scene) -> Plat
 def _triangles(anatomy: Anatomy, deployments: Mapping[str, Deployment], scene: Scene) -> Plate:
     """Return the picture of the triangle mesh of each contour near the neck, before and after the expansion."""
     profile, shots = scene.view("profile"), []
+    middle_mm = _middle_mm(anatomy)
     for name, title in scene.panes[1:]:
         history_mm = deployments[name].history_mm
         for words, nodes_mm in (("initial", history_mm[0]), ("deployed", history_mm[-1])):
-            middle = _middle_mm(anatomy)
-            near = np.linalg.norm(nodes_mm.mean(axis=1) - middle, axis=1) < MESH_MM
+            near = np.linalg.norm(nodes_mm.mean(axis=1) - middle_mm, axis=1) < MESH_MM
             rows = nodes_mm[near] if near.sum() > 2 else nodes_mm
             view = view_of("mesh", profile.axes, rows.reshape(-1, 3))
             shots.append(Shot(f"{title}: {words}", (*_glass(scene), *mesh_layers(rows)), view))

@@ -157,7 +157,7 @@ def test_sequences_make_every_pair_once_and_end_at_home(first_pair: int, count: 
 
 
 class Driver:
-    """Stands for the functions of CUDA's driver that record and replay; it counts, and fails where it is told to."""
+    """Substitute for the recording functions of CUDA's driver. It counts calls and fails in the one it is given."""
 
     CUstream = staticmethod(int)
 
