@@ -130,7 +130,7 @@ class FlowSettings:
     when the standard error of every time average is smaller than this fraction."""
     max_steps: int = 96_000
     """Maximum number of time steps of a steady flow on the fine grid. With `close_up`, the refined part makes at
-    most a sixth of them and the surrounding flow at most half."""
+    most a quarter of them and the surrounding flow at most half."""
     lattice_speed: float = 0.15
     """Peak speed in cells per time step. It sets the time step, which is a third longer in a steady refined sac
     (`close_up`). In steady flow it affects the result through the relaxation times, that is through the spatial
