@@ -304,7 +304,7 @@ def test_the_cells_foretold_are_enough_and_not_far_too_many() -> None:
     made = len(close_ups.build(wanted, 0.25, close_ups.close_up(case, outer)).cells)
     assert made < estimate(wanted).cells < 1.25 * made
     whole = estimate(replace(wanted, settings=replace(wanted.settings, close_up=False)))
-    assert estimate(wanted).steps == whole.steps / 6
+    assert estimate(wanted).steps == whole.steps / 4
     assert estimate(wanted).seconds < 0.4 * whole.seconds
 
 
@@ -316,11 +316,11 @@ def test_no_close_up_without_a_sac_or_of_what_has_none() -> None:
         simulate_case(replace(bare, settings=replace(bare.settings, engine=OPENFOAM)))
 
 
-def test_a_close_up_is_given_a_sixth_of_the_steps() -> None:
+def test_a_close_up_is_given_a_quarter_of_the_steps() -> None:
     case, outer = outer_of_demo()
     whole, near = (LatticeBoltzmann(0.25, None, around) for around in (None, outer))
     state = near.init(case, outer)
-    assert near.max_checks(state) == int(case.settings.max_steps / 6 // state.steps_per_check) >= 12
+    assert near.max_checks(state) == int(case.settings.max_steps / 4 // state.steps_per_check) >= 12
     assert whole.max_checks(state) == int(case.settings.max_steps // state.steps_per_check)
 
 
