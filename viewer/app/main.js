@@ -42,6 +42,7 @@ class Page {
     this.colour = "wall_gap";
     this.memory = {};
     this.changes = Promise.resolve();
+    this.isFollowing = false; // along the steps of the job that runs
     this.isWhole = false;
     this.measures = {};
     addEventListener("keydown", (event) => this.key(event));
@@ -89,6 +90,7 @@ class Page {
     this.events?.close();
     if (this.flowing?.isOn) this.flowing.turn(false);
     this.view = null;
+    this.isFollowing = false;
     this.anatomyKey = this.flowKey = this.scanKey = this.inputKey = this.inputViews = this.proposed = undefined;
     this.anatomy = null;
     this.scan = this.imaging = null;
@@ -209,9 +211,9 @@ class Page {
       this.flowKey = undefined; // what it has found is to be fetched
       this.films.forget();
     }
-    const follows = before?.job && !view.job && before.steps[this.step] === "running";
-    if (before?.job && view.job && before.steps[this.step] === "running" && view.steps[this.step] !== "running") this.follow(view);
-    if (follows) this.finished(before);
+    if (view.job && view.steps[this.step] === "running") this.isFollowing = true;
+    if (this.isFollowing && view.job) this.follow(view);
+    if (this.isFollowing && before?.job && !view.job) this.finished(before);
     this.load();
     const shape = JSON.stringify([view.choices, view.steps, view.failed, view.has_report, view.has_ranking, view.has_angiogram, !view.job, this.step, view.anatomy]);
     if (shape === this.shape) {
@@ -223,18 +225,22 @@ class Page {
     this.render();
   }
 
-  /** Go along with a job through its steps. */
+  /** Go along with a job through its steps; the state in which a short one runs may never have come. */
   follow(view) {
-    const running = STEPS.find(([name]) => view.steps[name] === "running");
-    if (running && ["image", "vessel", "sac"].includes(this.step)) this.go(running[0], "replace");
-    else if (running && running[0] === "flow") this.go("flow", "replace");
+    const running = STEPS.find(([name]) => view.steps[name] === "running")?.[0];
+    if (["vessel", "sac", "flow"].includes(running)) this.goForward(running);
   }
 
   finished(before) {
-    const failed = Object.entries(this.view.failed)[0];
-    if (failed) return;
-    if (before.job.kind === "anatomy") this.go("sac", "replace");
-    if (before.job.kind === "flow") this.go("flow", "replace");
+    this.isFollowing = false;
+    const step = { anatomy: "sac", flow: "flow" }[before.job.kind];
+    if (this.view.steps[step] === "done") this.goForward(step);
+  }
+
+  /** Turn to a step that lies ahead. */
+  goForward(step) {
+    const place = (wanted) => STEPS.findIndex(([name]) => name === wanted);
+    if (place(step) > place(this.step)) this.go(step, "replace");
   }
 
   /** Fetch what has changed for the picture. */
@@ -342,6 +348,7 @@ class Page {
     if (!step || !STEPS.some(([name]) => name === step)) return;
     if (VIEW[step] !== VIEW[this.step]) this.picture.look(VIEW[step]);
     this.step = step;
+    if (entry !== "replace") this.isFollowing = false;
     const address = `#${this.view.id}/${step}`;
     if (entry && address !== location.hash) history[`${entry}State`](null, "", address);
     this.shape = null;
@@ -635,6 +642,7 @@ class Page {
 
   async start(kind) {
     await this.changes; // what was typed last comes first
+    this.isFollowing = true;
     try {
       this.take(await post(`${this.path}/jobs/${kind}`));
     } catch (problem) {
