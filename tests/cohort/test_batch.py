@@ -19,15 +19,16 @@ import pytest
 
 from vstent import phantoms
 from vstent.cli import main
+from vstent.cohort import batch
 from vstent.cohort.batch import collect, left_to_do, run_cohort
 from vstent.cohort.cases import find_cases
-from vstent.cohort.crews import DaskCluster, Processes, Slurm
 from vstent.cohort.estimate import START_CPU_S, estimate
 from vstent.cohort.work import COST, LOST, flat_metrics, read_row, row_path, work
 from vstent.errors import FlowError, InputError, ReadError, VstentError
 from vstent.io.tables import write_parquet
 from vstent.io.writers import write_stl
 from vstent.reporting.cohort import cohort_report, modified_z_scores
+from vstent.study.crews import DaskCluster, Processes, Slurm
 from vstent.study.pipeline import run as run_study
 from vstent.study.types import Placing, Settings
 
@@ -141,9 +142,12 @@ def test_a_worker_killed_midway_is_replaced_and_the_table_is_the_same(scans, tab
     assert bare(collect(cases, tmp_path)) == table
 
 
-def test_a_case_whose_process_always_dies_costs_only_itself_and_is_done_by_the_next_run(scans, table, tmp_path):
+def test_a_case_whose_process_always_dies_costs_only_itself_and_is_done_by_the_next_run(
+    scans, table, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(batch, "work", killed)
     cases = find_cases(scans, SETTINGS)[1:]
-    run_cohort(left_to_do(cases, tmp_path), tmp_path, Processes(2, killed), told)
+    run_cohort(left_to_do(cases, tmp_path), tmp_path, Processes(2), told)
     rows = collect(cases, tmp_path)
     assert [row["outcome"] for row in rows] == ["done", "failed", LOST, LOST]
     assert "killed by signal 9" in rows[2]["sentence"]
@@ -290,7 +294,7 @@ def test_outliers_are_found_by_the_modified_z_score():
 
 @needs_dask
 def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_keeps_what_is_done(
-    scans, table, tmp_path
+    scans, table, tmp_path, monkeypatch
 ):
     cases = find_cases(scans, SETTINGS)
     with Scheduler(tmp_path) as scheduler:
@@ -304,8 +308,10 @@ def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_k
             for name in "bc":
                 row_path(tmp_path / "cases" / name, device).unlink()
         tasks = left_to_do(cases, tmp_path)
+        monkeypatch.setattr(batch, "work", held)
         with pytest.raises(VstentError, match="scheduler was lost"):
-            run_cohort(tasks, tmp_path, DaskCluster(scheduler.address, held), lambda *_: scheduler.process.kill())
+            run_cohort(tasks, tmp_path, DaskCluster(scheduler.address), lambda *_: scheduler.process.kill())
+    monkeypatch.undo()
     assert [task.case.name for task in left_to_do(cases, tmp_path)] == ["c"]
     run_cohort(left_to_do(cases, tmp_path), tmp_path, Processes(1), told)
     assert bare(collect(cases, tmp_path)) == table
@@ -313,9 +319,9 @@ def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_k
 
 @needs_dask
 def test_no_scheduler_is_told_in_a_sentence(scans, tmp_path, monkeypatch):
-    monkeypatch.setattr("vstent.cohort.crews.SCHEDULER_S", 0.5)
+    monkeypatch.setattr("vstent.study.crews.SCHEDULER_S", 0.5)
     with pytest.raises(InputError, match="No Dask scheduler answers"):
-        list(DaskCluster("tcp://127.0.0.1:9").do(left_to_do(find_cases(scans, SETTINGS), tmp_path)))
+        list(DaskCluster("tcp://127.0.0.1:9").do(work, left_to_do(find_cases(scans, SETTINGS), tmp_path)))
 
 
 def test_a_slurm_job_asks_for_twice_the_memory_foreseen_and_holds_one_case():

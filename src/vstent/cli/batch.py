@@ -3,13 +3,9 @@
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vstent.cli import options, run
-
-if TYPE_CHECKING:
-    from vstent.cohort.crews import AbstractCrew
-    from vstent.cohort.estimate import Estimate
 
 
 def add(commands: options.Commands) -> None:
@@ -27,10 +23,7 @@ def add(commands: options.Commands) -> None:
     options.add_outlet(options.add_given(parser))
     run.add_study(parser)
     working = parser.add_argument_group("parallel work")
-    options.add_jobs(working)
-    crew = working.add_mutually_exclusive_group()
-    crew.add_argument("--scheduler", metavar="ADDRESS", help="use the workers of this Dask scheduler")
-    crew.add_argument("--slurm", action="store_true", help="use --jobs jobs of a Slurm queue (needs the extra cluster)")
+    options.add_crew(working)
     working.add_argument(
         "--keep-files", action="store_true", help="keep all files of every case (default: the table only)"
     )
@@ -51,7 +44,9 @@ def _batch(arguments: argparse.Namespace) -> int:
     foreseen = estimate([task.case for task in tasks], arguments.jobs)
     console.print(f"{len(cases)} cases, {device_rows(cases)} rows; {len(tasks)} cases to do: {foreseen.sentence}.")
     with console.live():
-        run_cohort(tasks, arguments.out, _crew(arguments, foreseen), _teller(console))
+        run_cohort(
+            tasks, arguments.out, options.given_crew(arguments, foreseen.jobs, foreseen.memory_MB), _teller(console)
+        )
     rows = collect(cases, arguments.out)
     written = write_table(arguments.out, rows)
     _report(arguments.out, rows, pictures_of(rows, arguments.out))
@@ -61,17 +56,6 @@ def _batch(arguments: argparse.Namespace) -> int:
         console.say("No Parquet file was written: it needs pyarrow (pip install 'vstent[parquet]').")
     console.print("Research use only.")
     return 0
-
-
-def _crew(arguments: argparse.Namespace, foreseen: "Estimate") -> "AbstractCrew":
-    """Return the processes or the cluster that the options request."""
-    from vstent.cohort.crews import DaskCluster, Processes, Slurm
-
-    if arguments.scheduler:
-        return DaskCluster(arguments.scheduler)
-    if arguments.slurm:
-        return Slurm(arguments.jobs, foreseen.memory_MB)
-    return Processes(foreseen.jobs)
 
 
 def _teller(console: Any) -> Any:

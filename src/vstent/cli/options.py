@@ -14,6 +14,7 @@ from vstent.errors import InputError
 if TYPE_CHECKING:
     from vstent.flow.case import Blood, FlowSettings, Waveform
     from vstent.plan.uncertainty import Ranges
+    from vstent.study.crews import AbstractCrew
 
 EPILOG: Final = "Lengths are in mm, coordinates are LPS. Research use only: not cleared for diagnosis or treatment."
 """Last line of every help text."""
@@ -275,11 +276,44 @@ def add_flow(parser: argparse.ArgumentParser) -> "argparse._ArgumentGroup":
 def add_jobs(group: "argparse._ArgumentGroup") -> None:
     """Add the number of parallel processes."""
     group.add_argument(
-        "--jobs", type=_jobs, default=_cores(), metavar="N", help="parallel processes (default: one per core)"
+        "--jobs", type=_jobs, default=cores(), metavar="N", help="parallel processes (default: one per core)"
     )
 
 
-def _cores() -> int:
+def add_crew(group: "argparse._ArgumentGroup") -> None:
+    """Add the number of parallel processes, and the clusters that may be used in their place."""
+    add_jobs(group)
+    crew = group.add_mutually_exclusive_group()
+    crew.add_argument("--scheduler", metavar="ADDRESS", help="use the workers of this Dask scheduler")
+    crew.add_argument("--slurm", action="store_true", help="use --jobs jobs of a Slurm queue (needs the extra cluster)")
+
+
+def given_crew(arguments: argparse.Namespace, jobs: int, memory_MB: float) -> "AbstractCrew":
+    """Return the processes or the cluster that the options request.
+
+    Parameters
+    ----------
+    arguments : the parsed options.
+    jobs : number of parallel processes for which this machine's memory suffices.
+    memory_MB : estimated memory of one task; 0: unknown.
+
+    Raises
+    ------
+    InputError
+        A Slurm job is requested whose memory is unknown.
+    """
+    from vstent.study.crews import DaskCluster, Processes, Slurm
+
+    if arguments.scheduler:
+        return DaskCluster(arguments.scheduler)
+    if arguments.slurm and not memory_MB:
+        raise InputError("The memory of a flow with this engine is unknown. Use --scheduler instead of --slurm.")
+    if arguments.slurm:
+        return Slurm(arguments.jobs, memory_MB)
+    return Processes(jobs)
+
+
+def cores() -> int:
     """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

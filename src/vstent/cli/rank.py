@@ -46,7 +46,7 @@ def add(commands: options.Commands) -> None:
         action="store_true",
         help="carry contrast through these flows too; the time that it stays in the sac counts in their scores",
     )
-    options.add_jobs(ranking)
+    options.add_crew(ranking)
     options.add_flow(parser)
     parser.set_defaults(command=_rank)
 
@@ -64,6 +64,8 @@ def _rank(arguments: argparse.Namespace) -> int:
 
     if arguments.retention and not arguments.flow_count:
         raise InputError("Contrast moves with a flow. Give --flow N with --retention.")
+    if (arguments.scheduler or arguments.slurm) and not arguments.flow_count:
+        raise InputError("A cluster computes the flows of a ranking. Give --flow N with --scheduler or --slurm.")
     designs = [find_design(name) for name in options.given_devices(arguments)]
     criteria = read_criteria(arguments.criteria) if arguments.criteria else default_criteria()
     console = Console()
@@ -91,16 +93,20 @@ def _rank(arguments: argparse.Namespace) -> int:
 
 def _with_flows(arguments: argparse.Namespace, anatomy: "Anatomy", ranking: "Ranking", console: "Console") -> "Ranking":
     """Return the ranking with the flows of its best sizes; an interrupted one goes on."""
-    from vstent.plan.rank_flow import rank_flows
+    from vstent.plan.rank_flow import chosen_of, rank_flows
+    from vstent.study.flow_crew import compute_flows, parallel_flows
     from vstent.study.flow_store import FlowStore
 
-    settings = options.given_flow(arguments)
-    return rank_flows(
-        anatomy,
-        ranking,
-        settings,
-        arguments.flow_count,
-        has_contrast=arguments.retention,
-        stored=FlowStore(arguments.out, anatomy, settings),
-        progress=lambda done, total, name: console.progress("rank by flow", done / total, f"{done} of {total}: {name}"),
-    )
+    def told(done: int, total: int, name: str) -> None:
+        console.progress("rank by flow", done / total, f"{done} of {total}: {name}")
+
+    settings, count, has_contrast = options.given_flow(arguments), arguments.flow_count, arguments.retention
+    stored, chosen = FlowStore(arguments.out, anatomy, settings), chosen_of(ranking, count)
+    jobs, memory_MB = parallel_flows(anatomy, chosen, settings, min(arguments.jobs, count))
+    is_cluster = bool(arguments.scheduler or arguments.slurm)
+    if anatomy.aneurysms and chosen and (jobs > 1 or is_cluster):
+        crew = options.given_crew(arguments, jobs, memory_MB)
+        threads = 1 if is_cluster else max(1, options.cores() // jobs)
+        given = {"has_contrast": has_contrast, "threads": threads, "progress": told}
+        compute_flows(anatomy, chosen, settings, stored, crew, **given)
+    return rank_flows(anatomy, ranking, settings, count, has_contrast=has_contrast, stored=stored, progress=told)

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from vstent.cohort.cases import Case
-from vstent.cohort.crews import AbstractCrew
-from vstent.cohort.work import LOST, Row, Task, picture_path, read_row, write_row
+from vstent.cohort.work import LOST, Row, Task, picture_path, read_row, work, write_row
 from vstent.io.tables import write_parquet, write_rows
+from vstent.study.crews import AbstractCrew
 
 CASES: Final = "cases"
 """Subfolder of the output folder that holds one folder per case."""
@@ -63,7 +63,7 @@ def run_cohort(tasks: Sequence[Task], out: Path, crew: AbstractCrew, progress: P
     VstentError
         The connection to the cluster is lost; finished rows are kept.
     """
-    for done, ended in enumerate(crew.do(tasks), start=1):
+    for done, ended in enumerate(crew.do(work, tasks), start=1):
         task = tasks[ended.number]
         for device, key in task.keys.items():
             if read_row(task.folder, device, key) is None:

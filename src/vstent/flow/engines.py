@@ -101,6 +101,10 @@ class AbstractEngine(ABC, Generic[State]):
         """
         return "The run time and memory of this engine cannot be estimated in advance."
 
+    def memory_bytes(self, case: FlowCase) -> float | None:
+        """Return the expected peak memory of a flow; None: unknown."""
+        return None
+
     def calmer(self, case: FlowCase) -> FlowCase | None:
         """Return a modified case to retry after divergence; None: do not retry."""
         return None

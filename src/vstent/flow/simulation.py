@@ -163,6 +163,11 @@ def foretell_cost(case: FlowCase) -> str:
     return engine_class(case.settings)(default_cell_size_mm(case)).cost(case)
 
 
+def memory_bytes(case: FlowCase) -> float | None:
+    """Return the expected peak memory of a flow; None where its engine does not estimate it."""
+    return engine_class(case.settings)(default_cell_size_mm(case)).memory_bytes(case)
+
+
 def engine_class(settings: FlowSettings) -> type[AbstractEngine[Any]]:
     """Return the engine that the settings name: one of vstent's own or a plug-in.
 

@@ -1,8 +1,8 @@
 """Rank by flow: the best sizes by geometry get a flow, and its reductions and its retention join the ranking."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeVar
 
 from vstent.anatomy.morphology import Measures
 from vstent.angiography.angiogram import PREVIEW_ERROR, AngiogramSettings, angiogram
@@ -17,6 +17,8 @@ from vstent.flow.simulation import flow_case, simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.plan.criteria import Criteria
 from vstent.plan.rank import Candidate, Ranking, graded_anew, ordered
+
+Value = TypeVar("Value")
 
 REDUCED: Final = {
     "neck_inflow_mL_s": "neck_inflow_change_fraction",
@@ -101,8 +103,8 @@ def rank_flows(
     if not chosen:
         raise InputError("No size is suitable, so there is no flow to compute. Choose another device.")
     found: Stored = {} if stored is None else stored
-    unfinished = [one for one in chosen if not _is_finished(found.get(one), has_contrast)]
-    flows = _Flows(anatomy, settings, has_contrast, [_coverage(one) for one in unfinished])
+    unfinished = [one for one in chosen if not is_finished(found.get(one), has_contrast)]
+    flows = _Flows(anatomy, settings, has_contrast, [coverage_of(one) for one in unfinished])
     results: dict[Candidate | None, Mapping[str, Any]] = {}
     criteria = ranking.criteria if has_contrast else None
     for done, candidate in enumerate([None, *chosen]):
@@ -118,7 +120,7 @@ def rank_flows(
     return replace(ranking, candidates=tuple(_by_retention(told)))
 
 
-def _is_finished(result: Mapping[str, Any] | None, has_contrast: bool) -> bool:
+def is_finished(result: Mapping[str, Any] | None, has_contrast: bool) -> bool:
     """Return whether a result holds what is asked for."""
     return result is not None and ("error" in result or not has_contrast or "contrast" in result)
 
@@ -159,40 +161,84 @@ class _Flows:
 
     def computed(self, candidate: Candidate | None) -> Mapping[str, Any]:
         """Compute the flow with a candidate, or without a device, and return what is kept of it."""
-        case = flow_case(self.anatomy, None if candidate is None else _stent(self.anatomy, candidate), self.settings)
-        covered = _coverage(candidate)
         if candidate is not None:
             self._coming = self._coming[1:]
-        try:
-            field = simulate_case(case, start=self._bare, similar=self._nearest(covered))
-        except FlowError as error:
-            if candidate is None:
-                raise
-            return {"error": str(error)}
+        covered = coverage_of(candidate)
+        similar = nearest(covered, self._done)
+        field, kept = flow_with(
+            self.anatomy, candidate, self.settings, start=self._bare, similar=similar, has_contrast=self.has_contrast
+        )
         if candidate is None:
             self._bare = field
-        else:
+        elif field is not None:
             self._done.append((covered, field))
-            self._done = [one for one in self._done if any(_is_similar(one[0], other) for other in self._coming)]
-        values = indices(field, case.sac, case.ostium)
-        kept: dict[str, Any] = {key: values[key] for key in REDUCED} | {"unsettled_fraction": field.unsettled_fraction}
-        kept["grade"] = grade(case, field, values).level
-        if self.has_contrast:
-            kept["contrast"] = _contrast(self.anatomy, field)
+            self._done = [one for one in self._done if any(is_similar(one[0], other) for other in self._coming)]
         return kept
 
-    def _nearest(self, coverage: float) -> FlowField | None:
-        """Return the flow with the most similar device; None if none is similar."""
-        nearest = min(self._done, key=lambda one: abs(one[0] - coverage), default=(0.0, None))
-        return nearest[1] if _is_similar(nearest[0], coverage) else None
+
+def flow_with(
+    anatomy: Anatomy,
+    candidate: Candidate | None,
+    settings: FlowSettings,
+    *,
+    start: FlowField | None,
+    similar: FlowField | None,
+    has_contrast: bool,
+) -> tuple[FlowField | None, Mapping[str, Any]]:
+    """Compute the flow with one candidate and return it with what a ranking keeps of it.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The restored artery, with a sac.
+    candidate : Candidate or None
+        The candidate; None: no device.
+    settings : FlowSettings
+        Settings of the flow.
+    start : FlowField or None
+        The flow without a device.
+    similar : FlowField or None
+        The flow with a similar device.
+    has_contrast : bool
+        Whether the retention of contrast is measured.
+
+    Returns
+    -------
+    tuple of FlowField or None, and mapping
+        The flow, and its results; None and an error message where the flow with a device cannot be computed.
+
+    Raises
+    ------
+    FlowError
+        The flow without a device cannot be computed.
+    """
+    case = flow_case(anatomy, None if candidate is None else stent_of(anatomy, candidate), settings)
+    try:
+        field = simulate_case(case, start=start, similar=similar)
+    except FlowError as error:
+        if candidate is None:
+            raise
+        return None, {"error": str(error)}
+    values = indices(field, case.sac, case.ostium)
+    kept: dict[str, Any] = {key: values[key] for key in REDUCED} | {"unsettled_fraction": field.unsettled_fraction}
+    kept["grade"] = grade(case, field, values).level
+    if has_contrast:
+        kept["contrast"] = _contrast(anatomy, field)
+    return field, kept
 
 
-def _is_similar(coverage: float, other: float) -> bool:
+def nearest(coverage: float, done: Iterable[tuple[float, Value]]) -> Value | None:
+    """Return what belongs to the most similar coverage of the neck in `done`; None if none is similar."""
+    covered, found = min(done, key=lambda one: abs(one[0] - coverage), default=(0.0, None))
+    return found if is_similar(covered, coverage) else None
+
+
+def is_similar(coverage: float, other: float) -> bool:
     """Return whether a flow with this coverage is a start for that with another one."""
     return abs(coverage - other) < SIMILAR * other
 
 
-def _coverage(candidate: Candidate | None) -> float:
+def coverage_of(candidate: Candidate | None) -> float:
     """Return the metal coverage of the neck, 0 without a device or where the device misses the neck."""
     found = 0.0 if candidate is None else float(candidate.measures.get(COVERAGE) or 0.0)
     return found if found == found else 0.0
@@ -209,7 +255,7 @@ def _contrast(anatomy: Anatomy, field: FlowField) -> dict[str, Any]:
     return {"retention_s": found[0], "is_least": found[1]}
 
 
-def _stent(anatomy: Anatomy, candidate: Candidate) -> Stent:
+def stent_of(anatomy: Anatomy, candidate: Candidate) -> Stent:
     """Return the deployed device of a candidate."""
     design, size, shift_mm = candidate.design, candidate.size, candidate.shift_mm
     landing = Landing(propose_landing(design, anatomy, size).abscissa_mm + shift_mm) if shift_mm else None

@@ -27,7 +27,9 @@ class FlowStore:
     def __init__(self, out: Path, anatomy: Anatomy, settings: FlowSettings) -> None:
         lumen, landing = anatomy.vessel.lumen, anatomy.landing_surface
         shape = [lumen.volume_mm3, lumen.area_mm2, landing.area_mm2, *landing.vertices_mm.mean(axis=0).tolist()]
-        self._path = out / CACHE / f"rank-flow-{key_of(shape, settings)}.json"
+        self.folder = out / CACHE
+        self._path = self.folder / f"rank-flow-{key_of(shape, settings)}.json"
+        self._lost: dict[str, Any] = {}
         try:
             self._found: dict[str, Any] = json.loads(self._path.read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -35,11 +37,16 @@ class FlowStore:
 
     def get(self, candidate: Candidate | None) -> Mapping[str, Any] | None:
         """Return the result with a candidate (None: without a device), or None if there is none of these numbers."""
-        return self._found.get(_name_of(candidate))
+        name = _name_of(candidate)
+        return self._lost.get(name, self._found.get(name))
 
     def __setitem__(self, candidate: Candidate | None, result: Mapping[str, Any]) -> None:
         self._found[_name_of(candidate)] = dict(result)
         write_json(self._path, self._found, is_exact=True)
+
+    def lose(self, candidate: Candidate, why: str) -> None:
+        """Remember, for this run only, that a flow was lost with the process that computed it."""
+        self._lost[_name_of(candidate)] = {"error": why}
 
 
 def _name_of(candidate: Candidate | None) -> str:

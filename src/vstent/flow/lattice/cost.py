@@ -135,6 +135,11 @@ def _fitting_mm(case: FlowCase, needed: Callable[[float], float], most: float) -
     return fitting_mm
 
 
+def memory_bytes(case: FlowCase) -> float:
+    """Return the estimated peak memory of a flow."""
+    return _size(case, default_cell_size_mm(case))[1]
+
+
 def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     """Return the number of cells computed and the peak memory in bytes."""
     vessel = case.vessel

@@ -10,7 +10,7 @@ from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.lattice import close_up as close_ups
 from vstent.flow.lattice.checkpoint import pack, unpack
 from vstent.flow.lattice.close_up import CloseUp
-from vstent.flow.lattice.cost import estimate, refuse_too_large
+from vstent.flow.lattice.cost import estimate, memory_bytes, refuse_too_large
 from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.pace import longest_step_s, peak_speed_m_s
@@ -58,6 +58,10 @@ class AbstractLattice(AbstractEngine[State]):
             require_gpu()
         refuse_too_large(case)
         return str(estimate(case))
+
+    def memory_bytes(self, case: FlowCase) -> float:
+        """Return the expected peak memory of a flow."""
+        return memory_bytes(case)
 
     def calmer(self, case: FlowCase) -> FlowCase:
         """Return the case with a shorter time step, for a second attempt after a run has diverged.

@@ -58,6 +58,17 @@ def tell_cost(case: FlowCase, cell_size_mm: float) -> str:
     )
 
 
+def memory_bytes(case: FlowCase, cell_size_mm: float) -> float:
+    """Return the estimated peak memory of a flow, including struts if the case has a stent.
+
+    Raises
+    ------
+    LandingError
+        No wire is over a neck or a branch's ostium.
+    """
+    return _bytes(sum(_cells(case, cell_size_mm)))
+
+
 def _cells(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     """Return the number of cells of the bare vessel, and of the refined ones at the struts."""
     bare = CELLS_PER_CUBE * extended_volume_mm3(case.vessel) / cell_size_mm**3

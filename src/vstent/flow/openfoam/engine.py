@@ -21,7 +21,7 @@ from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
 from vstent.flow.openfoam.case import foam_case, strut_solids
-from vstent.flow.openfoam.cost import tell_cost
+from vstent.flow.openfoam.cost import memory_bytes, tell_cost
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.stopping import quantities_left
 from vstent.kernels.arrays import Floats, Ints
@@ -85,6 +85,10 @@ class OpenFoam(AbstractEngine[State]):
     def cost(self, case: FlowCase) -> str:
         """Return a sentence on cells, memory and run time, including a stent's struts."""
         return tell_cost(case, self.cell_size_mm)
+
+    def memory_bytes(self, case: FlowCase) -> float:
+        """Return the expected peak memory, including a stent's struts."""
+        return memory_bytes(case, self.cell_size_mm)
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Find OpenFOAM, write and mesh the case, and build the interpolation from its mesh to the grid."""

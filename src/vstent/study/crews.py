@@ -1,4 +1,4 @@
-"""Run the cases of a cohort in processes of this machine, on a Dask cluster, or in a Slurm queue."""
+"""Run tasks in processes of this machine, on a Dask cluster, or in a Slurm queue."""
 
 import multiprocessing
 import shutil
@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
-from typing import Any, Final, NamedTuple, final
+from typing import Any, Final, NamedTuple, TypeVar, final
 
-from vstent.cohort.work import Task, work
 from vstent.errors import InputError, VstentError
 
+Task = TypeVar("Task")
+
 ATTEMPTS: Final = 2
-"""Number of times a case is started where its process dies."""
+"""Number of times a task is started where its process dies."""
 SPARE: Final = 2.0
 """Factor on the estimated memory that a Slurm job requests, because a job that exceeds its request is killed."""
 SCHEDULER_S: Final = 20.0
@@ -32,24 +33,28 @@ class Ended(NamedTuple):
 
 
 class AbstractCrew(ABC):
-    """Runs tasks in parallel. Every task writes its own rows, so that they survive the main process."""
+    """Runs tasks in parallel. Every task writes its own results, so that they survive the main process."""
 
     @abstractmethod
-    def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Run tasks; yield each one when it has ended, in any order."""
+    def do(self, work: Callable[[Task], None], tasks: Sequence[Task]) -> Iterator[Ended]:
+        """Run tasks; yield each one when it has ended, in any order.
+
+        Parameters
+        ----------
+        work : function at the top level of a module that does a task.
+        tasks : the tasks.
+        """
 
 
 @final
 @dataclass(frozen=True)
 class Processes(AbstractCrew):
-    """Processes of this machine, a new one for every case, so that a crash affects one case only."""
+    """Processes of this machine, a new one for every task, so that a crash affects one task only."""
 
     jobs: int
     """Number of parallel processes."""
-    work: Callable[[Task], None] = work
-    """Function that each process calls."""
 
-    def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
+    def do(self, work: Callable[[Task], None], tasks: Sequence[Task]) -> Iterator[Ended]:
         """Run tasks; yield each one when its process has ended."""
         context = multiprocessing.get_context("spawn")
         waiting = [(number, 1) for number in reversed(range(len(tasks)))]
@@ -58,7 +63,7 @@ class Processes(AbstractCrew):
             while waiting or running:
                 while waiting and len(running) < self.jobs:
                     number, attempt = waiting.pop()
-                    process: BaseProcess = context.Process(target=_uninterrupted, args=(self.work, tasks[number]))
+                    process: BaseProcess = context.Process(target=_uninterrupted, args=(work, tasks[number]))
                     process.start()
                     running.append((process, number, attempt))
                 wait([one.sentinel for one, _, _ in running])
@@ -98,10 +103,8 @@ class DaskCluster(AbstractCrew):
 
     address: str
     """Address of the scheduler, such as ``tcp://head:8786``."""
-    work: Callable[[Task], None] = work
-    """Function that each worker calls."""
 
-    def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
+    def do(self, work: Callable[[Task], None], tasks: Sequence[Task]) -> Iterator[Ended]:
         """Run tasks; yield each one when it has ended. Dask gives the task of a worker that died to another worker.
 
         Raises
@@ -109,10 +112,10 @@ class DaskCluster(AbstractCrew):
         InputError
             Dask is not installed, or no scheduler answers.
         VstentError
-            The connection to the scheduler is lost; finished rows are kept.
+            The connection to the scheduler is lost; finished tasks are kept.
         """
         with _client(self.address) as client:
-            futures = {client.submit(self.work, task, pure=False): number for number, task in enumerate(tasks)}
+            futures = {client.submit(work, task, pure=False): number for number, task in enumerate(tasks)}
             while futures:
                 _see_alive(client)
                 for future in [future for future in futures if future.done()]:
@@ -123,14 +126,14 @@ class DaskCluster(AbstractCrew):
 @final
 @dataclass(frozen=True)
 class Slurm(AbstractCrew):
-    """Jobs of a Slurm queue, each a Dask worker; they are started for this cohort and ended with it."""
+    """Jobs of a Slurm queue, each a Dask worker; they are started for these tasks and ended with them."""
 
     jobs: int
     """Number of parallel jobs."""
     memory_MB: float
-    """Estimated memory of one case."""
+    """Estimated memory of one task."""
 
-    def do(self, tasks: Sequence[Task]) -> Iterator[Ended]:
+    def do(self, work: Callable[[Task], None], tasks: Sequence[Task]) -> Iterator[Ended]:
         """Run tasks; yield each one when it has ended.
 
         Raises
@@ -144,7 +147,7 @@ class Slurm(AbstractCrew):
             )
         with self.cluster() as cluster:
             cluster.adapt(minimum_jobs=self.jobs, maximum_jobs=self.jobs)  # a job that the queue ends is replaced
-            yield from DaskCluster(cluster.scheduler_address).do(tasks)
+            yield from DaskCluster(cluster.scheduler_address).do(work, tasks)
 
     def cluster(self) -> Any:
         """Start the scheduler; dask-jobqueue's configuration file sets queue, account and time limit."""
@@ -176,7 +179,7 @@ def _see_alive(client: Any) -> None:
     """Raise VstentError where the connection to the scheduler is lost."""
     if client.status not in ("running", "connecting"):
         raise VstentError(
-            "the Dask scheduler was lost; finished cases are kept: start it again and give the same command"
+            "the Dask scheduler was lost; finished results are kept: start it again and give the same command"
         )
 
 
@@ -186,4 +189,6 @@ def _future_fault(future: Any) -> str:
         return ""
     if future.status == "error":
         return f"Its worker failed: {future.exception()}. Check the workers' logs and run the same command again."
-    raise VstentError("the Dask scheduler was lost; finished cases are kept: start it again and give the same command")
+    raise VstentError(
+        "the Dask scheduler was lost; finished results are kept: start it again and give the same command"
+    )

@@ -1,0 +1,170 @@
+"""Compute the flows of a ranking in parallel: in processes of this machine, on a Dask cluster, or in a Slurm queue."""
+
+import pickle
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+from vstent.flow.case import FlowField, FlowSettings
+from vstent.flow.memory import free_memory_bytes
+from vstent.flow.simulation import flow_case, memory_bytes
+from vstent.geometry.vessel import Anatomy
+from vstent.io.files import atomic
+from vstent.plan.rank import Candidate
+from vstent.plan.rank_flow import coverage_of, flow_with, is_finished, nearest, stent_of
+from vstent.study.crews import AbstractCrew
+from vstent.study.flow_store import FlowStore
+
+COMMON: Final = "common"
+"""File of what all flows need."""
+FIELD: Final = ".flow"
+"""Suffix of the file of a finished flow, from which others start."""
+RESULT: Final = ".result"
+"""Suffix of the file of what the ranking keeps of a flow."""
+MB: Final = 1e6
+"""Bytes in a megabyte."""
+_ALONE: Final = threading.Lock()
+"""Lock for parallel kernels, which allow one caller per process; a Dask worker may have several threads."""
+
+
+@dataclass(frozen=True, eq=False)
+class Common:
+    """What all flows of a ranking need."""
+
+    anatomy: Anatomy
+    """The restored artery."""
+    settings: FlowSettings
+    """Settings of the flows."""
+    candidates: tuple[Candidate, ...]
+    """Candidates whose flow is missing."""
+    bare: FlowField
+    """The flow without a device."""
+    has_contrast: bool
+    """Whether the retention of contrast is measured."""
+    threads: int
+    """Number of threads of each flow."""
+
+
+@dataclass(frozen=True)
+class FlowTask:
+    """The flow with one candidate."""
+
+    folder: Path
+    """Folder that all workers reach, with the common data and the finished flows."""
+    number: int
+    """Index of the candidate."""
+
+
+def compute_flows(
+    anatomy: Anatomy,
+    chosen: Sequence[Candidate],
+    settings: FlowSettings,
+    stored: FlowStore,
+    crew: AbstractCrew,
+    *,
+    has_contrast: bool = False,
+    threads: int = 1,
+    progress: Callable[[int, int, str], None],
+) -> None:
+    """Compute the missing flows of a ranking in parallel and store their results for `rank_flows`.
+
+    Every flow starts from the most similar one that is finished when it begins, as in `rank_flows`.
+
+    Parameters
+    ----------
+    anatomy : the restored artery, with a sac.
+    chosen : candidates that get a flow, of `chosen_of`.
+    settings : settings of the flows.
+    stored : finished results; new ones are added.
+    crew : processes or cluster that compute the flows with a device; the one without is computed here.
+    has_contrast : whether the retention of contrast is measured.
+    threads : number of threads of each flow.
+    progress : called with the number of finished flows, the number of all, and the name of the last.
+
+    Raises
+    ------
+    InputError
+        The processes or the cluster cannot be started.
+    FlowError
+        The flow without a device cannot be computed.
+    VstentError
+        The connection to the cluster is lost; finished flows are kept.
+    """
+    wanted = tuple(one for one in chosen if not is_finished(stored.get(one), has_contrast))
+    if not wanted:
+        return
+    total = 1 + len(chosen)  # with the flow without a device
+    before = total - len(wanted)
+    progress(before - 1, total, "no device")
+    bare, stored[None] = flow_with(anatomy, None, settings, start=None, similar=None, has_contrast=has_contrast)
+    assert bare is not None  # without a device it would have been raised
+    progress(before, total, f"{len(wanted)} devices in parallel")
+    with TemporaryDirectory(prefix="rank-flow-", dir=stored.folder) as name:
+        folder = Path(name)
+        _keep(folder / COMMON, Common(anatomy, settings, wanted, bare, has_contrast, threads))
+        tasks = [FlowTask(folder, number) for number in range(len(wanted))]
+        for done, ended in enumerate(crew.do(work, tasks), start=1):
+            candidate = wanted[ended.number]
+            if ended.fault:
+                stored.lose(candidate, ended.fault)
+            else:
+                stored[candidate] = _kept(folder / f"{ended.number}{RESULT}")
+            progress(before + done, total, candidate.label)
+
+
+def work(task: FlowTask) -> None:
+    """Compute the flow with one candidate, and keep it and its result in the folder of the task."""
+    import numba
+
+    with _ALONE:
+        common: Common = _kept(task.folder / COMMON)
+        numba.set_num_threads(min(common.threads, numba.config.NUMBA_NUM_THREADS))
+        candidate = common.candidates[task.number]
+        paths = ((coverage_of(one), task.folder / f"{n}{FIELD}") for n, one in enumerate(common.candidates))
+        similar = nearest(coverage_of(candidate), [one for one in paths if one[1].exists()])
+        field, result = flow_with(
+            common.anatomy,
+            candidate,
+            common.settings,
+            start=common.bare,
+            similar=None if similar is None else _kept(similar),
+            has_contrast=common.has_contrast,
+        )
+        if field is not None:
+            _keep(task.folder / f"{task.number}{FIELD}", field)
+        _keep(task.folder / f"{task.number}{RESULT}", result)
+
+
+def parallel_flows(
+    anatomy: Anatomy, chosen: Sequence[Candidate], settings: FlowSettings, jobs: int
+) -> tuple[int, float]:
+    """Return how many flows fit beside each other on this machine, at most `jobs`, and the memory of one, in MB.
+
+    One at a time where they run on a GPU, or where the memory of a flow is unknown (0 is returned for it).
+    """
+    needed = _memory_bytes(anatomy, chosen, settings)
+    if settings.device_gpu or not needed:
+        return 1, needed / MB
+    fitting = min(jobs // settings.processes, free_memory_bytes() // needed)
+    return max(1, int(fitting)), needed / MB
+
+
+def _memory_bytes(anatomy: Anatomy, chosen: Sequence[Candidate], settings: FlowSettings) -> float:
+    """Return the memory of the flow with the first candidate; 0 where it is unknown or there is none."""
+    if not chosen or not anatomy.aneurysms:
+        return 0.0
+    return memory_bytes(flow_case(anatomy, stent_of(anatomy, chosen[0]), settings)) or 0.0
+
+
+def _keep(path: Path, what: Any) -> None:
+    """Write an object, so that a file of this name is always whole."""
+    with atomic(path) as partial:
+        partial.write_bytes(pickle.dumps(what))
+
+
+def _kept(path: Path) -> Any:
+    """Return an object that this module has written."""
+    return pickle.loads(path.read_bytes())
