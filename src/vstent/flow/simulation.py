@@ -135,7 +135,8 @@ def simulate_case(
     start : FlowField, optional
         Flow in the same vessel without a stent, to start from.
     similar : FlowField, optional
-        Flow in the same vessel with a similar stent, to start from instead; no first guess is then computed.
+        Flow in the same vessel with a similar stent, to start from instead, in a refined sac too; no first guess is
+        then computed.
     folder : Path, optional
         Folder for the files of an engine that works with files, also used to resume; None: they are deleted.
     progress : callable, optional
@@ -236,8 +237,8 @@ class _Runs:
         # Without the ostium: oscillations at the neck would need most of the steps, and the fine grid recomputes them.
         around = replace(case, ostium=None, settings=replace(case.settings, max_steps=steps))
         outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
-        engine = self.engine(cell_size_mm, self.folder, outer)
-        return self._run(engine, case, lambda: outer, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))
+        engine, guess = self.engine(cell_size_mm, self.folder, outer), self.similar or outer
+        return self._run(engine, case, lambda: guess, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))
 
     def _guess(self, case: FlowCase, start: FlowField | None, cell_size_mm: float, depth: int = 0) -> FlowField | None:
         """Return a first guess for a grid from coarser ones, or `start` if the next one is too coarse or diverges.

@@ -29,7 +29,7 @@ from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.pace import peak_speed_m_s
 from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
 from vstent.flow.lattice.setup import thickest
-from vstent.flow.lattice.stepping import build, imposed, take_pace
+from vstent.flow.lattice.stepping import build, imposed, snapshot, take_pace
 from vstent.flow.simulation import flow_case, simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.surface import Surface
@@ -322,6 +322,17 @@ def test_a_close_up_is_given_a_quarter_of_the_steps() -> None:
     state = near.init(case, outer)
     assert near.max_checks(state) == int(case.settings.max_steps / 4 // state.steps_per_check) >= 12
     assert whole.max_checks(state) == int(case.settings.max_steps // state.steps_per_check)
+
+
+def test_a_close_up_starts_from_a_similar_flow_at_the_pace_of_the_flow_around_it() -> None:
+    case, outer = outer_of_demo()
+    engine = LatticeBoltzmann(0.25, None, outer)
+    similar = replace(outer, velocity_m_s=0.5 * outer.velocity_m_s)
+    usual, from_similar = (engine.init(case, start) for start in (outer, similar))
+    assert from_similar.scales.step_s == usual.scales.step_s
+    usual_m_s, similar_m_s = (np.linalg.norm(snapshot(state).velocity, axis=1) for state in (usual, from_similar))
+    is_fast = usual_m_s > np.quantile(usual_m_s, 0.5)
+    np.testing.assert_allclose(similar_m_s[is_fast], 0.5 * usual_m_s[is_fast], rtol=0.02)
 
 
 def test_a_close_ups_time_step_goes_by_its_own_fastest_blood() -> None:

@@ -74,6 +74,10 @@ class AbstractLattice(AbstractEngine[State]):
         """Return the refined region of a case; None: the grid covers the whole vessel."""
         return None if self.outer is None else close_ups.close_up(case, self.outer)
 
+    def pacing(self, start: FlowField | None) -> FlowField | None:
+        """Return the flow that sets the time step: the one around a refined region, else the one it starts from."""
+        return start if self.outer is None else self.outer
+
     def save(self, state: State) -> Saved:
         """Return the run as arrays."""
         return pack(state)
@@ -100,7 +104,8 @@ class LatticeBoltzmann(AbstractLattice):
         """Set up a run whose fastest blood moves `lattice_speed` cells a step (times `STRETCH` in a refined region)."""
         close_up = self.close_up(case)
         stretch = 1 if close_up is None else close_ups.STRETCH
-        step_s = stretch * longest_step_s(case, self.cell_size_mm, peak_speed_m_s(case, start, close_up))
+        peak_m_s = peak_speed_m_s(case, self.pacing(start), close_up)
+        step_s = stretch * longest_step_s(case, self.cell_size_mm, peak_m_s)
         steps = _steps_per_check(case, step_s)
         pace, kept = np.array([steps]), 2 * CHECKS_APART + 1
         return build(case, self.cell_size_mm, steps * step_s, pace, close_up=close_up, start=start, kept=kept)

@@ -21,7 +21,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Set up a run whose time steps divide each phase, with a peak speed below `lattice_speed` cells per step."""
         close_up, phase_s = self.close_up(case), pulse_of(case).period_s / PHASES
-        steps = pace(case, self.cell_size_mm, start, close_up)
+        steps = pace(case, self.cell_size_mm, self.pacing(start), close_up)
         return build(case, self.cell_size_mm, phase_s, steps, close_up=close_up, start=start, kept=PHASES)
 
     def terminate(self, state: State) -> float | None:
