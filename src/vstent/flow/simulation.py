@@ -135,8 +135,8 @@ def simulate_case(
     start : FlowField, optional
         Flow in the same vessel without a stent, to start from.
     similar : FlowField, optional
-        Flow in the same vessel with a similar stent, to start from instead, in a refined sac too; no first guess is
-        then computed.
+        Flow in the same vessel with a similar stent, to start from instead, if it is steady in a refined sac too; no
+        first guess is then computed.
     folder : Path, optional
         Folder for the files of an engine that works with files, also used to resume; None: they are deleted.
     progress : callable, optional
@@ -237,7 +237,9 @@ class _Runs:
         # Without the ostium: oscillations at the neck would need most of the steps, and the fine grid recomputes them.
         around = replace(case, ostium=None, settings=replace(case.settings, max_steps=steps))
         outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
-        engine, guess = self.engine(cell_size_mm, self.folder, outer), self.similar or outer
+        # The mean of an unsteady flow lacks its oscillations: from it C0038's averages take longer than from `outer`.
+        guess = outer if self.similar is None or self.similar.swing is not None else self.similar
+        engine = self.engine(cell_size_mm, self.folder, outer)
         return self._run(engine, case, lambda: guess, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))
 
     def _guess(self, case: FlowCase, start: FlowField | None, cell_size_mm: float, depth: int = 0) -> FlowField | None:

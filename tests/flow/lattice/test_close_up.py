@@ -335,6 +335,19 @@ def test_a_close_up_starts_from_a_similar_flow_at_the_pace_of_the_flow_around_it
     np.testing.assert_allclose(similar_m_s[is_fast], 0.5 * usual_m_s[is_fast], rtol=0.02)
 
 
+def test_a_refined_sac_starts_from_a_similar_flow_if_that_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
+    case, outer = outer_of_demo()
+    wanted = replace(case, settings=replace(case.settings, close_up=True))
+    begun: list[FlowField] = []
+    monkeypatch.setattr(flow._Runs, "_coarse", lambda *_: outer)
+    monkeypatch.setattr(flow._Runs, "_run", lambda _, __, ___, guess, *____: begun.append(guess()))
+    steady = replace(outer, velocity_m_s=0.5 * outer.velocity_m_s)
+    swinging = replace(steady, swing=Swing(steady.speed_m_s, np.zeros(len(outer.wall.vertices_mm))))
+    for similar in (None, steady, swinging):
+        simulate_case(wanted, similar=similar)
+    assert [one is two for one, two in zip(begun, (outer, steady, outer), strict=True)] == [True] * 3
+
+
 def test_a_close_ups_time_step_goes_by_its_own_fastest_blood() -> None:
     """Blood that is ten times as fast, but beyond its cuts, changes nothing; within it does. It is a third longer."""
     case, outer = outer_of_demo()
