@@ -5,15 +5,22 @@ Usage: python benchmarks/live.py [--vessel NAME ...] [--device NAME ...] [--refe
 Every device begins with a new live flow; its first number is the first whose band the page shows. Without
 `--reference` only the preview is run. With it every flow is also computed on the default grid (minutes each). The last
 line gives the largest difference, which `vstent.app.preview.ERROR_POINTS` states on the page.
+
+`--switch` measures instead what a user of the page waits for, in a process as the page starts it: the time from the
+switch to the first number with a band, with nothing prepared, with the flow without a device prepared, and with that
+flow stored in the case folder; and how long the preparation takes and how large the stored flow is.
 """
 
 import argparse
-from time import perf_counter
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter, sleep
 
 from grades import SPACINGS_MM, anatomy_of
 
 import vstent
-from vstent.app.preview import ERROR_POINTS, SHOWN_POINTS
+from vstent.app.preview import ERROR_POINTS, SHOWN_POINTS, Preview, shelf_of
 from vstent.devices.stent import Landing, Stent
 from vstent.flow.case import FlowSettings
 from vstent.flow.indices import indices
@@ -25,6 +32,7 @@ from vstent.geometry.vessel import Anatomy
 DEVICES = ("silk", "enterprise", "pipeline")
 MOVE_MM = 2.0
 SLICE_S = 0.15
+ASKED_S = 0.22
 LONGEST_S = 40.0
 INFLOW = "neck_inflow_mL_s"
 Course = list[tuple[float, float, float]]
@@ -79,6 +87,54 @@ def full(anatomy: Anatomy, stents: dict[str, Stent]) -> dict[str, float]:
     return found
 
 
+def numbers(preview: Preview) -> dict:
+    """Return what the page is told, as often as it asks."""
+    sleep(ASKED_S)
+    raw = preview.message()
+    return json.loads(raw[4 : 4 + int.from_bytes(raw[:4], "little")])
+
+
+def switched(preview: Preview, stent: Stent) -> tuple[float, float, float]:
+    """Return the seconds from the switch to the first number with a band, the number, and its band in points."""
+    preview.place(stent)
+    began = perf_counter()
+    while perf_counter() - began < LONGEST_S:
+        told = numbers(preview)
+        if not told["is_stale"] and INFLOW in told["error_points"]:
+            return perf_counter() - began, told["reductions"][INFLOW], told["error_points"][INFLOW]
+    return float("nan"), float("nan"), float("nan")
+
+
+def prepared(preview: Preview) -> float:
+    """Return the seconds until nothing is left to prepare."""
+    began = perf_counter()
+    while preview.is_preparing:
+        sleep(0.05)
+    return perf_counter() - began
+
+
+def from_switch(name: str, devices: list[str]) -> None:
+    """Print the times from the switch for every device."""
+    anatomy, settings = anatomy_of(name), FlowSettings()
+    for device in devices:
+        stent = vstent.deploy(vstent.find_design(device), anatomy).stent
+        found, ready_s = [], []
+        with TemporaryDirectory() as folder:
+            shelf = shelf_of(Path(folder), name, settings)
+            for is_prepared in (False, True, True):
+                preview = Preview(anatomy, settings, shelf if is_prepared else None)
+                ready_s.append(prepared(preview) if is_prepared else 0.0)
+                found.append(switched(preview, stent))
+                preview.stop()
+            megabytes = sum(path.stat().st_size for path in Path(folder).iterdir()) / 1e6
+        times = [f"{seconds:.1f} | {value:.0f} ± {band:.0f} %" for seconds, value, band in found]
+        print(
+            f"| {name} | {device} | {times[0]} | {ready_s[1]:.0f} | {times[1]} | {ready_s[2]:.1f} | {times[2]} "
+            f"| {megabytes:.0f} |",
+            flush=True,
+        )
+
+
 def main() -> None:
     """Run the benchmark and print its table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -86,7 +142,16 @@ def main() -> None:
     parser.add_argument("--device", nargs="*", default=list(DEVICES))
     parser.add_argument("--reference", action="store_true")
     parser.add_argument("--longest", type=float, default=LONGEST_S, help="seconds that a flow is followed at most")
+    parser.add_argument("--switch", action="store_true", help="measure the time from the switch of the page")
     given = parser.parse_args()
+    if given.switch:
+        print(
+            "| vessel | device | nothing prepared, s | number | preparing, s | prepared, s | number | loading, s "
+            "| stored, s | number | stored flow, MB |\n" + 11 * "|---" + "|"
+        )
+        for name in given.vessel:
+            from_switch(name, given.device)
+        return
     print(
         "| vessel | spacing, mm | cells | lattice, s | device | screen, s | exchange, s | first number, s "
         "| first number | +- 10, s | +- 5, s | end | default grid | outside their band "

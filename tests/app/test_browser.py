@@ -54,7 +54,8 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         playwright.expect(page.locator(".opening-row.inlet")).to_have_count(1)
         assert in_time(page, lambda: drawn(page, page.locator(".viewer-area").bounding_box()) > 0.05)
         trim_and_draw_the_neck(client, page)
-        step(page, "Deploy")
+        with page.expect_request(lambda request: request.url.endswith("/preview") and request.method == "POST"):
+            step(page, "Deploy")  # the live flow is prepared, and its switch is off
         page.wait_for_selector(".sheet .row")
         before = place_of(page, "distal")
         assert in_time(page, lambda: ramps_are_true(page, 1))  # gap to the wall, whose title is wider than its ramp
@@ -69,8 +70,7 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         page.reload()
         page.wait_for_selector(".sheet .row")
         assert in_time(page, lambda: place_of(page, "distal") == pytest.approx(after, abs=0.11))
-        page.keyboard.press("Control+z")
-        page.wait_for_function("() => document.querySelector('button[aria-label=Undo]').disabled")
+        undone(page)
 
 
 RAMPS = """() => [...document.querySelectorAll('.viewer-bar')].map((bar) => {

@@ -4,6 +4,9 @@ import json
 import os
 import signal
 import time
+from multiprocessing import Pipe
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -11,10 +14,17 @@ import vstent
 from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
-from vstent.app.preview import Preview
+from vstent.app.cases import Store
+from vstent.app.choices import FlowChoice
+from vstent.app.desk import Desk
+from vstent.app.jobs import Jobs
+from vstent.app.preview import Preview, Shelf, _Worker, shelf_of
+from vstent.devices.stent import Stent
 from vstent.errors import InputError
 from vstent.flow.case import FlowSettings
 from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.io.archive import save_data
+from vstent.study.folder import CACHE
 
 LONGEST_S = 120.0
 
@@ -103,9 +113,8 @@ def test_killed_it_begins_again_with_the_same_device(preview: Preview) -> None:
     assert told["reductions"]["neck_inflow_mL_s"] == pytest.approx(before, abs=4.0)
 
 
-def test_unwatched_it_rests(preview: Preview) -> None:
-    until(preview, lambda told: told["is_settled"])
-    time.sleep(3.0)
+def is_at_rest(preview: Preview) -> bool:
+    """Return whether the process uses less than a fifth of a core."""
     path = f"/proc/{preview._process.pid}/stat"
     if not os.path.exists(path):
         pytest.skip("needs /proc")
@@ -116,11 +125,129 @@ def test_unwatched_it_rests(preview: Preview) -> None:
 
     first = ticks()
     time.sleep(1.0)
-    assert ticks() - first < 20  # of 100 a second and core
+    return ticks() - first < 20  # of 100 a second and core
+
+
+def test_unwatched_it_rests(preview: Preview) -> None:
+    until(preview, lambda told: told["is_settled"])
+    time.sleep(3.0)
+    assert is_at_rest(preview)
     until(preview, lambda told: not told["is_stale"])
+
+
+def in_time(holds) -> bool:
+    """Return whether something holds before long."""
+    began = time.monotonic()
+    while not holds() and time.monotonic() - began < LONGEST_S:
+        time.sleep(0.05)
+    return bool(holds())
+
+
+def test_what_is_prepared_is_stored_and_continued(anatomy: Anatomy, tmp_path: Path) -> None:
+    settings = FlowSettings(cells_per_diameter=13.0, inflow_mL_s=1.5)
+    shelf, bare = shelf_of(tmp_path, "anatomy", settings), []
+    stent = vstent.deploy(vstent.find_design("silk"), anatomy).stent
+    for damage in (None, None, slice(0, 1000)):
+        (kept,) = [*tmp_path.glob("live-*.npz")] or [tmp_path / "none"]
+        if damage is not None:
+            kept.write_bytes(kept.read_bytes()[damage])
+        written = kept.stat().st_mtime_ns if kept.exists() else 0
+        preview = Preview(anatomy, settings, shelf)
+        try:
+            assert in_time(lambda preview=preview: not preview.is_preparing)
+            assert damage or written or is_at_rest(preview)
+            assert preview._said.values == {}
+            (kept,) = tmp_path.glob("live-*.npz")
+            assert (kept.stat().st_mtime_ns == written) is (damage is None and written > 0)
+            preview.place(stent)
+            assert preview._sent == 0  # a device that nobody watches costs nothing
+            told = until(preview, lambda told: not told["is_stale"] and "neck_inflow_mL_s" in told["error_points"])
+            assert told["reductions"]["neck_inflow_mL_s"] < -15.0
+            bare.append(told["values"]["bare_neck_inflow_mL_s"])
+        finally:
+            preview.stop()
+    assert bare[0] == bare[1]
+    assert bare[2] == pytest.approx(bare[0], rel=0.01)
+
+
+def test_a_process_that_nobody_asks_ends(anatomy: Anatomy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vstent.app.preview.IDLE_S", 0.1)
+    flow, kept = SimpleNamespace(is_prepared=True), []
+    store = SimpleNamespace(begin=lambda *_: flow, keep=kept.append)
+    ours, theirs = Pipe()
+    _Worker(theirs, anatomy, FlowSettings(), store).run()
+    assert kept == [flow]
+    assert [ours.recv().is_prepared for _ in range(2)] == [False, True]
 
 
 def test_a_vessel_without_a_sac_has_none() -> None:
     healthy = restore(trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=30.0), edge_mm=0.4))))
     with pytest.raises(InputError, match="needs a sac"):
         Preview(healthy, FlowSettings())
+
+
+class Idle:
+    """A live flow without a process."""
+
+    def __init__(self, anatomy: Anatomy, settings: FlowSettings, shelf: Shelf) -> None:
+        self.shelf, self.is_watched, self.is_preparing, self.is_stopped = shelf, False, True, False
+
+    def place(self, stent: Stent) -> None:
+        """Do nothing."""
+
+    def stop(self) -> None:
+        self.is_stopped = True
+
+
+@pytest.fixture
+def desk(anatomy: Anatomy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Desk:
+    """Two cases with an anatomy, and live flows without a process."""
+    desk = Desk(Store(tmp_path))
+    for name in ("one", "two"):
+        case = desk.store.create(name, anatomy="of " + name, input="scan")
+        (case.folder / "scan").touch()
+        save_data(case.folder / CACHE / f"anatomy-of {name}.npz", anatomy)
+    monkeypatch.setattr("vstent.app.preview.Preview", Idle)
+    monkeypatch.setattr(Jobs, "start", lambda *_: None)
+    return desk
+
+
+def test_a_job_ends_what_is_prepared_and_nothing_else(desk: Desk) -> None:
+    one = desk.store.get("one")
+    for is_watched, is_preparing in ((True, False), (False, False), (False, True)):
+        assert desk.prepare_preview(one)
+        preview = desk.preview(one)
+        preview.is_watched, preview.is_preparing = is_watched, is_preparing
+        desk.start(one, "anatomy")
+        assert preview.is_stopped is is_preparing
+        preview.is_watched = False
+    desk.jobs._jobs["two"] = SimpleNamespace(is_alive=True)
+    assert not desk.prepare_preview(one)
+    assert desk._previews == {}
+
+
+def test_nothing_is_prepared_beside_a_watched_flow_or_without_memory(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = (desk.store.get(name) for name in ("one", "two"))
+    watched = desk.preview(one)
+    watched.is_watched = True
+    assert not desk.prepare_preview(two)
+    watched.is_watched = False
+    monkeypatch.setattr("vstent.flow.memory.free_memory_bytes", lambda: 1e9)
+    assert not desk.prepare_preview(two)
+    monkeypatch.undo()
+    monkeypatch.setattr("vstent.app.preview.Preview", Idle)
+    assert desk.prepare_preview(two)
+    assert watched.is_stopped
+
+
+def test_a_pulse_keeps_what_is_prepared_and_another_inflow_does_not(desk: Desk) -> None:
+    one = desk.store.get("one")
+    first = desk.preview(one)
+    for number, (flow, is_same) in enumerate(
+        ((FlowChoice(is_pulsatile=True), True), (FlowChoice(inflow_mL_s=2), False))
+    ):
+        one.change(number, one.state.choices.model_copy(update={"flow": flow}))
+        assert (desk.preview(one) is first) is is_same
+    assert first.is_stopped

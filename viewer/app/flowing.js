@@ -1,6 +1,6 @@
 // Live flow: a switch, numbers against the flow without a device, a chart of the last minute, streamlines in the picture.
 import { make, svg } from "../src/dom.js";
-import { drop, getBinary } from "./api.js";
+import { drop, getBinary, post } from "./api.js";
 import { chartButton } from "./exporting.js";
 
 const EVERY_MS = 220;
@@ -21,17 +21,37 @@ export class Flowing {
     chart.append(chartButton("live flow", chart));
     this.body = make("div", { className: "live-body", hidden: true }, [this.state, this.cards, chart]);
     this.element = make("div", { className: "live" }, [make("label", { htmlFor: "live-flow" }, [this.box, "Live blood flow (preview)"]), this.body]);
-    document.addEventListener("visibilitychange", () => this.watch());
+    document.addEventListener("visibilitychange", () => {
+      this.watch();
+      this.prepare(this.expected);
+    });
+  }
+
+  /** Have the flow without a device computed in advance, once for each vessel and settings; `expected` names them, or is null. */
+  prepare(expected) {
+    this.expected = expected;
+    if (document.hidden || expected === this.prepared) return;
+    this.prepared = expected;
+    if (expected && !this.isOn) post(`${this.host.path()}/preview`).catch(() => {}); // it only saves time later
+  }
+
+  /** The case is left: its process ends. */
+  end() {
+    if (this.isOn) this.turn(false);
+    if (this.prepared !== undefined) this.release();
+    this.expected = null;
+  }
+
+  release() {
+    drop(`${this.host.path()}/preview`).catch(() => {});
   }
 
   turn(isOn) {
     this.isOn = isOn;
     this.box.checked = isOn;
     this.body.hidden = !isOn;
-    if (!isOn) {
-      drop(`${this.host.path()}/preview`).catch(() => {});
-      this.forget();
-    } else {
+    if (!isOn) this.forget();
+    else {
       this.say("Starting …");
       this.watch();
     }
@@ -59,13 +79,18 @@ export class Flowing {
       try {
         this.take(await getBinary(`${this.host.path()}/preview?seen=${this.drawn}`));
       } catch (problem) {
-        this.turn(false);
-        this.host.failed(problem);
+        this.fail(problem);
       }
       await new Promise((resolve) => setTimeout(resolve, Math.max(0, EVERY_MS - (performance.now() - began))));
     }
     this.isAsking = false;
     this.element.classList.toggle("stale", this.isOn);
+  }
+
+  fail(problem) {
+    this.turn(false);
+    this.release();
+    this.host.failed(problem);
   }
 
   say(words) {
@@ -74,10 +99,7 @@ export class Flowing {
 
   take({ manifest, buffer }) {
     if (!this.isOn || !this.watched) return;
-    if (manifest.error) {
-      this.turn(false);
-      return this.host.failed(new Error(manifest.error));
-    }
+    if (manifest.error) return this.fail(new Error(manifest.error));
     if (manifest.layers.length) this.host.picture.put({ manifest, buffer });
     this.drawn = manifest.drawn;
     const { fraction, is_stale, is_settled, values, reductions, history, error_points } = manifest;

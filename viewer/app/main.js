@@ -88,7 +88,7 @@ class Page {
 
   close() {
     this.events?.close();
-    if (this.flowing?.isOn) this.flowing.turn(false);
+    this.flowing?.end();
     this.view = null;
     this.isFollowing = false;
     this.anatomyKey = this.flowKey = this.scanKey = this.inputKey = this.inputViews = this.proposed = undefined;
@@ -385,6 +385,7 @@ class Page {
     this.picture.setPanes(this.panes());
     this.picture.setLayers(layers, (this.memory[this.step] ??= {}));
     this.flowing.isWatched = this.step === "deploy";
+    this.flowing.prepare(this.expectedFlow());
     this.picture.element.hidden = this.isFilm;
     this.films.element.hidden = !this.isFilm;
     if (this.isFilm && !this.films.hasFilm) this.films.ask();
@@ -392,6 +393,13 @@ class Page {
     this.picture.moved = null;
     this.picture.setMarks(isScan ? this.imaging.marks : this.anatomy ? this.marks() : []);
     if (this.anatomy && this.step === "deploy") this.renderDeploy();
+  }
+
+  /** The flow that a live preview would begin with, named by what it depends on; null where none is near. */
+  expectedFlow() {
+    const { anatomy, choices, job } = this.view;
+    const isNear = ["device", "deploy"].includes(this.step) && this.anatomy?.neck.length && !job;
+    return isNear ? JSON.stringify([anatomy, choices.flow]) : null;
   }
 
   /** What lies on the scene in this step. They are laid once: a handle that is in hand must not be taken away between. */

@@ -4,6 +4,7 @@ import json
 import tempfile
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -165,6 +166,7 @@ class Desk:
             raise InputError("No device is chosen. Choose one in the step Device.")
         if kind == "angiogram" and not _has_flow(case):
             raise InputError("The flow is out of date or not computed, and contrast moves with it. Run the step Flow.")
+        self._yield_to_job()
         self.jobs.start(case, kind)
 
     def resume(self, case: Case) -> None:
@@ -200,18 +202,49 @@ class Desk:
         InputError
             The vessel has no sac.
         """
-        from vstent.app.preview import Preview
+        from vstent.app.preview import Preview, shelf_of
         from vstent.flow.case import FlowSettings
+        from vstent.study.folder import CACHE
 
-        live, settings = self.live(case), case.state.settings().flow or FlowSettings()
+        live, state = self.live(case), case.state
+        settings = replace(state.settings().flow or FlowSettings(), waveform=None, close_up=False)
+        shelf = shelf_of(case.folder / CACHE, state.anatomy, settings)
         with self._lock:
             found = self._previews.get(case.id)
-            if found is None or found.anatomy is not live.anatomy or found.settings != settings:
+            if found is None or found.shelf != shelf:
                 for one in self._previews.values():
                     one.stop()  # one at a time: each uses all cores
-                self._previews = {case.id: Preview(live.anatomy, settings)}
+                self._previews = {case.id: Preview(live.anatomy, settings, shelf)}
                 live.follow(self._previews[case.id].place)
             return self._previews[case.id]
+
+    def prepare_preview(self, case: Case) -> bool:
+        """Begin to compute the live flow without a device, so that numbers follow soon when it is switched on.
+
+        Returns
+        -------
+        bool
+            Whether it was begun: not during a job, beside a live flow that is watched, or where memory is short.
+
+        Raises
+        ------
+        InputError
+            The vessel has no sac.
+        """
+        from vstent.app.preview import FREE_BYTES
+        from vstent.flow.memory import free_memory_bytes
+
+        is_in_use = any(one.is_watched for one in tuple(self._previews.values()))
+        if is_in_use or self.jobs.are_running or free_memory_bytes() < FREE_BYTES:
+            return False
+        self.preview(case)
+        return True
+
+    def _yield_to_job(self) -> None:
+        """End the live flows that compute although nobody watches."""
+        with self._lock:
+            for case_id in [name for name, one in self._previews.items() if one.is_preparing]:
+                self._previews.pop(case_id).stop()
 
     def end_preview(self, case: Case) -> None:
         """Stop the live flow of a case."""

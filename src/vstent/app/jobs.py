@@ -227,6 +227,11 @@ class Jobs:
         """Return the running or last job of a case."""
         return self._jobs.get(case.id)
 
+    @property
+    def are_running(self) -> bool:
+        """Whether a job runs on any case."""
+        return any(job.is_alive for job in tuple(self._jobs.values()))
+
     def start(self, case: Case, kind: str) -> Job:
         """Start a job; a running one is stopped first."""
         with self._lock:

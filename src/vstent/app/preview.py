@@ -1,25 +1,33 @@
 """Live flow of a case, in a process of its own that steps while the page watches.
 
-The process ends when the server does. It only steps while somebody asks for its numbers, and it leaves the processor
-to everything else that the page does.
+The process first prepares the flow without a device, for a limited time, and stores it in the case folder. After that
+it only steps while somebody asks for its numbers. It leaves the processor to everything else that the page does. It
+ends when the server does, or when nobody has asked for some minutes.
 """
 
 import os
 import time
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from pathlib import Path
 from threading import Condition, Lock, Thread
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from vstent.devices.stent import Stent
 from vstent.errors import InputError, VstentError
-from vstent.flow.case import FlowSettings
+from vstent.flow.case import FlowCase, FlowSettings
 from vstent.geometry.vessel import Anatomy
+from vstent.io.archive import DAMAGE
 from vstent.reporting.packing import message
 from vstent.reporting.scene import LineLayer, scales_of, stream_layer
+from vstent.study.ledger import Ledger, key_of
+
+if TYPE_CHECKING:  # imported by the process, so that the server does not wait for it
+    from vstent.flow.lattice.live import LiveFlow
 
 NICE: Final = 10
 """Priority of the process, below that of the server."""
@@ -29,6 +37,16 @@ LINES_S: Final = 0.5
 """Time between two sets of streamlines, in s."""
 WATCHED_S: Final = 2.0
 """Time after the last request for which the process goes on stepping, in s."""
+PREPARED_S: Final = 60.0
+"""Longest time for which the flow without a device is computed while nobody watches, in s."""
+IDLE_S: Final = 600.0
+"""Time without a request after which the process ends and frees its memory, in s."""
+FREE_BYTES: Final = 2e9
+"""Free memory below which nothing is computed in advance, in bytes; the process of C0038 takes 0.5 GB."""
+LIVE_VERSION: Final = "0.2.0"
+"""Version of the live flow: it changes when its grid or its flow without a device changes."""
+STORED: Final = "live"
+"""Name under which the flow without a device is stored."""
 STALE_S: Final = 1.5
 """Age of the last message from which it counts as stale, in s."""
 HISTORY: Final = 240
@@ -57,6 +75,8 @@ class Said:
     """Uncertainty of the averages behind every reduction, in percentage points, where it is known."""
     is_settled: bool = False
     """Whether the last readings agree."""
+    is_prepared: bool = False
+    """Whether nothing is left to compute in advance."""
     error: str = ""
     """Why it cannot be computed."""
     lines: LineLayer | None = None
@@ -64,14 +84,14 @@ class Said:
 
 
 class _Post:
-    """Sends to the process from a thread of its own, of what waits only the newest.
+    """Sends to the process from a thread of its own: the anatomy first, then of what waits only the newest.
 
-    A device is larger than the buffer of a pipe, so sending it takes until the process reads it. Whoever draws the
-    device must not wait for that.
+    An anatomy or a device is larger than the buffer of a pipe, so sending it takes until the process reads it. Whoever
+    draws the device must not wait for that.
     """
 
-    def __init__(self, pipe: Connection) -> None:
-        self._pipe, self._ready = pipe, Condition()
+    def __init__(self, pipe: Connection, anatomy: Anatomy) -> None:
+        self._pipe, self._ready, self._anatomy = pipe, Condition(), anatomy
         self._device: tuple[int, Stent] | None = None
         self._is_asked = self._is_over = False
         Thread(target=self._run, daemon=True).start()
@@ -91,6 +111,7 @@ class _Post:
     def _run(self) -> None:
         """Send until the end, or until the process has ended."""
         with suppress(OSError):
+            self._pipe.send(self._anatomy)
             while True:
                 with self._ready:
                     self._ready.wait_for(lambda: self._is_asked or self._is_over)
@@ -101,6 +122,21 @@ class _Post:
         self._pipe.close()
 
 
+@dataclass(frozen=True)
+class Shelf:
+    """Where the flow without a device is stored."""
+
+    folder: Path
+    """Cache folder of the case."""
+    key: str
+    """Key of everything that the flow depends on."""
+
+
+def shelf_of(folder: Path, anatomy: str, settings: FlowSettings) -> Shelf:
+    """Return where the flow without a device is stored for an anatomy of this key and settings of the flow."""
+    return Shelf(folder, key_of(STORED, LIVE_VERSION, anatomy, settings))
+
+
 class Preview:
     """Live flow of one anatomy.
 
@@ -108,6 +144,7 @@ class Preview:
     ----------
     anatomy : vessel with a sac.
     settings : settings of the flow; a preview is steady.
+    shelf : where the flow without a device is stored; None: nowhere.
 
     Raises
     ------
@@ -115,29 +152,28 @@ class Preview:
         The vessel has no sac.
     """
 
-    def __init__(self, anatomy: Anatomy, settings: FlowSettings) -> None:
+    def __init__(self, anatomy: Anatomy, settings: FlowSettings, shelf: Shelf | None = None) -> None:
         if not anatomy.aneurysms:
             raise InputError("Live flow needs a sac, and none was found. Choose one in the step Sac and parent.")
-        self.anatomy, self.settings = anatomy, settings
+        self.anatomy, self.settings, self.shelf = anatomy, settings, shelf
         self._lock, self._serial = Lock(), 0
         self._stent: Stent | None = None
+        self._watched_s = -WATCHED_S
         self._begin()
 
     def _begin(self) -> None:
         """Start the process."""
-        self._said, self._at_s = Said(), time.monotonic()
+        self._said, self._at_s, self._sent = Said(), time.monotonic(), 0
         self._lines: LineLayer | None = None
         self._drawn = 0
         self._history: deque[float] = deque(maxlen=HISTORY)
         context = get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._post = _Post(self._pipe)
-        self._process = context.Process(target=work, args=(theirs, self.anatomy, self.settings), daemon=True)
+        self._process = context.Process(target=work, args=(theirs, self.settings, self.shelf), daemon=True)
         self._process.start()
         theirs.close()
+        self._post = _Post(self._pipe, self.anatomy)
         Thread(target=self._follow, args=(self._pipe,), daemon=True).start()
-        if self._stent is not None:
-            self._post.put((self._serial, self._stent))
 
     def _revive(self) -> None:
         """Start the process again where it had begun to step; else say that it ends at once."""
@@ -161,11 +197,30 @@ class Preview:
                     if "now_neck_inflow_mL_s" in said.values:
                         self._history.append(_reduction(said.values, "neck_inflow_mL_s"))
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether somebody has asked for the numbers a short time ago."""
+        return time.monotonic() - self._watched_s < WATCHED_S
+
+    @property
+    def is_preparing(self) -> bool:
+        """Whether the process computes although nobody watches."""
+        return not self.is_watched and not self._said.is_prepared and self._process.is_alive()
+
     def place(self, stent: Stent) -> None:
-        """Put a device into the flow in place of the last one."""
-        self._serial += 1
-        self._stent = stent
-        self._post.put((self._serial, stent))
+        """Put a device into the flow in place of the last one; while nobody watches it is only noted."""
+        with self._lock:
+            self._serial += 1
+            self._stent = stent
+        if self.is_watched:
+            self._send()
+
+    def _send(self) -> None:
+        """Send the device where the process does not have it, else the request to go on."""
+        with self._lock:
+            is_new, self._sent = self._sent != self._serial, self._serial
+            device = (self._serial, self._stent) if is_new and self._stent is not None else None
+        self._post.put(device)
 
     def message(self, seen: int = 0) -> bytes:
         """Return the numbers and new streamlines as a message for the page; the process goes on for a while.
@@ -176,7 +231,8 @@ class Preview:
         """
         if not self._process.is_alive() and not self._said.error:
             self._revive()
-        self._post.put(None)
+        self._watched_s = time.monotonic()
+        self._send()
         with self._lock:
             said, age_s, lines, drawn = self._said, time.monotonic() - self._at_s, self._lines, self._drawn
             history = list(self._history)
@@ -210,49 +266,93 @@ def _reduction(values: dict[str, float], key: str) -> float:
     return 100 * (values[f"now_{key}"] / max(values[f"bare_{key}"], 1e-12) - 1)
 
 
-def work(pipe: Connection, anatomy: Anatomy, settings: FlowSettings) -> None:
+def work(pipe: Connection, settings: FlowSettings, shelf: Shelf | None) -> None:
     """Step the flow until the server ends; the body of the process.
 
     Parameters
     ----------
-    pipe : receives (number, stent) for a new device and None for a request, sends `Said`.
-    anatomy : vessel with a sac.
+    pipe : receives the anatomy, then (number, stent) for a new device and None for a request; sends `Said`.
     settings : settings of the flow.
+    shelf : where the flow without a device is stored; None: nowhere.
     """
     with suppress(OSError, AttributeError):
         os.nice(NICE)
     with suppress(EOFError, BrokenPipeError, OSError, KeyboardInterrupt):
         try:
-            _Worker(pipe, anatomy, settings).run()
+            _Worker(pipe, pipe.recv(), settings, _Store(shelf)).run()
         except VstentError as error:
-            pipe.send(Said(error=str(error)))
-            while True:
-                pipe.recv()
+            pipe.send(Said(error=str(error), is_prepared=True))
+            pipe.poll(IDLE_S)
+
+
+class _Store:
+    """The stored flow without a device; a file that cannot be read or written only costs run time."""
+
+    def __init__(self, shelf: Shelf | None) -> None:
+        self.shelf = shelf
+        self._is_current = shelf is None
+
+    def begin(self, case: FlowCase, told: Callable[[float], None]) -> "LiveFlow":
+        """Return the live flow of a case, continued from the stored one where there is one."""
+        from vstent.flow.lattice.live import BareFlow, LiveFlow
+
+        stored = None if self.shelf is None else self._ledger(self.shelf).stored(STORED, self.shelf.key, BareFlow)
+        if stored is not None:
+            with suppress(*DAMAGE):
+                live = LiveFlow(case, stored=stored)
+                self._is_current = live.is_prepared
+                return live
+        return LiveFlow(case, told)
+
+    def keep(self, live: "LiveFlow") -> None:
+        """Store the flow without a device, once."""
+        if not self._is_current and self.shelf is not None:
+            self._is_current = True
+            with suppress(OSError):
+                self._ledger(self.shelf).keep(STORED, self.shelf.key, live.stored())
+
+    @staticmethod
+    def _ledger(shelf: Shelf) -> Ledger:
+        """Return the ledger of the cache folder."""
+        return Ledger(shelf.folder, lambda *_: None)
 
 
 class _Worker:
     """The flow and what was last said of it."""
 
-    def __init__(self, pipe: Connection, anatomy: Anatomy, settings: FlowSettings) -> None:
-        from vstent.flow.lattice.live import LiveFlow
+    def __init__(self, pipe: Connection, anatomy: Anatomy, settings: FlowSettings, store: _Store) -> None:
         from vstent.flow.simulation import flow_case
 
-        self.pipe, self.anatomy, self.settings = pipe, anatomy, settings
-        self.serial, self.watched_s, self.drawn_s = 0, time.monotonic(), 0.0
-        self.live = LiveFlow(flow_case(anatomy, None, settings), lambda done: pipe.send(Said(fraction=done)))
+        self.pipe, self.anatomy, self.settings, self.store = pipe, anatomy, settings, store
+        self.serial, self.watched_s, self.drawn_s = 0, -WATCHED_S, 0.0
+        self.left_s, self.said = PREPARED_S, Said(fraction=1.0)
+        self.live = store.begin(flow_case(anatomy, None, settings), lambda done: pipe.send(Said(fraction=done)))
+        pipe.send(self.said)
 
     def run(self) -> None:
-        """Step, take devices, and report."""
+        """Step and report while somebody watches; else prepare the flow without a device, and rest."""
         while True:
             self._take()
             began = time.perf_counter()
-            steps = self.live.advance(SLICE_S)
-            self._say(steps / (time.perf_counter() - began))
+            if time.monotonic() - self.watched_s < WATCHED_S:
+                steps = self.live.advance(SLICE_S)
+                self._say(steps / (time.perf_counter() - began))
+            elif self.left_s > 0 and not self.live.is_prepared:
+                self.live.prepare(SLICE_S)
+                self.left_s -= time.perf_counter() - began
+            elif not self._is_asked_again():
+                return
+
+    def _is_asked_again(self) -> bool:
+        """Store the flow without a device, and wait for a request; return whether one has come."""
+        self.store.keep(self.live)
+        self.pipe.send(replace(self.said, is_prepared=True))
+        return self.pipe.poll(IDLE_S)
 
     def _take(self) -> None:
-        """Take the newest device; wait where nobody watches."""
+        """Take the newest device."""
         newest = None
-        while self.pipe.poll() or time.monotonic() - self.watched_s > WATCHED_S:
+        while self.pipe.poll():
             newest = self.pipe.recv() or newest
             self.watched_s = time.monotonic()
         if newest is not None:
@@ -262,10 +362,11 @@ class _Worker:
             self.live.place(screen(stent, self.settings.blood))
 
     def _say(self, steps_per_s: float) -> None:
-        """Send the present numbers, and from time to time streamlines."""
+        """Send the present numbers, and from time to time streamlines after them."""
         bare, now = self.live.bare, self.live.read()
         if 100 * max(bare.error.values()) > SHOWN_POINTS:
-            self.pipe.send(Said(self.serial, 1.0))
+            self.said = Said(self.serial, 1.0)
+            self.pipe.send(self.said)
             return
         points = {key: self.live.change(key)[1] for key in _KEYS}
         points = {key: value for key, value in points.items() if value < SHOWN_POINTS}
@@ -277,11 +378,11 @@ class _Worker:
             "grid_spacing_mm": self.live.cell_size_mm,
             "steps_per_s": steps_per_s,
         }
-        lines = None
+        self.said = Said(self.serial, 1.0, values, points, now.is_settled, self.live.is_prepared)
+        self.pipe.send(self.said)
         if time.monotonic() - self.drawn_s > LINES_S:
             from vstent.flow.streamlines import neck_seeds_mm
 
             flow, self.drawn_s = self.live.field(), time.monotonic()
             seeds_mm = neck_seeds_mm(flow, self.anatomy.aneurysms[0].neck, LINES)
-            lines = stream_layer("", flow, seeds_mm)
-        self.pipe.send(Said(self.serial, 1.0, values, points, now.is_settled, "", lines))
+            self.pipe.send(replace(self.said, lines=stream_layer("", flow, seeds_mm)))

@@ -406,7 +406,11 @@ def _add_planning(api: APIRouter, desk: Desk) -> None:
     def preview(case_id: str, seen: Annotated[int, Query(ge=0)] = 0) -> Response:
         return Response(desk.preview(desk.store.get(case_id)).message(seen), media_type=BINARY)
 
-    @api.delete("/api/cases/{case_id}/preview", summary="Stop the live flow")
+    @api.post("/api/cases/{case_id}/preview", summary="Prepare the live flow at low priority; it answers sooner then")
+    def prepare_preview(case_id: str) -> dict[str, Any]:
+        return {"is_begun": desk.prepare_preview(desk.store.get(case_id))}
+
+    @api.delete("/api/cases/{case_id}/preview", summary="End the live flow")
     def end_preview(case_id: str) -> dict[str, Any]:
         desk.end_preview(desk.store.get(case_id))
         return {"is_on": False}

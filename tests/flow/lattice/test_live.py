@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from vstent.flow.lattice.live import (
     CELLS_ACROSS_NECK,
     CELLS_ACROSS_PARENT,
     KNOWN,
+    BareFlow,
     LiveFlow,
     Stepping,
     average,
@@ -29,6 +31,7 @@ from vstent.flow.screen import screen
 from vstent.flow.simulation import flow_case
 from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
 from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.io.archive import load_data, save_data
 
 SETTINGS = FlowSettings(cells_per_diameter=13.0, inflow_mL_s=1.5)
 """A default grid coarser than a preview's: the preview takes it."""
@@ -107,6 +110,36 @@ def test_both_flows_step_until_the_one_without_a_device_is_known(live: LiveFlow)
     live.advance(0.0)
     assert len(live._bare.readings) == 1
     assert not np.array_equal(live.state.populations, populations)
+
+
+def test_only_the_flow_without_a_device_is_prepared_until_it_is_known(live: LiveFlow) -> None:
+    live.place(None)
+    live.place(screens()[0])
+    settled(live)
+    shown, populations = live.read(), live.state.populations.copy()
+    live._bare.readings.clear()
+    live.prepare(60.0)
+    assert live.is_prepared
+    known = len(live._bare.readings)
+    live.prepare(60.0)
+    assert len(live._bare.readings) == known
+    assert live.read() == shown
+    np.testing.assert_array_equal(live.state.populations, populations)
+
+
+def test_a_stored_flow_continues_to_the_last_bit(live: LiveFlow, tmp_path: Path) -> None:
+    live.place(None)
+    save_data(tmp_path / "bare.npz", live.stored())
+    again = LiveFlow(case(), stored=load_data(tmp_path / "bare.npz", BareFlow))
+    assert again.bare == live.bare
+    for one in (again, live):
+        one.place(screens()[0])
+        one._shown.advance()
+        one._bare.advance()
+    assert again.change("neck_inflow_mL_s") == live.change("neck_inflow_mL_s")
+    for name in ("_shown", "_bare"):
+        stored, other = (getattr(one, name).state for one in (again, live))
+        np.testing.assert_array_equal(stored.populations, other.populations)
 
 
 def test_a_change_lies_within_its_band_while_the_flow_adapts(live: LiveFlow) -> None:

@@ -4,6 +4,9 @@ The sac and a piece of the artery are computed on a fine grid, inside the flow o
 (`close_up`). The coarse flow is computed once, without a device, until the blood of the vessel has been exchanged: a
 device changes the flow of the artery far less than that of the neck. Both lattices then step in turn. Every value is
 known at any time with an uncertainty, which falls while the flow develops and its averages grow longer.
+
+The flow without a device can be computed in advance (`LiveFlow.prepare`) and stored (`LiveFlow.stored`). Only the
+flow with the device is then left to compute.
 """
 
 from collections import deque
@@ -16,7 +19,8 @@ import numpy as np
 
 from vstent.flow.case import FlowCase, FlowField, Screen
 from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
-from vstent.flow.engines import DivergenceError, Outcome, stepped
+from vstent.flow.engines import DivergenceError, Outcome, Saved, stepped
+from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.close_up import WIDTH
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
@@ -69,6 +73,18 @@ class Reading:
     def is_settled(self) -> bool:
         """Whether both values are known to within the tolerance of a preview."""
         return max(self.error.values()) < TOLERANCE
+
+
+@dataclass(frozen=True, eq=False)
+class BareFlow:
+    """A flow without a device that was computed before; a live flow continues from it."""
+
+    outer: FlowField
+    """Flow of the whole vessel on the coarse grid."""
+    saved: Saved
+    """State of the lattice in the refined region (see `checkpoint.pack`)."""
+    readings: Floats
+    """(n, 2) neck inflow in mL/s and sac velocity in m/s at equal intervals of time."""
 
 
 class Stepping:
@@ -158,6 +174,8 @@ class LiveFlow:
         The flow case without a device; it must have a sac and an ostium.
     told : callable, optional
         Called with the fraction that is done while the flow of the artery is computed.
+    stored : BareFlow, optional
+        The flow of the same case as computed before; None: it is computed.
 
     Raises
     ------
@@ -165,12 +183,16 @@ class LiveFlow:
         The flow without a device diverges.
     """
 
-    def __init__(self, case: FlowCase, told: Callable[[float], None] | None = None) -> None:
+    def __init__(
+        self, case: FlowCase, told: Callable[[float], None] | None = None, stored: BareFlow | None = None
+    ) -> None:
         self.case = replace(case, settings=replace(case.settings, waveform=None, close_up=False, tolerance=TOLERANCE))
         self.cell_size_mm = preview_spacing_mm(self.case)
-        self.outer = self._around(told)
-        state = LatticeBoltzmann(self.cell_size_mm, None, self.outer).init(self.case, self.outer)
+        self.outer = self._around(told) if stored is None else stored.outer
+        engine = LatticeBoltzmann(self.cell_size_mm, None, self.outer)
+        state = engine.init(self.case, self.outer) if stored is None else engine.resume(self.case, stored.saved)
         self._bare = Stepping(state, 2 * max(1, round(0.5 * state.steps_per_check / READINGS_PER_CHECK)))
+        self._bare.readings.extend([] if stored is None else stored.readings)
         self._shown = self._bare
 
     def _around(self, told: Callable[[float], None] | None) -> FlowField:
@@ -209,11 +231,25 @@ class LiveFlow:
                 done += one.reading_steps
         return done
 
+    def prepare(self, seconds: float) -> None:
+        """Make time steps of the flow without a device for about a wall-clock time, or until it is known well."""
+        began = perf_counter()
+        while not self.is_prepared and perf_counter() - began < seconds:
+            self._bare.advance()
+
+    @property
+    def is_prepared(self) -> bool:
+        """Whether the flow without a device is known well, so that only the one with the device is continued."""
+        return bool(self._bare.readings) and max(self._bare.read().error.values()) < KNOWN
+
+    def stored(self) -> BareFlow:
+        """Return the flow without a device, from which another live flow can continue; its arrays change with it."""
+        return BareFlow(self.outer, pack(self._bare.state), np.array(self._bare.readings))
+
     @property
     def _unknown(self) -> tuple[Stepping, ...]:
         """The flow that is shown, and the one without a device as long as it is not known well."""
-        is_known = bool(self._bare.readings) and max(self._bare.read().error.values()) < KNOWN
-        return (self._shown,) if is_known or self._shown is self._bare else (self._bare, self._shown)
+        return (self._shown,) if self.is_prepared or self._shown is self._bare else (self._bare, self._shown)
 
     @property
     def state(self) -> State:
