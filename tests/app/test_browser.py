@@ -71,6 +71,7 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         page.wait_for_selector(".sheet .row")
         assert in_time(page, lambda: place_of(page, "distal") == pytest.approx(after, abs=0.11))
         undone(page)
+        type_while_the_page_is_redrawn(client, page)
 
 
 RAMPS = """() => [...document.querySelectorAll('.viewer-bar')].map((bar) => {
@@ -217,6 +218,23 @@ def chosen(client):
 def undone(page):
     page.keyboard.press("Control+z")
     page.wait_for_function("() => document.querySelector('button[aria-label=Undo]').disabled")
+
+
+def type_while_the_page_is_redrawn(client, page):
+    """Focus and text that is not committed yet outlive a redraw; the text is committed when its field is left."""
+    page.get_by_role("button", name="Flow →").click()
+    playwright.expect(page.locator(".panel h2")).to_be_focused()
+    field = page.locator("#field-inflow")
+    field.press_sequentially("3.2")
+    case = f"/api/cases/{client.get('/api/cases').json()['cases'][0]['id']}"
+    view = client.get(case).json()
+    flow = view["choices"]["flow"] | {"outlets": "murray"}
+    client.put(f"{case}/choices", json={"revision": view["revision"], "choices": view["choices"] | {"flow": flow}})
+    playwright.expect(page.locator("#field-outlets")).to_have_value("murray")
+    playwright.expect(field).to_have_value("3.2")
+    playwright.expect(field).to_be_focused()
+    page.keyboard.press("Tab")
+    assert in_time(page, lambda: chosen(client)["flow"] == flow | {"inflow_mL_s": 3.2})
 
 
 def trim_and_draw_the_neck(client, page):

@@ -1,5 +1,28 @@
-// Drawing a part of the page anew: what has the focus, what is unfolded and the definition on show are found again in it.
+// Drawing a part of the page anew: what has the focus, what is typed, unfolded and explained is found again in it.
 import { giveTip, tipOwner } from "./tips.js";
+
+/** Fields with text that is not committed yet, and those of them into which it was written when they were drawn anew. */
+const [typed, carried] = [new WeakSet(), new WeakSet()];
+let isChanging = false;
+
+document.addEventListener("input", ({ target }) => typed.add(target));
+document.addEventListener("change", ({ target }) => [typed, carried].forEach((fields) => fields.delete(target)), { capture: true });
+document.addEventListener("focusout", ({ target }) => commit(target));
+document.addEventListener("keydown", ({ key, target }) => key === "Enter" && commit(target));
+
+/** Commit the text that was written into a field: the browser commits only what was typed into it. */
+function commit(field) {
+  if (!isChanging && carried.has(field)) field.dispatchEvent(new Event("change", { bubbles: true }));
+}
+
+/** Write the text that is not committed yet into the field drawn in its place, with the cursor where it was. */
+function carry(field, { value, selectionStart, selectionEnd }) {
+  if (field.value === value) return;
+  field.value = value;
+  typed.add(field);
+  carried.add(field);
+  if (selectionStart != null) field.setSelectionRange(selectionStart, selectionEnd);
+}
 
 /** What an element is called in its part: by its key, or its words. */
 const nameOf = (element) => element.dataset.key ?? (element.id || element.getAttribute("aria-label") || element.textContent);
@@ -12,6 +35,14 @@ function finder(box, element) {
   return () => (box.contains(element) ? element : same()[place]);
 }
 
+/** Give the focus to what was drawn in place of an element, with the text typed into it; else to the heading of the box. */
+function refocus(box, before, after) {
+  const heading = box.querySelector("h2");
+  if (!after && heading) heading.tabIndex = -1;
+  (after ?? heading)?.focus({ preventScroll: true });
+  if (after && after !== before && typed.has(before)) carry(after, before);
+}
+
 /** Change what is in `box` and return the focus, the unfolded details and the definition to the elements that correspond. */
 export function keeping(box, change) {
   const { activeElement } = document;
@@ -20,9 +51,11 @@ export function keeping(box, change) {
   const focused = box !== activeElement && box.contains(activeElement) && find(activeElement);
   const described = owner && find(owner);
   const unfolded = [...box.querySelectorAll("details[open] > summary")].map(find);
+  isChanging = true;
   change();
+  isChanging = false;
   for (const summary of unfolded) summary()?.parentElement.toggleAttribute("open", true);
-  if (focused) focused()?.focus({ preventScroll: true });
+  if (focused) refocus(box, activeElement, focused());
   if (focused || described) giveTip(described?.());
 }
 
