@@ -33,6 +33,7 @@ DEVICES = ("silk", "enterprise", "pipeline")
 MOVE_MM = 2.0
 SLICE_S = 0.15
 ASKED_S = 0.22
+"""Time between two requests of the page, in s."""
 LONGEST_S = 40.0
 INFLOW = "neck_inflow_mL_s"
 Course = list[tuple[float, float, float]]
@@ -88,8 +89,7 @@ def full(anatomy: Anatomy, stents: dict[str, Stent]) -> dict[str, float]:
 
 
 def numbers(preview: Preview) -> dict:
-    """Return what the page is told, as often as it asks."""
-    sleep(ASKED_S)
+    """Return what the page is told."""
     raw = preview.message()
     return json.loads(raw[4 : 4 + int.from_bytes(raw[:4], "little")])
 
@@ -102,6 +102,7 @@ def switched(preview: Preview, stent: Stent) -> tuple[float, float, float]:
         told = numbers(preview)
         if not told["is_stale"] and INFLOW in told["error_points"]:
             return perf_counter() - began, told["reductions"][INFLOW], told["error_points"][INFLOW]
+        sleep(ASKED_S)
     return float("nan"), float("nan"), float("nan")
 
 

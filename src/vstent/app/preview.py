@@ -34,7 +34,7 @@ NICE: Final = 10
 SLICE_S: Final = 0.15
 """Time between two messages of the process, in s."""
 LINES_S: Final = 0.5
-"""Time between two sets of streamlines, in s."""
+"""Time between two sets of streamlines, in s; three times as long until a number has a band, which comes sooner so."""
 WATCHED_S: Final = 2.0
 """Time after the last request for which the process goes on stepping, in s."""
 PREPARED_S: Final = 60.0
@@ -347,7 +347,9 @@ class _Worker:
         """Store the flow without a device, and wait for a request; return whether one has come."""
         self.store.keep(self.live)
         self.pipe.send(replace(self.said, is_prepared=True))
-        return self.pipe.poll(IDLE_S)
+        is_asked = self.pipe.poll(IDLE_S)
+        self.drawn_s = time.monotonic()
+        return is_asked
 
     def _take(self) -> None:
         """Take the newest device."""
@@ -380,7 +382,7 @@ class _Worker:
         }
         self.said = Said(self.serial, 1.0, values, points, now.is_settled, self.live.is_prepared)
         self.pipe.send(self.said)
-        if time.monotonic() - self.drawn_s > LINES_S:
+        if time.monotonic() - self.drawn_s > (LINES_S if points else 3 * LINES_S):
             from vstent.flow.streamlines import neck_seeds_mm
 
             flow, self.drawn_s = self.live.field(), time.monotonic()

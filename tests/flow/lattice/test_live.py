@@ -24,6 +24,7 @@ from vstent.flow.lattice.live import (
     LiveFlow,
     Stepping,
     average,
+    known,
     preview_spacing_mm,
 )
 from vstent.flow.lattice.stepping import twin
@@ -105,11 +106,14 @@ def test_both_flows_step_until_the_one_without_a_device_is_known(live: LiveFlow)
     without = [one.copy() for one in live._bare.readings]
     live.advance(0.0)
     np.testing.assert_array_equal(live._bare.readings, without)
-    live._bare.readings.clear()
+    live._bare.forget()
     populations = live.state.populations.copy()
     live.advance(0.0)
     assert len(live._bare.readings) == 1
     assert not np.array_equal(live.state.populations, populations)
+    while live._unknown == (live._bare, live._shown):
+        live.advance(0.0)
+    assert max(live.bare.error.values()) < max(KNOWN, *live.read().error.values())
 
 
 def test_only_the_flow_without_a_device_is_prepared_until_it_is_known(live: LiveFlow) -> None:
@@ -117,7 +121,7 @@ def test_only_the_flow_without_a_device_is_prepared_until_it_is_known(live: Live
     live.place(screens()[0])
     settled(live)
     shown, populations = live.read(), live.state.populations.copy()
-    live._bare.readings.clear()
+    live._bare.forget()
     live.prepare(60.0)
     assert live.is_prepared
     known = len(live._bare.readings)
@@ -170,6 +174,17 @@ def test_an_average_lies_within_its_uncertainty_of_the_limit() -> None:
         mean, error = average(noisy)
         missed += abs(mean - 1) > error * mean
     assert missed <= 20
+
+
+def test_what_a_recent_reading_said_holds_still() -> None:
+    rng = np.random.default_rng(5)
+    values = 1 + 0.1 * np.convolve(rng.normal(size=150), 0.7 ** np.arange(20), "valid")
+    for n in range(2, len(values)):
+        (mean, error), own = known(values[:n]), average(values[:n])
+        assert mean == own[0]
+        assert error <= own[1]
+        before, reach = known(values[: n - 1])[0], average(values[: n - 1])[1]
+        assert error * mean <= reach * before + abs(mean - before) + 1e-12
 
 
 def test_few_readings_say_nothing() -> None:
