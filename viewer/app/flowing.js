@@ -106,7 +106,7 @@ export class Flowing {
     this.element.classList.toggle("stale", is_stale);
     if (!("neck_inflow_mL_s" in reductions)) return this.say(fraction < 1 ? `Computing the flow in the artery: ${Math.round(100 * fraction)} %` : "The flow develops: first numbers follow.");
     const moving = is_stale ? "The device has moved: new values follow." : is_settled ? "Steady." : "The flow is adapting to the device and is averaged: the uncertainty (±) decreases with time.";
-    this.say(`${moving} Grid spacing ${values.grid_spacing_mm.toFixed(2)} mm; ± includes the difference from the full computation.`);
+    this.say(`${moving} Grid spacing ${values.grid_spacing_mm.toFixed(2)} mm; ± includes the usual difference from the full computation.`);
     this.cards.replaceChildren(
       ...Object.entries(NAMES).map(([key, [name, unit, factor]]) =>
         make("div", { className: "card" }, [

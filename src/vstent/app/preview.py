@@ -366,7 +366,7 @@ class _Worker:
     def _say(self, steps_per_s: float) -> None:
         """Send the present numbers, and from time to time streamlines after them."""
         bare, now = self.live.bare, self.live.read()
-        if 100 * max(bare.error.values()) > SHOWN_POINTS:
+        if 100 * min(bare.error.values()) > SHOWN_POINTS:
             self.said = Said(self.serial, 1.0)
             self.pipe.send(self.said)
             return
