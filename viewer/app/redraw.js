@@ -5,23 +5,21 @@ import { giveTip, tipOwner } from "./tips.js";
 const [typed, carried] = [new WeakSet(), new WeakSet()];
 let isChanging = false;
 
-document.addEventListener("input", ({ target }) => typed.add(target));
-document.addEventListener("change", ({ target }) => [typed, carried].forEach((fields) => fields.delete(target)), { capture: true });
-document.addEventListener("focusout", ({ target }) => commit(target));
-document.addEventListener("keydown", ({ key, target }) => key === "Enter" && commit(target));
+addEventListener("input", ({ target }) => typed.add(target));
+addEventListener("change", committed, { capture: true });
+addEventListener("focusout", ({ target }) => commit(target));
+addEventListener("keyup", ({ key, target }) => key === "Enter" && commit(target));
+
+/** Note a committed text; a browser also commits what is typed into a field that is taken away, and that is too early. */
+function committed(event) {
+  if (isChanging) return event.stopImmediatePropagation();
+  typed.delete(event.target);
+  carried.delete(event.target);
+}
 
 /** Commit the text that was written into a field: the browser commits only what was typed into it. */
 function commit(field) {
   if (!isChanging && carried.has(field)) field.dispatchEvent(new Event("change", { bubbles: true }));
-}
-
-/** Write the text that is not committed yet into the field drawn in its place, with the cursor where it was. */
-function carry(field, { value, selectionStart, selectionEnd }) {
-  if (field.value === value) return;
-  field.value = value;
-  typed.add(field);
-  carried.add(field);
-  if (selectionStart != null) field.setSelectionRange(selectionStart, selectionEnd);
 }
 
 /** What an element is called in its part: by its key, or its words. */
@@ -40,7 +38,17 @@ function refocus(box, before, after) {
   const heading = box.querySelector("h2");
   if (!after && heading) heading.tabIndex = -1;
   (after ?? heading)?.focus({ preventScroll: true });
-  if (after && after !== before && typed.has(before)) carry(after, before);
+  if (after === before || !typed.has(before)) return;
+  if (after) carry(before, after);
+  else before.dispatchEvent(new Event("change")); // the field is not there any more
+}
+
+/** Write text that is not committed yet into the field drawn in place of its own, with the cursor where it was. */
+function carry({ value, selectionStart, selectionEnd }, field) {
+  field.value = value;
+  typed.add(field);
+  carried.add(field);
+  if (selectionStart != null) field.setSelectionRange(selectionStart, selectionEnd);
 }
 
 /** Change what is in `box` and return the focus, the unfolded details and the definition to the elements that correspond. */
