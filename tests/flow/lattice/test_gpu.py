@@ -21,14 +21,15 @@ from vstent.errors import FlowError, InputError
 from vstent.flow import domain
 from vstent.flow.case import Blood, CarreauYasuda, FlowCase, FlowSettings, Screen, Waveform
 from vstent.flow.lattice import gpu as gpus
+from vstent.flow.lattice import packing, stepping
 from vstent.flow.lattice import state as lattice_state
-from vstent.flow.lattice import stepping
 from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
+from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
 from vstent.flow.lattice.recording import NotRecordedError, Pairs, plan, recorded
-from vstent.flow.lattice.setup import build_bands
+from vstent.flow.lattice.setup import Grid
 from vstent.flow.simulation import engine_class, foretell_cost, simulate_case
 from vstent.kernels.directions import VELOCITIES
 from vstent.study import repeat
@@ -114,7 +115,7 @@ def everything() -> lattice_state.State:
     state.links = replace(links, openings=openings, start=start, wanted=wanted, course=course, shape=shape)
     septa, cell = septa_away_from_links(state)
     state.addressing = replace(a, septa=np.ascontiguousarray(septa), septum_cell=cell)
-    state.bands = build_bands(state.domain, state.addressing, state.links)
+    state.bands = Grid(state.domain, state.limit, state.addressing).bands
     state.limit[::2] = 1.0
     state.pace = np.array([2 * SETTLED_PAIRS + 20, 2 * SETTLED_PAIRS + 18])
     state.check_s = state.scales.step_s * int(state.pace[0])
@@ -141,6 +142,21 @@ def test_a_gpu_makes_the_steps_that_a_processor_makes(tmp_path: Path, monkeypatc
     for name in wanted.keys() - {"loop_seconds"}:
         most = np.abs(wanted[name]).max(initial=0.0)
         np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=ROUNDING * most, err_msg=name)
+
+
+def test_the_next_flow_of_a_vessel_has_the_numbering_of_the_first() -> None:
+    vessel = tube(line(8.0), 2.0).vessel
+    bare = FlowCase(vessel, settings=FlowSettings(inflow_mL_s=0.3))
+    stented = replace(bare, screen=screen(), settings=FlowSettings(inflow_mL_s=0.5, outlets="murray"))
+    first, second = (LatticeBoltzmann(CELL_MM).init(case, None) for case in (bare, stented))
+    assert second.refill.groups is first.refill.groups
+    assert second.bands is first.bands
+    shared = packing.layout_of(first)
+    assert packing.layout_of(second) is shared
+    alone = packing.layout_of(pickle.loads(pickle.dumps(second)))
+    assert alone is not shared
+    for name, array in vars(alone).items():
+        np.testing.assert_array_equal(array, getattr(shared, name), err_msg=name)
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 100])

@@ -13,7 +13,7 @@ from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.collision import collided, relaxed, squared_reach
 from vstent.flow.lattice.scales import ODD_RATE as VESSEL_ODD_RATE
-from vstent.flow.lattice.setup import address, build_bands, build_links, thickest
+from vstent.flow.lattice.setup import Grid, address, build_links, thickest
 from vstent.flow.lattice.stepping import advance
 from vstent.flow.lattice.walls import parabolic_weights
 from vstent.geometry.vessel import Vessel
@@ -91,10 +91,11 @@ def test_a_band_is_done_when_all_that_it_needs_is(threads):
     state.populations[:] = 0.01 * rng.normal(size=state.populations.size)
     state.refill.refill[:] = 0.01 * rng.normal(size=state.refill.refill.size)
     domain, refill = with_septa(state.domain, rng), state.refill
-    a = address(domain, thickest(case, domain))
-    links = build_links(case, domain, a, state.scales, None)
+    limit = thickest(case, domain)
+    grid = Grid(domain, limit, address(domain, limit))
+    a, links = grid.addressing, build_links(case, grid, state.scales, None)
     links.source[:] = 0.01 * rng.normal(size=links.source.size)
-    all_bands = build_bands(domain, a, links)
+    all_bands = grid.bands
     assert len(all_bands) > 20
     everything = [len(a.length), len(refill.refill), len(links.source), links.start[-1], len(a.septa[0])]
     assert np.array_equal(all_bands[-1], everything)

@@ -5,6 +5,7 @@ A *cut* is a cross-section of the vessel where the refined region ends and takes
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -106,7 +107,12 @@ class Ends:
         if kind == d3q19.INFLOW:
             return SOUND_MEMORY if self.case.settings.waveform is None else 1.0
         # Critical damping for a column of blood about as long as the grid.
-        return 0.25 / float(np.ptp(self.domain.cells, axis=0).max())
+        return 0.25 / self._length
+
+    @cached_property
+    def _length(self) -> float:
+        """Return the length of the grid in cells."""
+        return float(np.ptp(self.domain.cells, axis=0).max())
 
     def _entry(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
         """Return the row and profile coefficients of a cut with inflow.

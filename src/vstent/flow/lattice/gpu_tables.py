@@ -80,7 +80,7 @@ def single_of(state: State) -> NDArray[np.float32]:
 
 def tables(packed: Packed, numbers: Numbers) -> Tables:
     """Return the arrays of `kernels.even_step`."""
-    ends, blocks = len(numbers.openings), packed.blocks(kernels.THREADS)
+    ends, blocks = len(numbers.openings), packed.layout.blocks(kernels.THREADS)
     singles, (number, _, link, refill, entry) = joined(
         (numbers.single, numbers.limit, packed.link, numbers.refill, numbers.entry), np.float32
     )
@@ -114,15 +114,17 @@ def _integers(head: dict[int, int], packed: Packed, special: Ints, blocks: Ints,
     """Return the integers, of which `head` are the first, and where the codes begin."""
     named = {
         kernels.SPECIAL: special,
-        kernels.END_OF_LINK: packed.end_of_link,
-        kernels.OPENING_OF_END: packed.opening_of_end,
+        kernels.END_OF_LINK: packed.layout.end_of_link,
+        kernels.OPENING_OF_END: packed.layout.opening_of_end,
         kernels.BLOCKS: blocks,
-        kernels.END_CELL: packed.end_cell,
+        kernels.END_CELL: packed.layout.end_cell,
         kernels.FIRST_BLOCK: np.searchsorted(blocks[:, 0], np.arange(len(start))),
         kernels.COUNT: np.diff(start),
         kernels.DONE: np.zeros(len(start) - 1),
     }
-    whole, (_, _, code, *places) = joined((np.zeros(kernels.HEAD), packed.rows, packed.code, *named.values()), np.int32)
+    whole, (_, _, code, *places) = joined(
+        (np.zeros(kernels.HEAD), packed.layout.rows, packed.code, *named.values()), np.int32
+    )
     for entry, place in (head | dict(zip(named, (place.start for place in places), strict=True))).items():
         whole[entry] = place
     return whole, code.start

@@ -15,7 +15,7 @@ from vstent.flow.lattice.gpu_tables import PAIRS, START, Numbers, numbers_of, si
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.kernels import gpu as kernels
 from vstent.flow.lattice.kernels.gpu import THREADS
-from vstent.flow.lattice.packing import Packed, pack
+from vstent.flow.lattice.packing import Layout, Packed, pack
 from vstent.flow.lattice.readback import ReadBack
 from vstent.flow.lattice.recording import NotRecordedError, Pairs, plan, recorded
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, State
@@ -106,7 +106,8 @@ class Device:
     def _kernels_of_walls(self, state: State) -> tuple[Launch, Launch]:
         """Return the kernels of the deferred wall correction and of the mass balance, without their last argument."""
         walls, packed, ends = state.refill, self._packed, int(state.links.start[-1])
-        slot = np.where(packed.is_near, -1 - packed.slot, packed.slot)[ends:]
+        layout = packed.layout
+        slot = np.where(layout.is_near, -1 - layout.slot, layout.slot)[ends:]
         of_wall = self._address[ends:] if len(slot) else self._address
         lost, groups = put(walls.lost), tuple(map(put, (*walls.groups[:3], packed.refilled[walls.groups[3]])))
         of_links = of_wall, self._correction, put(slot.astype(np.int32)), lost
@@ -119,7 +120,7 @@ class Device:
     def _kernels_of_reading(self, state: State) -> tuple[tuple[Launch, Launch], Launch]:
         """Return the kernels that write density, velocity and flow rates, and the one that writes relaxation times."""
         packed, everywhere = self._packed, (*self._common, *self._layout)
-        ends = put(packed.end_cell), put(packed.end_cell_start), self._outflow
+        ends = put(packed.layout.end_cell), put(packed.layout.end_cell_start), self._outflow
         screened = put(state.screen.cell.astype(np.int32)), self._times
         return (
             Launch(kernels.moments, self._cells, (*everywhere, self._density, self._velocity)),
@@ -227,9 +228,10 @@ class Device:
         self.stream.synchronize()
         self._populations.copy_to_host(state.populations)
         state.links.openings[:] = self._openings()
-        if len(self._packed.slot):
+        slot = self._packed.layout.slot
+        if len(slot):
             link = self._singles[self._at.link].copy_to_host().reshape(-1, 2)
-            state.links.source[:] = link[self._packed.slot, 1]
+            state.links.source[:] = link[slot, 1]
             state.refill.refill[:] = self._singles[self._at.refill].copy_to_host()[self._packed.refilled]
 
     def _openings(self) -> Floats:
@@ -265,19 +267,9 @@ def seconds_of_update(place: Ints, length: Ints, stride: int, relaxation: Sequen
     rows[:, 0] = place - (np.cumsum(length) - length)
     code = np.repeat(np.arange(len(length), dtype=np.int32), length)
     nothing = np.zeros(0, np.float32)
-    packed = Packed(
-        code,
-        rows,
-        np.zeros((6, 0), np.int32),
-        none,
-        nothing.reshape(0, 2),
-        none,
-        none > 0,
-        none,
-        none,
-        none,
-        np.zeros(1, np.int32),
-    )
+    by_link = none, none, none > 0, none, none, none
+    layout = Layout(code, rows, none, np.zeros((4, 0), np.int32), none, *by_link, np.zeros(1, np.int32))
+    packed = Packed(layout, code, np.zeros((6, 0), np.int32), none, nothing.reshape(0, 2))
     single = np.array([time, *law, odd_rate], np.float32)
     numbers = Numbers(
         single,

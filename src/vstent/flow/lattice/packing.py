@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.screen import ScreenEntries
 from vstent.flow.lattice.setup import Addressing, Links
 from vstent.flow.lattice.state import State
 from vstent.kernels.arrays import Ints
@@ -31,28 +31,28 @@ def joined(tables: Sequence[NDArray[Any]], dtype: type) -> tuple[NDArray[Any], l
 
 
 @dataclass(frozen=True, eq=False)
-class Packed:
-    """Arrays of a run by cell. *Special* cells are those with a link, a refill or a screen; others need no more."""
+class Layout:
+    """Arrays by cell and link that depend on the grid alone, so that all flows on it share them."""
 
-    code: Ints
-    """(n,) segment of every cell; of a special cell, -1 minus its number."""
+    segment: Ints
+    """(n,) segment of every cell."""
     rows: Ints
     """(s, 9) storage place minus cell number, the same in a whole segment, of its cells and of their neighbours in the
     directions `IN_PLANE`. Neighbours along z are in adjacent places."""
-    special: Ints
-    """(6, m) of every special cell: segment; masks of its links, near links and links of ends (bit q: direction q);
-    first link; screen entry, or -1."""
+    cell: Ints
+    """(w,) cells with a link or a refill, ascending."""
+    of_cell: Ints
+    """(4, w) of every such cell: masks of its links, near links and links of ends (bit q: direction q); first link."""
     refilled: Ints
-    """(w,) number among the special cells of every cell of `Refill.place`."""
-    link: NDArray[np.float32]
-    """(l, 2) weight and source of every link, by cell and direction. The population sent has this weight, and 1 minus
-    its magnitude is the weight of the population beside it."""
+    """(r,) number in `cell` of every cell of `Refill.place`."""
+    order: Ints
+    """(l,) number in `Links` of the links by cell and direction."""
     slot: Ints
-    """(l,) number in `link` of every link of `Links`."""
+    """(l,) number in this order of every link of `Links`."""
     is_near: NDArray[np.bool_]
     """(l,) whether a link of `Links` needs a population that arrives at its cell: its wall is nearer than half-way."""
     end_of_link: Ints
-    """(l,) number of every link in `link` among those of the ends, or -1."""
+    """(l,) number of every link in this order among those of the ends, or -1."""
     opening_of_end: Ints
     """(o,) end that each of these links belongs to."""
     end_cell: Ints
@@ -69,40 +69,57 @@ class Packed:
         return np.array(rows, np.int32).reshape(-1, 3)
 
 
-def rows_of(addressing: Addressing) -> Ints:
-    """Return `Packed.rows` of a memory layout."""
-    away = addressing.address[1]
-    columns = [addressing.address[0, :, 0]]
-    columns += [away[:, d3q19.OPPOSITE[q]] - q * addressing.stride for q in IN_PLANE]
-    return np.ascontiguousarray(np.stack(columns, axis=1) - addressing.first_cell[:, None], dtype=np.int32)
+_LAYOUTS: WeakKeyDictionary[Addressing, Layout] = WeakKeyDictionary()
+"""Layouts by memory layout, as long as that exists."""
 
 
-def pack(state: State) -> Packed:
-    """Return the arrays of a run as the kernels of a GPU read them; sources and refill are those of `state`."""
-    a, links = state.addressing, state.links
+@dataclass(frozen=True, eq=False)
+class Packed:
+    """Arrays of a run by cell. *Special* cells are those with a link, a refill or a screen; others need no more."""
+
+    layout: Layout
+    """What all flows on the grid share."""
+    code: Ints
+    """(n,) segment of every cell; of a special cell, -1 minus its number."""
+    special: Ints
+    """(6, m) of every special cell: segment; masks of its links, near links and links of ends (bit q: direction q);
+    first link; screen entry, or -1."""
+    refilled: Ints
+    """(r,) number among the special cells of every cell of `Refill.place`."""
+    link: NDArray[np.float32]
+    """(l, 2) weight and source of every link, by cell and direction. The population sent has this weight, and 1 minus
+    its magnitude is the weight of the population beside it."""
+
+
+def layout_of(state: State) -> Layout:
+    """Return what all flows on the grid of a run share; it is built once for each memory layout."""
+    if state.addressing not in _LAYOUTS:
+        _LAYOUTS[state.addressing] = _layout(state.addressing, state.links, state.refill.place)
+    return _LAYOUTS[state.addressing]
+
+
+def _layout(a: Addressing, links: Links, refill_place: Ints) -> Layout:
+    """Return what all flows with a memory layout share; the links are those of any of them."""
     direction, place = np.divmod(links.address[:, 2], a.stride)
     cell = np.searchsorted(a.place, place)
     order = np.lexsort((direction, cell))
     slot = np.zeros(len(order), np.int32)
     slot[order] = np.arange(len(order), dtype=np.int32)
     is_near = (links.weight[:, 1] != 0) & (links.path[0, :, 1] == links.address[:, 1])
-    refilled_cell = np.searchsorted(a.place, state.refill.place)
-    special_cell = np.unique(np.concatenate([cell, refilled_cell, state.screen.cell]))
-    code = np.repeat(np.arange(len(a.length), dtype=np.int32), a.length)
-    special = _special(special_cell, cell, direction, is_near, links, state.screen)
-    special[0] = code[special_cell]
-    code[special_cell] = -1 - np.arange(len(special_cell), dtype=np.int32)
+    refilled_cell = np.searchsorted(a.place, refill_place)
+    wall_cell = np.unique(np.concatenate([cell, refilled_cell]))
     ends = int(links.start[-1])
     end_of_link = np.full(len(slot), -1, np.int32)
     end_of_link[slot[:ends]] = np.arange(ends)
     opening = np.repeat(np.arange(len(links.start) - 1, dtype=np.int32), np.diff(links.start))
     at_end = np.unique(np.stack([opening, cell[:ends]]), axis=1)
-    return Packed(
-        code,
+    return Layout(
+        np.repeat(np.arange(len(a.length), dtype=np.int32), a.length),
         rows_of(a),
-        special,
-        np.searchsorted(special_cell, refilled_cell).astype(np.int32),
-        np.stack([links.weight[order, 0], links.source[order]], axis=1),
+        wall_cell,
+        _of_cells(np.searchsorted(wall_cell, cell), 1 << direction, is_near, ends, len(wall_cell)),
+        np.searchsorted(wall_cell, refilled_cell),
+        order,
         slot,
         is_near,
         end_of_link,
@@ -112,21 +129,33 @@ def pack(state: State) -> Packed:
     )
 
 
-def _special(
-    special_cell: Ints,
-    cell: Ints,
-    direction: Ints,
-    is_near: NDArray[np.bool_],
-    links: Links,
-    screen: ScreenEntries,
-) -> Ints:
-    """Return `Packed.special` without its segments."""
-    of_link, bit = np.searchsorted(special_cell, cell), 1 << direction
-    is_end = np.arange(len(cell)) < links.start[-1]
-    special = np.zeros((6, len(special_cell)), np.int32)
-    for row, chosen in ((1, slice(None)), (2, is_near), (3, is_end)):
-        np.bitwise_or.at(special[row], of_link[chosen], bit[chosen].astype(np.int32))
-    special[4] = np.searchsorted(np.sort(of_link), np.arange(len(special_cell)))
-    special[5] = -1
-    special[5, np.searchsorted(special_cell, screen.cell)] = np.arange(len(screen.cell))
-    return special
+def rows_of(addressing: Addressing) -> Ints:
+    """Return `Layout.rows` of a memory layout."""
+    away = addressing.address[1]
+    columns = [addressing.address[0, :, 0]]
+    columns += [away[:, d3q19.OPPOSITE[q]] - q * addressing.stride for q in IN_PLANE]
+    return np.ascontiguousarray(np.stack(columns, axis=1) - addressing.first_cell[:, None], dtype=np.int32)
+
+
+def _of_cells(of_link: Ints, bit: Ints, is_near: NDArray[np.bool_], ends: int, cells: int) -> Ints:
+    """Return `Layout.of_cell` from the number of the cell and the bit of every link, of which the first are of ends."""
+    found, is_any = np.zeros((4, cells), np.int32), np.ones(len(bit), dtype=bool)
+    for row, chosen in enumerate((is_any, is_near, np.arange(len(bit)) < ends)):
+        np.bitwise_or.at(found[row], of_link[chosen], bit[chosen].astype(np.int32))
+    found[3] = np.searchsorted(np.sort(of_link), np.arange(cells))
+    return found
+
+
+def pack(state: State) -> Packed:
+    """Return the arrays of a run as the kernels of a GPU read them; sources and refill are those of `state`."""
+    layout, links, screened = layout_of(state), state.links, state.screen.cell
+    cell = np.union1d(layout.cell, screened)
+    of_wall = np.searchsorted(cell, layout.cell)
+    special = np.zeros((6, len(cell)), np.int32)
+    special[0], special[5] = layout.segment[cell], -1
+    special[1:5, of_wall] = layout.of_cell
+    special[5, np.searchsorted(cell, screened)] = np.arange(len(screened))
+    code = layout.segment.copy()
+    code[cell] = -1 - np.arange(len(cell), dtype=np.int32)
+    link = np.stack([links.weight[layout.order, 0], links.source[layout.order]], axis=1)
+    return Packed(layout, code, special, of_wall[layout.refilled].astype(np.int32), link)

@@ -1,6 +1,7 @@
 """Setup of a lattice-Boltzmann run: memory layout of the populations, walls, openings and viscosity limits."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -61,6 +62,58 @@ class Addressing:
     """(2, t) addresses of populations exchanged at septa (see `d3q19.update`), sorted by layer of their cell."""
     septum_cell: Ints
     """(t,) cell of every septum."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A grid and what depends on it alone; all flows of a whole vessel share it."""
+
+    domain: Domain
+    """Cells and links."""
+    limit: NDArray[np.float32]
+    """(n,) largest grid Reynolds number of every cell (see `thickest`)."""
+    addressing: Addressing
+    """Memory layout of the populations."""
+
+    @cached_property
+    def link_order(self) -> Ints:
+        """Order (l,) of links that reads memory in sequence: ends by cell, then the wall by layer and direction."""
+        domain = self.domain
+        is_wall = domain.link_patch == 0
+        patch = np.where(is_wall, domain.link_patch.max() + 1, domain.link_patch)
+        keys = domain.link_direction, domain.cells[domain.link_cell, 0]
+        return np.lexsort((domain.link_cell, *(np.where(is_wall, key, 0) for key in keys), patch))
+
+    @cached_property
+    def of_ends(self) -> int:
+        """Number of links of the ends, which are the first."""
+        return int((self.domain.link_patch > 0).sum())
+
+    @cached_property
+    def by_layer(self) -> Ints:
+        """Links (o,) of the ends, sorted by layer of their cell."""
+        cell = self.domain.link_cell[self.link_order[: self.of_ends]]
+        return np.argsort(cell, kind="stable").astype(np.int32)
+
+    @cached_property
+    def bands(self) -> Ints:
+        """Bands (b + 1, 5) for `d3q19.update`: the layers of cells across the first axis of the grid."""
+        a = self.addressing
+        of_ends, of_walls = np.split(self.domain.link_cell[self.link_order], [self.of_ends])
+        cells = a.first_cell, np.unique(of_walls), of_walls, of_ends[self.by_layer], a.septum_cell
+        layer = self.domain.cells[:, 0]
+        edges = np.arange(layer.min(), layer.max() + 2)
+        bands = np.stack([np.searchsorted(layer[ordered], edges) for ordered in cells], axis=1)
+        bands[:, 2] += self.of_ends
+        return bands.astype(np.int32)
+
+    @cached_property
+    def groups(self) -> tuple[Ints, tuple[Ints, Ints, Ints, Ints]]:
+        """`Refill.place` and `Refill.groups`: the groups of wall cells within which the lost mass is redistributed."""
+        cell = self.domain.link_cell[self.link_order[self.of_ends :]]
+        wall_cell, of_link = np.unique(cell, return_inverse=True)
+        group = np.unique(self.domain.cells[wall_cell] // REFILL_BLOCK, axis=0, return_inverse=True)[1].ravel()
+        return self.addressing.place[wall_cell], (*_grouped(group[of_link]), *_grouped(group))
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,28 +287,24 @@ def _septa(domain: Domain, number: Ints, stride: int) -> Ints:
     return np.stack([d3q19.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
 
 
-def build_links(
-    case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales, close_up: CloseUp | None
-) -> Links:
+def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | None) -> Links:
     """Return the links of the wall (interpolated bounce-back) and of the ends (imposed flow or pressure).
 
     Parameters
     ----------
     case : FlowCase
         The flow case.
-    domain : Domain
+    grid : Grid
         The grid.
-    addressing : Addressing
-        Memory layout.
     scales : Scales
         Lattice units.
     close_up : CloseUp or None
         Refined region and the flow around it; None: the grid covers the whole vessel.
     """
-    order = _link_order(domain)
+    domain, addressing, order = grid.domain, grid.addressing, grid.link_order
     patch = domain.link_patch[order]
     patches = np.unique(patch[patch > 0])
-    of_ends = patch[: int((patch > 0).sum())]
+    of_ends = patch[: grid.of_ends]
     start: Ints = np.asarray(np.searchsorted(of_ends, np.r_[patches, patches[-1] + 1]), dtype=np.int32)
     fraction = domain.link_fraction[order]
     weight = linear_weights(fraction, addressing.link_has_one[order])
@@ -277,7 +326,7 @@ def build_links(
         np.zeros(len(order), dtype=np.float32),
         openings,
         start,
-        np.argsort(domain.link_cell[opening_links], kind="stable").astype(np.int32),
+        grid.by_layer,
         addressing.place[domain.link_cell[opening_links]],
         domain.link_direction[opening_links],
         wanted,
@@ -286,34 +335,10 @@ def build_links(
     )
 
 
-def _link_order(domain: Domain) -> Ints:
-    """Return the order of links that reads memory in sequence: ends by cell, then the wall by layer and direction."""
-    is_wall = domain.link_patch == 0
-    patch = np.where(is_wall, domain.link_patch.max() + 1, domain.link_patch)
-    layer = domain.cells[domain.link_cell, 0]
-    return np.lexsort((domain.link_cell, *(np.where(is_wall, key, 0) for key in (domain.link_direction, layer)), patch))
-
-
-def build_bands(domain: Domain, addressing: Addressing, links: Links) -> Ints:
-    """Return the bands (b + 1, 5) for `d3q19.update`: the layers of cells across the first axis of the grid."""
-    of_ends, of_walls = np.split(domain.link_cell[_link_order(domain)], links.start[-1:])
-    cells = addressing.first_cell, np.unique(of_walls), of_walls, of_ends[links.by_layer], addressing.septum_cell
-    layer = domain.cells[:, 0]
-    edges = np.arange(layer.min(), layer.max() + 2)
-    bands = np.stack([np.searchsorted(layer[ordered], edges) for ordered in cells], axis=1)
-    bands[:, 2] += links.start[-1]
-    return bands.astype(np.int32)
-
-
-def build_refill(domain: Domain, addressing: Addressing) -> Refill:
-    """Return the groups of wall cells within which the lost mass is redistributed, with nothing lost yet."""
-    order = _link_order(domain)
-    cell = domain.link_cell[order][domain.link_patch[order] == 0]
-    wall_cell, of_link = np.unique(cell, return_inverse=True)
-    group = np.unique(domain.cells[wall_cell] // REFILL_BLOCK, axis=0, return_inverse=True)[1].ravel()
-    groups = *_grouped(group[of_link]), *_grouped(group)
-    lost, refill = (np.zeros(n, np.float32) for n in (len(of_link), len(wall_cell)))
-    return Refill(addressing.place[wall_cell], groups, lost, refill)
+def build_refill(grid: Grid) -> Refill:
+    """Return the redistribution of the mass lost at the walls of a grid, with nothing lost yet."""
+    place, groups = grid.groups
+    return Refill(place, groups, np.zeros(len(groups[1]), np.float32), np.zeros(len(place), np.float32))
 
 
 def _grouped(group: Ints) -> tuple[Ints, Ints]:

@@ -3,7 +3,7 @@
 from collections import deque
 from dataclasses import replace
 from time import perf_counter
-from typing import Final, TypeAlias
+from typing import Final
 from weakref import WeakKeyDictionary
 
 import numba
@@ -20,14 +20,7 @@ from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.warm import keep_flow
 from vstent.flow.lattice.scales import ODD_RATE, Scales
 from vstent.flow.lattice.screen import build_screen
-from vstent.flow.lattice.setup import (
-    Addressing,
-    address,
-    build_bands,
-    build_links,
-    build_refill,
-    thickest,
-)
+from vstent.flow.lattice.setup import Grid, address, build_links, build_refill, thickest
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, OnDevice, Probe, Snapshot, State
 from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats, Ints
@@ -38,8 +31,6 @@ SLICE_UPDATES: Final = 2e8
 GPU_SLICE_UPDATES: Final = 2e9
 """The same on a GPU: some tenths of a second."""
 
-Grid: TypeAlias = tuple[domains.Domain, NDArray[np.float32], Addressing]
-"""A domain, the largest grid Reynolds number of its cells, and its memory layout."""
 _GRIDS: WeakKeyDictionary[Vessel, dict[float, Grid]] = WeakKeyDictionary()
 """Grids of whole vessels by grid spacing, as long as the vessel exists."""
 
@@ -77,8 +68,9 @@ def build(
         require_gpu()
     keep_flow()
     scales = Scales(cell_size_mm * M_PER_MM, check_s / int(pace[0]), case.blood)
-    domain, limit, addressing = _grid(case, cell_size_mm, close_up)
-    links = build_links(case, domain, addressing, scales, close_up)
+    grid = _grid(case, cell_size_mm, close_up)
+    domain, addressing = grid.domain, grid.addressing
+    links = build_links(case, grid, scales, close_up)
     screen = build_screen(case, domain, addressing, scales)
     state = State(
         case,
@@ -90,9 +82,9 @@ def build(
         links,
         screen,
         _probe(case, domain),
-        build_refill(domain, addressing),
-        build_bands(domain, addressing, links),
-        limit[addressing.first_cell],
+        build_refill(grid),
+        grid.bands,
+        grid.limit[addressing.first_cell],
         np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
         pace,
         check_s,
@@ -114,9 +106,9 @@ def _grid(case: FlowCase, cell_size_mm: float, close_up: CloseUp | None) -> Grid
 
 
 def _numbered(case: FlowCase, domain: domains.Domain) -> Grid:
-    """Return a domain with the largest grid Reynolds number of its cells and its memory layout."""
+    """Return the grid of a domain."""
     limit = thickest(case, domain)
-    return domain, limit, address(domain, limit)
+    return Grid(domain, limit, address(domain, limit))
 
 
 def _probe(case: FlowCase, domain: domains.Domain) -> Probe:

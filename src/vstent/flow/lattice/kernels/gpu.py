@@ -33,7 +33,7 @@ from vstent.flow.lattice.kernels.d3q19 import INFLOW, OPPOSITE, OUTFLOW
 THREADS: Final = 8 if config.ENABLE_CUDASIM else 128
 """Number of threads per block; a power of 2. Numba simulates each by a thread of the processor, which is slow."""
 COLUMN: Final = np.array([0, 1, 2, 3, 4, 0, 0, 5, 6, 7, 8, 1, 2, 1, 2, 3, 4, 3, 4], np.int32)
-"""(19,) column of a segment's row of places that holds the neighbour in each direction (see `packing.Packed.rows`)."""
+"""(19,) column of a segment's row of places that holds the neighbour in each direction (see `packing.Layout.rows`)."""
 SHIFT: Final = np.array([0, 0, 0, 0, 0, 1, -1, 0, 0, 0, 0, 1, -1, -1, 1, 1, -1, -1, 1], np.int32)
 """(19,) number of places from there to the neighbour: neighbours along z are adjacent."""
 NOW, AT_HOME = 0, 1
@@ -412,9 +412,9 @@ def even_step(
     f : (19 * stride,) float32
         Populations, changed in place.
     integers : (:,) int32
-        `HEAD` entries (see `NOW`, `SPECIAL`), `Packed.rows`, and in places that these entries and `code_at` tell:
-        `Packed.code`, `Packed.special` with the places of link and screen entry, `Packed.end_of_link`,
-        `Packed.opening_of_end`, and the tables of `drive`.
+        `HEAD` entries (see `NOW`, `SPECIAL`), `Layout.rows`, and in places that these entries and `code_at` tell:
+        `Packed.code`, `Packed.special` with the places of link and screen entry, `Layout.end_of_link`,
+        `Layout.opening_of_end`, and the tables of `drive`.
     singles : (:,) float32
         Relaxation time at high shear rate, Carreau-Yasuda law (4), relaxation rate of the odd part (see
         `d3q19.update`); from `HEAD` on the limits (s,); then `Packed.link`, the refill of special cells, and screen
@@ -654,7 +654,7 @@ def outflow(
     f, integers, singles, stride, code_at
         As in `even_step`.
     end_cell, start
-        `Packed.end_cell` and `Packed.end_cell_start`.
+        `Layout.end_cell` and `Layout.end_cell_start`.
     """
     k, t = cuda.blockIdx.x, cuda.threadIdx.x
     parts = cuda.shared.array(THREADS, np.float64)
@@ -677,7 +677,7 @@ def drive(f: Any, integers: Any, singles: Any, doubles: Any, stride: int, code_a
     Parameters
     ----------
     f, integers, singles, doubles, stride, code_at
-        As in `even_step`. Further integers: `Packed.blocks` (b, 3), `Packed.end_cell` (j,), the first block (k + 1,)
+        As in `even_step`. Further integers: `Layout.blocks` (b, 3), `Layout.end_cell` (j,), the first block (k + 1,)
         and the number of links (k,) of every opening, and the number of its blocks done (k,), 0 before and after.
     """
     b, t = cuda.blockIdx.x, cuda.threadIdx.x
