@@ -155,8 +155,10 @@ def test_the_next_flow_of_a_vessel_has_the_numbering_of_the_first() -> None:
     assert packing.layout_of(second) is shared
     alone = packing.layout_of(pickle.loads(pickle.dumps(second)))
     assert alone is not shared
-    for name, array in vars(alone).items():
-        np.testing.assert_array_equal(array, getattr(shared, name), err_msg=name)
+    for name, found in vars(alone).items():
+        wanted = getattr(shared, name)
+        for one, other in zip(found, wanted, strict=True) if name == "groups" else [(found, wanted)]:
+            np.testing.assert_array_equal(one, other, err_msg=name)
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 100])

@@ -13,6 +13,7 @@ from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.kernels import gpu as kernels
 from vstent.flow.lattice.packing import Packed, joined
 from vstent.flow.lattice.scales import ODD_RATE
+from vstent.flow.lattice.setup import Links
 from vstent.flow.lattice.state import State
 from vstent.kernels.arrays import Floats, Ints
 
@@ -34,6 +35,8 @@ class Numbers:
     """(m,) what is added to the rest population of every special cell."""
     entry: NDArray[np.float32]
     """(e, d3q19.ENTRY) screen entries."""
+    correction: NDArray[np.float32]
+    """(5, w) `Links.correction` of the walls."""
     openings: Floats
     """(k, 9) `Links.openings`."""
     start: Ints
@@ -59,6 +62,8 @@ class Tables:
     """Place of `Numbers.refill`."""
     entry: slice
     """Place of `Numbers.entry`."""
+    correction: slice
+    """Place of `Numbers.correction`."""
     opening: slice
     """Place among the doubles of `Numbers.openings`."""
     imposed: slice
@@ -70,7 +75,13 @@ def numbers_of(state: State, packed: Packed) -> Numbers:
     refill = np.zeros(packed.special.shape[1], np.float32)
     refill[packed.refilled] = state.refill.refill
     links = state.links
-    return Numbers(single_of(state), state.limit, refill, state.screen.entry, links.openings, links.start)
+    correction = correction_of(links)
+    return Numbers(single_of(state), state.limit, refill, state.screen.entry, correction, links.openings, links.start)
+
+
+def correction_of(links: Links) -> NDArray[np.float32]:
+    """Return `Numbers.correction` of the links of a run."""
+    return links.correction[links.start[-1] :].T
 
 
 def single_of(state: State) -> NDArray[np.float32]:
@@ -81,8 +92,9 @@ def single_of(state: State) -> NDArray[np.float32]:
 def tables(packed: Packed, numbers: Numbers) -> Tables:
     """Return the arrays of `kernels.even_step`."""
     ends, blocks = len(numbers.openings), packed.layout.blocks(kernels.THREADS)
-    singles, (number, _, link, refill, entry) = joined(
-        (numbers.single, numbers.limit, packed.link, numbers.refill, numbers.entry), np.float32
+    correction, lost = numbers.correction, np.zeros(numbers.correction.shape[1])
+    singles, (number, _, link, refill, entry, wall, mass) = joined(
+        (numbers.single, numbers.limit, packed.link, numbers.refill, numbers.entry, correction, lost), np.float32
     )
     doubles, (opening, answer, part, imposed) = joined(
         (numbers.openings, np.zeros(ends), np.zeros(len(blocks)), np.zeros((PAIRS, ends + 3))), np.float64
@@ -97,9 +109,15 @@ def tables(packed: Packed, numbers: Numbers) -> Tables:
         kernels.ANSWER: answer.start,
         kernels.PARTS: part.start,
         kernels.IMPOSED: imposed.start,
+        kernels.SEPTUM_COUNT: packed.layout.septa.shape[1],
+        kernels.LINKS: len(packed.link),
+        kernels.WALLS: len(lost),
+        kernels.GROUPS: len(packed.layout.groups[0]) - 1,
+        kernels.LOST: mass.start,
+        kernels.CORRECTION: wall.start,
     }
     integers, code_at = _integers(head, packed, _placed(packed.special, link, entry), blocks, numbers.start)
-    return Tables(integers, singles, doubles, code_at, len(blocks), number, link, refill, entry, opening, imposed)
+    return Tables(integers, singles, doubles, code_at, len(blocks), number, link, refill, entry, wall, opening, imposed)
 
 
 def _placed(special: Ints, link: slice, entry: slice) -> Ints:
@@ -112,19 +130,26 @@ def _placed(special: Ints, link: slice, entry: slice) -> Ints:
 
 def _integers(head: dict[int, int], packed: Packed, special: Ints, blocks: Ints, start: Ints) -> tuple[Any, int]:
     """Return the integers, of which `head` are the first, and where the codes begin."""
+    layout = packed.layout
+    first_link, group_link, first_member, member = layout.groups
     named = {
         kernels.SPECIAL: special,
-        kernels.END_OF_LINK: packed.layout.end_of_link,
-        kernels.OPENING_OF_END: packed.layout.opening_of_end,
+        kernels.END_OF_LINK: layout.end_of_link,
+        kernels.OPENING_OF_END: layout.opening_of_end,
         kernels.BLOCKS: blocks,
-        kernels.END_CELL: packed.layout.end_cell,
+        kernels.END_CELL: layout.end_cell,
         kernels.FIRST_BLOCK: np.searchsorted(blocks[:, 0], np.arange(len(start))),
         kernels.COUNT: np.diff(start),
         kernels.DONE: np.zeros(len(start) - 1),
+        kernels.SEPTA: layout.septa,
+        kernels.ADDRESS: layout.address,
+        kernels.SLOT: layout.slot_of_wall,
+        kernels.FIRST_LINK: first_link,
+        kernels.GROUP_LINK: group_link,
+        kernels.FIRST_MEMBER: first_member,
+        kernels.GROUP_MEMBER: packed.refilled[member],
     }
-    whole, (_, _, code, *places) = joined(
-        (np.zeros(kernels.HEAD), packed.layout.rows, packed.code, *named.values()), np.int32
-    )
+    whole, (_, _, code, *places) = joined((np.zeros(kernels.HEAD), layout.rows, packed.code, *named.values()), np.int32)
     for entry, place in (head | dict(zip(named, (place.start for place in places), strict=True))).items():
         whole[entry] = place
     return whole, code.start

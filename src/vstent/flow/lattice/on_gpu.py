@@ -11,7 +11,7 @@ import numpy as np
 from numba import cuda
 from numpy.typing import NDArray
 
-from vstent.flow.lattice.gpu_tables import PAIRS, START, Numbers, numbers_of, single_of, tables
+from vstent.flow.lattice.gpu_tables import PAIRS, START, Numbers, correction_of, numbers_of, single_of, tables
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.kernels import gpu as kernels
 from vstent.flow.lattice.kernels.gpu import THREADS
@@ -62,7 +62,6 @@ class Device:
         self._integers, self._singles, self._doubles = put(at.integers), put(at.singles), put(at.doubles)
         self._common = self._populations, self._integers, self._singles
         self._layout = a.stride, at.code_at
-        self._address, self._correction = put(links.address), put(links.correction[links.start[-1] :])
         self._through = put(np.zeros(len(links.address), np.float32))
         self._density, self._velocity = (put(np.zeros((self._cells, *n), np.float32)) for n in ((), (3,)))
         self._outflow, self._times = (
@@ -71,7 +70,7 @@ class Device:
         )
         self._moments = ReadBack((self._density, self._velocity, self._outflow))
         self._steps = self._kernels_of_pair(state)
-        self._settle = self._kernels_of_walls(state)
+        self._settle = self._kernels_of_walls()
         self._read, self._read_times = self._kernels_of_reading(state)
         self._replay: dict[Pairs, Any] | None = None
         self._why = ""
@@ -93,28 +92,22 @@ class Device:
 
     def _kernels_of_pair(self, state: State) -> tuple[Launch, Launch, Launch, Launch]:
         """Return the kernels of a pair of steps: openings, even step, septa, and odd step without its last argument."""
-        septa, (stride, code_at) = state.addressing.septa, self._layout
+        septa, (stride, code_at) = state.addressing.septa.shape[1], self._layout
         cells = stride, self._cells, code_at
         drive = *self._common, self._doubles, *self._layout
         return (
             Launch(kernels.drive, self._at.blocks * THREADS, drive),
             Launch(kernels.even_step, self._cells, (*self._common, self._doubles, self._shape, *cells)),
-            Launch(kernels.swap, septa.shape[1], (self._populations, put(septa))),
+            Launch(kernels.swap, septa, self._common[:2]),
             Launch(kernels.odd_step, self._cells, (*self._common, *cells)),
         )
 
-    def _kernels_of_walls(self, state: State) -> tuple[Launch, Launch]:
+    def _kernels_of_walls(self) -> tuple[Launch, Launch]:
         """Return the kernels of the deferred wall correction and of the mass balance, without their last argument."""
-        walls, packed, ends = state.refill, self._packed, int(state.links.start[-1])
-        layout = packed.layout
-        slot = np.where(layout.is_near, -1 - layout.slot, layout.slot)[ends:]
-        of_wall = self._address[ends:] if len(slot) else self._address
-        lost, groups = put(walls.lost), tuple(map(put, (*walls.groups[:3], packed.refilled[walls.groups[3]])))
-        of_links = of_wall, self._correction, put(slot.astype(np.int32)), lost
-        of_groups = lost, groups, self._singles[self._at.refill], self._integers
+        layout = self._packed.layout
         return (
-            Launch(kernels.defer, len(slot), (*self._common, *of_links)),
-            Launch(kernels.balance, max(1, len(walls.groups[0]) - 1), of_groups),
+            Launch(kernels.defer, len(layout.slot) - len(layout.opening_of_end), self._common),
+            Launch(kernels.balance, max(1, len(layout.groups[0]) - 1), self._common[1:]),
         )
 
     def _kernels_of_reading(self, state: State) -> tuple[tuple[Launch, Launch], Launch]:
@@ -192,7 +185,7 @@ class Device:
         factor, f = np.float32(stretch), self._populations
         stride, code_at = self._layout
         everywhere = f, self._integers, stride, self._cells, code_at
-        of_links = f, self._address, self._through
+        of_links = f, self._integers, self._through
         Launch(kernels.sent, len(state.links.address), of_links)(self.stream)
         Launch(kernels.rescale, self._cells, everywhere)(self.stream, factor, np.float32(stress))
         Launch(kernels.resend, len(state.links.address), of_links)(self.stream, factor)
@@ -204,7 +197,7 @@ class Device:
             (self._singles[at.number], single_of(state)),
             (self._singles[at.entry], state.screen.entry),
             (self._shape, state.links.shape),
-            (self._correction, state.links.correction[state.links.start[-1] :]),
+            (self._singles[at.correction], correction_of(state.links)),
         ):
             if here.size:
                 there.copy_to_device(np.ascontiguousarray(here).reshape(there.shape))
@@ -267,15 +260,17 @@ def seconds_of_update(place: Ints, length: Ints, stride: int, relaxation: Sequen
     rows[:, 0] = place - (np.cumsum(length) - length)
     code = np.repeat(np.arange(len(length), dtype=np.int32), length)
     nothing = np.zeros(0, np.float32)
-    by_link = none, none, none > 0, none, none, none
-    layout = Layout(code, rows, none, np.zeros((4, 0), np.int32), none, *by_link, np.zeros(1, np.int32))
-    packed = Packed(layout, code, np.zeros((6, 0), np.int32), none, nothing.reshape(0, 2))
+    one, pairs = np.zeros(1, np.int32), np.zeros((6, 0), np.int32)
+    by_link = none, none, none > 0, pairs, pairs[:2], (one, none, one, none), none, none, none
+    layout = Layout(code, rows, none, pairs[:4], none, *by_link, one)
+    packed = Packed(layout, code, pairs, none, nothing.reshape(0, 2))
     single = np.array([time, *law, odd_rate], np.float32)
     numbers = Numbers(
         single,
         limit,
         nothing,
         np.zeros((0, d3q19.ENTRY), np.float32),
+        np.zeros((5, 0), np.float32),
         np.zeros((0, kernels.OPENING)),
         np.zeros(1, np.int32),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.setup import Addressing, Links
+from vstent.flow.lattice.setup import Addressing, Links, Refill
 from vstent.flow.lattice.state import State
 from vstent.kernels.arrays import Ints
 
@@ -51,6 +51,12 @@ class Layout:
     """(l,) number in this order of every link of `Links`."""
     is_near: NDArray[np.bool_]
     """(l,) whether a link of `Links` needs a population that arrives at its cell: its wall is nearer than half-way."""
+    address: Ints
+    """(6, l) `Links.address`, one column after the other, because neighbouring threads read neighbouring links."""
+    septa: Ints
+    """(2, t) `Addressing.septa`."""
+    groups: tuple[Ints, Ints, Ints, Ints]
+    """`Refill.groups`."""
     end_of_link: Ints
     """(l,) number of every link in this order among those of the ends, or -1."""
     opening_of_end: Ints
@@ -59,6 +65,12 @@ class Layout:
     """(j,) cells at every end, one end after the other."""
     end_cell_start: Ints
     """(k + 1,) first of these cells at every end."""
+
+    @property
+    def slot_of_wall(self) -> Ints:
+        """Return `slot` of the links of walls, or -1 minus it where they are near."""
+        ends = len(self.opening_of_end)
+        return np.where(self.is_near, -1 - self.slot, self.slot)[ends:]
 
     def blocks(self, threads: int) -> Ints:
         """Return end, first and last + 1 cell (b, 3) of blocks of at most `threads` of the cells at the ends."""
@@ -94,19 +106,19 @@ class Packed:
 def layout_of(state: State) -> Layout:
     """Return what all flows on the grid of a run share; it is built once for each memory layout."""
     if state.addressing not in _LAYOUTS:
-        _LAYOUTS[state.addressing] = _layout(state.addressing, state.links, state.refill.place)
+        _LAYOUTS[state.addressing] = _layout(state.addressing, state.links, state.refill)
     return _LAYOUTS[state.addressing]
 
 
-def _layout(a: Addressing, links: Links, refill_place: Ints) -> Layout:
-    """Return what all flows with a memory layout share; the links are those of any of them."""
+def _layout(a: Addressing, links: Links, refill: Refill) -> Layout:
+    """Return what all flows with a memory layout share; links and refill are those of any of them."""
     direction, place = np.divmod(links.address[:, 2], a.stride)
     cell = np.searchsorted(a.place, place)
     order = np.lexsort((direction, cell))
     slot = np.zeros(len(order), np.int32)
     slot[order] = np.arange(len(order), dtype=np.int32)
     is_near = (links.weight[:, 1] != 0) & (links.path[0, :, 1] == links.address[:, 1])
-    refilled_cell = np.searchsorted(a.place, refill_place)
+    refilled_cell = np.searchsorted(a.place, refill.place)
     wall_cell = np.unique(np.concatenate([cell, refilled_cell]))
     ends = int(links.start[-1])
     end_of_link = np.full(len(slot), -1, np.int32)
@@ -122,6 +134,9 @@ def _layout(a: Addressing, links: Links, refill_place: Ints) -> Layout:
         order,
         slot,
         is_near,
+        np.ascontiguousarray(links.address.T),
+        a.septa,
+        refill.groups,
         end_of_link,
         opening,
         at_end[1].astype(np.int32),

@@ -387,19 +387,23 @@ def paths(address: Ints, weight: Floats) -> tuple[Ints, NDArray[np.float32]]:
 
 
 @njit(cache=True, fastmath=True, forceinline=True)
-def deferred(k: int, f: Any, address: Any, correction: Any) -> Any:
-    """Return the source of link `k` with which it interpolates at higher order (see `defer`)."""
-    a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
-    e, g = _U(address[k, 5]), _U(address[k, 4])
-    wanted = correction[k, 0] * f[a] + correction[k, 1] * f[b] + correction[k, 2] * f[c]
-    return wanted + correction[k, 3] * f[e] + correction[k, 4] * f[g]
+def deferred(held: Any, weight: Any) -> Any:
+    """Return the source of a link with which it interpolates at higher order (see `defer`).
+
+    Both arguments are tuples: the populations a, b, c, e and g, and their weights.
+    """
+    wanted = weight[0] * held[0] + weight[1] * held[1] + weight[2] * held[2]
+    return wanted + weight[3] * held[3] + weight[4] * held[4]
 
 
 @njit(cache=True, fastmath=True, forceinline=True)
 def defer_link(k: int, f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
     """Apply `defer` to link `k`."""
-    lost[k] = f[_U(address[k, 3])] - f[_U(address[k, 0])]
-    source[k] += part * (deferred(k, f, address, correction) - source[k])
+    a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
+    e, g = _U(address[k, 5]), _U(address[k, 4])
+    lost[k] = f[a] - f[_U(address[k, 0])]
+    weight = correction[k, 0], correction[k, 1], correction[k, 2], correction[k, 3], correction[k, 4]
+    source[k] += part * (deferred((f[a], f[b], f[c], f[e], f[g]), weight) - source[k])
 
 
 @njit(cache=True, parallel=True, fastmath=True)

@@ -43,6 +43,10 @@ SPECIAL, SPECIALS, LINK, REFILL, END_OF_LINK, OPENING_OF_END, OPENINGS, ANSWER, 
 """Entries with the place where a table begins (see `even_step`), or the number of special cells or openings."""
 BLOCKS, END_CELL, FIRST_BLOCK, COUNT, DONE, PARTS = range(11, 17)
 """Further places, for `drive`."""
+SEPTA, ADDRESS, SLOT, FIRST_LINK, GROUP_LINK, FIRST_MEMBER, GROUP_MEMBER = range(17, 24)
+"""Further places, for `swap`, `defer` and `balance`."""
+SEPTUM_COUNT, LINKS, WALLS, GROUPS, LOST, CORRECTION = range(24, 30)
+"""Numbers of septa, links, links of walls, and groups; places among the singles, for the same kernels."""
 HEAD: Final = 32
 """Number of these entries, and of the numbers before the limits; `packing.LINE` is the same."""
 OPENING: Final = 9
@@ -61,7 +65,7 @@ def _inlined(function: Callable[..., Any]) -> Any:
     return function if config.ENABLE_CUDASIM else njit(forceinline=True)(function)
 
 
-_balance_group, _between, _deferred = (_of_arrays(one) for one in (d3q19.balance_group, d3q19.between, d3q19.deferred))
+_between, _deferred = _of_arrays(d3q19.between), _of_arrays(d3q19.deferred)
 _inflow_speed, _outlet_density = _of_arrays(d3q19.inflow_speed), _of_arrays(d3q19.outlet_density)
 _outlet_source = _of_arrays(d3q19.outlet_source)
 
@@ -502,56 +506,96 @@ def _send(f: Any, new: tuple[Any, ...], which: int, stride: int, integers: Any, 
 
 
 @cuda.jit(cache=True)
-def swap(f: Any, pairs: Any) -> None:
-    """Exchange the populations at addresses pairs[0] and pairs[1] (see `d3q19.update`)."""
-    k = cuda.grid(1)
-    if k < pairs.shape[1]:
-        first, second = load(f, pairs[0, k]), load(f, pairs[1, k])
-        store(f, pairs[0, k], second)
-        store(f, pairs[1, k], first)
+def swap(f: Any, integers: Any) -> None:
+    """Exchange the populations at septa (see `d3q19.update`); integers as in `even_step`."""
+    k, count = cuda.grid(1), integers[SEPTUM_COUNT]
+    if k < count:
+        at = integers[SEPTA] + k
+        one, other = _integer(integers, at), _integer(integers, at + count)
+        first, second = load(f, one), load(f, other)
+        store(f, one, second)
+        store(f, other, first)
+
+
+@_inlined
+def _at_link(column: int, k: int, integers: Any) -> int:
+    """Return an entry of `Links.address` for link `k`."""
+    address: int = _integer(integers, integers[ADDRESS] + column * integers[LINKS] + k)
+    return address
 
 
 @cuda.jit(cache=True)
-def defer(
-    f: Any, integers: Any, singles: Any, address: Any, correction: Any, slot: Any, lost: Any, part: float
-) -> None:
+def defer(f: Any, integers: Any, singles: Any, part: float) -> None:
     """Bring the populations of wall links home, and move their sources towards higher-order interpolation.
 
     The last odd step must have kept them. Where `part` is 0 the sources stay as they are.
 
     Parameters
     ----------
-    f, address, correction, lost, part
+    f, part
         As in `d3q19.defer`.
     integers, singles
-        As in `even_step`.
-    slot : (links,) int32
-        Number of each link in `Packed.link`, or -1 minus this number for a near link.
+        As in `even_step`. Further integers: `Links.address` (6, l), and the number of each link of the walls in
+        `Packed.link`, or -1 minus this number for a near link. Further singles: the mass lost (walls,), and
+        `Links.correction` of the walls (5, walls).
     """
-    k = cuda.grid(1)
-    if k >= slot.size:
+    w, walls = cuda.grid(1), integers[WALLS]
+    if w >= walls:
         return
-    number, home, sent = slot[k], address[k, 0], load(f, address[k, 3])
+    number, k = _integer(integers, integers[SLOT] + w), integers[LINKS] - walls + w
+    home, sent = _at_link(0, k, integers), load(f, _at_link(3, k, integers))
     is_near = number < 0
     n = integers[LINK] + 2 * (-1 - number if is_near else number)
     if is_near and not integers[AT_HOME]:
         weight = singles[n]
-        store(f, home, weight * sent + (_ONE - abs(weight)) * load(f, address[k, 2]) + singles[n + 1])
-    lost[k] = sent - load(f, home)
-    singles[n + 1] += part * (_deferred(k, f, address, correction) - singles[n + 1])
+        beside = load(f, _at_link(2, k, integers))
+        store(f, home, weight * sent + (_ONE - abs(weight)) * beside + singles[n + 1])
+    singles[integers[LOST] + w] = sent - load(f, home)
+    held = (
+        sent,
+        load(f, _at_link(2, k, integers)),
+        load(f, _at_link(1, k, integers)),
+        load(f, _at_link(5, k, integers)),
+        load(f, _at_link(4, k, integers)),
+    )
+    at = integers[CORRECTION] + w
+    weights = (
+        singles[at],
+        singles[at + walls],
+        singles[at + 2 * walls],
+        singles[at + 3 * walls],
+        singles[at + 4 * walls],
+    )
+    singles[n + 1] += part * (_deferred(held, weights) - singles[n + 1])
 
 
 @cuda.jit(cache=True)
-def balance(lost: Any, groups: Any, refill: Any, integers: Any, part: float) -> None:
+def balance(integers: Any, singles: Any, part: float) -> None:
     """Move the refill towards the mass lost at the walls, one thread per group of wall cells (see `d3q19.balance`).
 
-    It follows `defer`; populations are at home from here on, which the clock in `integers` keeps.
+    It follows `defer`; populations are at home from here on, which the clock keeps.
+
+    Parameters
+    ----------
+    integers, singles
+        As in `defer`. Further integers: `Refill.groups`, whose cells are numbers of special cells.
+    part
+        As in `d3q19.balance`.
     """
     g = cuda.grid(1)
     if g == 0:
         integers[AT_HOME] = 1
-    if g + 1 < groups[0].size:
-        _balance_group(g, lost, groups, refill, part)
+    if g >= integers[GROUPS]:
+        return
+    links, members = integers[FIRST_LINK] + g, integers[FIRST_MEMBER] + g
+    total = 0.0
+    for i in range(_integer(integers, links), _integer(integers, links + 1)):
+        total += float(singles[_U(integers[LOST] + _integer(integers, integers[GROUP_LINK] + i))])
+    first, last = _integer(integers, members), _integer(integers, members + 1)
+    share = total / (last - first)
+    for i in range(first, last):
+        n = _U(integers[REFILL] + _integer(integers, integers[GROUP_MEMBER] + i))
+        singles[n] += part * (share - singles[n])
 
 
 @cuda.jit(cache=True)
@@ -575,19 +619,19 @@ def times(f: Any, integers: Any, singles: Any, stride: int, code_at: int, cell: 
 
 
 @cuda.jit(cache=True)
-def sent(f: Any, address: Any, through: Any) -> None:
-    """Write the flow (l,) through every link; populations must be at home."""
+def sent(f: Any, integers: Any, through: Any) -> None:
+    """Write the flow (l,) through every link; populations must be at home. Integers as in `defer`."""
     k = cuda.grid(1)
-    if k < through.size:
-        through[k] = load(f, address[k, 3]) - load(f, address[k, 0])
+    if k < integers[LINKS]:
+        through[k] = load(f, _at_link(3, k, integers)) - load(f, _at_link(0, k, integers))
 
 
 @cuda.jit(cache=True)
-def resend(f: Any, address: Any, through: Any, stretch: float) -> None:
+def resend(f: Any, integers: Any, through: Any, stretch: float) -> None:
     """Write mailboxes such that the flow through every link is `stretch` times `through` (see `d3q19.rescale`)."""
     k = cuda.grid(1)
-    if k < through.size:
-        store(f, address[k, 3], load(f, address[k, 0]) + stretch * through[k])
+    if k < integers[LINKS]:
+        store(f, _at_link(3, k, integers), load(f, _at_link(0, k, integers)) + stretch * through[k])
 
 
 @cuda.jit(cache=True)
