@@ -70,6 +70,42 @@ for name in saved:
 np.savez(sys.argv[2], **saved)
 """
 
+AHEAD = """
+import pickle, sys
+from dataclasses import replace
+from pathlib import Path
+import numpy as np
+from vstent.flow.lattice.checkpoint import pack
+from vstent.flow.lattice.recording import Pairs
+from vstent.flow.lattice.stepping import advance, step
+
+waits, ahead = (pickle.loads(Path(sys.argv[1]).read_bytes()) for _ in range(2))
+for one in (waits, ahead):
+    one.case = replace(one.case, settings=replace(one.case.settings, device_gpu=True))
+    one.pace, one.check_s, one.since_check = np.array([4, 2]), 4 * one.scales.step_s, 0
+    step(one)
+device = ahead.device
+device._replay = {pairs: lambda pairs=pairs: device._launch_all(device.launches(pairs)) for pairs in Pairs}
+for one in (waits, ahead):
+    step(one)
+assert waits.begun_s is None
+assert device._begun == 2
+assert ahead.since_check == 0
+assert ahead.steps == waits.steps
+for name in ("velocity", "density", "outflow"):
+    one, other = (getattr(state.snapshots[-1], name) for state in (waits, ahead))
+    assert one.any() and one.tobytes() == other.tobytes()
+assert np.array(waits.history).tobytes() == np.array(ahead.history).tobytes()
+saved = pack(ahead)
+assert saved["steps"] == waits.steps + 4
+advance(waits, 4)
+for (name, one), other in zip(saved.items(), pack(waits).values()):
+    assert name == "loop_seconds" or one.tobytes() == other.tobytes()
+for one in (waits, waits, ahead, ahead):
+    step(one)
+assert np.array(waits.history).tobytes() == np.array(ahead.history).tobytes()
+"""
+
 
 def screen() -> Screen:
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-1.0, 1.0, 0.1), np.arange(-1.0, 1.0, 0.1)))
@@ -123,15 +159,20 @@ def everything() -> lattice_state.State:
     return state
 
 
+def simulate(script: str, folder: Path, state: lattice_state.State) -> None:
+    """Run a script on numba's simulator, with the path of a state and a path for results as arguments."""
+    (folder / "state").write_bytes(pickle.dumps(state))
+    simulated = os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}
+    command = [sys.executable, "-W", "error", "-c", script, str(folder / "state"), str(folder / "found.npz")]
+    ran = subprocess.run(command, env=simulated, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
 def test_a_gpu_makes_the_steps_that_a_processor_makes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(domain, "MIN_CELLS", 50)
     state = everything()
     stepping.advance(state, 2 * SETTLED_PAIRS)
-    (tmp_path / "state").write_bytes(pickle.dumps(state))
-    simulated = os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}
-    command = [sys.executable, "-W", "error", "-c", ON_GPU, str(tmp_path / "state"), str(tmp_path / "found.npz")]
-    ran = subprocess.run(command, env=simulated, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr
+    simulate(ON_GPU, tmp_path, state)
     stepping.step(state)
     wanted = pack(state)
     with np.load(tmp_path / "found.npz") as archive:
@@ -142,6 +183,11 @@ def test_a_gpu_makes_the_steps_that_a_processor_makes(tmp_path: Path, monkeypatc
     for name in wanted.keys() - {"loop_seconds"}:
         most = np.abs(wanted[name]).max(initial=0.0)
         np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=ROUNDING * most, err_msg=name)
+
+
+def test_a_gpu_goes_on_while_the_host_judges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(domain, "MIN_CELLS", 50)
+    simulate(AHEAD, tmp_path, everything())
 
 
 def test_the_next_flow_of_a_vessel_has_the_numbering_of_the_first() -> None:

@@ -74,6 +74,7 @@ class Device:
         self._read, self._read_times = self._kernels_of_reading(state)
         self._replay: dict[Pairs, Any] | None = None
         self._why = ""
+        self._begun = 0
 
     @property
     def how(self) -> str:
@@ -122,16 +123,33 @@ class Device:
 
     def advance(self, wanted: Floats, moments: Floats, first_pair: int) -> None:
         """Make one pair of time steps per row of `wanted` (see `state.OnDevice`)."""
-        imposed, first = np.column_stack([wanted, moments]), 0
+        imposed = np.column_stack([wanted, moments])
+        first, self._begun = self._begun, 0
+        self.stream.synchronize()
         while first < len(imposed):
             rows = imposed[first : first + (1 if self._replay is None else PAIRS)]
-            self._impose(rows)
-            for pairs in plan(first_pair + first, len(rows)):
-                self._make(pairs)
+            self._queue(rows, first_pair + first)
             self.stream.synchronize()
             first += len(rows)
             if self._replay is None:  # kernels are loaded now
                 self._replay = self._recorded()
+
+    def begin(self, wanted: Floats, moments: Floats, first_pair: int) -> bool:
+        """Queue the first pairs of the next `advance` (see `state.OnDevice`).
+
+        Launches one by one would keep the host from its own work, so there only a replay is queued.
+        """
+        if self._replay:
+            rows = np.column_stack([wanted, moments])[:PAIRS]
+            self._queue(rows, first_pair)
+            self._begun = len(rows)
+        return self._begun > 0
+
+    def _queue(self, rows: Floats, first_pair: int) -> None:
+        """Queue pairs of time steps with these boundary values."""
+        self._impose(rows)
+        for pairs in plan(first_pair, len(rows)):
+            self._make(pairs)
 
     def _impose(self, rows: Floats) -> None:
         """Copy the boundary values of the next pairs of steps to the GPU; populations are at home before the first."""
@@ -217,8 +235,11 @@ class Device:
         return np.asarray(self._times.copy_to_host())
 
     def fetch(self, state: State) -> None:
-        """Copy the arrays that the time steps change back to `state`."""
+        """Copy the arrays that the time steps change back to `state`, and count the pairs that were begun."""
         self.stream.synchronize()
+        state.steps += 2 * self._begun
+        state.since_check += 2 * self._begun
+        self._begun = 0
         self._populations.copy_to_host(state.populations)
         state.links.openings[:] = self._openings()
         slot = self._packed.layout.slot

@@ -122,6 +122,12 @@ class OnDevice(Protocol):
             Number of the first pair, counted from the last check.
         """
 
+    def begin(self, wanted: Floats, moments: Floats, first_pair: int) -> bool:
+        """Queue the first pairs of the next `advance`, without waiting for them; return whether there are any.
+
+        Until then only `fetch` may be called, which counts them as made. The arguments are those of `advance`.
+        """
+
     def read(self) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
         """Return density deviation (n,) and momentum (n, 3) of every cell, and the flow rate (k,) out of every end."""
 
@@ -144,7 +150,7 @@ class OnDevice(Protocol):
         """Return in words how the host launches the time steps."""
 
     def fetch(self, state: "State") -> None:
-        """Copy the arrays that the time steps change back to `state`."""
+        """Copy the arrays that the time steps change back to `state`, and count the pairs that were begun."""
 
 
 @dataclass(eq=False)
@@ -196,6 +202,8 @@ class State:
     """Monitored quantities at every check."""
     loop_seconds: float = 0.0
     """Run time of the time steps."""
+    begun_s: float | None = None
+    """Time at which a GPU began the next time steps, which it makes while the host judges the last check; else None."""
     device: "OnDevice | None" = None
     """The run on a GPU, once it has been copied there."""
 

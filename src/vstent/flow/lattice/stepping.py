@@ -166,16 +166,22 @@ def twin(state: State) -> State:
 
 
 def step(state: State) -> None:
-    """Make time steps for a few seconds, at most up to the next check, and record the flow at a check."""
-    began = perf_counter()
-    advance(state, min(_slice_steps(state), state.steps_per_check - state.since_check))
+    """Make time steps for a few seconds, at most up to the next check, and record the flow at a check.
+
+    A GPU goes on with the next time steps while the host evaluates the check.
+    """
+    began, state.begun_s = perf_counter() if state.begun_s is None else state.begun_s, None
+    advance(state, _slice_steps(state))
     state.loop_seconds += perf_counter() - began
     if state.since_check == state.steps_per_check:
         with np.errstate(over="ignore", invalid="ignore"):  # divergence is reported as an error, not as a warning
-            state.snapshots.append(snapshot(state))
-            state.history.append(monitored(state, state.snapshots[-1]))
+            now = snapshot(state)
+            state.snapshots.append(now)
+            state.history.append(np.zeros(0))
             state.since_check = 0
             _keep_pace(state)
+            _begin(state)
+            state.history[-1] = monitored(state, now)
 
 
 def is_at_check(state: State) -> bool:
@@ -209,22 +215,36 @@ def take_pace(state: State) -> None:
 
 
 def _slice_steps(state: State) -> int:
-    """Return the even number of time steps between two looks at the clock."""
+    """Return the even number of time steps to the next look at the clock or to the next check."""
     updates = GPU_SLICE_UPDATES if state.case.settings.device_gpu else SLICE_UPDATES
-    return 2 * max(1, round(updates / len(state.domain.cells) / 2))
+    steps = 2 * max(1, round(updates / len(state.domain.cells) / 2))
+    return min(steps, state.steps_per_check - state.since_check)
+
+
+def _begin(state: State) -> None:
+    """Let a GPU begin the next time steps, which `advance` finishes; a processor begins nothing."""
+    if state.device is None:
+        return
+    with told():
+        if state.device.begin(*_pairs(state, _slice_steps(state))):
+            state.begun_s = perf_counter()
 
 
 def advance(state: State, steps: int) -> None:
     """Make an even number of time steps."""
-    wanted, moments = imposed(state, state.since_check + 1 + np.arange(0, steps, 2))
-    first_pair = state.since_check // 2
+    pairs = _pairs(state, steps)
     if state.case.settings.device_gpu:
         with told():
-            _device(state).advance(wanted, moments, first_pair)
+            _device(state).advance(*pairs)
     else:
-        _advance_here(state, wanted, moments, first_pair)
+        _advance_here(state, *pairs)
     state.steps += steps
     state.since_check += steps
+
+
+def _pairs(state: State, steps: int) -> tuple[Floats, Floats, int]:
+    """Return the boundary values of the next time steps, and the number of their first pair since the last check."""
+    return *imposed(state, state.since_check + 1 + np.arange(0, steps, 2)), state.since_check // 2
 
 
 def imposed(state: State, steps: Floats | Ints) -> tuple[Floats, Floats]:
