@@ -153,7 +153,10 @@ def _raised_fraction(case: FlowCase, field: FlowField) -> float:
     fastest_m_s = np.max(moments, axis=0)
     middle_mm, reach_mm = sac.vertices_mm.mean(axis=0), np.ptp(sac.vertices_mm, axis=0).max()
     near = np.linalg.norm(field.centers_mm - middle_mm, axis=1) < reach_mm + width_mm
+    reynolds = fastest_m_s[near] * field.cell_size_mm * M_PER_MM / field.blood.kinematic_viscosity_m2_s
+    is_raised = reynolds > CELL_REYNOLDS
+    if not is_raised.any():
+        return 0.0  # without a search for the cells
     points_mm = field.centers_mm[near]
     counts = (ostium.closest(points_mm)[1] < 0.5 * width_mm) | (sac.closest(points_mm)[1] < field.cell_size_mm)
-    reynolds = fastest_m_s[near] * field.cell_size_mm * M_PER_MM / field.blood.kinematic_viscosity_m2_s
-    return float((reynolds[counts] > CELL_REYNOLDS).mean()) if counts.any() else 0.0
+    return float(is_raised[counts].mean()) if counts.any() else 0.0
