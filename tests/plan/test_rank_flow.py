@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from threading import Event, get_ident
 from types import SimpleNamespace
 
 import pytest
@@ -123,6 +124,36 @@ def test_a_flow_starts_from_that_of_the_most_similar_coverage(monkeypatch: pytes
     # only 0.32 and 0.30 are similar; the last device misses the neck
     assert begun == [None, None, None, fields[1], None, None]
     assert not flows._done  # no flow is kept from which none starts
+
+
+def test_on_a_gpu_a_flow_is_measured_while_the_next_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("numba.threading_layer", lambda: "omp")
+    monkeypatch.setattr(rank_flow, "grade", lambda *_: SimpleNamespace(level="good"))
+
+    def ranked(settings: FlowSettings, wait_s: float) -> tuple[Ranking, dict, list[int]]:
+        begun, threads, stored = [Event() for _ in range(4)], [], {}
+
+        def computing(case, **more):
+            number = [one.is_set() for one in begun].index(False)
+            begun[number].set()
+            return SimpleNamespace(unsettled_fraction=0.01 * number, number=number)
+
+        def measuring(field, *_):
+            is_last = field.number == 2
+            assert is_last or begun[field.number + 1].wait(wait_s) == (wait_s > 0)
+            threads.append(get_ident())
+            return dict.fromkeys(rank_flow.REDUCED, 1.0 + field.number)
+
+        monkeypatch.setattr(rank_flow, "simulate_case", computing)
+        monkeypatch.setattr(rank_flow, "indices", measuring)
+        return rank_flows(anatomy(), ranking(), settings, 2, stored=stored), stored, threads
+
+    here, in_place, at = ranked(SETTINGS, 0.0)
+    on_gpu, beside, other = ranked(replace(SETTINGS, device_gpu=True), 20.0)
+    assert set(at) == {get_ident()}
+    assert get_ident() not in other
+    assert list(beside.items()) == list(in_place.items())
+    assert [vars(one) for one in on_gpu.candidates] == [vars(one) for one in here.candidates]
 
 
 def test_a_flow_of_a_device_whose_numbers_changed_is_not_found(tmp_path) -> None:

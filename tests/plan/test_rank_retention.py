@@ -71,7 +71,7 @@ def test_a_flow_kept_without_contrast_is_computed_again(monkeypatch):
 
     def compute(flows, one):
         computed.append(one)
-        return flow(0.7)
+        return lambda: flow(0.7)
 
     monkeypatch.setattr(rank_flow._Flows, "computed", compute)
     bare, short = flow(0.5), flow(0.6)

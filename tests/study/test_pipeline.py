@@ -4,6 +4,8 @@ import json
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
+from threading import Event, get_ident
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_json, write_stl
 from vstent.study import stages
 from vstent.study.crate import write_crate
-from vstent.study.ledger import hash_of
+from vstent.study.ledger import Ledger, hash_of
 from vstent.study.outputs import write_anatomy
 from vstent.study.pipeline import restore_vessel, run
 from vstent.study.stages import deploy_one, engine_folders, size_of
@@ -323,6 +325,39 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     provenance = json.loads((out / "run.json").read_text())
     assert len(provenance["input"]["sha256"]) == 64
     assert {"numpy", "vstent", "python"} <= set(provenance["versions"])
+
+
+def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = Settings(devices=("silk",), flow=FlowSettings(device_gpu=True))
+    is_next_begun, threads, stored = Event(), set(), []
+
+    def computed(case: str, *, start: object, **given: object) -> SimpleNamespace:
+        if case == "silk":
+            is_next_begun.set()
+        return SimpleNamespace(name=case, start=start, advice="")
+
+    def write(ledger: Ledger, name: str, key: str, result: object, seconds: dict[str, float]) -> None:
+        assert is_next_begun.wait(20.0)
+        threads.add(get_ident())
+        stored.append((name, list(seconds)))
+
+    def written(folder: Path, field: object) -> None:
+        stored.append(folder.relative_to(tmp_path).as_posix())
+
+    monkeypatch.setattr("numba.threading_layer", lambda: "omp")
+    monkeypatch.setattr(stages, "_plan", lambda *_: None)
+    monkeypatch.setattr(stages, "flow_case", lambda anatomy, stent, flow: stent.name if stent else "bare")
+    monkeypatch.setattr(stages, "simulate_case", computed)
+    monkeypatch.setattr(stages, "write_field", written)
+    monkeypatch.setattr(Ledger, "_write", write)
+    silk = SimpleNamespace(stent=SimpleNamespace(name="silk", design=find_design("silk")))
+    ledger = Ledger(tmp_path / "cache", lambda *_: None)
+    fields, failures = stages.compute_flows(tmp_path, None, {"silk": silk}, settings, ledger, "")
+    assert not failures
+    assert fields["silk"].start is fields["bare"]
+    assert get_ident() not in threads
+    # The run time stored with a flow is its own, though the next one was begun before it was stored.
+    assert stored == [("flow bare", ["flow bare"]), "flow/bare", ("flow silk", ["flow silk"]), "flow/silk"]
 
 
 def test_a_device_whose_wires_change_does_not_get_the_flow_of_the_former(

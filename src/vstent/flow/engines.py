@@ -109,6 +109,9 @@ class AbstractEngine(ABC, Generic[State]):
         """Return a modified case to retry after divergence; None: do not retry."""
         return None
 
+    def prepare(self, case: FlowCase) -> None:
+        """Build what `init` needs and the start does not change; called in another thread while a GPU computes."""
+
     @abstractmethod
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Build the domain and the initial state: at rest, or from a field on any grid."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
@@ -16,6 +16,7 @@ from vstent.deployment.struts import over_restored
 from vstent.devices.stent import Stent
 from vstent.errors import InputError
 from vstent.flow import sampling
+from vstent.flow.beside import Beside
 from vstent.flow.case import LATTICE, OPENFOAM, FlowCase, FlowField, FlowSettings, Phase
 from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
@@ -303,7 +304,7 @@ class _Runs:
         bookmark: Bookmark | None,
     ) -> FlowField:
         """Run an engine from a guess or a saved state; after divergence start again with the engine's calmer case."""
-        guess = cache(guess)
+        guess = cache(partial(_guessed, engine, case, guess))
 
         def attempt() -> FlowField:
             is_under_way = bookmark is not None and bookmark.saved is not None
@@ -339,6 +340,17 @@ class _Runs:
             whole(Progress(fraction, now.residual, seconds_left))
 
         return report
+
+
+def _guessed(engine: AbstractEngine[Any], case: FlowCase, guess: Guess) -> FlowField | None:
+    """Return a first guess; while a GPU computes it, what the engine needs next is built."""
+    if not case.settings.device_gpu:
+        return guess()
+    with Beside(case.settings) as beside:
+        ready = beside.do(partial(engine.prepare, case))
+        found = guess()
+        ready()
+    return found
 
 
 def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowField:

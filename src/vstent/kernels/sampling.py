@@ -55,7 +55,7 @@ def stencils(index: Any, points: Any) -> tuple[Any, Any]:
     return cells, weights
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def interpolate(index: Any, values: Any, points: Any, is_zero_outside: bool) -> Any:
     """Return trilinearly interpolated values (m, d); zero where no cell is near.
 
@@ -94,7 +94,7 @@ def _cubic_weights(t: float, weights: Any) -> None:
     weights[3] = (t + 1.0) * t * (t - 1.0) / 6.0
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def interpolate_cubic(index: Any, values: Any, points: Any) -> Any:
     """Return tricubic values (m, d) at points (m, 3) from the 64 cells around each; cells outside count as zero."""
     result = np.zeros((len(points), values.shape[1]))
@@ -205,7 +205,7 @@ def _solve(matrix: Any, right: Any) -> None:
         right[i, :] /= matrix[i, i]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def fit_wall(index: Any, distance: Any, velocity: Any, pressure: Any, points: Any, normals: Any, reach: int) -> Any:
     """Return the wall-normal velocity gradient (3) and the pressure at wall points, (m, 4).
 

@@ -376,7 +376,7 @@ def _closest_one(corners: Any, low: Any, high: Any, p: Any, best: Any) -> tuple[
     return best2, best_triangle, best_feature
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def _closest_all(corners: Any, low: Any, high: Any, points: Any) -> tuple[Any, Any, Any, Any]:
     """Return closest point, distance, triangle and feature for every point."""
     n = points.shape[0]
@@ -514,7 +514,7 @@ def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: An
     return best, hit
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def _first_hit_all(corners: Any, low: Any, high: Any, origins: Any, directions: Any, limit: float) -> tuple[Any, Any]:
     """Return the parameter of every ray's first hit, inf where there is none, and the triangle."""
     n = origins.shape[0]

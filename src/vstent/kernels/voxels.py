@@ -32,7 +32,7 @@ def _is_left(ax: float, ay: float, bx: float, by: float, px: float, py: float) -
     return (bx - ax) * (py - ay) - (by - ay) * (px - ax) > 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _mark_crossings(corners: Any, change: Any) -> None:
     """Add +1 where a grid line along axis 0 enters the mesh and -1 where it leaves, at the next grid point."""
     n0, n1, n2 = change.shape

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final, Protocol, TypeVar
 
 from vstent.anatomy.morphology import Measures
@@ -10,7 +11,8 @@ from vstent.angiography.curves import retention_s
 from vstent.deployment.deploy import deploy, propose_landing
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import FlowError, InputError
-from vstent.flow.case import FlowField, FlowSettings
+from vstent.flow.beside import Beside
+from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.grade import NOT_USABLE, grade
 from vstent.flow.indices import indices
 from vstent.flow.simulation import flow_case, simulate_case
@@ -105,19 +107,33 @@ def rank_flows(
     found: Stored = {} if stored is None else stored
     unfinished = [one for one in chosen if not is_finished(found.get(one), has_contrast)]
     flows = _Flows(anatomy, settings, has_contrast, [coverage_of(one) for one in unfinished])
-    results: dict[Candidate | None, Mapping[str, Any]] = {}
+    waiting: dict[Candidate | None, Callable[[], Mapping[str, Any]]] = {}
     criteria = ranking.criteria if has_contrast else None
-    for done, candidate in enumerate([None, *chosen]):
-        if progress is not None:
-            progress(done, 1 + len(chosen), "no device" if candidate is None else candidate.label)
-        result = found.get(candidate)
-        if result is None or candidate in unfinished or (candidate is None and unfinished):
-            found[candidate] = result = flows.computed(candidate)
-        results[candidate] = result
+    with Beside(settings) as beside:
+        for done, candidate in enumerate([None, *chosen]):
+            if progress is not None:
+                progress(done, 1 + len(chosen), "no device" if candidate is None else candidate.label)
+            result = found.get(candidate)
+            if result is None or candidate in unfinished or (candidate is None and unfinished):
+                waiting[candidate] = beside.do(partial(_stored, found, candidate, flows.computed(candidate)))
+            else:
+                waiting[candidate] = partial(_itself, result)
+    results = {candidate: wait() for candidate, wait in waiting.items()}
     told = [
         _with_flow(one, results[None], results[one], criteria) if one in results else one for one in ranking.candidates
     ]
     return replace(ranking, candidates=tuple(_by_retention(told)))
+
+
+def _itself(result: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a result."""
+    return result
+
+
+def _stored(found: Stored, candidate: Candidate | None, measured: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Return the result of a flow, measured and stored."""
+    found[candidate] = result = measured()
+    return result
 
 
 def is_finished(result: Mapping[str, Any] | None, has_contrast: bool) -> bool:
@@ -159,13 +175,13 @@ class _Flows:
         self._bare: FlowField | None = None
         self._done: list[tuple[float, FlowField]] = []
 
-    def computed(self, candidate: Candidate | None) -> Mapping[str, Any]:
-        """Compute the flow with a candidate, or without a device, and return what is kept of it."""
+    def computed(self, candidate: Candidate | None) -> Callable[[], Mapping[str, Any]]:
+        """Compute the flow with a candidate, or without a device, and return a function that measures it."""
         if candidate is not None:
             self._coming = self._coming[1:]
         covered = coverage_of(candidate)
         similar = nearest(covered, self._done)
-        field, kept = flow_with(
+        field, measured = _flow_to_measure(
             self.anatomy, candidate, self.settings, start=self._bare, similar=similar, has_contrast=self.has_contrast
         )
         if candidate is None:
@@ -173,7 +189,7 @@ class _Flows:
         elif field is not None:
             self._done.append((covered, field))
             self._done = [one for one in self._done if any(is_similar(one[0], other) for other in self._coming)]
-        return kept
+        return measured
 
 
 def flow_with(
@@ -212,19 +228,40 @@ def flow_with(
     FlowError
         The flow without a device cannot be computed.
     """
+    field, measured = _flow_to_measure(
+        anatomy, candidate, settings, start=start, similar=similar, has_contrast=has_contrast
+    )
+    return field, measured()
+
+
+def _flow_to_measure(
+    anatomy: Anatomy,
+    candidate: Candidate | None,
+    settings: FlowSettings,
+    *,
+    start: FlowField | None,
+    similar: FlowField | None,
+    has_contrast: bool,
+) -> tuple[FlowField | None, Callable[[], Mapping[str, Any]]]:
+    """Return the flow with one candidate and a function that measures what a ranking keeps of it (see `flow_with`)."""
     case = flow_case(anatomy, None if candidate is None else stent_of(anatomy, candidate), settings)
     try:
         field = simulate_case(case, start=start, similar=similar)
     except FlowError as error:
         if candidate is None:
             raise
-        return None, {"error": str(error)}
+        return None, partial(_itself, {"error": str(error)})
+    return field, partial(_measured, anatomy if has_contrast else None, case, field)
+
+
+def _measured(carrying: Anatomy | None, case: FlowCase, field: FlowField) -> Mapping[str, Any]:
+    """Return what a ranking keeps of a flow, with the retention of contrast where an anatomy is given."""
     values = indices(field, case.sac, case.ostium)
     kept: dict[str, Any] = {key: values[key] for key in REDUCED} | {"unsettled_fraction": field.unsettled_fraction}
     kept["grade"] = grade(case, field, values).level
-    if has_contrast:
-        kept["contrast"] = _contrast(anatomy, field)
-    return field, kept
+    if carrying is not None:
+        kept["contrast"] = _contrast(carrying, field)
+    return kept
 
 
 def nearest(coverage: float, done: Iterable[tuple[float, Value]]) -> Value | None:

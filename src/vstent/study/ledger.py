@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass, replace
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -135,7 +136,18 @@ class Ledger:
         key : key of everything that it depends on.
         result : a data class of vstent.
         """
-        self._write(name, key, result, self._seconds_since(name))
+        self.keeping(name, key, result)()
+
+    def keeping(self, name: str, key: str, result: Any) -> Callable[[], None]:
+        """Return a function that does what `keep` does, with the run times of the stages until now.
+
+        Parameters
+        ----------
+        name : name of the result.
+        key : key of everything that it depends on.
+        result : a data class of vstent.
+        """
+        return partial(self._write, name, key, result, self._seconds_since(name))
 
     def _seconds_since(self, name: str) -> dict[str, float]:
         """Return the run time in s of every stage since a result was looked up."""

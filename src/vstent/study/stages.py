@@ -1,6 +1,6 @@
 """Stages of a study; the ledger measures and reports each of them."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -25,6 +25,7 @@ from vstent.devices.design import BARE, Design, Size
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, VstentError
+from vstent.flow.beside import Beside
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.grade import QUALITY, computation_of, grade
@@ -313,6 +314,8 @@ def compute_flows(
 ) -> tuple[dict[str, FlowField], dict[str, str]]:
     """Compute the flow without and with each device; each is stored as soon as it is finished.
 
+    With a GPU it is stored while the next one is computed.
+
     Parameters
     ----------
     out : the case folder.
@@ -339,33 +342,44 @@ def compute_flows(
     fields: dict[str, FlowField] = {}
     failures: dict[str, str] = {}
     folders = engine_folders(out, settings)
-    for name in (BARE, *(name for name in deployments if name not in settings.without_flow)):
-        stent = None if name == BARE else deployments[name].stent
-        stage, key = f"flow {name}", flow_key(source, settings, name, stent.design if stent else None)
-        field = ledger.recall(stage, key, FlowField)
-        if field is None:
-            if name == BARE:
-                _plan(anatomy, {name: one.stent for name, one in deployments.items()}, settings.flow, ledger)
-            try:
-                with ledger.stage(stage) as tell:
-                    field = simulate_case(
-                        flow_case(anatomy, stent, settings.flow),
-                        start=fields.get(BARE),
-                        folder=folders[name],
-                        progress=ledger.teller(stage),
-                        checkpoint=FlowCheckpoint(ledger.folder, stage, key),
-                    )
-                    tell(field.advice)
-            except FlowError as error:
+    stored = []
+    with Beside(settings.flow) as beside:
+        for name in (BARE, *(name for name in deployments if name not in settings.without_flow)):
+            stent = None if name == BARE else deployments[name].stent
+            stage, key = f"flow {name}", flow_key(source, settings, name, stent.design if stent else None)
+            field, store = ledger.recall(stage, key, FlowField), None
+            if field is None:
                 if name == BARE:
-                    raise
-                failures[name] = f"flow not computed: {error}"
-                ledger.progress(stage, 1.0, failures[name])
-                continue
-            ledger.keep(stage, key, field)
-        fields[name] = field
-        write_field(out / "flow" / name, field)
+                    _plan(anatomy, {name: one.stent for name, one in deployments.items()}, settings.flow, ledger)
+                try:
+                    with ledger.stage(stage) as tell:
+                        field = simulate_case(
+                            flow_case(anatomy, stent, settings.flow),
+                            start=fields.get(BARE),
+                            folder=folders[name],
+                            progress=ledger.teller(stage),
+                            checkpoint=FlowCheckpoint(ledger.folder, stage, key),
+                        )
+                        tell(field.advice)
+                except FlowError as error:
+                    if name == BARE:
+                        raise
+                    failures[name] = f"flow not computed: {error}"
+                    ledger.progress(stage, 1.0, failures[name])
+                    continue
+                store = ledger.keeping(stage, key, field)
+            fields[name] = field
+            stored.append(beside.do(partial(_store, store, out / "flow" / name, field)))
+    for done in stored:
+        done()
     return fields, failures
+
+
+def _store(store: Callable[[], None] | None, folder: Path, field: FlowField) -> None:
+    """Store a flow in the ledger, unless it was read from there, and write its files."""
+    if store is not None:
+        store()
+    write_field(folder, field)
 
 
 def flow_key(source: str, settings: Settings, name: str, design: Design | None) -> str:

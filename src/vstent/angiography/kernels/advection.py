@@ -107,7 +107,7 @@ def _limited(behind: Any, ahead: Any) -> Any:
     return sign * _smaller(HALF * abs(behind + ahead), TWO * _smaller(abs(behind), abs(ahead)))
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def drift(mesh: Any, flux: Any, result: Any) -> None:
     """Write the displacement (n, 3) of the blood of every cell along each axis, in cells per s.
 
@@ -248,7 +248,7 @@ def _settle(mesh: Any, groups: Any, held: Any, count: int, substep: int, base: f
                     state[i, RATE] = state[i, SLOPE] = state[i, SLOPE + 1] = state[i, SLOPE + 2] = ZERO
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def march(mesh: Any, groups: Any, held: Any, flux: Any, moves: Any, base: float, upper: Any, empty: Any) -> None:
     """Advance the concentration by one step of the slowest level.
 

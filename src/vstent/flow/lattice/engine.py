@@ -17,7 +17,7 @@ from vstent.flow.lattice.pace import longest_step_s, peak_speed_m_s
 from vstent.flow.lattice.reading import field_of, read, read_moving
 from vstent.flow.lattice.settling import CHECKS_APART, Mean, left_to_settle, mean_of, with_check
 from vstent.flow.lattice.state import State
-from vstent.flow.lattice.stepping import build, is_at_check, step
+from vstent.flow.lattice.stepping import build, is_at_check, prepare, step
 from vstent.flow.lattice.trouble import trouble
 from vstent.flow.stopping import SURE, swings
 from vstent.units import M_PER_MM
@@ -77,6 +77,11 @@ class AbstractLattice(AbstractEngine[State]):
     def pacing(self, start: FlowField | None) -> FlowField | None:
         """Return the flow that sets the time step: the one around a refined region, else the one it starts from."""
         return start if self.outer is None else self.outer
+
+    def prepare(self, case: FlowCase) -> None:
+        """Build the grid of the whole vessel; that of a refined sac depends on the flow around it."""
+        if self.outer is None:
+            prepare(case, self.cell_size_mm)
 
     def save(self, state: State) -> Saved:
         """Return the run as arrays."""

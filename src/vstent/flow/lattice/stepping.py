@@ -95,6 +95,20 @@ def build(
     return state
 
 
+def prepare(case: FlowCase, cell_size_mm: float) -> None:
+    """Build the grid of a whole vessel, and the distances from its wall that a result needs, for later flows on it.
+
+    Parameters
+    ----------
+    case : FlowCase
+        The flow case.
+    cell_size_mm : float
+        Grid spacing.
+    """
+    grid = _grid(case, cell_size_mm, None)
+    _ = grid.bands, grid.groups, grid.domain.index, grid.domain.depth_mm
+
+
 def _grid(case: FlowCase, cell_size_mm: float, close_up: CloseUp | None) -> Grid:
     """Return the grid of a case; that of a whole vessel is the same for all its flows and is built once."""
     if close_up is not None:

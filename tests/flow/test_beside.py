@@ -1,0 +1,136 @@
+"""Work beside a GPU: in a thread, in order, never lost; in place without one. Flows and results are the same."""
+
+from functools import partial
+from threading import Event, get_ident
+from types import SimpleNamespace
+
+import numba
+import numpy as np
+import pytest
+from tubes import line, tube
+
+from vstent.flow import simulation
+from vstent.flow.beside import Beside
+from vstent.flow.case import FlowCase, FlowSettings
+from vstent.flow.lattice.engine import LatticeBoltzmann
+
+HERE, GPU = FlowSettings(cell_size_mm=0.3, inflow_mL_s=0.5), FlowSettings(cell_size_mm=0.3, device_gpu=True)
+LONG_S = 20.0
+
+
+@pytest.fixture(autouse=True)
+def safe(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A threading layer that allows two threads, as on Linux."""
+    monkeypatch.setattr(numba, "threading_layer", lambda: "omp")
+
+
+def fail() -> None:
+    raise OSError("no space left")
+
+
+@pytest.mark.parametrize("settings", [None, HERE])
+def test_without_a_gpu_work_is_done_in_place_and_at_once(settings: FlowSettings | None) -> None:
+    with Beside(settings) as beside:
+        assert beside.do(get_ident)() == get_ident()
+        with pytest.raises(OSError, match="no space"):
+            beside.do(fail)
+
+
+@pytest.mark.parametrize("layer", ["workqueue", None])
+def test_parallel_kernels_of_two_threads_need_a_layer_that_allows_them(
+    layer: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def threading_layer() -> str:
+        if layer is None:
+            raise ValueError("Threading layer is not initialized.")
+        return layer
+
+    monkeypatch.setattr(numba, "threading_layer", threading_layer)
+    with Beside(GPU) as beside:
+        assert beside.do(get_ident)() == get_ident()
+
+
+def test_with_a_gpu_work_is_done_meanwhile_in_order_and_before_the_end() -> None:
+    goes_on, done = Event(), []
+
+    def first() -> int:
+        assert goes_on.wait(LONG_S)  # until this thread has come further
+        done.append("first")
+        return get_ident()
+
+    with Beside(GPU) as beside:
+        begun = beside.do(first)
+        failed = beside.do(fail)
+        threads = beside.do(numba.get_num_threads)
+        beside.do(partial(done.append, "last"))
+        assert not done
+        goes_on.set()
+        assert begun() != get_ident()
+    assert done == ["first", "last"]
+    assert threads() == numba.get_num_threads()
+    with pytest.raises(OSError, match="no space"):
+        failed()
+
+
+def test_a_study_that_fails_does_not_lose_what_was_begun() -> None:
+    goes_on, done = Event(), []
+
+    def late() -> None:
+        assert goes_on.wait(LONG_S)
+        done.append("late")
+
+    def study() -> None:
+        with Beside(GPU) as beside:
+            beside.do(late)
+            goes_on.set()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        study()
+    assert done == ["late"]
+
+
+def case(settings: FlowSettings) -> FlowCase:
+    return FlowCase(tube(line(8.0), 2.0).vessel, settings=settings)
+
+
+class Engine(LatticeBoltzmann):
+    """The embedded engine, whose preparation is recorded."""
+
+    calls: tuple[Event, list[int]]
+
+    def prepare(self, case: FlowCase) -> None:
+        begun, threads = self.calls
+        begun.set()
+        threads.append(get_ident())
+        super().prepare(case)
+
+
+def test_the_grid_is_built_while_the_gpu_computes_the_first_guess() -> None:
+    for settings in (GPU, HERE):
+        begun, threads = Engine.calls = Event(), []
+        engine, flow = Engine(0.3), case(settings)
+        is_meanwhile = []
+        simulation._guessed(engine, flow, lambda begun=begun, found=is_meanwhile: found.append(begun.wait(0.5)))
+        assert is_meanwhile == [settings is GPU]
+        assert len(threads) == (settings is GPU)
+        assert get_ident() not in threads
+
+
+def test_a_prepared_flow_is_the_same() -> None:
+    prepared, plain = case(HERE), case(HERE)
+    engine = LatticeBoltzmann(0.3)
+    engine.prepare(prepared)
+    first, second = (engine.init(one, None) for one in (prepared, plain))
+    assert {"index", "depth_mm"} <= vars(first.domain).keys()
+    assert "depth_mm" not in vars(second.domain)
+    for _ in range(2):
+        first, second = engine.step(first), engine.step(second)
+    np.testing.assert_array_equal(first.populations, second.populations)
+    np.testing.assert_array_equal(first.domain.depth_mm, second.domain.depth_mm)
+
+
+def test_the_grid_of_a_refined_sac_waits_for_the_flow_around_it() -> None:
+    engine, flow = LatticeBoltzmann(0.3, outer=SimpleNamespace()), case(HERE)
+    engine.prepare(flow)
+    assert "depth_mm" not in vars(LatticeBoltzmann(0.3).init(flow, None).domain)
