@@ -14,6 +14,7 @@ from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.collision import collided, relaxed, squared_reach
 from vstent.flow.lattice.scales import ODD_RATE as VESSEL_ODD_RATE
 from vstent.flow.lattice.setup import Grid, address, build_links, thickest
+from vstent.flow.lattice.state import speeds
 from vstent.flow.lattice.stepping import advance
 from vstent.flow.lattice.walls import parabolic_weights
 from vstent.geometry.vessel import Vessel
@@ -126,6 +127,13 @@ def test_flows_of_a_vessel_share_its_grid_and_not_their_populations():
     assert first.populations.any()
     for array, before in zip((second.populations, second.links.source, second.refill.refill), untouched, strict=True):
         np.testing.assert_array_equal(array, before)
+
+
+def test_speeds_are_those_of_numpys_norm():
+    velocity = np.random.default_rng(3).normal(size=(10_000, 3)).astype(np.float32)
+    found = speeds(velocity)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, np.linalg.norm(velocity, axis=1))
 
 
 def test_whole_vectors_reach_into_no_other_layer():

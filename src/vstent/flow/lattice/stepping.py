@@ -21,7 +21,7 @@ from vstent.flow.lattice.kernels.warm import keep_flow
 from vstent.flow.lattice.scales import ODD_RATE, Scales
 from vstent.flow.lattice.screen import build_screen
 from vstent.flow.lattice.setup import Grid, address, build_links, build_refill, thickest
-from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, OnDevice, Probe, Snapshot, State
+from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, OnDevice, Probe, Snapshot, State, speeds
 from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
@@ -358,7 +358,7 @@ def _read_here(state: State) -> tuple[NDArray[np.float32], NDArray[np.float32], 
 def monitored(state: State, now: Snapshot) -> Floats:
     """Return the monitored quantities: mean speed in the sac, inlet pressure, mean speed in the vessel, neck inflow."""
     velocity_m_s = now.velocity_m_s
-    speed_m_s = np.linalg.norm(velocity_m_s, axis=1)
+    speed_m_s = speeds(velocity_m_s)
     first_inflow = state.links.patch[np.argmax(state.links.openings[:, 0] == d3q19.INFLOW)]
     inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
     values = [speed_m_s[state.probe.cells].mean(), now.pressure_Pa[inlet].mean(), speed_m_s.mean()]
