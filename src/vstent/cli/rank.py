@@ -100,13 +100,23 @@ def _with_flows(arguments: argparse.Namespace, anatomy: "Anatomy", ranking: "Ran
     def told(done: int, total: int, name: str) -> None:
         console.progress("rank by flow", done / total, f"{done} of {total}: {name}")
 
-    settings, count, has_contrast = options.given_flow(arguments), arguments.flow_count, arguments.retention
-    stored, chosen = FlowStore(arguments.out, anatomy, settings), chosen_of(ranking, count)
-    jobs, memory_MB = parallel_flows(anatomy, chosen, settings, min(arguments.jobs, count))
+    settings, has_contrast = options.given_flow(arguments), arguments.retention
+    stored, chosen = FlowStore(arguments.out, anatomy, settings), chosen_of(ranking, arguments.flow_count)
+    jobs, memory_MB = parallel_flows(anatomy, chosen, settings, min(arguments.jobs, len(chosen)))
     is_cluster = bool(arguments.scheduler or arguments.slurm)
-    if anatomy.aneurysms and chosen and (jobs > 1 or is_cluster):
+    is_parallel = bool(anatomy.aneurysms and chosen) and (jobs > 1 or is_cluster)
+    if is_parallel:
         crew = options.given_crew(arguments, jobs, memory_MB)
         threads = 1 if is_cluster else max(1, options.cores() // jobs)
-        given = {"has_contrast": has_contrast, "threads": threads, "progress": told}
-        compute_flows(anatomy, chosen, settings, stored, crew, **given)
-    return rank_flows(anatomy, ranking, settings, count, has_contrast=has_contrast, stored=stored, progress=told)
+        compute_flows(
+            anatomy, chosen, settings, stored, crew, has_contrast=has_contrast, threads=threads, progress=told
+        )
+    return rank_flows(
+        anatomy,
+        ranking,
+        settings,
+        arguments.flow_count,
+        has_contrast=has_contrast,
+        stored=stored,
+        progress=None if is_parallel else told,
+    )
