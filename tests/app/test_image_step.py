@@ -322,6 +322,7 @@ def test_an_oblique_scan_is_shown_along_the_patient_or_along_its_file(client):
         page.mouse.click(*on_slice(pane_of(page, "Coronal"), *in_plane("Coronal", ball_mm - CENTER_MM)))
         # The ball is round in a true axial plane, and its middle is where the patient has it.
         assert in_time(page, lambda: abs(middle_mm(axial)[1] - (ball_mm - CENTER_MM)[1]) < 0.6)
+        page.mouse.move(1, 1)  # under a pointer the slices that are laid anew show another place
         before = reading(page)[1]
         along.select_option("file")
         playwright.expect(page.locator(".slice-label", has_text="Oblique to axial by 16°")).to_be_visible()
