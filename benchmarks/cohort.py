@@ -22,10 +22,10 @@ from vstent import phantoms
 from vstent.cli import main
 from vstent.cohort.batch import collect, left_to_do, run_cohort
 from vstent.cohort.cases import Case, find_cases
-from vstent.cohort.crews import DaskCluster
 from vstent.cohort.work import COST, Row
 from vstent.io.writers import write_stl
 from vstent.phantoms import Phantom
+from vstent.study.crews import DaskCluster
 from vstent.study.types import Settings
 
 SEED = 7
