@@ -89,7 +89,7 @@ def full(anatomy: Anatomy, stents: dict[str, Stent]) -> dict[str, float]:
 
 
 def numbers(preview: Preview) -> dict:
-    """Return what the page is told."""
+    """Return the numbers that the page shows."""
     raw = preview.message()
     return json.loads(raw[4 : 4 + int.from_bytes(raw[:4], "little")])
 

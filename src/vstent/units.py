@@ -1,4 +1,4 @@
-"""Conversions between units (mm for geometry, SI for flow, radians for angles), and numbers in sentences."""
+"""Conversions between units (mm for geometry, SI for flow, radians for angles), bytes, and numbers in sentences."""
 
 from collections.abc import Iterable
 from typing import Final
@@ -9,6 +9,8 @@ MM_PER_UM: Final = 1e-3
 """Millimeters in a micrometer."""
 M3_PER_ML: Final = 1e-6
 """Cubic meters in a milliliter."""
+BYTES_PER_MB: Final = 1e6
+"""Bytes in a megabyte."""
 MM_PER: Final = {"m": 1e3, "cm": 10.0, "mm": 1.0}
 """Millimeters in each length unit that a surface file may have."""
 

@@ -7,18 +7,15 @@ from threading import Event, get_ident
 from types import SimpleNamespace
 
 import pytest
+from ranked_artery import anatomy, wall
 
 import vstent
-from vstent import phantoms
-from vstent.anatomy.restore.restore import restore
-from vstent.anatomy.trace import trace
 from vstent.cli import main
 from vstent.deployment.deploy import deploy
 from vstent.errors import DeviceError, FlowError, InputError
 from vstent.flow.case import FlowSettings
 from vstent.flow.indices import indices
 from vstent.flow.simulation import flow_case, simulate_case
-from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.writers import write_stl
 from vstent.plan import rank_flow
 from vstent.plan.rank import Ranking, rank
@@ -26,16 +23,6 @@ from vstent.plan.rank_flow import chosen_of, rank_flows
 from vstent.study.flow_store import FlowStore
 
 SETTINGS = FlowSettings(cells_per_diameter=11.0, inflow_mL_s=1.5, tolerance=0.02)
-
-
-def wall():
-    phantom = phantoms.with_sac(phantoms.tube(length_mm=32.0), abscissa_mm=16.0, width_mm=5.0, neck_mm=3.6)
-    return phantoms.phantom_surface(phantom, edge_mm=0.35)
-
-
-@cache
-def anatomy() -> Anatomy:
-    return restore(trace(Vessel(wall())))
 
 
 @cache

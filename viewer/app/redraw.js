@@ -60,8 +60,11 @@ export function keeping(box, change) {
   const described = owner && find(owner);
   const unfolded = [...box.querySelectorAll("details[open] > summary")].map(find);
   isChanging = true;
-  change();
-  isChanging = false;
+  try {
+    change();
+  } finally {
+    isChanging = false;
+  }
   for (const summary of unfolded) summary()?.parentElement.toggleAttribute("open", true);
   if (focused) refocus(box, activeElement, focused());
   if (focused || described) giveTip(described?.());

@@ -94,7 +94,7 @@ def _rank(arguments: argparse.Namespace) -> int:
 def _with_flows(arguments: argparse.Namespace, anatomy: "Anatomy", ranking: "Ranking", console: "Console") -> "Ranking":
     """Return the ranking with the flows of its best sizes; an interrupted one goes on."""
     from vstent.plan.rank_flow import chosen_of, rank_flows
-    from vstent.study.flow_crew import compute_flows, parallel_flows
+    from vstent.study.flow_crew import compute_missing, parallel_flows
     from vstent.study.flow_store import FlowStore
 
     def told(done: int, total: int, name: str) -> None:
@@ -108,7 +108,7 @@ def _with_flows(arguments: argparse.Namespace, anatomy: "Anatomy", ranking: "Ran
     if is_parallel:
         crew = options.given_crew(arguments, jobs, memory_MB)
         threads = 1 if is_cluster else max(1, options.cores() // jobs)
-        compute_flows(
+        compute_missing(
             anatomy, chosen, settings, stored, crew, has_contrast=has_contrast, threads=threads, progress=told
         )
     return rank_flows(

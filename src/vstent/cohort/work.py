@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
@@ -15,8 +14,10 @@ from vstent.errors import VstentError
 from vstent.io.files import atomic
 from vstent.io.writers import write_json, write_text
 from vstent.reporting.figures import patient_picture
+from vstent.study.crews import alone
 from vstent.study.pipeline import restore_vessel, run
 from vstent.study.types import Progress, Settings
+from vstent.units import BYTES_PER_MB
 
 Row = dict[str, Any]
 """One case with one device: column name to value."""
@@ -29,10 +30,6 @@ FAILED: Final = "failed"
 """Outcome where the input cannot be used or a flow cannot be computed; a repetition would give the same."""
 LOST: Final = "lost"
 """Outcome where the process died; the next run repeats the case."""
-MB: Final = 1e6
-"""Bytes in a megabyte."""
-_ALONE: Final = threading.Lock()
-"""Lock for parallel kernels, which allow one caller per process; a Dask worker may have several threads."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +70,7 @@ def work(task: Task) -> None:
 
     A device that does not fit, or an input that cannot be used, gives a row with its stage and error message.
     """
-    import numba
-
-    with _ALONE:
-        numba.set_num_threads(1)  # cases run in parallel, one per core
+    with alone():
         began, cpu = time.perf_counter(), time.process_time()
         rows = _rows(task)
         done = tuple(device for device, row in rows.items() if row["outcome"] == DONE)
@@ -193,4 +187,4 @@ def peak_memory_MB() -> float | None:
     import sys
 
     per_unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * per_unit / MB
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * per_unit / BYTES_PER_MB

@@ -181,7 +181,7 @@ class _Flows:
             self._coming = self._coming[1:]
         covered = coverage_of(candidate)
         similar = nearest(covered, self._done)
-        field, measured = _flow_to_measure(
+        field, measured = flow_with(
             self.anatomy, candidate, self.settings, start=self._bare, similar=similar, has_contrast=self.has_contrast
         )
         if candidate is None:
@@ -200,8 +200,8 @@ def flow_with(
     start: FlowField | None,
     similar: FlowField | None,
     has_contrast: bool,
-) -> tuple[FlowField | None, Mapping[str, Any]]:
-    """Compute the flow with one candidate and return it with what a ranking keeps of it.
+) -> tuple[FlowField | None, Callable[[], Mapping[str, Any]]]:
+    """Compute the flow with one candidate and return it with a function that measures what a ranking keeps of it.
 
     Parameters
     ----------
@@ -220,30 +220,15 @@ def flow_with(
 
     Returns
     -------
-    tuple of FlowField or None, and mapping
-        The flow, and its results; None and an error message where the flow with a device cannot be computed.
+    tuple of FlowField or None, and callable
+        The flow, and a function that returns its results; None and a function that returns an error message where the
+        flow with a device cannot be computed.
 
     Raises
     ------
     FlowError
         The flow without a device cannot be computed.
     """
-    field, measured = _flow_to_measure(
-        anatomy, candidate, settings, start=start, similar=similar, has_contrast=has_contrast
-    )
-    return field, measured()
-
-
-def _flow_to_measure(
-    anatomy: Anatomy,
-    candidate: Candidate | None,
-    settings: FlowSettings,
-    *,
-    start: FlowField | None,
-    similar: FlowField | None,
-    has_contrast: bool,
-) -> tuple[FlowField | None, Callable[[], Mapping[str, Any]]]:
-    """Return the flow with one candidate and a function that measures what a ranking keeps of it (see `flow_with`)."""
     case = flow_case(anatomy, None if candidate is None else stent_of(anatomy, candidate), settings)
     try:
         field = simulate_case(case, start=start, similar=similar)

@@ -3,9 +3,11 @@
 import multiprocessing
 import shutil
 import signal
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
@@ -21,6 +23,19 @@ SPARE: Final = 2.0
 """Factor on the estimated memory that a Slurm job requests, because a job that exceeds its request is killed."""
 SCHEDULER_S: Final = 20.0
 """Time to wait for a Dask scheduler to answer, in s."""
+
+_ALONE: Final = threading.Lock()
+"""Lock for parallel kernels, which allow one caller per process; a Dask worker may have several threads."""
+
+
+@contextmanager
+def alone(threads: int = 1) -> Iterator[None]:
+    """Do a task alone in its process, with at most a number of threads, because tasks share the cores."""
+    import numba
+
+    with _ALONE:
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+        yield
 
 
 class Ended(NamedTuple):

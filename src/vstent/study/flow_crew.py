@@ -1,7 +1,6 @@
 """Compute the flows of a ranking in parallel: in processes of this machine, on a Dask cluster, or in a Slurm queue."""
 
 import pickle
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +14,9 @@ from vstent.geometry.vessel import Anatomy
 from vstent.io.files import atomic
 from vstent.plan.rank import Candidate
 from vstent.plan.rank_flow import coverage_of, flow_with, is_finished, nearest, stent_of
-from vstent.study.crews import AbstractCrew
+from vstent.study.crews import AbstractCrew, alone
 from vstent.study.flow_store import FlowStore
+from vstent.units import BYTES_PER_MB
 
 COMMON: Final = "common"
 """File of what all flows need."""
@@ -24,10 +24,6 @@ FIELD: Final = ".flow"
 """Suffix of the file of a finished flow, from which others start."""
 RESULT: Final = ".result"
 """Suffix of the file of what the ranking keeps of a flow."""
-MB: Final = 1e6
-"""Bytes in a megabyte."""
-_ALONE: Final = threading.Lock()
-"""Lock for parallel kernels, which allow one caller per process; a Dask worker may have several threads."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +54,7 @@ class FlowTask:
     """Index of the candidate."""
 
 
-def compute_flows(
+def compute_missing(
     anatomy: Anatomy,
     chosen: Sequence[Candidate],
     settings: FlowSettings,
@@ -99,7 +95,8 @@ def compute_flows(
     total = 1 + len(chosen)  # with the flow without a device
     before = total - len(wanted)
     progress(before - 1, total, "no device")
-    bare, stored[None] = flow_with(anatomy, None, settings, start=None, similar=None, has_contrast=has_contrast)
+    bare, measured = flow_with(anatomy, None, settings, start=None, similar=None, has_contrast=has_contrast)
+    stored[None] = measured()
     assert bare is not None  # without a device it would have been raised
     progress(before, total, f"{len(wanted)} devices in parallel")
     with TemporaryDirectory(prefix="rank-flow-", dir=stored.folder) as name:
@@ -117,15 +114,12 @@ def compute_flows(
 
 def work(task: FlowTask) -> None:
     """Compute the flow with one candidate, and keep it and its result in the folder of the task."""
-    import numba
-
-    with _ALONE:
-        common: Common = _kept(task.folder / COMMON)
-        numba.set_num_threads(min(common.threads, numba.config.NUMBA_NUM_THREADS))
+    common: Common = _kept(task.folder / COMMON)
+    with alone(common.threads):
         candidate = common.candidates[task.number]
         paths = ((coverage_of(one), task.folder / f"{n}{FIELD}") for n, one in enumerate(common.candidates))
         similar = nearest(coverage_of(candidate), [one for one in paths if one[1].exists()])
-        field, result = flow_with(
+        field, measured = flow_with(
             common.anatomy,
             candidate,
             common.settings,
@@ -135,7 +129,7 @@ def work(task: FlowTask) -> None:
         )
         if field is not None:
             _keep(task.folder / f"{task.number}{FIELD}", field)
-        _keep(task.folder / f"{task.number}{RESULT}", result)
+        _keep(task.folder / f"{task.number}{RESULT}", measured())
 
 
 def parallel_flows(
@@ -147,9 +141,9 @@ def parallel_flows(
     """
     needed = _memory_bytes(anatomy, chosen, settings)
     if settings.device_gpu or not needed:
-        return 1, needed / MB
+        return 1, needed / BYTES_PER_MB
     fitting = min(jobs // settings.processes, free_memory_bytes() // needed)
-    return max(1, int(fitting)), needed / MB
+    return max(1, int(fitting)), needed / BYTES_PER_MB
 
 
 def _memory_bytes(anatomy: Anatomy, chosen: Sequence[Candidate], settings: FlowSettings) -> float:
