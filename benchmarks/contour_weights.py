@@ -38,11 +38,12 @@ HEADER = f"{'weights':34} outcome          iterations  terminated  outside/mm  g
 def lobed() -> Anatomy:
     """A bent artery whose sections have three lobes: far from the inscribed circles in between."""
     artery = tube(arc(7.0, 1.2, 12), 1.7)
-    surface, around = artery.landing_surface, 160
-    middle_mm = np.repeat(artery.axis.points_mm, around, axis=0)
-    growth = 1 + 0.15 * (1 + np.cos(3 * np.tile(2 * np.pi * np.arange(around) / around, len(artery.axis.points_mm))))
+    parent, around = artery.parent, 160
+    surface, points_mm = parent.landing_surface, parent.axis.points_mm
+    middle_mm = np.repeat(points_mm, around, axis=0)
+    growth = 1 + 0.15 * (1 + np.cos(3 * np.tile(2 * np.pi * np.arange(around) / around, len(points_mm))))
     vertices_mm = middle_mm + growth[:, None] * (surface.vertices_mm - middle_mm)
-    return replace(artery, landing_surface=Surface(vertices_mm, surface.faces))
+    return replace(artery, paths=(replace(parent, landing_surface=Surface(vertices_mm, surface.faces)),))
 
 
 def row(anatomy: Anatomy, weights: dict[str, float]) -> str:

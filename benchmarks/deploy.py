@@ -163,7 +163,7 @@ def speed(anatomy: Anatomy) -> list[str]:
     centers_mm = course.opened.contour.centers_mm.reshape(-1, 3)
     _, closest_s = timed(lambda: wall.wall.contact(nodes_mm))
     _, crosses_s = timed(lambda: wall.wall.crosses(centers_mm, nodes_mm))
-    brute, few = BruteWall(anatomy.landing_surface), slice(None, None, 200)
+    brute, few = BruteWall(anatomy.parent.landing_surface), slice(None, None, 200)
     _, slow_closest_s = timed(lambda: brute.contact(nodes_mm[few]), 1)
     _, slow_crosses_s = timed(lambda: brute.crosses(centers_mm[few], nodes_mm[few]), 1)
     n, n_few = len(nodes_mm), len(nodes_mm[few])

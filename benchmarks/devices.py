@@ -54,7 +54,7 @@ def in_tube(key: str, size: Size, diameter_mm: float, bend_mm: float | None = No
     path = line(60) if bend_mm is None else arc(bend_mm, np.pi / 2, 20)
     artery = tube(path, 0.5 * diameter_mm)
     return artery, deploy(
-        catalogue.find_design(key), artery, size=size, landing=Landing(0.5 * float(artery.axis.length_mm))
+        catalogue.find_design(key), artery, size=size, landing=Landing(0.5 * float(artery.parent.axis.length_mm))
     )
 
 

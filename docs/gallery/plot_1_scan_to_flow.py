@@ -48,7 +48,7 @@ for first, last in zip(stent.wire_starts[:-1], stent.wire_starts[1:], strict=Tru
     axes.plot(wire_mm[:, across], wire_mm[:, along], color="0.4", linewidth=0.4)
 for line_mm, color, label in (
     (np.vstack([sac.neck_mm, sac.neck_mm[:1]]), "tab:red", "neck"),
-    (anatomy.axis.points_mm, "tab:blue", "axis of the parent artery"),
+    (anatomy.parent.axis.points_mm, "tab:blue", "axis of the parent artery"),
 ):
     axes.plot(line_mm[:, across], line_mm[:, along], color=color, label=label)
 axes.plot(

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tubes import on_parent
 
 import vstent
 from vstent import phantoms
@@ -33,9 +34,9 @@ def cut(whole: Anatomy, mm: float) -> Anatomy:
 
 
 def test_a_long_artery_stays_as_it_is(whole: Anatomy) -> None:
-    assert whole.continued_mm == (0.0, 0.0)
+    assert whole.parent.continued_mm == (0.0, 0.0)
     assert continued(whole) is whole
-    assert not whole.is_continued.any()
+    assert not whole.parent.is_continued.any()
     healthy = replace(whole, aneurysms=())
     assert continued(healthy) is healthy
 
@@ -43,54 +44,55 @@ def test_a_long_artery_stays_as_it_is(whole: Anatomy) -> None:
 def test_a_short_artery_without_a_sac_is_continued_about_its_middle() -> None:
     short = restore(trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=12.0), edge_mm=0.3))))
     assert not short.aneurysms
-    np.testing.assert_allclose(short.continued_mm, ENOUGH_MM - 6.0, atol=0.3)
-    assert short.axis.length_mm == pytest.approx(2 * ENOUGH_MM, abs=0.01)
+    np.testing.assert_allclose(short.parent.continued_mm, ENOUGH_MM - 6.0, atol=0.3)
+    assert short.parent.axis.length_mm == pytest.approx(2 * ENOUGH_MM, abs=0.01)
 
 
 def test_a_straight_artery_is_continued_along_itself(whole: Anatomy) -> None:
     short = cut(whole, 6.0)
     first_mm, last_mm = neck_span_mm(short)
     assert first_mm == pytest.approx(ENOUGH_MM)
-    assert short.axis.length_mm - last_mm == pytest.approx(ENOUGH_MM)
-    np.testing.assert_allclose(short.continued_mm, ENOUGH_MM - 6.0, atol=0.6)
-    points_mm = short.axis.points_mm
+    assert short.parent.axis.length_mm - last_mm == pytest.approx(ENOUGH_MM)
+    np.testing.assert_allclose(short.parent.continued_mm, ENOUGH_MM - 6.0, atol=0.6)
+    points_mm = short.parent.axis.points_mm
     assert np.linalg.norm(points_mm[:, :2], axis=1).max() < 0.1
     steps_mm = np.linalg.norm(np.diff(points_mm, axis=0), axis=1)
     assert steps_mm.max() / steps_mm.min() < 1.3
-    new = short.axis.abscissa_mm < short.own_mm[0] - 1e-6
-    np.testing.assert_allclose(short.section_radius_mm[new], 2.0, atol=0.04)
+    new = short.parent.axis.abscissa_mm < short.parent.own_mm[0] - 1e-6
+    np.testing.assert_allclose(short.parent.section_radius_mm[new], 2.0, atol=0.04)
 
 
 def test_an_oval_section_relaxes_to_the_circle_of_its_area(whole: Anatomy) -> None:
     """After RELAXING_DIAMETERS diameters 1/e of the difference from the circle is left."""
     short = cut(whole, 6.0)
-    rings_mm = whole.landing_surface.vertices_mm.copy() * [1.15, 1 / 1.15, 1.0]
-    surface = replace(whole.landing_surface, vertices_mm=rings_mm)
+    rings_mm = whole.parent.landing_surface.vertices_mm.copy() * [1.15, 1 / 1.15, 1.0]
+    surface = replace(whole.parent.landing_surface, vertices_mm=rings_mm)
     first_mm, _ = neck_span_mm(whole)
-    sac = replace(whole.aneurysms[0], proximal_abscissa_mm=4.0)
-    oval = continued(replace(whole, landing_surface=surface, aneurysms=(sac,)))
-    added_mm = oval.continued_mm[0]
+    points_mm = whole.parent.axis.at(np.linspace(4.0, neck_span_mm(whole)[1], 9))
+    sac = replace(whole.aneurysms[0], neck_mm=points_mm)
+    oval = continued(replace(on_parent(whole, landing_surface=surface), aneurysms=(sac,)))
+    added_mm = oval.parent.continued_mm[0]
     assert added_mm == pytest.approx(ENOUGH_MM - 4.0)
-    rings = oval.landing_surface.vertices_mm.reshape(len(oval.axis.points_mm), -1, 3)
-    rho_mm = np.linalg.norm(rings - oval.axis.points_mm[:, None], axis=2)
-    new = np.flatnonzero(oval.axis.abscissa_mm < added_mm - 1e-6)
+    rings = oval.parent.landing_surface.vertices_mm.reshape(len(oval.parent.axis.points_mm), -1, 3)
+    rho_mm = np.linalg.norm(rings - oval.parent.axis.points_mm[:, None], axis=2)
+    new = np.flatnonzero(oval.parent.axis.abscissa_mm < added_mm - 1e-6)
     at_end = rho_mm[new[-1] + 1]
     radius_mm = np.sqrt((at_end**2).mean())
-    from_end_mm = added_mm - oval.axis.abscissa_mm[new]
+    from_end_mm = added_mm - oval.parent.axis.abscissa_mm[new]
     expected = radius_mm + np.exp(-from_end_mm / (2 * radius_mm * RELAXING_DIAMETERS))[:, None] * (at_end - radius_mm)
     np.testing.assert_allclose(rho_mm[new], expected, rtol=1e-6)
     assert first_mm > ENOUGH_MM > 0
-    assert short.landing_surface.faces.max() == len(short.landing_surface.vertices_mm) - 1
+    assert short.parent.landing_surface.faces.max() == len(short.parent.landing_surface.vertices_mm) - 1
 
 
 def test_what_lies_in_the_continuation_counts_in_no_measure_of_the_wall(whole: Anatomy) -> None:
     short = cut(whole, 4.0)
-    z_mm = short.landing_surface.corners_mm.mean(axis=1)[:, 2]
+    z_mm = short.parent.landing_surface.corners_mm.mean(axis=1)[:, 2]
     own = (z_mm > short.vessel.lumen.vertices_mm[:, 2].min()) & (z_mm < short.vessel.lumen.vertices_mm[:, 2].max())
-    assert not short.is_patient_face[~own].any()
+    assert not short.parent.is_patient_face[~own].any()
     silk = vstent.find_design("silk")
     deployment = vstent.deploy(silk, short, size=propose_size(silk, whole))
-    apart = replace(short, landing_surface=replace(short.landing_surface))  # same wall; gaps are kept by node
+    apart = on_parent(short, landing_surface=replace(short.parent.landing_surface))  # same wall; gaps are kept by node
     gap_mm = deployment.wall_gap_mm.copy()
     rows_mm = deployment.stent.nodes_mm[..., 2].mean(axis=1)
     first_mm, last_mm = short.vessel.lumen.vertices_mm[:, 2].min(), short.vessel.lumen.vertices_mm[:, 2].max()

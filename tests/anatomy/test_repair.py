@@ -13,7 +13,7 @@ from vstent.io.surfaces import read_surface
 from vstent.kernels import topology, triangles
 
 ROWS, AROUND = 31, 32
-SOUND = tube(line(15.0, 0.5), 2.0, 1.7, around=AROUND).landing_surface
+SOUND = tube(line(15.0, 0.5), 2.0, 1.7, around=AROUND).parent.landing_surface
 CUBE = np.array([[x, y, z] for x in (0.0, 1) for y in (0.0, 1) for z in (0.0, 1)])
 CUBE_FACES = np.array(
     [
@@ -164,7 +164,7 @@ def test_loose_piece_is_dropped_and_its_size_told():
 
 
 def test_an_opening_that_looks_sideways_out_of_the_wall_is_told_with_its_place():
-    wall = tube(line(15.0, 0.25), 2.0, 2.0, around=48).landing_surface
+    wall = tube(line(15.0, 0.25), 2.0, 2.0, around=48).parent.landing_surface
     keep = np.linalg.norm(wall.corners_mm.mean(axis=1) - [2.0, 0, 7.5], axis=1) > 1.2
     surface, notes = repair(Surface(wall.vertices_mm, wall.faces[keep]))
     assert len(surface.boundary_loops) == 3

@@ -30,7 +30,7 @@ def turned(radius_mm, height_mm, turns=180):
     faces.append(np.stack([here + last, there + last, np.full(turns, top)], axis=1))
     disc = np.stack([there, here, np.full(turns, bottom)], axis=1)
     sac = Surface(vertices, np.concatenate([*faces, disc]))
-    return Aneurysm(sac, Surface(vertices, disc[:, ::-1]), vertices[:turns], 13.0, 17.0)
+    return Aneurysm(sac, Surface(vertices, disc[:, ::-1]), vertices[:turns])
 
 
 def half_ellipsoid(a_mm, c_mm, rings=120):

@@ -328,7 +328,7 @@ def test_any_blob_is_restored_or_refused(seed: int, n: int, n_gone: int, squash:
     with suppress(InputError):
         vessel = trace(Vessel(repair(Surface(points, faces))[0]))
         assert len(vessel.centerlines) == len(vessel.outlets)
-        assert len(restore(trim(vessel)).landing_surface.boundary_loops) == 2
+        assert len(restore(trim(vessel)).parent.landing_surface.boundary_loops) == 2
 
 
 def test_a_lens_of_two_flat_sides_is_no_vessel() -> None:

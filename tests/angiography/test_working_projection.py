@@ -1,11 +1,13 @@
 """The proposed C-arm direction on vessels for which it is known."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from vstent.angiography.view import axes_of
 from vstent.angiography.working_projection import overlap, working_projection
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Vessel
+from vstent.geometry.vessel import PARENT, Anatomy, Aneurysm, Centerline, Path, Vessel
 
 
 def sphere(center, radius) -> np.ndarray:
@@ -25,10 +27,11 @@ def artery(along: np.ndarray, toward_sac: np.ndarray) -> Anatomy:
     tube = Surface((line[:, None] + 2 * ring).reshape(-1, 3), np.array([[0, 1, 2]]))
     neck = Surface(np.stack([2 * toward_sac, 2 * toward_sac + along, 2 * toward_sac + side]), np.array([[0, 1, 2]]))
     sac = Surface(sphere(4.5 * toward_sac, 3.0), np.array([[0, 1, 2]]))
-    aneurysm = Aneurysm(sac, neck, neck.vertices_mm, 13.0, 17.0)
+    aneurysm = Aneurysm(sac, neck, 2 * toward_sac + np.outer([-2.0, 2.0], along))
     axis = Centerline(line, np.full(121, 2.0))
     n = len(tube.vertices_mm)
-    return Anatomy(Vessel(tube), axis, np.full(121, 2.0), tube, np.zeros(n, bool), (aneurysm,))
+    parent = Path(PARENT, axis, np.full(121, 2.0), tube, np.zeros(n, bool))
+    return Anatomy(Vessel(tube), (parent,), (aneurysm,))
 
 
 def test_the_beam_is_across_artery_and_sac():
@@ -53,8 +56,6 @@ def test_overlap_is_the_hidden_part_of_the_sac():
 
 def test_without_a_sac_the_artery_is_seen_at_full_length():
     anatomy = artery(np.array([0.0, 1, 0]), np.array([1.0, 0, 0]))
-    bare = Anatomy(
-        anatomy.vessel, anatomy.axis, anatomy.section_radius_mm, anatomy.landing_surface, anatomy.is_restored, ()
-    )
+    bare = replace(anatomy, aneurysms=())
     beam = axes_of(*working_projection(bare))[2]
     assert abs(beam @ [0, 1, 0]) < 1e-9

@@ -254,7 +254,7 @@ def test_a_device_dragged_out_of_the_artery_is_refused_with_a_sentence(client, c
 
 def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     anatomy = anatomy_of(client, case, workspace)
-    device = SILK | {"center_mm": round(anatomy.axis.length_mm / 2, 3)}
+    device = SILK | {"center_mm": round(anatomy.parent.axis.length_mm / 2, 3)}
     assert choose(client, case, devices=[device]).status_code == 200
     told, data = app_case.opened(client.post(f"{case}/deployment", json={"device": device, "colour": "coverage"}))
     deployment = deploy(find_design("silk"), anatomy, landing=Landing(device["center_mm"]))

@@ -79,10 +79,10 @@ def test_elasticity_alone_leaves_a_straight_line_of_equal_points_alone():
 
 def test_tree_and_brute_force_answer_alike_on_random_segments(bend):
     rng = np.random.default_rng(2)
-    low, high = bend.landing_surface.vertices_mm.min(axis=0), bend.landing_surface.vertices_mm.max(axis=0)
+    low, high = bend.parent.landing_surface.vertices_mm.min(axis=0), bend.parent.landing_surface.vertices_mm.max(axis=0)
     starts, ends = rng.uniform(low - 0.5, high + 0.5, size=(2, 150, 3))
     ends[:75] = starts[:75] + 0.3 * (ends[:75] - starts[:75])
-    fast, slow = TreeWall(bend.landing_surface), BruteWall(bend.landing_surface)
+    fast, slow = TreeWall(bend.parent.landing_surface), BruteWall(bend.parent.landing_surface)
     crossed = slow.crosses(starts, ends)
     assert 20 < crossed.sum() < 130
     assert np.array_equal(fast.crosses(starts, ends), crossed)
@@ -93,17 +93,17 @@ def test_tree_and_brute_force_answer_alike_on_random_segments(bend):
 
 def start(artery, method, radius_mm, rows=ROWS):
     z = np.linspace(2, 6, rows)
-    across = contour.planes(artery.axis)
+    across = contour.planes(artery.parent.axis)
     turn = np.array([[np.cos(0.1), np.sin(0.1)], [-np.sin(0.1), np.cos(0.1)]])  # no node has two nearest points
     nodes_mm = across.place(z, contour.circles(np.full(rows, radius_mm), COLUMNS) @ turn)
-    wall, centers_mm = TreeWall(artery.landing_surface), across.middle(z)
+    wall, centers_mm = TreeWall(artery.parent.landing_surface), across.middle(z)
     return method.init(nodes_mm, centers_mm, wall.contact(centers_mm).distance_mm, wall)
 
 
 def test_forces_are_those_of_equations_4_and_5(artery):
     method = ActiveContour(k1=0.7, k2=0.13)
     state = start(artery, method, 1.2)
-    brute = BruteWall(artery.landing_surface).contact(state.nodes_mm.reshape(-1, 3))
+    brute = BruteWall(artery.parent.landing_surface).contact(state.nodes_mm.reshape(-1, 3))
     d2 = brute.closest_mm.reshape(state.nodes_mm.shape) - state.nodes_mm
     d1 = np.linalg.norm(d2, axis=2, keepdims=True)
     radial = state.nodes_mm - state.centers_mm
@@ -118,9 +118,9 @@ def test_each_node_is_put_into_its_state_and_relocated_by_equations_6_and_7(arte
     scale = rng.uniform(0.8, 2.2, size=(ROWS, COLUMNS, 1))
     centers = before.centers_mm
     moved = dataclasses.replace(before, nodes_mm=centers + scale * (before.nodes_mm - centers))
-    after = method.classify(moved, np.ones((ROWS, COLUMNS), dtype=bool), TreeWall(artery.landing_surface))
+    after = method.classify(moved, np.ones((ROWS, COLUMNS), dtype=bool), TreeWall(artery.parent.landing_surface))
 
-    wall = BruteWall(artery.landing_surface)
+    wall = BruteWall(artery.parent.landing_surface)
     p = moved.nodes_mm.reshape(-1, 3)
     found = wall.contact(p)
     crosses = wall.crosses(before.centers_mm.reshape(-1, 3), p)
@@ -136,21 +136,21 @@ def test_each_node_is_put_into_its_state_and_relocated_by_equations_6_and_7(arte
 def test_a_node_exactly_on_the_wall_is_put_inside(artery):
     method = ActiveContour(dd_mm=0.1)
     state = start(artery, method, 1.0)
-    corners = artery.landing_surface.corners_mm
+    corners = artery.parent.landing_surface.corners_mm
     inner = triangles.normals(corners)
     middle = corners.mean(axis=1)[np.abs(corners.mean(axis=1)[:, 2] - 4) < 1][: ROWS * COLUMNS]
     inner = inner[np.abs(corners.mean(axis=1)[:, 2] - 4) < 1][: ROWS * COLUMNS]
     nodes_mm = state.nodes_mm.reshape(-1, 3).copy()
     nodes_mm[: len(middle)] = middle
     state = dataclasses.replace(state, nodes_mm=nodes_mm.reshape(state.nodes_mm.shape))
-    state = method.classify(state, np.ones((ROWS, COLUMNS), dtype=bool), TreeWall(artery.landing_surface))
+    state = method.classify(state, np.ones((ROWS, COLUMNS), dtype=bool), TreeWall(artery.parent.landing_surface))
     assert np.allclose(state.nodes_mm.reshape(-1, 3)[: len(middle)], middle - 0.1 * inner, atol=1e-9)
 
 
 def test_the_fraction_of_terminated_nodes_never_falls_and_terminated_nodes_stay(bend):
     method = ActiveContour(k1=0.15, k2=0.01)
-    wall = TreeWall(bend.landing_surface)
-    across = contour.planes(bend.axis)
+    wall = TreeWall(bend.parent.landing_surface)
+    across = contour.planes(bend.parent.axis)
     s = np.linspace(4, 10, 30)
     nodes_mm = across.place(s, contour.circles(np.full(30, 0.9), 20))
     seen = []
@@ -168,7 +168,7 @@ def test_the_fraction_of_terminated_nodes_never_falls_and_terminated_nodes_stay(
 
 def test_terminated_nodes_do_not_move(artery):
     method = ActiveContour(k1=0.2)
-    wall = TreeWall(artery.landing_surface)
+    wall = TreeWall(artery.parent.landing_surface)
     state = start(artery, method, 1.3)
     for _ in range(20):
         following = method.step(state, wall)
@@ -180,7 +180,7 @@ def test_terminated_nodes_do_not_move(artery):
 
 def test_too_few_iterations_are_a_result_not_an_error(artery):
     method = ActiveContour(k1=0.01, k2=0.0, iteration_limit=3)
-    done = relax(method, start(artery, method, 0.8), TreeWall(artery.landing_surface))
+    done = relax(method, start(artery, method, 0.8), TreeWall(artery.parent.landing_surface))
     assert done.outcome == "iteration_limit"
     assert len(done.history_mm) == len(done.energy_mm2) == 4
 
@@ -188,7 +188,7 @@ def test_too_few_iterations_are_a_result_not_an_error(artery):
 def test_weights_that_blow_up_are_refused(artery):
     method = ActiveContour(k1=1e308, tau=1e10)
     with pytest.raises(InputError, match="diverged in iteration 1"), np.errstate(all="ignore"):
-        relax(method, start(artery, method, 0.8), TreeWall(artery.landing_surface))
+        relax(method, start(artery, method, 0.8), TreeWall(artery.parent.landing_surface))
 
 
 def test_the_energy_wakes_no_threads_whose_number_would_change_its_last_bits():

@@ -39,7 +39,7 @@ def compared(name):
     anatomy, middle_mm, axes = artery(name)
     stent = deploy(BRAID, anatomy, size=BRAID.sizes[0], landing=Landing(middle_mm)).stent
     shape, case = formulas.grid(BRAID, BRAID.sizes[0]), RODS[name]
-    rods_mm = np.array(case["points_mm"]) @ axes + anatomy.axis.at(np.array([middle_mm]))[0]
+    rods_mm = np.array(case["points_mm"]) @ axes + anatomy.parent.axis.at(np.array([middle_mm]))[0]
     lattice_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
     nearest_mm = []
     for turn in range(0, 24, 2) if not case["bend_mm"] else [0]:  # about a straight axis a braid may lie turned
@@ -52,7 +52,7 @@ def _turned_back(rods_mm, ours_mm, case, anatomy):
     """The rods turned about a straight axis by what is left of the angle."""
     if case["bend_mm"]:
         return rods_mm
-    offset = anatomy.axis.points_mm[0, :2]
+    offset = anatomy.parent.axis.points_mm[0, :2]
     a, b = ((p[:, :2] - offset) @ np.array([1, 1j]) for p in (rods_mm, ours_mm))
     away = a * np.exp(1j * np.angle((b * a.conj()).sum()))
     return np.stack([away.real + offset[0], away.imag + offset[1], rods_mm[:, 2]], axis=1)

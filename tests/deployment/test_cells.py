@@ -41,10 +41,10 @@ def test_cells_leave_the_wall_outside_the_bend_and_nowhere_else():
     done, shape = deployed(), grid(ENTERPRISE, SIZE)
     joints_mm = done.stent.nodes_mm[:: shape.row_split, :: shape.column_split]
     gap_mm = done.wall_gap_mm[:: shape.row_split, :: shape.column_split]
-    s = bend().axis.nearest_abscissa_mm(joints_mm.reshape(-1, 3)).reshape(gap_mm.shape)
-    toward = np.gradient(np.gradient(bend().axis.points_mm, axis=0), axis=0)
-    toward = np.stack([np.interp(s, bend().axis.abscissa_mm, values) for values in toward.T], axis=-1)
-    aside = np.einsum("ijk,ijk->ij", joints_mm - bend().axis.at(s.ravel()).reshape(joints_mm.shape), toward)
+    s = bend().parent.axis.nearest_abscissa_mm(joints_mm.reshape(-1, 3)).reshape(gap_mm.shape)
+    toward = np.gradient(np.gradient(bend().parent.axis.points_mm, axis=0), axis=0)
+    toward = np.stack([np.interp(s, bend().parent.axis.abscissa_mm, values) for values in toward.T], axis=-1)
+    aside = np.einsum("ijk,ijk->ij", joints_mm - bend().parent.axis.at(s.ravel()).reshape(joints_mm.shape), toward)
     in_bend = (s > 15) & (s < 14 + BEND_MM * np.pi / 2 - 1)
     assert 0.05 < gap_mm.max() < 0.5
     assert gap_mm[in_bend & (aside > 0)].max() < 0.02

@@ -48,7 +48,7 @@ def deployed(design, anatomy):
 
 @pytest.mark.parametrize("design", [ENTERPRISE, ATLAS, PIPELINE])
 def test_in_a_straight_artery_every_cell_has_its_full_width(design):
-    found = cells(deployed(design, artery()).stent, artery().axis)
+    found = cells(deployed(design, artery()).stent, artery().parent.axis)
     assert found.width_fraction == pytest.approx(np.ones(len(found.width_fraction)), abs=0.004)
     assert not found.inward.any()
 
@@ -69,7 +69,7 @@ def test_a_cell_that_is_turned_about_its_height_is_as_wide_as_its_cosine(turn_ra
     changed = replace(stent, nodes_mm=nodes_mm)
     found = crumpling(artery(), changed)
     diameter_mm = [one.row_diameter_mm[row * shape.row_split] for one in (stent, changed)]
-    width = cells(changed, artery().axis).width_fraction
+    width = cells(changed, artery().parent.axis).width_fraction
     lattice_row, cells_around = row - 1, shape.lattice_columns // 2
     of_row = slice(lattice_row * cells_around, (lattice_row + 1) * cells_around)
     expected = np.cos(turn_rad) * diameter_mm[0] / diameter_mm[1]
@@ -87,7 +87,7 @@ def test_in_a_bend_widths_are_those_of_the_corners_seen_from_the_middle_of_the_t
     stent = deployed(design, anatomy).stent
     shape = grid(design, stent.size)
     joints_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
-    found, expected, inward = cells(stent, anatomy.axis), [], []
+    found, expected, inward = cells(stent, anatomy.parent.axis), [], []
     for row in range(1, shape.lattice_rows - 1):
         for column in range(1 - row % 2, shape.lattice_columns, 2):
             sides = [(row, (column - 1) % shape.lattice_columns), (row, (column + 1) % shape.lattice_columns)]
@@ -113,7 +113,7 @@ def test_in_a_bend_widths_are_those_of_the_corners_seen_from_the_middle_of_the_t
 def test_outside_a_bend_cells_are_as_narrow_as_the_net_of_chebyshev_and_inside_none_is_crumpled():
     anatomy, size = artery(7.0), SIZES["pipeline"]
     stent = deployed(PIPELINE, anatomy).stent
-    found, diameter_mm = cells(stent, anatomy.axis), float(np.median(stent.row_diameter_mm))
+    found, diameter_mm = cells(stent, anatomy.parent.axis), float(np.median(stent.row_diameter_mm))
     spacing_mm = row_spacing_mm(PIPELINE, size, diameter_mm, 1 / 7.0)
     straight_mm = row_spacing_mm(PIPELINE, size, diameter_mm)
     sine = np.sin(angle_rad(PIPELINE, size, diameter_mm))
@@ -169,5 +169,5 @@ def test_a_free_crown_that_moves_along_the_artery_leaves_the_width_of_its_cells(
     apart_mm[0, 4, :, 2], apart_mm[1, 4, :, 2] = -0.2, 0.2
     moved = replace(stent, crown_shift_mm=apart_mm)
     still: Stent = replace(stent, crown_shift_mm=np.zeros_like(apart_mm))
-    both = [cells(one, artery().axis).width_fraction for one in (moved, still)]
+    both = [cells(one, artery().parent.axis).width_fraction for one in (moved, still)]
     assert both[0] == pytest.approx(both[1], abs=0.02)

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from tubes import arc, line, tube, with_neck
+from tubes import arc, line, on_parent, tube, with_neck
 
 from vstent.anatomy import landing_zones
 from vstent.deployment import cells, contour, pieces, sizing
@@ -69,7 +69,7 @@ def deployed(anatomy, design=SILK, size=SILK_SIZE, landing=None):
 
 def wall_distance_mm(anatomy, deployment):
     nodes_mm = deployment.stent.nodes_mm
-    return anatomy.landing_surface.closest(nodes_mm.reshape(-1, 3))[1].reshape(nodes_mm.shape[:2])
+    return anatomy.parent.landing_surface.closest(nodes_mm.reshape(-1, 3))[1].reshape(nodes_mm.shape[:2])
 
 
 def outside_mm(anatomy, deployment):
@@ -159,8 +159,8 @@ def test_in_a_bend_the_braid_is_denser_inside_and_sparser_outside(side):
     stent = deployed(bent()).stent
     quads_mm = 0.5 * (stent.nodes_mm[1:] + stent.nodes_mm[:-1])
     center_mm = 0.5 * (quads_mm + np.roll(quads_mm, -1, axis=1))
-    _, frames = contour.planes(bent().axis).at(stent.row_abscissa_mm)
-    middle_mm = bent().axis.at(stent.row_abscissa_mm)
+    _, frames = contour.planes(bent().parent.axis).at(stent.row_abscissa_mm)
+    middle_mm = bent().parent.axis.at(stent.row_abscissa_mm)
     toward = frames[:-1, None, 0] @ np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])  # the bend's center
     aside_mm = np.einsum("ijk,ijk->ij", center_mm - middle_mm[:-1, None], np.broadcast_to(-toward, center_mm.shape))
     s = stent.row_abscissa_mm
@@ -206,7 +206,7 @@ def test_on_a_regular_lattice_nothing_slides():
 def test_rows_of_a_bend_tilt_and_draw_together_about_the_one_that_is_landed(held):
     n = len(deployed(bent()).stent.nodes_mm)
     s = np.arange(n) * formulas.row_spacing_mm(SILK, SILK_SIZE, 3.7)
-    flat_mm = contour.planes(bent().axis).place(s + 5.0, contour.circles(np.full(n, 1.85), 48))
+    flat_mm = contour.planes(bent().parent.axis).place(s + 5.0, contour.circles(np.full(n, 1.85), 48))
     held %= n
     row = pieces.slide(SILK, SILK_SIZE, flat_mm, held, cells.as_drawn).row
     assert np.ptp(row - np.arange(n)[:, None]) > 0.5
@@ -287,7 +287,9 @@ def test_in_a_wider_tube_the_device_stays_at_its_free_diameter_and_the_gap_is_sh
 def test_where_the_artery_widens_only_the_wide_part_stands_off():
     done = deployed(widening())
     diameter_mm = contour.perimeters(done.stent.nodes_mm) / np.pi
-    lumen_mm = 2 * np.interp(done.stent.row_abscissa_mm, widening().axis.abscissa_mm, widening().section_radius_mm)
+    lumen_mm = 2 * np.interp(
+        done.stent.row_abscissa_mm, widening().parent.axis.abscissa_mm, widening().parent.section_radius_mm
+    )
     wide, narrow = lumen_mm > 4.2 + 0.25, lumen_mm < 4.2 - 0.1
     assert min(wide.sum(), narrow.sum()) > 10
     assert diameter_mm.max() <= SILK_SIZE.free_diameter_mm * (1 + 1e-6)
@@ -313,7 +315,7 @@ def test_a_device_that_ends_in_a_wide_piece_of_a_bend_is_as_long_as_its_rows_say
     diameter_mm = contour.perimeters(stent.nodes_mm) / np.pi
     half_mm = 0.5 * (diameter_mm[1:] + diameter_mm[:-1])
     middle_mm = 0.5 * (stent.row_abscissa_mm[1:] + stent.row_abscissa_mm[:-1])
-    across = contour.planes(anatomy.axis)
+    across = contour.planes(anatomy.parent.axis)
     curvature = np.interp(middle_mm, across.abscissa_mm, across.curvature_per_mm)
     closed_mm = formulas.row_spacing_mm(SILK, SILK_SIZE, half_mm, curvature).sum()
     assert stent.deployed_length_mm == pytest.approx(closed_mm, abs=0.2)
@@ -349,15 +351,15 @@ def test_a_moved_artery_gives_the_moved_stent():
     turn = turn * np.sign(np.linalg.det(turn))
     shift = np.array([30.0, -80.0, 120.0])
     here = tube(arc(BEND_MM, 1.0, 8, 0.4), 2.0, 1.8, around=64)
-    vertices_mm = here.landing_surface.vertices_mm
+    vertices_mm = here.parent.landing_surface.vertices_mm
     waves = 0.04 * np.sin(vertices_mm @ rng.normal(size=(3, 3)))  # no point has two nearest ones by symmetry
-    here = replace(here, landing_surface=Surface(vertices_mm + waves, here.landing_surface.faces))
+    here = on_parent(here, landing_surface=Surface(vertices_mm + waves, here.parent.landing_surface.faces))
 
     def moved(surface):
         return Surface(surface.vertices_mm @ turn.T + shift, surface.faces)
 
-    axis = Centerline(here.axis.points_mm @ turn.T + shift, here.axis.inscribed_radius_mm)
-    there = replace(here, axis=axis, landing_surface=moved(here.landing_surface))
+    axis = Centerline(here.parent.axis.points_mm @ turn.T + shift, here.parent.axis.inscribed_radius_mm)
+    there = on_parent(here, axis=axis, landing_surface=moved(here.parent.landing_surface))
     size = catalogue.find_size(SILK, diameter_mm=4, length_mm=15)
     a, b = (deploy(SILK, anatomy, size=size, landing=Landing(11.0)) for anatomy in (here, there))
     assert a.stent.nodes_mm @ turn.T + shift == pytest.approx(b.stent.nodes_mm, abs=1e-6)
@@ -475,7 +477,7 @@ def test_near_the_end_of_the_artery_the_landing_gives_way():
 def longer_than_foreseen():
     """A neck near the distal end of an artery whose wall is 0.2 mm narrower than its sections say."""
     anatomy = with_neck(straight(), 25.0, 29.0)
-    return replace(anatomy, section_radius_mm=anatomy.section_radius_mm + 0.1)
+    return on_parent(anatomy, section_radius_mm=anatomy.parent.section_radius_mm + 0.1)
 
 
 def test_a_device_that_would_leave_the_artery_where_it_is_proposed_is_moved_into_it():
@@ -593,7 +595,9 @@ def test_of_a_device_that_is_as_it_should_be_no_more_is_said(anatomy):
 
 
 def test_of_a_device_wholly_over_restored_wall_nothing_is_said_of_gaps():
-    restored = replace(straight(), is_restored=np.ones(len(straight().landing_surface.vertices_mm), dtype=bool))
+    restored = on_parent(
+        straight(), is_restored=np.ones(len(straight().parent.landing_surface.vertices_mm), dtype=bool)
+    )
     assert deploy(SILK, restored, size=SILK_SIZE).advice.endswith(
         "(deployed length 18.0 mm). All of it is over restored wall."
     )

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from tubes import arc, line, tube
+from tubes import arc, line, on_parent, tube
 
 from vstent.anatomy.repair import repair
 from vstent.anatomy.restore.restore import restore
@@ -42,9 +42,9 @@ def straight(radius_mm=1.9):
 def wavy():
     """An artery whose sections are no circles: the contour needs several iterations."""
     artery = tube(arc(7.0, 1.2, 12), 1.9)
-    vertices_mm, surface = artery.landing_surface.vertices_mm, artery.landing_surface
-    middle_mm = np.repeat(artery.axis.points_mm, 160, axis=0)
-    angle = np.tile(2 * np.pi * np.arange(160) / 160, len(artery.axis.points_mm))
+    vertices_mm, surface = artery.parent.landing_surface.vertices_mm, artery.parent.landing_surface
+    middle_mm = np.repeat(artery.parent.axis.points_mm, 160, axis=0)
+    angle = np.tile(2 * np.pi * np.arange(160) / 160, len(artery.parent.axis.points_mm))
     growth = 1 + 0.12 * (1 + np.cos(3 * angle))
     return replace(
         artery, landing_surface=Surface(middle_mm + growth[:, None] * (vertices_mm - middle_mm), surface.faces)
@@ -103,7 +103,7 @@ def test_the_energy_is_equation_1():
         (weights.a4, np.roll(v, -1, axis=1) - 2 * v + np.roll(v, 1, axis=1)),
         (2 * weights.a5, np.roll(v_s, -1, axis=1) - v_s),
     )
-    distance_mm = wavy().landing_surface.closest(v.reshape(-1, 3))[1]
+    distance_mm = wavy().parent.landing_surface.closest(v.reshape(-1, 3))[1]
     outer = (weights.k1 * distance_mm**2 + 2 * weights.k2 * distance_mm).sum()
     assert done.energy_mm2[0] == pytest.approx(sum(a * (d**2).sum() for a, d in terms) + outer, rel=1e-9)
     assert done.energy_mm2[-1] < 0.5 * done.energy_mm2[0]
@@ -130,12 +130,12 @@ def test_the_mirrored_artery_gives_the_mirrored_contour(method):
     mirror = np.array([1.0, -1.0, 1.0])
     here = tube(arc(7.0, 1.0, 12, 0.25), 2.0, 1.8, around=96)
     rng = np.random.default_rng(3)
-    vertices_mm = here.landing_surface.vertices_mm
+    vertices_mm = here.parent.landing_surface.vertices_mm
     vertices_mm = vertices_mm + 0.05 * np.sin(vertices_mm @ rng.normal(size=(3, 3)))
-    here = replace(here, landing_surface=Surface(vertices_mm, here.landing_surface.faces))
-    axis = Centerline(here.axis.points_mm * mirror, here.axis.inscribed_radius_mm)
-    flipped = Surface(vertices_mm * mirror, here.landing_surface.faces[:, ::-1])
-    there = replace(here, axis=axis, landing_surface=flipped)
+    here = on_parent(here, landing_surface=Surface(vertices_mm, here.parent.landing_surface.faces))
+    axis = Centerline(here.parent.axis.points_mm * mirror, here.parent.axis.inscribed_radius_mm)
+    flipped = Surface(vertices_mm * mirror, here.parent.landing_surface.faces[:, ::-1])
+    there = on_parent(here, axis=axis, landing_surface=flipped)
     a, b = (deploy(SILK, x, size=SIZE, landing=Landing(14.0), method=method).stent.nodes_mm for x in (here, there))
     columns = -np.arange(a.shape[1]) % a.shape[1]
     assert (a * mirror)[:, columns] == pytest.approx(b, abs=1e-5)
@@ -266,8 +266,8 @@ def test_in_real_arteries_every_node_lies_inside_and_the_ends_as_near_to_the_wal
     # The landing surface is closed across sac and branches: what is not outside it is in neither.
     assert measure(anatomy, done)["max_outside_mm"] <= 0.002
     # A row that has its free perimeter, or whose artery is wider, touches where it can, and no more is asked of it.
-    free_mm, axis = done.stent.size.free_diameter_mm, anatomy.axis
-    artery_mm = 2 * np.interp(done.stent.row_abscissa_mm, axis.abscissa_mm, anatomy.section_radius_mm)
+    free_mm, axis = done.stent.size.free_diameter_mm, anatomy.parent.axis
+    artery_mm = 2 * np.interp(done.stent.row_abscissa_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm)
     is_free = (perimeters(done.stent.nodes_mm) > 0.99 * np.pi * free_mm) | (artery_mm > free_mm)
     gap_mm = np.where(is_free, 0.0, done.wall_gap_mm.max(axis=1))
     assert max(gap_mm[:3].max(), gap_mm[-3:].max()) <= max(0.002, gap_mm[3:-3].max())

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from tubes import arc, line, tube
+from tubes import arc, line, on_parent, tube
 
 from vstent.deployment.braid import over_openings
 from vstent.deployment.deploy import deploy
@@ -18,7 +18,6 @@ from vstent.devices.stent import Landing
 from vstent.errors import DeviceError
 from vstent.flow.case import Blood
 from vstent.flow.screen import screen
-from vstent.geometry.vessel import Anatomy
 
 FREE_MM, WIDER_MM = 3.7, 4.3
 PROFILE = ((0.0, WIDER_MM), (0.08, FREE_MM), (0.92, FREE_MM), (1.0, WIDER_MM))
@@ -137,11 +136,11 @@ def test_a_flare_opens_until_its_wires_lie_across_the_axis():
 def outer_neck():
     """The bend with a part of the outer side of its wall restored, as over a neck."""
     artery = bend()
-    points_mm = artery.landing_surface.vertices_mm
-    s = artery.axis.nearest_abscissa_mm(points_mm)
+    points_mm = artery.parent.landing_surface.vertices_mm
+    s = artery.parent.axis.nearest_abscissa_mm(points_mm)
     away = np.linalg.norm(points_mm - [7.0, 0.0, 0.0], axis=1) > 7.0 + 0.5 * RADIUS_MM
     is_neck = (np.abs(s - 19.5) < 2.0) & away & (np.abs(points_mm[:, 1]) < 1.6)
-    return Anatomy(artery.vessel, artery.axis, artery.section_radius_mm, artery.landing_surface, is_neck, ())
+    return on_parent(artery, is_restored=is_neck)
 
 
 def test_free_crowns_point_out_over_a_neck_outside_a_bend_and_into_the_lumen_inside_it():

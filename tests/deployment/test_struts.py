@@ -114,11 +114,11 @@ def test_outer_faces_touch_the_wall_and_never_pass_it(design, artery):
     half_mm = 0.5 * (design.strut_thickness_um * 1e-3 if design is ENTERPRISE else 0)
     if design is SILK:
         half_mm = np.repeat(placed.wire_diameter_um, np.diff(placed.wire_starts)) * 5e-4
-    distance_mm = artery().landing_surface.closest(placed.wire_points_mm)[1]
+    distance_mm = artery().parent.landing_surface.closest(placed.wire_points_mm)[1]
     assert (distance_mm - half_mm).min() > -1e-6
     assert (distance_mm - half_mm).min() < 0.002
-    centers = artery().axis.at(artery().axis.nearest_abscissa_mm(placed.wire_points_mm))
-    assert not artery().landing_surface.crosses(centers, placed.wire_points_mm).any()
+    centers = artery().parent.axis.at(artery().parent.axis.nearest_abscissa_mm(placed.wire_points_mm))
+    assert not artery().parent.landing_surface.crosses(centers, placed.wire_points_mm).any()
 
 
 def test_laser_cut_rings_meet_crown_to_crown():
@@ -202,7 +202,7 @@ def test_what_stands_off_the_wall_is_over_the_neck_as_what_lies_on_it(radius_mm)
     artery = with_neck(tube(line(32), radius_mm), 13, 19)
     device_in_place = deploy(ENTERPRISE, artery, size=SIZES["enterprise"]).stent
     points_mm = device_in_place.wire_points_mm
-    off_mm = artery.landing_surface.closest(points_mm)[1]
+    off_mm = artery.parent.landing_surface.closest(points_mm)[1]
     assert (off_mm.min() > 1.0) == (radius_mm > 2)
     left = over_restored(device_in_place, artery).wire_points_mm
     is_over = over_by_samples(points_mm, artery, device_in_place.spacing_mm)
@@ -213,7 +213,7 @@ def test_what_stands_off_the_wall_is_over_the_neck_as_what_lies_on_it(radius_mm)
 
 def over_by_samples(points_mm, artery, within_mm):
     """Whether the nearest of many points on the wall lies so near to one on the neck."""
-    wall, neck = (densely(one) for one in (artery.landing_surface, artery.aneurysms[0].neck))
+    wall, neck = (densely(one) for one in (artery.parent.landing_surface, artery.aneurysms[0].neck))
     foot_mm = wall[cKDTree(wall).query(points_mm)[1]]
     return cKDTree(neck).query(foot_mm)[0] < within_mm
 

@@ -182,7 +182,7 @@ def test_the_parent_artery_leads_to_an_inlet_only_where_it_is_told_to() -> None:
     vessel = siphon(sac_at_mm=10.0)
     anatomy, forced = restore(vessel), restore(vessel, outlet_mm=vessel.inlets[1].center_mm)
     for found, end in ((anatomy, vessel.outlets[0]), (forced, vessel.inlets[1])):
-        np.testing.assert_allclose(found.axis.points_mm[-1], end.center_mm, atol=0.5)
+        np.testing.assert_allclose(found.parent.axis.points_mm[-1], end.center_mm, atol=0.5)
         assert f"to {end.role} " in found.notes[0]
         assert len(found.aneurysms) == 1
 

@@ -9,7 +9,7 @@ from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Deployment, Stent, tube_faces
 from vstent.flow.case import Blood, FlowField
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Opening, Vessel
+from vstent.geometry.vessel import PARENT, Anatomy, Aneurysm, Centerline, Opening, Path, Vessel
 from vstent.reporting.page import as_html, contents_of
 from vstent.reporting.scene import scene_of
 
@@ -69,14 +69,12 @@ def anatomy():
         Opening(arc(ANGLES[:1])[0], np.array([0.0, 0, -1]), np.pi * RADIUS_MM**2, "inlet"),
         Opening(arc(ANGLES[-1:])[0], np.array([0.0, 0, -1]), np.pi * RADIUS_MM**2, "outlet_1"),
     ]
-    middle = 0.5 * axis.length_mm
     return Anatomy(
         vessel=Vessel(joined(artery, sac), tuple(ends), (axis,)),
-        axis=axis,
-        section_radius_mm=np.full(len(ANGLES), RADIUS_MM),
-        landing_surface=artery,
-        is_restored=np.zeros(len(artery.vertices_mm), dtype=bool),
-        aneurysms=(Aneurysm(sac, patch(artery), neck, middle - 1.7, middle + 1.7),),
+        paths=(
+            Path(PARENT, axis, np.full(len(ANGLES), RADIUS_MM), artery, np.zeros(len(artery.vertices_mm), dtype=bool)),
+        ),
+        aneurysms=(Aneurysm(sac, patch(artery), neck),),
     )
 
 

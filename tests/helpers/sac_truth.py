@@ -60,14 +60,14 @@ def scanned_anatomy_of(phantom: phantoms.Phantom, voxel_mm: float) -> Anatomy:
 
 def relative_errors(anatomy: Anatomy, phantom: phantoms.Phantom) -> tuple[np.ndarray, np.ndarray]:
     """Radius error (fraction) of the landing surface's sections, and distance (mm) of its vertices to the true wall."""
-    axis = anatomy.axis
-    first_mm, last_mm = anatomy.own_mm
+    axis = anatomy.parent.axis
+    first_mm, last_mm = anatomy.parent.own_mm
     inner = (axis.abscissa_mm > first_mm + 3) & (axis.abscissa_mm < last_mm - 3)
     place = curves.project(phantom.parent.points_mm, axis.points_mm[inner])[0]
     true_mm = np.interp(place, phantom.parent.abscissa_mm, phantom.parent.inscribed_radius_mm)
-    rings = anatomy.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
+    rings = anatomy.parent.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
     wall = phantoms.tube_implicit_mm(phantom.parent, rings)[0]
-    return anatomy.section_radius_mm[inner] / true_mm - 1, np.abs(wall)
+    return anatomy.parent.section_radius_mm[inner] / true_mm - 1, np.abs(wall)
 
 
 def beside_the_fork_without_sac(data: Path, side: float) -> tuple[Anatomy, Anatomy, np.ndarray, np.ndarray]:
@@ -82,17 +82,17 @@ def beside_the_fork_without_sac(data: Path, side: float) -> tuple[Anatomy, Anato
         )
         for name in ("with", "without")
     )
-    axis = sick.axis
-    first_mm, last_mm = sick.own_mm
+    axis = sick.parent.axis
+    first_mm, last_mm = sick.parent.own_mm
     inner = (axis.abscissa_mm > first_mm + 1.5) & (axis.abscissa_mm < last_mm - 1.5)
-    place = curves.project(healthy.axis.points_mm, axis.points_mm[inner])[0]
-    radius_mm = np.interp(place, healthy.axis.abscissa_mm, healthy.section_radius_mm)
-    rings_mm = sick.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
-    distance_mm = healthy.landing_surface.closest(rings_mm)[1]
-    return sick, healthy, sick.section_radius_mm[inner] / radius_mm - 1, distance_mm
+    place = curves.project(healthy.parent.axis.points_mm, axis.points_mm[inner])[0]
+    radius_mm = np.interp(place, healthy.parent.axis.abscissa_mm, healthy.parent.section_radius_mm)
+    rings_mm = sick.parent.landing_surface.vertices_mm.reshape(len(axis.points_mm), -1, 3)[inner].reshape(-1, 3)
+    distance_mm = healthy.parent.landing_surface.closest(rings_mm)[1]
+    return sick, healthy, sick.parent.section_radius_mm[inner] / radius_mm - 1, distance_mm
 
 
 def moved_mm(anatomy: Anatomy) -> float:
     """Largest distance from the lumen of what the landing surface keeps of it."""
-    own_mm = anatomy.landing_surface.vertices_mm[~anatomy.is_restored & ~anatomy.is_continued]
+    own_mm = anatomy.parent.landing_surface.vertices_mm[~anatomy.parent.is_restored & ~anatomy.parent.is_continued]
     return float(anatomy.vessel.lumen.closest(own_mm)[1].max())

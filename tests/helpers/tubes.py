@@ -1,10 +1,12 @@
 """Analytic arteries for the tests: a tube round any smooth axis with any section."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from vstent.devices.stent import tube_faces
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Opening, Vessel
+from vstent.geometry.vessel import PARENT, Anatomy, Aneurysm, Centerline, Opening, Path, Vessel
 
 
 def line(length_mm, step_mm=0.2):
@@ -42,20 +44,27 @@ def tube(path, first_radius_mm, second_radius_mm=None, *, around=160):
     )
     axis = Centerline(points, np.minimum(a, b))
     vessel = Vessel(surface, ends, (axis,))
-    return Anatomy(vessel, axis, np.sqrt(a * b), surface, np.zeros(len(vertices), dtype=bool), ())
+    parent = Path(PARENT, axis, np.sqrt(a * b), surface, np.zeros(len(vertices), dtype=bool))
+    return Anatomy(vessel, (parent,), ())
+
+
+def on_parent(anatomy, **changes):
+    """The anatomy with changed fields of its parent path."""
+    return replace(anatomy, paths=(replace(anatomy.parent, **changes),))
 
 
 def with_neck(anatomy, proximal_mm, distal_mm):
     """A straight tube with a round neck on its +x side; the sac is only the neck itself."""
-    center_mm = anatomy.axis.at(np.array([0.5 * (proximal_mm + distal_mm)]))[0] + [anatomy.section_radius_mm[0], 0, 0]
-    surface = anatomy.landing_surface
+    middle_mm = anatomy.parent.axis.at(np.array([0.5 * (proximal_mm + distal_mm)]))[0]
+    center_mm = middle_mm + np.array([anatomy.parent.section_radius_mm[0], 0, 0])
+    surface = anatomy.parent.landing_surface
     radius_mm = 0.5 * (distal_mm - proximal_mm)
     middle = surface.corners_mm.mean(axis=1)
     is_neck = (np.linalg.norm(middle - center_mm, axis=1) < radius_mm) & (middle[:, 0] > 0)
     neck = Surface(surface.vertices_mm, surface.faces[is_neck])
     angle = np.linspace(0, 2 * np.pi, 80, endpoint=False)
     rim_mm = center_mm + radius_mm * np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=1)
-    sac = Aneurysm(neck, neck, rim_mm, proximal_mm, distal_mm)
+    sac = Aneurysm(neck, neck, rim_mm)
     is_restored = np.zeros(len(surface.vertices_mm), dtype=bool)
     is_restored[surface.faces[is_neck]] = True
-    return Anatomy(anatomy.vessel, anatomy.axis, anatomy.section_radius_mm, surface, is_restored, (sac,), anatomy.notes)
+    return replace(on_parent(anatomy, is_restored=is_restored), aneurysms=(sac,))

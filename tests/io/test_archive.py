@@ -12,7 +12,7 @@ from vstent.devices.stent import Landing
 from vstent.errors import ReadError
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Opening, Vessel
+from vstent.geometry.vessel import PARENT, Anatomy, Aneurysm, Centerline, Opening, Path, Vessel
 from vstent.io.archive import load_data, save_data
 from vstent.phantoms import Phantom, Scanner, demo_phantom
 
@@ -44,9 +44,10 @@ def an_anatomy():
     surface = Surface([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     line = Centerline(np.linspace([0, 0, 0], [0, 0, 9], 10), np.linspace(1, 2, 10))
     ends = (Opening([0, 0, 0], [0, 0, -1], 3.0, "inlet"), Opening([0, 0, 9], [0, 0, 1], 1.0, "outlet_1"))
-    sac = Aneurysm(surface, surface, [[0, 0, 0], [1, 0, 0], [0, 1, 0]], 2.0, 5.0)
+    sac = Aneurysm(surface, surface, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     vessel = Vessel(surface, ends, (line,), ("a note", "größer"))
-    return Anatomy(vessel, line, np.ones(10), surface, [True, False, True, False], (sac,), ())
+    parent = Path(PARENT, line, np.ones(10), surface, [True, False, True, False], (0.0, 1.5))
+    return Anatomy(vessel, (parent,), (sac,))
 
 
 @pytest.mark.parametrize(

@@ -186,7 +186,7 @@ def compared(key, count):
     """Width of the band over that of full deployments, by result."""
     design = catalogue()[key]
     size = min(design.sizes, key=lambda one: (abs(one.diameter_mm - 3.75), one.length_mm))
-    landing = Landing(0.5 * bent().axis.length_mm)
+    landing = Landing(0.5 * bent().parent.axis.length_mm)
     deployment = deploy(design, bent(), size=size, landing=landing)
     found = bands(bent(), deployment, measure(bent(), deployment)).results
     others = sampled(design, size, landing, count)

@@ -174,9 +174,9 @@ ASKED = "[[criterion]]\nkey='apposed_fraction'\ntitle='x'\nweight=1\nnone=0.7\nf
 
 def test_what_criteria_can_ask_for_is_what_is_measured():
     deployment = deploy(SILK, artery(), size=catalogue.find_size(SILK, diameter_mm=4, length_mm=15))
-    up, out = artery().axis.points_mm, np.linspace([0.1, 0, 35.0], [8.0, 0, 35.0], 40)
+    up, out = artery().parent.axis.points_mm, np.linspace([0.1, 0, 35.0], [8.0, 0, 35.0], 40)
     branch = Centerline(np.concatenate([up[up[:, 2] < 35], out]), np.full((up[:, 2] < 35).sum() + 40, 0.5))
-    forked = replace(artery(), vessel=replace(artery().vessel, centerlines=(artery().axis, branch)))
+    forked = replace(artery(), vessel=replace(artery().vessel, centerlines=(artery().parent.axis, branch)))
     measures = measure(forked, deployment)
     measures |= landing_measures(forked, measures)
     of_flows = {RETENTION}

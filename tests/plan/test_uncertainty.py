@@ -209,16 +209,16 @@ def test_a_widened_artery_is_wider_by_as_much_everywhere_and_its_sac_stays_close
     vessel = trace(Vessel(phantom_surface(demo_phantom(), edge_mm=0.35)))
     anatomy = restore(vessel)
     other = widened(anatomy, 0.2)
-    away_mm = anatomy.landing_surface.closest(other.landing_surface.vertices_mm)[1]
+    away_mm = anatomy.parent.landing_surface.closest(other.parent.landing_surface.vertices_mm)[1]
     assert away_mm == pytest.approx(0.1, abs=0.02)
-    assert other.section_radius_mm == pytest.approx(anatomy.section_radius_mm + 0.1)
+    assert other.parent.section_radius_mm == pytest.approx(anatomy.parent.section_radius_mm + 0.1)
     sac, wider = anatomy.aneurysms[0], other.aneurysms[0]
     assert not wider.sac.boundary_loops
     # the sac grows by its wall's area times the shift, and loses what its neck moves in
     wall_mm2 = sac.sac.area_mm2 - sac.neck.area_mm2
     grown_mm3 = abs(wider.sac.volume_mm3) - abs(sac.sac.volume_mm3)
     assert grown_mm3 == pytest.approx(0.1 * (wall_mm2 - sac.neck.area_mm2), rel=0.1)
-    on_tube = other.landing_surface.closest(wider.neck.vertices_mm)[1]
+    on_tube = other.parent.landing_surface.closest(wider.neck.vertices_mm)[1]
     assert on_tube.max() < 0.03
     opening, wide = anatomy.vessel.inlet, other.vessel.inlet
     assert wide.diameter_mm == pytest.approx(opening.diameter_mm + 0.2)

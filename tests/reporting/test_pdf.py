@@ -104,16 +104,16 @@ def test_spheres_on_the_axis_are_as_wide_as_the_artery_and_follow_it_from_end_to
     beads = _bead_layer(anatomy).surface.vertices_mm.reshape(-1, n, 3)
     centers = beads.mean(axis=1)
     assert np.linalg.norm(beads - centers[:, None], axis=2) == pytest.approx(report_case.RADIUS_MM, rel=1e-3)
-    along = anatomy.axis.nearest_abscissa_mm(centers)
+    along = anatomy.parent.axis.nearest_abscissa_mm(centers)
     assert along[0] == pytest.approx(0, abs=0.05)
-    assert anatomy.axis.length_mm - along[-1] < report_case.RADIUS_MM
+    assert anatomy.parent.axis.length_mm - along[-1] < report_case.RADIUS_MM
     assert np.diff(along) == pytest.approx(0.9 * report_case.RADIUS_MM, rel=0.01)
 
 
 def test_expansion_begins_at_the_first_contour_and_ends_at_the_deployed_one():
     case = report_case.case()
     deployment = case.deployments["silk"]
-    frames, gaps = thin_frames(deployment, case.anatomy.landing_surface, 4)
+    frames, gaps = thin_frames(deployment, case.anatomy.parent.landing_surface, 4)
     chosen = some_frames(deployment, 4)
     assert chosen.tolist() == [0, 2, 4, 7]
     np.testing.assert_array_equal(frames, deployment.history_mm[chosen].reshape(4, -1, 3))

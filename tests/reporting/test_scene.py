@@ -48,7 +48,7 @@ def test_the_side_that_hides_less_is_chosen():
     free = report_case.scene().view("profile").axes[2]
     screen = report_case.sphere(12.0 * free + [0, 0, 9.0], 5.0)
     vessel = SimpleNamespace(lumen=report_case.joined(case.anatomy.vessel.lumen, screen))
-    hidden = SimpleNamespace(vessel=vessel, axis=case.anatomy.axis, aneurysms=case.anatomy.aneurysms)
+    hidden = SimpleNamespace(vessel=vessel, axis=case.anatomy.parent.axis, aneurysms=case.anatomy.aneurysms)
     chosen = views_of(hidden, case.deployments)[0].axes
     assert chosen[2] == pytest.approx(-free)
     assert np.linalg.det(chosen) == pytest.approx(1)  # turned round, not mirrored
@@ -182,9 +182,7 @@ def test_blocks_lie_on_multiples_of_four_and_do_not_overlap():
 def test_a_case_without_flow_and_a_healthy_artery_have_scenes():
     case = report_case.case()
     anatomy = case.anatomy
-    healthy = type(anatomy)(
-        anatomy.vessel, anatomy.axis, anatomy.section_radius_mm, anatomy.landing_surface, anatomy.is_restored, ()
-    )
+    healthy = replace(anatomy, aneurysms=())
     scene = scene_of(healthy, {}, {})
     assert {layer.id for layer in scene.layers} == {"lumen", "landing", "centerlines", "axis"}
     assert scene.scales == ()

@@ -274,7 +274,7 @@ def test_trimmed_otherwise_the_vessel_is_the_one_that_was_traced_and_the_result_
     assert list(dict.fromkeys(told)) == ["vessel", "trim", "restore"]
     for name in ("vessel.vtp", "landing_surface.vtp", "sac.vtp", "morphology.json"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "anew" / name).read_bytes()
-    np.testing.assert_array_equal(again.landing_surface.vertices_mm, anew.landing_surface.vertices_mm)
+    np.testing.assert_array_equal(again.parent.landing_surface.vertices_mm, anew.parent.landing_surface.vertices_mm)
 
 
 @pytest.mark.parametrize("given", ["at_mm", "inlet_mm"])

@@ -51,12 +51,12 @@ def continued(anatomy: Anatomy) -> Anatomy:
         Otherwise abscissae count from the continued proximal end, and `continued_mm` tells the lengths that were added.
     """
     first_mm, last_mm = neck_span_mm(anatomy)
-    spare_mm = first_mm, anatomy.axis.length_mm - last_mm
+    spare_mm = first_mm, anatomy.parent.axis.length_mm - last_mm
     added_mm = tuple(ENOUGH_MM - spare if spare < ENOUGH_MM else 0.0 for spare in spare_mm)
     if not any(added_mm):
         return anatomy
-    points_mm = anatomy.axis.points_mm
-    rings_mm = anatomy.landing_surface.vertices_mm.reshape(len(points_mm), -1, 3)
+    points_mm = anatomy.parent.axis.points_mm
+    rings_mm = anatomy.parent.landing_surface.vertices_mm.reshape(len(points_mm), -1, 3)
     before = _beyond(points_mm[::-1], rings_mm[::-1], added_mm[0])
     after = _beyond(points_mm, rings_mm, added_mm[1])
     return _assembled(anatomy, rings_mm, before, after)
@@ -87,34 +87,26 @@ def _direction(points_mm: Floats, diameter_mm: float) -> Floats:
 
 
 def _assembled(anatomy: Anatomy, rings_mm: Floats, before: _End, after: _End) -> Anatomy:
-    """Return the anatomy with both continuations, its abscissae shifted."""
-    points_mm = np.concatenate([before.points_mm[::-1], anatomy.axis.points_mm, after.points_mm])
+    """Return the anatomy with both continuations; abscissae count from the new proximal end."""
+    points_mm = np.concatenate([before.points_mm[::-1], anatomy.parent.axis.points_mm, after.points_mm])
     rings_mm = np.concatenate([before.rings_mm[::-1], rings_mm, after.rings_mm])
     k, m = len(before.points_mm), len(after.points_mm)
     new = [*range(k), *range(len(points_mm) - m, len(points_mm))]
     rho_mm = np.linalg.norm(rings_mm[new] - points_mm[new, None], axis=2)
     round_mm = np.sqrt((rho_mm**2).mean(axis=1))
-    axis = Centerline(points_mm, _around(anatomy.axis.inscribed_radius_mm, rho_mm.min(axis=1), k))
+    axis = Centerline(points_mm, _around(anatomy.parent.axis.inscribed_radius_mm, rho_mm.min(axis=1), k))
     shift_mm = float(axis.abscissa_mm[k])
     n_rays = rings_mm.shape[1]
     added_mm = shift_mm, float(axis.length_mm - axis.abscissa_mm[len(points_mm) - 1 - m])
-    return replace(
-        anatomy,
+    parent = replace(
+        anatomy.parent,
         axis=axis,
-        section_radius_mm=_around(anatomy.section_radius_mm, round_mm, k),
+        section_radius_mm=_around(anatomy.parent.section_radius_mm, round_mm, k),
         landing_surface=Surface(rings_mm.reshape(-1, 3), tube_faces(len(points_mm), n_rays)),
-        is_restored=_around(anatomy.is_restored, np.zeros((k + m) * n_rays, dtype=bool), k * n_rays),
-        aneurysms=tuple(
-            replace(
-                one,
-                proximal_abscissa_mm=one.proximal_abscissa_mm + shift_mm,
-                distal_abscissa_mm=one.distal_abscissa_mm + shift_mm,
-            )
-            for one in anatomy.aneurysms
-        ),
-        notes=(*anatomy.notes, _told(added_mm)),
+        is_restored=_around(anatomy.parent.is_restored, np.zeros((k + m) * n_rays, dtype=bool), k * n_rays),
         continued_mm=added_mm,
     )
+    return replace(anatomy, paths=(parent,), notes=(*anatomy.notes, _told(added_mm)))
 
 
 def _around(own: NDArray[Value], new: NDArray[Value], k: int) -> NDArray[Value]:

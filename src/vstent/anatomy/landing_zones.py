@@ -24,8 +24,8 @@ def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
     proximal_mm, distal_mm : abscissae in mm; both are the middle of the axis without an aneurysm.
     """
     if anatomy.aneurysms:
-        return anatomy.aneurysms[0].proximal_abscissa_mm, anatomy.aneurysms[0].distal_abscissa_mm
-    middle_mm = 0.5 * anatomy.axis.length_mm
+        return anatomy.parent.span_mm(anatomy.aneurysms[0])
+    middle_mm = 0.5 * anatomy.parent.axis.length_mm
     return middle_mm, middle_mm
 
 
@@ -54,9 +54,9 @@ def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
     proximal_mm, distal_mm : mean diameter of each zone in mm.
     """
     proximal_mm, distal_mm = neck_span_mm(anatomy)
-    first_mm, last_mm = anatomy.own_mm
+    first_mm, last_mm = anatomy.parent.own_mm
     before = np.linspace(max(first_mm, proximal_mm - ZONE_MM), max(first_mm, proximal_mm), 51)
     after = np.linspace(min(last_mm, distal_mm), min(last_mm, distal_mm + ZONE_MM), 51)
-    diameter_mm = 2 * anatomy.section_radius_mm
-    first, second = (np.interp(zone, anatomy.axis.abscissa_mm, diameter_mm).mean() for zone in (before, after))
+    diameter_mm = 2 * anatomy.parent.section_radius_mm
+    first, second = (np.interp(zone, anatomy.parent.axis.abscissa_mm, diameter_mm).mean() for zone in (before, after))
     return float(first), float(second)

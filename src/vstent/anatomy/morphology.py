@@ -71,7 +71,7 @@ def morphology(anatomy: Anatomy) -> Morphology:
     found |= _course(anatomy)
     for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
         beside = _parent(replace(anatomy, aneurysms=(aneurysm,)))
-        measures = _sac(aneurysm, anatomy.axis, 0.5 * sum(beside.values()))
+        measures = _sac(aneurysm, anatomy.parent.axis, 0.5 * sum(beside.values()))
         found |= measures if number == 1 else {f"sac_{number}": {**beside, **measures}}
     return found
 
@@ -84,9 +84,9 @@ def _parent(anatomy: Anatomy) -> dict[str, float]:
 
 def _course(anatomy: Anatomy) -> Measures:
     """Return curvature and torsion of the parent axis; empty for an axis of few points."""
-    axis = anatomy.axis
-    diameter_mm = 2 * float(np.median(anatomy.section_radius_mm))
-    first_mm, last_mm = anatomy.own_mm
+    axis = anatomy.parent.axis
+    diameter_mm = 2 * float(np.median(anatomy.parent.section_radius_mm))
+    first_mm, last_mm = anatomy.parent.own_mm
     inner = (axis.abscissa_mm >= first_mm + diameter_mm) & (axis.abscissa_mm <= last_mm - diameter_mm)
     if inner.sum() < FEWEST_AXIS_POINTS:
         return {}
@@ -143,7 +143,7 @@ def _inflow_angle(
     aneurysm: Aneurysm, axis: Centerline, center_mm: Floats, parent_diameter_mm: float
 ) -> dict[str, float]:
     """Return the angle between the artery upstream and the longest height of the sac; empty without artery upstream."""
-    neck_mm = float(np.clip(aneurysm.proximal_abscissa_mm, 0.0, axis.length_mm))
+    neck_mm = float(np.clip(axis.nearest_abscissa_mm(aneurysm.neck_mm).min(), 0.0, axis.length_mm))
     before_mm, here_mm = axis.at(np.array([max(neck_mm - parent_diameter_mm, 0.0), neck_mm]))
     if neck_mm < LEAST_UPSTREAM * parent_diameter_mm:
         return {}

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from vstent.anatomy.landing_zones import neck_span_mm
 from vstent.angiography import washout as washouts
 from vstent.angiography.bolus import Bolus, OverTime
 from vstent.angiography.curves import Curves
@@ -261,8 +262,8 @@ def _stay(found: washouts.Washout, near: Network, own: Ints, case: FlowCase) -> 
 
 def _parent_cells(grid: Grid, anatomy: Anatomy) -> Ints:
     """Return the cells of the parent artery over one diameter proximal to the neck, or next to the inlet."""
-    axis = anatomy.axis
-    end_mm = anatomy.aneurysms[0].proximal_abscissa_mm if anatomy.aneurysms else 0.5 * axis.length_mm
+    axis = anatomy.parent.axis
+    end_mm = neck_span_mm(anatomy)[0]
     place = int(np.argmin(np.abs(axis.abscissa_mm - end_mm)))
     diameter_mm = 2 * float(axis.inscribed_radius_mm[place])
     first_mm = max(end_mm - 1.5 * diameter_mm, 0.0)

@@ -66,12 +66,12 @@ def _cheapest(anatomy: Anatomy, walls_mm: tuple[Floats, Floats] | None, angles_d
 
 def _foreshortening(anatomy: Anatomy, toward: Floats) -> Floats:
     """Return the cost (k,) of beams (k, 3) along the artery or across the neck."""
-    axis = anatomy.axis
+    axis = anatomy.parent.axis
     if not anatomy.aneurysms:
         tangents = np.gradient(axis.points_mm, axis.abscissa_mm, axis=0)
         return np.asarray(np.mean((toward @ tangents.T) ** 2, axis=1))
     aneurysm = anatomy.aneurysms[0]
-    ends = np.array([aneurysm.proximal_abscissa_mm, aneurysm.distal_abscissa_mm])
+    ends = np.array(anatomy.parent.span_mm(aneurysm))
     start, end = axis.at(np.clip(ends + np.array([-1.0, 1.0]), 0.0, axis.length_mm))
     normal = (aneurysm.neck.areas_mm2[:, None] * aneurysm.neck.normals).sum(axis=0)
     along, across = ((vector / max(float(np.linalg.norm(vector)), 1e-12)) for vector in (end - start, normal))
@@ -83,7 +83,7 @@ def _sac_and_rest(anatomy: Anatomy) -> tuple[Floats, Floats]:
     sac_mm = anatomy.aneurysms[0].sac.vertices_mm
     lumen_mm = anatomy.vessel.lumen.vertices_mm
     away = cKDTree(sac_mm).query(lumen_mm, distance_upper_bound=GRID_MM)[0] > GRID_MM
-    return sac_mm, np.concatenate([lumen_mm[away], anatomy.landing_surface.vertices_mm])
+    return sac_mm, np.concatenate([lumen_mm[away], anatomy.parent.landing_surface.vertices_mm])
 
 
 def overlap(sac_mm: Floats, rest_mm: Floats, axes: Floats) -> float:

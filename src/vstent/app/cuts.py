@@ -26,7 +26,7 @@ def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
     """
     right, up = views_of(anatomy, {})[0].axes[:2]
     sacs = anatomy.aneurysms
-    middle = sacs[0].sac.vertices_mm.mean(axis=0) if sacs else anatomy.axis.points_mm.mean(axis=0)
+    middle = sacs[0].sac.vertices_mm.mean(axis=0) if sacs else anatomy.parent.axis.points_mm.mean(axis=0)
     step_mm = STEP_CELLS * field.cell_size_mm
     seen = (field.centers_mm - middle) @ np.stack([right, up], axis=1)
     ticks = [np.arange(low, high + step_mm, step_mm) for low, high in zip(seen.min(0), seen.max(0), strict=True)]

@@ -251,7 +251,7 @@ class Live:
         return message(
             layers,
             views=_views(anatomy),
-            fade=1.2 * float(np.median(anatomy.section_radius_mm)),
+            fade=1.2 * float(np.median(anatomy.parent.section_radius_mm)),
             axis=_axis(anatomy),
             is_oriented=anatomy.vessel.is_oriented,
             openings=[_said(opening) for opening in openings],
@@ -416,15 +416,15 @@ class Live:
         """
         with LOCK:
             anatomy = self.anatomy
-            across = self.remembered(("planes", self.case.state.anatomy), lambda: planes(anatomy.axis))
-            at_mm = float(np.clip(abscissa_mm, 0.0, anatomy.axis.length_mm))
+            across = self.remembered(("planes", self.case.state.anatomy), lambda: planes(anatomy.parent.axis))
+            at_mm = float(np.clip(abscissa_mm, 0.0, anatomy.parent.axis.length_mm))
             center, frame = (found[0] for found in across.at(np.array([at_mm])))
-            radius_mm = float(np.interp(at_mm, anatomy.axis.abscissa_mm, anatomy.section_radius_mm))
+            radius_mm = float(np.interp(at_mm, anatomy.parent.axis.abscissa_mm, anatomy.parent.section_radius_mm))
             shown = {
                 "abscissa_mm": at_mm,
                 "artery_diameter_mm": 2 * radius_mm,
                 "lumen": _cut(anatomy.vessel.lumen, center, frame),
-                "landing": _cut(anatomy.landing_surface, center, frame),
+                "landing": _cut(anatomy.parent.landing_surface, center, frame),
             }
             if name is None:
                 return shown
@@ -435,7 +435,7 @@ class Live:
 def _views(anatomy: Anatomy) -> list[View]:
     """Return the views: the profile around the neck, the whole vessel from the same side, and those of the report."""
     profile, *others = views_of(anatomy, {})
-    axis, span = anatomy.axis, _neck_span(anatomy) or [0.0, anatomy.axis.length_mm]
+    axis, span = anatomy.parent.axis, _neck_span(anatomy) or [0.0, anatomy.parent.axis.length_mm]
     is_near = (axis.abscissa_mm > span[0] - BESIDE_MM) & (axis.abscissa_mm < span[1] + BESIDE_MM)
     sacs = [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
     treated = np.concatenate([axis.points_mm[is_near], *sacs])
@@ -445,11 +445,11 @@ def _views(anatomy: Anatomy) -> list[View]:
 
 def _axis(anatomy: Anatomy) -> dict[str, list[float]]:
     """Return points, abscissa and diameter of the parent axis in mm."""
-    axis = anatomy.axis
+    axis = anatomy.parent.axis
     return {
         "points": np.round(axis.points_mm, 3).ravel().tolist(),
         "abscissa": np.round(axis.abscissa_mm, 3).tolist(),
-        "diameter": np.round(2 * anatomy.section_radius_mm, 3).tolist(),
+        "diameter": np.round(2 * anatomy.parent.section_radius_mm, 3).tolist(),
     }
 
 
@@ -500,7 +500,7 @@ def _neck_span(anatomy: Anatomy) -> list[float]:
     """Return the ends of the neck along the parent axis in mm; empty without a sac."""
     if not anatomy.aneurysms:
         return []
-    return [anatomy.aneurysms[0].proximal_abscissa_mm, anatomy.aneurysms[0].distal_abscissa_mm]
+    return list(anatomy.parent.span_mm(anatomy.aneurysms[0]))
 
 
 def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Callable[[], Floats]) -> LineLayer:

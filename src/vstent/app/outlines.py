@@ -44,7 +44,7 @@ def _surfaces(anatomy: Anatomy) -> dict[str, list[Surface]]:
     """Return the surfaces that are cut, by the name of their outline."""
     return {
         "lumen": [anatomy.vessel.lumen],
-        "parent": [anatomy.landing_surface],
+        "parent": [anatomy.parent.landing_surface],
         "sac": [aneurysm.sac for aneurysm in anatomy.aneurysms],
         "neck": [aneurysm.neck for aneurysm in anatomy.aneurysms],
     }

@@ -106,7 +106,7 @@ def _remedy_of_crumpling(stent: Stent) -> str:
 
 def _beyond_patient(anatomy: Anatomy, stent: Stent) -> str:
     """Return a sentence on the part of a device that lies in a continued artery, or an empty string."""
-    first_mm, last_mm = anatomy.own_mm
+    first_mm, last_mm = anatomy.parent.own_mm
     beyond_mm = {"proximal": first_mm - stent.proximal_abscissa_mm, "distal": stent.distal_abscissa_mm - last_mm}
     parts = [f"{length:.1f} mm at its {end} end" for end, length in beyond_mm.items() if length > SHORT_MM]
     return f" It leaves the patient's artery by {' and '.join(parts)}; the artery there is assumed." if parts else ""
@@ -115,7 +115,7 @@ def _beyond_patient(anatomy: Anatomy, stent: Stent) -> str:
 @lru_cache(maxsize=8)
 def _of_fork(anatomy: Anatomy) -> str:
     """Return a sentence that starts with a space if the neck opens into more than the parent artery, else nothing."""
-    off_mm = anatomy.landing_surface.closest(neck_points_mm(anatomy))[1].max(initial=0.0)
+    off_mm = anatomy.parent.landing_surface.closest(neck_points_mm(anatomy))[1].max(initial=0.0)
     if off_mm < OFF_MM:
         return ""
     return (
@@ -156,7 +156,7 @@ def _reach(anatomy: Anatomy, stent: Stent) -> str:
 def _remedy_of_reach(anatomy: Anatomy, stent: Stent, beyond_mm: Floats, move: str) -> str:
     """Return advice in brackets for a device that extends by `beyond_mm` (2,) beyond the neck, or nothing."""
     half_mm, center_mm = 0.5 * stent.deployed_length_mm, float(np.mean(neck_span_mm(anatomy)))
-    fits = half_mm < center_mm < anatomy.axis.length_mm - half_mm
+    fits = half_mm < center_mm < anatomy.parent.axis.length_mm - half_mm
     if fits and beyond_mm.mean() >= wanted_margin_mm(anatomy):
         return f" (move it {move})"
     size = stent.size

@@ -29,9 +29,9 @@ def apposition(anatomy: Anatomy, deployment: Deployment) -> Measures:
     """
     stent = deployment.stent
     points_mm = stent.nodes_mm.reshape(-1, 3)
-    surface = anatomy.landing_surface
+    surface = anatomy.parent.landing_surface
     _, distance_mm, face = surface.closest(points_mm)
-    is_wall = anatomy.is_patient_face[face]
+    is_wall = anatomy.parent.is_patient_face[face]
     middle_mm = np.repeat(stent.nodes_mm.mean(axis=1), stent.nodes_mm.shape[1], axis=0)
     outside_mm = np.where(surface.crosses(middle_mm, points_mm), distance_mm, 0.0)
     gap_mm, area_mm2 = deployment.wall_gap_mm.ravel()[is_wall], _node_areas_mm2(stent).ravel()[is_wall]

@@ -103,21 +103,21 @@ def expected_profile(design: Design, size: Size, anatomy: Anatomy) -> Profile:
         Expected diameter along the parent axis, with its curvature for a braid.
     """
     offset_mm = design.wall_offset_um * MM_PER_UM
-    diameter_mm = np.minimum(2 * (anatomy.section_radius_mm - offset_mm), widest_mm(design, size))
+    diameter_mm = np.minimum(2 * (anatomy.parent.section_radius_mm - offset_mm), widest_mm(design, size))
     if isinstance(design, LaserCut):
-        return Profile(anatomy.axis.abscissa_mm, diameter_mm)
-    return Profile(anatomy.axis.abscissa_mm, diameter_mm, bend(anatomy))
+        return Profile(anatomy.parent.axis.abscissa_mm, diameter_mm)
+    return Profile(anatomy.parent.axis.abscissa_mm, diameter_mm, bend(anatomy))
 
 
 def over_openings(anatomy: Anatomy, nodes_mm: Floats) -> Bools:
     """Return which points (..., 3) on a device lie over restored wall, where a neck or an ostium has none."""
-    face = anatomy.landing_surface.closest(nodes_mm.reshape(-1, 3))[2]
-    return np.asarray(anatomy.is_restored_face[face].reshape(nodes_mm.shape[:-1]))
+    face = anatomy.parent.landing_surface.closest(nodes_mm.reshape(-1, 3))[2]
+    return np.asarray(anatomy.parent.is_restored_face[face].reshape(nodes_mm.shape[:-1]))
 
 
 def bend(anatomy: Anatomy) -> tuple[Floats, Floats]:
     """Return arc lengths (m,) along the parent axis, in mm, and its curvature (m,), per mm."""
-    across = planes(anatomy.axis)
+    across = planes(anatomy.parent.axis)
     return across.abscissa_mm, across.curvature_per_mm
 
 
@@ -253,7 +253,7 @@ class ConstantWire(AbstractMethod):
             is_opening = over_openings(placement.anatomy, opened.contour.nodes_mm)
         slid = pieces.slide(design, size, opened.contour.nodes_mm, held, laid, is_opening)
         rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
-        check_inside(design, size, rows_mm, placement.anatomy.axis.length_mm)
+        check_inside(design, size, rows_mm, placement.anatomy.parent.axis.length_mm)
         where_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row)
         centers_mm = placement.across.middle(where_mm.ravel()).reshape(slid.nodes_mm.shape)
         state = opened.contour.about(centers_mm, _nearest(slid.row, len(rows)))
@@ -299,7 +299,7 @@ class ConstantWire(AbstractMethod):
 
     def _marched(self, placement: Placement, opened: Opened) -> Opened:
         """Return the device with its rows moved according to their measured diameters until they have converged."""
-        design, size, axis = placement.design, placement.size, placement.anatomy.axis
+        design, size, axis = placement.design, placement.size, placement.anatomy.parent.axis
         profile = expected_profile(design, size, placement.anatomy)
         for done in range(ROUNDS):
             profile = profile.corrected(opened.abscissa_mm, perimeters(opened.contour.nodes_mm) / np.pi)

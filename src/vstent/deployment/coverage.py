@@ -128,7 +128,7 @@ def _neck_on_landing(anatomy: Anatomy) -> Surface:
     # Where a sac is on a fork, its neck is at a distance from the landing surface.
     neck = anatomy.aneurysms[0].neck
     vertices_mm, faces = triangles.compact(neck.vertices_mm, neck.faces)
-    return Surface(anatomy.landing_surface.closest(vertices_mm)[0], faces)
+    return Surface(anatomy.parent.landing_surface.closest(vertices_mm)[0], faces)
 
 
 def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
@@ -147,7 +147,7 @@ def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
         Points where the landing surface closes or faces the neck.
     """
     neck = _neck_on_landing(anatomy)
-    at_most_mm = anatomy.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM
+    at_most_mm = anatomy.parent.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM
     low_mm, high_mm = neck.vertices_mm.min(axis=0), neck.vertices_mm.max(axis=0)
     is_over = curves.lengths(points_mm - np.clip(points_mm, low_mm, high_mm)) <= at_most_mm
     is_over[is_over] = neck.closest(points_mm[is_over])[1] <= at_most_mm[is_over]

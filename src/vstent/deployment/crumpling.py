@@ -134,7 +134,7 @@ def crumpling(anatomy: Anatomy, stent: Stent) -> Crumpling | None:
     Crumpling or None
         The narrowest cell and the number of crumpled cells; None where the device has no whole cell.
     """
-    found = cells(stent, anatomy.axis)
+    found = cells(stent, anatomy.parent.axis)
     if not len(found.width_fraction):
         return None
     worst = int(found.width_fraction.argmin())

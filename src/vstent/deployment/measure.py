@@ -129,8 +129,8 @@ def _free_crowns(anatomy: Anatomy, stent: Stent) -> Measures:
     nodes_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split][is_free]
     tips_mm = (nodes_mm + stent.crown_shift_mm[:, is_free]).reshape(-1, 3)
     middle_mm = np.tile(stent.nodes_mm.mean(axis=1)[:: shape.row_split][np.nonzero(is_free)[0]], (2, 1))
-    distance_mm = anatomy.landing_surface.closest(tips_mm)[1]
-    is_outside = anatomy.landing_surface.crosses(middle_mm, tips_mm)
+    distance_mm = anatomy.parent.landing_surface.closest(tips_mm)[1]
+    is_outside = anatomy.parent.landing_surface.crosses(middle_mm, tips_mm)
     from_wall_mm = distance_mm - stent.design.wall_offset_um * MM_PER_UM
     return {
         "free_crowns_count": float(len(tips_mm)),
@@ -155,11 +155,11 @@ def branch_abscissas_mm(anatomy: Anatomy) -> Floats:
     (b,) array, mm
         Arc lengths of the branches. The result is cached.
     """
-    axis, left_mm = anatomy.axis, []
+    axis, left_mm = anatomy.parent.axis, []
     ostia_mm: list[Floats] = []
     for line in anatomy.vessel.centerlines:
         foot_mm, distance_mm = curves.project(axis.points_mm, line.points_mm)
-        is_away = distance_mm > np.interp(foot_mm, axis.abscissa_mm, anatomy.section_radius_mm)
+        is_away = distance_mm > np.interp(foot_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm)
         is_gone = np.logical_and.accumulate(is_away[::-1])[::-1]
         first = np.argmax(is_gone)
         ostium_mm, radius_mm = line.points_mm[first], line.inscribed_radius_mm[first]

@@ -51,12 +51,12 @@ class Placement:
     """Wall against which the device opens."""
 
     def __post_init__(self) -> None:
-        check_landing(self.landing, self.anatomy.axis.length_mm)
+        check_landing(self.landing, self.anatomy.parent.axis.length_mm)
 
     @property
     def across(self) -> Planes:
         """Planes across the parent axis that hold the rows."""
-        return planes(self.anatomy.axis)
+        return planes(self.anatomy.parent.axis)
 
     def start(self, contour: ActiveContour, rows_mm: Floats, widest_mm: Floats | float = np.inf) -> State:
         """Create the closed contour from circles of the maximum inscribed spheres.
@@ -80,8 +80,8 @@ class Placement:
         LandingError
             A row lies beyond the artery.
         """
-        check_inside(self.design, self.size, rows_mm, self.anatomy.axis.length_mm)
-        axis = self.anatomy.axis
+        check_inside(self.design, self.size, rows_mm, self.anatomy.parent.axis.length_mm)
+        axis = self.anatomy.parent.axis
         centers_mm = self.across.middle(rows_mm)
         clearance_mm = self.wall.contact(centers_mm).distance_mm
         radius_mm = np.interp(rows_mm, axis.abscissa_mm, axis.inscribed_radius_mm)

@@ -52,7 +52,7 @@ def wanted_margin_mm(anatomy: Anatomy) -> float:
 
 def oversizing_fraction(anatomy: Anatomy, stent: Stent) -> float:
     """Return the label diameter over the mean diameter of the artery along the device, less one."""
-    artery_mm = 2 * np.interp(stent.row_abscissa_mm, anatomy.axis.abscissa_mm, anatomy.section_radius_mm)
+    artery_mm = 2 * np.interp(stent.row_abscissa_mm, anatomy.parent.axis.abscissa_mm, anatomy.parent.section_radius_mm)
     return stent.size.diameter_mm / float(artery_mm.mean()) - 1
 
 
@@ -93,7 +93,7 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
     shortest_mm = min(last - first for first, last in (_span(design, anatomy, size) for size in tried))
     raise LandingError(
         f"No size of {design.name} up to {tried_mm:g} mm in diameter fits: the shortest would be "
-        f"{shortest_mm:.1f} mm long in a parent artery of {anatomy.axis.length_mm:.1f} mm. Choose another "
+        f"{shortest_mm:.1f} mm long in a parent artery of {anatomy.parent.axis.length_mm:.1f} mm. Choose another "
         "device, or give a longer piece of the artery."
     )
 
@@ -121,11 +121,11 @@ def propose_landing(design: Design, anatomy: Anatomy, size: Size) -> Landing:
     for _ in range(4):  # where the artery tapers, the middle row is not in the middle of the length
         rows_mm = march(design, size, Landing(wanted_mm), profile)
         first, last = float(rows_mm[0]), float(rows_mm[-1])
-        spare_mm = anatomy.axis.length_mm - (last - first)
+        spare_mm = anatomy.parent.axis.length_mm - (last - first)
         move_mm = target_mm - 0.5 * (first + last)
         if spare_mm > 0:
             end_mm = min(END_MM, 0.5 * spare_mm)
-            move_mm = min(max(move_mm, end_mm - first), anatomy.axis.length_mm - end_mm - last)
+            move_mm = min(max(move_mm, end_mm - first), anatomy.parent.axis.length_mm - end_mm - last)
         wanted_mm += move_mm
     return Landing(wanted_mm)
 
@@ -185,7 +185,7 @@ def _span(design: Design, anatomy: Anatomy, size: Size) -> tuple[float, float]:
 
 def _fits(anatomy: Anatomy, first_mm: float, last_mm: float) -> bool:
     """Return whether both ends lie on the artery."""
-    return first_mm > 0 and last_mm < anatomy.axis.length_mm
+    return first_mm > 0 and last_mm < anatomy.parent.axis.length_mm
 
 
 def _margin(design: Design, anatomy: Anatomy, size: Size) -> float:

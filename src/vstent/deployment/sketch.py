@@ -94,7 +94,7 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     Bed
         Contour of the device and its gap to the wall along the whole artery.
     """
-    axis, columns = anatomy.axis, grid(design, size).columns
+    axis, columns = anatomy.parent.axis, grid(design, size).columns
     across = planes(axis)
     abscissa_mm = np.linspace(0.0, axis.length_mm, max(8, round(axis.length_mm / STEP_MM) + 1))
     radius_mm = np.interp(abscissa_mm, axis.abscissa_mm, axis.inscribed_radius_mm)
@@ -103,14 +103,14 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     centers_mm, frames = across.at(abscissa_mm)
     rays = circles(np.ones(len(abscissa_mm)), columns) @ frames[:, 1:]
     origins_mm = np.repeat(centers_mm, columns, axis=0)
-    reach_mm = anatomy.landing_surface.first_hit(origins_mm, rays.reshape(-1, 3)).reshape(-1, columns)
+    reach_mm = anatomy.parent.landing_surface.first_hit(origins_mm, rays.reshape(-1, 3)).reshape(-1, columns)
     # Rays that leave through an end of the artery or run along a bend do not measure the wall.
-    section_mm = np.interp(abscissa_mm, axis.abscissa_mm, anatomy.section_radius_mm)[:, None]
+    section_mm = np.interp(abscissa_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm)[:, None]
     reach_mm = np.where(reach_mm < 1.6 * section_mm, reach_mm, section_mm)
     outer = np.maximum(reach_mm - dd_mm, 0.1)[..., None] * circles(np.ones(len(abscissa_mm)), columns)
     in_plane_mm = evenly_spaced(FreeDiameter(np.full(len(inner), widest_mm(design, size)))(inner, outer)[0])
     nodes_mm = across.place(abscissa_mm, in_plane_mm).reshape(-1, 3)
-    gap_mm = np.maximum(anatomy.landing_surface.closest(nodes_mm)[1] - dd_mm, 0.0).reshape(-1, columns)
+    gap_mm = np.maximum(anatomy.parent.landing_surface.closest(nodes_mm)[1] - dd_mm, 0.0).reshape(-1, columns)
     band_mm = anatomy.vessel.threshold_band_mm or ASSUMED_BAND_MM
     is_opening = over_openings(anatomy, nodes_mm).reshape(gap_mm.shape)
     expected = expected_profile(design, size, anatomy)

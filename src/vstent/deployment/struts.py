@@ -97,8 +97,8 @@ def is_over_restored(stent: Stent, anatomy: Anatomy, points_mm: Floats) -> Bools
     (n,) array of bool
         Points whose closest point of the landing surface is within one spacing of restored wall.
     """
-    surface = anatomy.landing_surface
-    closing = Surface(surface.vertices_mm, surface.faces[anatomy.is_restored_face])
+    surface = anatomy.parent.landing_surface
+    closing = Surface(surface.vertices_mm, surface.faces[anatomy.parent.is_restored_face])
     if not len(closing.faces):
         return np.zeros(len(points_mm), dtype=bool)
     return np.asarray(closing.closest(surface.closest(points_mm)[0])[1] < stent.spacing_mm)

@@ -110,10 +110,10 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = T
         There is no plug-in called `search`.
     """
     kind = TreeWall if search == TREE else plugins.load("vstent.walls", search, built_in=TREE)
-    surface = anatomy.landing_surface
-    is_patient = anatomy.is_patient_face
+    surface = anatomy.parent.landing_surface
+    is_patient = anatomy.parent.is_patient_face
     for stent in inside:
-        foot_mm = curves.project(anatomy.axis.points_mm, surface.corners_mm.mean(axis=1))[0]
+        foot_mm = curves.project(anatomy.parent.axis.points_mm, surface.corners_mm.mean(axis=1))[0]
         first_mm, last_mm = stent.proximal_abscissa_mm + OVERLAP_MM, stent.distal_abscissa_mm - OVERLAP_MM
         is_open = (foot_mm < first_mm) | (foot_mm > last_mm)
         surface = _joined(Surface(surface.vertices_mm, surface.faces[is_open]), inner_face(stent))

@@ -1,10 +1,12 @@
-"""Data classes of an artery: `Opening`, `Centerline`, `Vessel`, `Aneurysm`, `Candidate` and `Anatomy`."""
+"""Data classes of an artery: `Opening`, `Centerline`, `Vessel`, `Aneurysm`, `Candidate`, `Path` and `Anatomy`."""
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
+from vstent.errors import InputError
 from vstent.geometry.surface import Surface
 from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats, freeze
@@ -150,26 +152,17 @@ class Vessel:
 
 @dataclass(frozen=True, eq=False)
 class Aneurysm:
-    """A sac and the neck that connects it to the parent artery."""
+    """A sac and the neck that connects it to the artery."""
 
     sac: Surface
     """The lumen outside the landing surface, closed across the neck."""
     neck: Surface
-    """The part of the landing surface that closes the sac; its normals point into the sac."""
+    """The surface that closes the sac; its normals point into the sac."""
     neck_mm: Floats
-    """(k, 3) closed curve where lumen and landing surface separate (the last point joins the first)."""
-    proximal_abscissa_mm: float
-    """Abscissa on the parent axis where the neck begins."""
-    distal_abscissa_mm: float
-    """Abscissa on the parent axis where the neck ends."""
+    """(k, 3) closed curve where the sac leaves the artery (the last point joins the first)."""
 
     def __post_init__(self) -> None:
         freeze(self, "neck_mm", np.float64, (-1, 3))
-
-    @property
-    def center_abscissa_mm(self) -> float:
-        """Abscissa of the neck's middle on the parent axis."""
-        return 0.5 * (self.proximal_abscissa_mm + self.distal_abscissa_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,31 +190,26 @@ class Candidate:
         return f"{self.kind} at {place(self.point_mm)}: {', '.join(self.reasons)}"
 
 
-BEYOND_MM = 1e-6
+PARENT: Final = "parent"
+"""Name of the path along the parent artery."""
+BEYOND_MM: Final = 1e-6
 """Rounding of abscissae, mm."""
 
 
 @dataclass(frozen=True, eq=False)
-class Anatomy:
-    """A traced vessel with its parent artery restored."""
+class Path:
+    """A way on which an implant is placed: an axis, and the surface against which the implant expands."""
 
-    vessel: Vessel
-    """The patient's lumen with sac and branches, through which blood flows."""
+    name: str
+    """``parent`` for the parent artery."""
     axis: Centerline
-    """Axis of the parent artery from inlet to outlet; its radius is the distance to the landing surface."""
+    """Axis from the proximal to the distal end; its radius is the distance to the landing surface."""
     section_radius_mm: Floats
     """(n,) radius of the circle with the area of the landing surface's section at every axis point."""
     landing_surface: Surface
-    """The parent artery with sac and side branches closed, as an open tube: the surface against which a stent
-    expands."""
+    """The way with sac and side branches closed, as an open tube."""
     is_restored: Bools
     """(v,) whether each vertex of the landing surface closes a neck or an ostium and is not the patient's own wall."""
-    aneurysms: tuple[Aneurysm, ...]
-    """The sacs found, the largest first; empty for a healthy artery."""
-    notes: tuple[str, ...] = ()
-    """Findings and assumptions, one sentence each."""
-    candidates: tuple[Candidate, ...] = ()
-    """Every bulge that was examined, with its class."""
     continued_mm: tuple[float, float] = (0.0, 0.0)
     """Lengths at the proximal and distal end of the axis, mm, that are assumed: the patient's artery ends before."""
 
@@ -254,3 +242,43 @@ class Anatomy:
     def is_restored_face(self) -> Bools:
         """(f,) whether all corners of each triangle of the landing surface are restored."""
         return np.asarray(self.is_restored[self.landing_surface.faces].all(axis=1))
+
+    def span_mm(self, aneurysm: Aneurysm) -> tuple[float, float]:
+        """Return the abscissae, in mm, between which the neck of a sac lies along this path."""
+        abscissa_mm = self.axis.nearest_abscissa_mm(aneurysm.neck_mm)
+        return float(abscissa_mm.min()), float(abscissa_mm.max())
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """A traced vessel with its sacs, and the paths on which implants are placed."""
+
+    vessel: Vessel
+    """The patient's lumen with sac and branches, through which blood flows."""
+    paths: tuple[Path, ...]
+    """The ways on which implants are placed; the first is that of the parent artery."""
+    aneurysms: tuple[Aneurysm, ...]
+    """The sacs found, the largest first; empty for a healthy artery."""
+    notes: tuple[str, ...] = ()
+    """Findings and assumptions, one sentence each."""
+    candidates: tuple[Candidate, ...] = ()
+    """Every bulge that was examined, with its class."""
+
+    @property
+    def parent(self) -> Path:
+        """The path along the parent artery."""
+        return self.paths[0]
+
+    def path(self, name: str) -> Path:
+        """Return the path of a name.
+
+        Raises
+        ------
+        InputError
+            There is none of this name.
+        """
+        for path in self.paths:
+            if path.name == name:
+                return path
+        known = ", ".join(path.name for path in self.paths)
+        raise InputError(f"This artery has no path {name!r}. Choose one of {known}.")

@@ -270,7 +270,7 @@ def landing_measures(anatomy: Anatomy, measures: Measures) -> Measures:
     wider_mm = max(landing_diameters_mm(anatomy))
     ends_mm = np.array([float(measures[f"{end}_end_abscissa_mm"]) for end in ("proximal", "distal")])
     found: Measures = {"landing_oversizing_fraction": float(measures["label_diameter_mm"]) / wider_mm - 1}
-    found["end_bend_ratio"] = float(np.interp(ends_mm, anatomy.axis.abscissa_mm, bend_ratios(anatomy)).max())
+    found["end_bend_ratio"] = float(np.interp(ends_mm, anatomy.parent.axis.abscissa_mm, bend_ratios(anatomy)).max())
     sides = [float(measures[key]) for key in ("neck_to_proximal_end_mm", "neck_to_distal_end_mm") if key in measures]
     if sides:
         found |= {"landing_length_mm": min(sides), "longest_landing_mm": max(sides)}
@@ -293,8 +293,8 @@ def bend_ratios(anatomy: Anatomy) -> Floats:
     (n,) array
         Ratio at every point of the axis.
     """
-    axis = anatomy.axis
-    diameter_mm = 2 * float(np.median(anatomy.section_radius_mm))
+    axis = anatomy.parent.axis
+    diameter_mm = 2 * float(np.median(anatomy.parent.section_radius_mm))
     even_mm = curves.resample_evenly(axis.points_mm, len(axis.points_mm))
     curvature, _ = curves.curvature_and_torsion(even_mm, diameter_mm)
     along_mm = np.linspace(0.0, axis.length_mm, len(even_mm))

@@ -127,7 +127,7 @@ class Reduced:
         """Diameter of the artery as the deployed device measures it; as expected where it is at its free diameter."""
         stent, rows_mm = self.deployment.stent, self._rows_mm
         expected = expected_profile(stent.design, stent.size, self.anatomy)
-        artery = replace(expected, diameter_mm=2 * self.anatomy.section_radius_mm)
+        artery = replace(expected, diameter_mm=2 * self.anatomy.parent.section_radius_mm)
         seen_mm = stent.row_diameter_mm + 2 * stent.design.wall_offset_um * MM_PER_UM
         is_free = stent.row_diameter_mm >= FREELY * free_diameters_mm(stent.design, stent.size)
         return artery.corrected(rows_mm, np.where(is_free, np.maximum(artery.at(rows_mm), seen_mm), seen_mm))
@@ -136,8 +136,8 @@ class Reduced:
     def _is_at_patient(self) -> Bools:
         """(rows, columns) whether the wall next to a node is the patient's own."""
         nodes_mm = self.deployment.stent.nodes_mm
-        face = self.anatomy.landing_surface.closest(nodes_mm.reshape(-1, 3))[2]
-        return self.anatomy.is_patient_face[face].reshape(nodes_mm.shape[:2])
+        face = self.anatomy.parent.landing_surface.closest(nodes_mm.reshape(-1, 3))[2]
+        return self.anatomy.parent.is_patient_face[face].reshape(nodes_mm.shape[:2])
 
     @cached_property
     def _neck(self) -> _Neck:

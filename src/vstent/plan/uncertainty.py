@@ -215,7 +215,7 @@ def vary(
     """
     spread, numbers = ranges.of(anatomy), ranges.numbers_of(deployment.stent.design)
     points = centered_points(len(CAUSES) + len(numbers), ranges.samples)
-    if 2 * spread[0] > anatomy.section_radius_mm.min():
+    if 2 * spread[0] > anatomy.parent.section_radius_mm.min():
         raise InputError(
             f"diameters that vary by {spread[0]:.2g} mm would close the artery: give a smaller range of the threshold"
         )

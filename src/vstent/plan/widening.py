@@ -29,20 +29,24 @@ def widened(anatomy: Anatomy, diameter_mm: float) -> Anatomy:
         The wider artery.
     """
     half_mm, vessel = 0.5 * diameter_mm, anatomy.vessel
-    lumen, landing = (_moved_out(surface, half_mm) for surface in (vessel.lumen, anatomy.landing_surface))
-    wall = _Shift.of((vessel.lumen, lumen), (anatomy.landing_surface, landing))
-    tube = _Shift.of((anatomy.landing_surface, landing))
+    lumen, landing = (_moved_out(surface, half_mm) for surface in (vessel.lumen, anatomy.parent.landing_surface))
+    wall = _Shift.of((vessel.lumen, lumen), (anatomy.parent.landing_surface, landing))
+    tube = _Shift.of((anatomy.parent.landing_surface, landing))
     openings = tuple(
         replace(opening, area_mm2=opening.area_mm2 * (1 + diameter_mm / opening.diameter_mm) ** 2)
         for opening in vessel.openings
     )
     lines = tuple(_line(line, half_mm) for line in vessel.centerlines)
+    parent = replace(
+        anatomy.parent,
+        axis=_line(anatomy.parent.axis, half_mm),
+        section_radius_mm=anatomy.parent.section_radius_mm + half_mm,
+        landing_surface=landing,
+    )
     return replace(
         anatomy,
         vessel=replace(vessel, lumen=lumen, openings=openings, centerlines=lines),
-        axis=_line(anatomy.axis, half_mm),
-        section_radius_mm=anatomy.section_radius_mm + half_mm,
-        landing_surface=landing,
+        paths=(parent,),
         aneurysms=tuple(_sac(aneurysm, wall, tube) for aneurysm in anatomy.aneurysms),
     )
 

@@ -10,7 +10,7 @@ from vstent.deployment.sketch import bed, sketch
 from vstent.devices.design import Design, Size, widest_mm
 from vstent.devices.stent import Landing, Stent, tube_faces
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Centerline, Opening, Vessel
+from vstent.geometry.vessel import PARENT, Anatomy, Centerline, Opening, Path, Vessel
 from vstent.reporting.figures import Plate, Shot
 from vstent.reporting.scene import LineLayer, Scene, scales_of, view_of
 
@@ -78,7 +78,8 @@ def straight_tube(radius_mm: float, length_mm: float) -> Anatomy:
     ends = Opening(points[0], -way, area_mm2, "inlet"), Opening(points[-1], way, area_mm2, "outlet_1")
     axis = Centerline(points, np.full(len(along), radius_mm))
     is_restored = np.zeros(len(wall.vertices_mm), dtype=bool)
-    return Anatomy(Vessel(wall, ends, (axis,)), axis, axis.inscribed_radius_mm, wall, is_restored, ())
+    parent = Path(PARENT, axis, axis.inscribed_radius_mm, wall, is_restored)
+    return Anatomy(Vessel(wall, ends, (axis,)), (parent,), ())
 
 
 def wire_layer(stent: Stent) -> LineLayer:

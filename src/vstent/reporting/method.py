@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from vstent.anatomy.landing_zones import neck_span_mm
 from vstent.devices.design import BARE
 from vstent.devices.stent import Deployment, tube_faces
 from vstent.geometry.surface import Surface
@@ -122,7 +123,7 @@ def _spheres(anatomy: Anatomy, scene: Scene) -> Plate:
 
 def _bead_layer(anatomy: Anatomy) -> MeshLayer:
     """Return the maximum inscribed spheres along the axis as one translucent layer."""
-    axis = anatomy.axis
+    axis = anatomy.parent.axis
     at_mm = [0.0]
     while at_mm[-1] < axis.length_mm:
         radius_mm = float(np.interp(at_mm[-1], axis.abscissa_mm, axis.inscribed_radius_mm))
@@ -178,9 +179,7 @@ def _triangles(anatomy: Anatomy, deployments: Mapping[str, Deployment], scene: S
 
 def _middle_mm(anatomy: Anatomy) -> Floats:
     """Return the point (3,) of the axis at the middle of the neck, or without a sac of the artery."""
-    axis, sacs = anatomy.axis, anatomy.aneurysms
-    middle = 0.5 * (sacs[0].proximal_abscissa_mm + sacs[0].distal_abscissa_mm) if sacs else 0.5 * axis.length_mm
-    return axis.at(np.array([middle]))[0]
+    return anatomy.parent.axis.at(np.array([np.mean(neck_span_mm(anatomy))]))[0]
 
 
 def mesh_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
@@ -209,7 +208,7 @@ def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
 
 def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene) -> Plate:
     """Return the picture of the expansion of one device, colored by the gap to the wall."""
-    frames_mm, gaps_mm = thin_frames(deployment, anatomy.landing_surface, FRAMES)
+    frames_mm, gaps_mm = thin_frames(deployment, anatomy.parent.landing_surface, FRAMES)
     contour = next(layer for layer in scene.pick(("contour",), name) if isinstance(layer, MeshLayer))
     reached = np.concatenate([[0.0], deployment.terminated_fraction])
     shots = []

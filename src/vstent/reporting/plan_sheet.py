@@ -141,7 +141,7 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
         rows.append(("Deployed length, band from the ranges of the device's numbers", band[1:-1]))
     for end, (first_mm, last_mm) in _zones_mm(anatomy).items():
         inside = np.linspace(first_mm, last_mm, 51)
-        diameters = 2 * np.interp(inside, anatomy.axis.abscissa_mm, anatomy.section_radius_mm)
+        diameters = 2 * np.interp(inside, anatomy.parent.axis.abscissa_mm, anatomy.parent.section_radius_mm)
         words = f"{diameters.min():.2f} to {diameters.max():.2f} mm"
         rows.append((f"{end} landing zone, {ZONE_MM:g} mm: smallest and largest diameter", words))
     keys = {
@@ -161,7 +161,7 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
 
 def _zones_mm(anatomy: Anatomy) -> dict[str, tuple[float, float]]:
     """Return the landing zones beside the neck within the patient's artery."""
-    first_mm, last_mm = anatomy.own_mm
+    first_mm, last_mm = anatomy.parent.own_mm
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     return {
         "Proximal": (max(first_mm, proximal_mm - ZONE_MM), max(first_mm, proximal_mm)),

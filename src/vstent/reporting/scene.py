@@ -167,7 +167,7 @@ def scene_of(anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Ma
         scales=scales_of(layers, anatomy),
         views=views_of(anatomy, deployments),
         is_oriented=anatomy.vessel.is_oriented,
-        fade_mm=1.2 * float(np.median(anatomy.section_radius_mm)),
+        fade_mm=1.2 * float(np.median(anatomy.parent.section_radius_mm)),
     )
 
 
@@ -194,18 +194,18 @@ RING_MM = 1.0
 def anatomy_layers(anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
     """Return the layers of lumen, landing surface, centerlines, axis, sacs and necks."""
     lumen, _ = thin_surface(anatomy.vessel.lumen, 40_000)
-    surface = anatomy.landing_surface
+    surface = anatomy.parent.landing_surface
     own = Surface(
-        *triangles.compact(surface.vertices_mm, surface.faces[~anatomy.is_continued[surface.faces].any(axis=1)])
+        *triangles.compact(surface.vertices_mm, surface.faces[~anatomy.parent.is_continued[surface.faces].any(axis=1)])
     )
-    landing, _ = thin_surface(own if any(anatomy.continued_mm) else surface, 24_000)
+    landing, _ = thin_surface(own if any(anatomy.parent.continued_mm) else surface, 24_000)
     layers: list[MeshLayer | LineLayer] = [
         MeshLayer(id="lumen", pane="", colour=_WALL, surface=lumen, opacity=0.16, **_PLAIN),
         MeshLayer(id="landing", pane="", colour=(0.80, 0.74, 0.66), surface=landing, **_PLAIN),
         curves_layer("centerlines", [line.points_mm for line in anatomy.vessel.centerlines], 0.05, (0.45, 0.36, 0.58)),
-        curves_layer("axis", [anatomy.axis.points_mm], 0.06, (0.17, 0.32, 0.55)),
+        curves_layer("axis", [anatomy.parent.axis.points_mm], 0.06, (0.17, 0.32, 0.55)),
     ]
-    if any(anatomy.continued_mm):
+    if any(anatomy.parent.continued_mm):
         layers += [curves_layer("continued", _continued_rings(anatomy), 0.05, _ASSUMED)]
     if anatomy.aneurysms:
         sacs = [thin_surface(aneurysm.sac, 12_000)[0] for aneurysm in anatomy.aneurysms]
@@ -217,10 +217,10 @@ def anatomy_layers(anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
 
 def _continued_rings(anatomy: Anatomy) -> list[Floats]:
     """Return closed rings of the continued artery, about `RING_MM` apart: assumed wall is not drawn solid."""
-    count = len(anatomy.axis.points_mm)
-    rings_mm = anatomy.landing_surface.vertices_mm.reshape(count, -1, 3)
-    is_assumed = anatomy.is_continued.reshape(count, -1).all(axis=1)
-    every = max(1, round(RING_MM / float(np.diff(anatomy.axis.abscissa_mm).mean())))
+    count = len(anatomy.parent.axis.points_mm)
+    rings_mm = anatomy.parent.landing_surface.vertices_mm.reshape(count, -1, 3)
+    is_assumed = anatomy.parent.is_continued.reshape(count, -1).all(axis=1)
+    every = max(1, round(RING_MM / float(np.diff(anatomy.parent.axis.abscissa_mm).mean())))
     return [np.vstack([ring, ring[:1]]) for ring in rings_mm[is_assumed][::every]]
 
 
@@ -249,7 +249,7 @@ def device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[M
     deployment : the deployment.
     anatomy : vessel, parent artery and sacs.
     """
-    frames_mm, gaps_mm = thin_frames(deployment, anatomy.landing_surface, n_frames=24)
+    frames_mm, gaps_mm = thin_frames(deployment, anatomy.parent.landing_surface, n_frames=24)
     stent = deployment.stent
     points, starts, _ = thin_lines(stent.wire_points_mm, stent.wire_starts, np.zeros(0), 60_000)
     contour = MeshLayer(
@@ -434,7 +434,7 @@ def views_of(anatomy: Anatomy, deployments: Mapping[str, Deployment]) -> tuple[V
     """
     points = [deployment.stent.nodes_mm.reshape(-1, 3) for deployment in deployments.values()]
     points += [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
-    treated = np.concatenate(points or [anatomy.axis.points_mm])
+    treated = np.concatenate(points or [anatomy.parent.axis.points_mm])
     whole = anatomy.vessel.lumen.vertices_mm
     right, up, toward = _profile(anatomy)
     profile = view_of("profile", np.stack([right, up, toward]), treated)
@@ -465,12 +465,12 @@ def view_of(name: str, axes: Floats, points_mm: Floats, room: float = 1.0) -> Vi
 
 def _profile(anatomy: Anatomy) -> Floats:
     """Return rows right, up and toward the eye (3, 3): the artery at the neck runs to the right, the sac points up."""
-    axis = anatomy.axis
+    axis = anatomy.parent.axis
     if not anatomy.aneurysms:
         plane = np.linalg.svd(axis.points_mm - axis.points_mm.mean(axis=0))[2]
         return np.stack([plane[0], plane[1], np.cross(plane[0], plane[1])])
     aneurysm = anatomy.aneurysms[0]
-    ends = np.array([aneurysm.proximal_abscissa_mm, aneurysm.distal_abscissa_mm])
+    ends = np.array(anatomy.parent.span_mm(aneurysm))
     start, end = axis.at(np.clip(ends + np.array([-1.0, 1.0]), 0.0, axis.length_mm))
     right = (end - start) / np.linalg.norm(end - start)
     up = aneurysm.sac.vertices_mm.mean(axis=0) - 0.5 * (start + end)

@@ -55,8 +55,9 @@ def truth(case: CaseResult) -> list[Row]:
 
 def _radii_mm(case: CaseResult, phantom: Phantom) -> tuple[np.ndarray, np.ndarray]:
     """Return the radius of the landing surface and of the phantom at the same points, without the ends."""
-    axis, parent = case.anatomy.axis, phantom.parent
+    path, parent = case.anatomy.parent, phantom.parent
+    axis = path.axis
     margin = 2 * END_DIAMETERS * float(axis.inscribed_radius_mm.mean())
     inner = (axis.abscissa_mm > margin) & (axis.abscissa_mm < axis.length_mm - margin)
     place = curves.project(parent.points_mm, axis.points_mm[inner])[0]
-    return case.anatomy.section_radius_mm[inner], np.interp(place, parent.abscissa_mm, parent.inscribed_radius_mm)
+    return path.section_radius_mm[inner], np.interp(place, parent.abscissa_mm, parent.inscribed_radius_mm)

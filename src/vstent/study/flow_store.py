@@ -25,7 +25,7 @@ class FlowStore:
     """
 
     def __init__(self, out: Path, anatomy: Anatomy, settings: FlowSettings) -> None:
-        lumen, landing = anatomy.vessel.lumen, anatomy.landing_surface
+        lumen, landing = anatomy.vessel.lumen, anatomy.parent.landing_surface
         shape = [lumen.volume_mm3, lumen.area_mm2, landing.area_mm2, *landing.vertices_mm.mean(axis=0).tolist()]
         self.folder = out / CACHE
         self._path = self.folder / f"rank-flow-{key_of(shape, settings)}.json"

@@ -104,9 +104,9 @@ def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
 
 def write_anatomy(out: Path, anatomy: Anatomy) -> None:
     """Write the vessel, the parent artery and the sacs; files of sacs that no longer exist are removed."""
-    write_vessel(out, anatomy.vessel, anatomy.axis)
-    restored = {"is_restored": anatomy.is_restored.astype(np.uint8)}
-    writers.write_surface(out / "landing_surface.vtp", anatomy.landing_surface, restored)
+    write_vessel(out, anatomy.vessel, anatomy.parent.axis)
+    restored = {"is_restored": anatomy.parent.is_restored.astype(np.uint8)}
+    writers.write_surface(out / "landing_surface.vtp", anatomy.parent.landing_surface, restored)
     written = set()
     for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
         sac, neck = (f"{part}.vtp" if number == 1 else f"{part}_{number}.vtp" for part in ("sac", "neck"))

@@ -63,8 +63,9 @@ def test_the_sac_has_its_volume_and_is_closed(demo) -> None:
     np.testing.assert_allclose(aneurysm.sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.03)
     into_sac = phantom.sac.center_mm - aneurysm.neck.corners_mm.mean(axis=1)
     assert (np.einsum("ij,ij->i", into_sac, aneurysm.neck.normals) > 0).mean() > 0.99
-    foot = float(anatomy.axis.nearest_abscissa_mm(phantom.neck_center_mm[None])[0])
-    assert aneurysm.proximal_abscissa_mm < foot < aneurysm.distal_abscissa_mm
+    foot = float(anatomy.parent.axis.nearest_abscissa_mm(phantom.neck_center_mm[None])[0])
+    proximal_mm, distal_mm = anatomy.parent.span_mm(aneurysm)
+    assert proximal_mm < foot < distal_mm
 
 
 def test_neck_and_sac_share_their_rim(demo) -> None:
@@ -117,13 +118,13 @@ def test_an_oval_artery_is_its_own_wall_and_keeps_its_sac(stretch: float) -> Non
     anatomy = restore(trace(Vessel(Surface(surface.vertices_mm * factor, surface.faces))))
     (aneurysm,) = anatomy.aneurysms
     np.testing.assert_allclose(aneurysm.sac.volume_mm3, round_one.sac_volume_mm3, rtol=0.01)
-    landed = anatomy.landing_surface.vertices_mm[~anatomy.is_continued] / factor
+    landed = anatomy.parent.landing_surface.vertices_mm[~anatomy.parent.is_continued] / factor
     error = np.hypot(landed[:, 0], landed[:, 1]) / 2.0 - 1
     beside = np.abs(landed[:, 2] - 13) > 5.0
     assert np.abs(error).max() < 0.06
     assert np.abs(error[beside]).max() < 0.01
     inside = (landed[:, 2] > 1.0) & (landed[:, 2] < 25.0)  # at the ends rays leave by the opening
-    assert not anatomy.is_restored[~anatomy.is_continued][beside & inside].any()
+    assert not anatomy.parent.is_restored[~anatomy.parent.is_continued][beside & inside].any()
 
 
 def test_two_sacs_are_both_found_and_the_one_at_a_point_alone() -> None:
@@ -134,10 +135,9 @@ def test_two_sacs_are_both_found_and_the_one_at_a_point_alone() -> None:
     assert second.sac is not None
     vessel = trace(Vessel(phantoms.phantom_surface(replace(first, blebs=(second.sac,)), edge_mm=0.3)))
     anatomy = restore(vessel)
-    found = {
-        round(a.center_abscissa_mm if anatomy.axis.points_mm[0, 2] < 1 else 46 - a.center_abscissa_mm): a
-        for a in anatomy.aneurysms
-    }
+    middles_mm = [np.mean(anatomy.parent.span_mm(one)) for one in anatomy.aneurysms]
+    is_upward = anatomy.parent.axis.points_mm[0, 2] < 1
+    found = {round(z if is_upward else 46 - z): one for z, one in zip(middles_mm, anatomy.aneurysms, strict=True)}
     assert list(found) == [30, 15]  # the larger first
     for abscissa_mm, phantom in ((15, first), (30, second)):
         np.testing.assert_allclose(found[abscissa_mm].sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.01)
@@ -165,7 +165,7 @@ def test_the_flank_is_freed_of_the_blur_of_the_artery_below_it() -> None:
 def test_the_neck_lies_on_the_landing_surface_in_the_lumen(demo) -> None:
     anatomy, phantom = demo
     (aneurysm,) = anatomy.aneurysms
-    assert anatomy.landing_surface.closest(aneurysm.neck_mm)[1].max() < 1e-6
+    assert anatomy.parent.landing_surface.closest(aneurysm.neck_mm)[1].max() < 1e-6
     assert anatomy.vessel.closed.signed_distance(aneurysm.neck_mm).max() < 0.05
     # The true neck is where the sac's ellipsoid meets the artery.
     assert np.abs(phantom.sac.implicit_mm(aneurysm.neck_mm)[0]).max() < 0.05
@@ -249,9 +249,9 @@ def test_without_a_sac_the_landing_surface_is_the_wall() -> None:
     anatomy = anatomy_of(phantom)
     assert anatomy.aneurysms == ()
     assert any("No sac" in note for note in anatomy.notes)
-    vertices = anatomy.landing_surface.vertices_mm[~anatomy.is_restored]
+    vertices = anatomy.parent.landing_surface.vertices_mm[~anatomy.parent.is_restored]
     assert anatomy.vessel.lumen.closest(vertices)[1].max() < 1e-6
-    assert anatomy.is_restored.mean() < 0.05
+    assert anatomy.parent.is_restored.mean() < 0.05
 
 
 def test_a_point_far_from_any_sac_is_refused() -> None:
@@ -269,8 +269,8 @@ def test_motion_mirror_and_order_of_the_triangles_do_not_change_the_sac(demo) ->
     moved = restore(trace(Vessel(Surface(anatomy.vessel.lumen.vertices_mm @ turn.T + [5.0, 60.0, -9.0], faces))))
     np.testing.assert_allclose(moved.aneurysms[0].sac.volume_mm3, anatomy.aneurysms[0].sac.volume_mm3, rtol=0.005)
     np.testing.assert_allclose(moved.aneurysms[0].neck.area_mm2, anatomy.aneurysms[0].neck.area_mm2, rtol=0.02)
-    there = anatomy.axis.points_mm @ turn.T + [5.0, 60.0, -9.0]
-    assert curves.project(there, moved.axis.points_mm)[1].max() < 0.05
+    there = anatomy.parent.axis.points_mm @ turn.T + [5.0, 60.0, -9.0]
+    assert curves.project(there, moved.parent.axis.points_mm)[1].max() < 0.05
 
 
 def test_trimming_cuts_a_long_artery_square_and_keeps_the_sac() -> None:
@@ -382,5 +382,5 @@ def test_a_real_healthy_artery_stays_as_it_is(shared_data, name: str) -> None:
 
     anatomy = restore(trace(Vessel(repair(read_surface(shared_data / name)[0])[0])))  # the siphon comes inside out
     assert anatomy.aneurysms == ()
-    assert anatomy.is_restored.mean() < 0.5
+    assert anatomy.parent.is_restored.mean() < 0.5
     assert moved_mm(anatomy) < 0.05

@@ -128,7 +128,7 @@ def test_a_fusiform_aneurysm_is_told_and_stays_part_of_the_landing_surface() -> 
     bulb = phantoms.Sac(middle, np.array([0.0, 0.0, 1.0]), 3.5, 3.5)
     anatomy = restore(traced(replace(phantoms.tube(length_mm=30.0), sac=bulb)))
     assert anatomy.aneurysms == ()
-    assert anatomy.section_radius_mm.max() == pytest.approx(3.5, rel=0.02)
+    assert anatomy.parent.section_radius_mm.max() == pytest.approx(3.5, rel=0.02)
     (note,) = (note for note in anatomy.notes if "fusiform" in note)
     assert note.startswith("The artery is 7.0 mm wide at ")
     np.testing.assert_allclose(place_in(note), middle, atol=0.2)
@@ -156,9 +156,9 @@ def test_a_sac_that_touches_its_artery_again_is_no_short_cut(sac_that_touches_it
     phantom, vessel = sac_that_touches_its_artery_again
     assert any("opens into the artery at two places" in note for note in vessel.notes)
     anatomy = restore(trim(vessel))
-    np.testing.assert_allclose(np.ptp(anatomy.own_mm), phantom.parent.length_mm, rtol=0.01)
+    np.testing.assert_allclose(np.ptp(anatomy.parent.own_mm), phantom.parent.length_mm, rtol=0.01)
     np.testing.assert_allclose(anatomy.aneurysms[0].sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.02)
-    own_mm = anatomy.landing_surface.vertices_mm[~anatomy.is_continued]
+    own_mm = anatomy.parent.landing_surface.vertices_mm[~anatomy.parent.is_continued]
     wall_mm = phantoms.tube_implicit_mm(phantom.parent, own_mm)[0]
     assert np.abs(wall_mm).max() < 0.15
 
@@ -196,7 +196,9 @@ def test_the_parent_artery_turns_back_into_an_arm_only_where_that_is_much_wider(
     phantom = replace(phantom, parent=replace(phantom.parent, inscribed_radius_mm=radius_mm))
     vessel = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.3)), inlet_mm=phantom.ends[1][0])
     anatomy = restore(vessel)
-    np.testing.assert_allclose(anatomy.axis.at(np.array(anatomy.own_mm))[-1], phantom.ends[end][0], atol=0.2)
+    np.testing.assert_allclose(
+        anatomy.parent.axis.at(np.array(anatomy.parent.own_mm))[-1], phantom.ends[end][0], atol=0.2
+    )
 
 
 def with_a_dome(phantom: phantoms.Phantom, *, beyond_mm: float, radius_mm: float) -> phantoms.Phantom:

@@ -53,7 +53,7 @@ def _anatomy(wall: Surface, outlet_mm: Floats | None = None) -> Anatomy:
 def test_real_necks_and_sacs_stand_noise(shared_data, name: str, kinds: tuple[str, ...], area: float) -> None:
     wall = repair(read_surface(shared_data / name)[0])[0]
     anatomy = _anatomy(wall)
-    still, outlet_mm = anatomy.aneurysms[0], anatomy.axis.points_mm[-1]  # the challenge's fork is one of equals
+    still, outlet_mm = anatomy.aneurysms[0], anatomy.parent.axis.points_mm[-1]  # the challenge's fork is one of equals
     for kind in kinds:
         for seed in (1, 2, 3):
             moved = _anatomy(_shaken(wall, kind, seed), outlet_mm).aneurysms[0]

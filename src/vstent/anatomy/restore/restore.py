@@ -23,7 +23,7 @@ from vstent.anatomy.restore.sac import cut_sac, drawn_sac, is_in_one
 from vstent.anatomy.restore.tubes import tubes_of
 from vstent.errors import InputError, VesselError
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Aneurysm, Candidate, Centerline, Vessel
+from vstent.geometry.vessel import PARENT, Anatomy, Aneurysm, Candidate, Centerline, Path, Vessel
 from vstent.kernels.arrays import Floats
 from vstent.units import place
 
@@ -81,17 +81,9 @@ def restore(
         candidates += others
     aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
     flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm, path, landing)
-    anatomy = Anatomy(
-        vessel,
-        landing.axis,
-        landing.section_radius_mm,
-        landing.surface,
-        landing.is_restored.ravel(),
-        aneurysms,
-        (*told(vessel, path, bulges or found, aneurysms), *candidates_told(aneurysms, candidates), *flat_told(flat)),
-        tuple(candidates),
-    )
-    return continued(anatomy)
+    parent = Path(PARENT, landing.axis, landing.section_radius_mm, landing.surface, landing.is_restored.ravel())
+    notes = (*told(vessel, path, bulges or found, aneurysms), *candidates_told(aneurysms, candidates), *flat_told(flat))
+    return continued(Anatomy(vessel, (parent,), aneurysms, notes, tuple(candidates)))
 
 
 def _closed(
@@ -108,7 +100,8 @@ def _closed(
 
 def _classified(vessel: Vessel, landing: Landing, sac: Aneurysm) -> Candidate:
     """Return the class of a sac, from its shape and the parent artery's diameter at its neck."""
-    middle_mm = 0.5 * (sac.proximal_abscissa_mm + sac.distal_abscissa_mm)
+    abscissa_mm = landing.axis.nearest_abscissa_mm(sac.neck_mm)
+    middle_mm = 0.5 * float(abscissa_mm.min() + abscissa_mm.max())
     return classified(vessel, sac, 2 * float(np.interp(middle_mm, landing.axis.abscissa_mm, landing.section_radius_mm)))
 
 

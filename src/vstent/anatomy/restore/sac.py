@@ -140,8 +140,7 @@ def _aneurysm(artery: Artery, flank: Flank, other_loops: list[Ints], rings: Floa
     """Return the aneurysm of a flank, its branch mouths, and its continuation, rings (n, k, 3), down to the neck."""
     neck = _neck(artery, rings[-1])
     sac = _closed_sac(flank, other_loops, rings, neck)
-    abscissa = curves.project(artery.landings[0].points_mm, rings[-1])[0]
-    return Aneurysm(sac, neck, rings[-1], float(abscissa.min()), float(abscissa.max()))
+    return Aneurysm(sac, neck, rings[-1])
 
 
 def _is_island(lumen: Surface, is_low: Bools) -> Bools:
