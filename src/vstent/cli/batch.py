@@ -34,15 +34,15 @@ def _batch(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     from vstent.cli.console import Console, cohort_table
     from vstent.cohort.batch import collect, left_to_do, pictures_of, run_cohort, write_table
-    from vstent.cohort.cases import device_rows, find_cases
+    from vstent.cohort.cases import row_count, find_cases
     from vstent.cohort.estimate import estimate
 
     console = Console()
-    settings = run.given_study(arguments, **options.given_geometry(arguments))
+    settings = run.given_study(arguments)
     cases = find_cases(arguments.cohort, settings)
     tasks = left_to_do(cases, arguments.out, keeps_files=arguments.keep_files)
     foreseen = estimate([task.case for task in tasks], arguments.jobs)
-    console.print(f"{len(cases)} cases, {device_rows(cases)} rows; {len(tasks)} cases to do: {foreseen.sentence}.")
+    console.print(f"{len(cases)} cases, {row_count(cases)} rows; {len(tasks)} cases to do: {foreseen.sentence}.")
     with console.live():
         run_cohort(
             tasks, arguments.out, options.given_crew(arguments, foreseen.jobs, foreseen.memory_MB), _teller(console)

@@ -14,6 +14,7 @@ from rich.table import Table
 from vstent.devices.design import Design
 from vstent.devices.fit import Fitted
 from vstent.devices.ranges import MARGIN
+from vstent.devices.treatment import BARE
 from vstent.flow.convergence import Refinement
 from vstent.flow.positions import POSITIONS, Scatter
 from vstent.geometry.vessel import Opening
@@ -110,66 +111,78 @@ class Console:
 
 
 def comparison_table(metrics: Mapping[str, Any]) -> Table:
-    """Return the table of the main results: without a device, and with each device and its relative change."""
-    stents = metrics["stents"]
-    table = Table("", "bare", *stents)
+    """Return the table of the main results: in the bare artery, and with each treatment and its relative change."""
+    treatments = _treatments(metrics)
+    table = Table("", BARE, *treatments)
     for title, key in DEVICE_ROWS:
-        if any(key in stent["deployment"] for stent in stents.values()):
-            table.add_row(title, "", *(_banded(key, stent) for stent in stents.values()))
-    if "bare" not in metrics:
+        cells = [" + ".join(_banded(key, one) for one in found["implants"].values()) for found in treatments.values()]
+        if any(cells):
+            table.add_row(title, "", *cells)
+    if not _bare(metrics):
         return table
     table.add_section()
     _add_grades(table, metrics)
     for title, key in ROWS:
-        bare = metrics["bare"].get(key)
+        bare = _bare(metrics).get(key)
         if bare is None:
             continue
         table.add_row(title, *_flow_cells(metrics, key, bare))
     return table
 
 
-def _banded(key: str, stent: Mapping[str, Any]) -> str:
-    """Return a measure of a deployment with its band."""
+def _treatments(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the metrics of all treatments with implants, by name."""
+    return {name: found for name, found in metrics["treatments"].items() if name != BARE}
+
+
+def _bare(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the metrics of the flow in the bare artery; empty without flows."""
+    return dict(metrics["treatments"].get(BARE, {}).get("flow", {}))
+
+
+def _banded(key: str, implant: Mapping[str, Any]) -> str:
+    """Return a measure of an implant with its band."""
     from vstent.reporting.bands import ends
 
-    return f"{_cell(key, stent['deployment'].get(key))} {_spaced(ends(stent, key))}".rstrip()
+    return f"{_cell(key, implant.get(key))} {_spaced(ends(implant, key))}".rstrip()
 
 
 def device_sentences(metrics: Mapping[str, Any]) -> list[str]:
-    """Return how sure each device is, one text each; metrics of earlier versions do not state it."""
+    """Return how sure the device of each implant is, one text each."""
     from vstent.reporting.bands import how_sure
 
-    return [_spaced(sentence) for stent in metrics["stents"].values() if (sentence := how_sure(stent))]
+    implants = [one for found in _treatments(metrics).values() for one in found["implants"].values()]
+    return list(dict.fromkeys(_spaced(how_sure(one)) for one in implants if one.get("bands")))
 
 
 def _add_grades(table: Table, metrics: Mapping[str, Any]) -> None:
     """Add the grades of the flows as a row, and their reasons and the grid as the caption."""
     from vstent.reporting.quality import qualities
 
-    graded = {one.name: one for one in qualities(metrics, {name: name for name in metrics["stents"]})}
+    graded = {one.name: one for one in qualities(metrics, {name: name for name in _treatments(metrics)})}
     if graded:
-        cells = (graded[name].grade if name in graded else "" for name in ("bare", *metrics["stents"]))
+        cells = (graded[name].grade if name in graded else "" for name in (BARE, *_treatments(metrics)))
         table.add_row("Grade of the flow", *cells)
         reasons = (one.sentence for one in graded.values() if one.reasons)
-        table.caption = "\n".join([f"Flow: {graded['bare'].computation}.", *reasons])
+        table.caption = "\n".join([f"Flow: {graded[BARE].computation}.", *reasons])
         table.caption_justify = "left"
 
 
 def _flow_cells(metrics: Mapping[str, Any], key: str, bare: float) -> list[str]:
-    """Return a row of a flow index: without a device, and with each device and its change where that may be shown."""
+    """Return a row of a flow index: bare, and with each treatment and its change where that may be shown."""
     from vstent.reporting.quality import unusable
 
     hidden = unusable(metrics)
-    values = {name: stent.get("flow", {}).get(key) for name, stent in metrics["stents"].items()}
+    values = {name: found.get("flow", {}).get(key) for name, found in _treatments(metrics).items()}
     shown = (_cell(key, one) if name in hidden else _change(key, bare, one) for name, one in values.items())
     return [_cell(key, bare), *shown]
 
 
 COHORT_COLUMNS: Final = (
-    ("length, mm", "deployment.deployed_length_mm", "{:.1f}"),
-    ("apposed", "deployment.apposed_fraction", "{:.0%}"),
-    ("metal at neck", "deployment.neck_metal_coverage_fraction", "{:.0%}"),
-    ("neck inflow, after / before", "ratios.neck_inflow_mL_s_ratio", "{:.2f}"),
+    ("length, mm", "implant.deployed_length_mm", "{:.1f}"),
+    ("apposed", "implant.apposed_fraction", "{:.0%}"),
+    ("metal at neck", "implant.neck_metal_coverage_fraction", "{:.0%}"),
+    ("neck inflow, after / before", "change.neck_inflow_mL_s_ratio", "{:.2f}"),
     ("s a case", "case_s", "{:.1f}"),
     ("CPU s a case", "case_cpu_s", "{:.1f}"),
     ("MB", "peak_memory_MB", "{:.0f}"),
@@ -248,17 +261,17 @@ def _shown(ranking: Ranking, count: int) -> list[tuple[int, Candidate]]:
 
 
 def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the table of a cohort: one row per device with medians over the finished cases."""
+    """Return the table of a cohort: one row per treatment with medians over the finished cases."""
     columns = [column for column in COHORT_COLUMNS if any(row.get(column[1]) is not None for row in rows)]
-    table = Table("device", "done", "failed", "lost", *(title for title, _, _ in columns))
-    for device in dict.fromkeys(row["device"] for row in rows):
-        own = [row for row in rows if row["device"] == device]
+    table = Table("treatment", "done", "failed", "lost", *(title for title, _, _ in columns))
+    for treatment in dict.fromkeys(row["treatment"] for row in rows):
+        own = [row for row in rows if row["treatment"] == treatment]
         counts = [str(sum(row["outcome"] == outcome for row in own)) for outcome in ("done", "failed", "lost")]
         found = [[row[key] for row in own if row.get(key) is not None] for _, key, _ in columns]
         cells = [
             form.format(median(values)) if values else "" for values, (*_, form) in zip(found, columns, strict=True)
         ]
-        table.add_row(device, *counts, *cells)
+        table.add_row(treatment, *counts, *cells)
     table.caption = "medians"
     return table
 
@@ -267,9 +280,9 @@ def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of uncertainty intervals of all results, with the main causes."""
     from vstent.reporting.uncertainty import intervals
 
-    table = Table("device", "result", "mean", "95 % interval from", "to", "main causes", title="uncertainty")
-    for name, stent in metrics["stents"].items():
-        for row in intervals(stent):
+    table = Table("treatment", "result", "mean", "95 % interval from", "to", "main causes", title="uncertainty")
+    for name, found in _treatments(metrics).items():
+        for row in intervals(found):
             causes = ", ".join(f"{cause} {share:.0%}" for cause, share in row.shares if share >= 0.005)
             table.add_row(name, row.name, row.mean, row.low, row.high, causes)
     return table
@@ -296,28 +309,27 @@ def morphology_table(measures: Mapping[str, Any]) -> Table:
 
 
 def flow_table(metrics: Mapping[str, Any]) -> Table:
-    """Return the table of all flow indices: without a device, and with each device and its relative change."""
+    """Return the table of all flow indices: bare, and with each treatment and its relative change."""
     from vstent.reporting.quantities import flatten
 
-    stents = metrics["stents"]
-    table = Table("flow", "bare", *stents)
+    table = Table("flow", BARE, *_treatments(metrics))
     _add_grades(table, metrics)
-    for quantity in flatten(metrics["bare"]):
+    for quantity in flatten(_bare(metrics)):
         table.add_row(quantity.name, *_flow_cells(metrics, quantity.key, quantity.value))
     return table
 
 
 def angiogram_table(metrics: Mapping[str, Any]) -> Table:
-    """Return the table of angiograms: without a device, and with each device and its relative change."""
+    """Return the table of angiograms: bare, and with each treatment and its relative change."""
     from vstent.reporting.definitions import INDICES_WITH_OCCLUSION
     from vstent.reporting.quantities import flatten
 
-    table = Table("angiogram", "bare", *metrics["stents"])
+    table, bare = Table("angiogram", BARE, *_treatments(metrics)), _bare(metrics)
     _add_grades(table, metrics)
     for key in CONTRAST_ROWS:
-        if key in metrics["bare"]:
+        if key in bare:
             name = flatten({key: 0.0})[0].name
-            table.add_row(name, *_flow_cells(metrics, key, metrics["bare"][key]))
+            table.add_row(name, *_flow_cells(metrics, key, bare[key]))
     table.caption = "\n".join([str(table.caption or ""), *INDICES_WITH_OCCLUSION]).strip()
     return table
 

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from vstent.cli import options
+from vstent.errors import InputError
 
 
 def add(commands: options.Commands) -> None:
@@ -19,9 +20,7 @@ def add(commands: options.Commands) -> None:
         "export openfoam case --device silk --out foam",
     )
     _add_input(foam)
-    foam.add_argument(
-        "--device", metavar="NAME", help="mesh this device's wires over necks and branch ostia (default: no device)"
-    )
+    options.add_treatments(foam)
     options.add_problem(foam)
     group = foam.add_argument_group("OpenFOAM")
     options.add_processes(group)
@@ -62,8 +61,11 @@ def _openfoam(arguments: argparse.Namespace) -> int:
     from vstent.study.exports import export_openfoam
     from vstent.study.types import Settings
 
-    devices = (arguments.device,) if arguments.device else ()
-    settings = Settings(devices=devices, flow=options.given_problem(arguments), **options.given_geometry(arguments))
+    treatments = options.given_treatments(arguments, usual=())
+    if len(treatments) > 1:
+        raise InputError("A case folder of OpenFOAM holds the wires of one treatment: give one --device or --treatment.")
+    flow = options.given_problem(arguments)
+    settings = Settings(**options.given_geometry(arguments), treatments=treatments, flow=flow)
     foam = {"processes": arguments.processes, "layers": arguments.layers}
     if arguments.flavour:
         foam["flavour"] = arguments.flavour
@@ -80,7 +82,7 @@ def _patches(arguments: argparse.Namespace) -> int:
     from vstent.study.exports import export_patches
     from vstent.study.types import Settings
 
-    settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
+    settings = Settings(treatments=(), flow=None, **options.given_geometry(arguments))
     console = Console()
     with console.live():
         patches = export_patches(arguments.input, arguments.out, settings, console.progress)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vstent.cli import options
+from vstent.errors import InputError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,11 +23,8 @@ def add(commands: options.Commands) -> None:
         "flow artery.stl --grid-spacing 0.2 --out case",
     )
     options.add_outlet(options.add_geometry(parser))
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument(
-        "--device", action="append", metavar="NAME", help="device of the catalogue; repeat for several (default: none)"
-    )
-    what.add_argument(
+    options.add_treatments(parser)
+    parser.add_argument(
         "--convergence",
         action="store_true",
         help="compare the flow without a device on three grids, with three time steps and in three orientations",
@@ -40,8 +38,11 @@ def _flow(arguments: argparse.Namespace) -> int:
     from vstent.cli.console import Console
     from vstent.study.types import Settings
 
-    devices = tuple(dict.fromkeys(arguments.device or ()))
-    settings = Settings(devices=devices, flow=options.given_flow(arguments), **options.given_geometry(arguments))
+    treatments = options.given_treatments(arguments, usual=())
+    if arguments.convergence and treatments:
+        raise InputError("--convergence compares flows without a device: leave out --device and --treatment.")
+    flow = options.given_flow(arguments)
+    settings = Settings(**options.given_geometry(arguments), treatments=treatments, flow=flow)
     console = Console()
     compute = _converge if arguments.convergence else _compute
     for table in compute(arguments.input, arguments.out, settings, console, arguments.replace):

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from vstent.errors import InputError
 
 if TYPE_CHECKING:
+    from vstent.devices.treatment import Treatment
     from vstent.flow.case import Blood, FlowSettings, Waveform
     from vstent.plan.uncertainty import Ranges
     from vstent.study.crews import AbstractCrew
+    from vstent.study.types import AnatomySettings, InputSettings
 
 EPILOG: Final = "Lengths are in mm, coordinates are LPS. Research use only: not cleared for diagnosis or treatment."
 """Last line of every help text."""
@@ -195,7 +197,20 @@ def add_devices(parser: argparse.ArgumentParser) -> None:
         "--device",
         action="append",
         metavar="NAME",
-        help="device of the catalogue; repeat for several (default: silk and enterprise)",
+        help="device of the catalogue; repeat for several, each a treatment (default: silk and enterprise)",
+    )
+
+
+def add_treatments(parser: argparse.ArgumentParser) -> None:
+    """Add the choice of treatments: devices alone, and several devices together."""
+    add_devices(parser)
+    parser.add_argument(
+        "--treatment",
+        type=_treatment,
+        action="append",
+        metavar="TEXT",
+        help='treatment of several devices in the order of their deployment, each inside those before it, such as "silk '
+        '4x20 + silk@-4": with a size, or with a shift of the proposed place in mm; NAME= before it names it',
     )
 
 
@@ -440,29 +455,39 @@ def _spacing(text: str) -> tuple[float, float, float]:
     return _three(text if "," in text else ",".join([text] * 3), float)
 
 
-def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options on the vessel by the names of the settings, with points in LPS mm."""
-    in_lps = _from_ras if arguments.frame == "ras" else _as_given
-    inlets = tuple(map(in_lps, arguments.inlet)) if arguments.inlet else None
-    at, outlet, neck = arguments.at, getattr(arguments, "outlet", None), _neck(getattr(arguments, "neck", None))
-    crop = arguments.crop
+def given_geometry(arguments: argparse.Namespace) -> "dict[str, InputSettings | AnatomySettings]":
+    """Return the options on input and anatomy as sections of the settings, with points in LPS mm."""
+    from vstent.study.types import AnatomySettings, InputSettings
+
+    given: dict[str, Any] = {name: getattr(arguments, name, None) for name in GEOMETRY}
+    in_lps = _from_ras if given["frame"] == "ras" else _as_given
+    at, outlet, neck, crop = given["at"], given["outlet"], _neck(given["neck"]), given["crop"]
     return {
-        "units": arguments.units,
-        "frame": arguments.frame,
-        "acquisition": arguments.acquisition,
-        "spacing_mm": arguments.spacing,
-        "shape": arguments.shape,
-        "crop_mm": crop and tuple(map(in_lps, crop)),
-        "threshold": arguments.threshold,
-        "at_mm": at and in_lps(at),
-        "inlet_mm": inlets,
-        "outlet_mm": outlet and in_lps(outlet),
-        "upstream_mm": getattr(arguments, "upstream", None),
-        "downstream_mm": getattr(arguments, "downstream", None),
-        "neck_mm": neck and tuple(map(in_lps, neck)),
+        "input": InputSettings(
+            units=given["units"],
+            frame=given["frame"],
+            acquisition=given["acquisition"],
+            spacing_mm=given["spacing"],
+            shape=given["shape"],
+            crop_mm=crop and tuple(map(in_lps, crop)),
+            threshold=given["threshold"],
+        ),
+        "anatomy": AnatomySettings(
+            at_mm=at and in_lps(at),
+            inlet_mm=tuple(map(in_lps, given["inlet"])) if given["inlet"] else None,
+            outlet_mm=outlet and in_lps(outlet),
+            neck_mm=neck and tuple(map(in_lps, neck)),
+            upstream_mm=given["upstream"],
+            downstream_mm=given["downstream"],
+        ),
     }
 
 
+GEOMETRY: Final = (
+    *("units", "frame", "acquisition", "spacing", "shape", "crop", "threshold"),
+    *("at", "inlet", "outlet", "neck", "upstream", "downstream"),
+)
+"""Options on input and anatomy; a command may lack some."""
 Point: TypeAlias = tuple[float, float, float]
 """Coordinates in mm."""
 
@@ -485,8 +510,34 @@ def _neck(path: Path | None) -> tuple[tuple[float, float, float], ...] | None:
 
 
 def given_devices(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """Return the names of the devices, each once; by default silk and enterprise, the devices of the paper."""
-    return tuple(dict.fromkeys(arguments.device or ("silk", "enterprise")))
+    """Return the names of the devices; by default silk and enterprise, the devices of the paper."""
+    return tuple(arguments.device or ("silk", "enterprise"))
+
+
+def given_treatments(
+    arguments: argparse.Namespace, usual: Sequence[str] = ("silk", "enterprise")
+) -> "tuple[Treatment, ...]":
+    """Return the treatments that the options state; where none is, those of the usual devices (of the paper)."""
+    from vstent.devices.treatment import with_device
+
+    size = {
+        "diameter_mm": getattr(arguments, "diameter", None),
+        "length_mm": getattr(arguments, "length", None),
+        "center_mm": getattr(arguments, "center", None),
+    }
+    several = tuple(getattr(arguments, "treatment", None) or ())
+    devices = arguments.device or (() if several else usual)
+    return (*(with_device(name, **size) for name in devices), *several)
+
+
+def _treatment(text: str) -> "Treatment":
+    """Return a treatment read from text."""
+    from vstent.devices.treatment import read_treatment
+
+    try:
+        return read_treatment(text)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def given_problem(arguments: argparse.Namespace) -> "FlowSettings":

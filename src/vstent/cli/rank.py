@@ -69,7 +69,7 @@ def _rank(arguments: argparse.Namespace) -> int:
     designs = [find_design(name) for name in options.given_devices(arguments)]
     criteria = read_criteria(arguments.criteria) if arguments.criteria else default_criteria()
     console = Console()
-    settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
+    settings = Settings(treatments=(), flow=None, **options.given_geometry(arguments))
     with console.live():
         anatomy, _ = restore_vessel(
             arguments.input, arguments.out, settings, console.progress, replaces=arguments.replace

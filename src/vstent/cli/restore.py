@@ -23,7 +23,7 @@ def _restore(arguments: argparse.Namespace) -> int:
     from vstent.study.types import Settings
 
     console = Console()
-    settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
+    settings = Settings(treatments=(), flow=None, **options.given_geometry(arguments))
     with console.live():
         _, measures = restore_vessel(
             arguments.input, arguments.out, settings, console.progress, replaces=arguments.replace

@@ -54,8 +54,8 @@ def add(commands: options.Commands) -> None:
 
 
 def add_study(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a study: devices, flow and uncertainty."""
-    options.add_devices(parser)
+    """Add the options of a study: treatments, flow and uncertainty."""
+    options.add_treatments(parser)
     flow = options.add_flow(parser)
     flow.add_argument("--no-flow", action="store_true", help="deploy only, without computing the flow")
     options.add_uncertainty(parser)
@@ -66,19 +66,22 @@ def add_pdf(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pdf", action="store_true", help="also write the report as report.pdf")
 
 
-def given_study(arguments: argparse.Namespace, **given: object) -> "Settings":
+def given_study(arguments: argparse.Namespace) -> "Settings":
     """Return the settings of a study.
 
     Parameters
     ----------
     arguments : parsed options.
-    given : further settings by name.
     """
     from vstent.study.types import Settings
 
     flow = None if arguments.no_flow else options.given_flow(arguments)
-    devices, ranges = options.given_devices(arguments), options.given_ranges(arguments)
-    return Settings(devices=devices, flow=flow, uncertainty=ranges, **given)  # type: ignore[arg-type]
+    return Settings(
+        **options.given_geometry(arguments),
+        treatments=options.given_treatments(arguments),
+        flow=flow,
+        uncertainty=options.given_ranges(arguments),
+    )
 
 
 def study(
@@ -147,13 +150,7 @@ def _run(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     from vstent.cli.console import Console
 
-    settings = given_study(
-        arguments,
-        **options.given_geometry(arguments),
-        diameter_mm=arguments.diameter,
-        length_mm=arguments.length,
-        center_mm=arguments.center,
-    )
+    settings = given_study(arguments)
     if arguments.plan:
         settings = replace(settings, flow=None)
     injected = given_angiogram(arguments) if arguments.angiogram else None

@@ -21,7 +21,7 @@ def _trace(arguments: argparse.Namespace) -> int:
     from vstent.study.types import Settings
 
     console = Console()
-    settings = Settings(devices=(), flow=None, **options.given_geometry(arguments))
+    settings = Settings(treatments=(), flow=None, **options.given_geometry(arguments))
     with console.live():
         vessel = trace_vessel(arguments.input, arguments.out, settings, console.progress, replaces=arguments.replace)
     console.print(opening_table(vessel.openings))

@@ -1,4 +1,4 @@
-"""Run a cohort: one table row per case and device, also where a case fails.
+"""Run a cohort: one table row per case and treatment, also where a case fails.
 
 Each row is written into the folder of its case as soon as it is known, under a key of everything it depends on: the
 hash of the input, the settings and the version. A later run computes only the rows that are missing. The table is
@@ -27,7 +27,7 @@ class Progress(Protocol):
 
 
 def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -> list[Task]:
-    """Return the work that is missing: cases with those devices whose row is missing or whose process died.
+    """Return the work that is missing: cases with those treatments whose row is missing or whose process died.
 
     Parameters
     ----------
@@ -38,11 +38,11 @@ def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -
     tasks = []
     for case in cases:
         folder, keys = _folder(case, out), case.keys
-        rows = {device: read_row(folder, device, key) for device, key in keys.items()}
-        missing = tuple(device for device, row in rows.items() if row is None or row["outcome"] == LOST)
+        rows = {treatment: read_row(folder, treatment, key) for treatment, key in keys.items()}
+        missing = tuple(treatment for treatment, row in rows.items() if row is None or row["outcome"] == LOST)
         if missing:
-            shorter = replace(case, settings=replace(case.settings, devices=missing))
-            tasks.append(Task(shorter, folder, {device: keys[device] for device in missing}, keeps_files))
+            shorter = replace(case, settings=replace(case.settings, treatments=tuple(one for one in case.settings.treatments if one.name in missing)))
+            tasks.append(Task(shorter, folder, {treatment: keys[treatment] for treatment in missing}, keeps_files))
     return tasks
 
 
@@ -65,33 +65,33 @@ def run_cohort(tasks: Sequence[Task], out: Path, crew: AbstractCrew, progress: P
     """
     for done, ended in enumerate(crew.do(work, tasks), start=1):
         task = tasks[ended.number]
-        for device, key in task.keys.items():
-            if read_row(task.folder, device, key) is None:
-                write_row(task, device, {"outcome": LOST, "stage": "", "sentence": ended.fault})
+        for treatment, key in task.keys.items():
+            if read_row(task.folder, treatment, key) is None:
+                write_row(task, treatment, {"outcome": LOST, "stage": "", "sentence": ended.fault})
         progress(done, len(tasks), task.case.name, collect([task.case], out))
 
 
 def collect(cases: Sequence[Case], out: Path) -> list[Row]:
-    """Return the rows that exist, in the order of cases and devices.
+    """Return the rows that exist, in the order of cases and treatments.
 
     Parameters
     ----------
     cases : cases of the cohort.
     out : output folder of the cohort.
     """
-    rows = [read_row(_folder(case, out), device, key) for case in cases for device, key in case.keys.items()]
+    rows = [read_row(_folder(case, out), treatment, key) for case in cases for treatment, key in case.keys.items()]
     return [row for row in rows if row is not None]
 
 
 def pictures_of(rows: Sequence[Row], out: Path) -> dict[tuple[str, str], bytes]:
-    """Return the pictures that exist of cases with devices, as WebP by name of case and device.
+    """Return the pictures that exist of cases with treatments, as WebP by name of case and treatment.
 
     Parameters
     ----------
     rows : rows of the cohort table.
     out : output folder of the cohort.
     """
-    paths = {(row["case"], row["device"]): picture_path(out / CASES / row["case"], row["device"]) for row in rows}
+    paths = {(row["case"], row["treatment"]): picture_path(out / CASES / row["case"], row["treatment"]) for row in rows}
     return {key: path.read_bytes() for key, path in paths.items() if path.is_file()}
 
 

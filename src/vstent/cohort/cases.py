@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from vstent.devices.catalogue import find_design
+from vstent.devices.treatment import Treatment, with_device
 from vstent.errors import InputError, ReadError
 from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
 from vstent.io.tables import finite
-from vstent.study.ledger import DEPLOYMENT_VERSION, hash_of, key_of, refuse_missing
+from vstent.study.ledger import hash_of, key_of, refuse_missing
 from vstent.study.types import Settings
+from vstent.study.written import code_key
 from vstent.units import MM_PER
 
 Number = TypeVar("Number", int, float)
@@ -27,15 +29,15 @@ class Case:
     path: Path
     """Scan or surface."""
     settings: Settings
-    """Settings of the study, with the devices to deploy."""
+    """Settings of the study, with the treatments to compare."""
 
     @cached_property
     def keys(self) -> dict[str, str]:
-        """Key of the row of every device; it covers everything that the row depends on."""
-        common = DEPLOYMENT_VERSION, hash_of(self.path)
+        """Key of the row of every treatment; it covers everything that the row depends on."""
+        source = hash_of(self.path)
         return {
-            name: key_of(*common, find_design(name), replace(self.settings, devices=(name,)))
-            for name in self.settings.devices
+            one.name: key_of(code_key(), source, replace(self.settings, treatments=(one,)), *map(find_design, one.devices))
+            for one in self.settings.treatments
         }
 
 
@@ -115,17 +117,32 @@ def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Cas
     if "input" not in given:
         raise InputError(f"{where} has no input: fill in its column `input`")
     path = file.parent / given["input"]
-    changes: dict[str, Any] = {}
+    found: dict[str, dict[str, Any]] = {"input": {}, "anatomy": {}, "treatments": {}}
     for title in set(given) & set(COLUMNS):
-        name, read = COLUMNS[title]
+        section, name, read = COLUMNS[title]
         try:
-            changes[name] = read(given[title])
+            found[section][name] = read(given[title])
         except ValueError as error:
             raise InputError(f"{where}: {title} is {given[title]!r}, which cannot be used: {error}") from error
     name = given.get("case", _name(path))
     if Path(name).name != name:
         raise InputError(f"{where} names its case {name!r}: give a name without slashes")
-    return Case(name, path, replace(settings, **changes))
+    changed = replace(
+        settings,
+        input=replace(settings.input, **found["input"]),
+        anatomy=replace(settings.anatomy, **found["anatomy"]),
+        treatments=_treatments(settings.treatments, **found["treatments"]),
+    )
+    return Case(name, path, changed)
+
+
+def _treatments(
+    usual: tuple[Treatment, ...], *, devices: tuple[str, ...] | None = None, **size: float
+) -> tuple[Treatment, ...]:
+    """Return the treatments with the devices of a row, or the usual ones, each with the size and place of the row."""
+    if devices is None and not size:
+        return usual
+    return tuple(with_device(name, **size) for name in devices or [name for one in usual for name in one.devices])
 
 
 def _size(text: str) -> float:
@@ -182,22 +199,22 @@ def _devices(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(_words(text)))
 
 
-COLUMNS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
-    "devices": ("devices", _devices),
-    "units": ("units", _units),
-    "threshold": ("threshold", finite),
-    "at": ("at_mm", _three(finite)),
-    "inlet": ("inlet_mm", _points),
-    "outlet": ("outlet_mm", _three(finite)),
-    "spacing": ("spacing_mm", _three(_size)),
-    "shape": ("shape", _three(_count)),
-    "diameter": ("diameter_mm", _size),
-    "length": ("length_mm", _size),
-    "center": ("center_mm", finite),
+COLUMNS: Final[dict[str, tuple[str, str, Callable[[str], Any]]]] = {
+    "devices": ("treatments", "devices", _devices),
+    "units": ("input", "units", _units),
+    "threshold": ("input", "threshold", finite),
+    "at": ("anatomy", "at_mm", _three(finite)),
+    "inlet": ("anatomy", "inlet_mm", _points),
+    "outlet": ("anatomy", "outlet_mm", _three(finite)),
+    "spacing": ("input", "spacing_mm", _three(_size)),
+    "shape": ("input", "shape", _three(_count)),
+    "diameter": ("treatments", "diameter_mm", _size),
+    "length": ("treatments", "length_mm", _size),
+    "center": ("treatments", "center_mm", finite),
 }
-"""Columns of a CSV file: the setting that each sets, and the function that reads it."""
+"""Columns of a CSV file: the section of the settings and the setting that each sets, and the function that reads it."""
 
 
-def device_rows(cases: Sequence[Case]) -> int:
+def row_count(cases: Sequence[Case]) -> int:
     """Return the number of rows of the cohort's table."""
-    return sum(len(case.settings.devices) for case in cases)
+    return sum(len(case.settings.treatments) for case in cases)

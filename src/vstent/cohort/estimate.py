@@ -79,7 +79,7 @@ def _cost(case: Case) -> tuple[float, float]:
     is_surface = is_surface_file(case.path)
     voxels = 0.0 if is_surface else n_bytes * (4 if suffix(case.path).endswith(".gz") else 1) / 2
     triangles = n_bytes / STL_BYTES if is_surface else SCAN_TRIANGLES
-    n_devices = len(case.settings.devices)
+    n_devices = sum(len(one.implants) for one in case.settings.treatments)
     cpu_s = START_CPU_S + CPU_S_PER_1000_TRIANGLES * triangles / 1e3 + CPU_S_PER_MILLION_VOXELS * voxels / 1e6
     memory = START_MB + MB_PER_1000_TRIANGLES * triangles / 1e3 + MB_PER_MILLION_VOXELS * voxels / 1e6
     cpu_s += CPU_S_PER_DEVICE * n_devices

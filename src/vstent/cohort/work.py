@@ -1,4 +1,4 @@
-"""Run one case of a cohort and write one row per device, also where the case fails."""
+"""Run one case of a cohort and write one row per treatment, also where the case fails."""
 
 import json
 import shutil
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from vstent.cohort.cases import Case
+from vstent.devices.treatment import BARE
 from vstent.errors import VstentError
 from vstent.io.files import atomic
 from vstent.io.writers import write_json, write_text
@@ -20,12 +21,12 @@ from vstent.study.types import Progress, Settings
 from vstent.units import BYTES_PER_MB
 
 Row = dict[str, Any]
-"""One case with one device: column name to value."""
+"""One case with one treatment: column name to value."""
 
 COST: Final = ("case_s", "case_cpu_s", "peak_memory_MB")
 """Columns on run time and memory; they describe the computer, so they differ between runs."""
 DONE: Final = "done"
-"""Outcome of a device that was deployed and measured."""
+"""Outcome of a treatment that was deployed and measured."""
 FAILED: Final = "failed"
 """Outcome where the input cannot be used or a flow cannot be computed; a repetition would give the same."""
 LOST: Final = "lost"
@@ -37,11 +38,11 @@ class Task:
     """Remaining work of one case."""
 
     case: Case
-    """The case; its devices are those whose rows are missing."""
+    """The case; its treatments are those whose rows are missing."""
     folder: Path
     """Folder in which its rows are written."""
     keys: Mapping[str, str]
-    """Key of every missing row, by device."""
+    """Key of every missing row, by treatment."""
     keeps_files: bool = False
     """Whether all files of `vstent run` are kept, in subfolder ``study``."""
 
@@ -55,30 +56,30 @@ class _Watch:
         self.stage = stage
 
 
-def row_path(folder: Path, device: str) -> Path:
-    """Return the file of the row of a device in the folder of a case."""
-    return folder / f"{device}.json"
+def row_path(folder: Path, treatment: str) -> Path:
+    """Return the file of the row of a treatment in the folder of a case."""
+    return folder / f"{treatment}.json"
 
 
-def picture_path(folder: Path, device: str) -> Path:
-    """Return the file of the picture of a device in the folder of a case."""
-    return folder / f"{device}.webp"
+def picture_path(folder: Path, treatment: str) -> Path:
+    """Return the file of the picture of a treatment in the folder of a case."""
+    return folder / f"{treatment}.webp"
 
 
 def work(task: Task) -> None:
-    """Run one case: deploy every missing device and write the rows.
+    """Run one case: deploy every missing treatment and write the rows.
 
-    A device that does not fit, or an input that cannot be used, gives a row with its stage and error message.
+    A treatment that does not fit, or an input that cannot be used, gives a row with its stage and error message.
     """
     with alone():
         began, cpu = time.perf_counter(), time.process_time()
         rows = _rows(task)
-        done = tuple(device for device, row in rows.items() if row["outcome"] == DONE)
-        if task.keeps_files and done and len(rows) > 1:  # one study of all devices, read from stored results
+        done = tuple(one for one in task.case.settings.treatments if rows[one.name]["outcome"] == DONE)
+        if task.keeps_files and done and len(rows) > 1:  # one study of all treatments, read from stored results
             run(
                 task.case.path,
                 task.folder / "study",
-                replace(task.case.settings, devices=done),
+                replace(task.case.settings, treatments=done),
                 _Watch(),
                 replaces=True,
             )
@@ -86,31 +87,32 @@ def work(task: Task) -> None:
             shutil.rmtree(task.folder / "study", ignore_errors=True)
         spent = time.perf_counter() - began, time.process_time() - cpu, peak_memory_MB()
         cost = dict(zip(COST, spent, strict=True))
-        for device, row in rows.items():
-            write_row(task, device, row | cost)
+        for treatment, row in rows.items():
+            write_row(task, treatment, row | cost)
 
 
 def _rows(task: Task) -> dict[str, Row]:
-    """Return the rows of a case by device; the artery is restored once, and failures are rows too."""
+    """Return the rows of a case by treatment; the artery is restored once, and failures are rows too."""
     case, study = task.case, task.folder / "study"
-    devices = case.settings.devices
+    treatments = case.settings.treatments
     failed = _failure(task, lambda watch: restore_vessel(case.path, study, case.settings, watch, replaces=True))
     if failed:
-        return dict.fromkeys(devices, failed)
+        return {treatment.name: failed for treatment in treatments}
     rows: dict[str, Row] = {}
-    for device in devices:
-        alone = replace(case.settings, devices=(device,))
+    for treatment in treatments:
+        name, alone = treatment.name, replace(case.settings, treatments=(treatment,))
 
-        def with_device(watch: Progress, device: str = device, alone: Settings = alone) -> None:
+        def with_treatment(watch: Progress, name: str = name, alone: Settings = alone) -> None:
             found = run(case.path, study, alone, watch, replaces=True)
-            advice = found.deployments[device].advice
-            with atomic(picture_path(task.folder, device)) as partial:
-                partial.write_bytes(patient_picture(found.anatomy, found.deployments[device]).webp)
-            rows[device] = {"outcome": DONE, "stage": "", "sentence": advice} | flat_metrics(found.metrics, device)
+            implants = list(found.implants[name].values())
+            with atomic(picture_path(task.folder, name)) as partial:
+                partial.write_bytes(patient_picture(found.anatomy, implants).webp)
+            advice = " ".join(one.advice for one in implants)
+            rows[name] = {"outcome": DONE, "stage": "", "sentence": advice} | flat_metrics(found.metrics, name)
 
-        failed = _failure(task, with_device)
+        failed = _failure(task, with_treatment)
         if failed:
-            rows[device] = failed
+            rows[name] = failed
     return rows
 
 
@@ -128,16 +130,21 @@ def _failure(task: Task, do: Callable[[Progress], object]) -> Row:
     return {}
 
 
-def flat_metrics(metrics: Mapping[str, Any], device: str) -> Row:
-    """Return all metrics of a study that concern one device, under dotted keys.
+def flat_metrics(metrics: Mapping[str, Any], treatment: str) -> Row:
+    """Return all metrics of a study that concern one treatment, under dotted keys.
+
+    Measures of the implant of a treatment with one begin with ``implant``, those of several with ``implants.ID``.
 
     Parameters
     ----------
     metrics : metrics of the study.
-    device : name of the device.
+    treatment : name of the treatment.
     """
-    parts = {"vessel": metrics["vessel"], "bare": metrics.get("bare", {})} | dict(metrics["stents"][device])
-    return _flat(parts, "")
+    found = dict(metrics["treatments"][treatment])
+    implants = found.pop("implants")
+    parts = {"vessel": metrics["vessel"], BARE: metrics["treatments"].get(BARE, {}).get("flow", {})}
+    alone = {"implant": next(iter(implants.values()))} if len(implants) == 1 else {"implants": implants}
+    return _flat(parts | alone | found, "")
 
 
 def _flat(values: Mapping[str, Any], before: str) -> Row:
@@ -148,31 +155,31 @@ def _flat(values: Mapping[str, Any], before: str) -> Row:
     return row
 
 
-def write_row(task: Task, device: str, row: Row) -> None:
-    """Write the row of a device with the key of everything it depends on.
+def write_row(task: Task, treatment: str, row: Row) -> None:
+    """Write the row of a treatment with the key of everything it depends on.
 
     Parameters
     ----------
     task : task of the case.
-    device : name of the device.
+    treatment : name of the treatment.
     row : values by column name.
     """
-    named = {"case": task.case.name, "device": device} | row
-    kept = {"key": task.keys[device], "row": named, "settings": asdict(task.case.settings)}
-    write_json(row_path(task.folder, device), kept)
+    named = {"case": task.case.name, "treatment": treatment} | row
+    kept = {"key": task.keys[treatment], "row": named, "settings": asdict(task.case.settings)}
+    write_json(row_path(task.folder, treatment), kept)
 
 
-def read_row(folder: Path, device: str, key: str) -> Row | None:
-    """Return the row of a device; None where it is missing, damaged, or has another key.
+def read_row(folder: Path, treatment: str, key: str) -> Row | None:
+    """Return the row of a treatment; None where it is missing, damaged, or has another key.
 
     Parameters
     ----------
     folder : folder of the case.
-    device : name of the device.
+    treatment : name of the treatment.
     key : key of everything that the row depends on.
     """
     try:
-        kept = json.loads(row_path(folder, device).read_text(encoding="utf-8"))
+        kept = json.loads(row_path(folder, treatment).read_text(encoding="utf-8"))
         return dict(kept["row"]) if kept["key"] == key else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -18,8 +18,6 @@ from vstent.units import MM_PER_UM
 
 Confidence = Literal["cited", "derived", "estimated"]
 """How sure a number of the catalogue is; see `Fact.confidence`."""
-BARE = "bare"
-"""Name of the flow without a device. No device may have it."""
 STEEP_RAD = 0.1, 1.5
 """Smallest and largest angle between wire and axis at the free diameter, in rad."""
 

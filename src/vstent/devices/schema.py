@@ -10,7 +10,8 @@ from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from vstent.devices.design import BARE, Braid, Confidence, Design, Fact, LaserCut, Range, Size, Strands, called
+from vstent.devices.design import Braid, Confidence, Design, Fact, LaserCut, Range, Size, Strands, called
+from vstent.devices.treatment import BARE
 from vstent.errors import DeviceError
 
 MOST_WIRES: Final = 1000

@@ -2,21 +2,17 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final, Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from vstent.devices.design import Design, Size
 from vstent.devices.formulas import mesh_nodes
+from vstent.devices.treatment import ANCHORS, Anchor
 from vstent.errors import LandingError
 from vstent.geometry.surface import Surface
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints, freeze
-
-Anchor = Literal["center", "distal", "proximal"]
-"""Point of a device that is placed at the landing position."""
-ANCHORS: Final[tuple[str, ...]] = get_args(Anchor)
-"""All values of `Anchor`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,15 +43,15 @@ def number_name(name: str) -> str:
     return f"{NUMBERS[f'wire_{group[2]}']}, group {group[1]}" if group else NUMBERS.get(name, name)
 
 
-def rows(stent: Mapping[str, Any]) -> list[Row]:
-    """Return the bands of a device; empty where its metrics or its catalogue entry have none.
+def rows(implant: Mapping[str, Any]) -> list[Row]:
+    """Return the bands of an implant; empty where its metrics or its catalogue entry have none.
 
     Parameters
     ----------
-    stent : metrics of the device.
+    implant : metrics of the implant.
     """
-    found = stent.get("bands", {}).get("results", {})
-    return [_row(key, stent["deployment"].get(key), band) for key, band in found.items()]
+    found = implant.get("bands", {}).get("results", {})
+    return [_row(key, implant.get(key), band) for key, band in found.items()]
 
 
 def _row(key: str, value: Any, band: Mapping[str, Any]) -> Row:
@@ -61,15 +61,15 @@ def _row(key: str, value: Any, band: Mapping[str, Any]) -> Row:
     return Row(Quantity((key,), 0.0).name, format_value(key, value), low, high, cause)
 
 
-def ends(stent: Mapping[str, Any], key: str) -> str:
+def ends(implant: Mapping[str, Any], key: str) -> str:
     """Return the band of one result in brackets, such as ``(14.7 to 19.1 mm)``; empty without a width.
 
     Parameters
     ----------
-    stent : metrics of the device.
+    implant : metrics of the implant.
     key : key of the result.
     """
-    band = stent.get("bands", {}).get("results", {}).get(key)
+    band = implant.get("bands", {}).get("results", {}).get(key)
     if band is None:
         return ""
     low, high = (format_value(key, band[end]) for end in ("low", "high"))
@@ -79,21 +79,21 @@ def ends(stent: Mapping[str, Any], key: str) -> str:
     return f"({number if unit else low} to {high})"
 
 
-def how_sure(stent: Mapping[str, Any]) -> str:
+def how_sure(implant: Mapping[str, Any]) -> str:
     """Return the sentences on how sure a device is; empty where its metrics do not state it.
 
     Parameters
     ----------
-    stent : metrics of the device.
+    implant : metrics of the implant.
     """
-    told = stent.get("bands", {})
+    told = implant.get("bands", {})
     if not told:
         return ""
     results = told.get("results", {})
     lies = [
-        f"{Quantity((key,), 0.0).name.lower()} {ends(stent, key)[1:-1]}{_because(results[key])}"
+        f"{Quantity((key,), 0.0).name.lower()} {ends(implant, key)[1:-1]}{_because(results[key])}"
         for key in HEADLINES
-        if ends(stent, key)
+        if ends(implant, key)
     ]
     ranges = f" Within the ranges of these numbers: {'; '.join(lies)}." if lies else ""
     sizes = told.get("proposed_sizes", "")

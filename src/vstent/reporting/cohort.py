@@ -13,28 +13,28 @@ from vstent.reporting.page import asset
 from vstent.reporting.quantities import Quantity, format_value
 
 Row = Mapping[str, Any]
-"""One case with one device: column name to value."""
+"""One case with one treatment: column name to value."""
 
 HEADLINES: Final = (
     "vessel.sac_volume_mm3",
     "vessel.neck_max_diameter_mm",
     "vessel.parent_proximal_diameter_mm",
-    "deployment.deployed_length_mm",
-    "deployment.oversizing_fraction",
-    "deployment.apposed_fraction",
-    "deployment.max_wall_gap_mm",
-    "deployment.neck_metal_coverage_fraction",
-    "deployment.neck_pore_density_per_mm2",
-    "deployment.p95_wire_stretch_fraction",
-    "ratios.neck_inflow_mL_s_ratio",
-    "ratios.mean_sac_velocity_m_s_ratio",
-    "ratios.mean_sac_wss_Pa_ratio",
-    "ratios.turnover_time_s_ratio",
+    "implant.deployed_length_mm",
+    "implant.oversizing_fraction",
+    "implant.apposed_fraction",
+    "implant.max_wall_gap_mm",
+    "implant.neck_metal_coverage_fraction",
+    "implant.neck_pore_density_per_mm2",
+    "implant.p95_wire_stretch_fraction",
+    "change.neck_inflow_mL_s_ratio",
+    "change.mean_sac_velocity_m_s_ratio",
+    "change.mean_sac_wss_Pa_ratio",
+    "change.turnover_time_s_ratio",
     "case_s",
     "peak_memory_MB",
 )
 """Keys of the table columns that are drawn and searched for outliers; the end of each key is its unit."""
-UNDER_PICTURE: Final = ("deployment.deployed_length_mm", "deployment.neck_metal_coverage_fraction")
+UNDER_PICTURE: Final = ("implant.deployed_length_mm", "implant.neck_metal_coverage_fraction")
 """Keys of the metrics that stand under the picture of a patient."""
 EMPTY: Final[Mapping[tuple[str, str], bytes]] = MappingProxyType({})
 """No pictures."""
@@ -50,10 +50,10 @@ WIDTH, HEIGHT, EDGE = 640, 34, 8
 
 
 class Distribution(NamedTuple):
-    """Distribution of one metric of one device over all cases."""
+    """Distribution of one metric of one treatment over all cases."""
 
-    device: str
-    """Name of the device."""
+    treatment: str
+    """Name of the treatment."""
     n_cases: int
     """Number of cases that have the metric."""
     quantiles: tuple[str, ...]
@@ -63,12 +63,12 @@ class Distribution(NamedTuple):
 
 
 class Outlier(NamedTuple):
-    """One value far from the median of its device."""
+    """One value far from the median of its treatment."""
 
     case: str
     """Name of the case."""
-    device: str
-    """Name of the device."""
+    treatment: str
+    """Name of the treatment."""
     name: str
     """Name of the metric."""
     value: str
@@ -87,8 +87,8 @@ def cohort_report(name: str, rows: Sequence[Row], pictures: Mapping[tuple[str, s
     Parameters
     ----------
     name : name of the cohort.
-    rows : one row per case and device, with ``case``, ``device``, ``outcome``, ``stage``, ``sentence`` and metrics.
-    pictures : pictures of the deployed devices as WebP, by case and device.
+    rows : one row per case and treatment, with ``case``, ``treatment``, ``outcome``, ``stage``, ``sentence`` and metrics.
+    pictures : pictures of the deployed treatments as WebP, by case and treatment.
 
     Returns
     -------
@@ -98,32 +98,32 @@ def cohort_report(name: str, rows: Sequence[Row], pictures: Mapping[tuple[str, s
     from jinja2 import Environment, PackageLoader
 
     done = [row for row in rows if row["outcome"] == "done"]
-    devices = list(dict.fromkeys(row["device"] for row in rows))
+    treatments = list(dict.fromkeys(row["treatment"] for row in rows))
     environment = Environment(loader=PackageLoader("vstent.reporting", "assets"), autoescape=True)
     return environment.get_template("cohort.html.j2").render(
         name=name,
         style=Markup(asset("report.css")),
-        counts=[(device, *_counts(rows, device)) for device in devices],
-        patients=[(device, shown) for device in devices if (shown := _patients(rows, device, pictures))],
+        counts=[(treatment, *_counts(rows, treatment)) for treatment in treatments],
+        patients=[(treatment, shown) for treatment in treatments if (shown := _patients(rows, treatment, pictures))],
         n_cases=len({row["case"] for row in rows}),
         distributions=[
-            (_name(key), [distribution(done, device, key) for device in devices if _values(done, device, key)])
+            (_name(key), [distribution(done, treatment, key) for treatment in treatments if _values(done, treatment, key)])
             for key in HEADLINES
             if any(_is_number(row.get(key)) for row in done)
         ],
-        outliers=[outlier for device in devices for key in HEADLINES for outlier in outliers(done, device, key)],
+        outliers=[outlier for treatment in treatments for key in HEADLINES for outlier in outliers(done, treatment, key)],
         failures=[row for row in rows if row["outcome"] != "done"],
         limit=OUTLYING,
     )
 
 
 def _patients(
-    rows: Sequence[Row], device: str, pictures: Mapping[tuple[str, str], bytes]
+    rows: Sequence[Row], treatment: str, pictures: Mapping[tuple[str, str], bytes]
 ) -> list[tuple[str, str, str]]:
-    """Return case, caption and base64-encoded WebP of every picture of a device, in the order of the rows."""
-    found = [row for row in rows if row["device"] == device and (row["case"], device) in pictures]
+    """Return case, caption and base64-encoded WebP of every picture of a treatment, in the order of the rows."""
+    found = [row for row in rows if row["treatment"] == treatment and (row["case"], treatment) in pictures]
     return [
-        (str(row["case"]), _caption(row), base64.b64encode(pictures[row["case"], device]).decode("ascii"))
+        (str(row["case"]), _caption(row), base64.b64encode(pictures[row["case"], treatment]).decode("ascii"))
         for row in found
     ]
 
@@ -134,9 +134,9 @@ def _caption(row: Row) -> str:
     return ", ".join(f"{_name(key).lower()} {format_value(_leaf(key), float(value))}" for key, value in shown)
 
 
-def _counts(rows: Sequence[Row], device: str) -> tuple[int, int, int]:
-    """Return the numbers of finished, failed and lost cases of a device."""
-    outcomes = [row["outcome"] for row in rows if row["device"] == device]
+def _counts(rows: Sequence[Row], treatment: str) -> tuple[int, int, int]:
+    """Return the numbers of finished, failed and lost cases of a treatment."""
+    outcomes = [row["outcome"] for row in rows if row["treatment"] == treatment]
     return outcomes.count("done"), outcomes.count("failed"), outcomes.count("lost")
 
 
@@ -167,41 +167,41 @@ def modified_z_scores(values: Sequence[float]) -> list[float]:
     return (NORMAL * away / deviation).tolist() if deviation > 0 else [0.0] * len(array)
 
 
-def outliers(rows: Sequence[Row], device: str, key: str) -> list[Outlier]:
-    """Return the outliers of one metric of one device, the farthest from the median first.
+def outliers(rows: Sequence[Row], treatment: str, key: str) -> list[Outlier]:
+    """Return the outliers of one metric of one treatment, the farthest from the median first.
 
     Parameters
     ----------
     rows : rows of the cohort table.
-    device : name of the device.
+    treatment : name of the treatment.
     key : column of the metric.
     """
-    found = _values(rows, device, key)
+    found = _values(rows, treatment, key)
     scores = modified_z_scores([value for _, value in found])
     median = format_value(_leaf(key), float(np.median([value for _, value in found]))) if found else ""
     apart = [
-        Outlier(case, device, _name(key), format_value(_leaf(key), value), median, score)
+        Outlier(case, treatment, _name(key), format_value(_leaf(key), value), median, score)
         for (case, value), score in zip(found, scores, strict=True)
         if abs(score) > OUTLYING
     ]
     return sorted(apart, key=lambda outlier: -abs(outlier.score))
 
 
-def distribution(rows: Sequence[Row], device: str, key: str) -> Distribution:
-    """Return the distribution of one metric of one device.
+def distribution(rows: Sequence[Row], treatment: str, key: str) -> Distribution:
+    """Return the distribution of one metric of one treatment.
 
     Parameters
     ----------
-    rows : rows of the cohort table, of all devices; they set the range of the strip plot.
-    device : name of the device.
+    rows : rows of the cohort table, of all treatments; they set the range of the strip plot.
+    treatment : name of the treatment.
     key : column of the metric.
     """
-    found = _values(rows, device, key)
+    found = _values(rows, treatment, key)
     values = [value for _, value in found]
     quantiles = np.quantile(values, (0.0, 0.25, 0.5, 0.75, 1.0))
     every = [float(row[key]) for row in rows if _is_number(row.get(key))]
     return Distribution(
-        device,
+        treatment,
         len(values),
         tuple(format_value(_leaf(key), float(value)) for value in quantiles),
         Markup(_strip(found, key, (min(every), max(every)))),
@@ -209,7 +209,7 @@ def distribution(rows: Sequence[Row], device: str, key: str) -> Distribution:
 
 
 def _strip(found: Sequence[tuple[str, float]], key: str, span: tuple[float, float]) -> str:
-    """Return an SVG strip plot: a point per case on the range `span` of all devices, and a box over the quartiles."""
+    """Return an SVG strip plot: a point per case on the range `span` of all treatments, and a box over the quartiles."""
     low, high = span
     per_unit = (WIDTH - 2 * EDGE) / (high - low) if high > low else 0.0
     at = [EDGE + (value - low) * per_unit for _, value in found]
@@ -228,9 +228,9 @@ def _strip(found: Sequence[tuple[str, float]], key: str, span: tuple[float, floa
     return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{box}{"".join(points)}</svg>'
 
 
-def _values(rows: Sequence[Row], device: str, key: str) -> list[tuple[str, float]]:
-    """Return case name and value of one metric of one device, where the value is a finite number."""
-    return [(str(row["case"]), float(row[key])) for row in rows if row["device"] == device and _is_number(row.get(key))]
+def _values(rows: Sequence[Row], treatment: str, key: str) -> list[tuple[str, float]]:
+    """Return case name and value of one metric of one treatment, where the value is a finite number."""
+    return [(str(row["case"]), float(row[key])) for row in rows if row["treatment"] == treatment and _is_number(row.get(key))]
 
 
 def _is_number(value: Any) -> bool:

@@ -7,12 +7,11 @@ from typing import Self, TypeVar
 
 from numba import config
 
-from vstent.devices.stent import Deployment
 from vstent.flow.case import FlowField
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.reporting.figures import Picture, plates
 from vstent.reporting.method import method_plates
-from vstent.reporting.scene import Scene, scene_of
+from vstent.reporting.scene import Implants, Scene, scene_of
 
 Item = TypeVar("Item")
 Found = TypeVar("Found")
@@ -56,7 +55,7 @@ class Drawing:
     def begin(
         self,
         anatomy: Anatomy,
-        deployments: Mapping[str, Deployment],
+        implants: Implants,
         fields: Mapping[str, FlowField],
         whole: Vessel | None,
     ) -> Scene:
@@ -65,14 +64,14 @@ class Drawing:
         Parameters
         ----------
         anatomy : vessel, parent artery and sacs.
-        deployments : deployed devices by name.
-        fields : flows by name; empty: no flow is shown.
+        implants : deployed implants by treatment and id.
+        fields : flows by treatment; empty: no flow is shown.
         whole : the vessel before it was trimmed; None: it is not shown.
         """
         if self._scene is None:
-            self._scene = scene_of(anatomy, deployments, fields)
+            self._scene = scene_of(anatomy, implants, fields)
             before, *after = plates(self._scene)
-            wanted = [before, *method_plates(anatomy, deployments, self._scene, whole), *after]
+            wanted = [before, *method_plates(anatomy, implants, self._scene, whole), *after]
             self._begun = [self._pool.submit(plate.drawn) for plate in wanted]
         return self._scene
 

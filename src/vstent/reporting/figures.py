@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.devices.design import BARE
+from vstent.devices.treatment import BARE
 from vstent.devices.stent import Deployment
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import raster
@@ -120,15 +120,15 @@ def plates(scene: Scene) -> list[Plate]:
     return found
 
 
-def patient_picture(anatomy: Anatomy, deployment: Deployment) -> Picture:
-    """Return a small picture of a device in the artery of a patient, in profile, for a grid of patients.
+def patient_picture(anatomy: Anatomy, deployments: Sequence[Deployment]) -> Picture:
+    """Return a small picture of implants in the artery of a patient, in profile, for a grid of patients.
 
     Parameters
     ----------
     anatomy : vessel, parent artery and sacs.
-    deployment : the deployed device.
+    deployments : the deployed implants.
     """
-    scene = scene_of(anatomy, {"one": deployment}, {})
+    scene = scene_of(anatomy, {"one": {str(k): one for k, one in enumerate(deployments)}}, {})
     view, picture = scene.views[0], blank(*PATIENT_PX)
     put(picture, draw(scene.pick(("lumen", "continued", "wires", "neck"), "one"), scene, view, PATIENT_PX), (0, 0))
     length_bar(picture, span_mm(view, PATIENT_PX), (0, 0), PATIENT_PX)

@@ -8,7 +8,7 @@ from typing import Any
 from vstent.angiography.angiogram import Angiogram, AngiogramSettings
 from vstent.angiography.filming import FilmSettings, aimed
 from vstent.devices.catalogue import find_design
-from vstent.devices.design import BARE
+from vstent.devices.treatment import BARE
 from vstent.reporting.films import Density, shown_of, write_films
 from vstent.reporting.write import write_report
 from vstent.study.contrast import FOLDER, angiograms
@@ -16,7 +16,7 @@ from vstent.study.films import Recording, stents_of
 from vstent.study.folder import claimed
 from vstent.study.pipeline import run
 from vstent.study.provenance import RUN
-from vstent.study.repeat import read_record
+from vstent.study.repeat import finished_run, read_record
 from vstent.study.types import Progress
 
 
@@ -54,9 +54,9 @@ def film_case(
     recording = Recording(replace(settings, frames_per_s=max(settings.frames_per_s, film.frame_rate_Hz)))
     found = angiograms(out, recording.settings, progress, record=recording)
     progress("film", 0.0, "")
-    devices = [name for name in found if name != BARE]
-    anatomy, stents = stents_of(out, devices if film.has_wires else ())
-    titles = {name: "Before" if name == BARE else find_design(name).name for name in found}
+    anatomy, stents = stents_of(out, found if film.has_wires else ())
+    treatments = finished_run(out)[1].treatments
+    titles = {BARE: "Before"} | {one.name: " + ".join(find_design(key).name for key in one.devices) for one in treatments}
     histories = {name: recording.histories[name] for name in found}
     shown = shown_of(histories, stents, titles, aimed(film, anatomy))
     curves = {titles[name]: one.curves for name, one in found.items()}

@@ -67,14 +67,14 @@ class Shown:
 
 
 def shown_of(
-    histories: Mapping[str, History], stents: Mapping[str, Stent], titles: Mapping[str, str], settings: FilmSettings
+    histories: Mapping[str, History], stents: Mapping[str, Sequence[Stent]], titles: Mapping[str, str], settings: FilmSettings
 ) -> dict[str, Shown]:
     """Film the contrast of every flow along one direction.
 
     Parameters
     ----------
     histories : contrast by name of the flow, ``bare`` first.
-    stents : devices by name.
+    stents : implants by treatment.
     titles : titles of the films by name.
     settings : how films are taken; without a direction they are frontal (`vstent.angiography.filming.aimed`).
     """
@@ -82,7 +82,8 @@ def shown_of(
     projectors = projectors_of(view, histories)
     found = {}
     for name, film in films_of(histories, projectors, settings).items():
-        wires = wire_shadow(view, stents[name]) if settings.has_wires and name in stents else None
+        shadows = [wire_shadow(view, stent) for stent in stents.get(name, ()) if settings.has_wires]
+        wires = np.sum(shadows, axis=0, dtype=np.float32) if shadows else None
         vessel = projectors[name](np.ones(histories[name].stored.shape[1])) if settings.has_vessel else None
         found[name] = Shown(titles[name], film, wires, vessel)
     return found

@@ -5,14 +5,14 @@ maximum inscribed spheres along its axis, the initial contour with its triangles
 and the wires in the parent artery and in the patient's own artery.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from vstent.anatomy.landing_zones import neck_span_mm
-from vstent.devices.design import BARE
+from vstent.devices.treatment import BARE
 from vstent.devices.stent import Deployment, tube_faces
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Vessel
@@ -20,7 +20,7 @@ from vstent.kernels.arrays import Floats, Ints
 from vstent.reporting.figures import Plate, Shot
 from vstent.reporting.freestanding import freestanding_plate
 from vstent.reporting.node_rule import NodeRule
-from vstent.reporting.scene import LineLayer, MeshLayer, Scene, curves_layer, round_up, view_of
+from vstent.reporting.scene import Implants, LineLayer, MeshLayer, Scene, curves_layer, device_title, round_up, view_of
 from vstent.reporting.thinning import some_frames, thin_frames, thin_surface
 from vstent.units import counted
 
@@ -42,14 +42,14 @@ _WALL: Final = (0.62, 0.68, 0.73)
 
 
 def method_plates(
-    anatomy: Anatomy, deployments: Mapping[str, Deployment], scene: Scene, whole: Vessel | None = None
+    anatomy: Anatomy, implants: Implants, scene: Scene, whole: Vessel | None = None
 ) -> list[Plate | NodeRule]:
     """Return the pictures of the steps from the patient's artery to the deployed devices, in that order, to be drawn.
 
     Parameters
     ----------
     anatomy : vessel, parent artery and sacs.
-    deployments : deployed devices by name.
+    implants : deployed implants by treatment and id.
     scene : the scene of the case.
     whole : the vessel before it was trimmed; None: it is not shown.
     """
@@ -57,11 +57,13 @@ def method_plates(
     if whole is not None and _is_trimmed(whole, anatomy):
         found.append(_trimming(whole, scene))
     found += [_restoration(scene), _spheres(anatomy, scene)]
+    deployments = [one for deployed in implants.values() for one in deployed.values()]
     if deployments:
-        stents = {title: deployments[name].stent for name, title in scene.panes[1:]}
+        stents = {device_title(one): one.stent for one in deployments}
         found = [freestanding_plate(stents, scene, anatomy), *found]
         found += [_first_contours(deployments, scene), _triangles(anatomy, deployments, scene), NodeRule()]
-        found += [_expansion(name, deployment, anatomy, scene) for name, deployment in deployments.items()]
+        for name, deployed in implants.items():
+            found += [_expansion(name, number, one, anatomy, scene) for number, one in enumerate(deployed.values())]
         found.append(_fitted(scene))
     return found
 
@@ -146,12 +148,12 @@ def _unit_sphere(rows: int = 17, columns: int = 32) -> tuple[Floats, Ints]:
     return points.reshape(-1, 3), tube_faces(rows, columns)[:, ::-1]
 
 
-def _first_contours(deployments: Mapping[str, Deployment], scene: Scene) -> Plate:
+def _first_contours(deployments: Sequence[Deployment], scene: Scene) -> Plate:
     """Return the picture of the contour of each device before the first iteration."""
     shots = []
-    for name, title in scene.panes[1:]:
-        layers = (*scene.pick(("axis",), BARE), *_contour_layers(deployments[name].history_mm[0]))
-        shots.append(Shot(title, (*_glass(scene), *layers), scene.view("profile")))
+    for deployment in deployments:
+        layers = (*scene.pick(("axis",), BARE), *_contour_layers(deployment.history_mm[0]))
+        shots.append(Shot(device_title(deployment), (*_glass(scene), *layers), scene.view("profile")))
     caption = (
         "The contour before the first iteration, in the parent artery (glass): rows of nodes on planes across "
         "the axis, each as wide as the maximum inscribed sphere. Some rows are drawn as lines."
@@ -159,17 +161,17 @@ def _first_contours(deployments: Mapping[str, Deployment], scene: Scene) -> Plat
     return Plate("first", "The initial contour", caption, scene, shots)
 
 
-def _triangles(anatomy: Anatomy, deployments: Mapping[str, Deployment], scene: Scene) -> Plate:
+def _triangles(anatomy: Anatomy, deployments: Sequence[Deployment], scene: Scene) -> Plate:
     """Return the picture of the triangle mesh of each contour near the neck, before and after the expansion."""
     profile, shots = scene.view("profile"), []
     middle_mm = _middle_mm(anatomy)
-    for name, title in scene.panes[1:]:
-        history_mm = deployments[name].history_mm
+    for deployment in deployments:
+        history_mm = deployment.history_mm
         for words, nodes_mm in (("initial", history_mm[0]), ("deployed", history_mm[-1])):
             near = np.linalg.norm(nodes_mm.mean(axis=1) - middle_mm, axis=1) < MESH_MM
             rows = nodes_mm[near] if near.sum() > 2 else nodes_mm
             view = view_of("mesh", profile.axes, rows.reshape(-1, 3))
-            shots.append(Shot(f"{title}: {words}", (*_glass(scene), *mesh_layers(rows)), view))
+            shots.append(Shot(f"{device_title(deployment)}: {words}", (*_glass(scene), *mesh_layers(rows)), view))
     caption = (
         f"The triangles of the contour within {MESH_MM:g} mm of the neck, before the first iteration and deployed, in "
         "the parent artery (glass; Zhong et al. 2016, fig. 6). Nodes are the corners of the triangles."
@@ -206,18 +208,18 @@ def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
     return MeshLayer("first", "", _STEEL, "", np.zeros(0), surface), curves_layer("rings", rings, 0.02, _INK)
 
 
-def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene) -> Plate:
-    """Return the picture of the expansion of one device, colored by the gap to the wall."""
+def _expansion(name: str, number: int, deployment: Deployment, anatomy: Anatomy, scene: Scene) -> Plate:
+    """Return the picture of the expansion of one implant of a treatment, colored by the gap to the wall."""
     frames_mm, gaps_mm = thin_frames(deployment, anatomy.parent.landing_surface, FRAMES)
-    contour = next(layer for layer in scene.pick(("contour",), name) if isinstance(layer, MeshLayer))
+    contour = [layer for layer in scene.pick(("contour",), name) if isinstance(layer, MeshLayer)][number]
     reached = np.concatenate([[0.0], deployment.terminated_fraction])
     shots = []
-    for number, nodes_mm, gap_mm in zip(some_frames(deployment, FRAMES), frames_mm, gaps_mm, strict=True):
+    for count, nodes_mm, gap_mm in zip(some_frames(deployment, FRAMES), frames_mm, gaps_mm, strict=True):
         surface = replace(contour.surface, vertices_mm=nodes_mm)
         layer = replace(contour, surface=surface, values=gap_mm, frames_mm=None, frame_values=None)
         words = (
-            f"after {counted(number, 'iteration')}, {100 * reached[number]:.0f} % of the nodes terminated"
-            if number
+            f"after {counted(count, 'iteration')}, {100 * reached[count]:.0f} % of the nodes terminated"
+            if count
             else "initial contour"
         )
         shots.append(Shot(words[:1].upper() + words[1:], (*_glass(scene), layer), scene.view("profile")))
@@ -225,12 +227,13 @@ def _expansion(name: str, deployment: Deployment, anatomy: Anatomy, scene: Scene
     gap = scene.scale("wall_gap")
     wide = replace(gap, high=round_up(max(gap.high, float(np.percentile(gaps_mm[0], 98)))))
     shown = replace(scene, scales=tuple(wide if scale is gap else scale for scale in scene.scales))
-    title = f"Expansion of {dict(scene.panes)[name]}"
+    title = f"Expansion of {device_title(deployment)}"
     caption = (
         "Expansion of the active contour to the wall of the parent artery (glass) in "
         f"{counted(len(deployment.history_mm) - 1, 'iteration')}, colored by the remaining gap."
     )
-    return Plate(f"expansion-{name}", title, caption, shown, shots, "wall_gap")
+    plate = f"expansion-{name}" if number == 0 else f"expansion-{name}-{number + 1}"
+    return Plate(plate, title, caption, shown, shots, "wall_gap")
 
 
 def _fitted(scene: Scene) -> Plate:

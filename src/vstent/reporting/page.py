@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from markupsafe import Markup
 
-from vstent.devices.design import BARE
+from vstent.devices.treatment import BARE
 from vstent.devices.stent import Deployment
 from vstent.flow.case import LATTICE, OPENFOAM
-from vstent.flow.grade import QUALITY
 from vstent.reporting import bands
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
 from vstent.reporting.drawing import Drawing, in_threads
@@ -49,8 +48,8 @@ AT_OUTLETS: Final = {
     "murray": "the flow is split among the outlets by their diameter cubed, not measured in the patient",
 }
 """Limit that a report states, by the outlet setting of the flow."""
-SHOWN: Final = ("deployment", "bands", "flow", "ratios", "uncertainty")
-"""Metrics of a device that have a section of their own."""
+SHOWN: Final = ("implants", "flow", "change", "quality", "uncertainty")
+"""Metrics of a treatment that have a section of their own."""
 AT_INLETS: Final = "The flow through each inlet is assumed, not measured in the patient."
 """Limit that a report states where the vessel has several inlets."""
 OF_DEVICE: Final = {
@@ -82,9 +81,9 @@ class Contents:
     pictures: tuple[Picture, ...]
     """Pictures in the order of the report."""
     changes: list[Change]
-    """Flow metrics without and with each device."""
-    stents: list[dict[str, Any]]
-    """One entry per device: title, words, advice, quantities, facts."""
+    """Flow metrics of the bare artery and with each treatment."""
+    implants: list[dict[str, Any]]
+    """One entry per implant: title, words, advice, quantities, facts."""
     openings: list[tuple[str, str, str, str]]
     """Role, diameter, area and center of every opening of the vessel, as text."""
     is_pulse: bool
@@ -99,8 +98,8 @@ class Contents:
     """Films of the contrast agent before and after, as an animated WebP; empty: none."""
 
     @property
-    def devices(self) -> tuple[tuple[str, str], ...]:
-        """Name and title of every device."""
+    def treatments(self) -> tuple[tuple[str, str], ...]:
+        """Name and title of every treatment."""
         return self.scene.panes[1:]
 
     @property
@@ -116,13 +115,13 @@ class Contents:
 
     @property
     def uncertainty(self) -> list[Varied]:
-        """Uncertainty intervals by device; empty where there is no uncertainty study."""
-        return uncertainty_of(self.metrics, dict(self.devices))
+        """Uncertainty intervals by treatment; empty where there is no uncertainty study."""
+        return uncertainty_of(self.metrics, dict(self.treatments))
 
     @property
     def qualities(self) -> list[Quality]:
         """Grades of the flows, the one without a device first."""
-        return qualities(self.metrics, dict(self.devices))
+        return qualities(self.metrics, dict(self.treatments))
 
     @property
     def definitions(self) -> list[tuple[Definition, str]]:
@@ -144,7 +143,7 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
     drawing : its pictures, if they are being drawn already.
     """
     with drawing or Drawing() as drawn:
-        scene, metrics = drawn.begin(case.anatomy, case.deployments, case.fields, case.whole), case.metrics
+        scene, metrics = drawn.begin(case.anatomy, case.implants, case.fields, case.whole), case.metrics
         pictures = drawn.pictures()
     return Contents(
         name=case.name,
@@ -152,7 +151,11 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
         scene=scene,
         pictures=pictures,
         changes=compare(metrics, unusable(metrics)),
-        stents=[_stent(name, deployment, metrics) for name, deployment in case.deployments.items()],
+        implants=[
+            _implant(deployment, metrics.get("treatments", {}).get(name, {}).get("implants", {}).get(key, {}), (name, key))
+            for name, deployed in case.implants.items()
+            for key, deployment in deployed.items()
+        ],
         openings=opening_rows(case.anatomy.vessel.openings),
         is_pulse=any(field.phases for field in case.fields.values()),
         notes=tuple(case.notes),
@@ -196,7 +199,7 @@ def as_html(told: Contents) -> str:
         script_hashes=Markup(" ".join(_hash(script) for script in scripts.values())),
         style=Markup(asset("report.css") + asset("viewer.css")),
         **{name: Markup(script) for name, script in scripts.items()},
-        devices=told.devices,
+        devices=told.treatments,
         qualities=told.qualities,
         of_grades=OF_GRADES,
         summary=told.headlines,
@@ -204,11 +207,11 @@ def as_html(told: Contents) -> str:
         film=base64.b64encode(told.film).decode("ascii"),
         vessel=told.vessel,
         openings=told.openings,
-        stents=told.stents,
+        stents=told.implants,
         flow=told.changes,
         of_pulse=OF_PULSE,
         is_pulse=told.is_pulse,
-        flow_only=_flow_only(told.metrics, told.changes, dict(told.devices)),
+        flow_only=_flow_only(told.metrics, told.changes, dict(told.treatments)),
         uncertainty=told.uncertainty,
         other=_other(told.metrics),
         notes=told.notes,
@@ -238,9 +241,9 @@ def _hash(script: str) -> str:
 def _sections(told: Contents) -> list[tuple[str, str]]:
     """Return id and title of every section of the report."""
     titles = {"summary": "Summary", "scene": "3-D view", "pictures": "Pictures", "anatomy": "Anatomy"}
-    if told.stents:
+    if told.implants:
         titles["devices"] = "Devices"
-    if told.metrics.get("bare"):
+    if told.changes:
         titles["flow"] = "Blood flow"
     if told.uncertainty:
         titles["uncertainty"] = "Uncertainty"
@@ -264,11 +267,10 @@ def _pane_notes(headlines: list[Change]) -> dict[str, str]:
     return {}
 
 
-def _stent(name: str, deployment: Deployment, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Return title, words, advice, quantities and facts of one device."""
+def _implant(deployment: Deployment, measured: dict[str, Any], path: tuple[str, str]) -> dict[str, Any]:
+    """Return title, words, advice, quantities and facts of one implant."""
     stent = deployment.stent
-    measured = metrics.get("stents", {}).get(name, {})
-    values = flatten(measured.get("deployment", {}), ("stents", name, "deployment"))
+    values = flatten({key: value for key, value in measured.items() if key != "bands"}, path)
     diameters = ", ".join(f"{d:g}" for d in np.unique(stent.wire_diameter_um))
     wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
     how = "terminated" if deployment.outcome == "terminated" else "stopped at its iteration limit"
@@ -288,22 +290,22 @@ def _stent(name: str, deployment: Deployment, metrics: dict[str, Any]) -> dict[s
 def _flow_only(metrics: dict[str, Any], rows: list[Change], titles: dict[str, str]) -> list[tuple[str, list[Quantity]]]:
     """Return flow metrics that exist on one side only, and ratios, by pane."""
     paired = {row.before.path for row in rows}
-    found = [("Before", [q for q in flatten(metrics.get("bare", {}), ("bare", "")) if q.path[2:] not in paired])]
-    for name, stent in metrics.get("stents", {}).items():
-        values = [q for q in flatten(stent.get("flow", {}), ("flow", name)) if q.path[2:] not in paired]
-        found.append((f"{titles.get(name, name)}: ratios", flatten(stent.get("ratios", {}), ("ratios", name))))
-        found.append((titles.get(name, name), values))
+    found, named = [], {BARE: "Before"} | titles
+    for name, one in metrics.get("treatments", {}).items():
+        values = [q for q in flatten(one.get("flow", {}), ("flow", name)) if q.path[2:] not in paired]
+        found.append((f"{named.get(name, name)}: ratios", flatten(one.get("change", {}), ("change", name))))
+        found.append((named.get(name, name), values))
     return [(title, values) for title, values in found if values]
 
 
 def _other(metrics: dict[str, Any]) -> list[Quantity]:
     """Return the metrics that no other section shows."""
-    top = {key: value for key, value in metrics.items() if key not in ("vessel", "bare", "stents", QUALITY)}
-    stents = {
-        name: {key: value for key, value in stent.items() if key not in SHOWN}
-        for name, stent in metrics.get("stents", {}).items()
+    top = {key: value for key, value in metrics.items() if key not in ("vessel", "treatments")}
+    treatments = {
+        name: {key: value for key, value in one.items() if key not in SHOWN}
+        for name, one in metrics.get("treatments", {}).items()
     }
-    return flatten(top) + list(flatten(stents))
+    return flatten(top) + list(flatten(treatments))
 
 
 def _provenance(provenance: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

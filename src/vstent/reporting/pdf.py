@@ -68,23 +68,23 @@ def _summary(paper: Paper, told: Contents) -> None:
 
 def _changes(paper: Paper, told: Contents, rows: list[Change]) -> None:
     """Write a table of metrics without and with each device."""
-    n = max(1, len(told.devices))
+    n = max(1, len(told.treatments))
     first = 0.40 if n < 3 else 0.31
     rest = (1 - first) / (1 + 1.5 * n)
     cells = []
     for row in rows:
         line = [_named(row.before, 0), row.before.text]
-        for name, _ in told.devices:
+        for name, _ in told.treatments:
             after = row.after.get(name)
             line.append(f"{after.text}  {row.of(name)}" if after else "–")
         cells.append(line)
-    head = ("", "Before", *(title for _, title in told.devices))
-    paper.table(cells, (first, rest, *[1.5 * rest] * len(told.devices)), head=head)
+    head = ("", "Before", *(title for _, title in told.treatments))
+    paper.table(cells, (first, rest, *[1.5 * rest] * len(told.treatments)), head=head)
 
 
 def _devices(paper: Paper, told: Contents) -> None:
     """Write the section of every device."""
-    for stent in told.stents:
+    for stent in told.implants:
         paper.heading(stent["title"])
         paper.text(stent["words"])
         paper.text(stent["advice"])

@@ -1,4 +1,4 @@
-"""Plan of a treatment, one page per device: pictures, sizes, landing zones, fit, warnings, alternatives."""
+"""Plan of every treatment, one page per implant: pictures, sizes, landing zones, fit, warnings, alternatives."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -9,7 +9,7 @@ import numpy as np
 from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import bed, sketch
-from vstent.devices.stent import Deployment, Landing
+from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.plan.rank import Candidate, alternatives
@@ -17,7 +17,7 @@ from vstent.reporting.bands import ends, how_sure
 from vstent.reporting.figures import Picture, Plate, Shot
 from vstent.reporting.paper import QUIET, Paper
 from vstent.reporting.quantities import format_value
-from vstent.reporting.scene import device_title, scene_of
+from vstent.reporting.scene import Implants, device_title, scene_of
 
 PICTURE_SHARE: Final = 0.19
 """Largest height of the picture as a fraction of the page."""
@@ -38,31 +38,30 @@ class Planned(NamedTuple):
     """Name of the case."""
     anatomy: Anatomy
     """Vessel, parent artery and sacs."""
-    deployments: Mapping[str, Deployment]
-    """Deployed devices by name."""
-    measures: Mapping[str, Mapping[str, Any]]
-    """Measures of every deployment (`vstent.deployment.measure.measure`)."""
+    implants: Implants
+    """Deployed implants by treatment and id."""
+    metrics: Mapping[str, Mapping[str, Mapping[str, Any]]]
+    """Metrics of every implant by treatment and id, with the bands of a study where there are any."""
     source: str
     """SHA-256 of the input."""
     day: str
     """Date of the plan, ISO 8601."""
-    bands: Mapping[str, Mapping[str, Any]] = {}
-    """Bands of every deployment, as in the metrics of a study; devices of earlier versions have none."""
-
 
 class _Page(NamedTuple):
-    """Page of one device."""
+    """Page of one implant."""
 
     case: Planned
     name: str
-    """Name of the device."""
+    """Name of its treatment."""
+    deployment: Deployment
+    metrics: Mapping[str, Any]
     picture: Picture
     alternatives: Sequence[tuple[str, str, str]]
     """Size, score and reason of other sizes."""
 
 
 def plan_pdf(case: Planned) -> bytes:
-    """Return the plan of every device as PDF, one A4 page each.
+    """Return the plan of every implant as PDF, one A4 page each.
 
     Parameters
     ----------
@@ -71,7 +70,11 @@ def plan_pdf(case: Planned) -> bytes:
     from matplotlib import rc_context
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
-        pages = [_Page(case, name, _picture(case, name), _alternative_rows(case, name)) for name in case.deployments]
+        pages = [
+            _Page(case, name, one, case.metrics[name][key], _picture(case, name), _alternative_rows(case, one.stent))
+            for name, deployed in case.implants.items()
+            for key, one in deployed.items()
+        ]
         scales = [next((scale for scale in SCALES if _fits(page, scale)), SCALES[-1]) for page in pages]
         paper = Paper(case.name, "plan", scale=scales[0])
         for number, (page, scale) in enumerate(zip(pages, scales, strict=True)):
@@ -89,10 +92,8 @@ def _fits(page: _Page, scale: float) -> bool:
 
 
 def _write(paper: Paper, page: _Page) -> None:
-    """Write the page of one device."""
-    case, name = page.case, page.name
-    deployment = case.deployments[name]
-    metrics = {"deployment": case.measures[name], "bands": case.bands.get(name, {})}
+    """Write the page of one implant."""
+    case, deployment, metrics = page.case, page.deployment, page.metrics
     paper.title(f"{case.name}: {device_title(deployment)}")
     paper.text(
         f"Plan of {case.day}. Input SHA-256 {case.source[:HASH_DIGITS]}… Deployed length and fit are predictions."
@@ -113,8 +114,8 @@ def _write(paper: Paper, page: _Page) -> None:
 
 
 def _picture(case: Planned, name: str) -> Picture:
-    """Return the device in profile and seen from the sac."""
-    scene = scene_of(case.anatomy, {name: case.deployments[name]}, {})
+    """Return a treatment in profile and seen from the sac."""
+    scene = scene_of(case.anatomy, {name: case.implants[name]}, {})
     looks = {
         "profile": ("In profile", ("lumen", "continued", "sac", "wires", "neck")),
         "neck": ("Seen from the sac", ("wires", "neck")),
@@ -130,7 +131,7 @@ def _picture(case: Planned, name: str) -> Picture:
 
 def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the table of device, landing zones and fit, with bands where there are any."""
-    stent, measures = deployment.stent, metrics["deployment"]
+    stent = deployment.stent
     rows = [
         ("Device and label size", f"{stent.design.name} {stent.size.label}"),
         ("Deployed length (range for the uncertainty of diameters)", _length(anatomy, deployment)),
@@ -153,9 +154,9 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
         "jailed_branches_count": "Jailed branches",
     }
     return rows + [
-        (words, f"{format_value(key, measures[key])} {ends(metrics, key)}".rstrip())
+        (words, f"{format_value(key, metrics[key])} {ends(metrics, key)}".rstrip())
         for key, words in keys.items()
-        if key in measures
+        if key in metrics
     ]
 
 
@@ -182,9 +183,8 @@ def _length(anatomy: Anatomy, deployment: Deployment) -> str:
     return f"{stent.deployed_length_mm:.1f} mm ({lengths[0] + shift:.1f} to {lengths[-1] + shift:.1f} mm)"
 
 
-def _alternative_rows(case: Planned, name: str) -> Sequence[tuple[str, str, str]]:
+def _alternative_rows(case: Planned, stent: Stent) -> Sequence[tuple[str, str, str]]:
     """Return the two best neighboring sizes of a device."""
-    stent = case.deployments[name].stent
     found = alternatives(case.anatomy, stent.design, stent.size)
     return [_alternative(one) for one in found] or [("none fits", "", "")]
 

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
-from vstent.devices.design import BARE
-from vstent.flow.grade import FAIR, GOOD, NOT_USABLE, QUALITY
+from vstent.devices.treatment import BARE
+from vstent.flow.grade import FAIR, GOOD, NOT_USABLE
 from vstent.reporting.quantities import format_value
 
 MARKS: Final = {GOOD: "✓", FAIR: "~", NOT_USABLE: "✗"}
@@ -19,7 +19,7 @@ class Quality(NamedTuple):
     """Grade of one flow in words."""
 
     name: str
-    """Name of the flow: ``bare`` or a device."""
+    """Name of the treatment."""
     title: str
     """Display name."""
     grade: str
@@ -46,9 +46,9 @@ def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Qua
     Parameters
     ----------
     metrics : metrics of a case.
-    titles : titles of the devices by name.
+    titles : titles of the treatments by name.
     """
-    graded = metrics.get(QUALITY, {})
+    graded = _graded(metrics)
     named = {BARE: "Without a device"} | dict(titles)
     return [
         Quality(name, title, graded[name]["grade"], "; ".join(graded[name]["reasons"]), _computation(graded[name]))
@@ -58,10 +58,15 @@ def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Qua
 
 
 def unusable(metrics: Mapping[str, Any]) -> frozenset[str]:
-    """Return the devices whose changes are not shown, because their flow or the bare one is not usable."""
-    graded = metrics.get(QUALITY, {})
+    """Return the treatments whose changes are not shown, because their flow or the bare one is not usable."""
+    graded = _graded(metrics)
     poor = {name for name, one in graded.items() if one["grade"] == NOT_USABLE}
     return frozenset(graded if BARE in poor else poor)
+
+
+def _graded(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the grade of every flow that has one, by treatment."""
+    return {name: one["quality"] for name, one in metrics.get("treatments", {}).items() if "quality" in one}
 
 
 def _computation(one: Mapping[str, Any]) -> str:

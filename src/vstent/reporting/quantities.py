@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from vstent.devices.treatment import BARE
 from vstent.geometry.vessel import Opening
 from vstent.reporting.definitions import DEFINITIONS, WANTED, Definition
 
@@ -265,13 +266,15 @@ def opening_rows(openings: Iterable[Opening]) -> list[tuple[str, str, str, str]]
 
 
 def compare(metrics: dict[str, Any], hidden: frozenset[str] = frozenset()) -> list[Change]:
-    """Return the flow metrics without (``bare``) and with each device (``stents.NAME.flow``), in order.
+    """Return the flow metrics of the bare artery and with each treatment (``treatments.NAME.flow``), in order.
 
     Metrics that state the reliability of a result are left out.
     """
-    after = {name: dict(_flow(stent)) for name, stent in metrics.get("stents", {}).items()}
+    treatments = metrics.get("treatments", {})
+    flows = {name: flatten(one.get("flow", {})) for name, one in treatments.items()}
+    after = {name: {quantity.path: quantity for quantity in found} for name, found in flows.items() if name != BARE}
     rows = []
-    for quantity in flatten(metrics.get("bare", {})):
+    for quantity in flows.get(BARE, []):
         found = {name: values[quantity.path] for name, values in after.items() if quantity.path in values}
         if found and _is_compared(quantity):
             rows.append(Change(quantity, found, hidden))
@@ -282,11 +285,6 @@ def _is_compared(quantity: Quantity) -> bool:
     """Return whether a quantity is a number whose change with a device is meaningful."""
     is_number = isinstance(quantity.value, (int, float)) and not isinstance(quantity.value, bool)
     return is_number and quantity.key not in ERRORS
-
-
-def _flow(stent: dict[str, Any]) -> list[tuple[tuple[str, ...], Quantity]]:
-    """Return path and quantity of every flow metric of a device."""
-    return [(quantity.path, quantity) for quantity in flatten(stent.get("flow", {}))]
 
 
 def _spell(words: str) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vstent.deployment.coverage import coverage_fractions
-from vstent.devices.design import BARE
+from vstent.devices.treatment import BARE
 from vstent.devices.stent import Deployment, Stent
 from vstent.flow.case import FlowField
 from vstent.flow.indices import on_sac
@@ -121,7 +121,7 @@ class Scene:
     """Layers, color scales and views of a case."""
 
     panes: tuple[tuple[str, str], ...]
-    """(name, title) of every pane: ``bare`` first, then the devices."""
+    """(name, title) of every pane: ``bare`` first, then the treatments."""
     layers: tuple[MeshLayer | LineLayer, ...]
     """All layers."""
     scales: tuple[Scale, ...]
@@ -146,26 +146,31 @@ class Scene:
         return tuple(layer for layer in self.layers if layer.id in ids and layer.pane in ("", pane))
 
 
-def scene_of(anatomy: Anatomy, deployments: Mapping[str, Deployment], fields: Mapping[str, FlowField]) -> Scene:
+Implants = Mapping[str, Mapping[str, Deployment]]
+"""Deployed implants by treatment and id."""
+
+
+def scene_of(anatomy: Anatomy, implants: Implants, fields: Mapping[str, FlowField]) -> Scene:
     """Return the scene of a case, decimated to the resolution of a screen.
 
     Parameters
     ----------
-    anatomy : vessel, parent artery and sacs.
-    deployments : deployed devices by name.
-    fields : flows by name, ``bare`` without a device; empty: no flow is shown.
+    anatomy : vessel, sacs and paths.
+    implants : deployed implants by treatment and id.
+    fields : flows by treatment, ``bare`` first; empty: no flow is shown.
     """
-    devices = tuple((name, device_title(deployment)) for name, deployment in deployments.items())
+    treatments = tuple((name, treatment_title(deployed)) for name, deployed in implants.items())
     layers: list[MeshLayer | LineLayer] = anatomy_layers(anatomy)
-    for name, deployment in deployments.items():
-        layers += [*device_layers(name, deployment, anatomy), coverage_layer(name, deployment.stent)]
+    for name, deployed in implants.items():
+        for deployment in deployed.values():
+            layers += [*device_layers(name, deployment, anatomy), coverage_layer(name, deployment.stent)]
     for name, field in fields.items():
         layers += flow_layers(name, field, anatomy)
     return Scene(
-        panes=((BARE, "Before (no device)"), *devices),
+        panes=((BARE, "Before (no device)"), *treatments),
         layers=tuple(layers),
         scales=scales_of(layers, anatomy),
-        views=views_of(anatomy, deployments),
+        views=views_of(anatomy, [one for deployed in implants.values() for one in deployed.values()]),
         is_oriented=anatomy.vessel.is_oriented,
         fade_mm=1.2 * float(np.median(anatomy.parent.section_radius_mm)),
     )
@@ -175,6 +180,11 @@ def device_title(deployment: Deployment) -> str:
     """Return the name of a device with its size: ``Silk 4.0 × 20 mm``."""
     size = deployment.stent.size
     return f"{deployment.stent.design.name} {size.diameter_mm:g} × {size.length_mm:g} mm"
+
+
+def treatment_title(deployed: Mapping[str, Deployment]) -> str:
+    """Return the devices of a treatment with their sizes: ``Silk 4.0 × 20 mm + Silk 3.5 × 15 mm``."""
+    return " + ".join(map(device_title, deployed.values()))
 
 
 _PLAIN: dict[str, Any] = {"scale": "", "values": np.zeros(0)}
@@ -424,15 +434,15 @@ def _colours(name: str) -> Floats:
     return matplotlib.colormaps[name](np.linspace(0.0, 0.93, 256))[:, :3]
 
 
-def views_of(anatomy: Anatomy, deployments: Mapping[str, Deployment]) -> tuple[View, ...]:
+def views_of(anatomy: Anatomy, deployments: Sequence[Deployment] = ()) -> tuple[View, ...]:
     """Return the views of a case, the profile of the first sac first.
 
     Parameters
     ----------
     anatomy : vessel, parent artery and sacs.
-    deployments : deployments by device name; the profile view encloses them.
+    deployments : deployed implants, which the profile view encloses.
     """
-    points = [deployment.stent.nodes_mm.reshape(-1, 3) for deployment in deployments.values()]
+    points = [deployment.stent.nodes_mm.reshape(-1, 3) for deployment in deployments]
     points += [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
     treated = np.concatenate(points or [anatomy.parent.axis.points_mm])
     whole = anatomy.vessel.lumen.vertices_mm

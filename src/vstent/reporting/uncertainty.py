@@ -32,19 +32,19 @@ class Interval(NamedTuple):
 
 
 class Varied(NamedTuple):
-    """Uncertainty of all results of one device."""
+    """Uncertainty of all results of one treatment."""
 
     title: str
-    """Title of the device."""
+    """Title of the treatment."""
     words: str
     """Number of deployments and the ranges that were varied, as text."""
     rows: list[Interval]
     """Uncertainty of every result."""
 
 
-def intervals(stent: Mapping[str, Any]) -> list[Interval]:
-    """Return the uncertainty of every result in the metrics of a device; empty without an uncertainty study."""
-    varied = stent.get("uncertainty", {})
+def intervals(treatment: Mapping[str, Any]) -> list[Interval]:
+    """Return the uncertainty of every result in the metrics of a treatment; empty without an uncertainty study."""
+    varied = treatment.get("uncertainty", {})
     return [_interval(key, ends, varied["shares"][key]) for key, ends in varied.get("intervals", {}).items()]
 
 
@@ -58,17 +58,17 @@ def _interval(key: str, ends: Mapping[str, float], shares: Mapping[str, float]) 
 
 
 def uncertainty_of(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Varied]:
-    """Return the uncertainty of all devices; empty without an uncertainty study.
+    """Return the uncertainty of all treatments; empty without an uncertainty study.
 
     Parameters
     ----------
     metrics : metrics of the case.
-    titles : titles of the devices by name.
+    titles : titles of the treatments by name.
     """
     found = []
-    for name, stent in metrics.get("stents", {}).items():
-        if "uncertainty" in stent:
-            found.append(Varied(titles.get(name, name), _words(stent["uncertainty"]), intervals(stent)))
+    for name, treatment in metrics.get("treatments", {}).items():
+        if "uncertainty" in treatment:
+            found.append(Varied(titles.get(name, name), _words(treatment["uncertainty"]), intervals(treatment)))
     return found
 
 

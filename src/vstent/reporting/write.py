@@ -24,7 +24,7 @@ DRAWN: Final = "report.key"
 
 
 def write_plan(case: "CaseResult", out: Path, day: str) -> None:
-    """Write ``plan.pdf`` into a case folder: one page per device, without the flow.
+    """Write ``plan.pdf`` into a case folder: one page per implant, without the flow.
 
     Parameters
     ----------
@@ -32,10 +32,8 @@ def write_plan(case: "CaseResult", out: Path, day: str) -> None:
     out : its case folder.
     day : date of the plan, ISO 8601.
     """
-    measures = {name: case.metrics["stents"][name]["deployment"] for name in case.deployments}
-    bands = {name: case.metrics["stents"][name].get("bands", {}) for name in case.deployments}
-    source = case.provenance["input"]["sha256"]
-    planned = Planned(case.name, case.anatomy, case.deployments, measures, source, day, bands)
+    metrics = {name: case.metrics["treatments"][name]["implants"] for name in case.implants}
+    planned = Planned(case.name, case.anatomy, case.implants, metrics, case.provenance["input"]["sha256"], day)
     with atomic(out / "plan.pdf") as partial:
         partial.write_bytes(plan_pdf(planned))
 

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from vstent.angiography.angiogram import Angiogram, AngiogramSettings, Watch, angiogram
-from vstent.devices.catalogue import find_design
-from vstent.devices.design import BARE
+from vstent.devices.treatment import BARE
 from vstent.errors import InputError, ReadError
 from vstent.flow.case import FlowField
 from vstent.flow.indices import compare
@@ -22,7 +21,7 @@ from vstent.study.folder import CACHE, claimed
 from vstent.study.ledger import ANATOMY, CONTRAST_VERSION, Ledger, anatomy_key, key_of
 from vstent.study.provenance import METRICS
 from vstent.study.repeat import UNTOLD, finished_run
-from vstent.study.stages import flow_key
+from vstent.study.stages import flow_keys
 from vstent.study.types import Progress, Settings
 
 FOLDER: Final = "angiogram"
@@ -73,16 +72,10 @@ def angiograms(
             raise ReadError(f"{out} does not hold the artery of its run: give the same command as for that run again")
         found = {
             name: _one(out, anatomy, name, key, settings, ledger, record)
-            for name, key in _flow_keys(source, study).items()
+            for name, key in flow_keys(source, study).items()
         }
-        _write(out, found, settings, _flow_keys(source, study))
+        _write(out, found, settings, flow_keys(source, study))
     return found
-
-
-def _flow_keys(source: str, study: Settings) -> dict[str, str]:
-    """Return the keys of the flows of a run by name, ``bare`` first."""
-    names = (BARE, *(name for name in study.devices if name not in study.without_flow))
-    return {name: flow_key(source, study, name, None if name == BARE else find_design(name)) for name in names}
 
 
 def _one(
@@ -163,13 +156,10 @@ def _former_keys(path: Path) -> set[str]:
 
 def _drop(metrics: dict[str, Any], keys: set[str]) -> None:
     """Remove measures of earlier angiograms from nested metrics: a new one need not have all of them."""
-    stents = metrics["stents"].values()
-    for part in (metrics.get(BARE, {}), *(stent.get("flow", {}) for stent in stents)):
-        for key in keys & part.keys():
-            del part[key]
-    for stent in stents:
-        for key in {f"{key}_ratio" for key in keys} & stent.get("ratios", {}).keys():
-            del stent["ratios"][key]
+    for treatment in metrics["treatments"].values():
+        for part, gone in (("flow", keys), ("change", {f"{key}_ratio" for key in keys})):
+            for key in gone & treatment.get(part, {}).keys():
+                del treatment[part][key]
 
 
 def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, float]]) -> None:
@@ -178,15 +168,14 @@ def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, fl
     Parameters
     ----------
     metrics : metrics of a case; changed in place.
-    measures : measures by name of the flow.
+    measures : measures by treatment.
     """
     for name, values in measures.items():
-        stent = metrics["stents"].get(name)
-        if name == BARE and BARE in metrics:
-            metrics[BARE].update(values)
-        elif stent is not None and "flow" in stent:
-            stent["flow"].update(values)
-            stent["ratios"].update(compare(dict(measures.get(BARE, {})), dict(values)))
+        treatment = metrics["treatments"].get(name, {})
+        if "flow" in treatment:
+            treatment["flow"].update(values)
+        if "change" in treatment:
+            treatment["change"].update(compare(dict(measures.get(BARE, {})), dict(values)))
 
 
 def kept_measures(out: Path, source: str, study: Settings) -> dict[str, dict[str, float]]:
@@ -200,7 +189,7 @@ def kept_measures(out: Path, source: str, study: Settings) -> dict[str, dict[str
     """
     try:
         flows = json.loads((out / FOLDER / NUMBERS).read_text(encoding="utf-8"))["flows"]
-        keys = _flow_keys(source, study)
+        keys = flow_keys(source, study)
         return {name: dict(one["measures"]) for name, one in flows.items() if one["flow"] == keys.get(name)}
     except UNTOLD:
         return {}

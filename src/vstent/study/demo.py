@@ -47,9 +47,10 @@ def truth(case: CaseResult) -> list[Row]:
     sacs = case.anatomy.aneurysms
     rows.append(("Sac volume", sacs[0].sac.volume_mm3 if sacs else 0.0, phantom.sac_volume_mm3, "mm3"))
     rows.append(("Neck area", sacs[0].neck.area_mm2 if sacs else 0.0, phantom.neck_area_mm2, "mm2"))
-    for name in case.deployments:
-        outside = case.metrics["stents"][name]["deployment"]["max_outside_mm"]
-        rows.append((f"Farthest node of {name} outside the landing surface", float(outside), 0.0, "mm"))
+    for treatment in case.metrics["treatments"].values():
+        for name, measures in treatment.get("implants", {}).items():
+            outside_mm = float(measures["max_outside_mm"])
+            rows.append((f"Farthest node of {name} outside the landing surface", outside_mm, 0.0, "mm"))
     return rows
 
 

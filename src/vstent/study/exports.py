@@ -1,39 +1,31 @@
 """Export a case or an input for other solvers: an OpenFOAM case folder, or named patches."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
-from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Stent
-from vstent.errors import FlowError, InputError, ReadError
-from vstent.flow.case import FlowCase, FlowSettings
+from vstent.errors import FlowError, InputError
+from vstent.flow.case import FlowCase
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.openfoam import program
 from vstent.flow.openfoam.case import FoamCase, foam_case, strut_solids
 from vstent.flow.openfoam.folder import write
 from vstent.flow.openfoam.patches import named_patches, stl_text
 from vstent.flow.openfoam.setup import Flavour, FoamSetup
-from vstent.flow.simulation import flow_case
+from vstent.flow.problem import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.io import writers
 from vstent.io.archive import load_data
 from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, hash_of
 from vstent.study.provenance import RUN
-from vstent.study.repeat import UNTOLD, told_in
-from vstent.study.stages import check_inflow, deploy_one, find_anatomy
+from vstent.study.repeat import finished_run
+from vstent.study.stages import check_inflow, deploy_implant, find_anatomy
 from vstent.study.types import Progress, Settings
-
-GEOMETRY: Final = (
-    *("units", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
-    *("neck_mm", "upstream_mm", "downstream_mm"),
-)
-"""Settings that determine the vessel."""
-
 
 def export_openfoam(
     path: Path, out: Path, settings: Settings, foam: Mapping[str, Any], progress: Progress
@@ -44,7 +36,7 @@ def export_openfoam(
     ----------
     path : a case folder of `run`, or a scan or surface.
     out : the folder to write.
-    settings : settings of the study; the wires of its first device, if any, are meshed.
+    settings : settings of the study; the wires of its first treatment, if any, are meshed.
     foam : fields of `FoamSetup` to set; the default flavor is that of the installed OpenFOAM.
     progress : called at every stage.
 
@@ -63,7 +55,7 @@ def export_openfoam(
     ledger = Ledger(out / CACHE, progress)
     anatomy = _anatomy(path, settings, ledger)
     check_inflow(anatomy, settings.flow)
-    case = flow_case(anatomy, _stent(path, anatomy, settings, ledger), settings.flow or FlowSettings())
+    case = flow_case(anatomy, _implants(path, anatomy, settings, ledger), settings.flow)
     setup = FoamSetup(default_cell_size_mm(case))
     setup = replace(setup, **{"flavour": _flavour_here(), **foam}, struts=strut_solids(case))
     with ledger.stage("export") as tell:
@@ -92,7 +84,7 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: Progress
         An input or option cannot be used; nothing has been written.
     """
     ledger = Ledger(out / CACHE, progress)
-    case = flow_case(_anatomy(path, settings, ledger), None, FlowSettings())
+    case = flow_case(_anatomy(path, settings, ledger))
     with ledger.stage("export") as tell:
         patches, _ = named_patches(case)
         patch_id = np.zeros(len(patches[0].surface.faces), dtype=np.int32)
@@ -123,9 +115,14 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
     kept = sorted((path / CACHE).glob("anatomy-*.npz")) if path.is_dir() else []
     if not kept:
         return find_anatomy(path, hash_of(path), settings, ledger)
-    given = [name for name in GEOMETRY if getattr(settings, name) is not None]
+    given = [
+        field.name
+        for part in (settings.input, settings.anatomy)
+        for field in fields(part)
+        if getattr(part, field.name) is not None
+    ]
     if given:
-        words = ", ".join(f"--{name.removesuffix('_mm')} ({name})" for name in given)
+        words = ", ".join(name.removesuffix("_mm").replace("_", " ") for name in given)
         raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
     with ledger.stage("anatomy") as tell:
         anatomy = load_data(kept[-1], Anatomy)
@@ -133,28 +130,20 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
     return anatomy
 
 
-def _stent(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Stent | None:
-    """Return the first device with the size and position of the case folder's own run, or as proposed."""
-    if not settings.devices:
-        return None
-    name = settings.devices[0]
-    with ledger.stage(f"deploy {name}") as tell:
-        deployment = deploy_one(find_design(name), anatomy, _told(path, settings).placing(name))
-        tell(deployment.advice)
-    return deployment.stent
-
-
-def _told(path: Path, settings: Settings) -> Settings:
-    """Return the settings of the run of a case folder; the given ones where there is no run."""
-    run = path / RUN
-    if not run.exists():
-        return settings
-    try:
-        return told_in(run)[1]
-    except UNTOLD:
-        raise ReadError(
-            f"{run} is from another version, so the position of the device is unknown: run the case again"
-        ) from None
+def _implants(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> list[Stent]:
+    """Return the implants of the first treatment, sized and placed as in the case folder's own run, or as proposed."""
+    if not settings.treatments:
+        return []
+    treatment = settings.treatments[0]
+    if (path / RUN).exists():
+        treatment = next((one for one in finished_run(path)[1].treatments if one.name == treatment.name), treatment)
+    stents: dict[str, Stent] = {}
+    for implant in treatment.implants:
+        with ledger.stage(f"deploy {implant.id}") as tell:
+            deployment = deploy_implant(implant, anatomy, [stents[name] for name in implant.inside])
+            tell(deployment.advice)
+        stents[implant.id] = deployment.stent
+    return list(stents.values())
 
 
 def _flavour_here() -> Flavour:

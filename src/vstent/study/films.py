@@ -2,21 +2,20 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from vstent.angiography.angiogram import AngiogramSettings, Watch, entering
 from vstent.angiography.history import History, Recorder
-from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Stent
 from vstent.errors import ReadError
 from vstent.flow.case import FlowField
 from vstent.geometry.vessel import Anatomy
 from vstent.io.archive import load_data, save_data
 from vstent.study.folder import CACHE, history_path
-from vstent.study.ledger import ANATOMY, CONTRAST_VERSION, anatomy_key, key_of
+from vstent.study.ledger import ANATOMY, CONTRAST_VERSION, Ledger, anatomy_key, key_of
 from vstent.study.repeat import finished_run
-from vstent.study.stages import deploy_one
+from vstent.study.stages import deploy_all
 
 
 @dataclass(frozen=True)
@@ -66,13 +65,13 @@ def _kept(path: Path, key: str) -> History | None:
     return None
 
 
-def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, Stent]]:
-    """Return the anatomy of a finished case folder, and its devices as its run deployed them, by name.
+def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, list[Stent]]]:
+    """Return the anatomy of a finished case folder, and the implants as its run deployed them, by treatment.
 
     Parameters
     ----------
     out : the case folder.
-    names : devices to deploy.
+    names : treatments to deploy.
 
     Raises
     ------
@@ -80,5 +79,8 @@ def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, Stent
         The folder holds no finished run of this version.
     """
     source, study = finished_run(out)
+    ledger = Ledger(out / CACHE, lambda *_: None)
     anatomy = load_data(out / CACHE / f"{ANATOMY}-{anatomy_key(source, study)}.npz", Anatomy)
-    return anatomy, {name: deploy_one(find_design(name), anatomy, study.placing(name)).stent for name in names}
+    chosen = replace(study, treatments=tuple(one for one in study.treatments if one.name in set(names)))
+    deployed = deploy_all(anatomy, chosen, ledger, source)[0] if chosen.treatments else {}
+    return anatomy, {name: [one.stent for one in found.values()] for name, found in deployed.items()}

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vstent.devices.design import BARE
+from vstent.devices.treatment import BARE
 from vstent.flow.case import FlowSettings
 from vstent.geometry.vessel import Anatomy
 from vstent.io.writers import write_json

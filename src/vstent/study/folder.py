@@ -14,6 +14,9 @@ from vstent.io.files import sweep
 CACHE: Final = ".vstent"
 """Subfolder of the case folder with finished stages and the lock."""
 
+TREATMENTS: Final = "treatments"
+"""Subfolder of the case folder with a folder for every treatment."""
+
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
 Study = Callable[Concatenate[Path, Path, Given], Found]
@@ -35,6 +38,16 @@ def claiming(study: Study[Given, Found]) -> Study[Given, Found]:
             return study(Path(path), Path(out), *args, **given)
 
     return alone
+
+
+def implant_folder(out: Path, treatment: str, implant: str) -> Path:
+    """Return the folder of a deployed implant in a case folder."""
+    return out / TREATMENTS / treatment / "implants" / implant
+
+
+def flow_folder(out: Path, treatment: str) -> Path:
+    """Return the folder of the flow with a treatment in a case folder."""
+    return out / TREATMENTS / treatment / "flow"
 
 
 def history_path(flow: Path) -> Path:

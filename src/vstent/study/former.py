@@ -10,27 +10,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
+from vstent.devices.treatment import Treatment
 from vstent.errors import InputError
 from vstent.io.writers import write_json
 from vstent.study.folder import CACHE
 from vstent.study.provenance import RUN
 from vstent.study.repeat import UNTOLD, former_source, settings_of
-from vstent.study.types import Placing, Settings
+from vstent.study.types import Settings
 
 BEGUN: Final = "settings.json"
 """File in the cache folder with the settings of the last run that was started, finished or not."""
-_OF_DEVICES: Final = (
-    "devices",
-    "diameter_mm",
-    "length_mm",
-    "center_mm",
-    "placings",
-    "flow",
-    "without_flow",
-    "uncertainty",
-)
-"""Settings that do not change the anatomy."""
-
 
 def former_settings(out: Path) -> Settings | None:
     """Return the settings of the last run of a case folder; None where there is none, or they cannot be read."""
@@ -49,8 +38,8 @@ def note_begun(out: Path, settings: Settings) -> None:
 def merged(out: Path, source: str, settings: Settings) -> Settings:
     """Return the settings of a run merged with those of the earlier runs of the case folder.
 
-    Earlier devices come first and keep their sizes, positions and flows; new ones are added. Where a run requests no
-    flow, new devices get none and existing flows are kept.
+    Earlier treatments come first and keep their sizes, places and flows; new ones are added. Where a run requests no
+    flow, new treatments get none and existing flows are kept.
 
     Parameters
     ----------
@@ -68,30 +57,28 @@ def merged(out: Path, source: str, settings: Settings) -> Settings:
     if former is None:
         return settings
     refuse_other_anatomy(out, settings, former)
+    before, now = ({one.name: one for one in run.treatments} for run in (former, settings))
+    treatments = []
+    for name in {**before, **now}:
+        old, new = before.get(name), now.get(name)
+        one = _same(out, f"sizes or places of {name}", old and replace(old, has_flow=True), _of_use(old, new))
+        had_flow = old is not None and old.has_flow and former.flow is not None
+        gets_flow = new is not None and new.has_flow and settings.flow is not None
+        treatments.append(replace(one, has_flow=had_flow or gets_flow))
     flow = _same(out, "flow settings", former.flow, settings.flow)
-    uncertainty = _same(out, "ranges of uncertainty", former.uncertainty, settings.uncertainty)
-    devices = tuple(dict.fromkeys((*former.devices, *settings.devices)))
-    placings = {}
-    for name in devices:
-        before = former.placing(name) if name in former.devices else None
-        now = settings.placing(name) if name in settings.devices else None
-        placings[name] = _same(out, f"size or place of {name}", before, now if now != Placing() else None) or Placing()
-    without = {name for name in former.without_flow if name not in settings.devices or settings.flow is None}
-    if settings.flow is None and former.flow is not None:
-        without |= set(settings.devices) - set(former.devices)
-    if settings.flow is not None and former.flow is None:
-        without |= set(former.devices) - set(settings.devices)
     return replace(
         former,
-        devices=devices,
-        diameter_mm=None,
-        length_mm=None,
-        center_mm=None,
-        placings={name: one for name, one in placings.items() if one != Placing()},
+        treatments=tuple(treatments if flow else (replace(one, has_flow=True) for one in treatments)),
         flow=flow,
-        without_flow=tuple(name for name in devices if name in without),
-        uncertainty=uncertainty,
+        uncertainty=_same(out, "ranges of uncertainty", former.uncertainty, settings.uncertainty),
     )
+
+
+def _of_use(old: Treatment | None, new: Treatment | None) -> Treatment | None:
+    """Return a new treatment; None where it leaves sizes and places to those of an old one with the same devices."""
+    if old and new and new.is_proposed and old.devices == new.devices:
+        return None
+    return new and replace(new, has_flow=True)
 
 
 def refuse_other_input(out: Path, source: str) -> None:
@@ -112,9 +99,7 @@ def refuse_other_anatomy(out: Path, settings: Settings, former: Settings | None 
     former = former or former_settings(out)
     if former is None:
         return
-    before, now = (
-        {key: value for key, value in asdict(one).items() if key not in _OF_DEVICES} for one in (former, settings)
-    )
+    before, now = (asdict(one.input) | asdict(one.anatomy) for one in (former, settings))
     changed = [key for key in now if now[key] != before[key]]
     if changed:
         raise InputError(

@@ -5,7 +5,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, is_dataclass, replace
+from dataclasses import asdict, is_dataclass
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -202,15 +202,14 @@ def hash_of(path: Path) -> str:
 
 
 def anatomy_key(source: str, settings: Settings) -> str:
-    """Return the key of the anatomy of an input; it does not depend on devices and flow.
+    """Return the key of the anatomy of an input; it does not depend on treatments and flow.
 
     Parameters
     ----------
     source : SHA-256 of the input.
     settings : settings of the study.
     """
-    geometry = replace(settings, devices=(), diameter_mm=None, length_mm=None, center_mm=None, flow=None, placings={})
-    return key_of(source, replace(geometry, uncertainty=None, without_flow=()))
+    return key_of(source, settings.input, settings.anatomy)
 
 
 def vessel_key(source: str, settings: Settings) -> str:
@@ -221,9 +220,7 @@ def vessel_key(source: str, settings: Settings) -> str:
     source : SHA-256 of the input.
     settings : settings of the study.
     """
-    given = settings.units, settings.spacing_mm, settings.shape, settings.threshold, settings.at_mm, settings.inlet_mm
-    later = [value for value in (settings.frame, settings.acquisition, settings.crop_mm) if value is not None]
-    return key_of(source, "vessel", given, *later)
+    return key_of(source, "vessel", settings.input, settings.anatomy.at_mm, settings.anatomy.inlet_mm)
 
 
 def key_of(*parts: Any) -> str:
@@ -232,13 +229,9 @@ def key_of(*parts: Any) -> str:
     return hashlib.sha256(json.dumps([RESULTS_VERSION, plain], sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]
 
 
-_LATER: Final = {"without_flow": (), "acquisition": None, "frame": None, "crop_mm": None}
-"""Settings that version 0.1 does not have, with defaults for which the keys equal those of version 0.1."""
-
-
 def _plain(part: Any) -> dict[str, Any]:
     """Return the fields of a data class that a key depends on."""
     fields = asdict(part)
     if isinstance(part, (Braid, LaserCut)):
         fields.pop("ranges")  # they change the bands, but no deployment and no flow
-    return {key: value for key, value in fields.items() if key not in _LATER or value != _LATER[key]}
+    return fields

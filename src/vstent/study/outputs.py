@@ -23,8 +23,8 @@ from vstent.plan.rank import Ranking, order_of
 from vstent.study.crate import NAME as CRATE
 from vstent.study.provenance import METRICS, RUN
 
-STENT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
-"""Files of one device."""
+IMPLANT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
+"""Files of one implant."""
 FIELD: Final = ("field.vtu", "wall.vtp")
 """Files of one flow."""
 ANGIOGRAM: Final = ("angiogram/*.*", "angiogram/*/frame_*.png")
@@ -33,13 +33,16 @@ SACS: Final = ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp")
 """Files of sacs and necks, as patterns."""
 OF_STUDY: Final = (
     *(METRICS, RUN, "report.html", "report.pdf", "plan.pdf", CRATE),
-    *(f"stents/*/{name}" for name in STENT),
-    *(f"flow/*/{name}" for name in FIELD),
+    *(f"treatments/*/implants/*/{name}" for name in IMPLANT),
+    *(f"treatments/*/flow/{name}" for name in FIELD),
     *ANGIOGRAM,
 )
 """Files of devices, flows and reports, as patterns."""
-FOLDERS: Final = ("stents", "flow", "angiogram")
-"""Folders of the case folder that are removed when they are empty."""
+FOLDERS: Final = (
+    *("treatments/*/implants/*/", "treatments/*/implants/", "treatments/*/flow/", "treatments/*/", "treatments/"),
+    *("convergence/", "angiogram/*/", "angiogram/"),
+)
+"""Folders of the case folder that are removed when they are empty, as patterns, the innermost first."""
 OF_ANATOMY: Final = ("morphology.json", "convergence.json")
 """Files that describe an anatomy alone."""
 RESULTS: Final = (
@@ -51,7 +54,7 @@ RESULTS: Final = (
 
 def take_away_results(out: Path) -> None:
     """Remove the results in a case folder; the cache and the user's own files stay."""
-    _take_away(out, RESULTS, list(out.glob(f"flow/**/{KEY}")))
+    _take_away(out, RESULTS, list(out.glob(f"**/{KEY}")))
 
 
 def take_away_study(out: Path, kept: Collection[Path]) -> None:
@@ -62,12 +65,12 @@ def take_away_study(out: Path, kept: Collection[Path]) -> None:
     out : the case folder.
     kept : OpenFOAM folders that stay, because their computation can be resumed.
     """
-    _take_away(out, OF_STUDY, [key for key in out.glob(f"flow/*/*/{KEY}") if key.parent not in kept])
+    _take_away(out, OF_STUDY, [key for key in out.glob(f"treatments/*/flow/*/{KEY}") if key.parent not in kept])
 
 
 def take_away_measures(out: Path) -> None:
     """Remove the results that describe a replaced anatomy alone."""
-    _take_away(out, OF_ANATOMY, list(out.glob(f"flow/convergence/**/{KEY}")))
+    _take_away(out, OF_ANATOMY, list(out.glob(f"convergence/**/{KEY}")))
 
 
 def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None:
@@ -76,13 +79,8 @@ def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None
         file.unlink()
     for key in keys:
         shutil.rmtree(key.parent)
-    for folder in [
-        *out.glob("stents/*/"),
-        *out.glob("flow/*/"),
-        *out.glob("angiogram/*/"),
-        *map(out.joinpath, FOLDERS),
-    ]:
-        with suppress(OSError):  # it does not exist, or is not empty
+    for folder in [folder for pattern in FOLDERS for folder in out.glob(pattern)]:
+        with suppress(OSError):  # it is not empty
             folder.rmdir()
 
 
@@ -119,8 +117,8 @@ def write_anatomy(out: Path, anatomy: Anatomy) -> None:
             (out / stale).unlink()
 
 
-def write_stent(folder: Path, deployment: Deployment) -> str:
-    """Write contour, wires and struts of a device.
+def write_implant(folder: Path, deployment: Deployment) -> str:
+    """Write contour, wires and struts of a deployed implant.
 
     Parameters
     ----------

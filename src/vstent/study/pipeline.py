@@ -20,16 +20,16 @@ from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
 from vstent.study.contrast import add_measures, kept_measures
 from vstent.study.crate import NAME as CRATE
-from vstent.study.folder import CACHE, claiming
+from vstent.study.folder import CACHE, claiming, implant_folder
 from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
 from vstent.study.ledger import ANATOMY, Ledger, hash_of, key_of, vessel_key
 from vstent.study.outputs import (
-    STENT,
+    IMPLANT,
     take_away_measures,
     take_away_results,
     take_away_study,
     write_anatomy,
-    write_stent,
+    write_implant,
     write_vessel,
 )
 from vstent.study.provenance import INPUT, METRICS, RUN, provenance
@@ -39,19 +39,22 @@ from vstent.study.stages import (
     check_inflow,
     compute_flows,
     deploy_all,
-    deployment_key,
     engine_folders,
     find_anatomy,
     find_vessel,
+    implant_keys,
     measure_all,
     refine,
+    stage_name,
     vary_all,
 )
 from vstent.study.types import CaseResult, Progress, Settings
 from vstent.study.written import code_key, compute_once, write_once
 
-BeforeMeasures = Callable[[Anatomy, Mapping[str, Deployment], Mapping[str, FlowField], Vessel | None], object]
-"""Takes anatomy, deployments, flows, and the vessel before it was trimmed (None: not stored)."""
+Implants = Mapping[str, Mapping[str, Deployment]]
+"""Deployed implants by treatment and id."""
+BeforeMeasures = Callable[[Anatomy, Implants, Mapping[str, FlowField], Vessel | None], object]
+"""Takes anatomy, deployed implants, flows, and the vessel before it was trimmed (None: not stored)."""
 
 
 @claiming
@@ -66,8 +69,8 @@ def run(
 ) -> CaseResult:
     """Run one study and write its folder; a study that was stopped there resumes.
 
-    Results of the same input and settings in the folder are kept, and new devices are added to them. A device that does
-    not fit, or whose flow cannot be computed, is reported in `CaseResult.failures`; the others are computed.
+    Results of the same input and settings in the folder are kept, and new treatments are added to them. A treatment
+    that does not fit, or whose flow cannot be computed, is reported in `CaseResult.failures`; the others are computed.
 
     Parameters
     ----------
@@ -76,21 +79,21 @@ def run(
     settings : settings of the study; missing values are proposed.
     progress : called at every stage.
     replaces : whether results of another input or of other settings are replaced.
-    before_measures : called with anatomy, deployments, flows and untrimmed vessel before their measures are computed,
+    before_measures : called with anatomy, implants, flows and untrimmed vessel before their measures are computed,
         unless these are stored; None: nothing is called.
 
     Returns
     -------
     CaseResult
-        Anatomy, deployments, flows, metrics and provenance.
+        Anatomy, implants, flows, metrics and provenance.
 
     Raises
     ------
     InputError
-        An input or option cannot be used, no device fits, or the folder holds results that this run would invalidate;
+        An input or option cannot be used, no treatment fits, or the folder holds results that this run would invalidate;
         nothing has been written.
     FlowError
-        The flow without a device could not be computed; everything before it is kept.
+        The flow in the bare artery could not be computed; everything before it is kept.
     FolderError
         Another process uses the folder, or it cannot be written.
     """
@@ -98,10 +101,11 @@ def run(
     source = hash_of(path)
     if not replaces:
         settings = merged(out, source, settings)
-    designs = {name: find_design(name) for name in settings.devices}
+    for device in settings.devices:
+        find_design(device)  # an unknown device is reported before anything is computed
     anatomy = find_anatomy(path, source, settings, ledger)
     check_inflow(anatomy, settings.flow)
-    deployments, failures = deploy_all(designs, anatomy, settings, ledger, source)
+    implants, failures = deploy_all(anatomy, settings, ledger, source)
     told = provenance(path, source, settings)
     has_former = replaces and is_of_another(out, told)
     _settle(path, out, source, ledger)
@@ -110,19 +114,22 @@ def run(
         take_away_study(out, engine_folders(out, settings).values())
     (out / CRATE).unlink(missing_ok=True)  # it describes files that this run replaces
     write_anatomy(out, anatomy)
-    for name, deployment in deployments.items():
-        folder, key = out / "stents" / name, deployment_key(source, settings, name, designs[name])
-        write_once(ledger, f"struts {name}", key, folder, STENT, partial(write_stent, folder, deployment))
-    fields, unflown = compute_flows(out, anatomy, deployments, settings, ledger, source)
+    for treatment in settings.treatments:
+        keys, deployed = implant_keys(source, settings, treatment), implants.get(treatment.name, {})
+        for implant in treatment.implants if deployed else ():
+            folder = implant_folder(out, treatment.name, implant.id)
+            write = partial(write_implant, folder, deployed[implant.id])
+            write_once(ledger, f"struts {stage_name(treatment, implant)}", keys[implant.id], folder, IMPLANT, write)
+    fields, unflown = compute_flows(out, anatomy, implants, settings, ledger, source)
     failures |= unflown
-    varied = vary_all(anatomy, deployments, settings, ledger, source)
+    varied = vary_all(anatomy, implants, settings, ledger, source)
 
     whole = ledger.stored("vessel", vessel_key(source, settings), Vessel)
 
     def measures() -> dict[str, Any]:
         if before_measures is not None:
-            before_measures(anatomy, deployments, fields, whole)
-        return _measures(anatomy, deployments, fields, settings, varied, failures)
+            before_measures(anatomy, implants, fields, whole)
+        return _measures(anatomy, implants, fields, settings, varied, failures)
 
     metrics = compute_once(ledger, "measure", key_of(code_key(), told, failures), measures)
     add_measures(metrics, kept_measures(out, source, settings) if fields else {})
@@ -132,22 +139,22 @@ def run(
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
     notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
-    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, failures, notes, whole)
+    return CaseResult(out.resolve().name, anatomy, implants, fields, metrics, told, failures, notes, whole)
 
 
 def _measures(
     anatomy: Anatomy,
-    deployments: Mapping[str, Deployment],
+    implants: Implants,
     fields: Mapping[str, FlowField],
     settings: Settings,
     varied: Mapping[str, Any],
     failures: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return all metrics of a study: of vessel, devices and flows, with bands, uncertainties and failures."""
-    metrics = measure_all(anatomy, deployments, fields, settings.flow)
-    band_all(anatomy, deployments, metrics, settings)
+    """Return all metrics of a study: of vessel, implants and flows, with bands, uncertainties and failures."""
+    metrics = measure_all(anatomy, implants, fields, settings.flow)
+    band_all(anatomy, implants, metrics, settings)
     for name, spread in varied.items():
-        metrics["stents"][name]["uncertainty"] = spread
+        metrics["treatments"][name]["uncertainty"] = spread
     return metrics | ({"failures": dict(failures)} if failures else {})
 
 

@@ -1,6 +1,6 @@
 """Stages of a study; the ledger measures and reports each of them."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -17,18 +17,18 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.segment import segment
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.deployment.deploy import deploy, propose_size
+from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.measure import measure
-from vstent.deployment.struts import over_restored
-from vstent.devices.catalogue import find_sizes
-from vstent.devices.design import BARE, Design, Size
+from vstent.devices.catalogue import find_design, find_sizes
+from vstent.devices.design import Size
+from vstent.devices.treatment import BARE, Implant, Treatment
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, VstentError
 from vstent.flow.beside import Beside
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.convergence import Sensitivity, convergence
-from vstent.flow.grade import QUALITY, computation_of, grade
+from vstent.flow.grade import computation_of, grade
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
 from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
@@ -41,9 +41,10 @@ from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
 from vstent.plan.uncertainty import Uncertainty, vary
 from vstent.study.checkpoint import FlowCheckpoint
-from vstent.study.ledger import ANATOMY, DEPLOYMENT_VERSION, Ledger, anatomy_key, key_of, vessel_key
+from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of, vessel_key
+from vstent.study.folder import flow_folder
 from vstent.study.outputs import write_field
-from vstent.study.types import Placing, Point, Settings
+from vstent.study.types import Point, Settings
 from vstent.study.written import code_key
 from vstent.units import counted
 
@@ -81,7 +82,7 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
     try:
         return _find_anatomy(path, source, settings, ledger, key)
     except InputError as error:
-        if settings.at_mm is None or settings.neck_mm is not None:
+        if settings.anatomy.at_mm is None or settings.anatomy.neck_mm is not None:
             raise
         found = other_reading(path, settings)
         if not found:
@@ -93,7 +94,7 @@ def other_reading(path: Path, settings: Settings) -> str:
     """Return a question that proposes another interpretation of the point `at_mm`; empty where none finds a vessel."""
     for words, point_mm in _readings(path, settings):
         with suppress(VstentError):
-            vessel = trace(_vessel(path, replace(settings, at_mm=point_mm)))
+            vessel = trace(_vessel(path, replace(settings, anatomy=replace(settings.anatomy, at_mm=point_mm))))
             near_mm = vessel.lumen.closest(np.array([point_mm]))[1][0]
             if near_mm < NEAR_MM:
                 return f"Did you mean {','.join(f'{x:.1f}' for x in point_mm)} ({words})?"
@@ -102,10 +103,10 @@ def other_reading(path: Path, settings: Settings) -> str:
 
 def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
     """Yield other interpretations of the point `at_mm`, as a description and a point in LPS mm."""
-    x, y, z = settings.at_mm or (0.0, 0.0, 0.0)
+    x, y, z = settings.anatomy.at_mm or (0.0, 0.0, 0.0)
     yield "the point given is RAS", (-x, -y, z)
     if not (path.is_file() and is_surface_file(path)):
-        image = _image(path, replace(settings, crop_mm=None))
+        image = _image(path, replace(settings, input=replace(settings.input, crop_mm=None)))
         if all(0 <= i < n for i, n in zip((x, y, z), image.voxels.shape, strict=True)):
             i, j, k = image.to_mm(np.array([[x, y, z]]))[0].tolist()
             yield "the point given is a voxel index", (i, j, k)
@@ -116,16 +117,16 @@ def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
 def _find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger, key: str) -> Anatomy:
     """Return the anatomy of an input, computed."""
     whole = find_vessel(path, source, settings, ledger)
-    neck_mm = None if settings.neck_mm is None else np.array(settings.neck_mm, dtype=np.float64)
-    at_mm = _array(settings.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
-    outlet_mm = _array(settings.outlet_mm)
+    neck_mm = None if settings.anatomy.neck_mm is None else np.array(settings.anatomy.neck_mm, dtype=np.float64)
+    at_mm = _array(settings.anatomy.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
+    outlet_mm = _array(settings.anatomy.outlet_mm)
     if outlet_mm is not None:
         opening_at(whole, outlet_mm)  # checked before trimming, which may cut this outlet off
     with ledger.stage("trim") as tell:
-        traced = trim(whole, at_mm=at_mm, upstream_mm=settings.upstream_mm, downstream_mm=settings.downstream_mm)
+        traced = trim(whole, at_mm=at_mm, upstream_mm=settings.anatomy.upstream_mm, downstream_mm=settings.anatomy.downstream_mm)
         tell(" ".join(traced.notes[len(whole.notes) :]))
     with ledger.stage("restore") as tell:
-        anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
+        anatomy = restore(traced, at_mm=_array(settings.anatomy.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
         tell(" ".join([*anatomy.notes, *(f"Sac volume {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
     ledger.hold(ANATOMY, key, anatomy)
     return anatomy
@@ -151,7 +152,7 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
         vessel = _vessel(path, settings)
         tell(" ".join(vessel.notes))
     with ledger.stage("trace") as tell:
-        traced = trace(vessel, inlet_mm=_array(settings.inlet_mm))
+        traced = trace(vessel, inlet_mm=_array(settings.anatomy.inlet_mm))
         widths = ", ".join(f"{inlet.role} {inlet.diameter_mm:.1f} mm wide" for inlet in traced.inlets)
         found = f"{counted(len(traced.outlets), 'outlet')}; {widths}."
         tell(" ".join([found, *traced.notes[len(vessel.notes) :]]))
@@ -162,102 +163,138 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
 def _vessel(path: Path, settings: Settings) -> Vessel:
     """Return the repaired vessel of an input, without openings and centerlines."""
     if path.is_file() and is_surface_file(path):
-        surface, notes = read_surface(path, units=settings.units, frame=settings.frame)
+        surface, notes = read_surface(path, units=settings.input.units, frame=settings.input.frame)
         vessel = Vessel(surface, notes=notes)
     else:
         image = _image(path, settings)
-        vessel = segment(image, threshold=settings.threshold, at_mm=_array(settings.at_mm))
-    near_mm = _array(settings.inlet_mm if settings.at_mm is None else settings.at_mm)
+        vessel = segment(image, threshold=settings.input.threshold, at_mm=_array(settings.anatomy.at_mm))
+    near_mm = _array(settings.anatomy.inlet_mm if settings.anatomy.at_mm is None else settings.anatomy.at_mm)
     lumen, repairs = repair(vessel.lumen, at_mm=None if near_mm is None else np.atleast_2d(near_mm)[0])
     return replace(vessel, lumen=lumen, notes=(*vessel.notes, *repairs))
 
 
 def _image(path: Path, settings: Settings) -> Image:
     """Return the scan, cropped where requested."""
-    image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape, acquisition=settings.acquisition)
-    return image if settings.crop_mm is None else image.cropped(np.array(settings.crop_mm, dtype=np.float64))
+    image = read_image(path, spacing_mm=settings.input.spacing_mm, shape=settings.input.shape, acquisition=settings.input.acquisition)
+    return image if settings.input.crop_mm is None else image.cropped(np.array(settings.input.crop_mm, dtype=np.float64))
 
 
 def deploy_all(
-    designs: Mapping[str, Design], anatomy: Anatomy, settings: Settings, ledger: Ledger, source: str
-) -> tuple[dict[str, Deployment], dict[str, str]]:
-    """Deploy every device in the given or the proposed size; a stored deployment is returned without computation.
+    anatomy: Anatomy, settings: Settings, ledger: Ledger, source: str
+) -> tuple[dict[str, dict[str, Deployment]], dict[str, str]]:
+    """Deploy the implants of every treatment in the given or the proposed sizes; stored ones are not computed again.
 
     Parameters
     ----------
-    designs : designs by device name.
-    anatomy : vessel, parent artery and sacs.
+    anatomy : vessel, sacs and paths.
     settings : settings of the study.
     ledger : record of the study; it keeps new deployments in memory until its `settle` stores them.
     source : SHA-256 of the input.
 
     Returns
     -------
-    deployments : dict
-        Deployments by device name.
+    implants : dict
+        Deployed implants by treatment and id.
     failures : dict
-        Reasons by the name of each device that was not deployed.
+        Reasons by the name of each treatment that could not be deployed.
 
     Raises
     ------
     DeviceError, LandingError
-        No device can be deployed; the reason is that of the last one.
+        No treatment can be deployed; the reason is that of the last one.
     """
-    deployments: dict[str, Deployment] = {}
+    found: dict[str, dict[str, Deployment]] = {}
     failures: dict[str, str] = {}
-    for name, design in designs.items():
-        stage, key = f"deploy {name}", deployment_key(source, settings, name, design)
-        kept = ledger.recall(stage, key, Deployment)
-        if kept is not None:
-            deployments[name] = kept
-            continue
+    for treatment in settings.treatments:
         try:
-            with ledger.stage(stage) as tell:
-                deployments[name] = deploy_one(design, anatomy, settings.placing(name))
-                tell(deployments[name].advice)
-            ledger.hold(stage, key, deployments[name])
+            found[treatment.name] = _deployed(treatment, anatomy, settings, ledger, source)
         except (DeviceError, LandingError) as error:
-            if len(failures) + 1 == len(designs):  # the last one too
+            if len(failures) + 1 == len(settings.treatments):  # the last one too
                 raise
-            failures[name] = f"not deployed: {error}"
-            ledger.progress(stage, 1.0, failures[name])
-    return deployments, failures
+            failures[treatment.name] = f"not deployed: {error}"
+            ledger.progress(f"deploy {treatment.name}", 1.0, failures[treatment.name])
+    return found, failures
 
 
-def deployment_key(source: str, settings: Settings, name: str, design: Design) -> str:
-    """Return the key of one deployment.
+def _deployed(
+    treatment: Treatment, anatomy: Anatomy, settings: Settings, ledger: Ledger, source: str
+) -> dict[str, Deployment]:
+    """Return the deployed implants of a treatment by id, each stored or computed."""
+    found: dict[str, Deployment] = {}
+    keys = implant_keys(source, settings, treatment)
+    for implant in treatment.implants:
+        stage = f"deploy {stage_name(treatment, implant)}"
+        deployment = ledger.recall(stage, keys[implant.id], Deployment)
+        if deployment is None:
+            with ledger.stage(stage) as tell:
+                deployment = deploy_implant(implant, anatomy, [found[name].stent for name in implant.inside])
+                tell(deployment.advice)
+            ledger.hold(stage, keys[implant.id], deployment)
+        found[implant.id] = deployment
+    return found
+
+
+def stage_name(treatment: Treatment, implant: Implant) -> str:
+    """Return the name of an implant in the names of stages: that of its treatment, with its own where it has several."""
+    return treatment.name if len(treatment.implants) == 1 else f"{treatment.name} {implant.id}"
+
+
+def implant_keys(source: str, settings: Settings, treatment: Treatment) -> dict[str, str]:
+    """Return the keys of the deployments of a treatment by the implants' ids.
 
     Parameters
     ----------
     source : SHA-256 of the input.
     settings : settings of the study.
-    name : name of the device.
-    design : the device.
+    treatment : the treatment.
     """
-    return key_of(code_key(), anatomy_key(source, settings), name, design, settings.placing(name))
+    keys: dict[str, str] = {}
+    for implant in treatment.implants:
+        given = find_design(implant.device), implant.diameter_mm, implant.length_mm, implant.placing
+        inside = [keys[name] for name in implant.inside]
+        keys[implant.id] = key_of(code_key(), anatomy_key(source, settings), *given, inside)
+    return keys
 
 
-def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
-    """Deploy a device in the given size and position; missing values are proposed.
+def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] = ()) -> Deployment:
+    """Deploy an implant in the given size and place; missing values are proposed.
 
     Parameters
     ----------
-    design : the device.
-    anatomy : vessel, parent artery and sacs.
-    placing : given size and position.
+    implant : the implant.
+    anatomy : vessel, sacs and paths.
+    inside : implants that are there before it, in the order of their deployment.
     """
-    landing = None if placing.center_mm is None else Landing(placing.center_mm)
-    return deploy(design, anatomy, size=size_of(design, anatomy, placing), landing=landing)
+    design, placing = find_design(implant.device), implant.placing
+    anatomy = on_path(anatomy, placing.path)
+    size, landing = size_of(implant, anatomy), None
+    if placing.position_mm is not None:
+        landing = Landing(placing.position_mm, placing.anchor)
+    elif placing.shift_mm:
+        proposed = propose_landing(design, anatomy, size)
+        landing = replace(proposed, abscissa_mm=proposed.abscissa_mm + placing.shift_mm)
+    return deploy(design, anatomy, size=size, landing=landing, inside=inside)
 
 
-def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
-    """Return the given size of a device; where diameter or length is missing, the best of the matching sizes.
+def on_path(anatomy: Anatomy, name: str) -> Anatomy:
+    """Return the anatomy with a path in the first place, where implants are deployed.
+
+    Raises
+    ------
+    InputError
+        There is no path of this name.
+    """
+    path = anatomy.path(name)
+    return replace(anatomy, paths=(path, *(other for other in anatomy.paths if other is not path)))
+
+
+def size_of(implant: Implant, anatomy: Anatomy) -> Size:
+    """Return the given size of an implant; where diameter or length is missing, the best of the matching sizes.
 
     Parameters
     ----------
-    design : the device.
-    anatomy : vessel, parent artery and sacs.
-    placing : given size and position.
+    implant : the implant.
+    anatomy : vessel, sacs and paths.
 
     Raises
     ------
@@ -266,8 +303,9 @@ def size_of(design: Design, anatomy: Anatomy, placing: Placing) -> Size:
     LandingError
         No matching size fits the artery.
     """
-    sizes = find_sizes(design, diameter_mm=placing.diameter_mm, length_mm=placing.length_mm)
-    if placing.diameter_mm is not None and placing.length_mm is not None:
+    design = find_design(implant.device)
+    sizes = find_sizes(design, diameter_mm=implant.diameter_mm, length_mm=implant.length_mm)
+    if implant.diameter_mm is not None and implant.length_mm is not None:
         return sizes[0]
     return propose_size(replace(design, sizes=sizes), anatomy)
 
@@ -298,29 +336,30 @@ def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
 
 
 def engine_folders(out: Path, settings: Settings) -> dict[str, Path]:
-    """Return the folder of the engine's own files for every flow, by name; empty where no flow is computed."""
+    """Return the folder of the engine's own files for every flow, by treatment; empty where no flow is computed."""
     if settings.flow is None:
         return {}
-    return {name: out / "flow" / name / settings.flow.engine for name in (BARE, *settings.devices)}
+    names = (BARE, *(treatment.name for treatment in settings.treatments))
+    return {name: flow_folder(out, name) / settings.flow.engine for name in names}
 
 
 def compute_flows(
     out: Path,
     anatomy: Anatomy,
-    deployments: Mapping[str, Deployment],
+    implants: Mapping[str, Mapping[str, Deployment]],
     settings: Settings,
     ledger: Ledger,
     source: str,
 ) -> tuple[dict[str, FlowField], dict[str, str]]:
-    """Compute the flow without and with each device; each is stored as soon as it is finished.
+    """Compute the flow in the bare artery and with every treatment; each is stored as soon as it is finished.
 
     With a GPU it is stored while the next one is computed.
 
     Parameters
     ----------
     out : the case folder.
-    anatomy : vessel, parent artery and sacs.
-    deployments : deployments by device name.
+    anatomy : vessel, sacs and paths.
+    implants : deployed implants by treatment and id.
     settings : settings of the study.
     ledger : record of the study.
     source : SHA-256 of the input.
@@ -328,33 +367,34 @@ def compute_flows(
     Returns
     -------
     fields : dict
-        Flows by name, ``bare`` first.
+        Flows by treatment, ``bare`` first.
     failures : dict
-        Reasons by the name of each device whose flow could not be computed.
+        Reasons by the name of each treatment whose flow could not be computed.
 
     Raises
     ------
     FlowError
-        The flow without a device could not be computed.
+        The flow in the bare artery could not be computed.
     """
     if settings.flow is None:
         return {}, {}
     fields: dict[str, FlowField] = {}
     failures: dict[str, str] = {}
-    folders = engine_folders(out, settings)
-    stored = []
+    folders, stored = engine_folders(out, settings), []
+    stents = {BARE: [], **{name: [one.stent for one in found.values()] for name, found in implants.items()}}
     with Beside(settings.flow) as beside:
-        for name in (BARE, *(name for name in deployments if name not in settings.without_flow)):
-            stent = None if name == BARE else deployments[name].stent
-            stage, key = f"flow {name}", flow_key(source, settings, name, stent.design if stent else None)
+        for name, key in flow_keys(source, settings).items():
+            if name not in stents:
+                continue  # it could not be deployed
+            stage = f"flow {name}"
             field, store = ledger.recall(stage, key, FlowField), None
             if field is None:
                 if name == BARE:
-                    _plan(anatomy, {name: one.stent for name, one in deployments.items()}, settings.flow, ledger)
+                    _plan(anatomy, stents, settings.flow, ledger)
                 try:
                     with ledger.stage(stage) as tell:
                         field = simulate_case(
-                            flow_case(anatomy, stent, settings.flow),
+                            flow_case(anatomy, stents[name], settings.flow),
                             start=fields.get(BARE),
                             folder=folders[name],
                             progress=ledger.teller(stage),
@@ -369,7 +409,7 @@ def compute_flows(
                     continue
                 store = ledger.keeping(stage, key, field)
             fields[name] = field
-            stored.append(beside.do(partial(_store, store, out / "flow" / name, field)))
+            stored.append(beside.do(partial(_store, store, flow_folder(out, name), field)))
     for done in stored:
         done()
     return fields, failures
@@ -382,18 +422,20 @@ def _store(store: Callable[[], None] | None, folder: Path, field: FlowField) -> 
     write_field(folder, field)
 
 
-def flow_key(source: str, settings: Settings, name: str, design: Design | None) -> str:
-    """Return the key of one flow.
+def flow_keys(source: str, settings: Settings) -> dict[str, str]:
+    """Return the keys of the flows of a study by treatment, ``bare`` first.
 
     Parameters
     ----------
     source : SHA-256 of the input.
     settings : settings of the study.
-    name : ``bare``, or the name of the device.
-    design : the device; None: no device.
     """
-    placed = (DEPLOYMENT_VERSION, design, settings.placing(name)) if design else ()
-    return key_of(anatomy_key(source, settings), settings.flow, name, *placed)
+    wanted = [treatment for treatment in settings.treatments if treatment.has_flow]
+    anatomy = anatomy_key(source, settings)
+    return {
+        one.name: key_of(anatomy, settings.flow, *implant_keys(source, settings, one).values())
+        for one in (Treatment(BARE), *wanted)
+    }
 
 
 def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Sensitivity:
@@ -415,30 +457,34 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
             done.append(sentence)
             ledger.progress("convergence", 0.99 * fraction, sentence)
 
-        folder = out / "flow" / "convergence" / flow.engine
-        found = convergence(flow_case(anatomy, None, flow), folder=folder, told=told)
+        found = convergence(flow_case(anatomy, (), flow), folder=out / "convergence" / flow.engine, told=told)
         tell(" ".join(done))
     return found
 
 
-def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings, ledger: Ledger) -> None:
-    """Report run time and memory of the flows; an error is raised where one does not fit in the memory."""
+def _plan(
+    anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings: FlowSettings, ledger: Ledger
+) -> None:
+    """Report run time and memory of the flows by treatment; an error is raised where one does not fit in the memory."""
     with ledger.stage("plan flow") as tell:
-        bare = flow_case(anatomy, None, settings)
-        said = foretell_cost(bare)
-        costs = {name: foretell_cost(replace(bare, stent=over_restored(one, anatomy))) for name, one in stents.items()}
-        tell(" ".join([said, *(f"Behind {name}, {cost}" for name, cost in costs.items() if cost != said)]))
+        costs = {name: foretell_cost(flow_case(anatomy, found, settings)) for name, found in stents.items()}
+        said = costs.pop(BARE)
+        tell(" ".join([said, *(f"With {name}, {cost}" for name, cost in costs.items() if cost != said)]))
 
 
 def vary_all(
-    anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
+    anatomy: Anatomy,
+    implants: Mapping[str, Mapping[str, Deployment]],
+    settings: Settings,
+    ledger: Ledger,
+    source: str,
 ) -> dict[str, dict[str, Any]]:
-    """Vary the uncertain inputs of every deployment.
+    """Vary the uncertain inputs of every treatment with one implant.
 
     Parameters
     ----------
-    anatomy : vessel, parent artery and sacs.
-    deployments : deployments by device name.
+    anatomy : vessel, sacs and paths.
+    implants : deployed implants by treatment and id.
     settings : settings of the study.
     ledger : record of the study.
     source : SHA-256 of the input.
@@ -446,18 +492,20 @@ def vary_all(
     Returns
     -------
     dict
-        Uncertainty metrics by device name; empty without an uncertainty study.
+        Uncertainty metrics by treatment; empty without an uncertainty study.
     """
     if settings.uncertainty is None:
         return {}
     flow = settings.flow if settings.uncertainty.flow_samples else None
     found = {}
-    for name, deployment in deployments.items():
-        stage = f"vary {name}"
-        design = deployment.stent.design
-        numbers = [asdict(one) for one in settings.uncertainty.numbers_of(design)]
-        placed = DEPLOYMENT_VERSION, design, settings.placing(name), numbers
-        key = key_of(anatomy_key(source, settings), settings.uncertainty, flow, name, *placed)
+    for treatment in settings.treatments:
+        if len(implants.get(treatment.name, ())) != 1:
+            continue
+        (deployment,) = implants[treatment.name].values()
+        (implant_key,) = implant_keys(source, settings, treatment).values()
+        stage = f"vary {treatment.name}"
+        numbers = [asdict(one) for one in settings.uncertainty.numbers_of(deployment.stent.design)]
+        key = key_of(implant_key, settings.uncertainty, flow, numbers)
         varied = ledger.recall(stage, key, Uncertainty)
         if varied is None:
             with ledger.stage(stage) as tell:
@@ -466,7 +514,7 @@ def vary_all(
                 varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
             ledger.keep(stage, key, varied)
-        found[name] = varied.metrics()
+        found[treatment.name] = varied.metrics()
     return found
 
 
@@ -477,72 +525,77 @@ def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
 
 def measure_all(
     anatomy: Anatomy,
-    deployments: Mapping[str, Deployment],
+    implants: Mapping[str, Mapping[str, Deployment]],
     fields: Mapping[str, FlowField],
     settings: FlowSettings | None = None,
 ) -> dict[str, Any]:
-    """Return the metrics of the vessel, every deployment and every flow, with ratios and grades of the flows.
+    """Return the metrics of the vessel and of every treatment.
 
     Parameters
     ----------
-    anatomy : vessel, parent artery and sacs.
-    deployments : deployments by device name.
-    fields : flows by name, ``bare`` first.
+    anatomy : vessel, sacs and paths.
+    implants : deployed implants by treatment and id.
+    fields : flows by treatment, ``bare`` first.
     settings : settings of the flows; None: the default.
 
     Returns
     -------
     dict
-        Nested metrics; the end of each key is its unit. ``flow_quality`` holds the grade of every flow, by name.
+        ``vessel`` and ``treatments.NAME.{implants.ID,flow,change,quality}``; the end of each key is its unit. The
+        treatment ``bare`` is there where flows are; ``quality`` is the grade of a flow.
     """
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
     shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
-    flow = {name: indices(field, *shapes) for name, field in fields.items()}
-    left = {
-        name: {"unsettled_fraction": field.unsettled_fraction} if isfinite(field.unsettled_fraction) else {}
-        for name, field in fields.items()
-    }
-    stents: dict[str, dict[str, Any]] = {}
-    for name, deployment in deployments.items():
-        stents[name] = {"deployment": measure(anatomy, deployment)}
-        if name in flow:
-            stents[name] |= {"flow": flow[name] | left[name], "ratios": compare(flow[BARE], flow[name])}
-    found = {"vessel": morphology(anatomy), "stents": stents}
-    if not flow:
-        return found
-    case = flow_case(anatomy, None, settings)
-    quality = {name: _quality(case, field, flow[name]) for name, field in fields.items()}
-    return found | {BARE: flow[BARE] | left[BARE], QUALITY: quality}
+    treatments: dict[str, dict[str, Any]] = {BARE: {}} if fields else {}
+    for name, found in implants.items():
+        treatments[name] = {"implants": {id_: measure(anatomy, one) for id_, one in found.items()}}
+    case = flow_case(anatomy, (), settings) if fields else None
+    bare: dict[str, float] = {}
+    for name, field in fields.items():
+        flow = indices(field, *shapes)
+        left = {"unsettled_fraction": field.unsettled_fraction} if isfinite(field.unsettled_fraction) else {}
+        treatments[name]["flow"] = flow | left
+        if name == BARE:
+            bare = flow
+        else:
+            treatments[name]["change"] = compare(bare, flow)
+        assert case is not None
+        treatments[name]["quality"] = _quality(case, field, flow)
+    return {"vessel": morphology(anatomy), "treatments": treatments}
 
 
 def band_all(
-    anatomy: Anatomy, deployments: Mapping[str, Deployment], metrics: dict[str, Any], settings: Settings
+    anatomy: Anatomy,
+    implants: Mapping[str, Mapping[str, Deployment]],
+    metrics: dict[str, Any],
+    settings: Settings,
 ) -> None:
-    """Add the bands that the ranges of its device give to the metrics of every deployment, and how sure the device is.
+    """Add to the metrics of every implant the bands from the ranges of its device, and how sure the device is.
 
     Parameters
     ----------
-    anatomy : vessel, parent artery and sacs.
-    deployments : deployments by device name.
-    metrics : result of `measure_all`; every device gets the entry ``bands``.
-    settings : settings of the study, with the size if one was given.
+    anatomy : vessel, sacs and paths.
+    implants : deployed implants by treatment and id.
+    metrics : result of `measure_all`; every implant gets the entry ``bands``.
+    settings : settings of the study, with the sizes that were given.
     """
-    for name, deployment in deployments.items():
-        stent = metrics["stents"][name]
-        stent["bands"] = bands_of(anatomy, deployment, stent["deployment"], settings.placing(name))
+    for treatment in settings.treatments:
+        for implant in treatment.implants if treatment.name in implants else ():
+            measures = metrics["treatments"][treatment.name]["implants"][implant.id]
+            measures["bands"] = bands_of(anatomy, implants[treatment.name][implant.id], measures, implant)
 
 
-def bands_of(anatomy: Anatomy, deployment: Deployment, measures: Measures, placing: Placing) -> dict[str, Any]:
+def bands_of(anatomy: Anatomy, deployment: Deployment, measures: Measures, implant: Implant) -> dict[str, Any]:
     """Return the bands that the ranges of its device give to a deployment, and how sure the device is, as metrics.
 
     Parameters
     ----------
-    anatomy : vessel, parent artery and sacs.
-    deployment : the deployed device.
+    anatomy : vessel, sacs and paths.
+    deployment : the deployed implant.
     measures : its measures.
-    placing : size and position that were given; the band of the proposed size is added where no size was.
+    implant : size and place that were given; the band of the proposed size is added where no size was.
     """
-    is_proposed = placing.diameter_mm is None and placing.length_mm is None
+    is_proposed = implant.diameter_mm is None and implant.length_mm is None
     found = bands(anatomy, deployment, measures, is_proposed=is_proposed)
     return found.metrics() | {"device": how_sure(deployment.stent.design)}
 

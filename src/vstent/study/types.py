@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from vstent.devices.stent import Deployment
+from vstent.devices.treatment import Treatment, with_device
+from vstent.errors import InputError
 from vstent.flow.case import FlowField, FlowSettings
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.plan.uncertainty import Ranges
@@ -13,23 +15,9 @@ Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Placing:
-    """Size and position of one device; missing values are proposed."""
+class InputSettings:
+    """How the input is read; None means that the value is found or proposed."""
 
-    diameter_mm: float | None = None
-    """Label diameter in mm."""
-    length_mm: float | None = None
-    """Label length in mm."""
-    center_mm: float | None = None
-    """Position of the device's middle along the parent axis, in mm."""
-
-
-@dataclass(frozen=True, eq=False)
-class Settings:
-    """All settings of a study; None means that the value is proposed."""
-
-    devices: tuple[str, ...] = ("silk", "enterprise")
-    """Names of the devices in the catalogue."""
     units: Literal["m", "cm", "mm"] | None = None
     """Length unit of a surface file."""
     frame: Literal["lps", "ras"] | None = None
@@ -44,6 +32,12 @@ class Settings:
     """Opposite corners, LPS mm, of the box along the image axes to which a scan is cropped."""
     threshold: float | None = None
     """Intensity at the lumen wall of a scan."""
+
+
+@dataclass(frozen=True)
+class AnatomySettings:
+    """What of the anatomy is given; None means that it is found."""
+
     at_mm: Point | None = None
     """Point near the sac, LPS mm."""
     inlet_mm: Point | tuple[Point, ...] | None = None
@@ -56,25 +50,33 @@ class Settings:
     """Length of artery to keep proximal to the middle of the sac, in mm."""
     downstream_mm: float | None = None
     """Length of vessel to keep distal to the middle of the sac, in mm."""
-    diameter_mm: float | None = None
-    """Label diameter of all devices, in mm."""
-    length_mm: float | None = None
-    """Label length of all devices, in mm."""
-    center_mm: float | None = None
-    """Position of the middle of all devices along the parent axis, in mm."""
-    flow: FlowSettings | None = field(default_factory=FlowSettings)
-    """Flow settings; None: no flow is computed."""
-    without_flow: tuple[str, ...] = ()
-    """Devices whose flow is not computed."""
-    placings: dict[str, Placing] = field(default_factory=dict)
-    """Size and position by device; they replace the settings above that apply to all devices."""
 
+
+@dataclass(frozen=True)
+class Settings:
+    """All settings of a study."""
+
+    input: InputSettings = InputSettings()
+    """How the input is read."""
+    anatomy: AnatomySettings = AnatomySettings()
+    """What of the anatomy is given."""
+    treatments: tuple[Treatment, ...] = (with_device("silk"), with_device("enterprise"))
+    """Treatments to compare with the bare artery, each under a name of its own."""
+    flow: FlowSettings | None = field(default_factory=FlowSettings)
+    """Settings of the flows; None: no flow is computed."""
     uncertainty: Ranges | None = None
     """Ranges of the uncertainty study; None: no uncertainty study."""
 
-    def placing(self, device: str) -> Placing:
-        """Return size and position given for a device."""
-        return self.placings.get(device) or Placing(self.diameter_mm, self.length_mm, self.center_mm)
+    def __post_init__(self) -> None:
+        names = [treatment.name for treatment in self.treatments]
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise InputError(f"Two treatments are called {twice[0]}: give each a name of its own, or leave one out.")
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """Keys of the devices of all treatments, each once."""
+        return tuple(dict.fromkeys(device for treatment in self.treatments for device in treatment.devices))
 
 
 class Progress(Protocol):
@@ -92,16 +94,16 @@ class CaseResult:
     """Name of the case folder (the name of a scan may be the patient's)."""
     anatomy: Anatomy
     """Vessel, parent artery and sacs."""
-    deployments: dict[str, Deployment]
-    """Deployments by device name."""
+    implants: dict[str, dict[str, Deployment]]
+    """Deployed implants by treatment and id."""
     fields: dict[str, FlowField]
-    """Flows by name: ``bare``, then devices; empty where no flow was requested."""
+    """Flows by treatment, ``bare`` first; empty where no flow was requested."""
     metrics: dict[str, Any]
-    """Metrics: ``vessel``, ``bare``, ``stents.NAME.{deployment,flow,ratios}``; the end of each key is its unit."""
+    """Metrics: ``vessel``, ``treatments.NAME.{implants.ID,flow,change,quality}``; the end of each key is its unit."""
     provenance: dict[str, Any]
     """Versions, input with hash, settings, seconds per stage."""
     failures: dict[str, str]
-    """Reason why a device was not deployed or its flow not computed, by device name."""
+    """Reason why a treatment was not deployed or its flow not computed, by treatment."""
     notes: tuple[str, ...]
     """Findings, assumptions and repairs, and the reliability of every flow, one sentence each."""
     whole: Vessel | None = None

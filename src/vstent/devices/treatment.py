@@ -1,0 +1,156 @@
+"""Data classes of what is planned for a patient: `Placing`, `Implant` and `Treatment`."""
+
+import re
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+from vstent.errors import InputError
+
+Anchor = Literal["center", "distal", "proximal"]
+"""Point of a device that is placed at the landing position."""
+ANCHORS: Final[tuple[str, ...]] = get_args(Anchor)
+"""All values of `Anchor`."""
+BARE: Final = "bare"
+"""Name of the treatment without an implant."""
+NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,59}")
+"""Form of the names of treatments and implants, which name folders."""
+
+IMPLANT: Final = re.compile(r"([\w-]+)(?:\s+([\d.]+)\s*x\s*([\d.]+))?(?:\s*@\s*([+-]?[\d.]+))?")
+"""Form of an implant in the text of a treatment: device, label diameter x length in mm, @ shift in mm."""
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Where an implant is placed; missing values are proposed."""
+
+    path: str = "parent"
+    """Name of the path in `Anatomy.paths`."""
+    position_mm: float | None = None
+    """Position of the anchor along the path, in mm."""
+    anchor: Anchor = "center"
+    """Point of the implant that lies there."""
+    shift_mm: float = 0.0
+    """Distance from the proposed position, in mm, positive distally; 0 where a position is given."""
+
+
+@dataclass(frozen=True)
+class Implant:
+    """One device of a treatment, with its size and placing; missing values are proposed."""
+
+    id: str
+    """Name within the treatment."""
+    device: str
+    """Key of the design in the catalogue."""
+    diameter_mm: float | None = None
+    """Label diameter in mm."""
+    length_mm: float | None = None
+    """Label length in mm."""
+    placing: Placing = Placing()
+    """Where it is placed."""
+    inside: tuple[str, ...] = ()
+    """Implants that are there before it, by id, in the order of their deployment; it opens inside them."""
+
+    def __post_init__(self) -> None:
+        _check_name("implant", self.id)
+
+    @property
+    def is_proposed(self) -> bool:
+        """Whether size and place are left to vstent."""
+        return self.diameter_mm is None and self.length_mm is None and self.placing == Placing(self.placing.path)
+
+
+@dataclass(frozen=True)
+class Treatment:
+    """Implants in the order of their deployment."""
+
+    name: str
+    """Short name, unique among the treatments of a study."""
+    implants: tuple[Implant, ...] = ()
+    """The implants; none in the bare artery."""
+    has_flow: bool = True
+    """Whether its flow is computed where the study computes flows."""
+
+    def __post_init__(self) -> None:
+        _check_name("treatment", self.name)
+        if self.name == BARE and self.implants:
+            raise InputError(f"The treatment {BARE!r} is the artery without an implant: choose another name.")
+        known: list[str] = []
+        for implant in self.implants:
+            if implant.id in known:
+                raise InputError(f"The treatment {self.name} has two implants called {implant.id}: rename one.")
+            missing = [name for name in implant.inside if name not in known]
+            if missing:
+                raise InputError(
+                    f"In the treatment {self.name}, {implant.id} is inside {missing[0]}, which is not deployed before "
+                    "it: change the order."
+                )
+            known.append(implant.id)
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """Keys of the devices of the implants."""
+        return tuple(implant.device for implant in self.implants)
+
+    @property
+    def is_proposed(self) -> bool:
+        """Whether sizes and places of all implants are left to vstent."""
+        return all(implant.is_proposed for implant in self.implants)
+
+
+def with_device(
+    device: str, *, diameter_mm: float | None = None, length_mm: float | None = None, center_mm: float | None = None
+) -> Treatment:
+    """Return the treatment with one device in the parent artery; missing values are proposed.
+
+    Parameters
+    ----------
+    device : key of the design in the catalogue; also the name of the treatment and of its implant.
+    diameter_mm, length_mm : label diameter and length in mm.
+    center_mm : position of the device's middle along the parent artery, in mm.
+    """
+    placing = Placing(position_mm=center_mm)
+    return Treatment(device, (Implant(device, device, diameter_mm, length_mm, placing),))
+
+
+def read_treatment(text: str) -> Treatment:
+    """Return a treatment read from text; every implant opens inside those before it.
+
+    Parameters
+    ----------
+    text : devices in the order of their deployment, joined by ``+``, such as ``silk 4x20 + silk@-4``. After a device
+        may stand its label diameter and length in mm, and after ``@`` a shift of the proposed place in mm, positive
+        distally. ``NAME=`` before them names the treatment; otherwise its name is made of its devices.
+
+    Raises
+    ------
+    InputError
+        The text has another form.
+    """
+    given, equals, devices = text.rpartition("=")
+    implants: list[Implant] = []
+    for part in devices.split("+"):
+        found = IMPLANT.fullmatch(part.strip())
+        if not found:
+            raise InputError(
+                f"{part.strip()!r} is not an implant: write a device, its size and its shift such as 'silk 4x20 @-4'"
+            )
+        device, diameter, length, shift = found.groups()
+        count = sum(one.device == device for one in implants)
+        implants.append(
+            Implant(
+                device if count == 0 else f"{device}_{count + 1}",
+                device,
+                diameter and float(diameter),
+                length and float(length),
+                Placing(shift_mm=float(shift or 0.0)),
+                tuple(one.id for one in implants),
+            )
+        )
+    name = given.strip() if equals else "+".join(one.id for one in implants)
+    return Treatment(name, tuple(implants))
+
+
+def _check_name(what: str, name: str) -> None:
+    """Raise InputError where a name cannot be that of a folder."""
+    if not NAME.fullmatch(name):
+        raise InputError(f"{name!r} is not a name of {what}s: use up to 60 letters, digits, and . _ + -")
