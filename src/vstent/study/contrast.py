@@ -14,7 +14,7 @@ from vstent.devices.catalogue import find_design
 from vstent.devices.design import BARE
 from vstent.errors import InputError, ReadError
 from vstent.flow.case import FlowField
-from vstent.flow.indices import compare
+from vstent.flow.indices import ratios
 from vstent.geometry.vessel import Anatomy
 from vstent.io.tables import write_rows
 from vstent.io.writers import write_json
@@ -186,7 +186,7 @@ def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, fl
             metrics[BARE].update(values)
         elif stent is not None and "flow" in stent:
             stent["flow"].update(values)
-            stent["ratios"].update(compare(dict(measures.get(BARE, {})), dict(values)))
+            stent["ratios"].update(ratios(dict(measures.get(BARE, {})), dict(values)))
 
 
 def kept_measures(out: Path, source: str, study: Settings) -> dict[str, dict[str, float]]:

@@ -12,9 +12,8 @@ import numpy as np
 
 from vstent.anatomy.morphology import Measures, morphology
 from vstent.anatomy.openings import opening_at
-from vstent.anatomy.repair import repair
+from vstent.anatomy.read import read_vessel
 from vstent.anatomy.restore.restore import restore
-from vstent.anatomy.segment import segment
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.deploy import deploy, propose_size
@@ -29,14 +28,12 @@ from vstent.flow.beside import Beside
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.grade import QUALITY, computation_of, grade
-from vstent.flow.indices import compare, indices
+from vstent.flow.indices import indices, ratios
 from vstent.flow.ostium import ostium
 from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
-from vstent.geometry.image import Image
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
-from vstent.io.surfaces import read_surface
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
 from vstent.plan.uncertainty import Uncertainty, vary
@@ -105,7 +102,7 @@ def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
     x, y, z = settings.at_mm or (0.0, 0.0, 0.0)
     yield "the point given is RAS", (-x, -y, z)
     if not (path.is_file() and is_surface_file(path)):
-        image = _image(path, replace(settings, crop_mm=None))
+        image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape, acquisition=settings.acquisition)
         if all(0 <= i < n for i, n in zip((x, y, z), image.voxels.shape, strict=True)):
             i, j, k = image.to_mm(np.array([[x, y, z]]))[0].tolist()
             yield "the point given is a voxel index", (i, j, k)
@@ -161,21 +158,20 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
 
 def _vessel(path: Path, settings: Settings) -> Vessel:
     """Return the repaired vessel of an input, without openings and centerlines."""
-    if path.is_file() and is_surface_file(path):
-        surface, notes = read_surface(path, units=settings.units, frame=settings.frame)
-        vessel = Vessel(surface, notes=notes)
-    else:
-        image = _image(path, settings)
-        vessel = segment(image, threshold=settings.threshold, at_mm=_array(settings.at_mm))
-    near_mm = _array(settings.inlet_mm if settings.at_mm is None else settings.at_mm)
-    lumen, repairs = repair(vessel.lumen, at_mm=None if near_mm is None else np.atleast_2d(near_mm)[0])
-    return replace(vessel, lumen=lumen, notes=(*vessel.notes, *repairs))
-
-
-def _image(path: Path, settings: Settings) -> Image:
-    """Return the scan, cropped where requested."""
-    image = read_image(path, spacing_mm=settings.spacing_mm, shape=settings.shape, acquisition=settings.acquisition)
-    return image if settings.crop_mm is None else image.cropped(np.array(settings.crop_mm, dtype=np.float64))
+    at_mm = settings.at_mm
+    if at_mm is None and settings.inlet_mm is not None and is_surface_file(path):  # it chooses a piece of the surface
+        at_mm = np.atleast_2d(settings.inlet_mm)[0]
+    return read_vessel(
+        path,
+        units=settings.units,
+        frame=settings.frame,
+        acquisition=settings.acquisition,
+        spacing_mm=settings.spacing_mm,
+        shape=settings.shape,
+        crop_mm=settings.crop_mm,
+        threshold=settings.threshold,
+        at_mm=at_mm,
+    )
 
 
 def deploy_all(
@@ -506,7 +502,7 @@ def measure_all(
     for name, deployment in deployments.items():
         stents[name] = {"deployment": measure(anatomy, deployment)}
         if name in flow:
-            stents[name] |= {"flow": flow[name] | left[name], "ratios": compare(flow[BARE], flow[name])}
+            stents[name] |= {"flow": flow[name] | left[name], "ratios": ratios(flow[BARE], flow[name])}
     found = {"vessel": morphology(anatomy), "stents": stents}
     if not flow:
         return found
