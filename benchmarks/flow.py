@@ -120,10 +120,10 @@ def anatomy_of(surface: Path | None) -> Anatomy:
 def cost(surface: Path | None, *, close_up: bool) -> None:
     """Print what an artery takes, steady, bare and with both devices."""
     anatomy = anatomy_of(surface)
-    stents = [None, *(vstent.deploy(vstent.find_design(name), anatomy).stent for name in ("silk", "enterprise"))]
+    deployments = [None, *(vstent.deploy(name, anatomy) for name in ("silk", "enterprise"))]
     settings = FlowSettings(cell_size_mm=0.1, close_up=close_up)
     began, began_core = time.perf_counter(), time.process_time()
-    fields = simulate(anatomy, stents, settings, progress=tell)
+    fields = simulate(anatomy, deployments, settings, progress=tell)
     clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
     print(f"\n{named(surface, close_up=close_up)}:\n")
     case = flow_case(anatomy, None, settings)

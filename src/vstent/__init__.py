@@ -1,6 +1,6 @@
 """Virtual stenting of intracranial aneurysms, from a scan to a deployed device and the blood flow.
 
-Each function is imported on first use, so that ``import vstent`` is fast.
+Each public name is imported on first use, so that ``import vstent`` is fast.
 """
 
 from importlib import import_module
@@ -8,51 +8,72 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vstent.anatomy.morphology import morphology as morphology
-    from vstent.anatomy.repair import repair as repair
+    from vstent.anatomy.read import read_vessel as read_vessel
     from vstent.anatomy.restore.restore import restore as restore
     from vstent.anatomy.segment import segment as segment
     from vstent.anatomy.trace import trace as trace
     from vstent.anatomy.trim import trim as trim
+    from vstent.angiography.angiogram import AngiogramSettings as AngiogramSettings
     from vstent.angiography.angiogram import angiogram as angiogram
     from vstent.deployment.deploy import deploy as deploy
     from vstent.deployment.measure import measure as measure
     from vstent.deployment.struts import struts as struts
     from vstent.devices.catalogue import catalogue as catalogue
     from vstent.devices.catalogue import find_design as find_design
+    from vstent.devices.catalogue import find_size as find_size
+    from vstent.devices.stent import Landing as Landing
+    from vstent.flow.case import FlowSettings as FlowSettings
+    from vstent.flow.indices import compare as compare
+    from vstent.flow.indices import indices as indices
+    from vstent.flow.ostium import ostium as ostium
     from vstent.flow.simulation import simulate as simulate
+    from vstent.geometry.image import Image as Image
     from vstent.io.images import read_image as read_image
-    from vstent.io.surfaces import read_surface as read_surface
     from vstent.plan.rank import rank as rank
     from vstent.reporting.page import report as report
     from vstent.study.pipeline import run as run
+    from vstent.study.types import Settings as Settings
 
 _HOMES = {
+    "read_vessel": "vstent.anatomy.read",
     "read_image": "vstent.io.images",
-    "read_surface": "vstent.io.surfaces",
     "segment": "vstent.anatomy.segment",
-    "repair": "vstent.anatomy.repair",
     "trace": "vstent.anatomy.trace",
     "trim": "vstent.anatomy.trim",
     "restore": "vstent.anatomy.restore.restore",
     "morphology": "vstent.anatomy.morphology",
     "catalogue": "vstent.devices.catalogue",
     "find_design": "vstent.devices.catalogue",
+    "find_size": "vstent.devices.catalogue",
     "deploy": "vstent.deployment.deploy",
     "struts": "vstent.deployment.struts",
     "measure": "vstent.deployment.measure",
     "simulate": "vstent.flow.simulation",
+    "compare": "vstent.flow.indices",
+    "indices": "vstent.flow.indices",
+    "ostium": "vstent.flow.ostium",
     "angiogram": "vstent.angiography.angiogram",
     "rank": "vstent.plan.rank",
     "run": "vstent.study.pipeline",
     "report": "vstent.reporting.page",
+    "Image": "vstent.geometry.image",
+    "Landing": "vstent.devices.stent",
+    "FlowSettings": "vstent.flow.case",
+    "AngiogramSettings": "vstent.angiography.angiogram",
+    "Settings": "vstent.study.types",
 }
-"""Module that defines each public function."""
+"""Module that defines each public function and data class."""
 
 __all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public function on first use."""
+    """Import a public function or data class on first use."""
     if name not in _HOMES:
         raise AttributeError(f"module 'vstent' has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Return the names of the module, those included that are imported on first use."""
+    return sorted({*globals(), *__all__})

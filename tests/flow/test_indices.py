@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from shapes import sphere
 
 from vstent.flow.case import Blood, FlowField, Phase, Swing
-from vstent.flow.indices import NEAR_MM, compare, indices
+from vstent.flow.indices import NEAR_MM, compare, indices, ratios
 from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats
 
@@ -167,4 +168,13 @@ def test_of_a_pulse_on_a_finer_mesh_each_moments_inflow_is_what_that_mesh_told()
 
 
 def test_ratios_are_of_what_both_have_and_nothing_is_divided_by_zero() -> None:
-    assert compare({"a": 2.0, "b": 0.0, "c": 1.0}, {"a": 1.0, "b": 3.0}) == {"a_ratio": 0.5}
+    assert ratios({"a": 2.0, "b": 0.0, "c": 1.0}, {"a": 1.0, "b": 3.0}) == {"a_ratio": 0.5}
+
+
+def test_compared_flows_have_both_values_and_their_ratio() -> None:
+    healthy = SimpleNamespace(aneurysms=())
+    found = compare(healthy, *(flow(through_neck(0.1, 0.0), inlets_mL_s) for inlets_mL_s in ([10.0, 0.0], [4.0, 2.0])))
+    assert found["inlet_flow_mL_s"] == (10.0, 4.0, 0.4)
+    assert found["inlet_2_flow_mL_s"][:2] == (0.0, 2.0)
+    assert np.isnan(found["inlet_2_flow_mL_s"].ratio)
+    assert "neck_inflow_mL_s" not in found

@@ -28,9 +28,9 @@ from vstent.deployment.measure import measure
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import Bed, Sketch, bed, sketch
 from vstent.devices.catalogue import find_design
-from vstent.devices.treatment import BARE
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.stent import Deployment, Landing, Stent
+from vstent.devices.treatment import BARE
 from vstent.errors import InputError, ReadError, VstentError
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.domain import default_cell_size_mm

@@ -34,7 +34,7 @@ def _batch(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     from vstent.cli.console import Console, cohort_table
     from vstent.cohort.batch import collect, left_to_do, pictures_of, run_cohort, write_table
-    from vstent.cohort.cases import row_count, find_cases
+    from vstent.cohort.cases import find_cases, row_count
     from vstent.cohort.estimate import estimate
 
     console = Console()

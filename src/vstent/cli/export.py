@@ -63,7 +63,9 @@ def _openfoam(arguments: argparse.Namespace) -> int:
 
     treatments = options.given_treatments(arguments, usual=())
     if len(treatments) > 1:
-        raise InputError("A case folder of OpenFOAM holds the wires of one treatment: give one --device or --treatment.")
+        raise InputError(
+            "A case folder of OpenFOAM holds the wires of one treatment: give one --device or --treatment."
+        )
     flow = options.given_problem(arguments)
     settings = Settings(**options.given_geometry(arguments), treatments=treatments, flow=flow)
     foam = {"processes": arguments.processes, "layers": arguments.layers}

@@ -41,7 +41,12 @@ def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -
         rows = {treatment: read_row(folder, treatment, key) for treatment, key in keys.items()}
         missing = tuple(treatment for treatment, row in rows.items() if row is None or row["outcome"] == LOST)
         if missing:
-            shorter = replace(case, settings=replace(case.settings, treatments=tuple(one for one in case.settings.treatments if one.name in missing)))
+            shorter = replace(
+                case,
+                settings=replace(
+                    case.settings, treatments=tuple(one for one in case.settings.treatments if one.name in missing)
+                ),
+            )
             tasks.append(Task(shorter, folder, {treatment: keys[treatment] for treatment in missing}, keeps_files))
     return tasks
 

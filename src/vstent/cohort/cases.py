@@ -36,7 +36,9 @@ class Case:
         """Key of the row of every treatment; it covers everything that the row depends on."""
         source = hash_of(self.path)
         return {
-            one.name: key_of(code_key(), source, replace(self.settings, treatments=(one,)), *map(find_design, one.devices))
+            one.name: key_of(
+                code_key(), source, replace(self.settings, treatments=(one,)), *map(find_design, one.devices)
+            )
             for one in self.settings.treatments
         }
 

@@ -12,6 +12,7 @@ from vstent.deployment.crowns import shifts_mm
 from vstent.deployment.evenly_spaced import Zhong2016
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, laid_inside, run
 from vstent.deployment.wall import landing_wall
+from vstent.devices.catalogue import find_design
 from vstent.devices.design import Design, Size
 from vstent.devices.formulas import compacted
 from vstent.devices.stent import Deployment, Landing, Stent
@@ -28,7 +29,7 @@ propose_size = sizing.propose_size
 
 
 def deploy(
-    design: Design,
+    design: Design | str,
     anatomy: Anatomy,
     *,
     size: Size | None = None,
@@ -42,8 +43,8 @@ def deploy(
 
     Parameters
     ----------
-    design : Design
-        The device; see `vstent.devices.catalogue.catalogue`.
+    design : Design or str
+        The device, or its key or name in the catalogue.
     anatomy : Anatomy
         The restored artery.
     size : Size, optional
@@ -70,7 +71,7 @@ def deploy(
     LandingError
         The device does not fit the artery at this place.
     DeviceError
-        The device cannot be compacted by this fraction.
+        There is no such device, or it cannot be compacted by this fraction.
     InputError
         There is no such method, or the contour diverges because its weights are too large.
 
@@ -80,6 +81,7 @@ def deploy(
     is wider than the free device, the device keeps its free diameter, and ``wall_gap_mm`` holds the gap.
     """
     began = time.perf_counter()
+    design = find_design(design) if isinstance(design, str) else design
     chosen = _method(method).beside(design.wall_offset_um * MM_PER_UM)
     size = compacted(design, size or propose_size(design, anatomy), compaction_fraction)
     wall, is_patient = landing_wall(anatomy, inside, chosen.wall)

@@ -5,7 +5,7 @@ Start reading in ``simulation.py``. The two engines are in the packages ``lattic
 
 from vstent.flow.case import Blood, FlowCase, FlowField, FlowSettings, Screen
 from vstent.flow.engines import Progress
-from vstent.flow.indices import compare, indices
+from vstent.flow.indices import Change, compare, indices
 from vstent.flow.ostium import ostium
 from vstent.flow.screen import screen
 from vstent.flow.simulation import Checkpoint, flow_case, foretell_cost, simulate, simulate_case
@@ -13,6 +13,7 @@ from vstent.flow.streamlines import Streamlines, streamlines
 
 __all__ = [
     "Blood",
+    "Change",
     "Checkpoint",
     "FlowCase",
     "FlowField",

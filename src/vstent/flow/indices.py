@@ -1,13 +1,14 @@
-"""Hemodynamic indices of a flow, and their ratios with and without a stent."""
+"""Hemodynamic indices of a flow, and their change with a device."""
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from vstent.flow import sampling
 from vstent.flow.case import FlowField
+from vstent.flow.ostium import ostium
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import roles
+from vstent.geometry.vessel import Anatomy, roles
 from vstent.kernels.arrays import Bools, Floats
 from vstent.units import M_PER_MM
 
@@ -78,9 +79,45 @@ def _over_cycle(key: str, of_moments: list[float]) -> float:
     return max(of_moments) if key.startswith("max_") else float(np.mean(of_moments))
 
 
-def compare(bare: dict[str, float], stented: dict[str, float]) -> dict[str, float]:
-    """Return the ratios stented over bare, ``KEY_ratio``, of the indices in both that are not 0 when bare."""
-    return {f"{key}_ratio": stented[key] / value for key, value in bare.items() if key in stented and value != 0}
+def ratios(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
+    """Return the ratios after over before, ``KEY_ratio``, of the indices in both that are not 0 before."""
+    return {f"{key}_ratio": after[key] / value for key, value in before.items() if key in after and value != 0}
+
+
+class Change(NamedTuple):
+    """An index of two flows, in the unit at the end of its name."""
+
+    before: float
+    """Value in the first flow."""
+    after: float
+    """Value in the second flow."""
+    ratio: float
+    """`after` divided by `before`; nan where that is 0."""
+
+
+def compare(anatomy: Anatomy, before: FlowField, after: FlowField) -> dict[str, Change]:
+    """Compute the hemodynamic indices of two flows in one vessel, and their change.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The vessel of both flows; the indices of the sac are those of its largest aneurysm.
+    before : FlowField
+        Usually the flow without a device.
+    after : FlowField
+        Usually the flow with a device.
+
+    Returns
+    -------
+    dict
+        Values before and after and their ratio, by the names of `indices`; those of the vessel alone where it has no
+        aneurysm.
+    """
+    largest = anatomy.aneurysms[0] if anatomy.aneurysms else None
+    shapes = () if largest is None else (largest.sac, ostium(largest, anatomy.vessel.lumen))
+    first, second = indices(before, *shapes), indices(after, *shapes)
+    change = ratios(first, second)
+    return {key: Change(first[key], second[key], change.get(f"{key}_ratio", np.nan)) for key in first if key in second}
 
 
 def _of_vessel(field: FlowField) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Flow computation: `simulate` an anatomy with and without stents, or `simulate_case` for a single flow."""
+"""Flow computation: `simulate` an anatomy with and without devices, or `simulate_case` for a single flow."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
@@ -13,7 +13,7 @@ import numpy as np
 
 from vstent import plugins
 from vstent.deployment.struts import over_restored
-from vstent.devices.stent import Stent
+from vstent.devices.stent import Deployment, Stent
 from vstent.errors import InputError
 from vstent.flow import sampling
 from vstent.flow.beside import Beside
@@ -56,19 +56,19 @@ class Checkpoint(Protocol):
 
 def simulate(
     anatomy: Anatomy,
-    stents: Sequence[Stent | None],
+    deployments: Sequence[Deployment | None],
     settings: FlowSettings | None = None,
     *,
     progress: OnProgress | None = None,
 ) -> tuple[FlowField, ...]:
-    """Compute the flow, steady or pulsatile, for each of several stents.
+    """Compute the flow, steady or pulsatile, without a device and with each of several deployed devices.
 
     Parameters
     ----------
     anatomy : Anatomy
         The patient's vessel and aneurysms.
-    stents : sequence of Stent or None
-        Deployed stents; None stands for the vessel without a device.
+    deployments : sequence of Deployment or None
+        Deployed devices, each alone in the vessel; None stands for the vessel without a device.
     settings : FlowSettings, optional
         Settings of the computation.
     progress : callable, optional
@@ -77,7 +77,7 @@ def simulate(
     Returns
     -------
     tuple of FlowField
-        One field per stent, in order. Flows with a stent start from the first flow without one, if that comes before.
+        One field per deployment, in order. Flows with a device start from the first one without, if that comes before.
 
     Raises
     ------
@@ -86,7 +86,8 @@ def simulate(
     """
     fields: list[FlowField] = []
     bare: FlowField | None = None
-    for stent in stents:
+    for deployment in deployments:
+        stent = None if deployment is None else deployment.stent
         field = simulate_case(flow_case(anatomy, stent, settings), start=bare, progress=progress)
         if stent is None and bare is None:
             bare = field

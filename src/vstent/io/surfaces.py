@@ -50,7 +50,7 @@ def read_surface(
     Returns
     -------
     surface : Surface
-        The mesh in LPS mm as it is in the file, including its faults (see `vstent.repair`).
+        The mesh in LPS mm as it is in the file, including its faults (see `vstent.anatomy.repair`).
     notes : tuple of str
         One sentence for every assumption.
 

@@ -22,7 +22,7 @@ from vstent.devices.ranges import altered, uncertain, values_at
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, InputError, LandingError
 from vstent.flow.case import FlowSettings
-from vstent.flow.indices import compare, indices
+from vstent.flow.indices import indices, ratios
 from vstent.flow.ostium import ostium
 from vstent.flow.simulation import Checkpoint, flow_case, simulate_case
 from vstent.geometry.vessel import Anatomy
@@ -296,5 +296,5 @@ def _flow_ratios(anatomy: Anatomy, stent: Stent, flow: FlowSettings) -> dict[str
     shapes = sac.sac, ostium(sac, anatomy.vessel.lumen)
     bare = simulate_case(flow_case(anatomy, None, flow))
     after = simulate_case(flow_case(anatomy, stent, flow), start=bare)
-    ratios = compare(indices(bare, *shapes), indices(after, *shapes))
-    return {name: ratios[name] for name in FLOW_RESULTS if name in ratios}
+    found = ratios(indices(bare, *shapes), indices(after, *shapes))
+    return {name: found[name] for name in FLOW_RESULTS if name in found}

@@ -107,11 +107,16 @@ def cohort_report(name: str, rows: Sequence[Row], pictures: Mapping[tuple[str, s
         patients=[(treatment, shown) for treatment in treatments if (shown := _patients(rows, treatment, pictures))],
         n_cases=len({row["case"] for row in rows}),
         distributions=[
-            (_name(key), [distribution(done, treatment, key) for treatment in treatments if _values(done, treatment, key)])
+            (
+                _name(key),
+                [distribution(done, treatment, key) for treatment in treatments if _values(done, treatment, key)],
+            )
             for key in HEADLINES
             if any(_is_number(row.get(key)) for row in done)
         ],
-        outliers=[outlier for treatment in treatments for key in HEADLINES for outlier in outliers(done, treatment, key)],
+        outliers=[
+            outlier for treatment in treatments for key in HEADLINES for outlier in outliers(done, treatment, key)
+        ],
         failures=[row for row in rows if row["outcome"] != "done"],
         limit=OUTLYING,
     )
@@ -230,7 +235,11 @@ def _strip(found: Sequence[tuple[str, float]], key: str, span: tuple[float, floa
 
 def _values(rows: Sequence[Row], treatment: str, key: str) -> list[tuple[str, float]]:
     """Return case name and value of one metric of one treatment, where the value is a finite number."""
-    return [(str(row["case"]), float(row[key])) for row in rows if row["treatment"] == treatment and _is_number(row.get(key))]
+    return [
+        (str(row["case"]), float(row[key]))
+        for row in rows
+        if row["treatment"] == treatment and _is_number(row.get(key))
+    ]
 
 
 def _is_number(value: Any) -> bool:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.devices.treatment import BARE
 from vstent.devices.stent import Deployment
+from vstent.devices.treatment import BARE
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import raster
 from vstent.kernels.arrays import Floats

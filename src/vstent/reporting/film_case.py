@@ -56,7 +56,9 @@ def film_case(
     progress("film", 0.0, "")
     anatomy, stents = stents_of(out, found if film.has_wires else ())
     treatments = finished_run(out)[1].treatments
-    titles = {BARE: "Before"} | {one.name: " + ".join(find_design(key).name for key in one.devices) for one in treatments}
+    titles = {BARE: "Before"} | {
+        one.name: " + ".join(find_design(key).name for key in one.devices) for one in treatments
+    }
     histories = {name: recording.histories[name] for name in found}
     shown = shown_of(histories, stents, titles, aimed(film, anatomy))
     curves = {titles[name]: one.curves for name, one in found.items()}

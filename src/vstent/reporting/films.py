@@ -67,7 +67,10 @@ class Shown:
 
 
 def shown_of(
-    histories: Mapping[str, History], stents: Mapping[str, Sequence[Stent]], titles: Mapping[str, str], settings: FilmSettings
+    histories: Mapping[str, History],
+    stents: Mapping[str, Sequence[Stent]],
+    titles: Mapping[str, str],
+    settings: FilmSettings,
 ) -> dict[str, Shown]:
     """Film the contrast of every flow along one direction.
 

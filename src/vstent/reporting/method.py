@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 
 from vstent.anatomy.landing_zones import neck_span_mm
-from vstent.devices.treatment import BARE
 from vstent.devices.stent import Deployment, tube_faces
+from vstent.devices.treatment import BARE
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.kernels.arrays import Floats, Ints

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from markupsafe import Markup
 
-from vstent.devices.treatment import BARE
 from vstent.devices.stent import Deployment
+from vstent.devices.treatment import BARE
 from vstent.flow.case import LATTICE, OPENFOAM
 from vstent.reporting import bands
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
@@ -152,7 +152,9 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
         pictures=pictures,
         changes=compare(metrics, unusable(metrics)),
         implants=[
-            _implant(deployment, metrics.get("treatments", {}).get(name, {}).get("implants", {}).get(key, {}), (name, key))
+            _implant(
+                deployment, metrics.get("treatments", {}).get(name, {}).get("implants", {}).get(key, {}), (name, key)
+            )
             for name, deployed in case.implants.items()
             for key, deployment in deployed.items()
         ],

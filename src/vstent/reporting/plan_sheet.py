@@ -47,6 +47,7 @@ class Planned(NamedTuple):
     day: str
     """Date of the plan, ISO 8601."""
 
+
 class _Page(NamedTuple):
     """Page of one implant."""
 

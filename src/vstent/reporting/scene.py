@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vstent.deployment.coverage import coverage_fractions
-from vstent.devices.treatment import BARE
 from vstent.devices.stent import Deployment, Stent
+from vstent.devices.treatment import BARE
 from vstent.flow.case import FlowField
 from vstent.flow.indices import on_sac
 from vstent.flow.streamlines import inlet_seeds_mm, neck_seeds_mm, streamlines

@@ -13,7 +13,7 @@ from vstent.angiography.angiogram import Angiogram, AngiogramSettings, Watch, an
 from vstent.devices.treatment import BARE
 from vstent.errors import InputError, ReadError
 from vstent.flow.case import FlowField
-from vstent.flow.indices import compare
+from vstent.flow.indices import ratios
 from vstent.geometry.vessel import Anatomy
 from vstent.io.tables import write_rows
 from vstent.io.writers import write_json
@@ -175,7 +175,7 @@ def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, fl
         if "flow" in treatment:
             treatment["flow"].update(values)
         if "change" in treatment:
-            treatment["change"].update(compare(dict(measures.get(BARE, {})), dict(values)))
+            treatment["change"].update(ratios(dict(measures.get(BARE, {})), dict(values)))
 
 
 def kept_measures(out: Path, source: str, study: Settings) -> dict[str, dict[str, float]]:

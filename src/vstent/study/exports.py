@@ -27,6 +27,7 @@ from vstent.study.repeat import finished_run
 from vstent.study.stages import check_inflow, deploy_implant, find_anatomy
 from vstent.study.types import Progress, Settings
 
+
 def export_openfoam(
     path: Path, out: Path, settings: Settings, foam: Mapping[str, Any], progress: Progress
 ) -> tuple[FlowCase, FoamCase]:

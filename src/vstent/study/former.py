@@ -21,6 +21,7 @@ from vstent.study.types import Settings
 BEGUN: Final = "settings.json"
 """File in the cache folder with the settings of the last run that was started, finished or not."""
 
+
 def former_settings(out: Path) -> Settings | None:
     """Return the settings of the last run of a case folder; None where there is none, or they cannot be read."""
     for path in (out / CACHE / BEGUN, out / RUN):

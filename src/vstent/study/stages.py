@@ -12,9 +12,8 @@ import numpy as np
 
 from vstent.anatomy.morphology import Measures, morphology
 from vstent.anatomy.openings import opening_at
-from vstent.anatomy.repair import repair
+from vstent.anatomy.read import read_vessel
 from vstent.anatomy.restore.restore import restore
-from vstent.anatomy.segment import segment
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
@@ -29,14 +28,12 @@ from vstent.flow.beside import Beside
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.grade import computation_of, grade
-from vstent.flow.indices import compare, indices
+from vstent.flow.indices import indices, ratios
 from vstent.flow.ostium import ostium
 from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
-from vstent.geometry.image import Image
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
-from vstent.io.surfaces import read_surface
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
 from vstent.plan.uncertainty import Uncertainty, vary
@@ -106,7 +103,8 @@ def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
     x, y, z = settings.anatomy.at_mm or (0.0, 0.0, 0.0)
     yield "the point given is RAS", (-x, -y, z)
     if not (path.is_file() and is_surface_file(path)):
-        image = _image(path, replace(settings, input=replace(settings.input, crop_mm=None)))
+        given = settings.input
+        image = read_image(path, spacing_mm=given.spacing_mm, shape=given.shape, acquisition=given.acquisition)
         if all(0 <= i < n for i, n in zip((x, y, z), image.voxels.shape, strict=True)):
             i, j, k = image.to_mm(np.array([[x, y, z]]))[0].tolist()
             yield "the point given is a voxel index", (i, j, k)
@@ -162,21 +160,10 @@ def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> 
 
 def _vessel(path: Path, settings: Settings) -> Vessel:
     """Return the repaired vessel of an input, without openings and centerlines."""
-    if path.is_file() and is_surface_file(path):
-        surface, notes = read_surface(path, units=settings.input.units, frame=settings.input.frame)
-        vessel = Vessel(surface, notes=notes)
-    else:
-        image = _image(path, settings)
-        vessel = segment(image, threshold=settings.input.threshold, at_mm=_array(settings.anatomy.at_mm))
-    near_mm = _array(settings.anatomy.inlet_mm if settings.anatomy.at_mm is None else settings.anatomy.at_mm)
-    lumen, repairs = repair(vessel.lumen, at_mm=None if near_mm is None else np.atleast_2d(near_mm)[0])
-    return replace(vessel, lumen=lumen, notes=(*vessel.notes, *repairs))
-
-
-def _image(path: Path, settings: Settings) -> Image:
-    """Return the scan, cropped where requested."""
-    image = read_image(path, spacing_mm=settings.input.spacing_mm, shape=settings.input.shape, acquisition=settings.input.acquisition)
-    return image if settings.input.crop_mm is None else image.cropped(np.array(settings.input.crop_mm, dtype=np.float64))
+    at_mm, inlet_mm = settings.anatomy.at_mm, settings.anatomy.inlet_mm
+    if at_mm is None and inlet_mm is not None and is_surface_file(path):  # it chooses a piece of the surface
+        at_mm = np.atleast_2d(inlet_mm)[0]
+    return read_vessel(path, **asdict(settings.input), at_mm=at_mm)
 
 
 def deploy_all(
@@ -558,7 +545,7 @@ def measure_all(
         if name == BARE:
             bare = flow
         else:
-            treatments[name]["change"] = compare(bare, flow)
+            treatments[name]["change"] = ratios(bare, flow)
         assert case is not None
         treatments[name]["quality"] = _quality(case, field, flow)
     return {"vessel": morphology(anatomy), "treatments": treatments}
