@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from vstent.flow.case import Blood, FlowSettings, Waveform
     from vstent.plan.uncertainty import Ranges
     from vstent.study.crews import AbstractCrew
-    from vstent.study.types import AnatomySettings, InputSettings
 
 EPILOG: Final = "Lengths are in mm, coordinates are LPS. Research use only: not cleared for diagnosis or treatment."
 """Last line of every help text."""
@@ -209,8 +208,8 @@ def add_treatments(parser: argparse.ArgumentParser) -> None:
         type=_treatment,
         action="append",
         metavar="TEXT",
-        help='treatment of several devices in the order of their deployment, each inside those before it, such as "silk '
-        '4x20 + silk@-4": with a size, or with a shift of the proposed place in mm; NAME= before it names it',
+        help="treatment of several devices in the order of their deployment, each inside those before it, such as "
+        "'silk 4x20 + silk@-4': with a size, or with a shift of the proposed place in mm; NAME= before it names it",
     )
 
 
@@ -455,7 +454,7 @@ def _spacing(text: str) -> tuple[float, float, float]:
     return _three(text if "," in text else ",".join([text] * 3), float)
 
 
-def given_geometry(arguments: argparse.Namespace) -> "dict[str, InputSettings | AnatomySettings]":
+def given_geometry(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the options on input and anatomy as sections of the settings, with points in LPS mm."""
     from vstent.study.types import AnatomySettings, InputSettings
 

@@ -39,15 +39,11 @@ def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -
     for case in cases:
         folder, keys = _folder(case, out), case.keys
         rows = {treatment: read_row(folder, treatment, key) for treatment, key in keys.items()}
-        missing = tuple(treatment for treatment, row in rows.items() if row is None or row["outcome"] == LOST)
+        missing = {name for name, row in rows.items() if row is None or row["outcome"] == LOST}
         if missing:
-            shorter = replace(
-                case,
-                settings=replace(
-                    case.settings, treatments=tuple(one for one in case.settings.treatments if one.name in missing)
-                ),
-            )
-            tasks.append(Task(shorter, folder, {treatment: keys[treatment] for treatment in missing}, keeps_files))
+            treatments = tuple(one for one in case.settings.treatments if one.name in missing)
+            shorter = replace(case, settings=replace(case.settings, treatments=treatments))
+            tasks.append(Task(shorter, folder, {one.name: keys[one.name] for one in treatments}, keeps_files))
     return tasks
 
 

@@ -140,8 +140,8 @@ def read_treatment(text: str) -> Treatment:
             Implant(
                 device if count == 0 else f"{device}_{count + 1}",
                 device,
-                diameter and float(diameter),
-                length and float(length),
+                float(diameter) if diameter else None,
+                float(length) if length else None,
                 Placing(shift_mm=float(shift or 0.0)),
                 tuple(one.id for one in implants),
             )

@@ -87,7 +87,7 @@ def cohort_report(name: str, rows: Sequence[Row], pictures: Mapping[tuple[str, s
     Parameters
     ----------
     name : name of the cohort.
-    rows : one row per case and treatment, with ``case``, ``treatment``, ``outcome``, ``stage``, ``sentence`` and metrics.
+    rows : one row per case and treatment, with ``case``, ``treatment``, ``outcome``, ``stage``, ``sentence``, metrics.
     pictures : pictures of the deployed treatments as WebP, by case and treatment.
 
     Returns
@@ -214,7 +214,7 @@ def distribution(rows: Sequence[Row], treatment: str, key: str) -> Distribution:
 
 
 def _strip(found: Sequence[tuple[str, float]], key: str, span: tuple[float, float]) -> str:
-    """Return an SVG strip plot: a point per case on the range `span` of all treatments, and a box over the quartiles."""
+    """Return an SVG strip plot: a point per case on the range `span` of all treatments, a box over the quartiles."""
     low, high = span
     per_unit = (WIDTH - 2 * EDGE) / (high - low) if high > low else 0.0
     at = [EDGE + (value - low) * per_unit for _, value in found]

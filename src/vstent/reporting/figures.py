@@ -1,6 +1,7 @@
 """Render pictures of a scene without a graphics library: a depth buffer for the geometry, Pillow for the labels."""
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np

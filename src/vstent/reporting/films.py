@@ -86,7 +86,7 @@ def shown_of(
     found = {}
     for name, film in films_of(histories, projectors, settings).items():
         shadows = [wire_shadow(view, stent) for stent in stents.get(name, ()) if settings.has_wires]
-        wires = np.sum(shadows, axis=0, dtype=np.float32) if shadows else None
+        wires = np.sum(np.stack(shadows), axis=0) if shadows else None
         vessel = projectors[name](np.ones(histories[name].stored.shape[1])) if settings.has_vessel else None
         found[name] = Shown(titles[name], film, wires, vessel)
     return found

@@ -90,8 +90,8 @@ def run(
     Raises
     ------
     InputError
-        An input or option cannot be used, no treatment fits, or the folder holds results that this run would invalidate;
-        nothing has been written.
+        An input or option cannot be used, no treatment fits, or the folder holds results that this run would
+        invalidate; nothing has been written.
     FlowError
         The flow in the bare artery could not be computed; everything before it is kept.
     FolderError

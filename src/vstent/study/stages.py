@@ -20,9 +20,9 @@ from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.measure import measure
 from vstent.devices.catalogue import find_design, find_sizes
 from vstent.devices.design import Size
-from vstent.devices.treatment import BARE, Implant, Treatment
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
+from vstent.devices.treatment import BARE, Implant, Treatment
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, VstentError
 from vstent.flow.beside import Beside
 from vstent.flow.case import FlowCase, FlowField, FlowSettings
@@ -38,8 +38,8 @@ from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
 from vstent.plan.uncertainty import Uncertainty, vary
 from vstent.study.checkpoint import FlowCheckpoint
-from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of, vessel_key
 from vstent.study.folder import flow_folder
+from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of, vessel_key
 from vstent.study.outputs import write_field
 from vstent.study.types import Point, Settings
 from vstent.study.written import code_key
@@ -121,7 +121,9 @@ def _find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger, k
     if outlet_mm is not None:
         opening_at(whole, outlet_mm)  # checked before trimming, which may cut this outlet off
     with ledger.stage("trim") as tell:
-        traced = trim(whole, at_mm=at_mm, upstream_mm=settings.anatomy.upstream_mm, downstream_mm=settings.anatomy.downstream_mm)
+        traced = trim(
+            whole, at_mm=at_mm, upstream_mm=settings.anatomy.upstream_mm, downstream_mm=settings.anatomy.downstream_mm
+        )
         tell(" ".join(traced.notes[len(whole.notes) :]))
     with ledger.stage("restore") as tell:
         anatomy = restore(traced, at_mm=_array(settings.anatomy.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
@@ -222,7 +224,7 @@ def _deployed(
 
 
 def stage_name(treatment: Treatment, implant: Implant) -> str:
-    """Return the name of an implant in the names of stages: that of its treatment, with its own where it has several."""
+    """Return the name of an implant in names of stages: that of its treatment, and its own beside others."""
     return treatment.name if len(treatment.implants) == 1 else f"{treatment.name} {implant.id}"
 
 
@@ -449,9 +451,7 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
     return found
 
 
-def _plan(
-    anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings: FlowSettings, ledger: Ledger
-) -> None:
+def _plan(anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings: FlowSettings, ledger: Ledger) -> None:
     """Report run time and memory of the flows by treatment; an error is raised where one does not fit in the memory."""
     with ledger.stage("plan flow") as tell:
         costs = {name: foretell_cost(flow_case(anatomy, found, settings)) for name, found in stents.items()}
