@@ -8,8 +8,11 @@ from pathlib import Path
 import pytest
 
 import vstent
-from vstent import cli, flow
+from vstent import cli
 from vstent.flow import simulation
+from vstent.flow.indices import indices
+from vstent.flow.ostium import ostium
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.study import demo
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
@@ -21,15 +24,16 @@ def blocks(language: str) -> list[str]:
 
 def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     demo.write_scan(tmp_path / "3dra")
-    coarse = flow.FlowSettings(cell_size_mm=0.4, max_steps=1200)
-    monkeypatch.setattr(simulation, "simulate", partial(flow.simulate, settings=coarse))
+    coarse = FlowSettings(numerics=Numerics(cell_size_mm=0.4, max_steps=1200))
+    monkeypatch.setattr(simulation, "simulate", partial(simulation.simulate, settings=coarse))
     monkeypatch.chdir(tmp_path)
     (example,) = blocks("python")
     names = {}
     exec(compile(example, "README.md", "exec"), names)
     anatomy = names["anatomy"]
-    sac, ostium = anatomy.aneurysms[0].sac, flow.ostium(anatomy.aneurysms[0], anatomy.vessel.lumen)
-    before, after = (flow.indices(names[k], sac, ostium) for k in ("before", "after"))
+    largest = anatomy.aneurysms[0]
+    shapes = largest.sac, ostium(largest, anatomy.vessel.lumen)
+    before, after = (indices(names[k], *shapes) for k in ("before", "after"))
     assert before["neck_outflow_mL_s"] == pytest.approx(before["neck_inflow_mL_s"], rel=0.1)
     assert after["mean_sac_velocity_m_s"] < before["mean_sac_velocity_m_s"]
 

@@ -12,9 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import vstent
-from vstent.flow.case import FlowSettings
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.phantoms import Scanner, demo_phantom, scan
 
 phantom = demo_phantom()
@@ -60,7 +60,7 @@ axes.legend()
 # %%
 # The flow before and after, on cells far too coarse for a result (0.45 mm) but quick.
 
-settings = FlowSettings(cell_size_mm=0.45)
+settings = FlowSettings(numerics=Numerics(cell_size_mm=0.45))
 before, after = vstent.simulate(anatomy, [None, deployment.stent], settings)
 shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen))
 ratios = compare(indices(before, *shapes), indices(after, *shapes))

@@ -10,14 +10,14 @@ import numpy as np
 from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Stent
 from vstent.errors import FlowError, InputError, ReadError
-from vstent.flow.case import FlowCase, FlowSettings
+from vstent.flow.case import FlowCase
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.openfoam import program
 from vstent.flow.openfoam.case import FoamCase, foam_case, strut_solids
 from vstent.flow.openfoam.folder import write
 from vstent.flow.openfoam.patches import named_patches, stl_text
 from vstent.flow.openfoam.setup import Flavour, FoamSetup
-from vstent.flow.simulation import flow_case
+from vstent.flow.problem import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.io import writers
 from vstent.io.archive import load_data
@@ -63,7 +63,7 @@ def export_openfoam(
     ledger = Ledger(out / CACHE, progress)
     anatomy = _anatomy(path, settings, ledger)
     check_inflow(anatomy, settings.flow)
-    case = flow_case(anatomy, _stent(path, anatomy, settings, ledger), settings.flow or FlowSettings())
+    case = flow_case(anatomy, _implants(path, anatomy, settings, ledger), settings.flow)
     setup = FoamSetup(default_cell_size_mm(case))
     setup = replace(setup, **{"flavour": _flavour_here(), **foam}, struts=strut_solids(case))
     with ledger.stage("export") as tell:
@@ -92,7 +92,7 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: Progress
         An input or option cannot be used; nothing has been written.
     """
     ledger = Ledger(out / CACHE, progress)
-    case = flow_case(_anatomy(path, settings, ledger), None, FlowSettings())
+    case = flow_case(_anatomy(path, settings, ledger))
     with ledger.stage("export") as tell:
         patches, _ = named_patches(case)
         patch_id = np.zeros(len(patches[0].surface.faces), dtype=np.int32)
@@ -133,15 +133,15 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
     return anatomy
 
 
-def _stent(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Stent | None:
-    """Return the first device with the size and position of the case folder's own run, or as proposed."""
+def _implants(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> tuple[Stent, ...]:
+    """Return the first device, if any, with the size and position of the case folder's own run, or as proposed."""
     if not settings.devices:
-        return None
+        return ()
     name = settings.devices[0]
     with ledger.stage(f"deploy {name}") as tell:
         deployment = deploy_one(find_design(name), anatomy, _told(path, settings).placing(name))
         tell(deployment.advice)
-    return deployment.stent
+    return (deployment.stent,)
 
 
 def _told(path: Path, settings: Settings) -> Settings:

@@ -26,12 +26,14 @@ from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, VstentError
 from vstent.flow.beside import Beside
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.grade import QUALITY, computation_of, grade
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
-from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
+from vstent.flow.problem import flow_case, vessel_case
+from vstent.flow.settings import FlowSettings
+from vstent.flow.simulation import foretell_cost, simulate_case
 from vstent.geometry.image import Image
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
@@ -287,7 +289,7 @@ def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
     """
     if flow is None or flow.inflow_mL_s is None:
         return
-    case = FlowCase(anatomy.vessel, settings=flow)
+    case = vessel_case(anatomy.vessel, flow)
     for inlet, part_mL_s, speed_m_s in zip(case.vessel.inlets, case.inlets_mL_s, case.inlet_speeds_m_s, strict=True):
         if not SLOWEST_M_S <= speed_m_s <= FASTEST_M_S:
             raise InputError(
@@ -301,7 +303,7 @@ def engine_folders(out: Path, settings: Settings) -> dict[str, Path]:
     """Return the folder of the engine's own files for every flow, by name; empty where no flow is computed."""
     if settings.flow is None:
         return {}
-    return {name: out / "flow" / name / settings.flow.engine for name in (BARE, *settings.devices)}
+    return {name: out / "flow" / name / settings.flow.numerics.engine for name in (BARE, *settings.devices)}
 
 
 def compute_flows(
@@ -343,7 +345,7 @@ def compute_flows(
     failures: dict[str, str] = {}
     folders = engine_folders(out, settings)
     stored = []
-    with Beside(settings.flow) as beside:
+    with Beside(settings.flow.numerics) as beside:
         for name in (BARE, *(name for name in deployments if name not in settings.without_flow)):
             stent = None if name == BARE else deployments[name].stent
             stage, key = f"flow {name}", flow_key(source, settings, name, stent.design if stent else None)
@@ -354,7 +356,7 @@ def compute_flows(
                 try:
                     with ledger.stage(stage) as tell:
                         field = simulate_case(
-                            flow_case(anatomy, stent, settings.flow),
+                            flow_case(anatomy, () if stent is None else (stent,), settings.flow),
                             start=fields.get(BARE),
                             folder=folders[name],
                             progress=ledger.teller(stage),
@@ -415,8 +417,8 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
             done.append(sentence)
             ledger.progress("convergence", 0.99 * fraction, sentence)
 
-        folder = out / "flow" / "convergence" / flow.engine
-        found = convergence(flow_case(anatomy, None, flow), folder=folder, told=told)
+        folder = out / "flow" / "convergence" / flow.numerics.engine
+        found = convergence(flow_case(anatomy, (), flow), folder=folder, told=told)
         tell(" ".join(done))
     return found
 
@@ -424,9 +426,11 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
 def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings, ledger: Ledger) -> None:
     """Report run time and memory of the flows; an error is raised where one does not fit in the memory."""
     with ledger.stage("plan flow") as tell:
-        bare = flow_case(anatomy, None, settings)
+        bare = flow_case(anatomy, (), settings)
         said = foretell_cost(bare)
-        costs = {name: foretell_cost(replace(bare, stent=over_restored(one, anatomy))) for name, one in stents.items()}
+        costs = {
+            name: foretell_cost(replace(bare, solids=(over_restored(one, anatomy),))) for name, one in stents.items()
+        }
         tell(" ".join([said, *(f"Behind {name}, {cost}" for name, cost in costs.items() if cost != said)]))
 
 
@@ -510,7 +514,7 @@ def measure_all(
     found = {"vessel": morphology(anatomy), "stents": stents}
     if not flow:
         return found
-    case = flow_case(anatomy, None, settings)
+    case = flow_case(anatomy, (), settings)
     quality = {name: _quality(case, field, flow[name]) for name, field in fields.items()}
     return found | {BARE: flow[BARE] | left[BARE], QUALITY: quality}
 

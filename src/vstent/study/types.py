@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from vstent.devices.stent import Deployment
-from vstent.flow.case import FlowField, FlowSettings
+from vstent.flow.case import FlowField
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.plan.uncertainty import Ranges
 
