@@ -24,10 +24,10 @@ from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.flow.case import Blood
+from vstent.flow.settings import Blood
 from vstent.flow.domain import build
 from vstent.flow.lattice.screen import on_grid
-from vstent.flow.screen import screen
+from vstent.flow.media import media
 from vstent.geometry.vessel import Vessel
 
 anatomy = restore(trim(trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))))
@@ -35,7 +35,7 @@ stent = vstent.deploy(vstent.find_design("{device}"), anatomy).stent
 grid = build(anatomy.vessel, 0.17)
 for _ in range(2):
     began = process_time()
-    made = screen(stent, Blood())
+    made = media(stent, Blood())
     on_grid(made, grid.index, grid.origin_mm, grid.cell_size_mm)
     took = process_time() - began
 print("SECONDS", took)
@@ -45,13 +45,14 @@ STEPS = """
 from time import process_time
 from vstent import phantoms
 from vstent.anatomy.trace import trace
-from vstent.flow.case import FlowCase, FlowSettings
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import FlowSettings
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.stepping import advance
 from vstent.geometry.vessel import Vessel
 
 vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=30.0, radius_mm=2.0))))
-state = LatticeBoltzmann(0.1).init(FlowCase(vessel, settings=FlowSettings(inflow_mL_s=0.5)), None)
+state = LatticeBoltzmann(0.1).init(vessel_case(vessel, FlowSettings(inflow_mL_s=0.5)), None)
 took = []
 for _ in range(6):
     began = process_time()

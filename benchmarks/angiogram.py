@@ -22,9 +22,11 @@ from vstent.angiography.network import Network
 from vstent.angiography.transport import Transport
 from vstent.angiography.washout import wash_out
 from vstent.flow import sampling
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.indices import indices
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.archive import load_data
 from vstent.kernels.arrays import Floats, Ints
@@ -56,7 +58,7 @@ def main() -> None:
                 if path.stem.endswith(".running"):
                     continue
                 name = path.stem.split("-")[0].removeprefix("flow ")
-                ages(f"{folder.name} {name}", flow_case(anatomy, None), load_data(path, FlowField))
+                ages(f"{folder.name} {name}", flow_case(anatomy, ()), load_data(path, FlowField))
         else:
             demo(float(word))
 
@@ -65,7 +67,7 @@ def demo(spacing_mm: float) -> None:
     """Compute the flow in the demo's artery on one grid, and report its ages and the times of an injection."""
     surface = phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.25)
     anatomy = restore(trace(Vessel(surface)))
-    case = flow_case(anatomy, None, FlowSettings(cell_size_mm=spacing_mm))
+    case = flow_case(anatomy, (), FlowSettings(numerics=Numerics(cell_size_mm=spacing_mm)))
     field = simulate_case(case)
     ages(f"demo {spacing_mm:g} mm", case, field)
     began, busy = time.perf_counter(), time.process_time()

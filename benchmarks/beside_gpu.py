@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import vstent
 from flow import anatomy_of
-from vstent.flow.case import FlowField, FlowSettings
+from vstent.flow.case import FlowField
 from vstent.flow.engines import Outcome
 from vstent.flow.grade import grade
 from vstent.flow.indices import indices
@@ -23,7 +23,8 @@ from vstent.flow.lattice import packing, settling, stepping
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.reading import field_of, read
 from vstent.flow.lattice.state import State
-from vstent.flow.simulation import flow_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.geometry.vessel import Anatomy
 from vstent.study.ledger import Ledger
 from vstent.study.outputs import write_field
@@ -54,9 +55,9 @@ def result_of(state: State) -> FlowField:
 
 
 def table(anatomy: Anatomy, spacing_mm: float) -> None:
-    settings, engine = FlowSettings(cell_size_mm=spacing_mm), LatticeBoltzmann(spacing_mm)
+    settings, engine = FlowSettings(numerics=Numerics(cell_size_mm=spacing_mm)), LatticeBoltzmann(spacing_mm)
     stent = vstent.deploy(vstent.find_design("silk"), anatomy).stent
-    bare = flow_case(anatomy, None, settings)
+    bare = flow_case(anatomy, (), settings)
     print("| work of the processor | s |\n|---|---|")
     timed("grid and distances from the wall", lambda: engine.prepare(bare))
     before = engine.init(bare, None)
@@ -65,7 +66,7 @@ def table(anatomy: Anatomy, spacing_mm: float) -> None:
     before.snapshots.append(stepping.snapshot(before))
     before.loop_seconds = 1.0
     start = result_of(before)
-    case = timed("screen of Silk", lambda: flow_case(anatomy, stent, settings))
+    case = timed("screen of Silk", lambda: flow_case(anatomy, (stent,), settings))
     state = timed("links, screen on the grid, monitored places, initial flow", lambda: engine.init(case, start))
     timed("tables of the GPU, later flow", lambda: packing.pack(state))
     state.loop_seconds = 1.0

@@ -23,12 +23,14 @@ from vstent.anatomy.repair import repair
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.engines import Progress
 from vstent.flow.indices import indices
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.stepping import advance
-from vstent.flow.simulation import flow_case, simulate, simulate_case
+from vstent.flow.problem import flow_case, vessel_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate, simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
@@ -74,7 +76,7 @@ def throughput(vessel: Vessel, cell_mm: float) -> tuple[int, float, float]:
     The share of the bandwidth goes by processor seconds: the bandwidth is measured in bursts that nothing interrupts.
     """
     began = time.process_time()
-    case = FlowCase(vessel, settings=FlowSettings(inflow_mL_s=INFLOW_ML_S))
+    case = vessel_case(vessel, FlowSettings(inflow_mL_s=INFLOW_ML_S))
     state = LatticeBoltzmann(cell_mm).init(case, None)
     setup_s = time.process_time() - began
     advance(state, STEPS)
@@ -121,19 +123,21 @@ def cost(surface: Path | None, *, close_up: bool) -> None:
     """Print what an artery takes, steady, bare and with both devices."""
     anatomy = anatomy_of(surface)
     deployments = [None, *(vstent.deploy(name, anatomy) for name in ("silk", "enterprise"))]
-    settings = FlowSettings(cell_size_mm=0.1, close_up=close_up)
+    settings = FlowSettings(numerics=Numerics(cell_size_mm=0.1, close_up=close_up))
     began, began_core = time.perf_counter(), time.process_time()
     fields = simulate(anatomy, deployments, settings, progress=tell)
     clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
     print(f"\n{named(surface, close_up=close_up)}:\n")
-    case = flow_case(anatomy, None, settings)
+    case = flow_case(anatomy, (), settings)
     table(case, dict(zip(("bare", "silk", "enterprise"), fields, strict=True)), clock_s, core_s)
 
 
 def pulse(surface: Path | None, *, close_up: bool) -> None:
     """Print what two cycles take in an artery."""
-    settings = FlowSettings(cell_size_mm=0.1, waveform=OLDER_ADULT_ICA, max_cycles=2, close_up=close_up)
-    case = flow_case(anatomy_of(surface), None, settings)
+    settings = FlowSettings(
+        waveform=OLDER_ADULT_ICA, numerics=Numerics(cell_size_mm=0.1, max_cycles=2, close_up=close_up)
+    )
+    case = flow_case(anatomy_of(surface), (), settings)
     began, began_core = time.perf_counter(), time.process_time()
     field = simulate_case(case, progress=tell)
     clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
@@ -185,8 +189,8 @@ def errors(field: FlowField, length_mm: float) -> tuple[float, float, float]:
 
 
 def poiseuille(cell_mm: float, length_mm: float = 12.0) -> None:
-    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=cell_mm, tolerance=1e-3)
-    field = simulate_case(FlowCase(tube(length_mm), settings=settings))
+    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, numerics=Numerics(cell_size_mm=cell_mm, tolerance=1e-3))
+    field = simulate_case(vessel_case(tube(length_mm), settings))
     velocity, pressure, stress = errors(field, length_mm)
     print(
         f"| {2 * RADIUS_MM / cell_mm:.0f} | {100 * velocity:.2f} % | {100 * pressure:+.2f} % | {100 * stress:+.2f} % "

@@ -36,7 +36,7 @@ from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.errors import FlowError
 from vstent.flow import domain
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.engines import Progress
 from vstent.flow.indices import indices
 from vstent.flow.lattice.engine import LatticeBoltzmann
@@ -44,7 +44,9 @@ from vstent.flow.lattice.gpu import gpu_name, require_gpu
 from vstent.flow.lattice.recording import Pairs
 from vstent.flow.lattice.state import DEFER_PAIRS, State
 from vstent.flow.lattice.stepping import advance, snapshot
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case, vessel_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
@@ -61,7 +63,7 @@ NAN = float("nan")
 Part = TypeVar("Part")
 PATIENCE = 1.5
 """A whole flow is stopped when it has taken this many times its goal."""
-WHOLE = FlowSettings(cell_size_mm=0.1)
+WHOLE = FlowSettings(numerics=Numerics(cell_size_mm=0.1))
 """Settings of whole flows."""
 
 
@@ -99,7 +101,15 @@ class Found:
     same: bool | None = None
 
 
-TINY = Extent((0.4,), 1, Pairs.CORRECTED, 1.0, 1, 1 << 9, FlowSettings(cell_size_mm=0.4, max_steps=4, inflow_mL_s=0.3))
+TINY = Extent(
+    (0.4,),
+    1,
+    Pairs.CORRECTED,
+    1.0,
+    1,
+    1 << 9,
+    FlowSettings(inflow_mL_s=0.3, numerics=Numerics(cell_size_mm=0.4, max_steps=4)),
+)
 
 
 def is_simulated() -> bool:
@@ -147,8 +157,8 @@ def bandwidth_GB_s(extent: Extent, *, in_place: bool) -> float:
 
 
 def state_of(case: FlowCase, spacing_mm: float, *, on_gpu: bool) -> State:
-    settings = replace(case.settings, device_gpu=on_gpu, cell_size_mm=spacing_mm)
-    return LatticeBoltzmann(spacing_mm).init(replace(case, settings=settings), None)
+    numerics = replace(case.numerics, device_gpu=on_gpu, cell_size_mm=spacing_mm)
+    return LatticeBoltzmann(spacing_mm).init(replace(case, numerics=numerics), None)
 
 
 def kernel_times(state: State, rounds: int, pairs: Pairs) -> dict[str, tuple[int, float, float]]:
@@ -242,14 +252,14 @@ def timed(name: str, goal_s: float, compute: Callable[[Callable[[Progress], None
 
 def steady_flows(cases: list[FlowCase], settings: FlowSettings) -> float:
     """Print and return the run time of steady flows, set-up included."""
-    on_gpu = replace(settings, device_gpu=True)
+    on_gpu = replace(settings.numerics, device_gpu=True)
     print("\n| whole flows | run time | steps on the finest grid | billion updates/s |\n|---|---|---|---|")
 
     def steady(tell: Callable[[Progress], None]) -> tuple[FlowField, ...]:
         fields: list[FlowField] = []
         for case in cases:
             start = fields[0] if fields else None
-            fields.append(simulate_case(replace(case, settings=on_gpu), start=start, progress=tell))
+            fields.append(simulate_case(replace(case, numerics=on_gpu), start=start, progress=tell))
         return tuple(fields)
 
     return timed(f"{len(cases)} steady flows", STEADY_GOAL_S, steady)
@@ -257,11 +267,12 @@ def steady_flows(cases: list[FlowCase], settings: FlowSettings) -> float:
 
 def two_cycles(case: FlowCase, settings: FlowSettings) -> float:
     """Print and return the run time of two cycles, set-up included."""
-    pulse = replace(settings, device_gpu=True, waveform=OLDER_ADULT_ICA, max_cycles=2)
+    numerics = replace(settings.numerics, device_gpu=True, max_cycles=2)
+    pulse = replace(case, waveform=OLDER_ADULT_ICA, numerics=numerics)
     return timed(
         "two cycles, bare",
         CYCLES_GOAL_S,
-        lambda tell: (simulate_case(replace(case, settings=pulse), progress=tell),),
+        lambda tell: (simulate_case(pulse, progress=tell),),
     )
 
 
@@ -279,7 +290,7 @@ def agreement(case: FlowCase, settings: FlowSettings) -> tuple[float, bool]:
     """Print and return the largest relative difference from the processor, and whether two runs have the same bits."""
     with stopped_after(left_s()) as tell:
         gpu, again, here = (
-            simulate_case(replace(case, settings=replace(settings, device_gpu=on_gpu)), progress=tell)
+            simulate_case(replace(case, numerics=replace(settings.numerics, device_gpu=on_gpu)), progress=tell)
             for on_gpu in (True, True, False)
         )
     wanted, found = measures(here, case), measures(gpu, case)
@@ -288,7 +299,9 @@ def agreement(case: FlowCase, settings: FlowSettings) -> tuple[float, bool]:
         for name in ("velocity_m_s", "pressure_Pa", "wall_shear_stress_Pa", "residual")
     )
     difference = float(np.abs(found / wanted - 1).max())
-    print(f"\nAgreement at {settings.cell_size_mm} mm (inflow, velocity, stress): processor {wanted}, GPU {found}")
+    print(
+        f"\nAgreement at {settings.numerics.cell_size_mm} mm (inflow, velocity, stress): processor {wanted}, GPU {found}"
+    )
     print(
         f"Largest difference {difference:.1e}; two runs on the GPU: {'same' if same else 'different'} bits", flush=True
     )
@@ -326,14 +339,14 @@ def anatomy_of(surface: Path | None) -> Anatomy:
 
 def cases_of(anatomy: Anatomy, settings: FlowSettings) -> list[FlowCase]:
     """The flow bare, with Silk and with Enterprise."""
-    stents = [None, *(vstent.deploy(vstent.find_design(name), anatomy).stent for name in ("silk", "enterprise"))]
-    return [flow_case(anatomy, stent, settings) for stent in stents]
+    stents = [(vstent.deploy(vstent.find_design(name), anatomy).stent,) for name in ("silk", "enterprise")]
+    return [flow_case(anatomy, implants, settings) for implants in ((), *stents)]
 
 
 def tiny_cases(settings: FlowSettings) -> list[FlowCase]:
     domain.MIN_CELLS = 50  # the simulator is slow
     tube = phantoms.phantom_surface(phantoms.tube(length_mm=2.4, radius_mm=0.8))
-    return [FlowCase(trace(Vessel(tube)), settings=settings)]
+    return [vessel_case(trace(Vessel(tube)), settings)]
 
 
 def about() -> str:

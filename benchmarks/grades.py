@@ -21,10 +21,11 @@ from vstent.anatomy.repair import repair
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.flow.case import FlowSettings
 from vstent.flow.grade import GOOD, NOT_USABLE, grade_of, measures_of
 from vstent.flow.indices import indices
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.phantoms import Phantom
@@ -73,19 +74,20 @@ def anatomy_of(name: str) -> Anatomy:
 def compute(name: str, rows: dict[str, dict[str, Any]]) -> None:
     """Compute the missing flows of a vessel, coarse grids first, and keep each at once."""
     anatomy = anatomy_of(name)
-    stents = {"bare": None} | {one: vstent.deploy(vstent.find_design(one), anatomy).stent for one in DEVICES}
+    implants = {one: (vstent.deploy(vstent.find_design(one), anatomy).stent,) for one in DEVICES}
+    implants = {"bare": (), **implants}
     for spacing_mm in SPACINGS_MM[name]:
         bare = None
-        for device, stent in stents.items():
+        for device, deployed in implants.items():
             key = f"{name} {spacing_mm} {device}"
             if key in rows and device != "bare":
                 continue
-            if all(f"{name} {spacing_mm} {one}" in rows for one in stents):
+            if all(f"{name} {spacing_mm} {one}" in rows for one in implants):
                 continue
-            case = flow_case(anatomy, stent, FlowSettings(cell_size_mm=spacing_mm))
+            case = flow_case(anatomy, deployed, FlowSettings(numerics=Numerics(cell_size_mm=spacing_mm)))
             began = time.perf_counter()
             field = simulate_case(case, start=bare)
-            bare = field if stent is None else bare
+            bare = bare if deployed else field
             found = indices(field, case.sac, case.ostium)
             row = measures_of(case, field, found) | {"seconds": time.perf_counter() - began}
             rows[key] = row | {one: found[one] for one in ("neck_inflow_mL_s", "mean_sac_velocity_m_s")}

@@ -22,11 +22,11 @@ from grades import SPACINGS_MM, anatomy_of
 import vstent
 from vstent.app.preview import ERROR_POINTS, SHOWN_POINTS, Preview, shelf_of
 from vstent.devices.stent import Landing, Stent
-from vstent.flow.case import FlowSettings
 from vstent.flow.indices import indices
 from vstent.flow.lattice.live import LiveFlow
-from vstent.flow.screen import screen
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Anatomy
 
 DEVICES = ("silk", "enterprise", "pipeline")
@@ -77,12 +77,12 @@ def moved(anatomy: Anatomy, stent: Stent) -> Stent:
 
 def full(anatomy: Anatomy, stents: dict[str, Stent]) -> dict[str, float]:
     """Return the change of the neck inflow on the default grid in percent, by device."""
-    case = flow_case(anatomy, None, FlowSettings())
+    case = flow_case(anatomy, (), FlowSettings())
     bare = simulate_case(case)
     before = indices(bare, case.sac, case.ostium)["neck_inflow_mL_s"]
     found = {}
     for name, stent in stents.items():
-        one = flow_case(anatomy, stent, FlowSettings())
+        one = flow_case(anatomy, (stent,), FlowSettings())
         now = indices(simulate_case(one, start=bare), one.sac, one.ostium)["neck_inflow_mL_s"]
         found[name] = 100 * (now / before - 1)
     return found
@@ -165,14 +165,14 @@ def main() -> None:
         reference = full(anatomy, stents) if given.reference else {}
         for device, stent in stents.items():
             began = perf_counter()
-            live = LiveFlow(flow_case(anatomy, None, FlowSettings()))
+            live = LiveFlow(flow_case(anatomy, (), FlowSettings()))
             times = [perf_counter()]
-            made = screen(stent, live.case.blood)
+            made = media(stent, live.case.blood)
             times.append(perf_counter())
             live.place(made)
             times.append(perf_counter())
             found = [(times[2] - began + seconds, *rest) for seconds, *rest in course(live, given.longest)]
-            live.place(screen(moved(anatomy, stent), live.case.blood))
+            live.place(media(moved(anatomy, stent), live.case.blood))
             after = course(live, given.longest)
             end, first = found[-1][1], known(found, SHOWN_POINTS)
             whole = f"{reference[device]:.0f} %" if reference else ""

@@ -22,18 +22,19 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.errors import FlowError
-from vstent.flow.case import FlowCase, FlowSettings
+from vstent.flow.case import FlowCase
 from vstent.flow.engines import run
 from vstent.flow.indices import indices
 from vstent.flow.openfoam import program
 from vstent.flow.openfoam.engine import OpenFoam
-from vstent.flow.simulation import flow_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Vessel
 
 
 def row(name: str, case: FlowCase, cell_size_mm: float, processes: int, folder: Path) -> float:
     """Mesh and compute, print a row of the table; return the solver's seconds an iteration."""
-    case = replace(case, settings=replace(case.settings, processes=processes))
+    case = replace(case, numerics=replace(case.numerics, processes=processes))
     engine = OpenFoam(cell_size_mm, folder)
     began = time.perf_counter()
     cells = engine.init(case, None).bridge.n_cells
@@ -56,8 +57,8 @@ def main(cell_mm: float, struts_cell_mm: float, folder: Path | None) -> int:
         print(f"Not measured: {error}.")
         return 0
     anatomy = restore(trim(trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))))
-    bare = flow_case(anatomy, None, FlowSettings())
-    stented = flow_case(anatomy, vstent.deploy(vstent.find_design("silk"), anatomy).stent, FlowSettings())
+    bare = flow_case(anatomy, (), FlowSettings())
+    stented = flow_case(anatomy, (vstent.deploy(vstent.find_design("silk"), anatomy).stent,), FlowSettings())
     print(
         "| demo | processes | cells | iterations | settled | mesh s | an iteration s | together min | GB "
         f"| neck inflow mL/s | sac velocity mm/s |\n{11 * '|---'}|"

@@ -28,7 +28,7 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.flow import sampling
-from vstent.flow.case import PHASES, FlowCase, FlowField, FlowSettings
+from vstent.flow.case import PHASES, FlowCase, FlowField
 from vstent.flow.engines import Outcome
 from vstent.flow.indices import indices
 from vstent.flow.lattice.engine import LatticeBoltzmann
@@ -36,7 +36,9 @@ from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
 from vstent.flow.lattice.reading import field_of, read
 from vstent.flow.lattice.stepping import snapshot
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case, vessel_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.vessel import Vessel
 
@@ -129,7 +131,7 @@ def computed(judged: Judged, form: Format | None, *, shifted: bool) -> dict[str,
         while len(state.history) < judged.checks:
             judged.engine.step(state)
     outcome = Outcome(is_converged=True, residual=(0.0,) * judged.checks, seconds=0.0, loop_seconds=0.0)
-    if judged.case.settings.waveform is not None:
+    if judged.case.waveform is not None:
         return judged.quantities(judged.engine.result(state, outcome))
     return judged.quantities(field_of(state, read(state, [state.snapshots[-1]]), outcome, 0.0, ""))
 
@@ -145,9 +147,9 @@ def demo(cell_mm: float, checks: int, *, pulse: bool = False) -> Judged:
     """Return the demo with Silk, from the converged flow at twice the spacing."""
     anatomy = restore(trim(trace(Vessel(phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.2)))))
     stent = vstent.deploy(vstent.find_design("silk"), anatomy).stent
-    coarse = simulate_case(flow_case(anatomy, stent, FlowSettings(cell_size_mm=2 * cell_mm)))
-    settings = FlowSettings(cell_size_mm=cell_mm, waveform=OLDER_ADULT_ICA if pulse else None)
-    case = flow_case(anatomy, stent, settings)
+    coarse = simulate_case(flow_case(anatomy, (stent,), FlowSettings(numerics=Numerics(cell_size_mm=2 * cell_mm))))
+    settings = FlowSettings(waveform=OLDER_ADULT_ICA if pulse else None, numerics=Numerics(cell_size_mm=cell_mm))
+    case = flow_case(anatomy, (stent,), settings)
     engine = PulsatileLatticeBoltzmann(cell_mm) if pulse else LatticeBoltzmann(cell_mm)
     return Judged(engine, case, coarse, checks, lambda field: of_sac(case, field))
 
@@ -156,8 +158,10 @@ def jet() -> Judged:
     """Return the nozzle at the flow and on the grid of the test of round jets."""
     from test_fda_nozzle import BLOOD, INFLOW_ML_S, nozzle
 
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=0.4 * INFLOW_ML_S, cell_size_mm=0.5, lattice_speed=0.04)
-    return Judged(LatticeBoltzmann(0.5), FlowCase(nozzle(14.0), settings=settings), None, 24, of_jet)
+    settings = FlowSettings(
+        blood=BLOOD, inflow_mL_s=0.4 * INFLOW_ML_S, numerics=Numerics(cell_size_mm=0.5, lattice_speed=0.04)
+    )
+    return Judged(LatticeBoltzmann(0.5), vessel_case(nozzle(14.0), settings), None, 24, of_jet)
 
 
 def of_jet(field: FlowField) -> dict[str, float]:

@@ -20,14 +20,16 @@ from grades import anatomy_of
 import vstent
 from vstent.errors import FlowError
 from vstent.flow import simulation
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.engines import Outcome, run, stepped
 from vstent.flow.indices import indices
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.state import TOO_FAST, State
 from vstent.flow.lattice.stepping import snapshot
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 
 CASES = {
     "demo 0.3": ("demo", 0.3),
@@ -76,19 +78,19 @@ def extrapolated(engine: LatticeBoltzmann, case: FlowCase, start: FlowField | No
     What is known of the course before is dropped, because convergence is judged by a course without jumps.
     """
     state, residual, kept = engine.init(case, start), [np.inf], []
-    while len(residual) < engine.max_checks(state) and residual[-1] >= case.settings.tolerance:
+    while len(residual) < engine.max_checks(state) and residual[-1] >= case.numerics.tolerance:
         state, left = stepped(engine, state)
         if left is None:
             continue
         residual.append(left)
         kept.append(tuple(one.copy() for one in changing(state)))
-        if len(kept) == CYCLE and left >= case.settings.tolerance:
+        if len(kept) == CYCLE and left >= case.numerics.tolerance:
             if combine(state, kept[-SNAPSHOTS:]):
                 state.history.clear()
                 state.snapshots.clear()
                 state.blocks = ()
             kept = []
-    return engine.result(state, Outcome(residual[-1] < case.settings.tolerance, tuple(residual), 0.0, 0.0))
+    return engine.result(state, Outcome(residual[-1] < case.numerics.tolerance, tuple(residual), 0.0, 0.0))
 
 
 def changing(state: State) -> tuple[np.ndarray, ...]:
@@ -127,7 +129,7 @@ def values(case: FlowCase, field: FlowField) -> np.ndarray:
 
 def counted(case: FlowCase, start: FlowField | None, *, extrapolates: bool = False) -> tuple[float, FlowField]:
     """Return the steps and the flow of vstent's own way to begin."""
-    one = Counted(case.settings.cell_size_mm, extrapolates)
+    one = Counted(case.numerics.cell_size_mm, extrapolates)
     simulation.run = one.run
     try:
         found = simulate_case(case, start=start)
@@ -138,7 +140,7 @@ def counted(case: FlowCase, start: FlowField | None, *, extrapolates: bool = Fal
 
 def direct(case: FlowCase, start: FlowField | None) -> tuple[float, FlowField]:
     """Return the steps and the flow of a run on the grid itself."""
-    found = run(LatticeBoltzmann(case.settings.cell_size_mm), case, start=start)
+    found = run(LatticeBoltzmann(case.numerics.cell_size_mm), case, start=start)
     return found.steps, found
 
 
@@ -158,7 +160,7 @@ def compare(name: str) -> None:
     anatomy = anatomy_of(vessel)
     stents = {one: vstent.deploy(vstent.find_design(one), anatomy).stent for one in DEVICES}
     cases = {
-        one: flow_case(anatomy, stent, FlowSettings(cell_size_mm=spacing_mm))
+        one: flow_case(anatomy, (stent,), FlowSettings(numerics=Numerics(cell_size_mm=spacing_mm)))
         for one, stent in ({"bare": None} | stents).items()
     }
     fields: dict[str, FlowField] = {}
@@ -191,7 +193,7 @@ def show(
     ways: dict[str, Callable[[], tuple[float, FlowField]]],
 ) -> None:
     """Print the rows of one flow."""
-    _, reference = direct(replace(case, settings=replace(case.settings, tolerance=REFERENCE)), known)
+    _, reference = direct(replace(case, numerics=replace(case.numerics, tolerance=REFERENCE)), known)
     wanted = values(case, reference)
     for way, compute in ways.items():
         try:

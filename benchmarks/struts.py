@@ -31,12 +31,14 @@ from vstent.anatomy.trim import trim
 from vstent.deployment.struts import is_over_restored
 from vstent.devices.stent import Stent
 from vstent.flow import sampling
-from vstent.flow.case import OPENFOAM, FlowCase, FlowField, FlowSettings, Screen
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.engines import run
 from vstent.flow.indices import indices
 from vstent.flow.openfoam import setup
 from vstent.flow.openfoam.engine import OpenFoam
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import OPENFOAM, FlowSettings
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.phantoms import Phantom
@@ -65,26 +67,28 @@ def cases(names: list[str], phantom: Phantom) -> dict[str, tuple[FlowCase, FlowC
     whole = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.2)))
     anatomy = restore(trim(whole))
     short = trim(whole, upstream_mm=KEPT_MM, downstream_mm=KEPT_MM)
-    inflow_mL_s = flow_case(anatomy, None).inflow_mL_s
+    inflow_mL_s = flow_case(anatomy, ()).inflow_mL_s
     settings = FlowSettings(inflow_mL_s=inflow_mL_s)
-    stents = {"bare": None} | {name: vstent.deploy(vstent.find_design(name), anatomy).stent for name in names}
-    whole_cases = {name: replace(flow_case(anatomy, one, settings), vessel=short) for name, one in stents.items()}
-    return {name: (case, where_meshed(case, stents[name], anatomy)) for name, case in whole_cases.items()}
+    stents = {name: (vstent.deploy(vstent.find_design(name), anatomy).stent,) for name in names}
+    found = {}
+    for name, implants in {"bare": (), **stents}.items():
+        whole_case = replace(flow_case(anatomy, implants, settings), vessel=short)
+        parts = (where_meshed(sheet, one, anatomy) for sheet, one in zip(whole_case.media, implants, strict=True))
+        found[name] = whole_case, replace(whole_case, media=tuple(parts))
+    return found
 
 
-def where_meshed(case: FlowCase, stent: Stent | None, anatomy: Anatomy) -> FlowCase:
-    """The screen only where OpenFOAM meshes struts."""
-    if case.screen is None or stent is None:
-        return case
-    chosen = is_over_restored(stent, anatomy, case.screen.points_mm)
-    return replace(case, screen=Screen(**{one.name: getattr(case.screen, one.name)[chosen] for one in fields(Screen)}))
+def where_meshed(sheet: Sheet, stent: Stent, anatomy: Anatomy) -> Sheet:
+    """The sheet only where OpenFOAM meshes struts."""
+    chosen = is_over_restored(stent, anatomy, sheet.points_mm)
+    return Sheet(**{one.name: getattr(sheet, one.name)[chosen] for one in fields(Sheet)})
 
 
 def computed(
     case: FlowCase, start: FlowField | None, folder: Path | None = None, **changes: object
 ) -> tuple[FlowField, dict[str, float]]:
-    settings = replace(case.settings, **changes)
-    case, began = replace(case, settings=settings), time.perf_counter()
+    settings = replace(case.numerics, **changes)
+    case, began = replace(case, numerics=settings), time.perf_counter()
     if settings.engine == OPENFOAM:
         with nullcontext(folder) if folder is not None else TemporaryDirectory() as own:
             field = run(OpenFoam(settings.cell_size_mm, Path(own), layers=0), case, start=start)

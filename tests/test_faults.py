@@ -66,8 +66,8 @@ def replacing(source, target):
 os.replace = replacing
 flow = None
 if cell:
-    from vstent.flow import FlowSettings
-    flow = FlowSettings(cell_size_mm=float(cell))
+    from vstent.flow.settings import FlowSettings, Numerics
+    flow = FlowSettings(numerics=Numerics(cell_size_mm=float(cell)))
 settings = Settings(devices=("silk",), units="mm", flow=flow)
 run(pathlib.Path(path), pathlib.Path(out), settings, lambda stage, fraction, detail: die(f"{stage} {fraction:.0f}"))
 """

@@ -23,8 +23,9 @@ from vstent.deployment.deploy import deploy
 from vstent.devices import catalogue
 from vstent.devices.stent import Deployment, Landing
 from vstent.errors import DeviceError, PluginError
-from vstent.flow.case import FlowSettings
-from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import foretell_cost, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 
 API = Path(__file__).parents[1] / "docs" / "reference" / "api.rst"
@@ -198,7 +199,7 @@ def test_a_wall_is_plugged_in_and_gives_the_same_deployment(anatomy: Anatomy) ->
 
 @pytest.mark.usefixtures("distribution")
 def test_a_flow_engine_is_plugged_in(anatomy: Anatomy, tmp_path: Path) -> None:
-    case = flow_case(anatomy, None, FlowSettings(engine="still", cell_size_mm=3.0))
+    case = flow_case(anatomy, (), FlowSettings(numerics=Numerics(engine="still", cell_size_mm=3.0)))
     assert simulate_case(case) == ("still", 3.0, True)
     assert simulate_case(case, folder=tmp_path / "own") == ("still", 3.0, True)
     assert (tmp_path / "own" / "notes").read_text() == "still"
@@ -210,9 +211,9 @@ def test_plugins_that_are_not_there_are_named(anatomy: Anatomy) -> None:
     with pytest.raises(
         PluginError, match=r"no 'stil' in vstent.engines: choose one of lattice_boltzmann, openfoam, missing, still"
     ):
-        simulate_case(flow_case(anatomy, None, FlowSettings(engine="stil", cell_size_mm=3.0)))
+        simulate_case(flow_case(anatomy, (), FlowSettings(numerics=Numerics(engine="stil", cell_size_mm=3.0))))
     with pytest.raises(PluginError, match=r"missing of vstent.engines cannot be loaded"):
-        simulate_case(flow_case(anatomy, None, FlowSettings(engine="missing", cell_size_mm=3.0)))
+        simulate_case(flow_case(anatomy, (), FlowSettings(numerics=Numerics(engine="missing", cell_size_mm=3.0))))
     with pytest.raises(PluginError, match=r"no 'x' in vstent.walls: choose one of tree, counting"):
         deploy(vstent.find_design("silk"), anatomy, method=ConstantWire(wall="x"))
 

@@ -29,7 +29,8 @@ from vstent.deployment.measure import measure
 from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Landing
 from vstent.errors import ReadError
-from vstent.flow.case import Blood, CarreauYasuda, FlowField, FlowSettings, Phase, Waveform
+from vstent.flow.case import FlowField, Phase
+from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics, Waveform
 from vstent.geometry.vessel import Anatomy
 from vstent.io.archive import load_data, save_data
 from vstent.io.dicom_writer import write_dicom
@@ -492,7 +493,7 @@ def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_
     folder, told = flown
     pulse = Waveform(0.8, (0.2,), (0.1,))
     blood = Blood(1050.0, 0.0035, CarreauYasuda())
-    flow = FlowSettings(inflow_mL_s=1.0, blood=blood, waveform=pulse, close_up=True)
+    flow = FlowSettings(inflow_mL_s=1.0, blood=blood, waveform=pulse, numerics=Numerics(close_up=True))
     given = replace(settings_of(told["settings"]), flow=flow, uncertainty=Ranges(16, landing_mm=2.0), length_mm=20.0)
     told["settings"] = asdict(given)
     (folder / "run.json").write_text(json.dumps(told))
@@ -510,7 +511,7 @@ def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_
 
 def test_a_setting_that_the_page_does_not_take_is_named(flown, tmp_path):
     folder, told = flown
-    told["settings"]["flow"]["cell_size_mm"] = 0.03
+    told["settings"]["flow"]["numerics"]["cell_size_mm"] = 0.03
     (folder / "run.json").write_text(json.dumps(told))
     with pytest.raises(ReadError, match=r"flow.cell_size_mm = 0.03.*vstent run"):
         Desk(Store(tmp_path / "cases")).open(folder)

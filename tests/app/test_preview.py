@@ -21,7 +21,7 @@ from vstent.app.jobs import Jobs
 from vstent.app.preview import Preview, Shelf, _Worker, shelf_of
 from vstent.devices.stent import Stent
 from vstent.errors import InputError
-from vstent.flow.case import FlowSettings
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.archive import save_data
 from vstent.study.folder import CACHE
@@ -37,7 +37,7 @@ def anatomy() -> Anatomy:
 
 @pytest.fixture(scope="module")
 def preview(anatomy: Anatomy):
-    found = Preview(anatomy, FlowSettings(cells_per_diameter=13.0, inflow_mL_s=1.5))
+    found = Preview(anatomy, FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0)))
     yield found
     found.stop()
 
@@ -144,7 +144,7 @@ def in_time(holds) -> bool:
 
 
 def test_what_is_prepared_is_stored_and_continued(anatomy: Anatomy, tmp_path: Path) -> None:
-    settings = FlowSettings(cells_per_diameter=13.0, inflow_mL_s=1.5)
+    settings = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0))
     shelf, bare = shelf_of(tmp_path, "anatomy", settings), []
     stent = vstent.deploy(vstent.find_design("silk"), anatomy).stent
     for damage in (None, None, slice(0, 1000)):

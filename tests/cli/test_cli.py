@@ -17,7 +17,7 @@ from vstent import phantoms
 from vstent.cli import main, rank
 from vstent.cli import run as cli_run
 from vstent.errors import InputError
-from vstent.flow.case import FlowSettings
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl

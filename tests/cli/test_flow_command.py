@@ -13,8 +13,9 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 from vstent import phantoms
 from vstent.cli import main, options
 from vstent.errors import FlowError
-from vstent.flow.case import Blood, CarreauYasuda, FlowCase
+from vstent.flow.case import FlowCase
 from vstent.flow.openfoam.engine import OpenFoam
+from vstent.flow.settings import Blood, CarreauYasuda
 from vstent.io.writers import write_stl
 
 RADIUS_MM, LENGTH_MM, INFLOW_ML_S = 2.0, 16.0, 0.8
@@ -51,7 +52,7 @@ def test_openfoam_gets_the_vessel_after_its_cost_is_told(
     asked = []
 
     def refused(engine: OpenFoam, case: FlowCase, start: object) -> None:
-        asked.append((engine.folder, case.stent))
+        asked.append((engine.folder, case.solids))
         raise FlowError("It is not here")
 
     monkeypatch.setattr(OpenFoam, "init", refused)
@@ -60,10 +61,10 @@ def test_openfoam_gets_the_vessel_after_its_cost_is_told(
     assert main([*command, "--units", "mm"]) == 1
     told = " ".join(capsys.readouterr().err.split())
     assert 0 < told.index("OpenFOAM: about") < told.index("It is not here")
-    assert asked == [(tmp_path / "out" / "flow" / "bare" / "openfoam", None)]
+    assert asked == [(tmp_path / "out" / "flow" / "bare" / "openfoam", ())]
     assert main([*command, "--units", "mm", "--convergence", "--grid-spacing", "0.25"]) == 1
     assert "It is not here" in capsys.readouterr().err
-    assert asked[1] == (tmp_path / "out" / "flow" / "convergence" / "openfoam" / "cell_size_mm-0.5", None)
+    assert asked[1] == (tmp_path / "out" / "flow" / "convergence" / "openfoam" / "cell_size_mm-0.5", ())
 
 
 @pytest.mark.parametrize(

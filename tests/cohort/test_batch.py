@@ -170,7 +170,7 @@ def test_a_second_run_does_only_what_is_missing(scans, table, tmp_path):
     # one row damaged, one input changed, one more device: just these are missing
     row_path(tmp_path / "cases" / "a", "silk").write_text('{"key": ')
     changed = [replace(case, path=scans / "a.stl") if case.name == "b" else case for case in cases]
-    more = [replace(c, settings=replace(c.settings, devices=("silk", "enterprise", "pipeline"))) for c in changed]
+    more = [replace(c, devices=("silk", "enterprise", "pipeline")) for c in changed]
     missing = {task.case.name: task.case.settings.devices for task in left_to_do(more, tmp_path)}
     assert missing == {
         "a": ("silk", "pipeline"),

@@ -16,8 +16,8 @@ from vstent.devices.design import Braid, LaserCut, Size, Strands
 from vstent.devices.formulas import deployed_length_mm, free_diameters_mm, grid, mesh_rows, row_spacing_mm
 from vstent.devices.stent import Landing
 from vstent.errors import DeviceError
-from vstent.flow.case import Blood
-from vstent.flow.screen import screen
+from vstent.flow.media import media
+from vstent.flow.settings import Blood
 
 FREE_MM, WIDER_MM = 3.7, 4.3
 PROFILE = ((0.0, WIDER_MM), (0.08, FREE_MM), (0.92, FREE_MM), (1.0, WIDER_MM))
@@ -67,7 +67,7 @@ def test_every_structure_keeps_the_length_of_its_wires_and_is_meshed_and_screene
     assert found["max_outside_mm"] == 0.0
     assert is_closed(solid)
     assert solid.volume_mm3 > 0
-    metal = screen(done.stent, Blood())
+    (metal,) = media(done.stent, Blood())
     # The samples of the screen represent half the area between neighbouring wires of each family.
     assert (2 * metal.area_mm2 / metal.spacing_mm).sum() == pytest.approx(done.stent.wire_length_mm, rel=1e-6)
     if name == "straight":

@@ -11,10 +11,15 @@ from tubes import line, tube
 
 from vstent.flow import simulation
 from vstent.flow.beside import Beside
-from vstent.flow.case import FlowCase, FlowSettings
+from vstent.flow.case import FlowCase
 from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import FlowSettings, Numerics
 
-HERE, GPU = FlowSettings(cell_size_mm=0.3, inflow_mL_s=0.5), FlowSettings(cell_size_mm=0.3, device_gpu=True)
+HERE, GPU = (
+    Numerics(cell_size_mm=0.3),
+    Numerics(cell_size_mm=0.3, device_gpu=True),
+)
 LONG_S = 20.0
 
 
@@ -28,9 +33,9 @@ def fail() -> None:
     raise OSError("no space left")
 
 
-@pytest.mark.parametrize("settings", [None, HERE])
-def test_without_a_gpu_work_is_done_in_place_and_at_once(settings: FlowSettings | None) -> None:
-    with Beside(settings) as beside:
+@pytest.mark.parametrize("numerics", [None, HERE])
+def test_without_a_gpu_work_is_done_in_place_and_at_once(numerics: Numerics | None) -> None:
+    with Beside(numerics) as beside:
         assert beside.do(get_ident)() == get_ident()
         with pytest.raises(OSError, match="no space"):
             beside.do(fail)
@@ -91,7 +96,7 @@ def test_a_study_that_fails_does_not_lose_what_was_begun() -> None:
 
 
 def case(settings: FlowSettings) -> FlowCase:
-    return FlowCase(tube(line(8.0), 2.0).vessel, settings=settings)
+    return vessel_case(tube(line(8.0), 2.0).vessel, settings)
 
 
 class Engine(LatticeBoltzmann):
@@ -107,13 +112,13 @@ class Engine(LatticeBoltzmann):
 
 
 def test_the_grid_is_built_while_the_gpu_computes_the_first_guess() -> None:
-    for settings in (GPU, HERE):
+    for numerics in (GPU, HERE):
         begun, threads = Engine.calls = Event(), []
-        engine, flow = Engine(0.3), case(settings)
+        engine, flow = Engine(0.3), case(numerics)
         is_meanwhile = []
         simulation._guessed(engine, flow, lambda begun=begun, found=is_meanwhile: found.append(begun.wait(0.5)))
-        assert is_meanwhile == [settings is GPU]
-        assert len(threads) == (settings is GPU)
+        assert is_meanwhile == [numerics is GPU]
+        assert len(threads) == (numerics is GPU)
         assert get_ident() not in threads
 
 

@@ -15,7 +15,9 @@ import pytest
 from axisymmetric import axial_speed
 
 from vstent.flow import sampling
-from vstent.flow.case import Blood, FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowField
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import Blood, FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Opening, Vessel
@@ -174,8 +176,8 @@ def outside(field: FlowField, experiments: list[dict[str, np.ndarray]], z_mm: fl
 def test_the_profile_in_the_throat_is_inside_the_spread_of_the_experiments(
     experiments: list[dict[str, np.ndarray]],
 ) -> None:
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.5)
-    field = simulate_case(FlowCase(nozzle(-4.0), settings=settings))
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, numerics=Numerics(cell_size_mm=0.5))
+    field = simulate_case(vessel_case(nozzle(-4.0), settings))
     assert field.outlets_mL_s[0] == pytest.approx(field.inflow_mL_s, rel=1e-3)
     assert field.inflow_mL_s == pytest.approx(INFLOW_ML_S, rel=5e-3)
     assert outside(field, experiments, -20.0).axis < BEYOND
@@ -184,8 +186,10 @@ def test_the_profile_in_the_throat_is_inside_the_spread_of_the_experiments(
 @pytest.mark.validation
 def test_a_round_jet_stays_round() -> None:
     """With the usual equilibrium of D3Q19 it becomes a cross on the grid's diagonals: 22 % here."""
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=0.4 * INFLOW_ML_S, cell_size_mm=0.5, lattice_speed=0.02)
-    field = simulate_case(FlowCase(nozzle(14.0), settings=settings))
+    settings = FlowSettings(
+        blood=BLOOD, inflow_mL_s=0.4 * INFLOW_ML_S, numerics=Numerics(cell_size_mm=0.5, lattice_speed=0.02)
+    )
+    field = simulate_case(vessel_case(nozzle(14.0), settings))
     angle = np.pi / 4 * np.arange(8)
     r_mm = np.array([1.0, 1.5, 2.0, 2.5])[:, None]
     ring = np.stack([r_mm * np.cos(angle), r_mm * np.sin(angle), np.full((4, 8), 6.0)], axis=-1)
@@ -201,8 +205,10 @@ def jet(experiments: list[dict[str, np.ndarray]]) -> FlowField:
     With 16 the jet is not quite round, and profiles along x are outside by up to 6.7 % of the peak.
     """
     inflow_mL_s = own_flow_mL_s(experiments)
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=inflow_mL_s, cell_size_mm=0.2, max_steps=200_000)
-    return simulate_case(FlowCase(nozzle(95.0), settings=settings))
+    settings = FlowSettings(
+        blood=BLOOD, inflow_mL_s=inflow_mL_s, numerics=Numerics(cell_size_mm=0.2, max_steps=200_000)
+    )
+    return simulate_case(vessel_case(nozzle(95.0), settings))
 
 
 @pytest.mark.validation
@@ -253,8 +259,8 @@ def test_a_jet_leaves_a_lip_straight_however_it_lies_on_the_grid(cell_size_mm: f
 
     At the nominal flow blood is too fast for 4 to 5 % of these cells, and computed thicker there: 4.8 % for 2.8.
     """
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=0.6 * INFLOW_ML_S, cell_size_mm=cell_size_mm)
-    field = simulate_case(FlowCase(nozzle(14.0), settings=settings))
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=0.6 * INFLOW_ML_S, numerics=Numerics(cell_size_mm=cell_size_mm))
+    field = simulate_case(vessel_case(nozzle(14.0), settings))
     angle = np.pi / 12 * np.arange(24)
     ring = np.stack([1.8 * np.cos(angle), 1.8 * np.sin(angle), np.full(24, 8.0)], axis=1)
     harmonics = np.abs(np.fft.rfft(sampling.values_at(field, ring)[0][:, 2])) / 12 / field.speed_m_s.max()

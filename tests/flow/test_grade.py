@@ -8,9 +8,10 @@ import pytest
 from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
-from vstent.flow.case import Blood, FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.grade import CRITERIA, FAIR, GOOD, NOT_USABLE, computation_of, grade, grade_of, measures_of
-from vstent.flow.simulation import flow_case
+from vstent.flow.problem import flow_case, vessel_case
+from vstent.flow.settings import Blood, FlowSettings, Numerics
 from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
 
@@ -24,7 +25,7 @@ def case() -> FlowCase:
     """A straight artery of 4 mm with a sac of 6 mm."""
     phantom = phantoms.with_sac(phantoms.tube(length_mm=30.0), abscissa_mm=15.0, width_mm=6.0, neck_mm=4.0)
     anatomy = restore(trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.3))))
-    return flow_case(anatomy, None, FlowSettings(cell_size_mm=SPACING_MM))
+    return flow_case(anatomy, (), FlowSettings(numerics=Numerics(cell_size_mm=SPACING_MM)))
 
 
 def uniform(case: FlowCase, speed_m_s: float, **changes: object) -> FlowField:
@@ -56,7 +57,7 @@ def test_cells_are_counted_across_neck_sac_and_artery(case: FlowCase) -> None:
 def test_a_branch_counts_where_its_resistance_decides(case: FlowCase) -> None:
     forked = phantoms.phantom_surface(phantoms.bifurcation(), edge_mm=0.3)
     vessel = trace(Vessel(forked))
-    fork = FlowCase(vessel, settings=FlowSettings(cell_size_mm=SPACING_MM))
+    fork = vessel_case(vessel, FlowSettings(numerics=Numerics(cell_size_mm=SPACING_MM)))
     field = uniform(fork, 0.1, outlets_mL_s=np.array([1.5, 1.5]), outlet_pressure_Pa=np.zeros(2))
     found = measures_of(fork, field, {})
     narrowest_mm = min(outlet.diameter_mm for outlet in vessel.outlets)
@@ -64,7 +65,7 @@ def test_a_branch_counts_where_its_resistance_decides(case: FlowCase) -> None:
     wide, narrow = vessel.outlets[0], replace(vessel.outlets[1], area_mm2=0.02 * vessel.outlets[0].area_mm2)
     stub = replace(fork, vessel=replace(vessel, openings=(vessel.inlet, wide, narrow)))
     assert measures_of(stub, field, {})["cells_across_outlet_count"] == wide.diameter_mm / SPACING_MM
-    split = replace(fork, settings=replace(fork.settings, outlets="murray"))
+    split = vessel_case(vessel, FlowSettings(outlets="murray"))
     assert "cells_across_outlet_count" not in measures_of(split, field, {})
 
 

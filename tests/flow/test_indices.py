@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from shapes import sphere
 
-from vstent.flow.case import Blood, FlowField, Phase, Swing
+from vstent.flow.case import FlowField, Phase, Swing
 from vstent.flow.indices import NEAR_MM, compare, indices, ratios
+from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats
 

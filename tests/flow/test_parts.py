@@ -15,7 +15,6 @@ from vstent.devices import catalogue
 from vstent.devices.stent import Stent
 from vstent.errors import FlowError
 from vstent.flow import domain
-from vstent.flow.case import Blood, CarreauYasuda, FlowCase, FlowSettings
 from vstent.flow.drag import (
     BREADTH,
     CROSSING_PER_SOLIDITY,
@@ -34,8 +33,10 @@ from vstent.flow.lattice.scales import Scales
 from vstent.flow.lattice.screen import on_grid
 from vstent.flow.lattice.settling import field_left, mean_of, with_check
 from vstent.flow.lattice.state import Snapshot
+from vstent.flow.media import media
+from vstent.flow.problem import vessel_case
 from vstent.flow.profile import developed_profile
-from vstent.flow.screen import screen
+from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics
 from vstent.flow.stopping import fraction_left, standard_error, swings
 from vstent.flow.wall_stress import mean_shear_Pa, wall_stress
 from vstent.geometry.surface import Surface
@@ -86,10 +87,9 @@ def test_the_screen_of_a_laser_cut_device_resists_as_its_round_wires_would() -> 
     wide = round_diameter(78.0, 78.0)
     thin = replace(stent.design, strut_thickness_um=1e-3)
     flat = replace(stent, design=thin, wire_diameter_um=np.full_like(stent.wire_diameter_um, 2 * wide))
+    (one,), (other,) = media(stent, Blood()), media(flat, Blood())
     for name in ("normal_resistance_Pa_s_m", "tangential_resistance_Pa_s_m", "inertial_loss"):
-        np.testing.assert_allclose(
-            getattr(screen(stent, Blood()), name), getattr(screen(flat, Blood()), name), rtol=1e-3
-        )
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-3)
 
 
 def test_the_inertial_loss_vanishes_without_wires():
@@ -100,7 +100,7 @@ def test_the_inertial_loss_vanishes_without_wires():
 
 @pytest.mark.parametrize(("degrees", "expected"), [(70, 480.0), (60, 250.0)])
 def test_the_screen_of_a_braid_resists_as_its_closed_form(degrees, expected):
-    made = screen(braid(np.radians(degrees)), Blood())
+    (made,) = media(braid(np.radians(degrees)), Blood())
     middle = (made.points_mm[:, 2] > 2) & (made.points_mm[:, 2] < LENGTH_MM - 2)
     found = made.normal_resistance_Pa_s_m[middle]
     spacing_mm = np.pi * DIAMETER_MM * np.cos(np.radians(degrees)) / (N_WIRES / 2)
@@ -123,7 +123,7 @@ def resolved():
 
 def test_a_screen_lies_where_the_wires_are():
     outside_mm = 0.08
-    made = screen(braid(np.radians(65), outside_mm=outside_mm), Blood())
+    (made,) = media(braid(np.radians(65), outside_mm=outside_mm), Blood())
     radius_mm = np.hypot(*made.points_mm[:, :2].T)
     assert radius_mm.mean() == pytest.approx(0.5 * DIAMETER_MM + outside_mm, abs=0.003)
     assert made.area_mm2.sum() == pytest.approx(np.pi * (DIAMETER_MM + 2 * outside_mm) * LENGTH_MM, rel=0.005)
@@ -143,7 +143,7 @@ def test_wires_so_near_that_their_bands_melt_are_a_sheet_and_far_ones_are_lines(
 
 def test_struts_far_apart_leave_open_what_lies_between_them() -> None:
     stent = deploy(catalogue.find_design("enterprise"), tube(line(26), 1.9)).stent
-    made = screen(stent, Blood())
+    (made,) = media(stent, Blood())
     start = stent.piece_starts
     part = np.linspace(0, 1, 20)[:, None, None]
     axes_mm = (1 - part) * stent.wire_points_mm[start] + part * stent.wire_points_mm[start + 1]
@@ -178,10 +178,10 @@ def test_blood_at_an_angle_loses_as_much_to_inertia_as_in_resolved_wires(resolve
 
 
 def test_thicker_wires_resist_more_and_none_of_it_is_lost_inside_the_blood():
-    thin, thick = (screen(braid(np.radians(65), um), Blood()) for um in (30.0, 50.0))
+    (thin,), (thick,) = (media(braid(np.radians(65), um), Blood()) for um in (30.0, 50.0))
     assert (thick.normal_resistance_Pa_s_m > thin.normal_resistance_Pa_s_m).all()
     index = np.arange(31 * 31 * 61, dtype=np.int32).reshape(31, 31, 61)
-    spread = on_grid(thin, index, np.array([-3.0, -3.0, -1.0]), 0.2)
+    spread = on_grid((thin,), index, np.array([-3.0, -3.0, -1.0]), 0.2)
     total = (spread.along_Pa_s_m2 * 0.2**3 * 1e-3).sum()
     assert total == pytest.approx((thin.normal_resistance_Pa_s_m * thin.area_mm2).sum(), rel=1e-9)
     np.testing.assert_allclose(np.linalg.norm(spread.normal, axis=1), 1.0)
@@ -413,7 +413,7 @@ class Halving(AbstractEngine[list]):
 
 
 def flow_case_of(tolerance):
-    return FlowCase(tube(line(8.0), 2.0).vessel, settings=FlowSettings(tolerance=tolerance))
+    return vessel_case(tube(line(8.0), 2.0).vessel, FlowSettings(numerics=Numerics(tolerance=tolerance)))
 
 
 def test_the_driver_stops_at_the_tolerance_or_says_that_it_did_not():

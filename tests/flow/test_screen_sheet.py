@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from vstent.flow.case import Screen
+from vstent.flow.case import Sheet
 from vstent.flow.drag import concentration, drag_per_length
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.scales import ODD_RATE
 from vstent.flow.lattice.screen import on_grid
-from vstent.flow.screen import bands
+from vstent.flow.media import bands
 from vstent.kernels import directions
 
 SHAPE = np.array([32, 4, 32])
@@ -21,22 +21,22 @@ SETTLED = 1e-5
 """Change in 500 steps, of the largest speed, at which the flow has settled."""
 
 
-def samples(normal: np.ndarray, resistance_Pa_s_m: float, offset: float) -> Screen:
+def samples(normal: np.ndarray, resistance_Pa_s_m: float, offset: float) -> Sheet:
     """A plane through the box, so many cells off its cells' centres."""
     x, y = (a.ravel() for a in np.meshgrid(*((np.arange(8 * n) + 0.5) / 8 for n in SHAPE[:2]), indexing="ij"))
     level = SHAPE[2] / 2 + offset
     z = (level - x * normal[0] / normal[2]) % SHAPE[2]
     points_mm = 1e3 * CELL_M * np.stack([x, y, z], axis=1)
     area_mm2, alike = np.full(len(x), (1e3 * CELL_M / 8) ** 2 / normal[2]), np.full(len(x), resistance_Pa_s_m)
-    return Screen(points_mm, np.tile(normal, (len(x), 1)), area_mm2, alike, alike, 0 * alike, alike, alike)
+    return Sheet(points_mm, np.tile(normal, (len(x), 1)), area_mm2, alike, alike, 0 * alike, alike, alike)
 
 
-def entries(screen: Screen) -> tuple[np.ndarray, np.ndarray]:
+def entries(screen: Sheet) -> tuple[np.ndarray, np.ndarray]:
     """Cells (e,) of the box, and what they resist (e, ENTRY): what lies beyond a side comes in at the other."""
     around = np.stack(np.meshgrid(*(np.arange(-1, n + 1) for n in SHAPE), indexing="ij"), axis=-1) % SHAPE
     number = np.ravel_multi_index(tuple(np.moveaxis(around, -1, 0)), tuple(SHAPE)).ravel()
     index = np.arange(len(number), dtype=np.int32).reshape(SHAPE + 2)
-    spread = on_grid(screen, index, np.full(3, -1e3 * CELL_M), 1e3 * CELL_M)
+    spread = on_grid((screen,), index, np.full(3, -1e3 * CELL_M), 1e3 * CELL_M)
     linear = np.stack([spread.along_Pa_s_m2, spread.across_Pa_s_m2], axis=1) * STEP_S / DENSITY_KG_M3
     twice = spread.spread_Pa_s_m / DENSITY_KG_M3 * STEP_S / CELL_M
     cell, of = np.unique(number[spread.cell], return_inverse=True)
@@ -46,7 +46,7 @@ def entries(screen: Screen) -> tuple[np.ndarray, np.ndarray]:
     return cell, np.column_stack([mean[:, :3], total, 0 * cell, mean[:, 3]]).astype(np.float32)
 
 
-def row(diameter_mm: float, spacing: int, offset: float) -> Screen:
+def row(diameter_mm: float, spacing: int, offset: float) -> Sheet:
     """Wires along y across the box, so many cells apart, their axes so many off its cells' centres."""
     cell_mm = 1e3 * CELL_M
     x, y = (a.ravel() for a in np.meshgrid(np.arange(0, SHAPE[0], spacing) + offset, np.arange(0, SHAPE[1], 0.5)))
@@ -58,13 +58,13 @@ def row(diameter_mm: float, spacing: int, offset: float) -> Screen:
     one, across = np.ones(band_mm[..., 0].size), band_mm.shape[1]
     lying = np.repeat(upwards, across, axis=0), np.repeat(area_mm2, across), drag * one, drag * one, 0 * one
     points_mm = band_mm.reshape(-1, 3) % (cell_mm * SHAPE)
-    return Screen(points_mm, *lying, diameter_mm * one, cell_mm * spacing * one)
+    return Sheet(points_mm, *lying, diameter_mm * one, cell_mm * spacing * one)
 
 
 class Box:
     """The box's populations, and what drives them."""
 
-    def __init__(self, screen: Screen, force: np.ndarray, velocity: np.ndarray) -> None:
+    def __init__(self, screen: Sheet, force: np.ndarray, velocity: np.ndarray) -> None:
         self.cells = np.argwhere(np.ones(SHAPE, bool))
         last = SHAPE[2] - 1
         cut = (self.cells[:, 2] == 0) | (self.cells[:, 2] == 1) | (self.cells[:, 2] == last)

@@ -14,7 +14,7 @@ from vstent.anatomy.openings import open_ends
 from vstent.anatomy.trace import trace
 from vstent.flow import domain, sampling
 from vstent.flow import simulation as flow
-from vstent.flow.case import FlowCase, FlowField, FlowSettings, Screen
+from vstent.flow.case import FlowCase, FlowField, Sheet, Target
 from vstent.flow.engines import AbstractEngine, Outcome, run
 from vstent.flow.indices import indices
 from vstent.flow.lattice.close_up import close_up
@@ -23,6 +23,8 @@ from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.reading import read
 from vstent.flow.lattice.settling import mean_of, with_check
 from vstent.flow.lattice.state import State
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
 from vstent.flow.stopping import SURE, swings
 from vstent.geometry.surface import Surface
@@ -30,7 +32,7 @@ from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
 
 RADIUS_MM, LENGTH_MM, INFLOW_ML_S = 2.0, 14.0, 3.0
-SETTINGS = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.2, tolerance=0.002)
+SETTINGS = FlowSettings(inflow_mL_s=INFLOW_ML_S, numerics=Numerics(cell_size_mm=0.2, tolerance=0.002))
 
 
 @cache
@@ -40,7 +42,7 @@ def tube() -> Vessel:
 
 @cache
 def poiseuille() -> FlowField:
-    return simulate_case(FlowCase(tube(), settings=SETTINGS))
+    return simulate_case(vessel_case(tube(), SETTINGS))
 
 
 def along(field: FlowField) -> float:
@@ -89,7 +91,9 @@ def test_wall_shear_stress_is_poiseuilles() -> None:
 def unsettled(checks: int) -> tuple[LatticeBoltzmann, State, list[Floats]]:
     """A run from rest, far from its end, and the velocity at each of its checks."""
     engine = LatticeBoltzmann(0.4)
-    state = engine.init(FlowCase(tube(), settings=replace(SETTINGS, max_steps=480)), None)
+    state = engine.init(
+        vessel_case(tube(), replace(SETTINGS, numerics=replace(SETTINGS.numerics, max_steps=480))), None
+    )
     seen = []
     for _ in range(checks):
         state = engine.step(state)
@@ -135,7 +139,7 @@ def test_a_flow_that_swings_is_its_mean_once_that_is_known() -> None:
         state.snapshots.append(now)
         state.blocks = with_check(state.blocks, now)
         left.append(engine.terminate(state))
-    known = next(k for k, one in enumerate(left) if one < state.case.settings.tolerance)
+    known = next(k for k, one in enumerate(left) if one < state.case.numerics.tolerance)
     assert 24 <= known + 1 < 40
     field = engine.result(state, Outcome(True, tuple(left), 1.0, 1.0))
     mean = mean_of(state.blocks, np.array(state.history), state.probe.cells)
@@ -168,7 +172,7 @@ def test_what_goes_to_and_fro_is_told_by_its_size_and_not_by_its_mean() -> None:
     assert field.neck_inflow_mL_s == pytest.approx(2.0 + size)
 
 
-def disc(resistance_Pa_s_m: float) -> Screen:
+def disc(resistance_Pa_s_m: float) -> Sheet:
     """A screen across the tube at half its length."""
     ticks = np.arange(-RADIUS_MM - 0.5, RADIUS_MM + 0.5, 0.05)
     x, y = (a.ravel() for a in np.meshgrid(ticks, ticks))
@@ -177,19 +181,21 @@ def disc(resistance_Pa_s_m: float) -> Screen:
     points = np.stack([x, y, np.full(n, LENGTH_MM / 2)], axis=1)
     one = np.ones(n)
     resistances = resistance_Pa_s_m * one, 0.5 * resistance_Pa_s_m * one, 0 * one
-    return Screen(points, normals, 0.05**2 * one, *resistances, one, one)
+    return Sheet(points, normals, 0.05**2 * one, *resistances, one, one)
 
 
 def test_a_screen_without_resistance_changes_nothing() -> None:
     bare = poiseuille()
-    open_ = simulate_case(FlowCase(tube(), screen=disc(0.0), settings=SETTINGS))
+    open_ = simulate_case(vessel_case(tube(), SETTINGS, media=(disc(0.0),)))
     np.testing.assert_allclose(open_.velocity_m_s, bare.velocity_m_s, atol=1e-4 * bare.speed_m_s.max())
 
 
 def test_a_screen_costs_the_pressure_of_its_law() -> None:
     resistance, slow_mL_s = 4000.0, 0.3  # so slow that evening out the profile and back costs nothing beside it
-    settings = replace(SETTINGS, cell_size_mm=0.18, inflow_mL_s=slow_mL_s)  # 0.19 to 0.25: 0 to 4 % too little
-    field = simulate_case(FlowCase(tube(), screen=disc(resistance), settings=settings))
+    settings = replace(
+        SETTINGS, inflow_mL_s=slow_mL_s, numerics=replace(SETTINGS.numerics, cell_size_mm=0.18)
+    )  # 0.19 to 0.25: 0 to 4 % too little
+    field = simulate_case(vessel_case(tube(), settings, media=(disc(resistance),)))
     before, after = sampling.values_at(field, np.array([[0, 0, 3.0], [0, 0, 11.0]]))[1][:: int(along(field))]
     gradient = 8 * 0.004 * slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 4)
     mean_speed = slow_mL_s * 1e-6 / (np.pi * (RADIUS_MM * 1e-3) ** 2)
@@ -207,20 +213,20 @@ def test_a_guess_has_a_guess_as_long_as_grids_hold_the_vessel(monkeypatch: pytes
 
     def telling(engine: AbstractEngine[Any], case: FlowCase, **more: Any) -> FlowField:
         start = more["start"]
-        seen.append((engine.cell_size_mm, case.screen is not None, None if start is None else start.cell_size_mm))
+        seen.append((engine.cell_size_mm, bool(case.media), None if start is None else start.cell_size_mm))
         return run(engine, case, **more)
 
     monkeypatch.setattr(flow, "run", telling)
-    settings = replace(SETTINGS, cell_size_mm=0.25, max_steps=40)
-    bare = simulate_case(FlowCase(tube(), settings=settings))
+    settings = replace(SETTINGS, numerics=replace(SETTINGS.numerics, cell_size_mm=0.25, max_steps=40))
+    bare = simulate_case(vessel_case(tube(), settings))
     assert seen == [(1.0, False, None), (0.5, False, 1.0), (0.25, False, 0.5)]
     seen.clear()
-    simulate_case(FlowCase(tube(), screen=disc(100.0), settings=settings), start=bare)
+    simulate_case(vessel_case(tube(), settings, media=(disc(100.0),)), start=bare)
     coarsest = [(1.0, False, 0.5), (1.0, True, 1.0)]
     assert seen == [(0.5, False, 0.25), *coarsest, (0.5, True, 0.5), (0.25, True, 0.25)]
     seen.clear()
-    denser = FlowCase(tube(), screen=disc(200.0), settings=settings)
-    equal = replace(denser, settings=replace(settings))
+    denser = vessel_case(tube(), settings, media=(disc(200.0),))
+    equal = replace(denser, numerics=replace(settings.numerics))
     shared, anew = (
         simulate_case(case, start=start).velocity_m_s for case, start in ((equal, bare), (denser, replace(bare)))
     )
@@ -238,16 +244,16 @@ def fork() -> Vessel:
 
 
 def test_a_branch_too_narrow_for_its_cells_is_told_of_where_that_matters() -> None:
-    case = FlowCase(fork(), settings=SETTINGS)
+    case = vessel_case(fork(), SETTINGS)
     assert domain.too_narrow(case, 0.37) == ""
     said = domain.too_narrow(case, 0.5)
     assert re.search(r"grid spacing of 0\.5 mm, outlet_2 \(2\.4 mm\) has 4\.8 cells across", said)
     assert "outlet_1" not in said
-    assert domain.too_narrow(replace(case, settings=replace(SETTINGS, outlets="murray")), 0.5) == ""
-    assert domain.too_narrow(FlowCase(tube()), 1.0) == ""
-    assert simulate_case(replace(case, settings=replace(SETTINGS, cell_size_mm=0.5, max_steps=48))).advice.endswith(
-        said
-    )
+    assert domain.too_narrow(vessel_case(fork(), replace(SETTINGS, outlets="murray")), 0.5) == ""
+    assert domain.too_narrow(vessel_case(tube()), 1.0) == ""
+    assert simulate_case(
+        replace(case, numerics=replace(SETTINGS.numerics, cell_size_mm=0.5, max_steps=48))
+    ).advice.endswith(said)
 
 
 def test_from_a_branch_that_no_cell_reaches_no_blood_leaves_and_that_is_told() -> None:
@@ -256,14 +262,14 @@ def test_from_a_branch_that_no_cell_reaches_no_blood_leaves_and_that_is_told() -
     phantom = phantoms.with_branch(straight, abscissa_mm=6.0, direction=[1, 0, 1], radius_mm=0.25, length_mm=7.0)
     vessel = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.15)))
     thin = vessel.outlets[1]
-    settings = replace(SETTINGS, cell_size_mm=0.5, max_steps=600, tolerance=0.05)
-    field = simulate_case(FlowCase(vessel, settings=settings))
+    settings = replace(SETTINGS, numerics=replace(SETTINGS.numerics, cell_size_mm=0.5, max_steps=600, tolerance=0.05))
+    field = simulate_case(vessel_case(vessel, settings))
     assert field.outlets_mL_s[1] == 0.0
     assert field.outlets_mL_s[0] == pytest.approx(INFLOW_ML_S, rel=0.1)
     assert f"At a grid spacing of 0.5 mm no cell reaches outlet_2 ({thin.diameter_mm:.2g} mm)" in field.advice
     assert all(np.isfinite(value) for value in indices(field).values())
     sac = Surface(sphere(1.0).vertices_mm + vessel.inlet.center_mm * [1, 1, 0] + [0, 0, 10.0], sphere(1.0).faces)
-    assert np.isfinite(close_up(FlowCase(vessel, sac=sac, settings=settings), field).inflow_mL_s).all()
+    assert np.isfinite(close_up(vessel_case(vessel, settings, target=Target(sac, None)), field).inflow_mL_s).all()
 
 
 def test_a_sac_wider_than_its_artery_leaves_the_artery_its_cells() -> None:
@@ -271,16 +277,19 @@ def test_a_sac_wider_than_its_artery_leaves_the_artery_its_cells() -> None:
     thin = phantoms.tube(length_mm=40.0, radius_mm=1.25)
     giant = phantoms.with_sac(thin, abscissa_mm=20.0, width_mm=18.0, neck_mm=6.0)
     vessel = open_ends(Vessel(phantoms.phantom_surface(giant, edge_mm=0.6)))[0]
-    fine = FlowCase(vessel, settings=FlowSettings(cell_budget=1e9))
+    fine = vessel_case(vessel, FlowSettings(numerics=Numerics(cell_budget=1e9)))
     assert domain.default_cell_size_mm(fine) == pytest.approx(vessel.inlet.diameter_mm / 29)
     volume_mm3 = vessel.closed.volume_mm3
-    assert domain.default_cell_size_mm(FlowCase(vessel)) == pytest.approx((volume_mm3 / 480_000) ** (1 / 3))
+    assert domain.default_cell_size_mm(vessel_case(vessel)) == pytest.approx((volume_mm3 / 480_000) ** (1 / 3))
 
 
 def test_blood_too_fast_for_its_cells_is_told_of_but_behind_the_openings() -> None:
     """Speed x cell / viscosity is 75 there at most, by blood that is computed thicker."""
     assert "viscosity is raised" not in poiseuille().advice
-    fast = FlowCase(tube(), settings=replace(SETTINGS, inflow_mL_s=12.0, cell_size_mm=0.5, max_steps=240))
+    fast = vessel_case(
+        tube(),
+        replace(SETTINGS, inflow_mL_s=12.0, numerics=replace(SETTINGS.numerics, cell_size_mm=0.5, max_steps=240)),
+    )
     field = simulate_case(fast)
     z, speed = field.centers_mm[:, 2], np.where(field.centers_mm[:, 2] < 0, 0.0, field.speed_m_s)
     speed[z > LENGTH_MM] = 0.0
@@ -300,8 +309,8 @@ def test_blood_too_fast_for_its_cells_is_told_of_but_behind_the_openings() -> No
 @pytest.mark.parametrize("outlets", ["murray", "zero_pressure"])
 def test_outlets_share_the_flow_as_murray_says_when_asked(outlets: str) -> None:
     vessel = fork()
-    settings = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.25, outlets=outlets, tolerance=0.005)
-    field = simulate_case(FlowCase(vessel, settings=settings))
+    settings = FlowSettings(inflow_mL_s=2.0, outlets=outlets, numerics=Numerics(cell_size_mm=0.25, tolerance=0.005))
+    field = simulate_case(vessel_case(vessel, settings))
     cubes = np.array([outlet.diameter_mm**3 for outlet in vessel.outlets])
     shares = field.outlets_mL_s / field.outlets_mL_s.sum()
     assert field.outlets_mL_s.sum() == pytest.approx(2.0, rel=2e-3)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from vstent.flow.case import Blood
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.dictionary import foam_file
+from vstent.flow.settings import Blood
 from vstent.io.writers import write_text
 from vstent.units import M3_PER_ML, M_PER_MM
 

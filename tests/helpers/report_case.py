@@ -7,7 +7,8 @@ import numpy as np
 
 from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Deployment, Stent, tube_faces
-from vstent.flow.case import Blood, FlowField
+from vstent.flow.case import FlowField
+from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import PARENT, Anatomy, Aneurysm, Centerline, Opening, Path, Vessel
 from vstent.reporting.page import as_html, contents_of

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import jv
 
-from vstent.flow.case import Waveform
+from vstent.flow.settings import Waveform
 
 RADIUS_M, MEAN_MEAN_M_S, SWING = 2e-3, 0.03, 0.8
 VISCOSITY_PA_S, DENSITY_KG_M3 = 0.004, 1060.0

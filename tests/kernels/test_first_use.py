@@ -10,6 +10,8 @@ import pytest
 from numba import njit
 
 from vstent.cli import warm
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import Numerics
 from vstent.kernels import cache
 from vstent.kernels.first_use import kept, telling
 
@@ -90,11 +92,12 @@ def test_while_one_thread_takes_kernels_from_the_cache_others_may_compile():
 @pytest.mark.validation
 def test_after_a_bare_installation_the_first_flow_has_the_bits_of_all_later_ones(tmp_path):
     work = (
-        "from vstent import phantoms; from vstent.flow import FlowCase, FlowSettings, simulate_case;"
+        "from vstent import phantoms; from vstent.flow.problem import vessel_case;"
+        "from vstent.flow.settings import FlowSettings, Numerics; from vstent.flow.simulation import simulate_case;"
         "from vstent.anatomy.trace import trace; from vstent.geometry.vessel import Vessel; import hashlib;"
         "v = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.5)));"
-        "s = FlowSettings(inflow_mL_s=1.0, cell_size_mm=0.4, max_steps=200);"
-        "print(hashlib.sha256(simulate_case(FlowCase(v, settings=s)).velocity_m_s.tobytes()).hexdigest())"
+        "s = FlowSettings(inflow_mL_s=1.0, numerics=Numerics(cell_size_mm=0.4, max_steps=200));"
+        "print(hashlib.sha256(simulate_case(vessel_case(v, s)).velocity_m_s.tobytes()).hexdigest())"
     )
     fresh = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_NUM_THREADS": "1"}
     first, second = (subprocess.run([sys.executable, "-c", work], env=fresh, capture_output=True) for _ in range(2))
@@ -122,8 +125,8 @@ def test_the_set_up_compiles_every_kernel_of_a_deployment():
 def test_the_set_up_compiles_what_takes_a_flows_time_so_that_all_processes_run_the_same_code():
     from vstent import phantoms
     from vstent.anatomy.trace import trace
-    from vstent.flow.case import FlowCase, FlowSettings
     from vstent.flow.lattice.kernels import d3q19
+    from vstent.flow.settings import FlowSettings
     from vstent.flow.simulation import simulate_case
     from vstent.geometry.vessel import Vessel
 
@@ -132,7 +135,9 @@ def test_the_set_up_compiles_what_takes_a_flows_time_so_that_all_processes_run_t
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.5)))
     said = []
     with telling(lambda: said.append("compiling")):
-        simulate_case(FlowCase(vessel, settings=FlowSettings(inflow_mL_s=1.0, cell_size_mm=0.4, max_steps=10)))
+        simulate_case(
+            vessel_case(vessel, FlowSettings(inflow_mL_s=1.0, numerics=Numerics(cell_size_mm=0.4, max_steps=10)))
+        )
     assert said == []
     assert [len(kernel.signatures) for kernel in kernels] == [1, 1]  # no other layout than the set-up's, here or before
 

@@ -13,16 +13,17 @@ import vstent
 from vstent.cli import main
 from vstent.deployment.deploy import deploy
 from vstent.errors import DeviceError, FlowError, InputError
-from vstent.flow.case import FlowSettings
 from vstent.flow.indices import indices
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.io.writers import write_stl
 from vstent.plan import rank_flow
 from vstent.plan.rank import Ranking, rank
 from vstent.plan.rank_flow import chosen_of, rank_flows
 from vstent.study.flow_store import FlowStore
 
-SETTINGS = FlowSettings(cells_per_diameter=11.0, inflow_mL_s=1.5, tolerance=0.02)
+SETTINGS = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=11.0, tolerance=0.02))
 
 
 @cache
@@ -75,10 +76,10 @@ def test_changes_are_those_of_flows_of_their_own_and_an_interrupted_ranking_goes
     with_flow = [one for one in found.candidates if "flow_grade" in one.measures]
     assert len(with_flow) == 2
     assert [one.measures for one in again.candidates] == [one.measures for one in found.candidates]
-    bare = flow_case(anatomy(), None, SETTINGS)
+    bare = flow_case(anatomy(), (), SETTINGS)
     before = simulate_case(bare)
     first = with_flow[0]
-    case = flow_case(anatomy(), deploy(first.design, anatomy(), size=first.size).stent, SETTINGS)
+    case = flow_case(anatomy(), (deploy(first.design, anatomy(), size=first.size).stent,), SETTINGS)
     after = simulate_case(case, start=before)
     ratio = (
         indices(after, case.sac, case.ostium)["neck_inflow_mL_s"]
@@ -137,7 +138,7 @@ def test_on_a_gpu_a_flow_is_measured_while_the_next_is_computed(monkeypatch: pyt
         return rank_flows(anatomy(), ranking(), settings, 2, stored=stored), stored, threads
 
     here, in_place, at = ranked(SETTINGS, 0.0)
-    on_gpu, beside, other = ranked(replace(SETTINGS, device_gpu=True), 20.0)
+    on_gpu, beside, other = ranked(replace(SETTINGS, numerics=replace(SETTINGS.numerics, device_gpu=True)), 20.0)
     assert set(at) == {get_ident()}
     assert get_ident() not in other
     assert list(beside.items()) == list(in_place.items())

@@ -4,7 +4,7 @@ import pytest
 
 import vstent
 from vstent.cli import main
-from vstent.flow.case import FlowSettings
+from vstent.flow.settings import FlowSettings
 from vstent.plan import rank_flow
 from vstent.plan.criteria import default_criteria
 from vstent.plan.rank import Candidate, Ranking

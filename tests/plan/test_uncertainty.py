@@ -17,7 +17,7 @@ from vstent.devices import catalogue, formulas
 from vstent.devices.ranges import altered, uncertain, values_at
 from vstent.devices.stent import Landing
 from vstent.errors import InputError
-from vstent.flow.case import FlowSettings
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Vessel
 from vstent.io.writers import write_stl
 from vstent.phantoms import demo_phantom, phantom_surface
@@ -233,13 +233,13 @@ def test_inflow_and_flow_are_varied_where_the_flow_is_asked(monkeypatch):
         return case
 
     def known(case, *shapes):
-        inflow = case.settings.inflow_mL_s
-        return {"neck_inflow_mL_s": inflow if case.screen is None else 0.1 * inflow**2}
+        inflow = case.inflow_mL_s
+        return {"neck_inflow_mL_s": 0.1 * inflow**2 if case.media else inflow}
 
     monkeypatch.setattr(uncertainty, "simulate_case", answer)
     monkeypatch.setattr(uncertainty, "indices", known)
     monkeypatch.setattr(uncertainty, "ostium", lambda *_: None)
-    monkeypatch.setattr("vstent.flow.simulation.ostium", lambda *_: None)
+    monkeypatch.setattr("vstent.flow.problem.ostium", lambda *_: None)
     ranges = Ranges(8, flow_samples=8, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
     found = vary(artery(), deployed(), ranges, flow=FlowSettings(inflow_mL_s=4.0))
     ratio = found.values[:, found.names.index("neck_inflow_mL_s_ratio")]
@@ -258,7 +258,7 @@ def test_a_sample_whose_flow_is_done_is_not_computed_again(monkeypatch, tmp_path
         return {"neck_inflow_mL_s_ratio": flow.inflow_mL_s**2}
 
     monkeypatch.setattr(uncertainty, "_flow_ratios", ratios)
-    monkeypatch.setattr("vstent.flow.simulation.ostium", lambda *_: None)
+    monkeypatch.setattr("vstent.flow.problem.ostium", lambda *_: None)
     ranges = Ranges(4, flow_samples=4, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
     begun, flow = FlowCheckpoint(tmp_path, "vary silk", "key"), FlowSettings(inflow_mL_s=4.0)
     with pytest.raises(KeyboardInterrupt):

@@ -14,7 +14,8 @@ import pytest
 import report_case
 from pages import Page
 
-from vstent.flow.case import Blood, CarreauYasuda, FlowSettings, Phase
+from vstent.flow.case import Phase
+from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE
 from vstent.reporting.page import as_html, contents_of, limits_of, report
 from vstent.reporting.quantities import compare, flatten, format_change, format_number, format_value, split_unit
@@ -149,11 +150,11 @@ def test_of_a_pulse_it_is_said_which_numbers_are_means(page):
             ("shear-thinning", "cubed"),
         ),
         (
-            FlowSettings(blood=Blood(thinning=CarreauYasuda()), outlets="murray", engine="openfoam"),
+            FlowSettings(blood=Blood(thinning=CarreauYasuda()), outlets="murray", numerics=Numerics(engine="openfoam")),
             ("Blood is shear-thinning", "by their diameter cubed", "meshed wires over the neck"),
             ("Newtonian", "pressure at the outlets", "porous screen"),
         ),
-        (FlowSettings(engine="my_engine"), ("Blood is Newtonian",), ("a device is",)),
+        (FlowSettings(numerics=Numerics(engine="my_engine")), ("Blood is Newtonian",), ("a device is",)),
         (None, (), ("Blood", "outlets", "a device is")),
     ],
 )

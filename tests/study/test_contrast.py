@@ -10,8 +10,9 @@ import pytest
 from vstent import phantoms
 from vstent.angiography.network import network
 from vstent.cli import main
-from vstent.flow.case import FlowField, FlowSettings
-from vstent.flow.simulation import flow_case
+from vstent.flow.case import FlowField
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Anatomy
 from vstent.io.archive import load_data
 from vstent.io.writers import write_stl
@@ -72,7 +73,7 @@ def test_the_network_of_a_flow_is_balanced_and_closed_at_the_wall(flown: tuple[P
     cache = flown[0] / CACHE
     anatomy = load_data(next(cache.glob("anatomy-*.npz")), Anatomy)
     field = load_data(next(cache.glob("flow bare-*.npz")), FlowField)
-    net = network(flow_case(anatomy, None, FlowSettings()), field)
+    net = network(flow_case(anatomy, (), FlowSettings()), field)
     n, flux = len(net.cells), net.flux_mm3_s[0]
     gain = np.bincount(net.right, flux, n + net.openings) - np.bincount(net.left, flux, n + net.openings)
     assert np.abs(gain[:n] / net.volume_mm3).max() < 1e-5

@@ -12,9 +12,11 @@ from vstent.angiography.angiogram import AngiogramSettings, injection
 from vstent.angiography.bolus import Bolus
 from vstent.angiography.washout import wash_out
 from vstent.flow import sampling
-from vstent.flow.case import FlowField, FlowSettings, Phase
+from vstent.flow.case import FlowField, Phase
 from vstent.flow.openfoam import scatter
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 
 SPACING_MM = 0.3
@@ -39,8 +41,8 @@ def uniform(anatomy: Anatomy) -> FlowField:
 
 
 def flow(anatomy: Anatomy, spacing_mm: float = SPACING_MM, *, close_up: bool = False) -> FlowField:
-    settings = FlowSettings(inflow_mL_s=2.0, cell_size_mm=spacing_mm, close_up=close_up)
-    return simulate_case(flow_case(anatomy, None, settings))
+    settings = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=spacing_mm, close_up=close_up))
+    return simulate_case(flow_case(anatomy, (), settings))
 
 
 def pulse_of(field: FlowField, factors: np.ndarray, period_s: float) -> FlowField:
@@ -65,7 +67,7 @@ def meshed(field: FlowField) -> FlowField:
 
 def sac_curve(anatomy: Anatomy, field: FlowField) -> np.ndarray:
     """The mean concentration (t,) in the sac; that all contrast is accounted for and bounded is asserted."""
-    ready = injection(flow_case(anatomy, None), field, SETTINGS)
+    ready = injection(flow_case(anatomy, ()), field, SETTINGS)
     sac, found = ready.grid.sac, []
     for _, values in ready.frames():
         assert values.min() >= -1e-6
@@ -82,7 +84,7 @@ def test_a_pulse_is_conserved_and_washes_the_sac_as_its_volume_has_passed(anatom
     period_s, turn = 0.4, 2 * np.pi * np.arange(20) / 20
     pulse = pulse_of(uniform, 1 + 0.5 * np.sin(turn), period_s)
     sac_curve(anatomy, pulse)
-    case = flow_case(anatomy, None)
+    case = flow_case(anatomy, ())
     steady, found = (wash_out(*injection(case, field, SETTINGS).grid.near, end_s=5.0) for field in (uniform, pulse))
     passed_s = found.time_s + 0.5 * period_s / (2 * np.pi) * (1 - np.cos(2 * np.pi * found.time_s / period_s))
     wanted = np.interp(passed_s, steady.time_s, steady.left_fraction)

@@ -9,7 +9,7 @@ from ranked_artery import anatomy, wall
 
 import vstent
 from vstent.cli import main
-from vstent.flow.case import FlowSettings
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.io.writers import write_stl
 from vstent.plan.rank import Ranking, rank
 from vstent.plan.rank_flow import chosen_of, coverage_of, is_similar, rank_flows
@@ -19,7 +19,7 @@ from vstent.study.flow_crew import Common, FlowTask, compute_missing, parallel_f
 from vstent.study.flow_store import FlowStore
 from vstent.study.folder import CACHE
 
-SETTINGS = FlowSettings(cells_per_diameter=8.0, inflow_mL_s=1.5, tolerance=0.05)
+SETTINGS = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=8.0, tolerance=0.05))
 
 
 @cache
@@ -77,7 +77,7 @@ def test_as_many_flows_as_fit_in_memory_run_beside_each_other(monkeypatch):
     for free, jobs, wanted in ((3.5, 8, 3), (3.5, 2, 2), (0.5, 8, 1)):
         monkeypatch.setattr(flow_crew, "free_memory_bytes", lambda free=free: free * needed_MB * 1e6)
         assert parallel_flows(anatomy(), chosen, SETTINGS, jobs)[0] == wanted
-    on_gpu = FlowSettings(cells_per_diameter=8.0, device_gpu=True)
+    on_gpu = FlowSettings(numerics=Numerics(cells_per_diameter=8.0, device_gpu=True))
     assert parallel_flows(anatomy(), chosen, on_gpu, 8)[0] == 1
 
 

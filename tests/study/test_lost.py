@@ -10,7 +10,8 @@ import pytest
 from vstent import phantoms
 from vstent.devices.catalogue import find_design
 from vstent.errors import FlowError, InputError, LandingError
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
@@ -22,7 +23,7 @@ from vstent.study.outputs import write_ranking
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
 from vstent.study.types import Placing, Settings
 
-FLOW = FlowSettings(cell_size_mm=0.5, max_steps=20, inflow_mL_s=2.0)
+FLOW = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20))
 PLAIN = Settings(devices=("silk",), units="mm", flow=None)
 
 
@@ -42,7 +43,7 @@ def bare_flow_for_all(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     real, computed = stages.simulate_case, []
 
     def quick(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
-        computed.append("bare" if case.screen is None else "device")
+        computed.append("device" if case.media else "bare")
         return start if start is not None else real(case, start=start, **given)
 
     monkeypatch.setattr(stages, "simulate_case", quick)
@@ -169,7 +170,7 @@ def test_a_flow_that_diverges_is_a_row_with_its_reason(
     settings, real = replace(PLAIN, devices=("silk", "enterprise"), flow=FLOW), stages.simulate_case
 
     def diverging(case: FlowCase, **given: object) -> FlowField:
-        if case.stent is not None and case.stent.design.key == "silk":
+        if case.solids and case.solids[0].design.key == "silk":
             raise FlowError("the flow diverged: use a finer grid spacing")
         return real(case, **given)
 

@@ -17,7 +17,8 @@ from vstent.deployment.deploy import deploy, propose_size
 from vstent.devices.catalogue import find_design, find_size
 from vstent.devices.design import Size
 from vstent.errors import DeviceError, InputError, LandingError
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.io.dicom_writer import write_dicom
@@ -174,7 +175,9 @@ def test_a_folder_replaced_with_other_settings_holds_nothing_of_the_former(
 ) -> None:
     out, anew = tmp_path / "out", tmp_path / "anew"
     former = Settings(
-        devices=("silk", "enterprise"), units="mm", flow=FlowSettings(cell_size_mm=0.5, engine="openfoam")
+        devices=("silk", "enterprise"),
+        units="mm",
+        flow=FlowSettings(numerics=Numerics(cell_size_mm=0.5, engine="openfoam")),
     )
     written_by_openfoam = [*engine_folders(out, former).values(), out / "flow" / "convergence" / "openfoam" / "grid"]
     run(arteries[0], out, replace(former, flow=None), lambda *_: None, replaces=True)
@@ -209,13 +212,17 @@ def test_stopped_while_replacing_a_folder_holds_nothing_of_the_former_beside_the
     stops = {"of": None}
 
     def counted(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
-        if case.screen is not None and stops["of"] == case.settings.inflow_mL_s:
+        if case.media and stops["of"] == case.inflow_mL_s:
             raise KeyboardInterrupt
-        computed.append((case.screen is not None, case.settings.inflow_mL_s))
+        computed.append((bool(case.media), case.inflow_mL_s))
         return start if start is not None else real(case, start=start, **given)
 
     monkeypatch.setattr(stages, "simulate_case", counted)
-    slow = Settings(devices=("silk",), units="mm", flow=FlowSettings(cell_size_mm=0.5, inflow_mL_s=1.0, max_steps=20))
+    slow = Settings(
+        devices=("silk",),
+        units="mm",
+        flow=FlowSettings(inflow_mL_s=1.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20)),
+    )
     fast = replace(slow, flow=replace(slow.flow, inflow_mL_s=3.0))
     run(arteries[0], out, slow, lambda *_: None, replaces=True)
     (out / "report.html").write_text("of the slow flow")
@@ -298,10 +305,10 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     real, computed = stages.simulate_case, []
 
     def stopped_with_a_stent(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
-        if case.screen is not None and not computed.count("silk"):
+        if case.media and not computed.count("silk"):
             computed.append("silk")
             raise KeyboardInterrupt
-        computed.append("silk" if case.screen else "bare")
+        computed.append("silk" if case.media else "bare")
         return start if start is not None else real(case, start=start, **given)
 
     monkeypatch.setattr(stages, "simulate_case", stopped_with_a_stent)
@@ -328,7 +335,7 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
 
 
 def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = Settings(devices=("silk",), flow=FlowSettings(device_gpu=True))
+    settings = Settings(devices=("silk",), flow=FlowSettings(numerics=Numerics(device_gpu=True)))
     is_next_begun, threads, stored = Event(), set(), []
 
     def computed(case: str, *, start: object, **given: object) -> SimpleNamespace:
@@ -346,7 +353,7 @@ def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, mo
 
     monkeypatch.setattr("numba.threading_layer", lambda: "omp")
     monkeypatch.setattr(stages, "_plan", lambda *_: None)
-    monkeypatch.setattr(stages, "flow_case", lambda anatomy, stent, flow: stent.name if stent else "bare")
+    monkeypatch.setattr(stages, "flow_case", lambda anatomy, implants, flow: implants[0].name if implants else "bare")
     monkeypatch.setattr(stages, "simulate_case", computed)
     monkeypatch.setattr(stages, "write_field", written)
     monkeypatch.setattr(Ledger, "_write", write)
@@ -369,11 +376,11 @@ def test_a_device_whose_wires_change_does_not_get_the_flow_of_the_former(
     design = find_design("silk")
 
     def computed_once(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
-        computed.append(case.stent.design.wires if case.stent else ())
+        computed.append(case.solids[0].design.wires if case.solids else ())
         return start if start is not None else real(case, start=start, **given)
 
     monkeypatch.setattr(stages, "simulate_case", computed_once)
-    settings = Settings(devices=("silk",), flow=FlowSettings(cell_size_mm=0.35))
+    settings = Settings(devices=("silk",), flow=FlowSettings(numerics=Numerics(cell_size_mm=0.35)))
     run(artery, out, settings, lambda *_: None)
     monkeypatch.setattr("vstent.study.pipeline.find_design", lambda _: replace(design, wires=((48, 40.0),)))
     run(artery, out, settings, lambda *_: None)

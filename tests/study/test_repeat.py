@@ -13,7 +13,7 @@ import pytest
 
 from vstent import phantoms
 from vstent.cli import main
-from vstent.flow.case import FlowSettings
+from vstent.flow.settings import FlowSettings
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.io.writers import write_json, write_stl
 from vstent.plan.uncertainty import Ranges
@@ -49,7 +49,7 @@ def test_a_repeated_run_is_the_same_to_the_last_bit(case, capsys):
     one, other = (json.loads((folder / "run.json").read_text()) for folder in (first, again))
     assert one["settings"] == other["settings"]
     assert one["settings"]["center_mm"] == 12.000000123
-    assert one["settings"]["flow"]["cell_size_mm"] == 0.333333333333
+    assert one["settings"]["flow"]["numerics"]["cell_size_mm"] == 0.333333333333
     _check_crate(again)
 
 

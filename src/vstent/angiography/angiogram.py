@@ -19,7 +19,7 @@ from vstent.errors import FlowError, InputError
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.indices import on_sac
 from vstent.flow.memory import free_memory_bytes
-from vstent.flow.simulation import flow_case
+from vstent.flow.problem import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 
@@ -195,7 +195,7 @@ def angiogram(
         The flow does not fit in the free memory, or its flow rates cannot be balanced.
     """
     settings = settings or AngiogramSettings()
-    case = flow_case(anatomy, None)
+    case = flow_case(anatomy, ())
     tell = progress or (lambda _: None)
     ready = injection(case, field, settings)
     share = 1.0 if case.sac is None else 0.6

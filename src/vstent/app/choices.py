@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 if (
     TYPE_CHECKING
 ):  # the modules of a study are imported only when its settings are needed, so that the page appears at once
-    from vstent.flow.case import FlowSettings, Waveform
+    from vstent.flow.settings import FlowSettings, Waveform
     from vstent.study.types import Placing, Settings
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
@@ -65,7 +65,7 @@ class FlowChoice(Strict):
             inflow_mL_s=self.inflow_mL_s,
             waveform=pulse_of(former) if self.is_pulsatile else None,
             outlets=self.outlets,
-            cell_size_mm=self.cell_size_mm,
+            numerics=replace(former.numerics, cell_size_mm=self.cell_size_mm),
         )
 
 
@@ -158,7 +158,7 @@ class Choices(Strict):
 
     def settings(self, former: "Settings") -> "Settings":
         """Return the settings of the study; settings that the page cannot change are taken from `former`."""
-        from vstent.flow.case import FlowSettings
+        from vstent.flow.settings import FlowSettings
         from vstent.plan.uncertainty import Ranges
         from vstent.study.types import Placing
 

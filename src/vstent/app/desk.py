@@ -203,11 +203,12 @@ class Desk:
             The vessel has no sac.
         """
         from vstent.app.preview import Preview, shelf_of
-        from vstent.flow.case import FlowSettings
+        from vstent.flow.settings import FlowSettings
         from vstent.study.folder import CACHE
 
         live, state = self.live(case), case.state
-        settings = replace(state.settings().flow or FlowSettings(), waveform=None, close_up=False)
+        given = state.settings().flow or FlowSettings()
+        settings = replace(given, waveform=None, numerics=replace(given.numerics, close_up=False))
         shelf = shelf_of(case.folder / CACHE, state.anatomy, settings)
         with self._lock:
             found = self._previews.get(case.id)
@@ -465,7 +466,7 @@ def pulse(case: Case | None) -> dict[str, Any]:
     """
     import numpy as np
 
-    from vstent.flow.case import FlowSettings
+    from vstent.flow.settings import FlowSettings
 
     former = None if case is None else case.state.former_settings().flow
     waveform = pulse_of(former or FlowSettings())

@@ -32,8 +32,10 @@ from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.devices.treatment import BARE
 from vstent.errors import InputError, ReadError, VstentError
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowField
 from vstent.flow.domain import default_cell_size_mm
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Opening
 from vstent.io.archive import load_data
@@ -285,7 +287,10 @@ class Live:
 
         def find() -> dict[str, Any]:
             given = self.case.state.former_settings().flow or FlowSettings()
-            case = FlowCase(self.anatomy.vessel, settings=replace(given, inflow_mL_s=None, cell_size_mm=None))
+            case = vessel_case(
+                self.anatomy.vessel,
+                replace(given, inflow_mL_s=None, numerics=replace(given.numerics, cell_size_mm=None)),
+            )
             sizes = {}
             for choice in self.case.state.choices.devices:
                 with suppress(VstentError):

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Final
 
 from vstent.devices.stent import Stent
 from vstent.errors import InputError, VstentError
-from vstent.flow.case import FlowCase, FlowSettings
+from vstent.flow.case import FlowCase
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Anatomy
 from vstent.io.archive import DAMAGE
 from vstent.reporting.packing import message
@@ -321,12 +322,12 @@ class _Worker:
     """The flow and what was last said of it."""
 
     def __init__(self, pipe: Connection, anatomy: Anatomy, settings: FlowSettings, store: _Store) -> None:
-        from vstent.flow.simulation import flow_case
+        from vstent.flow.problem import flow_case
 
         self.pipe, self.anatomy, self.settings, self.store = pipe, anatomy, settings, store
         self.serial, self.watched_s, self.drawn_s = 0, -WATCHED_S, 0.0
         self.left_s, self.said = PREPARED_S, Said(fraction=1.0)
-        self.live = store.begin(flow_case(anatomy, None, settings), lambda done: pipe.send(Said(fraction=done)))
+        self.live = store.begin(flow_case(anatomy, (), settings), lambda done: pipe.send(Said(fraction=done)))
         pipe.send(self.said)
 
     def run(self) -> None:
@@ -358,10 +359,10 @@ class _Worker:
             newest = self.pipe.recv() or newest
             self.watched_s = time.monotonic()
         if newest is not None:
-            from vstent.flow.screen import screen
+            from vstent.flow.media import media
 
             self.serial, stent = newest
-            self.live.place(screen(stent, self.settings.blood))
+            self.live.place(media(stent, self.settings.blood))
 
     def _say(self, steps_per_s: float) -> None:
         """Send the present numbers, and from time to time streamlines after them."""

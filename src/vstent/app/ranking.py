@@ -6,7 +6,7 @@ from typing import Any, Final
 from vstent.app.cases import Case
 from vstent.app.jobs import RANKING
 from vstent.devices.catalogue import find_design
-from vstent.flow.case import FlowSettings
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Anatomy
 from vstent.io.writers import write_json
 from vstent.plan.rank import Ranking, rank

@@ -21,8 +21,8 @@ GEOMETRY: Final = (
     *("neck_mm", "upstream_mm", "downstream_mm"),
 )
 """Settings of the vessel that the page can change."""
-FLOW: Final = ("cell_size_mm", "inflow_mL_s", "outlets")
-"""Settings of the flow that the page can change."""
+FLOW: Final = ("inflow_mL_s", "outlets")
+"""Settings of the flow that the page can change, besides grid spacing and waveform."""
 
 
 def stem(path: Path) -> str:
@@ -74,7 +74,8 @@ def _choices(settings: "Settings", folder: Path) -> Choices:
     chosen["devices"] = [{"name": name} | asdict(settings.placing(name)) for name in settings.devices]
     chosen["flow"] = {"is_wanted": False}
     if flow is not None:
-        chosen["flow"] = {name: getattr(flow, name) for name in FLOW} | {"is_pulsatile": flow.waveform is not None}
+        chosen["flow"] = {name: getattr(flow, name) for name in FLOW}
+        chosen["flow"] |= {"cell_size_mm": flow.numerics.cell_size_mm, "is_pulsatile": flow.waveform is not None}
     chosen["uncertainty_samples"] = None if varied is None else varied.samples
     try:
         return Choices.model_validate(chosen)

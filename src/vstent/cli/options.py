@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from vstent.errors import InputError
+from vstent.flow.settings import Numerics
 
 if TYPE_CHECKING:
     from vstent.devices.treatment import Treatment
-    from vstent.flow.case import Blood, FlowSettings, Waveform
+    from vstent.flow.settings import Blood, FlowSettings, Waveform
     from vstent.plan.uncertainty import Ranges
     from vstent.study.crews import AbstractCrew
 
@@ -541,14 +542,14 @@ def _treatment(text: str) -> "Treatment":
 
 def given_problem(arguments: argparse.Namespace) -> "FlowSettings":
     """Return the settings of the flow problem."""
-    from vstent.flow.case import FlowSettings
+    from vstent.flow.settings import FlowSettings
 
     return FlowSettings(
         inflow_mL_s=arguments.flow_rate,
         blood=_blood(arguments),
         waveform=_waveform(arguments.pulsatile),
         outlets=arguments.outlets,
-        cell_size_mm=arguments.grid_spacing,
+        numerics=Numerics(cell_size_mm=arguments.grid_spacing),
     )
 
 
@@ -557,22 +558,24 @@ def given_flow(arguments: argparse.Namespace) -> "FlowSettings":
     from vstent.flow.lattice.gpu import require_gpu
     from vstent.flow.simulation import engine_class
 
-    settings = replace(
-        given_problem(arguments),
+    settings = given_problem(arguments)
+    numerics = replace(
+        settings.numerics,
         close_up=arguments.refine_sac,
         engine=arguments.engine,
         processes=arguments.processes,
         device_gpu=arguments.gpu,
     )
-    engine_class(settings)  # an unknown engine is reported before anything is computed
-    if settings.device_gpu:
+    # An unknown engine is reported before anything is computed.
+    engine_class(numerics, is_pulsatile=settings.waveform is not None)
+    if numerics.device_gpu:
         require_gpu()
-    return settings
+    return replace(settings, numerics=numerics)
 
 
 def _blood(arguments: argparse.Namespace) -> "Blood":
     """Return the blood properties that the options state."""
-    from vstent.flow.case import HIGH_SHEAR_VISCOSITY_PA_S, Blood, CarreauYasuda
+    from vstent.flow.settings import HIGH_SHEAR_VISCOSITY_PA_S, Blood, CarreauYasuda
 
     if not arguments.shear_thinning:
         return Blood(arguments.density, arguments.viscosity or Blood.viscosity_Pa_s)

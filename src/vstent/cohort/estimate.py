@@ -84,7 +84,7 @@ def _cost(case: Case) -> tuple[float, float]:
     memory = START_MB + MB_PER_1000_TRIANGLES * triangles / 1e3 + MB_PER_MILLION_VOXELS * voxels / 1e6
     cpu_s += CPU_S_PER_DEVICE * n_devices
     if case.settings.flow is not None:
-        finer = COMMON_CELL_MM / (case.settings.flow.cell_size_mm or COMMON_CELL_MM)
+        finer = COMMON_CELL_MM / (case.settings.flow.numerics.cell_size_mm or COMMON_CELL_MM)
         cells = FLOW_CELLS * finer**3
         cpu_s += (1 + n_devices) * CPU_S_PER_1000_CELLS * finer * cells / 1e3
         memory += MB_PER_1000_CELLS * cells / 1e3

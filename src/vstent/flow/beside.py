@@ -8,7 +8,7 @@ from typing import Final, Self, TypeVar
 
 import numba
 
-from vstent.flow.case import FlowSettings
+from vstent.flow.settings import Numerics
 
 Result = TypeVar("Result")
 SAFE_LAYERS: Final = ("omp", "tbb")
@@ -22,12 +22,12 @@ class Beside:
 
     Parameters
     ----------
-    settings : FlowSettings or None
-        Settings of the flow; None: no flow is computed.
+    numerics : Numerics or None
+        Numerical settings of the flow; None: no flow is computed.
     """
 
-    def __init__(self, settings: FlowSettings | None) -> None:
-        self._is_on_gpu = settings is not None and settings.device_gpu
+    def __init__(self, numerics: Numerics | None) -> None:
+        self._is_on_gpu = numerics is not None and numerics.device_gpu
         self._pool: ThreadPoolExecutor | None = None
 
     def __enter__(self) -> Self:

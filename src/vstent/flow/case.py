@@ -1,160 +1,22 @@
-"""Data classes of a flow computation: Blood, FlowSettings, Screen, FlowCase, FlowField."""
+"""Data classes of a flow computation: FlowCase with its Target and Sheets, and FlowField."""
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Final, Literal
 
 import numpy as np
 
 from vstent.devices.stent import Stent
-from vstent.geometry.murray import murray_shares
+from vstent.flow.ends import End, FlowRate, Inflow
+from vstent.flow.settings import Blood, Numerics, Waveform
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 from vstent.kernels import voxels
 from vstent.kernels.arrays import Floats, Ints, freeze
 
-LATTICE: Final = "lattice_boltzmann"
-"""Name of the embedded lattice-Boltzmann engine."""
-OPENFOAM: Final = "openfoam"
-"""Name of the engine that runs OpenFOAM, a separate program."""
-
-
-HIGH_SHEAR_VISCOSITY_PA_S: Final = 0.00345
-"""Viscosity at high shear rate, Pa s, that belongs to the default values of `CarreauYasuda` (Cho and Kensey 1991)."""
-
-
-@dataclass(frozen=True)
-class CarreauYasuda:
-    """Shear-thinning viscosity after Carreau and Yasuda.
-
-    mu = m + (m0 - m) (1 + (t g)^a)^((n - 1) / a), where g is the shear rate and m the viscosity at high shear rate.
-
-    References
-    ----------
-    Bird, Armstrong and Hassager 1987, Dynamics of Polymeric Liquids 1, eq. 4.1-8.
-    Cho and Kensey 1991, Biorheology 28, 241: the default values, for blood with m = 0.00345 Pa s.
-    """
-
-    rest_viscosity_Pa_s: float = 0.056
-    """m0, viscosity at zero shear rate."""
-    time_s: float = 1.902
-    """t, time constant."""
-    a: float = 1.25
-    """a, exponent of the transition from m0 to m."""
-    n: float = 0.22
-    """n, power-law index."""
-
-
-@dataclass(frozen=True)
-class Blood:
-    """Blood as a fluid: Newtonian unless a shear-thinning law is given.
-
-    The defaults are those of Zhong et al. 2016, Sci. Rep. 6:21724.
-    """
-
-    density_kg_m3: float = 1060.0
-    """Mass density."""
-    viscosity_Pa_s: float = 0.004
-    """Dynamic viscosity; with a shear-thinning law, its value at high shear rate."""
-    thinning: CarreauYasuda | None = None
-    """Shear-thinning law; None: Newtonian."""
-
-    @property
-    def kinematic_viscosity_m2_s(self) -> float:
-        """Kinematic viscosity: dynamic viscosity divided by density."""
-        return self.viscosity_Pa_s / self.density_kg_m3
-
-    def viscosity_at_Pa_s(self, rate_per_s: Floats) -> Floats:
-        """Return the dynamic viscosity (n,) at shear rates (n,)."""
-        law = self.thinning
-        if law is None:
-            return np.full_like(rate_per_s, self.viscosity_Pa_s)
-        falling = (1 + (law.time_s * rate_per_s) ** law.a) ** ((law.n - 1) / law.a)
-        return self.viscosity_Pa_s + (law.rest_viscosity_Pa_s - self.viscosity_Pa_s) * falling
-
-
-@dataclass(frozen=True)
-class Waveform:
-    """A periodic flow rate as a Fourier series, in multiples of its mean.
-
-    q(t) / mean = 1 + sum over k of a_k cos(k w t) + b_k sin(k w t), with w = 2 pi / period.
-    """
-
-    period_s: float
-    """Length of a cycle."""
-    cosine: tuple[float, ...]
-    """a_k for k = 1, 2, ..."""
-    sine: tuple[float, ...]
-    """b_k for k = 1, 2, ..."""
-
-    def factor(self, time_s: Floats) -> Floats:
-        """Return the flow rate divided by its mean (t,) at times (t,)."""
-        angle = 2 * np.pi / self.period_s * np.multiply.outer(time_s, np.arange(1, len(self.cosine) + 1))
-        return 1 + np.cos(angle) @ np.array(self.cosine) + np.sin(angle) @ np.array(self.sine)
-
-    def curvature_per_s2(self, time_s: Floats) -> Floats:
-        """Return the second time derivative (t,) of `factor` at times (t,)."""
-        rate_per_s = 2 * np.pi / self.period_s * np.arange(1, len(self.cosine) + 1)
-        harmonics = replace(self, cosine=tuple(rate_per_s**2 * self.cosine), sine=tuple(rate_per_s**2 * self.sine))
-        return 1 - harmonics.factor(time_s)
-
-
-@dataclass(frozen=True)
-class FlowSettings:
-    """Settings of a flow computation."""
-
-    inflow_mL_s: float | None = None
-    """Mean flow rate through all inlets together; None: 0.27 m/s times the area of each inlet."""
-    blood: Blood = field(default_factory=Blood)
-    """The fluid."""
-    waveform: Waveform | None = None
-    """Inflow waveform; None: steady inflow at the mean."""
-    max_cycles: int = 4
-    """Maximum number of cycles of a pulsatile flow."""
-    cycle_tolerance: float = 0.02
-    """A pulsatile flow has converged when two consecutive cycles differ by less than this fraction (root mean
-    square)."""
-    outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
-    """Zero pressure at every outlet, or outflow in proportion to radius cubed (Murray 1926, PNAS 12, 207)."""
-    cell_size_mm: float | None = None
-    """Grid spacing; None: `cells_per_diameter` cells across the vessel, but at most `cell_budget` cells in all."""
-    close_up: bool = False
-    """Whether to use this grid spacing only in and near the sac, and twice it elsewhere (see `lattice.close_up`)."""
-    cells_per_diameter: float = 29.0
-    """Number of cells across the mean (hydraulic) diameter 4 V / A of the vessel, where no grid spacing is given."""
-    cell_budget: float = 480_000.0
-    """Maximum number of cells in the vessel, where no grid spacing is given."""
-    tolerance: float = 0.01
-    """A flow has converged when every monitored quantity is expected to change by less than this fraction of itself,
-    and the velocity in the sac by less than twice this fraction (root mean square). An unsteady flow has converged
-    when the standard error of every time average is smaller than this fraction."""
-    max_steps: int = 96_000
-    """Maximum number of time steps of a steady flow on the fine grid. With `close_up`, the refined part makes at
-    most a quarter of them and the surrounding flow at most half."""
-    lattice_speed: float = 0.15
-    """Peak speed in cells per time step. It sets the time step, which is a third longer in a steady refined sac
-    (`close_up`). In steady flow it affects the result through the relaxation times, that is through the spatial
-    error, not through the error in time."""
-    engine: str = LATTICE
-    """Flow engine: ``lattice_boltzmann``, ``openfoam``, or the name of a plug-in (`vstent.plugins`)."""
-    processes: int = 1
-    """Number of processes on this machine (OpenFOAM only)."""
-    device_gpu: bool = False
-    """Whether the embedded engine computes on a GPU (needs the extra ``gpu``); results differ in the last bits."""
-
-    @property
-    def settled_below(self) -> float:
-        """Residual below which the flow has converged."""
-        return self.tolerance if self.waveform is None else self.cycle_tolerance
-
-    def inflow_factor(self, time_s: Floats) -> Floats:
-        """Return the inflow divided by its mean (t,) at times (t,)."""
-        return np.ones(len(time_s)) if self.waveform is None else self.waveform.factor(time_s)
-
 
 @dataclass(frozen=True, eq=False)
-class Screen:
-    """A stent as a thin porous screen: a flow resistance on the surface that its wires span."""
+class Sheet:
+    """A thin porous medium: the flow resistance of an implant on the surface that its wires span."""
 
     points_mm: Floats
     """(p, 3) sample points, dense on the surface."""
@@ -181,34 +43,51 @@ class Screen:
 
 
 @dataclass(frozen=True, eq=False)
+class Target:
+    """The sac for which a flow is computed."""
+
+    sac: Surface
+    """Its closed surface, for its indices and for judging convergence."""
+    ostium: Surface | None
+    """Surface through which blood passes between artery and sac, with normals into the sac; None: convergence is
+    judged without the flow through it."""
+
+
+@dataclass(frozen=True, eq=False)
 class FlowCase:
-    """One flow problem: geometry, device and settings."""
+    """One flow problem: a vessel with what is in it and what drives it, and how it is computed."""
 
     vessel: Vessel
     """The vessel that the blood flows through."""
-    sac: Surface | None = None
-    """Closed surface of the sac, for its indices and for judging convergence."""
-    ostium: Surface | None = None
-    """Surface through which blood passes between artery and sac, with normals into the sac."""
-    screen: Screen | None = None
-    """The stent as a porous screen, or None."""
-    stent: Stent | None = None
-    """The stent's wires over necks and ostia, for engines that resolve them, or None."""
-    settings: FlowSettings = field(default_factory=FlowSettings)
-    """Settings of the computation."""
+    ends: tuple[End, ...]
+    """Boundary condition at every opening of the vessel, in their order: inlets first."""
+    target: Target | None = None
+    """The sac, or None."""
+    media: tuple[Sheet, ...] = ()
+    """The implants as flow resistances, for engines that do not resolve their wires."""
+    solids: tuple[Stent, ...] = ()
+    """The implants' wires over necks and ostia, for engines that resolve them."""
+    blood: Blood = field(default_factory=Blood)
+    """The fluid."""
+    waveform: Waveform | None = None
+    """Course of all prescribed flow rates over a cycle; None: steady."""
+    numerics: Numerics = field(default_factory=Numerics)
+    """How the flow is computed."""
 
     @property
-    def blood(self) -> Blood:
-        """The fluid."""
-        return self.settings.blood
+    def sac(self) -> Surface | None:
+        """Closed surface of the sac, or None."""
+        return None if self.target is None else self.target.sac
+
+    @property
+    def ostium(self) -> Surface | None:
+        """Surface through which blood enters the sac, or None (see `Target`)."""
+        return None if self.target is None else self.target.ostium
 
     @property
     def inlets_mL_s(self) -> Floats:
-        """Mean flow rate (i,) of each inlet: its Murray share of the given inflow, or 0.27 m/s times its area."""
-        inlets = self.vessel.inlets
-        if self.settings.inflow_mL_s is not None:
-            return self.settings.inflow_mL_s * murray_shares(inlets)
-        return MEAN_INLET_SPEED_M_S * np.array([inlet.area_mm2 for inlet in inlets])
+        """Mean flow rate (i,) into each inlet."""
+        return np.array([end.mean_mL_s for end in self.ends if isinstance(end, Inflow)])
 
     @property
     def inlet_speeds_m_s(self) -> Floats:
@@ -221,19 +100,21 @@ class FlowCase:
         return float(self.inlets_mL_s.sum())
 
     @property
-    def held_mL_s(self) -> Floats:
-        """Mean flow rate (k,) prescribed at each outlet by Murray's law; nan where zero pressure is prescribed instead.
+    def is_split_given(self) -> bool:
+        """Whether the flow of every opening is given: all but one have a flow rate, so that resistances do not matter.
 
-        With Murray's law that is the widest outlet. Without it every outlet has zero pressure, and all values are nan.
+        With a single outlet it always is.
         """
-        outlets = self.vessel.outlets
-        held = self.inflow_mL_s * murray_shares(outlets)
-        held[: 1 if self.settings.outlets == "murray" else len(outlets)] = np.nan
-        return held
+        return sum(not isinstance(end, Inflow | FlowRate) for end in self.ends) < 2
 
+    @property
+    def settled_below(self) -> float:
+        """Residual below which the flow has converged."""
+        return self.numerics.tolerance if self.waveform is None else self.numerics.cycle_tolerance
 
-MEAN_INLET_SPEED_M_S = 0.27
-"""Default mean speed in an inlet, m/s, for an internal carotid artery."""
+    def inflow_factor(self, time_s: Floats) -> Floats:
+        """Return the inflow divided by its mean (t,) at times (t,)."""
+        return np.ones(len(time_s)) if self.waveform is None else self.waveform.factor(time_s)
 
 
 PHASES = 20

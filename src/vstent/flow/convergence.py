@@ -7,10 +7,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.indices import QUANTITIES, indices
 from vstent.flow.positions import POSITIONS, Scatter, scatter, turned
+from vstent.flow.settings import Numerics
 from vstent.flow.simulation import engine_class, simulate_case
 
 RATIO: Final = 2**0.5
@@ -105,15 +106,15 @@ def convergence(
     FlowError
         A flow cannot be computed.
     """
-    cell_size, *others = engine_class(case.settings).refined_by
+    cell_size, *others = engine_class(case.numerics, is_pulsatile=case.waveform is not None).refined_by
     runs = _Runs(case, folder, told, 3 + 2 * len(others) + len(POSITIONS) - 1, [])
-    given = case.settings
-    settings = replace(
+    given = case.numerics
+    numerics = replace(
         given, tolerance=min(TOLERANCE, given.tolerance), cycle_tolerance=min(TOLERANCE, given.cycle_tolerance)
     )
-    grids = runs.refine(cell_size, RATIO**2 * default_cell_size_mm(case), settings, None)
-    middle, known = replace(settings, cell_size_mm=grids.sizes[1]), runs.done[1]
-    further = (runs.refine(name, getattr(settings, name), middle, known) for name in others)
+    grids = runs.refine(cell_size, RATIO**2 * default_cell_size_mm(case), numerics, None)
+    middle, known = replace(numerics, cell_size_mm=grids.sizes[1]), runs.done[1]
+    further = (runs.refine(name, getattr(numerics, name), middle, known) for name in others)
     return Sensitivity((grids, *further), runs.turn(middle, known))
 
 
@@ -128,19 +129,19 @@ class _Runs:
     """Total number of runs planned."""
     done: list[FlowField]
 
-    def refine(self, name: str, coarsest: float, settings: FlowSettings, known: FlowField | None) -> Refinement:
+    def refine(self, name: str, coarsest: float, numerics: Numerics, known: FlowField | None) -> Refinement:
         """Compute the flow with a setting at three sizes; `known` is the flow at the coarsest size, if available."""
         sizes = (coarsest, coarsest / RATIO, coarsest / RATIO**2)
         fields = [] if known is None else [known]
         for size in sizes[len(fields) :]:
             start = fields[-1] if fields else None
-            case = replace(self.case, settings=_changed(settings, name, size))
+            case = replace(self.case, numerics=_changed(numerics, name, size))
             fields.append(self._flow(case, f"{name}-{size:.4g}", start))
         return Refinement(name, sizes, _compared(self.case, fields))
 
-    def turn(self, settings: FlowSettings, known: FlowField) -> dict[str, Scatter]:
+    def turn(self, numerics: Numerics, known: FlowField) -> dict[str, Scatter]:
         """Compute the flow with the vessel rotated on the grid; `known` is the flow in the original position."""
-        case = replace(self.case, settings=settings)
+        case = replace(self.case, numerics=numerics)
         found = [indices(known, case.sac, case.ostium)]
         for name, turn in list(POSITIONS.items())[1:]:
             lying = turned(case, turn)
@@ -150,18 +151,18 @@ class _Runs:
     def _flow(self, case: FlowCase, name: str, start: FlowField | None) -> FlowField:
         """Compute one flow, record it and report it."""
         own = None if self.folder is None else self.folder / name
-        # With a screen, `start` would be taken for the flow without a device.
-        field = simulate_case(case, start=start if case.screen is None else None, folder=own)
+        # With media, `start` would be taken for the flow without a device.
+        field = simulate_case(case, start=start if not case.media else None, folder=own)
         self.done.append(field)
         said = f"{name}: {len(field.cells)} cells, {field.steps} time steps, run time {field.seconds:.0f} s."
         self.told(len(self.done) / self.count, said)
         return field
 
 
-def _changed(settings: FlowSettings, name: str, size: float) -> FlowSettings:
+def _changed(numerics: Numerics, name: str, size: float) -> Numerics:
     """Return the settings with one of them set to `size`."""
     values: dict[str, Any] = {name: size}
-    return replace(settings, **values)
+    return replace(numerics, **values)
 
 
 def _compared(case: FlowCase, fields: list[FlowField]) -> dict[str, Convergence]:

@@ -5,7 +5,8 @@ from typing import Final
 import numpy as np
 
 from vstent.errors import FlowError
-from vstent.flow.case import PHASES, FlowCase, Waveform
+from vstent.flow.case import PHASES, FlowCase
+from vstent.flow.settings import Waveform
 from vstent.kernels.arrays import Floats
 
 STALLED: Final = 0.8
@@ -69,6 +70,6 @@ def pulse_of(case: FlowCase) -> Waveform:
     FlowError
         The case has no waveform.
     """
-    if case.settings.waveform is None:
+    if case.waveform is None:
         raise FlowError("pulsatile flow needs an inflow waveform: set one, or compute steady flow")
-    return case.settings.waveform
+    return case.waveform

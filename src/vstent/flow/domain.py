@@ -9,7 +9,8 @@ from scipy import ndimage
 
 from vstent.errors import FlowError
 from vstent.flow import sampling
-from vstent.flow.case import Blood, FlowCase
+from vstent.flow.case import FlowCase
+from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Opening, Vessel
 from vstent.kernels import triangles, voxels
@@ -113,7 +114,7 @@ def too_narrow(case: FlowCase, cell_size_mm: float) -> str:
     """
     outlets = case.vessel.outlets
     narrow = [outlet for outlet in outlets if outlet.diameter_mm < BRANCH_CELLS * cell_size_mm]
-    if len(outlets) < 2 or case.settings.outlets == "murray" or not narrow:
+    if case.is_split_given or not narrow:
         return ""
     named = ", ".join(
         f"{outlet.role} ({outlet.diameter_mm:.2g} mm) has {outlet.diameter_mm / cell_size_mm:.1f}" for outlet in narrow
@@ -210,13 +211,13 @@ def default_cell_size_mm(case: FlowCase) -> float:
     The cells are counted across the mean diameter 4 V / A of the vessel, or across its inlet where that is narrower,
     because a large sac increases the mean.
     """
-    settings = case.settings
-    if settings.cell_size_mm is not None:
-        return settings.cell_size_mm
+    numerics = case.numerics
+    if numerics.cell_size_mm is not None:
+        return numerics.cell_size_mm
     volume_mm3 = case.vessel.closed.volume_mm3
     across_mm = min(mean_diameter_mm(case.vessel), case.vessel.inlet.diameter_mm)
-    by_diameter = across_mm / settings.cells_per_diameter
-    by_budget = (volume_mm3 / settings.cell_budget) ** (1 / 3)
+    by_diameter = across_mm / numerics.cells_per_diameter
+    by_budget = (volume_mm3 / numerics.cell_budget) ** (1 / 3)
     return max(by_diameter, by_budget)
 
 

@@ -181,7 +181,7 @@ def run(
     state = engine.init(case, start) if saved is None else engine.resume(case, saved)
     residual = [] if saved is None else saved["residual"].tolist()
     before, loop_before = (0.0, 0.0) if saved is None else saved["seconds"].tolist()
-    limit, tolerance = engine.max_checks(state), case.settings.settled_below
+    limit, tolerance = engine.max_checks(state), case.settled_below
     saver, loop_began = _Saver(bookmark), perf_counter()
 
     def seconds() -> tuple[float, float]:

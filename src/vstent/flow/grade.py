@@ -6,9 +6,10 @@ from typing import Final, Literal
 
 import numpy as np
 
-from vstent.flow.case import LATTICE, FlowCase, FlowField
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
 from vstent.flow.lattice.setup import CELL_REYNOLDS
+from vstent.flow.settings import LATTICE
 from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
 from vstent.geometry.murray import murray_shares
 from vstent.geometry.vessel import Opening
@@ -115,7 +116,7 @@ def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) ->
     """Return the measures of a flow that its grade rests on; counts are in cells, fractions from 0 to 1."""
     spacing_mm = field.cell_size_mm
     measures = {"cells_across_parent_count": mean_diameter_mm(case.vessel) / spacing_mm}
-    if len(case.vessel.outlets) > 1 and case.settings.outlets != "murray":
+    if not case.is_split_given:
         measures["cells_across_outlet_count"] = _narrowest_mm(case.vessel.outlets) / spacing_mm
     if np.isfinite(field.unsettled_fraction):
         measures["unsettled_fraction"] = field.unsettled_fraction
@@ -125,7 +126,7 @@ def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) ->
     measures["cells_across_neck_count"] = neck_diameter_mm(case.ostium) / spacing_mm
     measures["cells_across_sac_count"] = float(np.cbrt(6 * abs(case.sac.volume_mm3) / np.pi)) / spacing_mm
     measures["neck_imbalance_fraction"] = _imbalance(field, found)
-    if case.settings.engine == LATTICE:
+    if case.numerics.engine == LATTICE:
         measures["raised_viscosity_fraction"] = _raised_fraction(case, field)
     return measures
 

@@ -39,16 +39,18 @@ def scatter(values: tuple[float, ...]) -> Scatter:
 
 def turned(case: FlowCase, turn: Rotation) -> FlowCase:
     """Return a case rotated about the origin with everything in it: the same flow on a different grid."""
-    matrix = turn.as_matrix()
-    screen, stent = case.screen, case.stent
+    matrix, target, ostium = turn.as_matrix(), case.target, case.ostium
     return replace(
         case,
         vessel=_vessel(case.vessel, matrix),
-        sac=None if case.sac is None else _surface(case.sac, matrix),
-        ostium=None if case.ostium is None else _surface(case.ostium, matrix),
-        screen=screen and replace(screen, points_mm=screen.points_mm @ matrix.T, normals=screen.normals @ matrix.T),
-        stent=stent
-        and replace(stent, nodes_mm=stent.nodes_mm @ matrix.T, wire_points_mm=stent.wire_points_mm @ matrix.T),
+        target=target and replace(target, sac=_surface(target.sac, matrix), ostium=ostium and _surface(ostium, matrix)),
+        media=tuple(
+            replace(one, points_mm=one.points_mm @ matrix.T, normals=one.normals @ matrix.T) for one in case.media
+        ),
+        solids=tuple(
+            replace(one, nodes_mm=one.nodes_mm @ matrix.T, wire_points_mm=one.wire_points_mm @ matrix.T)
+            for one in case.solids
+        ),
     )
 
 

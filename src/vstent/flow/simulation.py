@@ -1,6 +1,6 @@
 """Flow computation: `simulate` an anatomy with and without devices, or `simulate_case` for a single flow."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -12,17 +12,16 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from vstent import plugins
-from vstent.deployment.struts import over_restored
-from vstent.devices.stent import Deployment, Stent
+from vstent.devices.stent import Deployment
 from vstent.errors import InputError
 from vstent.flow import sampling
 from vstent.flow.beside import Beside
-from vstent.flow.case import LATTICE, OPENFOAM, FlowCase, FlowField, FlowSettings, Phase
+from vstent.flow.case import FlowCase, FlowField, Phase, Target
 from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
 from vstent.flow.lattice.close_up import SHARE_AROUND, WIDTH, require_sac
-from vstent.flow.ostium import ostium
-from vstent.flow.screen import screen
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import LATTICE, OPENFOAM, FlowSettings, Numerics
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats
 
@@ -35,7 +34,7 @@ OUTER_SHARE = 0.35
 CALMER_TRIES = 3
 """Maximum number of retries of a diverged run, each with a shorter time step."""
 
-_BARE_GUESSES: WeakKeyDictionary[FlowField, dict[tuple[float, FlowSettings], FlowField]] = WeakKeyDictionary()
+_BARE_GUESSES: WeakKeyDictionary[FlowField, dict[Hashable, FlowField]] = WeakKeyDictionary()
 """Coarse-grid flows without a device, by the fine flow they start from: computed once and shared by all devices."""
 
 OnProgress = Callable[[Progress], None]
@@ -87,36 +86,12 @@ def simulate(
     fields: list[FlowField] = []
     bare: FlowField | None = None
     for deployment in deployments:
-        stent = None if deployment is None else deployment.stent
-        field = simulate_case(flow_case(anatomy, stent, settings), start=bare, progress=progress)
+        case = flow_case(anatomy, () if deployment is None else (deployment.stent,), settings)
+        field = simulate_case(case, start=bare, progress=progress)
         if stent is None and bare is None:
             bare = field
         fields.append(field)
     return tuple(fields)
-
-
-def flow_case(anatomy: Anatomy, stent: Stent | None, settings: FlowSettings | None = None) -> FlowCase:
-    """Build the flow problem: the patient's lumen, its largest sac, and a stent or None.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The patient's vessel and aneurysms.
-    stent : Stent or None
-        Deployed stent, included both as a screen and as wires over necks and ostia.
-    settings : FlowSettings, optional
-        Settings of the computation.
-    """
-    settings = settings or FlowSettings()
-    largest = anatomy.aneurysms[0] if anatomy.aneurysms else None
-    return FlowCase(
-        vessel=anatomy.vessel,
-        sac=None if largest is None else largest.sac,
-        ostium=None if largest is None else ostium(largest, anatomy.vessel.lumen),
-        screen=None if stent is None else screen(stent, settings.blood),
-        stent=None if stent is None else over_restored(stent, anatomy),
-        settings=settings,
-    )
 
 
 def simulate_case(
@@ -152,7 +127,7 @@ def simulate_case(
         The vessel cannot be discretized, or the computation diverges.
     """
     with nullcontext(folder) if folder is not None else TemporaryDirectory(prefix="vstent-") as own:
-        return _Runs(engine_class(case.settings), Path(own), progress, checkpoint, similar).answer(case, start)
+        return _Runs(_engine_of(case), Path(own), progress, checkpoint, similar).answer(case, start)
 
 
 def foretell_cost(case: FlowCase) -> str:
@@ -163,16 +138,23 @@ def foretell_cost(case: FlowCase) -> str:
     FlowError
         The case does not fit in the free memory.
     """
-    return engine_class(case.settings)(default_cell_size_mm(case)).cost(case)
+    return _engine_of(case)(default_cell_size_mm(case)).cost(case)
 
 
 def memory_bytes(case: FlowCase) -> float | None:
     """Return the expected peak memory of a flow; None where its engine does not estimate it."""
-    return engine_class(case.settings)(default_cell_size_mm(case)).memory_bytes(case)
+    return _engine_of(case)(default_cell_size_mm(case)).memory_bytes(case)
 
 
-def engine_class(settings: FlowSettings) -> type[AbstractEngine[Any]]:
+def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngine[Any]]:
     """Return the engine that the settings name: one of vstent's own or a plug-in.
+
+    Parameters
+    ----------
+    numerics : Numerics
+        Numerical settings.
+    is_pulsatile : bool
+        Whether the inflow follows a waveform.
 
     Raises
     ------
@@ -181,31 +163,36 @@ def engine_class(settings: FlowSettings) -> type[AbstractEngine[Any]]:
     InputError
         The settings request a GPU or a refined sac, and the engine does not support it.
     """
-    engine = _engine_of(settings)
-    if settings.close_up and not engine.closes_up:
+    engine = _named(numerics.engine, is_pulsatile)
+    if numerics.close_up and not engine.closes_up:
         raise InputError(
-            f"the engine {settings.engine} does not support a finer grid in the sac alone: switch it off "
+            f"the engine {numerics.engine} does not support a finer grid in the sac alone: switch it off "
             f"(--refine-sac), or choose the engine {LATTICE}"
         )
-    if settings.device_gpu and not engine.runs_on_gpu:
+    if numerics.device_gpu and not engine.runs_on_gpu:
         raise InputError(
-            f"the engine {settings.engine} does not support a GPU: compute on the CPU (without --gpu), or choose the "
+            f"the engine {numerics.engine} does not support a GPU: compute on the CPU (without --gpu), or choose the "
             f"engine {LATTICE}"
         )
     return engine
 
 
-def _engine_of(settings: FlowSettings) -> type[AbstractEngine[Any]]:
-    """Return the engine's class by its name in the settings."""
+def _engine_of(case: FlowCase) -> type[AbstractEngine[Any]]:
+    """Return the engine that computes a case."""
+    return engine_class(case.numerics, is_pulsatile=case.waveform is not None)
+
+
+def _named(name: str, is_pulsatile: bool) -> type[AbstractEngine[Any]]:
+    """Return the engine of a name."""
     from vstent.flow.lattice.engine import LatticeBoltzmann
     from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
     from vstent.flow.openfoam.engine import OpenFoam
 
-    lattice = LatticeBoltzmann if settings.waveform is None else PulsatileLatticeBoltzmann
+    lattice = PulsatileLatticeBoltzmann if is_pulsatile else LatticeBoltzmann
     built_in: dict[str, type[AbstractEngine[Any]]] = {LATTICE: lattice, OPENFOAM: OpenFoam}
-    if settings.engine in built_in:
-        return built_in[settings.engine]
-    found: type[AbstractEngine[Any]] = plugins.load("vstent.engines", settings.engine, built_in=", ".join(built_in))
+    if name in built_in:
+        return built_in[name]
+    found: type[AbstractEngine[Any]] = plugins.load("vstent.engines", name, built_in=", ".join(built_in))
     return found
 
 
@@ -223,7 +210,7 @@ class _Runs:
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
         """Compute a flow, from a coarse-grid guess unless a saved run is resumed or the coarse grid is too coarse."""
         cell_size_mm = default_cell_size_mm(case)
-        if case.settings.close_up:
+        if case.numerics.close_up:
             return self._close_up(case, start, cell_size_mm)
         runs = 0 if self.similar is not None else _coarse_runs(self.engine, case, start)
         progress = self._part(runs * COARSE_SHARE, 1.0)
@@ -234,10 +221,10 @@ class _Runs:
 
     def _close_up(self, case: FlowCase, start: FlowField | None, cell_size_mm: float) -> FlowField:
         """Compute the whole vessel on a coarse grid, then the sac and its neck on a fine grid inside it."""
-        require_sac(case)
-        steps = int(SHARE_AROUND * case.settings.max_steps)
+        target = Target(require_sac(case), None)
+        steps = int(SHARE_AROUND * case.numerics.max_steps)
         # Without the ostium: oscillations at the neck would need most of the steps, and the fine grid recomputes them.
-        around = replace(case, ostium=None, settings=replace(case.settings, max_steps=steps))
+        around = replace(case, target=target, numerics=replace(case.numerics, max_steps=steps))
         outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
         # The mean of an unsteady flow lacks its oscillations: from it C0038's averages take longer than from `outer`.
         guess = outer if self.similar is None or self.similar.swing is not None else self.similar
@@ -258,7 +245,7 @@ class _Runs:
             return start
         coarse_mm = self.engine.coarsening * cell_size_mm
         is_tiny = abs(case.vessel.closed.volume_mm3) < 4 * MIN_CELLS * coarse_mm**3
-        if is_tiny or (start is not None and case.screen is None):
+        if is_tiny or (start is not None and not case.media):
             return start
         first, second = (
             self._part(rank * COARSE_SHARE, (rank + 1) * COARSE_SHARE) if depth == 0 else None for rank in range(2)
@@ -274,9 +261,12 @@ class _Runs:
         self, case: FlowCase, start: FlowField, coarse_mm: float, progress: OnProgress | None, depth: int
     ) -> FlowField:
         """Return the coarse-grid flow without a device, started from the fine one and computed only once."""
-        done, key = _BARE_GUESSES.setdefault(start, {}), (coarse_mm, case.settings)
+        done, key = (
+            _BARE_GUESSES.setdefault(start, {}),
+            (coarse_mm, case.ends, case.blood, case.waveform, case.numerics),
+        )
         if key not in done:
-            bare = replace(case, screen=None, stent=None)
+            bare = replace(case, media=(), solids=())
             done[key] = self._coarse(bare, coarse_mm, start, "bare guess", progress, depth)
         return done[key]
 
@@ -291,7 +281,7 @@ class _Runs:
     ) -> FlowField:
         """Compute a flow on a coarser grid, itself from a guess; runs below the first level need negligible time."""
         name = depth * "coarser " + name
-        engine = engine_class(case.settings)(cell_size_mm, self.folder / name)
+        engine = _engine_of(case)(cell_size_mm, self.folder / name)
         return self._run(
             engine, case, lambda: self._guess(case, start, cell_size_mm, depth + 1), progress, self._bookmark(name)
         )
@@ -345,9 +335,9 @@ class _Runs:
 
 def _guessed(engine: AbstractEngine[Any], case: FlowCase, guess: Guess) -> FlowField | None:
     """Return a first guess; while a GPU computes it, what the engine needs next is built."""
-    if not case.settings.device_gpu:
+    if not case.numerics.device_gpu:
         return guess()
-    with Beside(case.settings) as beside:
+    with Beside(case.numerics) as beside:
         ready = beside.do(partial(engine.prepare, case))
         found = guess()
         ready()
@@ -387,4 +377,4 @@ def _coarse_runs(engine: type[AbstractEngine[Any]], case: FlowCase, start: FlowF
         return 0
     if start is None:
         return 1
-    return 0 if case.screen is None else 2
+    return 2 if case.media else 0

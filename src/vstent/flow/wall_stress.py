@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from vstent.flow.case import Blood
 from vstent.flow.domain import Domain
+from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
 from vstent.kernels import sampling
 from vstent.kernels.arrays import Floats

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from vstent.errors import InputError
-from vstent.flow.case import Waveform
+from vstent.flow.settings import Waveform
 from vstent.kernels.arrays import Floats
 
 OLDER_ADULT_ICA = Waveform(

@@ -12,10 +12,12 @@ from vstent.deployment.deploy import deploy, propose_landing
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import FlowError, InputError
 from vstent.flow.beside import Beside
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.grade import NOT_USABLE, grade
 from vstent.flow.indices import indices
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.plan.criteria import Criteria
 from vstent.plan.rank import Candidate, Ranking, graded_anew, ordered
@@ -109,7 +111,7 @@ def rank_flows(
     flows = _Flows(anatomy, settings, has_contrast, [coverage_of(one) for one in unfinished])
     waiting: dict[Candidate | None, Callable[[], Mapping[str, Any]]] = {}
     criteria = ranking.criteria if has_contrast else None
-    with Beside(settings) as beside:
+    with Beside(settings.numerics) as beside:
         for done, candidate in enumerate([None, *chosen]):
             if progress is not None:
                 progress(done, 1 + len(chosen), "no device" if candidate is None else candidate.label)
@@ -229,7 +231,7 @@ def flow_with(
     FlowError
         The flow without a device cannot be computed.
     """
-    case = flow_case(anatomy, None if candidate is None else stent_of(anatomy, candidate), settings)
+    case = flow_case(anatomy, () if candidate is None else (stent_of(anatomy, candidate),), settings)
     try:
         field = simulate_case(case, start=start, similar=similar)
     except FlowError as error:

@@ -21,10 +21,11 @@ from vstent.devices.design import Design, Range, Size
 from vstent.devices.ranges import altered, uncertain, values_at
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, InputError, LandingError
-from vstent.flow.case import FlowSettings
 from vstent.flow.indices import indices, ratios
 from vstent.flow.ostium import ostium
-from vstent.flow.simulation import Checkpoint, flow_case, simulate_case
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings
+from vstent.flow.simulation import Checkpoint, simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats, freeze
 from vstent.kernels.sobol import centered_points
@@ -286,7 +287,7 @@ def _sample(
     found: dict[str, float] = {name: float(measures[name]) for name in RESULTS if name in measures}
     if flow is None or not other.aneurysms:
         return found
-    inflow_mL_s = flow_case(anatomy, None, flow).inflow_mL_s * (1 + inflow_fraction)
+    inflow_mL_s = flow_case(anatomy, (), flow).inflow_mL_s * (1 + inflow_fraction)
     return found | _flow_ratios(other, deployed.stent, replace(flow, inflow_mL_s=inflow_mL_s))
 
 
@@ -294,7 +295,7 @@ def _flow_ratios(anatomy: Anatomy, stent: Stent, flow: FlowSettings) -> dict[str
     """Return the ratios of the flow with to the flow without the device."""
     sac = anatomy.aneurysms[0]
     shapes = sac.sac, ostium(sac, anatomy.vessel.lumen)
-    bare = simulate_case(flow_case(anatomy, None, flow))
-    after = simulate_case(flow_case(anatomy, stent, flow), start=bare)
+    bare = simulate_case(flow_case(anatomy, (), flow))
+    after = simulate_case(flow_case(anatomy, (stent,), flow), start=bare)
     found = ratios(indices(bare, *shapes), indices(after, *shapes))
     return {name: found[name] for name in FLOW_RESULTS if name in found}

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from vstent.devices.stent import Deployment
 from vstent.devices.treatment import BARE
-from vstent.flow.case import LATTICE, OPENFOAM
+from vstent.flow.settings import LATTICE, OPENFOAM
 from vstent.reporting import bands
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
 from vstent.reporting.drawing import Drawing, in_threads

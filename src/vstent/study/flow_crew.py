@@ -7,9 +7,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-from vstent.flow.case import FlowField, FlowSettings
+from vstent.flow.case import FlowField
 from vstent.flow.memory import free_memory_bytes
-from vstent.flow.simulation import flow_case, memory_bytes
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings
+from vstent.flow.simulation import memory_bytes
 from vstent.geometry.vessel import Anatomy
 from vstent.io.files import atomic
 from vstent.plan.rank import Candidate
@@ -140,9 +142,9 @@ def parallel_flows(
     One at a time where they run on a GPU, or where the memory of a flow is unknown (0 is returned for it).
     """
     needed = _memory_bytes(anatomy, chosen, settings)
-    if settings.device_gpu or not needed:
+    if settings.numerics.device_gpu or not needed:
         return 1, needed / BYTES_PER_MB
-    fitting = min(jobs // settings.processes, free_memory_bytes() // needed)
+    fitting = min(jobs // settings.numerics.processes, free_memory_bytes() // needed)
     return max(1, int(fitting)), needed / BYTES_PER_MB
 
 
@@ -150,7 +152,7 @@ def _memory_bytes(anatomy: Anatomy, chosen: Sequence[Candidate], settings: FlowS
     """Return the memory of the flow with the first candidate; 0 where it is unknown or there is none."""
     if not chosen or not anatomy.aneurysms:
         return 0.0
-    return memory_bytes(flow_case(anatomy, stent_of(anatomy, chosen[0]), settings)) or 0.0
+    return memory_bytes(flow_case(anatomy, (stent_of(anatomy, chosen[0]),), settings)) or 0.0
 
 
 def _keep(path: Path, what: Any) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from vstent.devices.treatment import BARE
-from vstent.flow.case import FlowSettings
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Anatomy
 from vstent.io.writers import write_json
 from vstent.plan.rank import Candidate

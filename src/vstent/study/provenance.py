@@ -53,7 +53,7 @@ def versions() -> dict[str, str]:
 
 def machine(settings: Settings) -> dict[str, str]:
     """Return the properties of the machine that can change the last digits of a result."""
-    uses_gpu = settings.flow is not None and settings.flow.device_gpu
+    uses_gpu = settings.flow is not None and settings.flow.numerics.device_gpu
     return {"system": platform.system(), "processor": platform.machine()} | ({"gpu": gpu_name()} if uses_gpu else {})
 
 

@@ -25,12 +25,14 @@ from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant, Treatment
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, VstentError
 from vstent.flow.beside import Beside
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.grade import computation_of, grade
 from vstent.flow.indices import indices, ratios
 from vstent.flow.ostium import ostium
-from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
+from vstent.flow.problem import flow_case, vessel_case
+from vstent.flow.settings import FlowSettings
+from vstent.flow.simulation import foretell_cost, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
@@ -314,7 +316,7 @@ def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
     """
     if flow is None or flow.inflow_mL_s is None:
         return
-    case = FlowCase(anatomy.vessel, settings=flow)
+    case = vessel_case(anatomy.vessel, flow)
     for inlet, part_mL_s, speed_m_s in zip(case.vessel.inlets, case.inlets_mL_s, case.inlet_speeds_m_s, strict=True):
         if not SLOWEST_M_S <= speed_m_s <= FASTEST_M_S:
             raise InputError(
@@ -329,7 +331,7 @@ def engine_folders(out: Path, settings: Settings) -> dict[str, Path]:
     if settings.flow is None:
         return {}
     names = (BARE, *(treatment.name for treatment in settings.treatments))
-    return {name: flow_folder(out, name) / settings.flow.engine for name in names}
+    return {name: flow_folder(out, name) / settings.flow.numerics.engine for name in names}
 
 
 def compute_flows(
@@ -371,7 +373,7 @@ def compute_flows(
     failures: dict[str, str] = {}
     folders, stored = engine_folders(out, settings), []
     stents = {BARE: [], **{name: [one.stent for one in found.values()] for name, found in implants.items()}}
-    with Beside(settings.flow) as beside:
+    with Beside(settings.flow.numerics) as beside:
         for name, key in flow_keys(source, settings).items():
             if name not in stents:
                 continue  # it could not be deployed
@@ -446,7 +448,8 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
             done.append(sentence)
             ledger.progress("convergence", 0.99 * fraction, sentence)
 
-        found = convergence(flow_case(anatomy, (), flow), folder=out / "convergence" / flow.engine, told=told)
+        folder = out / "convergence" / flow.numerics.engine
+        found = convergence(flow_case(anatomy, (), flow), folder=folder, told=told)
         tell(" ".join(done))
     return found
 

@@ -6,7 +6,8 @@ from typing import Any, Literal, Protocol
 from vstent.devices.stent import Deployment
 from vstent.devices.treatment import Treatment, with_device
 from vstent.errors import InputError
-from vstent.flow.case import FlowField, FlowSettings
+from vstent.flow.case import FlowField
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.plan.uncertainty import Ranges
 

@@ -14,16 +14,20 @@ from shapes import sphere
 from vstent import phantoms
 from vstent.anatomy.trace import trace
 from vstent.flow import engines
-from vstent.flow.case import FlowCase, FlowField, FlowSettings, Screen, Waveform
+from vstent.flow.case import FlowField, Sheet, Target
 from vstent.flow.lattice import stepping
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import FlowSettings, Numerics, Waveform
 from vstent.flow.simulation import simulate_case
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 from vstent.study.checkpoint import FlowCheckpoint
 
-SETTINGS = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.3, max_steps=800)
+SETTINGS = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.3, max_steps=800))
 PULSE = FlowSettings(
-    inflow_mL_s=1.0, cell_size_mm=0.4, waveform=Waveform(0.05, (0.5,), (0.0,)), max_cycles=2, lattice_speed=0.2
+    inflow_mL_s=1.0,
+    waveform=Waveform(0.05, (0.5,), (0.0,)),
+    numerics=Numerics(cell_size_mm=0.4, max_cycles=2, lattice_speed=0.2),
 )
 
 
@@ -32,13 +36,13 @@ def vessel() -> Vessel:
     return trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.4)))
 
 
-def screen() -> Screen:
+def screen() -> Sheet:
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-2.2, 2.2, 0.1), np.arange(-2.2, 2.2, 0.1)))
     n = len(x)
     points = np.stack([x, y, np.full(n, 5.0)], axis=1)
     normals = np.tile([0.0, 0.0, 1.0], (n, 1))
     one = np.ones(n)
-    return Screen(points, normals, 0.01 * one, 300 * one, 150 * one, 0 * one, one, one)
+    return Sheet(points, normals, 0.01 * one, 300 * one, 150 * one, 0 * one, one, one)
 
 
 class Stopping(FlowCheckpoint):
@@ -62,14 +66,15 @@ def test_a_stopped_flow_goes_on_to_the_same_bits(
     monkeypatch.setattr(engines, "SAVE_SHARE", np.inf)
     monkeypatch.setattr(stepping, "SLICE_UPDATES", 5e5)  # stops between checks too
     settings = PULSE if "pulsatile" in kind else SETTINGS
-    case = FlowCase(vessel(), settings=settings)
+    case = vessel_case(vessel(), settings)
     start = None
     if kind == "stented":
         start = simulate_case(case)
-        case = replace(case, screen=screen())
+        case = replace(case, media=(screen(),))
     if "close-up" in kind:
         sac = Surface(sphere(1.0).vertices_mm + np.array([0.0, 0.0, 5.0]), sphere(1.0).faces)
-        case = replace(case, sac=sac, settings=replace(settings, cell_size_mm=0.2, close_up=True))
+        numerics = replace(settings.numerics, cell_size_mm=0.2, close_up=True)
+        case = replace(case, target=Target(sac, None), numerics=numerics)
     whole = simulate_case(case, start=start)
     stopping = Stopping(tmp_path, "flow", "key")
     stopping.last = saves
@@ -97,10 +102,10 @@ sys.path.insert(0, {str(Path(__file__).parents[2] / "helpers")!r})
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 import test_checkpoint as here
 here.engines.SAVE_EVERY_S = 0.05
-case = here.FlowCase(here.vessel(), settings=here.LONG)
+case = here.vessel_case(here.vessel(), here.LONG)
 here.simulate_case(case, checkpoint=here.FlowCheckpoint(Path(sys.argv[1]), "flow", "key"))
 """
-LONG = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.3, max_steps=1600, tolerance=1e-9)
+LONG = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.3, max_steps=1600, tolerance=1e-9))
 
 
 def test_a_killed_flow_goes_on_to_the_same_bits(tmp_path: Path) -> None:
@@ -115,7 +120,7 @@ def test_a_killed_flow_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     finally:
         process.kill()
         process.wait()
-    case = FlowCase(vessel(), settings=LONG)
+    case = vessel_case(vessel(), LONG)
     resumed = simulate_case(case, checkpoint=FlowCheckpoint(tmp_path, "flow", "key"))
     assert_same(resumed, simulate_case(case))
 

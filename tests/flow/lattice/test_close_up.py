@@ -19,7 +19,7 @@ from vstent.anatomy.trim import trim
 from vstent.errors import FlowError, InputError
 from vstent.flow import domain
 from vstent.flow import simulation as flow
-from vstent.flow.case import OPENFOAM, FlowCase, FlowField, FlowSettings, Screen, Swing
+from vstent.flow.case import FlowCase, FlowField, Sheet, Swing, Target
 from vstent.flow.engines import AbstractEngine, run
 from vstent.flow.indices import indices
 from vstent.flow.lattice import close_up as close_ups
@@ -30,7 +30,9 @@ from vstent.flow.lattice.pace import peak_speed_m_s
 from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
 from vstent.flow.lattice.setup import thickest
 from vstent.flow.lattice.stepping import build, imposed, snapshot, take_pace
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case, vessel_case
+from vstent.flow.settings import OPENFOAM, FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Vessel
@@ -53,8 +55,8 @@ def demo() -> Anatomy:
 @cache
 def of_tube() -> FlowField:
     vessel = tube(line(40.0), RADIUS_MM).vessel
-    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.2, close_up=True, tolerance=2e-3)
-    return simulate_case(FlowCase(vessel, sac=ball((0.0, 0.0, 24.0)), settings=settings))
+    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, numerics=Numerics(cell_size_mm=0.2, close_up=True, tolerance=2e-3))
+    return simulate_case(vessel_case(vessel, settings, target=Target(ball((0.0, 0.0, 24.0)), None)))
 
 
 def at_rest(case: FlowCase, grid: domain.Domain) -> FlowField:
@@ -68,7 +70,7 @@ def at_rest(case: FlowCase, grid: domain.Domain) -> FlowField:
 
 @cache
 def outer_of_demo() -> tuple[FlowCase, FlowField]:
-    case = flow_case(demo(), None, FlowSettings(cell_size_mm=0.5))
+    case = flow_case(demo(), (), FlowSettings(numerics=Numerics(cell_size_mm=0.5)))
     return case, simulate_case(case)
 
 
@@ -93,13 +95,13 @@ def test_what_surrounds_a_close_up_is_given_half_of_the_steps_and_no_neck_to_wat
     seen = []
 
     def telling(engine: AbstractEngine[Any], case: FlowCase, **more: Any) -> FlowField:
-        seen.append((engine.cell_size_mm, case.settings.max_steps, case.ostium))
+        seen.append((engine.cell_size_mm, case.numerics.max_steps, case.ostium))
         return run(engine, case, **more)
 
     monkeypatch.setattr(flow, "run", telling)
     sac = ball((0.0, 0.0, 24.0))
-    case = FlowCase(tube(line(40.0), RADIUS_MM).vessel, sac=sac, ostium=sac)
-    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.3, close_up=True, max_steps=960)
+    case = vessel_case(tube(line(40.0), RADIUS_MM).vessel, target=Target(sac, sac))
+    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, numerics=Numerics(cell_size_mm=0.3, close_up=True, max_steps=960))
     simulate_case(replace(case, settings=settings))
     assert seen == [(0.6, 480, None), (0.3, 960, sac)]
 
@@ -122,9 +124,9 @@ def test_a_close_up_of_womersleys_flow_is_womersleys_flow() -> None:
     vessel = tube(line(40.0), RADIUS_MM).vessel
     inflow_mL_s = MEAN_MEAN_M_S * np.pi * RADIUS_M**2 * 1e6
     settings = FlowSettings(
-        inflow_mL_s=inflow_mL_s, cell_size_mm=0.25, close_up=True, waveform=PULSE, lattice_speed=0.05
+        inflow_mL_s=inflow_mL_s, waveform=PULSE, numerics=Numerics(cell_size_mm=0.25, close_up=True, lattice_speed=0.05)
     )
-    field = simulate_case(FlowCase(vessel, sac=ball((0.0, 0.0, 24.0)), settings=settings))
+    field = simulate_case(vessel_case(vessel, settings, target=Target(ball((0.0, 0.0, 24.0)), None)))
     assert field.is_converged
     x, y, z = field.centers_mm.T
     within = (z > 15) & (z < 25)
@@ -139,7 +141,7 @@ def test_a_close_up_of_womersleys_flow_is_womersleys_flow() -> None:
 
 def test_at_every_phase_cuts_let_through_what_the_flow_around_has_there() -> None:
     case, _ = outer_of_demo()
-    pulse = replace(case, settings=replace(case.settings, waveform=OLDER_ADULT_ICA, max_cycles=1))
+    pulse = replace(case, waveform=OLDER_ADULT_ICA, numerics=replace(case.numerics, max_cycles=1))
     outer = simulate_case(pulse)
     state = PulsatileLatticeBoltzmann(0.25, None, outer).init(pulse, outer)
     chosen = close_ups.close_up(pulse, outer)
@@ -166,9 +168,9 @@ def test_what_is_built_for_some_steps_serves_longer_ones_as_if_built_for_them() 
     points_mm = demo().aneurysms[0].neck.vertices_mm
     ones = np.ones(len(points_mm))
     resistances = 300 * ones, 150 * ones, 0.5 * ones
-    screen = Screen(points_mm, ones[:, None] * [0.0, 0.6, 0.8], 0.1 * ones, *resistances, ones, ones)
-    settings = replace(case.settings, waveform=OLDER_ADULT_ICA, max_cycles=1, outlets="murray")
-    pulse = replace(case, screen=screen, settings=settings)
+    screen = Sheet(points_mm, ones[:, None] * [0.0, 0.6, 0.8], 0.1 * ones, *resistances, ones, ones)
+    settings = FlowSettings(waveform=OLDER_ADULT_ICA, outlets="murray", numerics=replace(case.numerics, max_cycles=1))
+    pulse = vessel_case(case.vessel, settings, target=case.target, media=(screen,))
     outer = simulate_case(pulse)
     state = PulsatileLatticeBoltzmann(0.25, None, outer).init(pulse, outer)
     checks = int(state.pace.argmin())
@@ -196,9 +198,8 @@ def test_every_place_has_one_cell() -> None:
 
 def test_through_every_cut_passes_what_the_openings_beyond_it_take() -> None:
     case, outer = outer_of_demo()
-    settings = replace(case.settings, cell_size_mm=0.25, close_up=True)
     engine = LatticeBoltzmann(0.25, None, outer)
-    state = engine.init(replace(case, settings=settings), outer)
+    state = engine.init(replace(case, numerics=replace(case.numerics, cell_size_mm=0.25, close_up=True)), outer)
     close_up = close_ups.close_up(case, outer)
     assert close_up.inflow_mL_s.sum() == pytest.approx(0, abs=1e-3 * outer.inflow_mL_s)
     assert (np.sort(close_up.inflow_mL_s) == np.sort([*outer.inlets_mL_s, *-outer.outlets_mL_s])).all()
@@ -230,8 +231,12 @@ def test_blood_may_be_thick_in_and_near_a_cut_and_behind_openings_only() -> None
 
 def test_an_artery_that_only_passes_by_is_not_in_the_close_up() -> None:
     path = arc(2.4, np.pi, straight_mm=14.0)
-    case = FlowCase(tube(path, 1.9).vessel, sac=ball((0.0, 0.0, -9.0)), settings=FlowSettings(cell_size_mm=0.38))
-    outer = simulate_case(replace(case, settings=replace(case.settings, max_steps=240)))
+    case = vessel_case(
+        tube(path, 1.9).vessel,
+        FlowSettings(numerics=Numerics(cell_size_mm=0.38)),
+        target=Target(ball((0.0, 0.0, -9.0)), None),
+    )
+    outer = simulate_case(replace(case, numerics=replace(case.numerics, max_steps=240)))
     close_up = close_ups.close_up(case, outer)
     passing = outer.centers_mm[:, 0] > 2.4
     beside = passing & (np.linalg.norm(outer.centers_mm - [0, 0, -9.0], axis=1) < 4.0)
@@ -250,7 +255,7 @@ def test_a_close_up_does_not_reach_through_the_walls_of_arteries_that_touch(gap_
     vessel = tube(arc(middle_mm, np.pi, straight_mm=28.0), 1.5).vessel
     grid = domain.build(vessel, 0.6)
     assert len(grid.septum_cell) > 100
-    case = FlowCase(vessel, sac=ball((-1.5, 0.0, -14.0)), settings=FlowSettings(inflow_mL_s=2.0))
+    case = vessel_case(vessel, FlowSettings(inflow_mL_s=2.0), target=Target(ball((-1.5, 0.0, -14.0)), None))
     close_up = close_ups.close_up(case, at_rest(case, grid))
     assert (close_up.part[grid.centers_mm[:, 0] > middle_mm] >= 0).all()
     assert close_up.part_of_opening.tolist() == [0, 1]
@@ -259,7 +264,7 @@ def test_a_close_up_does_not_reach_through_the_walls_of_arteries_that_touch(gap_
 
 def test_what_a_swing_tells_is_the_close_ups_within_and_that_of_the_wide_cells_elsewhere() -> None:
     vessel = tube(line(30.0), RADIUS_MM).vessel
-    case = FlowCase(vessel, sac=ball((0.0, 0.0, 15.0)), settings=FlowSettings(inflow_mL_s=INFLOW_ML_S))
+    case = vessel_case(vessel, FlowSettings(inflow_mL_s=INFLOW_ML_S), target=Target(ball((0.0, 0.0, 15.0)), None))
     outer = at_rest(case, domain.build(vessel, 0.5))
     outer = replace(outer, velocity_m_s=outer.velocity_m_s + np.array([0.0, 0.0, 0.3]))
     chosen = close_ups.close_up(case, outer)
@@ -290,8 +295,8 @@ def test_a_recess_that_leads_nowhere_belongs_to_the_close_up() -> None:
 
 def test_a_vessel_that_is_all_near_is_computed_as_a_whole() -> None:
     long = Surface(sphere(1.0).vertices_mm * [1.0, 1.0, 7.0] + [0.0, 0.0, 6.0], sphere(1.0).faces)
-    settings = FlowSettings(cell_size_mm=0.4, max_steps=240)
-    case = FlowCase(tube(line(8.0), RADIUS_MM).vessel, sac=long, settings=settings)
+    settings = FlowSettings(numerics=Numerics(cell_size_mm=0.4, max_steps=240))
+    case = vessel_case(tube(line(8.0), RADIUS_MM).vessel, settings, target=Target(long, None))
     near = close_ups.build(case, 0.2, close_ups.close_up(case, simulate_case(case)))
     whole = domain.build(case.vessel, 0.2)
     assert len(near.cells) == pytest.approx(len(whole.cells), rel=1e-2)
@@ -300,28 +305,28 @@ def test_a_vessel_that_is_all_near_is_computed_as_a_whole() -> None:
 
 def test_the_cells_foretold_are_enough_and_not_far_too_many() -> None:
     case, outer = outer_of_demo()
-    wanted = replace(case, settings=replace(case.settings, cell_size_mm=0.25, close_up=True))
+    wanted = replace(case, numerics=replace(case.numerics, cell_size_mm=0.25, close_up=True))
     made = len(close_ups.build(wanted, 0.25, close_ups.close_up(case, outer)).cells)
     assert made < estimate(wanted).cells < 1.25 * made
-    whole = estimate(replace(wanted, settings=replace(wanted.settings, close_up=False)))
+    whole = estimate(replace(wanted, numerics=replace(wanted.numerics, close_up=False)))
     assert estimate(wanted).steps == whole.steps / 4
     assert estimate(wanted).seconds < 0.4 * whole.seconds
 
 
 def test_no_close_up_without_a_sac_or_of_what_has_none() -> None:
-    bare = FlowCase(tube(line(8.0), 2.0).vessel, settings=FlowSettings(cell_size_mm=0.3, close_up=True))
+    bare = vessel_case(tube(line(8.0), 2.0).vessel, FlowSettings(numerics=Numerics(cell_size_mm=0.3, close_up=True)))
     with pytest.raises(FlowError, match=r"this vessel has none: switch that off \(--refine-sac\)"):
         simulate_case(bare)
     with pytest.raises(InputError, match=r"openfoam does not support a finer grid in the sac alone: .*--refine-sac"):
-        simulate_case(replace(bare, settings=replace(bare.settings, engine=OPENFOAM)))
+        simulate_case(replace(bare, numerics=replace(bare.numerics, engine=OPENFOAM)))
 
 
 def test_a_close_up_is_given_a_quarter_of_the_steps() -> None:
     case, outer = outer_of_demo()
     whole, near = (LatticeBoltzmann(0.25, None, around) for around in (None, outer))
     state = near.init(case, outer)
-    assert near.max_checks(state) == int(case.settings.max_steps / 4 // state.steps_per_check) >= 12
-    assert whole.max_checks(state) == int(case.settings.max_steps // state.steps_per_check)
+    assert near.max_checks(state) == int(case.numerics.max_steps / 4 // state.steps_per_check) >= 12
+    assert whole.max_checks(state) == int(case.numerics.max_steps // state.steps_per_check)
 
 
 def test_a_close_up_starts_from_a_similar_flow_at_the_pace_of_the_flow_around_it() -> None:
@@ -337,7 +342,7 @@ def test_a_close_up_starts_from_a_similar_flow_at_the_pace_of_the_flow_around_it
 
 def test_a_refined_sac_starts_from_a_similar_flow_if_that_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
     case, outer = outer_of_demo()
-    wanted = replace(case, settings=replace(case.settings, close_up=True))
+    wanted = replace(case, numerics=replace(case.numerics, close_up=True))
     begun: list[FlowField] = []
     monkeypatch.setattr(flow._Runs, "_coarse", lambda *_: outer)
     monkeypatch.setattr(flow._Runs, "_run", lambda _, __, ___, guess, *____: begun.append(guess()))
@@ -377,7 +382,7 @@ def test_a_little_blood_may_be_twice_as_fast_as_time_steps_go_by() -> None:
 def test_a_close_up_tells_of_branches_too_narrow_for_the_cells_around_it() -> None:
     case, _ = outer_of_demo()
     field = simulate_case(
-        replace(case, settings=replace(case.settings, close_up=True, cell_size_mm=0.2, max_steps=192))
+        replace(case, numerics=replace(case.numerics, close_up=True, cell_size_mm=0.2, max_steps=192))
     )
     assert "at a grid spacing of 0.4 mm, outlet_2 (1.3 mm) has 3.2 cells across" in field.advice
     assert "at a grid spacing of 0.2 mm" not in field.advice
@@ -385,9 +390,9 @@ def test_a_close_up_tells_of_branches_too_narrow_for_the_cells_around_it() -> No
 
 @pytest.mark.validation
 def test_a_close_up_of_the_demo_is_what_fine_cells_all_over_give() -> None:
-    case = flow_case(demo(), None, FlowSettings(cell_size_mm=0.14))
+    case = flow_case(demo(), (), FlowSettings(numerics=Numerics(cell_size_mm=0.14)))
     whole, near = (
-        indices(simulate_case(replace(case, settings=replace(case.settings, close_up=close_up))), case.sac, case.ostium)
+        indices(simulate_case(replace(case, numerics=replace(case.numerics, close_up=close_up))), case.sac, case.ostium)
         for close_up in (False, True)
     )
     for key, most in (("neck_inflow_mL_s", 0.03), ("mean_sac_velocity_m_s", 0.03), ("mean_sac_wss_Pa", 0.05)):

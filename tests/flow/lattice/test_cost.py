@@ -9,21 +9,23 @@ from tubes import line, tube
 
 from vstent.errors import FlowError
 from vstent.flow import domain
-from vstent.flow.case import PHASES, FlowCase, FlowSettings
+from vstent.flow.case import PHASES, Target
 from vstent.flow.engines import DivergenceError
 from vstent.flow.lattice.cost import MOST_CELLS, block_rate, estimate, refuse_too_large
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
 from vstent.flow.memory import free_memory_bytes
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.surface import Surface
 
-SETTINGS = FlowSettings(inflow_mL_s=2.0, cell_size_mm=0.2)
+SETTINGS = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.2))
 
 
 def case_of(**changes):
-    return FlowCase(tube(line(8.0), 2.0).vessel, settings=replace(SETTINGS, **changes))
+    return vessel_case(tube(line(8.0), 2.0).vessel, replace(SETTINGS, **changes))
 
 
 def test_the_cells_foretold_are_the_grids():
@@ -44,7 +46,7 @@ def test_the_pulsatile_steps_foretold_are_those_made():
     case = case_of(waveform=OLDER_ADULT_ICA)
     state = PulsatileLatticeBoltzmann(0.2).init(case, None)
     assert len(state.pace) == PHASES
-    assert estimate(case).steps == state.pace.sum() * case.settings.max_cycles
+    assert estimate(case).steps == state.pace.sum() * case.numerics.max_cycles
 
 
 def test_the_time_foretold_is_of_a_measured_rate():
@@ -86,13 +88,13 @@ def test_a_narrow_place_inside_is_computed_with_a_shorter_time_step(monkeypatch)
     real = LatticeBoltzmann.init
 
     def ill_guessed(engine, case, start):
-        tried.append(case.settings.lattice_speed)
-        faster = replace(case.settings, lattice_speed=8 * case.settings.lattice_speed)
-        return real(engine, replace(case, settings=faster), start)
+        tried.append(case.numerics.lattice_speed)
+        faster = replace(case.numerics, lattice_speed=8 * case.numerics.lattice_speed)
+        return real(engine, replace(case, numerics=faster), start)
 
     monkeypatch.setattr(LatticeBoltzmann, "init", ill_guessed)
     field = simulate_case(case)
-    asked = case.settings.lattice_speed
+    asked = case.numerics.lattice_speed
     assert tried == pytest.approx([asked, 0.5 * asked, 0.25 * asked])
     assert field.outlets_mL_s.sum() == pytest.approx(field.inflow_mL_s, rel=0.02)
 
@@ -125,7 +127,10 @@ def test_a_guess_whose_grid_is_too_coarse_is_done_without(monkeypatch):
     radius = 2.0 - 1.75 * np.exp(-(((points[:, 2] - 8.0) / 1.5) ** 2))
     turn = np.array([[1, 0, 1], [0, 2**0.5, 0], [-1, 0, 1]]) / 2**0.5
     vessel = tube((points @ turn.T, frames @ turn.T), radius).vessel
-    case, tried = FlowCase(vessel, settings=replace(SETTINGS, cell_size_mm=0.11, max_steps=60)), []
+    case, tried = (
+        vessel_case(vessel, replace(SETTINGS, numerics=replace(SETTINGS.numerics, cell_size_mm=0.11, max_steps=60))),
+        [],
+    )
     real = LatticeBoltzmann.init
 
     def told(engine, case, start):
@@ -144,7 +149,7 @@ def test_what_diverges_after_it_was_resumed_begins_anew_from_the_guess(monkeypat
     case, tried = case_of(cell_size_mm=0.1), []
 
     def stub(engine, case, *, start, progress, bookmark):
-        tried.append((engine.cell_size_mm, case.settings.lattice_speed, start))
+        tried.append((engine.cell_size_mm, case.numerics.lattice_speed, start))
         if len(tried) == 1:
             raise DivergenceError("too fast")
         return f"cells of {engine.cell_size_mm} mm"
@@ -158,13 +163,13 @@ def test_what_diverges_after_it_was_resumed_begins_anew_from_the_guess(monkeypat
 
     monkeypatch.setattr("vstent.flow.simulation.run", stub)
     assert simulate_case(case, checkpoint=Kept()) == "cells of 0.1 mm"
-    speed = case.settings.lattice_speed
+    speed = case.numerics.lattice_speed
     assert tried == [(0.1, speed, None), (0.2, speed, None), (0.1, 0.5 * speed, "cells of 0.2 mm")]
 
 
 def test_a_sac_smaller_than_a_cell_is_told_as_that():
     sac = Surface(sphere(0.08).vertices_mm + np.array([0.07, 0.07, 4.07]), sphere(0.08).faces)
-    case = replace(case_of(cell_size_mm=0.4), sac=sac)
+    case = replace(case_of(cell_size_mm=0.4), target=Target(sac, None))
     with pytest.raises(FlowError, match=r"of 0\.4 mm no cell is inside the sac .* near \(0\.1, 0\.1, 4\.1\) mm: use"):
         simulate_case(case)
 

@@ -19,7 +19,7 @@ from tubes import line, tube
 from vstent.cli import main
 from vstent.errors import FlowError, InputError
 from vstent.flow import domain
-from vstent.flow.case import Blood, CarreauYasuda, FlowCase, FlowSettings, Screen, Waveform
+from vstent.flow.case import FlowCase, Sheet
 from vstent.flow.lattice import gpu as gpus
 from vstent.flow.lattice import packing, stepping
 from vstent.flow.lattice import state as lattice_state
@@ -30,6 +30,8 @@ from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
 from vstent.flow.lattice.recording import NotRecordedError, Pairs, plan, recorded
 from vstent.flow.lattice.setup import Grid
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics, Waveform
 from vstent.flow.simulation import engine_class, foretell_cost, simulate_case
 from vstent.kernels.directions import VELOCITIES
 from vstent.study import repeat
@@ -53,7 +55,7 @@ from vstent.flow.lattice.stepping import _read_here, advance, step
 state, twin = (pickle.loads(Path(sys.argv[1]).read_bytes()) for _ in range(2))
 assert "vstent.flow.lattice.kernels.gpu" not in sys.modules  # who did not ask for a GPU does not load what it takes
 for one in (state, twin):
-    one.case = replace(state.case, settings=replace(state.case.settings, device_gpu=True))
+    one.case = replace(state.case, numerics=replace(state.case.numerics, device_gpu=True))
     advance(one, 4)
 for (name, one), other in zip(pack(state).items(), pack(twin).values()):
     assert name == "loop_seconds" or one.tobytes() == other.tobytes()  # sums do not depend on the order of threads
@@ -81,7 +83,7 @@ from vstent.flow.lattice.stepping import advance, step
 
 waits, ahead = (pickle.loads(Path(sys.argv[1]).read_bytes()) for _ in range(2))
 for one in (waits, ahead):
-    one.case = replace(one.case, settings=replace(one.case.settings, device_gpu=True))
+    one.case = replace(one.case, numerics=replace(one.case.numerics, device_gpu=True))
     one.pace, one.check_s, one.since_check = np.array([4, 2]), 4 * one.scales.step_s, 0
     step(one)
 device = ahead.device
@@ -107,12 +109,12 @@ assert np.array(waits.history).tobytes() == np.array(ahead.history).tobytes()
 """
 
 
-def screen() -> Screen:
+def screen() -> Sheet:
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-1.0, 1.0, 0.1), np.arange(-1.0, 1.0, 0.1)))
     n = len(x)
     points, normals = np.stack([x, y, np.full(n, 0.5 * LENGTH_MM)], axis=1), np.tile([0.0, 0.6, 0.8], (n, 1))
     one = np.ones(n)
-    return Screen(points, normals, 0.01 * one, 300 * one, 150 * one, 0.5 * one, one, one)
+    return Sheet(points, normals, 0.01 * one, 300 * one, 150 * one, 0.5 * one, one, one)
 
 
 def septa_away_from_links(state: lattice_state.State) -> tuple[np.ndarray, np.ndarray]:
@@ -132,13 +134,12 @@ def everything() -> lattice_state.State:
     """
     settings = FlowSettings(
         inflow_mL_s=0.3,
-        cell_size_mm=CELL_MM,
         blood=Blood(viscosity_Pa_s=0.00345, thinning=CarreauYasuda()),
         waveform=Waveform(0.05, (0.5,), (0.2,)),
-        lattice_speed=0.05,
+        numerics=Numerics(cell_size_mm=CELL_MM, lattice_speed=0.05),
     )
     vessel = tube(line(LENGTH_MM), RADIUS_MM, around=32).vessel
-    case = FlowCase(vessel, screen=screen(), settings=settings)
+    case = vessel_case(vessel, settings, media=(screen(),))
     state = PulsatileLatticeBoltzmann(CELL_MM).init(case, None)
     links, a = state.links, state.addressing
     openings = links.openings[[0, 1, 1]]
@@ -192,8 +193,8 @@ def test_a_gpu_goes_on_while_the_host_judges(tmp_path: Path, monkeypatch: pytest
 
 def test_the_next_flow_of_a_vessel_has_the_numbering_of_the_first() -> None:
     vessel = tube(line(8.0), 2.0).vessel
-    bare = FlowCase(vessel, settings=FlowSettings(inflow_mL_s=0.3))
-    stented = replace(bare, screen=screen(), settings=FlowSettings(inflow_mL_s=0.5, outlets="murray"))
+    bare = vessel_case(vessel, FlowSettings(inflow_mL_s=0.3))
+    stented = vessel_case(vessel, FlowSettings(inflow_mL_s=0.5, outlets="murray"), media=(screen(),))
     first, second = (LatticeBoltzmann(CELL_MM).init(case, None) for case in (bare, stented))
     assert second.refill.groups is first.refill.groups
     assert second.bands is first.bands
@@ -319,11 +320,11 @@ def test_the_benchmark_says_why_it_measures_nothing() -> None:
         assert benchmark("--tiny").startswith("Not measured: the flow cannot be computed on a GPU, because")
 
 
-ASKED = FlowSettings(cell_size_mm=0.2, device_gpu=True)
+ASKED = FlowSettings(numerics=Numerics(cell_size_mm=0.2, device_gpu=True))
 
 
 def case_of(settings: FlowSettings = ASKED) -> FlowCase:
-    return FlowCase(tube(line(8.0), 2.0).vessel, settings=settings)
+    return vessel_case(tube(line(8.0), 2.0).vessel, settings)
 
 
 @pytest.mark.parametrize(
@@ -360,7 +361,7 @@ def test_the_command_line_says_so_before_it_reads_anything(
 
 def test_an_engine_that_knows_no_gpu_is_not_asked_to_use_one() -> None:
     with pytest.raises(InputError, match="the engine openfoam does not support a GPU"):
-        engine_class(replace(ASKED, engine="openfoam"))
+        engine_class(Numerics(engine="openfoam", device_gpu=True), is_pulsatile=False)
 
 
 def test_what_a_gpu_refuses_is_a_sentence() -> None:
@@ -377,7 +378,8 @@ def test_what_the_compiler_refuses_is_not_blamed_on_the_gpu() -> None:
 
 
 def test_what_does_not_fit_in_the_gpus_memory_is_refused_with_the_cell_size_that_does() -> None:
-    gpu_bytes = 0.5 * GPU_BYTES_PER_CELL * estimate(replace(case_of(), settings=replace(ASKED, device_gpu=False))).cells
+    on_cpu = replace(case_of(), numerics=replace(ASKED.numerics, device_gpu=False))
+    gpu_bytes = 0.5 * GPU_BYTES_PER_CELL * estimate(on_cpu).cells
     with pytest.raises(FlowError, match="GB of the GPU's memory are free: use a grid spacing of") as refusal:
         refuse_too_large(case_of(), 1e12, gpu_bytes)
     fitting_mm = float(str(refusal.value).split("use a grid spacing of ")[1].split(" mm")[0])

@@ -8,7 +8,6 @@ from shapes import sphere
 
 from vstent import phantoms
 from vstent.anatomy.trace import trace
-from vstent.flow.case import FlowCase, FlowSettings
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.collision import collided, relaxed, squared_reach
@@ -17,6 +16,8 @@ from vstent.flow.lattice.setup import Grid, address, build_links, thickest
 from vstent.flow.lattice.state import speeds
 from vstent.flow.lattice.stepping import advance
 from vstent.flow.lattice.walls import parabolic_weights
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Vessel
 from vstent.kernels import directions, sampling, voxels
 
@@ -86,7 +87,7 @@ def test_a_band_is_done_when_all_that_it_needs_is(threads):
     A bend has links of all kinds; walls half-way between its cells are put in.
     """
     arc = phantoms.torus_arc(bend_radius_mm=5.0, angle_rad=1.0, radius_mm=2.0)
-    case = FlowCase(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), settings=FlowSettings(inflow_mL_s=3.0))
+    case = vessel_case(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), FlowSettings(inflow_mL_s=3.0))
     state = LatticeBoltzmann(0.3).init(case, None)
     rng = np.random.default_rng(5)
     state.populations[:] = 0.01 * rng.normal(size=state.populations.size)
@@ -116,7 +117,7 @@ def test_a_band_is_done_when_all_that_it_needs_is(threads):
 def test_flows_of_a_vessel_share_its_grid_and_not_their_populations():
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=8.0, radius_mm=2.0))))
     first, second, other = (
-        LatticeBoltzmann(spacing_mm).init(FlowCase(one, settings=FlowSettings(inflow_mL_s=0.5)), None)
+        LatticeBoltzmann(spacing_mm).init(vessel_case(one, FlowSettings(inflow_mL_s=0.5)), None)
         for one, spacing_mm in ((vessel, 0.3), (vessel, 0.3), (vessel, 0.25))
     )
     assert second.domain is first.domain
@@ -142,7 +143,7 @@ def test_whole_vectors_reach_into_no_other_layer():
 
 def test_layers_share_no_line_of_the_cache():
     arc = phantoms.torus_arc(bend_radius_mm=5.0, angle_rad=1.0, radius_mm=2.0)
-    case = FlowCase(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), settings=FlowSettings(inflow_mL_s=3.0))
+    case = vessel_case(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), FlowSettings(inflow_mL_s=3.0))
     state = LatticeBoltzmann(0.3).init(case, None)
     domain, a = state.domain, state.addressing
     beyond = domain.cells[domain.link_cell] + directions.VELOCITIES[domain.link_direction]

@@ -11,7 +11,7 @@ import vstent
 from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
-from vstent.flow.case import FlowCase, FlowSettings, Screen
+from vstent.flow.case import FlowCase, Sheet
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.engines import DivergenceError, run
 from vstent.flow.indices import indices
@@ -28,13 +28,14 @@ from vstent.flow.lattice.live import (
     preview_spacing_mm,
 )
 from vstent.flow.lattice.stepping import twin
-from vstent.flow.screen import screen
-from vstent.flow.simulation import flow_case
+from vstent.flow.media import media
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.archive import load_data, save_data
 
-SETTINGS = FlowSettings(cells_per_diameter=13.0, inflow_mL_s=1.5)
+SETTINGS = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0))
 """A default grid coarser than a preview's: the preview takes it."""
 
 
@@ -46,13 +47,13 @@ def anatomy() -> Anatomy:
 
 @cache
 def case() -> FlowCase:
-    return flow_case(anatomy(), None, SETTINGS)
+    return flow_case(anatomy(), (), SETTINGS)
 
 
 @cache
-def screens() -> tuple[Screen, Screen]:
+def devices() -> tuple[tuple[Sheet, ...], tuple[Sheet, ...]]:
     designs = (vstent.find_design(name) for name in ("silk", "enterprise"))
-    dense, sparse = (screen(vstent.deploy(one, anatomy()).stent, case().blood) for one in designs)
+    dense, sparse = (media(vstent.deploy(one, anatomy()).stent, case().blood) for one in designs)
     return dense, sparse
 
 
@@ -77,31 +78,31 @@ def settled(live: LiveFlow) -> tuple[float, float]:
     return float(found[0]), float(found[1])
 
 
-def alone(live: LiveFlow, one: Screen | None) -> tuple[float, float]:
+def alone(live: LiveFlow, one: tuple[Sheet, ...]) -> tuple[float, float]:
     """Return neck inflow and sac velocity of a run of its own, in the same coarse flow."""
     engine = LatticeBoltzmann(live.cell_size_mm, None, live.outer)
-    fine = replace(case(), screen=one, settings=replace(SETTINGS, tolerance=1e-3))
+    fine = replace(case(), media=one, numerics=replace(SETTINGS.numerics, tolerance=1e-3))
     found = indices(run(engine, fine, start=live.outer), fine.sac, fine.ostium)
     return found["neck_inflow_mL_s"], found["mean_sac_velocity_m_s"]
 
 
 def test_the_flow_without_a_device_is_that_of_a_run(live: LiveFlow) -> None:
-    live.place(None)
-    np.testing.assert_allclose(settled(live), alone(live, None), rtol=0.03)
+    live.place(())
+    np.testing.assert_allclose(settled(live), alone(live, ()), rtol=0.03)
     assert live.bare == live.read()
     assert live.change("neck_inflow_mL_s") == (0.0, 0.0)
 
 
 def test_an_exchanged_device_comes_to_its_own_flow(live: LiveFlow) -> None:
-    dense, sparse = screens()
+    dense, sparse = devices()
     for one in (sparse, dense, None, dense):
         live.place(one)
         np.testing.assert_allclose(settled(live), alone(live, one), rtol=0.03)
 
 
 def test_both_flows_step_until_the_one_without_a_device_is_known(live: LiveFlow) -> None:
-    live.place(None)
-    live.place(screens()[0])
+    live.place(())
+    live.place(devices()[0])
     assert max(live.bare.error.values()) < KNOWN
     without = [one.copy() for one in live._bare.readings]
     live.advance(0.0)
@@ -117,8 +118,8 @@ def test_both_flows_step_until_the_one_without_a_device_is_known(live: LiveFlow)
 
 
 def test_only_the_flow_without_a_device_is_prepared_until_it_is_known(live: LiveFlow) -> None:
-    live.place(None)
-    live.place(screens()[0])
+    live.place(())
+    live.place(devices()[0])
     settled(live)
     shown, populations = live.read(), live.state.populations.copy()
     live._bare.forget()
@@ -132,12 +133,12 @@ def test_only_the_flow_without_a_device_is_prepared_until_it_is_known(live: Live
 
 
 def test_a_stored_flow_continues_to_the_last_bit(live: LiveFlow, tmp_path: Path) -> None:
-    live.place(None)
+    live.place(())
     save_data(tmp_path / "bare.npz", live.stored())
     again = LiveFlow(case(), stored=load_data(tmp_path / "bare.npz", BareFlow))
     assert again.bare == live.bare
     for one in (again, live):
-        one.place(screens()[0])
+        one.place(devices()[0])
         one._shown.advance()
         one._bare.advance()
     assert again.change("neck_inflow_mL_s") == live.change("neck_inflow_mL_s")
@@ -147,9 +148,9 @@ def test_a_stored_flow_continues_to_the_last_bit(live: LiveFlow, tmp_path: Path)
 
 
 def test_a_change_lies_within_its_band_while_the_flow_adapts(live: LiveFlow) -> None:
-    live.place(None)
+    live.place(())
     settled(live)
-    live.place(screens()[0])
+    live.place(devices()[0])
     course = []
     for _ in range(150):
         live.advance(0.0)
@@ -192,12 +193,12 @@ def test_few_readings_say_nothing() -> None:
 
 
 def test_an_exchange_changes_the_screen_and_nothing_else(live: LiveFlow) -> None:
-    live.place(screens()[0])
+    live.place(devices()[0])
     before = live.state.populations.copy()
-    live.place(screens()[1])
+    live.place(devices()[1])
     np.testing.assert_array_equal(live.state.populations, before)
     assert len(live.state.screen.cell) > 0
-    live.place(None)
+    live.place(())
     assert len(live.state.screen.cell) == 0
 
 
@@ -210,7 +211,7 @@ def test_a_flow_that_diverges_says_so(live: LiveFlow) -> None:
 
 
 def test_the_grid_is_as_coarse_as_neck_and_artery_allow() -> None:
-    fine = replace(case(), settings=replace(SETTINGS, cells_per_diameter=80.0, cell_size_mm=0.5))
+    fine = replace(case(), numerics=replace(SETTINGS.numerics, cells_per_diameter=80.0, cell_size_mm=0.5))
     assert fine.ostium is not None
     across = neck_diameter_mm(fine.ostium) / CELLS_ACROSS_NECK, parent_diameter_mm(fine) / CELLS_ACROSS_PARENT
     assert preview_spacing_mm(fine) == min(across)

@@ -12,11 +12,13 @@ from vstent.anatomy.trace import trace
 from vstent.errors import InputError
 from vstent.flow import domain, sampling
 from vstent.flow import simulation as flow
-from vstent.flow.case import PHASES, FlowCase, FlowField, FlowSettings, Waveform
+from vstent.flow.case import PHASES, FlowField
 from vstent.flow.cycles import cycle_change, cycles_advice
 from vstent.flow.lattice import pace as lattice_pace
 from vstent.flow.lattice import pulse as lattice_pulse
 from vstent.flow.lattice.pace import pace
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import FlowSettings, Numerics, Waveform
 from vstent.flow.simulation import simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
 from vstent.geometry.vessel import Vessel
@@ -26,8 +28,10 @@ from vstent.geometry.vessel import Vessel
 def pulsing(cell_size_mm: float = 0.25) -> FlowField:
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=14.0, radius_mm=2.0))))
     inflow_mL_s = MEAN_MEAN_M_S * np.pi * RADIUS_M**2 * 1e6
-    settings = FlowSettings(inflow_mL_s=inflow_mL_s, cell_size_mm=cell_size_mm, waveform=PULSE, lattice_speed=0.05)
-    return simulate_case(FlowCase(vessel, settings=settings))
+    settings = FlowSettings(
+        inflow_mL_s=inflow_mL_s, waveform=PULSE, numerics=Numerics(cell_size_mm=cell_size_mm, lattice_speed=0.05)
+    )
+    return simulate_case(vessel_case(vessel, settings))
 
 
 @cache
@@ -81,7 +85,9 @@ SWING_OF_HALF = Waveform(1.0, (0.5,), (0.0,))
 def steps_of(waveform: Waveform, speed_m_s: np.ndarray | None, way_mm: float = 1e-6) -> np.ndarray:
     """Steps of every phase of a pulse whose blood is that fast at the end of each; None: that is not known."""
     field = pulsing()
-    case = FlowCase(trace(Vessel(field.wall)), settings=FlowSettings(waveform=waveform, lattice_speed=0.05))
+    case = vessel_case(
+        trace(Vessel(field.wall)), FlowSettings(waveform=waveform, numerics=Numerics(lattice_speed=0.05))
+    )
     fastest_m_s = np.array([fast(np.linalg.norm(phase.velocity_m_s, axis=1)) for phase in field.phases])
     phases = [] if speed_m_s is None else zip(field.phases, speed_m_s / fastest_m_s, strict=True)
     known = replace(field, phases=tuple(replace(phase, velocity_m_s=s * phase.velocity_m_s) for phase, s in phases))
@@ -226,8 +232,7 @@ def test_cycles_are_compared_phase_by_phase() -> None:
 
 
 def test_pulsatile_flow_without_swing_is_steady_flow() -> None:
-    case = FlowCase(pulsing().wall and trace(Vessel(pulsing().wall)), settings=FlowSettings(inflow_mL_s=0.4))
-    coarse = replace(case.settings, cell_size_mm=0.4)
-    steady = simulate_case(replace(case, settings=replace(coarse, tolerance=0.001)))
-    pulsed = simulate_case(replace(case, settings=replace(coarse, waveform=Waveform(0.5, (0.0,), (0.0,)))))
+    settings = FlowSettings(inflow_mL_s=0.4, numerics=Numerics(cell_size_mm=0.4, tolerance=0.001))
+    case = vessel_case(trace(Vessel(pulsing().wall)), settings)
+    steady, pulsed = simulate_case(case), simulate_case(replace(case, waveform=Waveform(0.5, (0.0,), (0.0,))))
     np.testing.assert_allclose(pulsed.velocity_m_s, steady.velocity_m_s, atol=0.01 * steady.speed_m_s.max())

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vstent.flow.case import Screen
+from vstent.flow.case import Sheet
 from vstent.flow.drag import concentration
 from vstent.flow.lattice.screen import on_grid
 from vstent.units import M_PER_MM
@@ -11,14 +11,14 @@ CELL_MM = 0.2
 ORIGIN_MM = np.array([1.0, -2.0, 0.5])
 
 
-def sheet(rng: np.random.Generator) -> Screen:
+def sheet(rng: np.random.Generator) -> Sheet:
     """Samples on wires of nine samples each, partly outside the blood, with any normal."""
     wires = 60
     normals = rng.normal(size=(wires, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     columns = [rng.uniform(0.1, 1.0, wires) for _ in range(6)]
     points_mm = ORIGIN_MM + CELL_MM * rng.uniform(-1, 7, (9 * wires, 3))
-    return Screen(points_mm, *(np.repeat(column, 9, axis=0) for column in (normals, *columns)))
+    return Sheet(points_mm, *(np.repeat(column, 9, axis=0) for column in (normals, *columns)))
 
 
 def blood(rng: np.random.Generator) -> np.ndarray:
@@ -32,7 +32,7 @@ def blood(rng: np.random.Generator) -> np.ndarray:
 def test_every_cell_gets_what_all_samples_give_it():
     rng = np.random.default_rng(7)
     screen, index = sheet(rng), blood(rng)
-    found = on_grid(screen, index, ORIGIN_MM, CELL_MM)
+    found = on_grid((screen,), index, ORIGIN_MM, CELL_MM)
     cells = np.argwhere(index >= 0)
     at = (screen.points_mm - ORIGIN_MM) / CELL_MM
     weight = np.clip(1 - np.abs(cells[:, None] - at), 0, None).prod(axis=2)
@@ -57,5 +57,5 @@ def test_every_cell_gets_what_all_samples_give_it():
 
 
 def test_an_empty_sheet_gives_nothing():
-    empty = Screen(np.zeros((0, 3)), np.zeros((0, 3)), *(np.zeros(0) for _ in range(6)))
+    empty = Sheet(np.zeros((0, 3)), np.zeros((0, 3)), *(np.zeros(0) for _ in range(6)))
     assert len(on_grid(empty, blood(np.random.default_rng(1)), ORIGIN_MM, CELL_MM).cell) == 0

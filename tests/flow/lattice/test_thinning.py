@@ -7,8 +7,9 @@ from scipy.optimize import brentq
 from vstent import phantoms
 from vstent.anatomy.trace import trace
 from vstent.flow import domain, sampling
-from vstent.flow.case import Blood, CarreauYasuda, FlowCase, FlowSettings, Waveform
 from vstent.flow.lattice.kernels import d3q19
+from vstent.flow.problem import vessel_case
+from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics, Waveform
 from vstent.flow.simulation import simulate_case
 from vstent.flow.wall_stress import wall_stress
 from vstent.geometry.vessel import Vessel
@@ -37,8 +38,8 @@ def test_thinning_blood_flows_in_a_pipe_as_its_law_has_it() -> None:
     poiseuille_m_s = 2 * INFLOW_ML_S * 1e-6 / (np.pi * RADIUS_M**2)
     assert exact[0] < 0.93 * poiseuille_m_s  # blunter than Poiseuille's, so that the law shows
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=LENGTH_MM, radius_mm=1e3 * RADIUS_M))))
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, cell_size_mm=0.25, tolerance=0.005)
-    field = simulate_case(FlowCase(vessel, settings=settings))
+    settings = FlowSettings(blood=BLOOD, inflow_mL_s=INFLOW_ML_S, numerics=Numerics(cell_size_mm=0.25, tolerance=0.005))
+    field = simulate_case(vessel_case(vessel, settings))
     sign = np.sign(field.velocity_m_s[:, 2].mean())
     points = np.stack([1e3 * R_M[:700:50], 0 * R_M[:700:50], np.full(14, 7.0)], axis=1)
     found = sign * sampling.values_at(field, points)[0][:, 2]
@@ -54,8 +55,10 @@ def test_a_pulses_mean_stress_is_the_mean_of_its_stresses() -> None:
     """Not that of the mean flow: thinning blood resists less when it flows faster. It goes one way: OSI is 0."""
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=8.0, radius_mm=2.0), edge_mm=0.4)))
     waveform = Waveform(0.2, (0.9,), (0.0,))
-    settings = FlowSettings(blood=BLOOD, inflow_mL_s=0.3, cell_size_mm=0.4, waveform=waveform, max_cycles=2)
-    field = simulate_case(FlowCase(vessel, settings=settings))
+    settings = FlowSettings(
+        blood=BLOOD, inflow_mL_s=0.3, waveform=waveform, numerics=Numerics(cell_size_mm=0.4, max_cycles=2)
+    )
+    field = simulate_case(vessel_case(vessel, settings))
     middle = np.abs(field.wall.vertices_mm[:, 2] - 4.0) < 2.0
     stress_Pa = np.mean([phase.wall_shear_stress_Pa for phase in field.phases], axis=0)
     np.testing.assert_allclose(field.wall_shear_stress_Pa, stress_Pa, atol=1e-6)

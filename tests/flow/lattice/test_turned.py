@@ -13,9 +13,11 @@ from vstent.deployment.deploy import deploy
 from vstent.devices.catalogue import find_design
 from vstent.flow import domain, sampling
 from vstent.flow import simulation as flows
-from vstent.flow.case import Blood, FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowField
 from vstent.flow.positions import turned
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case, vessel_case
+from vstent.flow.settings import Blood, FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Vessel
 from vstent.units import M_PER_MM
 
@@ -31,8 +33,8 @@ def bend() -> Vessel:
 
 
 def flow(turn: Rotation, cell_size_mm: float) -> FlowField:
-    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, cell_size_mm=cell_size_mm, tolerance=0.005)
-    return simulate_case(turned(FlowCase(bend(), settings=settings), turn))
+    settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, numerics=Numerics(cell_size_mm=cell_size_mm, tolerance=0.005))
+    return simulate_case(turned(vessel_case(bend(), settings), turn))
 
 
 def on_section(field: FlowField, turn: Rotation, part: float) -> np.ndarray:
@@ -58,13 +60,13 @@ def differences(turn: Rotation, cell_size_mm: float) -> tuple[float, float]:
 
 def test_a_turned_device_lies_in_the_turned_artery_as_before() -> None:
     anatomy = tube(line(26), 1.9)
-    case = flow_case(anatomy, deploy(find_design("silk"), anatomy).stent)
+    case = flow_case(anatomy, (deploy(find_design("silk"), anatomy).stent,))
     other = turned(case, DIAGONAL)
     for way in (
-        lambda c: c.screen.points_mm,
-        lambda c: c.screen.points_mm + c.screen.normals,
-        lambda c: c.stent.nodes_mm.reshape(-1, 3),
-        lambda c: c.stent.wire_points_mm,
+        lambda c: c.media[0].points_mm,
+        lambda c: c.media[0].points_mm + c.media[0].normals,
+        lambda c: c.solids[0].nodes_mm.reshape(-1, 3),
+        lambda c: c.solids[0].wire_points_mm,
     ):
         far_mm = [c.vessel.lumen.signed_distance(way(c)[::50]) for c in (case, other)]
         np.testing.assert_allclose(*far_mm, atol=1e-9)
@@ -92,9 +94,11 @@ BRANCH_MM, BRANCH_LENGTH_MM = 1.0, 16.0
 def resistance(turn: Rotation, cells_across: float, reynolds: float) -> float:
     """Fall of pressure in a narrow tube over Poiseuille's."""
     mean_m_s = reynolds * BLOOD.kinematic_viscosity_m2_s / (BRANCH_MM * M_PER_MM)
-    settings = FlowSettings(inflow_mL_s=mean_m_s * np.pi / 4 * BRANCH_MM**2, cell_size_mm=BRANCH_MM / cells_across)
+    settings = FlowSettings(
+        inflow_mL_s=mean_m_s * np.pi / 4 * BRANCH_MM**2, numerics=Numerics(cell_size_mm=BRANCH_MM / cells_across)
+    )
     branch = tube(line(BRANCH_LENGTH_MM), 0.5 * BRANCH_MM, around=60).vessel
-    field = simulate_case(turned(FlowCase(branch, settings=settings), turn))
+    field = simulate_case(turned(vessel_case(branch, settings), turn))
     along_m = M_PER_MM * turn.inv().apply(field.centers_mm)[:, 2]
     middle = np.abs(along_m / (M_PER_MM * BRANCH_LENGTH_MM) - 0.5) < 0.25
     fall_Pa_m = -np.polyfit(along_m[middle], field.pressure_Pa[middle], 1)[0]

@@ -15,14 +15,15 @@ from vstent.deployment.deploy import deploy
 from vstent.deployment.struts import struts
 from vstent.devices.catalogue import find_design
 from vstent.errors import FlowError, LandingError, ReadError
-from vstent.flow.case import Blood, CarreauYasuda, FlowCase, FlowSettings
+from vstent.flow.case import FlowCase, Target
 from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.control import fluid
 from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.dictionary import foam_file, parse
 from vstent.flow.openfoam.patches import named_patches
 from vstent.flow.openfoam.setup import FoamSetup
-from vstent.flow.simulation import flow_case
+from vstent.flow.problem import flow_case, vessel_case
+from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
@@ -37,7 +38,7 @@ def case(outlets: str = "zero_pressure", *, is_pulse: bool = False) -> FlowCase:
     phantom = phantoms.with_branch(straight, abscissa_mm=6.0, direction=[1, 0, 1], radius_mm=BRANCH_MM, length_mm=11.0)
     vessel = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.4)))
     waveform = OLDER_ADULT_ICA if is_pulse else None
-    return FlowCase(vessel, settings=FlowSettings(inflow_mL_s=FLOW_ML_S, outlets=outlets, waveform=waveform))
+    return vessel_case(vessel, FlowSettings(inflow_mL_s=FLOW_ML_S, outlets=outlets, waveform=waveform))
 
 
 def with_sac() -> FlowCase:
@@ -45,7 +46,7 @@ def with_sac() -> FlowCase:
     lumen = case().vessel.lumen
     inside = np.linalg.norm(lumen.corners_mm.mean(axis=1) - [-RADIUS_MM, 0, 7.0], axis=1) < 1.5
     cut = Surface(lumen.vertices_mm, lumen.faces[inside])
-    return replace(case(), sac=cut, ostium=sphere(1.0))
+    return replace(case(), target=Target(cut, sphere(1.0)))
 
 
 @pytest.mark.parametrize("flavour", ["com", "org"])
@@ -237,14 +238,14 @@ def test_a_device_is_meshed_by_its_wires_over_an_ostium_or_refused() -> None:
     healthy = tube(line(32), 1.9)
     branched = replace(with_neck(healthy, 14, 18), aneurysms=())
     stent = deploy(find_design("enterprise"), healthy).stent
-    solids = strut_solids(flow_case(branched, stent))
+    solids = strut_solids(flow_case(branched, (stent,)))
     assert solids is not None
     assert 0 < solids.volume_mm3 < 0.3 * struts(stent).volume_mm3
-    assert strut_solids(flow_case(branched, None)) is None
+    assert strut_solids(flow_case(branched, ())) is None
     with pytest.raises(LandingError, match="over a neck or a branch's ostium"):
-        strut_solids(flow_case(healthy, stent))
+        strut_solids(flow_case(healthy, (stent,)))
     with pytest.raises(FlowError, match="give the stent itself"):
-        strut_solids(replace(flow_case(branched, stent), stent=None))
+        strut_solids(replace(flow_case(branched, (stent,)), solids=()))
 
 
 @pytest.mark.parametrize(("name", "across_mm"), [("silk", (0.030, 0.050)), ("enterprise", (0.078, 0.078))])
@@ -259,9 +260,9 @@ def test_two_cells_lie_across_a_strut_and_no_more_than_twice_as_many(name: str, 
 
 def test_what_struts_cost_is_told_and_what_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     branched = replace(with_neck(tube(line(32), 1.9), 14, 18), aneurysms=())
-    cases = [flow_case(branched, deploy(find_design(name), branched).stent) for name in ("silk", "enterprise")]
+    cases = [flow_case(branched, (deploy(find_design(name), branched).stent,)) for name in ("silk", "enterprise")]
     for stented, times in zip(cases, (4.0, 2.0), strict=True):
-        bare, told = tell_cost(replace(stented, screen=None, stent=None), 0.2), tell_cost(stented, 0.2)
+        bare, told = tell_cost(replace(stented, media=(), solids=()), 0.2), tell_cost(stented, 0.2)
         assert "struts" not in bare
         assert told.startswith(bare.split(",")[0])
         assert _thousands(told) > times * _thousands(bare)

@@ -18,14 +18,16 @@ from vstent.deployment.deploy import deploy
 from vstent.devices.catalogue import find_design
 from vstent.errors import FlowError, ReadError
 from vstent.flow import domain, sampling
-from vstent.flow.case import PHASES, FlowCase, FlowSettings, Screen, Waveform
+from vstent.flow.case import PHASES, Sheet, Target
 from vstent.flow.engines import Outcome, Progress, run
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results, scatter
 from vstent.flow.openfoam.bridge import Snapshot, bridge
 from vstent.flow.openfoam.engine import OpenFoam, State, swing_of
 from vstent.flow.openfoam.setup import Flavour, FoamSetup
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.problem import flow_case, vessel_case
+from vstent.flow.settings import FlowSettings, Numerics, Waveform
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 
@@ -73,7 +75,7 @@ def test_parts_are_put_together_in_the_order_of_their_numbers(tmp_path: Path) ->
 def test_a_flow_that_a_run_begins_from_leaves_no_blood_at_rest_between_the_parts(tmp_path: Path) -> None:
     rest = "value uniform (0 0 0);"
     field = simulate_case(
-        FlowCase(tube(), settings=FlowSettings(inflow_mL_s=FLOW_ML_S, cell_size_mm=0.5, max_steps=96))
+        vessel_case(tube(), FlowSettings(inflow_mL_s=FLOW_ML_S, numerics=Numerics(cell_size_mm=0.5, max_steps=96)))
     )
     parts = {name: field.centers_mm[chosen] for name, chosen in (("processor0", [9, 2]), ("processor1", [5, 70, 3]))}
     for name, points_mm in parts.items():
@@ -138,7 +140,7 @@ def test_jets_thinner_than_a_cell_go_through_the_neck_as_the_mesh_has_them(tmp_p
     write(tmp_path / "0" / "C", f"nonuniform List<vector> {len(inside_mm)}({rows})", wall=at_wall, inlet=at_wall)
     corners_mm = np.array([[-1.0, -1, 7], [1, -1, 7], [1, 1, 7], [-1, 1, 7]])
     neck = Surface(corners_mm, np.array([[0, 1, 2], [0, 2, 3]]))
-    case = FlowCase(tube(), sac=neck, ostium=neck)
+    case = vessel_case(tube(), target=Target(neck, neck))
     across = bridge(case, domain.build(case.vessel, 0.2), tmp_path)
     speed_m_s = np.r_[0.1 * np.cos(2 * np.pi * inside_mm[:, 0] / 0.23 + 0.4), np.zeros(2)]
     through = sampling.through_mL_s(across.to_ostium @ speed_m_s[:, None] * [0, 0, 1], across.ostium_area_mm2)
@@ -195,15 +197,15 @@ def test_without_openfoam_its_install_command_is_named(monkeypatch: pytest.Monke
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(program, "INSTALLED", ())
     with pytest.raises(FlowError, match="apt-get install openfoam"):
-        run(OpenFoam(0.3, tmp_path / "case"), FlowCase(tube(), settings=FlowSettings(inflow_mL_s=1.0)))
+        run(OpenFoam(0.3, tmp_path / "case"), vessel_case(tube(), FlowSettings(inflow_mL_s=1.0)))
     assert not (tmp_path / "case").exists()
 
 
 def test_a_screen_is_refused() -> None:
     one = np.ones(1)
-    screen = Screen(np.zeros((1, 3)), np.ones((1, 3)), one, one, one, one, one, one)
+    screen = Sheet(np.zeros((1, 3)), np.ones((1, 3)), one, one, one, one, one, one)
     with pytest.raises(FlowError, match="struts"):
-        OpenFoam(0.3, Path("nowhere")).init(FlowCase(tube(), screen=screen), None)
+        OpenFoam(0.3, Path("nowhere")).init(vessel_case(tube(), media=(screen,)), None)
 
 
 RADIUS_MM, LENGTH_MM, FLOW_ML_S = 2.0, 14.0, 3.0
@@ -216,7 +218,7 @@ def tube() -> Vessel:
 @pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")
 def test_openfoams_flow_in_a_tube_is_poiseuilles(tmp_path: Path) -> None:
     engine = OpenFoam(0.3, tmp_path / "case")
-    case = FlowCase(tube(), settings=FlowSettings(inflow_mL_s=FLOW_ML_S))
+    case = vessel_case(tube(), FlowSettings(inflow_mL_s=FLOW_ML_S))
     field = run(engine, case)
     assert field.is_converged
     assert field.inflow_mL_s == pytest.approx(FLOW_ML_S, rel=1e-4)
@@ -248,7 +250,7 @@ def test_struts_over_an_ostium_are_meshed_in_as_many_cells_as_told_and_hold_bloo
     )
     branch_mL_s = []
     for name, device in (("bare", None), ("thick", thick)):
-        case = flow_case(anatomy, device, FlowSettings(inflow_mL_s=FLOW_ML_S, tolerance=0.02))
+        case = flow_case(anatomy, (device,), FlowSettings(inflow_mL_s=FLOW_ML_S, numerics=Numerics(tolerance=0.02)))
         engine = OpenFoam(0.35, tmp_path / name, layers=0)
         field = run(engine, case)
         assert field.outlets_mL_s.sum() == pytest.approx(FLOW_ML_S, rel=1e-3)
@@ -266,7 +268,7 @@ def test_openfoams_flow_from_two_inlets_is_the_embedded_engines(tmp_path: Path) 
     fork = phantoms.bifurcation()
     legs_mm = np.array([fork.ends[k][0] for k in (1, 2)])
     vessel = trace(Vessel(phantoms.phantom_surface(fork, edge_mm=0.3)), inlet_mm=legs_mm)
-    case = FlowCase(vessel, settings=FlowSettings(inflow_mL_s=FLOW_ML_S, cell_size_mm=0.2))
+    case = vessel_case(vessel, FlowSettings(inflow_mL_s=FLOW_ML_S, numerics=Numerics(cell_size_mm=0.2)))
     foam, own = run(OpenFoam(0.25, tmp_path / "case"), case), simulate_case(case)
     assert foam.is_converged
     np.testing.assert_allclose(foam.inlets_mL_s, case.inlets_mL_s, rtol=1e-4)
@@ -289,7 +291,7 @@ def test_what_goes_to_and_fro_from_check_to_check_is_told_by_its_size() -> None:
 
 
 def test_of_a_flow_that_does_not_settle_the_neck_inflow_is_the_mean_of_its_checks(tmp_path: Path) -> None:
-    case = FlowCase(tube(), settings=FlowSettings(inflow_mL_s=FLOW_ML_S))
+    case = vessel_case(tube(), FlowSettings(inflow_mL_s=FLOW_ML_S))
     grid = domain.build(case.vessel, 0.5)
     n, v = len(grid.cells), len(case.vessel.lumen.vertices_mm)
     one = Snapshot("50", np.zeros((n, 3)), np.zeros(n), np.zeros((v, 3)), np.zeros(v), np.zeros(2), 1.0)
@@ -307,7 +309,7 @@ def test_of_a_flow_that_does_not_settle_the_neck_inflow_is_the_mean_of_its_check
 def test_a_pulse_that_openfoam_stopped_in_goes_on_in_the_same_cycle(tmp_path: Path) -> None:
     """It was stopped in the second of two cycles: that one is completed, and compared with the first."""
     engine, pulse = OpenFoam(0.6, tmp_path / "case", layers=0, grid_size_mm=0.4), Waveform(0.4, (0.5,), (0.0,))
-    case = FlowCase(tube(), settings=FlowSettings(inflow_mL_s=FLOW_ML_S, waveform=pulse, max_cycles=2))
+    case = vessel_case(tube(), FlowSettings(inflow_mL_s=FLOW_ML_S, waveform=pulse, numerics=Numerics(max_cycles=2)))
     checks = []
 
     def stopping(progress: Progress) -> None:

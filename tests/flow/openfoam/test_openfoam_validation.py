@@ -16,12 +16,14 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.flow import sampling
-from vstent.flow.case import FlowCase, FlowField, FlowSettings
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.engines import run
 from vstent.flow.indices import indices
 from vstent.flow.openfoam.engine import OpenFoam
+from vstent.flow.problem import flow_case
 from vstent.flow.sampling import cells_inside
-from vstent.flow.simulation import flow_case, simulate_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Vessel
 from vstent.io.surfaces import read_surface
 
@@ -77,8 +79,8 @@ def check(found: Agreement) -> None:
 
 
 def restored(vessel: Vessel, cell_size_mm: float) -> FlowCase:
-    settings = FlowSettings(cell_size_mm=cell_size_mm, processes=min(2, os.cpu_count() or 1))
-    return flow_case(restore(trim(trace(vessel))), None, settings)
+    settings = FlowSettings(numerics=Numerics(cell_size_mm=cell_size_mm, processes=min(2, os.cpu_count() or 1)))
+    return flow_case(restore(trim(trace(vessel))), (), settings)
 
 
 def test_the_demo(tmp_path: Path) -> None:

@@ -76,11 +76,11 @@ def estimate(case: FlowCase) -> Cost:
     """Estimate the cost of a flow from the vessel's volume and the speed measured on this machine."""
     cell_size_mm = default_cell_size_mm(case)
     cells, memory_bytes = _size(case, cell_size_mm)
-    steps = _steps(case, cell_size_mm, close_up.SHARE_WITHIN if case.settings.close_up else 1)
+    steps = _steps(case, cell_size_mm, close_up.SHARE_WITHIN if case.numerics.close_up else 1)
     updates = cells * steps
-    if case.settings.close_up:
+    if case.numerics.close_up:
         updates += _wide_cells(case, cell_size_mm) * _steps(case, cell_size_mm, close_up.SHARE_AROUND)
-    seconds = updates / block_rate(on_gpu=case.settings.device_gpu) * WHOLE_OVER_BLOCK
+    seconds = updates / block_rate(on_gpu=case.numerics.device_gpu) * WHOLE_OVER_BLOCK
     return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds)
 
 
@@ -110,7 +110,7 @@ def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes:
             f"{_fitting_mm(case, lambda cell_mm: _size(case, cell_mm)[0], MOST_CELLS):.2g} mm"
         )
     _refuse(case, lambda cell_mm: _size(case, cell_mm)[1], free_bytes, "memory")
-    if case.settings.device_gpu:
+    if case.numerics.device_gpu:
         gpu_bytes = free_gpu_bytes() if gpu_bytes is None else gpu_bytes
         _refuse(case, lambda cell_mm: GPU_BYTES_PER_CELL * _size(case, cell_mm)[0], gpu_bytes, "the GPU's memory")
 
@@ -146,12 +146,12 @@ def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     volume_mm3 = extended_volume_mm3(vessel)
     widest = max(opening.diameter_mm for opening in vessel.openings)
     box_mm3 = float(np.prod(np.ptp(vessel.lumen.vertices_mm, axis=0) + 2 * widest))
-    phases = 0 if case.settings.waveform is None else PHASES
+    phases = 0 if case.waveform is None else PHASES
     whole = volume_mm3 / cell_size_mm**3
     of_all = (
         BYTES_AT_LEAST + box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT + whole * phases * BYTES_PER_PHASE_AND_CELL
     )
-    if not case.settings.close_up:
+    if not case.numerics.close_up:
         return whole, of_all + whole * BYTES_PER_CELL
     cells = close_up.volume_mm3(case) / cell_size_mm**3
     return cells, of_all + cells * BYTES_PER_CELL + (whole - cells) * BYTES_PER_CELL_OF_RESULT
@@ -164,10 +164,9 @@ def _wide_cells(case: FlowCase, cell_size_mm: float) -> float:
 
 def _steps(case: FlowCase, cell_size_mm: float, share: float) -> int:
     """Return the maximum number of time steps; a steady flow makes the given share of those allowed."""
-    settings = case.settings
-    if settings.waveform is None:
-        return int(share * settings.max_steps)
-    return int(pace(case, cell_size_mm, None).sum()) * settings.max_cycles
+    if case.waveform is None:
+        return int(share * case.numerics.max_steps)
+    return int(pace(case, cell_size_mm, None).sum()) * case.numerics.max_cycles
 
 
 def block_rate(*, on_gpu: bool = False) -> float:

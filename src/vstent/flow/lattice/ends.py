@@ -6,12 +6,14 @@ A *cut* is a cross-section of the vessel where the refined region ends and takes
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import assert_never
 
 import numpy as np
 
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase
 from vstent.flow.domain import Domain
+from vstent.flow.ends import FlowRate, Inflow, Pressure
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.scales import ODD_RATE, Scales
@@ -69,7 +71,7 @@ class Ends:
         if not phases:
             return usual, wanted, np.zeros((1, len(patches))), shape[None]
         moments = [self._at(self._outside.at_phase(phase), patches, links) for phase in phases]
-        factor = self.case.settings.inflow_factor(np.array([phase.time_s for phase in phases]))
+        factor = self.case.inflow_factor(np.array([phase.time_s for phase in phases]))
         course = np.stack([rows[:, 1] for rows, _ in moments]) - factor[:, None] * wanted
         return usual, wanted, course, np.stack([shape for _, shape in moments])
 
@@ -87,13 +89,22 @@ class Ends:
 
     def _opening(self, k: int, links: Ints) -> tuple[Floats, Floats]:
         """Return the row (9,) and profile coefficients (l, 2) of opening `k`."""
-        opening = self.case.vessel.openings[k]
-        flow_mL_s = np.concatenate([self.case.inlets_mL_s, self.case.held_mL_s])[k]
-        kind = d3q19.INFLOW if opening.is_inlet else d3q19.PRESSURE if np.isnan(flow_mL_s) else d3q19.OUTFLOW
-        speed = np.nan_to_num(flow_mL_s) / opening.area_mm2 / self.scales.speed_m_s
+        opening, end = self.case.vessel.openings[k], self.case.ends[k]
         area = opening.area_mm2 / self.domain.cell_size_mm**2
+        shape = np.zeros((len(links), 2))
+        match end:
+            case Inflow():
+                kind, mean_mL_s, shape = d3q19.INFLOW, end.mean_mL_s, self._developed(k, links, area)
+            case FlowRate():
+                kind, mean_mL_s = d3q19.OUTFLOW, end.mean_mL_s
+            case Pressure():
+                kind, mean_mL_s = d3q19.PRESSURE, 0.0
+                shape[:, 0] = end.pressure_Pa / self.scales.pressure_Pa
+            case _:
+                assert_never(end)
+        speed = mean_mL_s / opening.area_mm2 / self.scales.speed_m_s
         row = np.array([kind, speed, 0.0, self._rate(kind), *opening.normal, area, 0.0])
-        return row, self._developed(k, links, area) if opening.is_inlet else np.zeros((len(links), 2))
+        return row, shape
 
     def _developed(self, k: int, links: Ints, area: float) -> Floats:
         """Return the profile coefficients (l, 2) of the links of inlet `k` for fully developed flow."""
@@ -105,7 +116,7 @@ class Ends:
     def _rate(self, kind: float) -> float:
         """Return the rate per step pair at which an end of this kind updates its remembered density."""
         if kind == d3q19.INFLOW:
-            return SOUND_MEMORY if self.case.settings.waveform is None else 1.0
+            return SOUND_MEMORY if self.case.waveform is None else 1.0
         # Critical damping for a column of blood about as long as the grid.
         return 0.25 / self._length
 

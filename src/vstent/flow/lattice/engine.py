@@ -54,7 +54,7 @@ class AbstractLattice(AbstractEngine[State]):
         FlowError
             When the GPU is requested but not usable, or the case does not fit in memory.
         """
-        if case.settings.device_gpu:
+        if case.numerics.device_gpu:
             require_gpu()
         refuse_too_large(case)
         return str(estimate(case))
@@ -68,7 +68,7 @@ class AbstractLattice(AbstractEngine[State]):
 
         A narrow place in the vessel may hold faster blood than the openings suggest.
         """
-        return replace(case, settings=replace(case.settings, lattice_speed=SLOWER * case.settings.lattice_speed))
+        return replace(case, numerics=replace(case.numerics, lattice_speed=SLOWER * case.numerics.lattice_speed))
 
     def close_up(self, case: FlowCase) -> CloseUp | None:
         """Return the refined region of a case; None: the grid covers the whole vessel."""
@@ -135,13 +135,13 @@ class LatticeBoltzmann(AbstractLattice):
 
     def max_checks(self, state: State) -> int:
         """Return the maximum number of checks within the limit of time steps."""
-        steps = state.case.settings.max_steps * (1 if self.outer is None else close_ups.SHARE_WITHIN)
+        steps = state.case.numerics.max_steps * (1 if self.outer is None else close_ups.SHARE_WITHIN)
         return max(4, int(steps // state.steps_per_check))
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
         """Return the last check of a converged flow, or the time average of an unsteady one."""
         left = _left(state)
-        if left < state.case.settings.tolerance:
+        if left < state.case.numerics.tolerance:
             return field_of(state, read(state, [state.snapshots[-1]]), outcome, left, "The flow has converged.")
         mean = _mean(state)
         uncertain, advice = _of_mean(state, mean, is_converged=outcome.is_converged)
@@ -151,7 +151,7 @@ class LatticeBoltzmann(AbstractLattice):
 def _steps_per_check(case: FlowCase, step_s: float) -> int:
     """Return the even number of time steps between checks."""
     steps = CHECK_DIAMETERS * case.vessel.inlet.diameter_mm * M_PER_MM / float(case.inlet_speeds_m_s[0]) / step_s
-    return 2 * max(1, round(0.5 * min(steps, case.settings.max_steps / LEAST_CHECKS)))
+    return 2 * max(1, round(0.5 * min(steps, case.numerics.max_steps / LEAST_CHECKS)))
 
 
 def _left(state: State) -> float:

@@ -17,11 +17,11 @@ from typing import Final
 
 import numpy as np
 
-from vstent.flow.case import FlowCase, FlowField, Screen
+from vstent.flow.case import FlowCase, FlowField, Sheet, Target
 from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
 from vstent.flow.engines import DivergenceError, Outcome, Saved, stepped
 from vstent.flow.lattice.checkpoint import pack
-from vstent.flow.lattice.close_up import WIDTH
+from vstent.flow.lattice.close_up import WIDTH, require_sac
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
 from vstent.flow.lattice.stepping import advance, exchange, monitored, snapshot, twin
@@ -215,7 +215,8 @@ class LiveFlow:
     def __init__(
         self, case: FlowCase, told: Callable[[float], None] | None = None, stored: BareFlow | None = None
     ) -> None:
-        self.case = replace(case, settings=replace(case.settings, waveform=None, close_up=False, tolerance=TOLERANCE))
+        numerics = replace(case.numerics, close_up=False, tolerance=TOLERANCE)
+        self.case = replace(case, waveform=None, numerics=numerics)
         self.cell_size_mm = preview_spacing_mm(self.case)
         self.outer = self._around(told) if stored is None else stored.outer
         engine = LatticeBoltzmann(self.cell_size_mm, None, self.outer)
@@ -227,7 +228,7 @@ class LiveFlow:
     def _around(self, told: Callable[[float], None] | None) -> FlowField:
         """Return the flow of the whole vessel on the coarse grid once its blood has been exchanged."""
         # Oscillations at the neck would need most of the steps, and the fine grid computes the neck.
-        case = replace(self.case, ostium=None)
+        case = replace(self.case, target=Target(require_sac(self.case), None))
         engine = LatticeBoltzmann(WIDTH * self.cell_size_mm)
         state, left = engine.init(case, None), None
         exchange_s = extended_volume_mm3(case.vessel) * M_PER_MM**3 / (case.inflow_mL_s * M3_PER_ML)
@@ -239,17 +240,17 @@ class LiveFlow:
             state, left = stepped(engine, state)
         return engine.result(state, Outcome(left < TOLERANCE, (left,), 0.0, 0.0))
 
-    def place(self, screen: Screen | None) -> None:
-        """Exchange the device; None removes it.
+    def place(self, media: tuple[Sheet, ...]) -> None:
+        """Exchange the device for other media; without media it is removed.
 
         The flow with a device continues from its present state; the first one continues from the flow without a device.
         """
-        if screen is None:
+        if not media:
             self._shown = self._bare
             return
         if self._shown is self._bare:
             self._shown = Stepping(twin(self._bare.state), self._bare.reading_steps)
-        self._shown.place(replace(self.case, screen=screen))
+        self._shown.place(replace(self.case, media=media))
 
     def advance(self, seconds: float) -> int:
         """Make time steps for about a wall-clock time, take one reading at least, and return the number of steps."""
@@ -331,4 +332,4 @@ def preview_spacing_mm(case: FlowCase) -> float:
     """Return the grid spacing of a preview: as coarse as neck and artery allow, not finer than by default."""
     assert case.ostium is not None
     coarsest_mm = min(neck_diameter_mm(case.ostium) / CELLS_ACROSS_NECK, parent_diameter_mm(case) / CELLS_ACROSS_PARENT)
-    return max(coarsest_mm, default_cell_size_mm(replace(case, settings=replace(case.settings, cell_size_mm=None))))
+    return max(coarsest_mm, default_cell_size_mm(replace(case, numerics=replace(case.numerics, cell_size_mm=None))))

@@ -9,11 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from vstent.flow.case import PHASES, FlowCase, FlowField, Waveform
+from vstent.flow.case import PHASES, FlowCase, FlowField
 from vstent.flow.cycles import pulse_of
 from vstent.flow.domain import extended_volume_mm3
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
+from vstent.flow.settings import Waveform
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
@@ -58,7 +59,7 @@ def peak_speed_m_s(case: FlowCase, start: FlowField | None, close_up: CloseUp | 
 
 def longest_step_s(case: FlowCase, cell_size_mm: float, peak_m_s: float) -> float:
     """Return the time step, s, in which blood at `peak_m_s` moves `lattice_speed` cells."""
-    return case.settings.lattice_speed * cell_size_mm * M_PER_MM / peak_m_s
+    return case.numerics.lattice_speed * cell_size_mm * M_PER_MM / peak_m_s
 
 
 def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up: CloseUp | None = None) -> Ints:

@@ -35,7 +35,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
 
     def max_checks(self, state: State) -> int:
         """Return the number of phases in the maximum number of cycles."""
-        return PHASES * state.case.settings.max_cycles
+        return PHASES * state.case.numerics.max_cycles
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
         """Return the mean flow of the last cycle, with its phases."""

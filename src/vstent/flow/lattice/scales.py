@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.flow.case import Blood
+from vstent.flow.settings import Blood
 from vstent.units import M3_PER_ML
 
 ODD_RATE = 0.7

@@ -1,11 +1,11 @@
 """The porous screen of a stent on the lattice: its resistance in the grid cells near it, in lattice units."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.flow.case import FlowCase, Screen
+from vstent.flow.case import FlowCase, Sheet
 from vstent.flow.domain import Domain
 from vstent.flow.drag import concentration
 from vstent.flow.lattice.kernels import d3q19, sheet
@@ -61,7 +61,7 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
     Parameters
     ----------
     case : FlowCase
-        The flow case; without a screen the result is empty.
+        The flow case; without media the result is empty.
     domain : Domain
         The grid.
     addressing : Addressing
@@ -70,9 +70,9 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
         Lattice units.
     """
     segments = len(addressing.length)
-    if case.screen is None:
+    if not case.media:
         return ScreenEntries(*d3q19.no_screen(segments), np.zeros(0, np.int32))
-    spread = on_grid(case.screen, domain.index, domain.origin_mm, domain.cell_size_mm)
+    spread = on_grid(case.media, domain.index, domain.origin_mm, domain.cell_size_mm)
     per_step = scales.step_s / case.blood.density_kg_m3
     entry = np.column_stack(
         [
@@ -89,16 +89,16 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
     return ScreenEntries(start, place, entry.astype(np.float32), spread.cell)
 
 
-def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float) -> GridResistance:
-    """Distribute the resistance of a screen over grid cells.
+def on_grid(media: tuple[Sheet, ...], index: Ints, origin_mm: Floats, cell_size_mm: float) -> GridResistance:
+    """Distribute the resistance of media over grid cells.
 
-    Every sample point of the screen is shared among the eight cells around it with trilinear weights. The share of
+    Every sample point is shared among the eight cells around it with trilinear weights. The share of
     points outside the blood is dropped. A cell at the rim therefore resists as its neighbours do where the screen
     extends over the wall beyond the neck.
 
     Parameters
     ----------
-    screen : Screen
+    media : tuple of Sheet
         Sample points with normals, areas and resistances.
     index : (i, j, k) int
         Cell number at every grid point, -1 outside.
@@ -107,6 +107,7 @@ def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float)
     cell_size_mm : float
         Grid spacing.
     """
+    screen = Sheet(*(np.concatenate([getattr(one, part.name) for one in media]) for part in fields(Sheet)))
     factor, volume = _concentration(screen, cell_size_mm), cell_size_mm**3 * M_PER_MM
     along_Pa_s_m, across_Pa_s_m = screen.normal_resistance_Pa_s_m, screen.tangential_resistance_Pa_s_m
     values = screen.area_mm2 / volume, factor * along_Pa_s_m, factor * across_Pa_s_m, screen.inertial_loss
@@ -130,7 +131,7 @@ def on_grid(screen: Screen, index: Ints, origin_mm: Floats, cell_size_mm: float)
     )
 
 
-def _concentration(screen: Screen, cell_size_mm: float) -> Floats:
+def _concentration(screen: Sheet, cell_size_mm: float) -> Floats:
     """Return the factor on the drag of every sample (see `concentration`); neighbours on one wire share theirs."""
     diameter_mm, spacing_mm = screen.wire_diameter_mm, screen.spacing_mm
     is_new = np.ones(len(diameter_mm), dtype=bool)

@@ -64,7 +64,7 @@ def build(
     kept : int
         Number of last checks that are kept.
     """
-    if case.settings.device_gpu:
+    if case.numerics.device_gpu:
         require_gpu()
     keep_flow()
     scales = Scales(cell_size_mm * M_PER_MM, check_s / int(pace[0]), case.blood)
@@ -136,7 +136,7 @@ def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
 
 def _begin_from(state: State, start: FlowField) -> None:
     """Set the initial flow; a pulse starts from the last phase of `start`, if it has phases."""
-    pulses = state.case.settings.waveform is not None and start.phases
+    pulses = state.case.waveform is not None and start.phases
     moment = start.at_phase(start.phases[-1]) if pulses else start
     velocity, pressure = sampling.values_at(moment, state.domain.centers_mm)
     d3q19.set_equilibrium(
@@ -230,7 +230,7 @@ def take_pace(state: State) -> None:
 
 def _slice_steps(state: State) -> int:
     """Return the even number of time steps to the next look at the clock or to the next check."""
-    updates = GPU_SLICE_UPDATES if state.case.settings.device_gpu else SLICE_UPDATES
+    updates = GPU_SLICE_UPDATES if state.case.numerics.device_gpu else SLICE_UPDATES
     steps = 2 * max(1, round(updates / len(state.domain.cells) / 2))
     return min(steps, state.steps_per_check - state.since_check)
 
@@ -247,7 +247,7 @@ def _begin(state: State) -> None:
 def advance(state: State, steps: int) -> None:
     """Make an even number of time steps."""
     pairs = _pairs(state, steps)
-    if state.case.settings.device_gpu:
+    if state.case.numerics.device_gpu:
         with told():
             _device(state).advance(*pairs)
     else:
@@ -284,7 +284,7 @@ def imposed(state: State, steps: Floats | Ints) -> tuple[Floats, Floats]:
     now, part = np.divmod(checks - 1, 1)  # the first moment is the first check
     moments = np.column_stack([now % count, (now + 1) % count, part])
     before, after = (links.course[moments[:, k].astype(int)] for k in range(2))
-    factor = state.case.settings.inflow_factor(state.check_s * checks)
+    factor = state.case.inflow_factor(state.check_s * checks)
     return factor[:, None] * links.wanted + before + part[:, None] * (after - before), moments
 
 

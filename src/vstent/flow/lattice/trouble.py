@@ -37,7 +37,7 @@ def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
     if speed[fastest] > FAST:
         return (
             f"the time step is too long ({speed[fastest]:.2g} cells per step): use half the lattice speed "
-            f"({state.case.settings.lattice_speed:.3g})"
+            f"({state.case.numerics.lattice_speed:.3g})"
         )
     outlets = [(k, one) for k, one in enumerate(state.case.vessel.openings) if not one.is_inlet]
     coming_back = [one.role for k, one in outlets if _backflow(state, last, k) > FAST * speed[fastest]]

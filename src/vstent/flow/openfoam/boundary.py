@@ -1,14 +1,17 @@
 """OpenFOAM boundary conditions: developed profiles at the inlets, zero pressure or a prescribed flow at the outlets."""
 
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, assert_never
 
 import numpy as np
 
 from vstent.flow.case import FlowCase
+from vstent.flow.ends import End, FlowRate, Inflow, Pressure
 from vstent.flow.openfoam.dictionary import foam_file
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.profile import developed_profile
+from vstent.geometry.vessel import Opening
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
@@ -17,10 +20,26 @@ PROFILE_POINTS: Final = 81
 """Number of points across an inlet at which its profile is written."""
 TABLE_POINTS: Final = 100
 """Number of intervals of a cycle in a table of flow rates."""
+ZERO_GRADIENT: Final[dict[str, Any]] = {"type": "zeroGradient"}
+"""Pressure where the velocity is prescribed."""
+AT_REST: Final[dict[str, Any]] = {"value": "uniform (0 0 0)"}
+"""Initial velocity at an opening."""
 
 
-def velocity(case: FlowCase, setup: FoamSetup, walls: list[str]) -> str:
-    """Return the text of the file 0/U.
+@dataclass(frozen=True)
+class Condition:
+    """Boundary condition of one opening in OpenFOAM's words."""
+
+    velocity: dict[str, Any]
+    """Entry in the file 0/U."""
+    pressure: dict[str, Any]
+    """Entry in the file 0/p."""
+    files: dict[str, str]
+    """Files in constant/ that these entries refer to."""
+
+
+def conditions(case: FlowCase, setup: FoamSetup, sections: Sequence[Floats]) -> dict[str, Condition]:
+    """Return the boundary condition of every opening, by its role.
 
     Parameters
     ----------
@@ -28,24 +47,38 @@ def velocity(case: FlowCase, setup: FoamSetup, walls: list[str]) -> str:
         The flow.
     setup : FoamSetup
         Setup of the OpenFOAM case.
-    walls : list of str
-        Names of the wall patches.
+    sections : sequence of (k, 3) float
+        Polygon of every opening in mm.
     """
-    patches: dict[str, Any] = {name: {"type": "noSlip"} for name in walls}
-    for inlet, flow_mL_s in zip(case.vessel.inlets, case.inlets_mL_s, strict=True):
-        patches[inlet.role] = _inlet(case, setup, inlet.role, flow_mL_s)
-    for outlet, flow_mL_s in zip(case.vessel.outlets, case.held_mL_s, strict=True):
-        patches[outlet.role] = _outlet_velocity(case, setup, outlet.role, flow_mL_s)
+    ends = zip(case.vessel.openings, case.ends, sections, strict=True)
+    return {opening.role: _condition(case, setup, opening, end, section) for opening, end, section in ends}
+
+
+def _condition(case: FlowCase, setup: FoamSetup, opening: Opening, end: End, section_mm: Floats) -> Condition:
+    """Return the condition of one opening, which depends on the type of its end only here."""
+    role, density = opening.role, case.blood.density_kg_m3
+    match end:
+        case Inflow():
+            return _inflow(case, setup, opening, end, section_mm)
+        case FlowRate():
+            flow, files = _over_time(case, setup, "volumetricFlowRate", role, end.mean_mL_s * M3_PER_ML)
+            return Condition({"type": "flowRateOutletVelocity", **flow} | AT_REST, ZERO_GRADIENT, files)
+        case Pressure():
+            free = {"type": "inletOutlet", "inletValue": "uniform (0 0 0)"} | AT_REST
+            return Condition(free, {"type": "fixedValue", "value": f"uniform {end.pressure_Pa / density:.9g}"}, {})
+        case _:
+            assert_never(end)
+
+
+def velocity(of_openings: Mapping[str, Condition], walls: list[str]) -> str:
+    """Return the text of the file 0/U; `walls` are the names of the wall patches."""
+    patches = {name: {"type": "noSlip"} for name in walls} | {name: one.velocity for name, one in of_openings.items()}
     return _field("U", "volVectorField", "[0 1 -1 0 0 0 0]", "(0 0 0)", patches)
 
 
-def pressure(case: FlowCase, walls: list[str]) -> str:
+def pressure(of_openings: Mapping[str, Condition], walls: list[str]) -> str:
     """Return the text of the file 0/p; `walls` are the names of the wall patches."""
-    inlets = (inlet.role for inlet in case.vessel.inlets)
-    patches: dict[str, Any] = {name: {"type": "zeroGradient"} for name in (*walls, *inlets)}
-    for outlet, flow_mL_s in zip(case.vessel.outlets, case.held_mL_s, strict=True):
-        is_held = not np.isnan(flow_mL_s)
-        patches[outlet.role] = {"type": "zeroGradient"} if is_held else {"type": "fixedValue", "value": "uniform 0"}
+    patches = dict.fromkeys(walls, ZERO_GRADIENT) | {name: one.pressure for name, one in of_openings.items()}
     return _field("p", "volScalarField", "[0 2 -2 0 0 0 0]", "0", patches)
 
 
@@ -55,83 +88,50 @@ def _field(name: str, kind: str, dimensions: str, inside: str, patches: dict[str
     return foam_file(name, entries, kind=kind)
 
 
-def tables(case: FlowCase) -> dict[str, str]:
-    """Return the files with functions of time that the boundary conditions refer to: one cycle each, time in s."""
-    if case.settings.waveform is None:
-        return {}
-    means = {inlet.role: 1.0 for inlet in case.vessel.inlets}  # an inlet's profile is written for its mean flow
-    held = zip(case.vessel.outlets, case.held_mL_s, strict=True)
-    means |= {outlet.role: flow_mL_s * M3_PER_ML for outlet, flow_mL_s in held if not np.isnan(flow_mL_s)}
-    return {f"flow_{name}": _cycle(case, mean) for name, mean in means.items()}
-
-
-def _cycle(case: FlowCase, mean: float) -> str:
-    """Return one cycle of a quantity with this mean, as a list of (time, value) pairs."""
-    waveform = case.settings.waveform
-    assert waveform is not None
-    time_s = np.linspace(0.0, waveform.period_s, TABLE_POINTS + 1)
-    values = mean * waveform.factor(time_s)
-    return "(" + " ".join(f"({t:.9g} {q:.9g})" for t, q in zip(time_s, values, strict=True)) + ")\n"
-
-
-def _over_time(case: FlowCase, setup: FoamSetup, key: str, patch: str, mean: float) -> dict[str, Any]:
-    """Return the dictionary entry of a quantity with this mean: constant, or a repeated cycle."""
-    if case.settings.waveform is None:
-        return {key: f"constant {mean:.9g}"}
+def _over_time(
+    case: FlowCase, setup: FoamSetup, key: str, patch: str, mean: float
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the entry of a quantity with this mean, constant or a repeated cycle, and the file of the cycle."""
+    if case.waveform is None:
+        return {key: f"constant {mean:.9g}"}, {}
+    time_s = np.linspace(0.0, case.waveform.period_s, TABLE_POINTS + 1)
+    values = mean * case.waveform.factor(time_s)
+    cycle = "(" + " ".join(f"({t:.9g} {q:.9g})" for t, q in zip(time_s, values, strict=True)) + ")"
     if setup.flavour == "org":
-        return {key: {"type": "table", "values": _cycle(case, mean).strip(), "outOfBounds": "repeat"}}
+        return {key: {"type": "table", "values": cycle, "outOfBounds": "repeat"}}, {}
     # Release 1912 accepts options next to a table only if the table is in a file.
-    return {key: "tableFile", f"{key}Coeffs": {"file": f'"<constant>/flow_{patch}"', "outOfBounds": "repeat"}}
+    file = f"flow_{patch}"
+    entry = {key: "tableFile", f"{key}Coeffs": {"file": f'"<constant>/{file}"', "outOfBounds": "repeat"}}
+    return entry, {file: cycle + "\n"}
 
 
-def _inlet(case: FlowCase, setup: FoamSetup, role: str, flow_mL_s: float) -> dict[str, Any]:
-    """Return the velocity condition of an inlet.
+def _inflow(case: FlowCase, setup: FoamSetup, opening: Opening, end: Inflow, section_mm: Floats) -> Condition:
+    """Return the condition of an inlet.
 
     The profile is developed flow for the inlet's own shape (openfoam.com) or a function of the distance to the wall
     (openfoam.org), times the flow rate.
     """
-    start = {"value": "uniform (0 0 0)"}
+    role = opening.role
     if setup.flavour == "org":
-        flow = _over_time(case, setup, "volumetricFlowRate", role, flow_mL_s * M3_PER_ML)
-        return {"type": "flowRateInletVelocity", **flow, "profile": "laminarBL"} | start
+        flow, files = _over_time(case, setup, "volumetricFlowRate", role, end.mean_mL_s * M3_PER_ML)
+        entry = {"type": "flowRateInletVelocity", **flow, "profile": "laminarBL"} | AT_REST
+        return Condition(entry, ZERO_GRADIENT, files)
+    profile = _profile(section_mm, -opening.normal, end.mean_mL_s)
+    files = {f"boundaryData/{role}/{name}": text for name, text in profile.items()}
     # Nearest point, because OpenFOAM's planar interpolation fails on sections of a few millimetres.
-    mapped = {"type": "timeVaryingMappedFixedValue", "mapMethod": "nearest", "setAverage": True} | start
-    if case.settings.waveform is None:
-        return mapped
-    return {"type": "scaledFixedValue", **_over_time(case, setup, "scale", role, 1.0), "refValue": mapped} | start
-
-
-def _outlet_velocity(case: FlowCase, setup: FoamSetup, role: str, flow_mL_s: float) -> dict[str, Any]:
-    """Return the velocity condition of an outlet: a prescribed flow rate, or free outflow where it is nan."""
-    if np.isnan(flow_mL_s):
-        return {"type": "inletOutlet", "inletValue": "uniform (0 0 0)", "value": "uniform (0 0 0)"}
-    flow = _over_time(case, setup, "volumetricFlowRate", role, flow_mL_s * M3_PER_ML)
-    return {"type": "flowRateOutletVelocity", **flow, "value": "uniform (0 0 0)"}
-
-
-def inlet_profiles(case: FlowCase, sections: Sequence[Floats]) -> dict[str, str]:
-    """Return the files in constant/ with the inlet profiles: points in m, and the developed velocity there.
-
-    The velocities have the mean of the inlet's mean flow. The mean that OpenFOAM enforces on the patch (`setAverage`)
-    follows the values.
-
-    Parameters
-    ----------
-    case : FlowCase
-        The flow.
-    sections : sequence of (k, 3) float
-        Polygon of every opening in mm, inlets first.
-    """
-    inlets = zip(case.vessel.inlets, sections, case.inlets_mL_s, strict=False)  # `sections` continues with the outlets
-    return {
-        f"boundaryData/{inlet.role}/{name}": text
-        for inlet, section_mm, flow_mL_s in inlets
-        for name, text in _profile(section_mm, -inlet.normal, flow_mL_s).items()
-    }
+    mapped = {"type": "timeVaryingMappedFixedValue", "mapMethod": "nearest", "setAverage": True} | AT_REST
+    if case.waveform is None:
+        return Condition(mapped, ZERO_GRADIENT, files)
+    scale, cycle = _over_time(case, setup, "scale", role, 1.0)  # the profile is that of the mean flow
+    return Condition({"type": "scaledFixedValue", **scale, "refValue": mapped} | AT_REST, ZERO_GRADIENT, files | cycle)
 
 
 def _profile(section_mm: Floats, inward: Floats, flow_mL_s: float) -> dict[str, str]:
-    """Return the files in the folder of one inlet."""
+    """Return the files in the folder of an inlet: points in m, and the developed velocity there.
+
+    The velocities have the mean of the inlet's mean flow. The mean that OpenFOAM enforces on the patch (`setAverage`)
+    follows the values.
+    """
     points_mm = _section_points_mm(section_mm, inward)
     shape = developed_profile(section_mm, inward, points_mm)
     mean_m_s = flow_mL_s / _polygon_area_mm2(section_mm, inward)

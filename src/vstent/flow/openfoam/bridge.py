@@ -157,6 +157,6 @@ def _at_inlets(case: FlowCase, velocity: results.VolumeField, time: float) -> li
 
     With a waveform, OpenFOAM's files hold the velocity divided by the waveform's factor.
     """
-    factor = float(case.settings.inflow_factor(np.array([time]))[0])
+    factor = float(case.inflow_factor(np.array([time]))[0])
     multiples = {name: factor * values for name, values in velocity.references.items()}
     return [(multiples | velocity.patches)[inlet.role] for inlet in case.vessel.inlets]

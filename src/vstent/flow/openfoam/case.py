@@ -48,23 +48,26 @@ def strut_solids(case: FlowCase) -> Surface | None:
     Raises
     ------
     FlowError
-        The case has a screen but no wires.
+        The case has media but no wires.
     LandingError
         No wire is over a neck or a branch's ostium.
     """
-    if case.stent is None and case.screen is None:
+    if not case.solids and not case.media:
         return None
-    if case.stent is None:
+    if not case.solids:
         raise FlowError(
             "the engine openfoam does not support the screen model of a stent: give the stent itself, whose struts are "
             "meshed, or choose the embedded engine"
         )
-    if not len(case.stent.wire_points_mm):
+    solids = [struts(one) for one in case.solids if len(one.wire_points_mm)]
+    if not solids:
         raise LandingError(
             "no wire of the device is over a neck or a branch's ostium, the only places where OpenFOAM meshes struts: "
             "move the landing zone across one, or compute without the device"
         )
-    return struts(case.stent)
+    before = np.cumsum([0, *(len(one.vertices_mm) for one in solids)])
+    faces = [one.faces + first for one, first in zip(solids, before[:-1], strict=True)]
+    return Surface(np.concatenate([one.vertices_mm for one in solids]), np.concatenate(faces))
 
 
 def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
@@ -73,7 +76,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
     Parameters
     ----------
     case : FlowCase
-        The flow. A screen is ignored, because OpenFOAM meshes struts instead.
+        The flow. Media are ignored, because OpenFOAM meshes struts instead.
     setup : FoamSetup
         Mesh, parallel processes, OpenFOAM flavour and struts.
 
@@ -87,7 +90,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
     walls = [name for name, kind in kinds.items() if kind == "wall"]
     if setup.struts is not None:
         walls.append(mesh.STRUTS)
-    application = _application(case, setup)
+    application, of_openings = _application(case, setup), boundary.conditions(case, setup, sections)
     files = _system(case, setup, patches, walls, sections)
     features, text = mesh.feature_extract(setup)
     files |= {
@@ -95,8 +98,8 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         "system/snappyHexMeshDict": mesh.snappy(
             setup, kinds, _ends(case, sections), _inside_mm(case, sections), has_neck=case.ostium is not None
         ),
-        "0/U": boundary.velocity(case, setup, walls),
-        "0/p": boundary.pressure(case, walls),
+        "0/U": boundary.velocity(of_openings, walls),
+        "0/p": boundary.pressure(of_openings, walls),
         "Allrun": scripts.all_run(setup, application),
         "Allclean": scripts.all_clean(),
         "submit.slurm": scripts.slurm(setup),
@@ -111,9 +114,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
     files |= {f"constant/{name}": text for name, text in control.fluid(case.blood, setup).items()}
     folder = "constant/geometry" if setup.flavour == "org" else "constant/triSurface"
     files |= {f"{folder}/{name}.stl": text for name, text in _surfaces(case, setup, patches).items()}
-    if setup.flavour == "com":
-        files |= {f"constant/{name}": text for name, text in boundary.tables(case).items()}
-        files |= {f"constant/{name}": text for name, text in boundary.inlet_profiles(case, sections).items()}
+    files |= {f"constant/{name}": text for one in of_openings.values() for name, text in one.files.items()}
     return FoamCase(files, ("Allrun", "Allclean", "submit.slurm"), application)
 
 
@@ -131,14 +132,14 @@ def _application(case: FlowCase, setup: FoamSetup) -> str:
     """Return the name of the solver program."""
     if setup.flavour == "org":
         return "foamRun"
-    return "simpleFoam" if case.settings.waveform is None else "pimpleFoam"
+    return "simpleFoam" if case.waveform is None else "pimpleFoam"
 
 
 def _system(
     case: FlowCase, setup: FoamSetup, patches: tuple[Patch, ...], walls: list[str], sections: tuple[Floats, ...]
 ) -> dict[str, str]:
     """Return the files in the folder system/."""
-    is_steady = case.settings.waveform is None
+    is_steady = case.waveform is None
     step_s = 0.2 * setup.cell_size_mm * M_PER_MM / (2 * float(case.inlet_speeds_m_s.max()))
     return {
         "system/controlDict": control.control(case, setup, step_s, walls=walls, has_neck=case.ostium is not None),

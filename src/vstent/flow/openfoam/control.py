@@ -5,10 +5,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from vstent.flow.case import PHASES, Blood, FlowCase
+from vstent.flow.case import PHASES, FlowCase
 from vstent.flow.openfoam.dictionary import foam_file
 from vstent.flow.openfoam.mesh import NECK
 from vstent.flow.openfoam.setup import FoamSetup
+from vstent.flow.settings import Blood
 from vstent.kernels.arrays import Floats
 
 MAX_COURANT: Final = 2.0
@@ -76,7 +77,7 @@ def control(case: FlowCase, setup: FoamSetup, step_s: float, *, walls: Sequence[
     has_neck : bool
         Whether to sample the flow through the neck.
     """
-    is_org, is_steady = setup.flavour == "org", case.settings.waveform is None
+    is_org, is_steady = setup.flavour == "org", case.waveform is None
     program = "foamRun" if is_org else "simpleFoam" if is_steady else "pimpleFoam"
     patches = [opening.role for opening in case.vessel.openings]
     entries: dict[str, Any] = {"application": program} | ({"solver": "incompressibleFluid"} if is_org else {})
@@ -100,10 +101,10 @@ def _steady_times(setup: FoamSetup) -> dict[str, Any]:
 
 def _transient_times(case: FlowCase, step_s: float) -> dict[str, Any]:
     """Return the entries of a transient flow's time steps and output."""
-    waveform = case.settings.waveform
+    waveform = case.waveform
     assert waveform is not None
     return {
-        "endTime": case.settings.max_cycles * waveform.period_s,
+        "endTime": case.numerics.max_cycles * waveform.period_s,
         "deltaT": step_s,
         "adjustTimeStep": True,
         "maxCo": MAX_COURANT,

@@ -5,11 +5,12 @@ from typing import Final
 import numpy as np
 
 from vstent.errors import FlowError
-from vstent.flow.case import LATTICE, FlowCase
+from vstent.flow.case import FlowCase
 from vstent.flow.domain import extended_volume_mm3
 from vstent.flow.memory import free_memory_bytes
 from vstent.flow.openfoam.case import strut_solids
 from vstent.flow.openfoam.setup import FoamSetup
+from vstent.flow.settings import LATTICE
 
 CELLS_PER_CUBE: Final = 1.6
 """Number of mesh cells over the blood's volume in cubic grid spacings: more than 1 because of layers and the refined
@@ -33,7 +34,7 @@ SECONDS_PER_STRUT_CELL: Final = 1.7e-3
 
 
 def tell_cost(case: FlowCase, cell_size_mm: float) -> str:
-    """Return a sentence on cells, memory and run time of a steady flow, including struts if the case has a stent.
+    """Return a sentence on cells, memory and run time of a steady flow, including struts if the case has solids.
 
     Raises
     ------
@@ -59,7 +60,7 @@ def tell_cost(case: FlowCase, cell_size_mm: float) -> str:
 
 
 def memory_bytes(case: FlowCase, cell_size_mm: float) -> float:
-    """Return the estimated peak memory of a flow, including struts if the case has a stent.
+    """Return the estimated peak memory of a flow, including struts if the case has solids.
 
     Raises
     ------
@@ -72,12 +73,13 @@ def memory_bytes(case: FlowCase, cell_size_mm: float) -> float:
 def _cells(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     """Return the number of cells of the bare vessel, and of the refined ones at the struts."""
     bare = CELLS_PER_CUBE * extended_volume_mm3(case.vessel) / cell_size_mm**3
-    if case.stent is None:
+    if not case.solids:
         return bare, 0.0
     setup = FoamSetup(cell_size_mm, struts=strut_solids(case))
     small_mm = cell_size_mm / 2**setup.levels_at_struts
     base, more = CELLS_ALONG_WIRE
-    return bare, case.stent.wire_length_mm / small_mm * (base + more * setup.strut_thickness_mm / small_mm)
+    length_mm = sum(one.wire_length_mm for one in case.solids)
+    return bare, length_mm / small_mm * (base + more * setup.strut_thickness_mm / small_mm)
 
 
 def _what_fits(case: FlowCase, cell_size_mm: float, free_bytes: float) -> str:

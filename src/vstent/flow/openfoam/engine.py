@@ -66,7 +66,7 @@ class State:
     @property
     def is_pulse(self) -> bool:
         """Whether the inflow follows a waveform."""
-        return self.case.settings.waveform is not None
+        return self.case.waveform is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class OpenFoam(AbstractEngine[State]):
             raise FlowError("the engine openfoam needs a folder for its files: name one")
         solids, found = strut_solids(case), program.find()
         setup = FoamSetup(
-            self.cell_size_mm, found.flavour, self.layers, processes=case.settings.processes, struts=solids
+            self.cell_size_mm, found.flavour, self.layers, processes=case.numerics.processes, struts=solids
         )
         domain = domains.build(case.vessel, self.grid_size_mm or self.cell_size_mm)
         sac = domains.cells_of_sac(case, domain)
@@ -106,7 +106,7 @@ class OpenFoam(AbstractEngine[State]):
         if start is not None and not results.times(self.folder):
             folders.begin_from(self.folder, start)
         across = bridge(case, domain, self.folder)
-        kept: deque[Snapshot] = deque(maxlen=PHASES if case.settings.waveform else CHECKS_AVERAGED)
+        kept: deque[Snapshot] = deque(maxlen=PHASES if case.waveform else CHECKS_AVERAGED)
         state = State(case, setup, found, foam.application, self.folder, domain, across, sac, kept)
         for time in _whole_cycles(case, results.times(self.folder)):
             _note(state, time)
@@ -153,7 +153,7 @@ class OpenFoam(AbstractEngine[State]):
     def max_checks(self, state: State) -> int:
         """Return the number of checks within the limit of iterations, or of remaining phases of all cycles."""
         if state.is_pulse:
-            left = PHASES * state.case.settings.max_cycles - _phases_done(state)
+            left = PHASES * state.case.numerics.max_cycles - _phases_done(state)
             return left if left > 0 else PHASES
         return state.setup.iterations // CHECK_ITERATIONS
 
@@ -173,9 +173,9 @@ def _next_end(state: State, reached: float) -> float:
 
 def _whole_cycles(case: FlowCase, written: list[str]) -> list[str]:
     """Return the times from the start of the first complete cycle on; none for a steady flow."""
-    if case.settings.waveform is None:
+    if case.waveform is None:
         return []
-    phase_s = case.settings.waveform.period_s / PHASES
+    phase_s = case.waveform.period_s / PHASES
     is_first = [round(float(time) / phase_s) % PHASES == 1 for time in written]
     return written[is_first.index(True) :] if any(is_first) else []
 
@@ -204,7 +204,7 @@ def _monitored(state: State, now: Snapshot) -> Floats:
 def _correct_inflow(state: State) -> bool:
     """Correct the inlets' mean speeds for their smaller meshed areas; return whether a correction was made."""
     case, now = state.case, state.snapshots[-1]
-    share = float(case.settings.inflow_factor(np.array([float(now.time)]))[0])
+    share = float(case.inflow_factor(np.array([float(now.time)]))[0])
     if len(state.history) > CHECKS_HELD or abs(share) < 0.2:
         return False
     factors = -share * case.inlets_mL_s / case.vessel.of_inlets_and_outlets(now.outflow_mL_s)[0]

@@ -4,7 +4,7 @@ import numpy as np
 
 from vstent.devices.design import LaserCut
 from vstent.devices.stent import Stent
-from vstent.flow.case import Blood, Screen
+from vstent.flow.case import Sheet
 from vstent.flow.drag import (
     BREADTH,
     crossing_factor,
@@ -14,6 +14,7 @@ from vstent.flow.drag import (
     round_diameter,
     tangential_share,
 )
+from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
 from vstent.kernels import curves, nearby
 from vstent.kernels.arrays import Floats, Ints
@@ -29,8 +30,8 @@ ACROSS = 9
 """Number of samples across a wire's band; they are closer together than grid cells."""
 
 
-def screen(stent: Stent, blood: Blood) -> Screen:
-    """Build the porous screen of a deployed stent.
+def media(stent: Stent, blood: Blood) -> tuple[Sheet, ...]:
+    """Build the flow resistances of a deployed stent: one porous sheet, the screen model of its wires.
 
     Every piece of wire resists like a wire in a row with the local spacing, spread over a band around it. One law
     therefore covers braids, laser-cut cells and mixed wire diameters, also where bends have opened or closed the cells.
@@ -55,7 +56,7 @@ def screen(stent: Stent, blood: Blood) -> Screen:
     normals = sheet.normals[face]
     band_mm, area_mm2 = bands(points_mm, along_mm, normals, spacing_mm)
     columns = normals, area_mm2, normal_Pa_s_m, tangential_Pa_s_m, inertial_loss(solidity), diameter_mm, spacing_mm
-    return Screen(band_mm.reshape(-1, 3), *(np.repeat(column, ACROSS, axis=0) for column in columns))
+    return (Sheet(band_mm.reshape(-1, 3), *(np.repeat(column, ACROSS, axis=0) for column in columns)),)
 
 
 def bands(points_mm: Floats, along_mm: Floats, normals: Floats, spacing_mm: Floats) -> tuple[Floats, Floats]:

@@ -1,0 +1,67 @@
+"""From an anatomy with its deployed implants, or a bare vessel, to a `FlowCase`."""
+
+from collections.abc import Sequence
+
+from vstent.deployment.struts import over_restored
+from vstent.devices.stent import Stent
+from vstent.flow.case import FlowCase, Sheet, Target
+from vstent.flow.ends import ends_of
+from vstent.flow.media import media
+from vstent.flow.ostium import ostium
+from vstent.flow.settings import FlowSettings
+from vstent.geometry.vessel import Anatomy, Vessel
+
+
+def flow_case(anatomy: Anatomy, implants: Sequence[Stent] = (), settings: FlowSettings | None = None) -> FlowCase:
+    """Build the flow problem: the patient's lumen, its largest sac, and implants.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+        The patient's vessel and aneurysms.
+    implants : sequence of Stent, optional
+        Deployed implants, each included both as media and as wires over necks and ostia; none by default.
+    settings : FlowSettings, optional
+        Settings of the flow.
+    """
+    settings = settings or FlowSettings()
+    largest = anatomy.aneurysms[0] if anatomy.aneurysms else None
+    return vessel_case(
+        anatomy.vessel,
+        settings,
+        target=None if largest is None else Target(largest.sac, ostium(largest, anatomy.vessel.lumen)),
+        media=tuple(medium for one in implants for medium in media(one, settings.blood)),
+        solids=tuple(over_restored(one, anatomy) for one in implants),
+    )
+
+
+def vessel_case(
+    vessel: Vessel,
+    settings: FlowSettings | None = None,
+    *,
+    target: Target | None = None,
+    media: tuple[Sheet, ...] = (),
+    solids: tuple[Stent, ...] = (),
+) -> FlowCase:
+    """Build the flow problem of a vessel.
+
+    Parameters
+    ----------
+    vessel : Vessel
+        The vessel.
+    settings : FlowSettings, optional
+        Settings of the flow.
+    target, media, solids
+        As in `FlowCase`.
+    """
+    settings = settings or FlowSettings()
+    return FlowCase(
+        vessel=vessel,
+        ends=ends_of(vessel, settings),
+        target=target,
+        media=media,
+        solids=solids,
+        blood=settings.blood,
+        waveform=settings.waveform,
+        numerics=settings.numerics,
+    )

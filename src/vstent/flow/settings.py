@@ -1,0 +1,151 @@
+"""Settings of a flow as the user gives them: blood, waveform, outlets, and the numerical settings of an engine.
+
+This module imports no numpy, so that command-line options and settings of a study can be read without it.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final, Literal
+
+if TYPE_CHECKING:
+    from vstent.kernels.arrays import Floats
+
+LATTICE: Final = "lattice_boltzmann"
+"""Name of the embedded lattice-Boltzmann engine."""
+OPENFOAM: Final = "openfoam"
+"""Name of the engine that runs OpenFOAM, a separate program."""
+HIGH_SHEAR_VISCOSITY_PA_S: Final = 0.00345
+"""Viscosity at high shear rate, Pa s, that belongs to the default values of `CarreauYasuda` (Cho and Kensey 1991)."""
+
+
+@dataclass(frozen=True)
+class CarreauYasuda:
+    """Shear-thinning viscosity after Carreau and Yasuda.
+
+    mu = m + (m0 - m) (1 + (t g)^a)^((n - 1) / a), where g is the shear rate and m the viscosity at high shear rate.
+
+    References
+    ----------
+    Bird, Armstrong and Hassager 1987, Dynamics of Polymeric Liquids 1, eq. 4.1-8.
+    Cho and Kensey 1991, Biorheology 28, 241: the default values, for blood with m = 0.00345 Pa s.
+    """
+
+    rest_viscosity_Pa_s: float = 0.056
+    """m0, viscosity at zero shear rate."""
+    time_s: float = 1.902
+    """t, time constant."""
+    a: float = 1.25
+    """a, exponent of the transition from m0 to m."""
+    n: float = 0.22
+    """n, power-law index."""
+
+
+@dataclass(frozen=True)
+class Blood:
+    """Blood as a fluid: Newtonian unless a shear-thinning law is given.
+
+    The defaults are those of Zhong et al. 2016, Sci. Rep. 6:21724.
+    """
+
+    density_kg_m3: float = 1060.0
+    """Mass density."""
+    viscosity_Pa_s: float = 0.004
+    """Dynamic viscosity; with a shear-thinning law, its value at high shear rate."""
+    thinning: CarreauYasuda | None = None
+    """Shear-thinning law; None: Newtonian."""
+
+    @property
+    def kinematic_viscosity_m2_s(self) -> float:
+        """Kinematic viscosity: dynamic viscosity divided by density."""
+        return self.viscosity_Pa_s / self.density_kg_m3
+
+    def viscosity_at_Pa_s(self, rate_per_s: "Floats") -> "Floats":
+        """Return the dynamic viscosity (n,) at shear rates (n,)."""
+        import numpy as np
+
+        law = self.thinning
+        if law is None:
+            return np.full_like(rate_per_s, self.viscosity_Pa_s)
+        falling = (1 + (law.time_s * rate_per_s) ** law.a) ** ((law.n - 1) / law.a)
+        return self.viscosity_Pa_s + (law.rest_viscosity_Pa_s - self.viscosity_Pa_s) * falling
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """A periodic flow rate as a Fourier series, in multiples of its mean.
+
+    q(t) / mean = 1 + sum over k of a_k cos(k w t) + b_k sin(k w t), with w = 2 pi / period.
+    """
+
+    period_s: float
+    """Length of a cycle."""
+    cosine: tuple[float, ...]
+    """a_k for k = 1, 2, ..."""
+    sine: tuple[float, ...]
+    """b_k for k = 1, 2, ..."""
+
+    def factor(self, time_s: "Floats") -> "Floats":
+        """Return the flow rate divided by its mean (t,) at times (t,)."""
+        import numpy as np
+
+        angle = 2 * np.pi / self.period_s * np.multiply.outer(time_s, np.arange(1, len(self.cosine) + 1))
+        return 1 + np.cos(angle) @ np.array(self.cosine) + np.sin(angle) @ np.array(self.sine)
+
+    def curvature_per_s2(self, time_s: "Floats") -> "Floats":
+        """Return the second time derivative (t,) of `factor` at times (t,)."""
+        import numpy as np
+
+        rate_per_s = 2 * np.pi / self.period_s * np.arange(1, len(self.cosine) + 1)
+        harmonics = replace(self, cosine=tuple(rate_per_s**2 * self.cosine), sine=tuple(rate_per_s**2 * self.sine))
+        return 1 - harmonics.factor(time_s)
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """How a flow is computed; its physics is in the other `FlowSettings`."""
+
+    cell_size_mm: float | None = None
+    """Grid spacing; None: `cells_per_diameter` cells across the vessel, but at most `cell_budget` cells in all."""
+    close_up: bool = False
+    """Whether to use this grid spacing only in and near the sac, and twice it elsewhere (see `lattice.close_up`)."""
+    cells_per_diameter: float = 29.0
+    """Number of cells across the mean (hydraulic) diameter 4 V / A of the vessel, where no grid spacing is given."""
+    cell_budget: float = 480_000.0
+    """Maximum number of cells in the vessel, where no grid spacing is given."""
+    tolerance: float = 0.01
+    """A flow has converged when every monitored quantity is expected to change by less than this fraction of itself,
+    and the velocity in the sac by less than twice this fraction (root mean square). An unsteady flow has converged
+    when the standard error of every time average is smaller than this fraction."""
+    max_steps: int = 96_000
+    """Maximum number of time steps of a steady flow on the fine grid. With `close_up`, the refined part makes at
+    most a quarter of them and the surrounding flow at most half."""
+    max_cycles: int = 4
+    """Maximum number of cycles of a pulsatile flow."""
+    cycle_tolerance: float = 0.02
+    """A pulsatile flow has converged when two consecutive cycles differ by less than this fraction (root mean
+    square)."""
+    lattice_speed: float = 0.15
+    """Peak speed in cells per time step. It sets the time step, which is a third longer in a steady refined sac
+    (`close_up`). In steady flow it affects the result through the relaxation times, that is through the spatial
+    error, not through the error in time."""
+    engine: str = LATTICE
+    """Flow engine: ``lattice_boltzmann``, ``openfoam``, or the name of a plug-in (`vstent.plugins`)."""
+    processes: int = 1
+    """Number of processes on this machine (OpenFOAM only)."""
+    device_gpu: bool = False
+    """Whether the embedded engine computes on a GPU (needs the extra ``gpu``); results differ in the last bits."""
+
+
+@dataclass(frozen=True)
+class FlowSettings:
+    """Settings of a flow computation."""
+
+    inflow_mL_s: float | None = None
+    """Mean flow rate through all inlets together; None: 0.27 m/s times the area of each inlet."""
+    blood: Blood = field(default_factory=Blood)
+    """The fluid."""
+    waveform: Waveform | None = None
+    """Inflow waveform; None: steady inflow at the mean."""
+    outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
+    """Zero pressure at every outlet, or outflow in proportion to radius cubed (Murray 1926, PNAS 12, 207)."""
+    numerics: Numerics = field(default_factory=Numerics)
+    """How it is computed."""
