@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from vstent.devices.catalogue import find_design as find_design
     from vstent.devices.catalogue import find_size as find_size
     from vstent.devices.stent import Landing as Landing
-    from vstent.flow.case import FlowSettings as FlowSettings
+    from vstent.flow.settings import FlowSettings as FlowSettings
     from vstent.flow.indices import compare as compare
     from vstent.flow.indices import indices as indices
     from vstent.flow.ostium import ostium as ostium
@@ -58,7 +58,7 @@ _HOMES = {
     "report": "vstent.reporting.page",
     "Image": "vstent.geometry.image",
     "Landing": "vstent.devices.stent",
-    "FlowSettings": "vstent.flow.case",
+    "FlowSettings": "vstent.flow.settings",
     "AngiogramSettings": "vstent.angiography.angiogram",
     "Settings": "vstent.study.types",
 }

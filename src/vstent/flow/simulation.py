@@ -88,7 +88,7 @@ def simulate(
     for deployment in deployments:
         case = flow_case(anatomy, () if deployment is None else (deployment.stent,), settings)
         field = simulate_case(case, start=bare, progress=progress)
-        if stent is None and bare is None:
+        if deployment is None and bare is None:
             bare = field
         fields.append(field)
     return tuple(fields)
