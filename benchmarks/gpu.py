@@ -294,14 +294,13 @@ def agreement(case: FlowCase, settings: FlowSettings) -> tuple[float, bool]:
             for on_gpu in (True, True, False)
         )
     wanted, found = measures(here, case), measures(gpu, case)
+    spacing_mm = settings.numerics.cell_size_mm
     same = all(
         getattr(gpu, name).tobytes() == getattr(again, name).tobytes()
         for name in ("velocity_m_s", "pressure_Pa", "wall_shear_stress_Pa", "residual")
     )
     difference = float(np.abs(found / wanted - 1).max())
-    print(
-        f"\nAgreement at {settings.numerics.cell_size_mm} mm (inflow, velocity, stress): processor {wanted}, GPU {found}"
-    )
+    print(f"\nAgreement at {spacing_mm} mm (inflow, velocity, stress): processor {wanted}, GPU {found}")
     print(
         f"Largest difference {difference:.1e}; two runs on the GPU: {'same' if same else 'different'} bits", flush=True
     )

@@ -24,6 +24,7 @@ from vstent.app.preview import ERROR_POINTS, SHOWN_POINTS, Preview, shelf_of
 from vstent.devices.stent import Landing, Stent
 from vstent.flow.indices import indices
 from vstent.flow.lattice.live import LiveFlow
+from vstent.flow.media import media
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import simulate_case

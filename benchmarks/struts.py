@@ -31,7 +31,7 @@ from vstent.anatomy.trim import trim
 from vstent.deployment.struts import is_over_restored
 from vstent.devices.stent import Stent
 from vstent.flow import sampling
-from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.case import FlowCase, FlowField, Sheet
 from vstent.flow.engines import run
 from vstent.flow.indices import indices
 from vstent.flow.openfoam import setup

@@ -19,6 +19,7 @@ from vstent.cli import main
 from vstent.errors import InputError, VesselError
 from vstent.flow import domain, sampling
 from vstent.flow.case import FlowField
+from vstent.flow.ends import FlowRate, Pressure
 from vstent.flow.indices import indices
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import FlowSettings, Numerics, Waveform

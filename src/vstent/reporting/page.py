@@ -185,7 +185,8 @@ def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
     thins = flow["blood"]["thinning"] is not None
     blood = "Blood is shear-thinning, with parameters from the literature" if thins else "Blood is Newtonian"
     told = [f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
-    return [*told, OF_DEVICE[flow["engine"]]] if flow["engine"] in OF_DEVICE else told
+    engine = flow["numerics"]["engine"]
+    return [*told, OF_DEVICE[engine]] if engine in OF_DEVICE else told
 
 
 def as_html(told: Contents) -> str:

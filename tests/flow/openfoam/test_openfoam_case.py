@@ -184,9 +184,11 @@ def test_the_inlet_carries_the_flow_that_was_asked_for() -> None:
 
 @pytest.mark.parametrize("is_pulse", [False, True])
 def test_every_inlet_has_a_patch_and_a_profile_of_its_own(is_pulse: bool) -> None:
-    former = case("murray", is_pulse=is_pulse)
-    inlets_mm = np.array([former.vessel.openings[k].center_mm for k in (0, 2)])
-    several = replace(former, vessel=trace(replace(former.vessel, centerlines=()), inlet_mm=inlets_mm))
+    former = case().vessel
+    inlets_mm = np.array([former.openings[k].center_mm for k in (0, 2)])
+    vessel = trace(replace(former, centerlines=()), inlet_mm=inlets_mm)
+    waveform = OLDER_ADULT_ICA if is_pulse else None
+    several = vessel_case(vessel, FlowSettings(inflow_mL_s=FLOW_ML_S, outlets="murray", waveform=waveform))
     com, org = (foam_case(several, replace(SETUP, flavour=flavour)).files for flavour in ("com", "org"))
     velocity, pressure = (parse(com[f"0/{name}"])["boundaryField"] for name in ("U", "p"))
     area_mm2 = {one.name: one.area_mm2 for one in named_patches(several)[0]}
