@@ -12,7 +12,8 @@ from vstent.io.archive import load_data, save_data
 
 
 def flow(centers_mm: np.ndarray, spacing_mm: float) -> SimpleNamespace:
-    return SimpleNamespace(centers_mm=centers_mm, cell_size_mm=spacing_mm)
+    grid = SimpleNamespace(centers_mm=centers_mm, cell_size_mm=spacing_mm)
+    return SimpleNamespace(levels=(grid,), finest=grid)
 
 
 def test_cells_have_the_value_of_their_block():

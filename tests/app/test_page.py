@@ -571,8 +571,8 @@ def test_a_cut_lies_in_one_plane_and_has_the_flows_speed_at_a_moment_or_in_the_m
         0.25,
         2 * mean.inlets_mL_s,
         2 * mean.outlets_mL_s,
-        2 * mean.velocity_m_s,
-        mean.pressure_Pa,
+        (2 * mean.velocity_m_s,),
+        (mean.pressure_Pa,),
         3 * mean.wall_shear_stress_Pa,
     )
     pulsing = replace(mean, phases=(fast,))
@@ -700,7 +700,7 @@ def keep_contrast(folder):
         carrier = load_data(path, FlowField)
         stored = np.full((3, len(carrier.cells)), 200, np.uint8)
         block = np.arange(len(carrier.cells))
-        history = History(carrier.centers_mm, carrier.cell_size_mm, block, np.arange(3) / 15, stored, 300.0)
+        history = History(carrier.centers_mm, carrier.finest.cell_size_mm, block, np.arange(3) / 15, stored, 300.0)
         save_data(history_path(path), history)
 
 

@@ -8,7 +8,7 @@ import pytest
 from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
-from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.case import FlowCase, FlowField, Level
 from vstent.flow.grade import CRITERIA, FAIR, GOOD, NOT_USABLE, computation_of, grade, grade_of, measures_of
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import Blood, FlowSettings, Numerics
@@ -37,7 +37,8 @@ def uniform(case: FlowCase, speed_m_s: float, **changes: object) -> FlowField:
     n = len(case.vessel.lumen.vertices_mm)
     none: Floats = np.zeros(1)
     field = FlowField(
-        *(cells, low, SPACING_MM, velocity, np.zeros(len(cells)), case.vessel.lumen, np.zeros((n, 3)), np.zeros(n)),
+        *((Level(cells, low, SPACING_MM, velocity, np.zeros(len(cells))),), case.vessel.lumen),
+        *(np.zeros((n, 3)), np.zeros(n)),
         *(np.array([3.0]), np.array([3.0]), none, none, Blood(), True, 0.01, "", none, 7, 1.0, 1.0),
     )
     return replace(field, **changes)  # type: ignore[arg-type]

@@ -6,9 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from levels import with_values
 from shapes import sphere
 
-from vstent.flow.case import FlowField, Phase, Swing
+from vstent.flow.case import FlowField, Level, Phase
 from vstent.flow.indices import NEAR_MM, compare, indices, ratios
 from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
@@ -51,8 +52,9 @@ def flow(velocity_m_s: Floats, inlets_mL_s: Sequence[float] = (10.0,)) -> FlowFi
     told = Blood(), True, 0.0, "", np.zeros(1), 1, 1.0, 1.0
     cells, pressure_Pa = places()[0], np.zeros(len(velocity_m_s))
     through_mL_s = np.array(inlets_mL_s), np.array([sum(inlets_mL_s)])
-    values = velocity_m_s, pressure_Pa, surface, stress_Pa, 0 * size_Pa, *through_mL_s, 100.0 * through_mL_s[0]
-    return FlowField(cells, np.full(3, -HALF_MM), CELL_MM, *values, np.zeros(1), *told)
+    values = surface, stress_Pa, 0 * size_Pa, *through_mL_s, 100.0 * through_mL_s[0]
+    grid = Level(cells, np.full(3, -HALF_MM), CELL_MM, velocity_m_s, pressure_Pa)
+    return FlowField((grid,), *values, np.zeros(1), *told)
 
 
 def places() -> tuple[np.ndarray, Floats]:
@@ -109,10 +111,15 @@ def test_the_parents_stress_is_that_within_ten_millimetres_of_the_necks_edge() -
 def test_quotients_of_a_pulse_are_of_its_means() -> None:
     """The flow comes to a stand-still: the mean of the moments' turnover times would be without bound."""
     neck, steady = plate(NECK_HALF_MM, 0.2), flow(through_neck(0.1, 0.0))
-    stress_Pa, still_Pa = steady.wall_shear_stress_Pa, np.zeros(len(steady.cells))
+    stress_Pa, still_Pa = steady.wall_shear_stress_Pa, np.zeros(len(steady.centers_mm))
     phases = tuple(
         Phase(
-            k, np.array([share * 10.0]), np.array([share * 10.0]), through_neck(share * 0.1, 0.0), still_Pa, stress_Pa
+            k,
+            np.array([share * 10.0]),
+            np.array([share * 10.0]),
+            (through_neck(share * 0.1, 0.0),),
+            (still_Pa,),
+            stress_Pa,
         )
         for k, share in enumerate((1.9, 1.0, 0.1, 1e-6))
     )
@@ -126,14 +133,14 @@ def test_quotients_of_a_pulse_are_of_its_means() -> None:
 def test_the_largest_of_a_pulse_is_that_of_its_moments_and_the_rest_its_mean() -> None:
     """Velocity and stress rise and fall with the inflow, which is 1.9 times its mean at most."""
     steady, shares = flow(through_neck(0.1, 0.0)), np.array([1.9, 1.0, 0.1])
-    still_Pa, stress_Pa = np.zeros(len(steady.cells)), steady.wall_shear_stress_Pa
+    still_Pa, stress_Pa = np.zeros(len(steady.centers_mm)), steady.wall_shear_stress_Pa
     phases = tuple(
         Phase(
             k,
             np.array([share * 10.0]),
             np.array([share * 10.0]),
-            through_neck(share * 0.1, 0.0),
-            still_Pa,
+            (through_neck(share * 0.1, 0.0),),
+            (still_Pa,),
             share * stress_Pa,
         )
         for k, share in enumerate(shares)
@@ -151,8 +158,10 @@ def test_the_largest_of_a_pulse_is_that_of_its_moments_and_the_rest_its_mean() -
 def test_of_a_flow_that_moves_sizes_are_meant_not_the_size_of_the_mean() -> None:
     """Its mean goes into the sac at 0.02 m/s; what goes to and fro besides is told by its swing."""
     still = flow(through_neck(0.02, 0.0))
-    swing = Swing(np.full(len(still.cells), 0.09), 3.0 * still.shear_Pa)
-    found = indices(replace(still, swing=swing, neck_inflow_mL_s=5.0), sac(), plate(NECK_HALF_MM, 0.2))
+    moving = with_values(still, mean_speed_m_s=np.full(len(still.centers_mm), 0.09))
+    found = indices(
+        replace(moving, mean_shear_Pa=3.0 * still.shear_Pa, neck_inflow_mL_s=5.0), sac(), plate(NECK_HALF_MM, 0.2)
+    )
     assert found["mean_sac_velocity_m_s"] == pytest.approx(0.09)
     assert found["fast_sac_volume_mm3"] == pytest.approx(sac().volume_mm3)
     assert found["mean_sac_wss_Pa"] == pytest.approx(6.0)
@@ -162,7 +171,7 @@ def test_of_a_flow_that_moves_sizes_are_meant_not_the_size_of_the_mean() -> None
 
 def test_of_a_pulse_on_a_finer_mesh_each_moments_inflow_is_what_that_mesh_told() -> None:
     steady = flow(through_neck(0.02, 0.0))
-    moment = steady.inlets_mL_s, steady.outlets_mL_s, through_neck(0.02, 0.0), steady.pressure_Pa
+    moment = steady.inlets_mL_s, steady.outlets_mL_s, (through_neck(0.02, 0.0),), (steady.pressure_Pa,)
     phases = tuple(Phase(k, *moment, steady.wall_shear_stress_Pa, told) for k, told in enumerate((2.0, 5.0)))
     found = indices(replace(steady, phases=phases, neck_inflow_mL_s=9.0), sac(), plate(NECK_HALF_MM, 0.2))
     assert found["neck_inflow_mL_s"] == 3.5

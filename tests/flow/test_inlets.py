@@ -258,7 +258,7 @@ def test_streamlines_go_from_opening_to_opening() -> None:
     beyond_mm = [(lines.points_mm - opening.center_mm) @ opening.normal for opening in vessel.openings]
     assert len(first) == 70
     assert np.max(beyond_mm) < 1e-3
-    step_mm = STEP_CELLS * field.cell_size_mm
+    step_mm = STEP_CELLS * field.finest.cell_size_mm
     into, out = (
         np.max([(ends - opening.center_mm) @ opening.normal for opening in openings], axis=0)
         for ends, openings in ((first, vessel.inlets), (last, vessel.outlets))
@@ -271,7 +271,7 @@ def test_streamlines_a_little_outside_the_wall_end_at_the_openings_too() -> None
     """Between cells velocity does not end at the wall: such a line passed an opening beside its rim, and went on."""
     vessel, field = joined(), joined_flow()
     wall = vessel.lumen
-    beside_mm = wall.vertices_mm + 0.2 * field.cell_size_mm * wall.vertex_normals
+    beside_mm = wall.vertices_mm + 0.2 * field.finest.cell_size_mm * wall.vertex_normals
     before_mm = np.min([(one.center_mm - beside_mm) @ one.normal for one in vessel.openings], axis=0)
     lines = streamlines(field, beside_mm[(before_mm > 0.5) & (before_mm < 3.0)])
     beyond_mm = [(lines.points_mm - one.center_mm) @ one.normal for one in vessel.openings]

@@ -168,7 +168,7 @@ def test_what_goes_to_and_fro_is_told_by_its_size_and_not_by_its_mean() -> None:
     np.testing.assert_allclose(field.speed_m_s, size * speed_m_s, rtol=1e-4)
     steady_Pa = np.linalg.norm(read(state, [still]).wall_shear_stress_Pa, axis=1)
     np.testing.assert_allclose(field.shear_Pa, size * steady_Pa, atol=0.02 * size * steady_Pa.max())
-    assert field.swing is not None
+    assert field.mean_shear_Pa is not None
     assert field.neck_inflow_mL_s == pytest.approx(2.0 + size)
 
 
@@ -213,7 +213,7 @@ def test_a_guess_has_a_guess_as_long_as_grids_hold_the_vessel(monkeypatch: pytes
 
     def telling(engine: AbstractEngine[Any], case: FlowCase, **more: Any) -> FlowField:
         start = more["start"]
-        seen.append((engine.cell_size_mm, bool(case.media), None if start is None else start.cell_size_mm))
+        seen.append((engine.cell_size_mm, bool(case.media), None if start is None else start.finest.cell_size_mm))
         return run(engine, case, **more)
 
     monkeypatch.setattr(flow, "run", telling)

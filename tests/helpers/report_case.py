@@ -7,7 +7,7 @@ import numpy as np
 
 from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Deployment, Stent, tube_faces
-from vstent.flow.case import FlowField
+from vstent.flow.case import FlowField, Level
 from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import PARENT, Anatomy, Aneurysm, Centerline, Opening, Path, Vessel
@@ -124,12 +124,9 @@ def field(strength):
     wall = joined(tube(RADIUS_MM), sphere(SAC_CENTER, SAC_MM))
     is_artery = np.arange(len(wall.vertices_mm)) < len(tube(RADIUS_MM).vertices_mm)
     shear = np.where(is_artery, 3.0 + wall.vertices_mm[:, 0] / 6, 1.5 * strength)
+    velocity = np.where(in_tube[:, None], 0.5 * (1 - (off / RADIUS_MM) ** 2)[:, None] * round_bend, spin)
     return FlowField(
-        cells=cells,
-        origin_mm=origin,
-        cell_size_mm=CELL_MM,
-        velocity_m_s=np.where(in_tube[:, None], 0.5 * (1 - (off / RADIUS_MM) ** 2)[:, None] * round_bend, spin),
-        pressure_Pa=-10 * centers[:, 0],
+        levels=(Level(cells, origin, CELL_MM, velocity, -10 * centers[:, 0]),),
         wall=wall,
         wall_shear_stress_Pa=shear[:, None] * np.array([1.0, 0, 0]),
         wall_pressure_Pa=np.zeros(len(shear)),

@@ -97,13 +97,13 @@ def test_cells_share_their_corners_and_fill_their_volume(tmp_path):
     grid = np.stack(np.meshgrid(*[np.arange(n) for n in (5, 4, 3)], indexing="ij"), axis=-1).reshape(-1, 3)
     kept = grid[np.random.default_rng(1).random(len(grid)) < 0.6]
     centers = kept * 0.25 + [10.0, -3.0, 7.125]
-    corners, cells = grid_corners(centers, 0.25)
+    corners, cells = grid_corners(centers, np.full(len(centers), 0.25))
     assert len(np.unique(np.round(corners, 9), axis=0)) == len(corners) == len(np.unique(cells))
     np.testing.assert_allclose(corners[cells].mean(axis=1), centers, atol=1e-12)
     edges = corners[cells[:, [1, 3, 4]]] - corners[cells[:, [0]]]
     np.testing.assert_allclose(np.linalg.det(edges), 0.25**3, rtol=1e-9)  # right-handed: no cell inside out
     speed = np.random.default_rng(2).random((len(kept), 3))
-    write_cells(tmp_path / "f.vtu", centers, 0.25, {"velocity_m_s": speed}, {"z": corners[:, 2]})
+    write_cells(tmp_path / "f.vtu", centers, np.full(len(kept), 0.25), {"velocity_m_s": speed}, {"z": corners[:, 2]})
     data, points, (on_points, on_cells) = vtk_read(tmp_path / "f.vtu")
     np.testing.assert_array_equal(on_cells["velocity_m_s"], speed)
     np.testing.assert_array_equal(points, corners)
@@ -116,7 +116,7 @@ def test_300_000_cells_are_written_in_seconds(tmp_path):
 
     grid = np.stack(np.meshgrid(*[np.arange(67.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     began = time.perf_counter()
-    write_cells(tmp_path / "f.vtu", grid, 1.0, {"velocity_m_s": grid.astype(np.float32)})
+    write_cells(tmp_path / "f.vtu", grid, np.ones(len(grid)), {"velocity_m_s": grid.astype(np.float32)})
     assert time.perf_counter() - began < 10.0  # a loop over cells would take a minute
 
 
@@ -169,7 +169,7 @@ def test_files_have_the_usual_mode(tmp_path):
 @given(centers=hnp.arrays(np.int64, st.tuples(st.integers(1, 40), st.just(3)), elements=st.integers(-50, 50)))
 def test_grid_corners_of_any_set_of_cubes(centers):
     unique = np.unique(centers, axis=0)
-    corners, cells = grid_corners(unique * 0.3, 0.3)
+    corners, cells = grid_corners(unique * 0.3, np.full(len(unique), 0.3))
     np.testing.assert_allclose(corners[cells].mean(axis=1), unique * 0.3, atol=1e-9)
     every = (unique[:, None] + np.array(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5])).reshape(3, -1).T).reshape(
         -1, 3

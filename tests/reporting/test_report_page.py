@@ -136,7 +136,7 @@ def test_of_a_pulse_it_is_said_which_numbers_are_means(page):
     assert contents_of(bare_case()).is_pulse is False
     flow = report_case.field(1.0)
     moment = Phase(
-        0.0, flow.inlets_mL_s, flow.outlets_mL_s, flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa
+        0.0, flow.inlets_mL_s, flow.outlets_mL_s, (flow.velocity_m_s,), (flow.pressure_Pa,), flow.wall_shear_stress_Pa
     )
     assert contents_of(bare_case(fields={"bare": replace(flow, phases=(moment,))})).is_pulse is True
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from levels import with_values
 
 from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
@@ -48,9 +49,9 @@ def flow(anatomy: Anatomy, spacing_mm: float = SPACING_MM, *, close_up: bool = F
 def pulse_of(field: FlowField, factors: np.ndarray, period_s: float) -> FlowField:
     """A flow whose velocity is everywhere a multiple of a steady one."""
     times = period_s * np.arange(len(factors)) / len(factors)
-    still = field.pressure_Pa, field.wall_shear_stress_Pa
+    still = (field.pressure_Pa,), field.wall_shear_stress_Pa
     phases = tuple(
-        Phase(t, s * field.inlets_mL_s, s * field.outlets_mL_s, s * field.velocity_m_s, *still)
+        Phase(t, s * field.inlets_mL_s, s * field.outlets_mL_s, (s * field.velocity_m_s,), *still)
         for t, s in zip(times, factors, strict=True)
     )
     return replace(field, phases=phases)
@@ -58,11 +59,11 @@ def pulse_of(field: FlowField, factors: np.ndarray, period_s: float) -> FlowFiel
 
 def meshed(field: FlowField) -> FlowField:
     """The flow after its transfer to the points of a mesh and back, as that of OpenFOAM is brought to the grid."""
-    spread = np.random.default_rng(1).uniform(-0.5, 0.5, (2, *field.centers_mm.shape)) * field.cell_size_mm
+    spread = np.random.default_rng(1).uniform(-0.5, 0.5, (2, *field.centers_mm.shape)) * field.finest.cell_size_mm
     points_mm = (field.centers_mm + spread).reshape(-1, 3)
     at_rest_mm = field.wall.vertices_mm
     known = np.concatenate([sampling.values_at(field, points_mm)[0], np.zeros_like(at_rest_mm)])
-    return replace(field, velocity_m_s=scatter.fits(np.r_[points_mm, at_rest_mm], field.centers_mm) @ known)
+    return with_values(field, velocity_m_s=scatter.fits(np.r_[points_mm, at_rest_mm], field.centers_mm) @ known)
 
 
 def sac_curve(anatomy: Anatomy, field: FlowField) -> np.ndarray:

@@ -13,7 +13,8 @@ from vstent.study.folder import history_path
 POINTS = np.stack([np.arange(6.0), np.zeros(6), np.zeros(6)], axis=1)
 
 
-CARRIER = SimpleNamespace(centers_mm=POINTS, cell_size_mm=1.0, inflow_mL_s=4.0, phases=())
+GRID = SimpleNamespace(centers_mm=POINTS, cell_size_mm=1.0)
+CARRIER = SimpleNamespace(levels=(GRID,), finest=GRID, inflow_mL_s=4.0, phases=())
 
 
 @pytest.fixture

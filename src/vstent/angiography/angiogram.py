@@ -114,9 +114,14 @@ class Injection:
         return self.transport.frames(1 / settings.frames_per_s, settings.bolus.begin_s + settings.window_s)
 
 
+def n_cells(field: FlowField) -> int:
+    """Return the number of cells of a flow on one grid with its finest spacing."""
+    return round(float(((field.sizes_mm / field.finest.cell_size_mm) ** 3).sum()))
+
+
 def memory_bytes(field: FlowField) -> float:
     """Return the peak memory of an angiogram in bytes, beyond that of the flow."""
-    return (BYTES_PER_CELL + BYTES_PER_PHASE_AND_CELL * len(field.phases)) * float(len(field.cells))
+    return (BYTES_PER_CELL + BYTES_PER_PHASE_AND_CELL * len(field.phases)) * float(n_cells(field))
 
 
 def entering(bolus: Bolus, field: FlowField) -> tuple[OverTime, float]:
@@ -155,7 +160,7 @@ def injection(case: FlowCase, field: FlowField, settings: AngiogramSettings) -> 
     need_bytes = memory_bytes(field)
     if need_bytes > free_memory_bytes():
         raise FlowError(
-            f"an angiogram on {len(field.cells):,} cells needs {need_bytes / 1e9:.2g} GB of memory, more than is free: "
+            f"an angiogram on {n_cells(field):,} cells needs {need_bytes / 1e9:.2g} GB of memory, more than is free: "
             "compute the flow with a wider grid spacing"
         )
     grid = grid_of(case, field, is_preview=settings.is_preview)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vstent.flow.case import FlowField
+from vstent.flow.sampling import uniform
 from vstent.kernels.arrays import Floats, Ints, freeze
 
 STEPS: Final = 255
@@ -101,7 +102,8 @@ class Recorder:
         """
         if self._points_mm is None or not self._stored:
             raise ValueError("no frame has been stored")
-        spacing_mm, centers_mm = self._field.cell_size_mm, self._field.centers_mm
+        grid = uniform(self._field).finest
+        spacing_mm, centers_mm = grid.cell_size_mm, grid.centers_mm
         distance_mm, block = cKDTree(self._points_mm).query(centers_mm)
         near = distance_mm < self._reach_mm
         stored, times = np.stack(self._stored), np.array(self._times)

@@ -11,7 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from vstent.angiography.balance import balancer
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
-from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.case import FlowCase, FlowField, Level
+from vstent.flow.sampling import uniform
 from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze, unique_rows
 
@@ -190,15 +191,17 @@ def network(case: FlowCase, field: FlowField) -> Network:
     FlowError
         No cell of the flow is at an inlet, or the flow rates cannot be balanced.
     """
+    field = uniform(field)
+    grid = field.finest
     surface, face_patch, _ = domains.extend(case.vessel)
-    neighbour = domains.neighbours(field.index, field.cells)
+    neighbour = domains.neighbours(grid.index, grid.cells)
     is_open = neighbour >= 0
-    parted = domains.septa(surface, neighbour, field.cells, field.origin_mm, field.cell_size_mm)
+    parted = domains.septa(surface, neighbour, grid.cells, grid.origin_mm, grid.cell_size_mm)
     is_open[parted] = False
     left, axis = np.nonzero(is_open[:, ALONG_AXES])
     right = neighbour[left, 2 * axis + 1]
-    at_cell, at_axis, at_sign, opening = _mouths(case, field, neighbour, surface, face_patch)
-    kept = _connected(len(field.cells), left, right, at_cell[opening < len(case.vessel.inlets)])
+    at_cell, at_axis, at_sign, opening = _mouths(case, grid, neighbour, surface, face_patch)
+    kept = _connected(len(grid.cells), left, right, at_cell[opening < len(case.vessel.inlets)])
     if not kept.any():
         raise FlowError("no cell of the flow lies at an inlet, so no contrast can enter: compute the flow again")
     solver_faces = kept[left] & kept[right]
@@ -235,16 +238,16 @@ class _Mouths:
 
 
 def _mouths(
-    case: FlowCase, field: FlowField, neighbour: Ints, surface: Surface, face_patch: Ints
+    case: FlowCase, grid: Level, neighbour: Ints, surface: Surface, face_patch: Ints
 ) -> tuple[Ints, Ints, Ints, Ints]:
     """Return cell, axis, sign and opening (b,) of every face at an opening."""
     cell, direction = np.nonzero(neighbour[:, 1:7] < 0)
     axis, sign = direction // 2, 1 - 2 * (direction % 2)
-    middle = field.centers_mm[cell]
-    middle[np.arange(len(cell)), axis] += 0.5 * sign * field.cell_size_mm
+    middle = grid.centers_mm[cell]
+    middle[np.arange(len(cell)), axis] += 0.5 * sign * grid.cell_size_mm
     near = np.zeros(len(cell), dtype=bool)
     for mouth in case.vessel.openings:
-        near |= (middle - mouth.center_mm) @ mouth.normal > -field.cell_size_mm
+        near |= (middle - mouth.center_mm) @ mouth.normal > -grid.cell_size_mm
     cell, axis, sign, middle = cell[near], axis[near], sign[near], middle[near]
     patch = face_patch[surface.closest(middle)[2]]
     is_mouth = patch > 0
@@ -263,12 +266,13 @@ def _balanced(
 ) -> Network:
     """Return the network of the kept cells (n,), with the flow rates of every moment balanced."""
     left, right, axis = faces
-    cells = field.cells[kept]
-    n, n_openings, h = len(cells), len(case.vessel.openings), field.cell_size_mm
+    grid = field.finest
+    cells = grid.cells[kept]
+    n, n_openings, h = len(cells), len(case.vessel.openings), grid.cell_size_mm
     solve, guess = balancer(cells, left, right), None
     rows, change, size = [], 0.0, 0.0
-    for moment in field.phases or (field,):
-        velocity = moment.velocity_m_s[kept].astype(np.float64)
+    for moment in field.moments():
+        velocity = moment.finest.velocity_m_s[kept]
         inner = 0.5 * (velocity[left, axis] + velocity[right, axis]) * h**2 * MM3_PER_ML
         through = np.r_[-moment.inlets_mL_s, _reached(moment.outlets_mL_s, mouths, len(moment.inlets_mL_s))]
         through[len(moment.inlets_mL_s) :] *= moment.inflow_mL_s / through[len(moment.inlets_mL_s) :].sum()
@@ -281,7 +285,7 @@ def _balanced(
         cells=cells,
         width=np.ones(n, dtype=np.int32),
         spacing_mm=h,
-        points_mm=field.centers_mm[kept],
+        points_mm=grid.centers_mm[kept],
         volume_mm3=np.full(n, h**3),
         left=np.r_[left, np.where(mouths.sign > 0, mouths.cell, beyond)],
         right=np.r_[right, np.where(mouths.sign > 0, beyond, mouths.cell)],

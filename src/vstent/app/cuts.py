@@ -5,14 +5,14 @@ from typing import Final
 import numpy as np
 
 from vstent.flow.case import FlowField
-from vstent.flow.sampling import values_at
+from vstent.flow.sampling import is_blood, values_at
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.reporting.scene import MeshLayer, views_of
 
 STEP_CELLS: Final = 0.6
-"""Distance between the points of a cut, as a fraction of the grid spacing."""
+"""Distance between the points of a cut, as a fraction of the finest grid spacing."""
 
 
 def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
@@ -27,23 +27,14 @@ def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
     right, up = views_of(anatomy, {})[0].axes[:2]
     sacs = anatomy.aneurysms
     middle = sacs[0].sac.vertices_mm.mean(axis=0) if sacs else anatomy.parent.axis.points_mm.mean(axis=0)
-    step_mm = STEP_CELLS * field.cell_size_mm
+    step_mm = STEP_CELLS * field.finest.cell_size_mm
     seen = (field.centers_mm - middle) @ np.stack([right, up], axis=1)
     ticks = [np.arange(low, high + step_mm, step_mm) for low, high in zip(seen.min(0), seen.max(0), strict=True)]
     columns, rows = np.meshgrid(*ticks, indexing="ij")
     points_mm = middle + columns[..., None] * right + rows[..., None] * up
     speed = np.linalg.norm(values_at(field, points_mm.reshape(-1, 3))[0], axis=1)
-    surface, used = _where_blood_is(points_mm, _is_blood(field, points_mm.reshape(-1, 3)))
+    surface, used = _where_blood_is(points_mm, is_blood(field, points_mm.reshape(-1, 3)))
     return MeshLayer("slice", pane, (0.5, 0.5, 0.5), "speed", speed[used], surface)
-
-
-def _is_blood(field: FlowField, points_mm: Floats) -> Bools:
-    """Return whether points (n, 3) lie in cells of the flow."""
-    place = np.rint((points_mm - field.origin_mm) / field.cell_size_mm).astype(int)
-    is_near = ((place >= 0) & (place < field.index.shape)).all(axis=1)
-    found = np.zeros(len(points_mm), dtype=bool)
-    found[is_near] = field.index[tuple(place[is_near].T)] >= 0
-    return found
 
 
 def _where_blood_is(points_mm: Floats, is_blood: Bools) -> tuple[Surface, Ints]:

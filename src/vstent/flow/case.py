@@ -1,5 +1,6 @@
-"""Data classes of a flow computation: FlowCase with its Target and Sheets, and FlowField."""
+"""Data classes of a flow computation: FlowCase with its Target and Sheets, Level and FlowField."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
@@ -11,7 +12,7 @@ from vstent.flow.settings import Blood, Numerics, Waveform
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 from vstent.kernels import voxels
-from vstent.kernels.arrays import Floats, Ints, freeze
+from vstent.kernels.arrays import Bools, Floats, Ints, freeze, read_only
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,54 +123,8 @@ PHASES = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Phase:
-    """One moment of a pulsatile flow."""
-
-    time_s: float
-    """Time since the start of the waveform."""
-    inlets_mL_s: Floats
-    """(i,) flow rate in through each inlet."""
-    outlets_mL_s: Floats
-    """(k,) flow rate out through each outlet."""
-    velocity_m_s: Floats
-    """(n, 3) velocity at the cell centres."""
-    pressure_Pa: Floats
-    """(n,) pressure at the cell centres."""
-    wall_shear_stress_Pa: Floats
-    """(v, 3) wall shear stress at the lumen's vertices."""
-    neck_inflow_mL_s: float | None = None
-    """Neck inflow at this moment, or None (see `FlowField.neck_inflow_mL_s`)."""
-
-    def __post_init__(self) -> None:
-        freeze(self, "inlets_mL_s", np.float64, (-1,))
-        freeze(self, "outlets_mL_s", np.float64, (-1,))
-        freeze(self, "velocity_m_s", np.float32, (-1, 3))
-        freeze(self, "pressure_Pa", np.float32, (len(self.velocity_m_s),))
-        freeze(self, "wall_shear_stress_Pa", np.float32, (-1, 3))
-
-    @property
-    def inflow_mL_s(self) -> float:
-        """Flow rate in through all inlets together."""
-        return float(self.inlets_mL_s.sum())
-
-
-@dataclass(frozen=True, eq=False)
-class Swing:
-    """Mean magnitudes of an unsteady flow at constant inflow; the mean vectors alone miss oscillations that cancel."""
-
-    speed_m_s: Floats
-    """(n,) time-averaged speed at the cell centres."""
-    shear_Pa: Floats
-    """(v,) time-averaged magnitude of the wall shear stress at the lumen's vertices."""
-
-    def __post_init__(self) -> None:
-        freeze(self, "speed_m_s", np.float64, (-1,))
-        freeze(self, "shear_Pa", np.float64, (-1,))
-
-
-@dataclass(frozen=True, eq=False)
-class FlowField:
-    """A computed flow and its convergence: a steady state, or the time average of an unsteady or pulsatile flow."""
+class Level:
+    """One grid of a flow: its blood cells and the flow in them."""
 
     cells: Ints
     """(n, 3) integer grid coordinates of the blood cells, sorted."""
@@ -181,6 +136,87 @@ class FlowField:
     """(n, 3) velocity at the cell centres."""
     pressure_Pa: Floats
     """(n,) pressure at the cell centres, relative to the outlets."""
+    mean_speed_m_s: Floats | None = None
+    """(n,) time-averaged speed of an unsteady flow at constant inflow, which the mean velocity does not contain because
+    oscillations cancel; None for any other flow."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "cells", np.int32, (-1, 3))
+        n = len(self.cells)
+        freeze(self, "origin_mm", np.float64, (3,))
+        freeze(self, "velocity_m_s", np.float64, (n, 3))
+        freeze(self, "pressure_Pa", np.float64, (n,))
+        if self.mean_speed_m_s is not None:
+            freeze(self, "mean_speed_m_s", np.float64, (n,))
+
+    @cached_property
+    def centers_mm(self) -> Floats:
+        """Cell centres (n, 3)."""
+        return self.origin_mm + self.cells * self.cell_size_mm
+
+    @cached_property
+    def index(self) -> Ints:
+        """Index of the cell at every grid point (i, j, k), -1 outside the blood."""
+        return voxels.index_of(self.cells)
+
+    @cached_property
+    def speed_m_s(self) -> Floats:
+        """Magnitude (n,) of the velocity; its time average in an unsteady flow at constant inflow."""
+        return np.linalg.norm(self.velocity_m_s, axis=1) if self.mean_speed_m_s is None else self.mean_speed_m_s
+
+    def places(self, points_mm: Floats) -> Floats:
+        """Return the grid coordinates (m, 3) of points (m, 3)."""
+        return (points_mm - self.origin_mm) / self.cell_size_mm
+
+    def cells_at(self, points_mm: Floats) -> Ints:
+        """Return the cell (m,) in which each point (m, 3) lies, -1 outside the blood."""
+        place = np.rint(self.places(points_mm)).astype(int)
+        is_near = ((place >= 0) & (place < self.index.shape)).all(axis=1)
+        found = np.full(len(points_mm), -1, dtype=np.int32)
+        found[is_near] = self.index[tuple(place[is_near].T)]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """One moment of a pulsatile flow."""
+
+    time_s: float
+    """Time since the start of the waveform."""
+    inlets_mL_s: Floats
+    """(i,) flow rate in through each inlet."""
+    outlets_mL_s: Floats
+    """(k,) flow rate out through each outlet."""
+    velocity_m_s: tuple[Floats, ...]
+    """(n, 3) velocity at the cell centres of every level."""
+    pressure_Pa: tuple[Floats, ...]
+    """(n,) pressure at the cell centres of every level."""
+    wall_shear_stress_Pa: Floats
+    """(v, 3) wall shear stress at the lumen's vertices."""
+    neck_inflow_mL_s: float | None = None
+    """Neck inflow at this moment, or None (see `FlowField.neck_inflow_mL_s`)."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "inlets_mL_s", np.float64, (-1,))
+        freeze(self, "outlets_mL_s", np.float64, (-1,))
+        freeze(self, "wall_shear_stress_Pa", np.float32, (-1, 3))
+        for name, shape in (("velocity_m_s", (-1, 3)), ("pressure_Pa", (-1,))):
+            values = tuple(read_only(one, np.float32, shape, name) for one in getattr(self, name))
+            object.__setattr__(self, name, values)
+
+    @property
+    def inflow_mL_s(self) -> float:
+        """Flow rate in through all inlets together."""
+        return float(self.inlets_mL_s.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class FlowField:
+    """A computed flow and its convergence: a steady state, or the time average of an unsteady or pulsatile flow."""
+
+    levels: tuple[Level, ...]
+    """Grids, coarse to fine; at a place where several have cells, the finest one counts. The first is the whole vessel
+    or the only one."""
     wall: Surface
     """The lumen."""
     wall_shear_stress_Pa: Floats
@@ -216,19 +252,16 @@ class FlowField:
     """Cell updates per second in the main loop on the finest grid."""
     phases: tuple[Phase, ...] = ()
     """The last cycle of a pulsatile flow at equally spaced times; empty for a steady flow."""
-    swing: Swing | None = None
-    """Mean magnitudes of an unsteady flow at constant inflow; None for any other flow."""
+    mean_shear_Pa: Floats | None = None
+    """(v,) time-averaged magnitude of the wall shear stress of an unsteady flow at constant inflow, which the mean
+    vectors do not contain because oscillations cancel; None for any other flow."""
     neck_inflow_mL_s: float | None = None
     """Neck inflow where it cannot be computed from this field: the time average of an unsteady flow, or the value
     from an OpenFOAM mesh that is finer around the wires than this grid (0 where there is no neck). None: it is
     computed from the field."""
 
     def __post_init__(self) -> None:
-        freeze(self, "cells", np.int32, (-1, 3))
-        n, v = len(self.cells), len(self.wall.vertices_mm)
-        freeze(self, "origin_mm", np.float64, (3,))
-        freeze(self, "velocity_m_s", np.float64, (n, 3))
-        freeze(self, "pressure_Pa", np.float64, (n,))
+        v = len(self.wall.vertices_mm)
         freeze(self, "wall_shear_stress_Pa", np.float64, (v, 3))
         freeze(self, "wall_pressure_Pa", np.float64, (v,))
         freeze(self, "inlets_mL_s", np.float64, (-1,))
@@ -236,32 +269,63 @@ class FlowField:
         freeze(self, "inlet_pressure_Pa", np.float64, (len(self.inlets_mL_s),))
         freeze(self, "outlet_pressure_Pa", np.float64, (len(self.outlets_mL_s),))
         freeze(self, "residual", np.float64, (-1,))
+        if self.mean_shear_Pa is not None:
+            freeze(self, "mean_shear_Pa", np.float64, (v,))
 
     @property
     def inflow_mL_s(self) -> float:
         """Flow rate in through all inlets together."""
         return float(self.inlets_mL_s.sum())
 
+    @property
+    def finest(self) -> Level:
+        """The level with the finest grid."""
+        return self.levels[-1]
+
+    @cached_property
+    def is_finest(self) -> tuple[Bools, ...]:
+        """Whether each cell of every level contains no cell of a finer one: these (n,) cells fill the blood once."""
+        result = tuple(np.ones(len(level.cells), dtype=bool) for level in self.levels)
+        for k, level in enumerate(self.levels):
+            for finer in self.levels[k + 1 :]:
+                found = level.cells_at(finer.centers_mm)
+                result[k][found[found >= 0]] = False
+        return result
+
+    def _joined(self, values: Iterable[Floats]) -> Floats:
+        """Return values of the cells of every level as one array of the cells that fill the blood once."""
+        return np.concatenate([one[own] for one, own in zip(values, self.is_finest, strict=True)])
+
     @cached_property
     def centers_mm(self) -> Floats:
-        """Cell centres (n, 3)."""
-        return self.origin_mm + self.cells * self.cell_size_mm
+        """Centres (n, 3) of the cells that fill the blood once, as in the arrays below."""
+        return self._joined(level.centers_mm for level in self.levels)
+
+    @cached_property
+    def sizes_mm(self) -> Floats:
+        """Edge (n,) of these cells."""
+        return self._joined(np.full(len(level.cells), level.cell_size_mm) for level in self.levels)
+
+    @cached_property
+    def velocity_m_s(self) -> Floats:
+        """Velocity (n, 3) at the centres of these cells."""
+        return self._joined(level.velocity_m_s for level in self.levels)
+
+    @cached_property
+    def pressure_Pa(self) -> Floats:
+        """Pressure (n,) at the centres of these cells."""
+        return self._joined(level.pressure_Pa for level in self.levels)
 
     @cached_property
     def speed_m_s(self) -> Floats:
-        """Magnitude (n,) of the velocity; its time average in an unsteady flow at constant inflow."""
-        return np.linalg.norm(self.velocity_m_s, axis=1) if self.swing is None else self.swing.speed_m_s
-
-    @cached_property
-    def index(self) -> Ints:
-        """Index of the cell at every grid point (i, j, k), -1 outside the blood."""
-        return voxels.index_of(self.cells)
+        """Speed (n,) in these cells; its time average in an unsteady flow at constant inflow."""
+        return self._joined(level.speed_m_s for level in self.levels)
 
     @cached_property
     def shear_Pa(self) -> Floats:
         """Magnitude (v,) of the wall shear stress; its time average (TAWSS) in an unsteady or pulsatile flow."""
-        if self.swing is not None:
-            return self.swing.shear_Pa
+        if self.mean_shear_Pa is not None:
+            return self.mean_shear_Pa
         moments = self.phases or (self,)
         return np.mean([np.linalg.norm(now.wall_shear_stress_Pa, axis=1) for now in moments], axis=0, dtype=float)
 
@@ -283,14 +347,18 @@ class FlowField:
 
     def at_phase(self, phase: Phase) -> "FlowField":
         """Return the flow at one moment of the cycle."""
+        parts = zip(self.levels, phase.velocity_m_s, phase.pressure_Pa, strict=True)
         return replace(
             self,
-            velocity_m_s=phase.velocity_m_s,
-            pressure_Pa=phase.pressure_Pa,
+            levels=tuple(replace(level, velocity_m_s=u, pressure_Pa=p, mean_speed_m_s=None) for level, u, p in parts),
             wall_shear_stress_Pa=phase.wall_shear_stress_Pa,
             inlets_mL_s=phase.inlets_mL_s,
             outlets_mL_s=phase.outlets_mL_s,
             phases=(),
-            swing=None,
+            mean_shear_Pa=None,
             neck_inflow_mL_s=phase.neck_inflow_mL_s,
         )
+
+    def moments(self) -> "Iterator[FlowField]":
+        """Yield the flow at every phase of the cycle, or a flow without phases itself."""
+        yield from (self.at_phase(phase) for phase in self.phases) if self.phases else (self,)

@@ -154,7 +154,7 @@ class _Runs:
         # With media, `start` would be taken for the flow without a device.
         field = simulate_case(case, start=start if not case.media else None, folder=own)
         self.done.append(field)
-        said = f"{name}: {len(field.cells)} cells, {field.steps} time steps, run time {field.seconds:.0f} s."
+        said = f"{name}: {len(field.centers_mm)} cells, {field.steps} time steps, run time {field.seconds:.0f} s."
         self.told(len(self.done) / self.count, said)
         return field
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Final, Literal
 
 import numpy as np
@@ -79,8 +80,8 @@ def computation_of(case: FlowCase, field: FlowField) -> dict[str, float]:
     speed_m_s = float(field.inlets_mL_s[0]) * 1e-6 / (inlet.area_mm2 * M_PER_MM**2)
     viscosity_m2_s = field.blood.kinematic_viscosity_m2_s
     return {
-        "grid_spacing_mm": field.cell_size_mm,
-        "cells_count": len(field.cells),
+        "grid_spacing_mm": field.finest.cell_size_mm,
+        "cells_count": len(field.centers_mm),
         "steps_count": field.steps,
         "inflow_mL_s": field.inflow_mL_s,
         "inlet_reynolds_number_count": speed_m_s * inlet.diameter_mm * M_PER_MM / viscosity_m2_s,
@@ -114,7 +115,7 @@ def grade_of(measures: Mapping[str, float]) -> Grade:
 
 def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> dict[str, float]:
     """Return the measures of a flow that its grade rests on; counts are in cells, fractions from 0 to 1."""
-    spacing_mm = field.cell_size_mm
+    spacing_mm = field.finest.cell_size_mm
     measures = {"cells_across_parent_count": mean_diameter_mm(case.vessel) / spacing_mm}
     if not case.is_split_given:
         measures["cells_across_outlet_count"] = _narrowest_mm(case.vessel.outlets) / spacing_mm
@@ -145,19 +146,18 @@ def _imbalance(field: FlowField, found: Mapping[str, float]) -> float:
 
 
 def _raised_fraction(case: FlowCase, field: FlowField) -> float:
-    """Return the fraction of the cells of sac and neck in which the viscosity is raised at some time."""
+    """Return the fraction of the volume of sac and neck in which the viscosity is raised at some time."""
     ostium, sac = case.ostium, case.sac
     assert ostium is not None
     assert sac is not None
     width_mm = neck_diameter_mm(ostium)
-    moments = [np.linalg.norm(phase.velocity_m_s, axis=1) for phase in field.phases] or [field.speed_m_s]
-    fastest_m_s = np.max(moments, axis=0)
+    fastest_m_s = reduce(np.maximum, (moment.speed_m_s for moment in field.moments()))
     middle_mm, reach_mm = sac.vertices_mm.mean(axis=0), np.ptp(sac.vertices_mm, axis=0).max()
     near = np.linalg.norm(field.centers_mm - middle_mm, axis=1) < reach_mm + width_mm
-    reynolds = fastest_m_s[near] * field.cell_size_mm * M_PER_MM / field.blood.kinematic_viscosity_m2_s
-    is_raised = reynolds > CELL_REYNOLDS
+    points_mm, sizes_mm = field.centers_mm[near], field.sizes_mm[near]
+    is_raised = fastest_m_s[near] * sizes_mm * M_PER_MM / field.blood.kinematic_viscosity_m2_s > CELL_REYNOLDS
     if not is_raised.any():
         return 0.0  # without a search for the cells
-    points_mm = field.centers_mm[near]
-    counts = (ostium.closest(points_mm)[1] < 0.5 * width_mm) | (sac.closest(points_mm)[1] < field.cell_size_mm)
-    return float(is_raised[counts].mean()) if counts.any() else 0.0
+    counts = (ostium.closest(points_mm)[1] < 0.5 * width_mm) | (sac.closest(points_mm)[1] < sizes_mm)
+    volume = (sizes_mm[counts] / field.finest.cell_size_mm) ** 3
+    return float(np.average(is_raised[counts], weights=volume)) if counts.any() else 0.0

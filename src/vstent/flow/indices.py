@@ -66,9 +66,7 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
     """
     result = _of_vessel(field)
     if sac is not None and ostium is not None:
-        # A generator, so that only one moment's full field is in memory at a time.
-        moments = (field.at_phase(phase) for phase in field.phases) if field.phases else (field,)
-        of_moments = [_of_ostium(now, ostium) | _of_sac(now, sac) for now in moments]
+        of_moments = [_of_ostium(now, ostium) | _of_sac(now, sac) for now in field.moments()]
         result |= {key: _over_cycle(key, [one[key] for one in of_moments]) for key in of_moments[0]}
         result |= _quotients(result, field.inflow_mL_s, sac) | _of_sac_wall(field, sac, ostium)
     return result
@@ -134,9 +132,8 @@ def _of_vessel(field: FlowField) -> dict[str, float]:
 
 def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
     """Return the indices of the flow through the ostium."""
-    points_mm, area_mm2 = sampling.surface_samples(ostium, field.cell_size_mm)
-    points = (points_mm - field.origin_mm) / field.cell_size_mm
-    through_mL_s = sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2)
+    points_mm, area_mm2 = sampling.surface_samples(ostium, field.finest.cell_size_mm)
+    through_mL_s = sampling.through_surface_mL_s(field, points_mm, area_mm2)
     sizes_mm2 = np.linalg.norm(area_mm2, axis=1)
     told_mL_s = field.neck_inflow_mL_s
     inflow_mL_s = sampling.inflow_mL_s(through_mL_s) if told_mL_s is None else told_mL_s
@@ -158,17 +155,19 @@ def _quotients(mean: dict[str, float], entering_mL_s: float, sac: Surface) -> di
 
 def _of_sac(field: FlowField, sac: Surface) -> dict[str, float]:
     """Return the indices of the flow in the sac."""
-    cells = sampling.cells_inside(sac, field.centers_mm, field.cell_size_mm)
-    speed_m_s = field.speed_m_s[cells]
+    cells = sampling.field_cells_inside(field, sac)
+    speed_m_s, volume = field.speed_m_s[cells], (field.sizes_mm[cells] / field.finest.cell_size_mm) ** 3
     # Cells cut by the sac's wall count fully or not at all, so integrals are scaled to the true volume.
     volume_mm3 = abs(sac.volume_mm3)
-    energy_J = 0.5 * field.blood.density_kg_m3 * float((speed_m_s**2).mean()) * volume_mm3 * M_PER_MM**3
+    energy_J = (
+        0.5 * field.blood.density_kg_m3 * float(np.average(speed_m_s**2, weights=volume)) * volume_mm3 * M_PER_MM**3
+    )
     return {
-        "mean_sac_velocity_m_s": float(speed_m_s.mean()),
+        "mean_sac_velocity_m_s": float(np.average(speed_m_s, weights=volume)),
         "max_sac_velocity_m_s": float(speed_m_s.max()),
-        "mean_sac_pressure_Pa": float(field.pressure_Pa[cells].mean()),
+        "mean_sac_pressure_Pa": float(np.average(field.pressure_Pa[cells], weights=volume)),
         "sac_kinetic_energy_J": energy_J,
-        "fast_sac_volume_mm3": float((speed_m_s > FAST_M_S).mean()) * volume_mm3,
+        "fast_sac_volume_mm3": float(np.average(speed_m_s > FAST_M_S, weights=volume)) * volume_mm3,
     }
 
 
@@ -176,7 +175,7 @@ def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, f
     """Return the indices of wall shear stress on the sac and the parent artery."""
     stress_Pa = field.shear_Pa
     area_mm2 = _vertex_areas_mm2(field.wall)
-    is_sac = on_sac(field.wall, sac, 0.2 * field.cell_size_mm)
+    is_sac = on_sac(field.wall, sac, 0.2 * field.finest.cell_size_mm)
     is_near = ostium.closest(field.wall.vertices_mm)[1] < NEAR_MM
     parent_Pa = _mean(stress_Pa, area_mm2, is_near & ~is_sac)
     moments_Pa = [np.linalg.norm(phase.wall_shear_stress_Pa[is_sac], axis=1) for phase in field.phases]

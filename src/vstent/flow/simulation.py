@@ -16,14 +16,13 @@ from vstent.devices.stent import Deployment
 from vstent.errors import InputError
 from vstent.flow import sampling
 from vstent.flow.beside import Beside
-from vstent.flow.case import FlowCase, FlowField, Phase, Target
+from vstent.flow.case import FlowCase, FlowField, Level, Phase, Target
 from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
 from vstent.flow.lattice.close_up import SHARE_AROUND, WIDTH, require_sac
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import LATTICE, OPENFOAM, FlowSettings, Numerics
 from vstent.geometry.vessel import Anatomy
-from vstent.kernels.arrays import Floats
 
 COARSE_SHARE = 0.12
 """Assumed share of the run time of each coarse run, for the progress."""
@@ -227,7 +226,7 @@ class _Runs:
         around = replace(case, target=target, numerics=replace(case.numerics, max_steps=steps))
         outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
         # The mean of an unsteady flow lacks its oscillations: from it C0038's averages take longer than from `outer`.
-        guess = outer if self.similar is None or self.similar.swing is not None else self.similar
+        guess = outer if self.similar is None or self.similar.mean_shear_Pa is not None else self.similar
         engine = self.engine(cell_size_mm, self.folder, outer)
         return self._run(engine, case, lambda: guess, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))
 
@@ -254,7 +253,9 @@ class _Runs:
             if start is None:
                 return self._coarse(case, coarse_mm, None, "guess", first, depth)
             bare = self._bare_guess(case, start, coarse_mm, first, depth)
-            return _corrected(start, bare, self._coarse(case, coarse_mm, bare, "stented guess", second, depth))
+            return _corrected(
+                sampling.uniform(start), bare, self._coarse(case, coarse_mm, bare, "stented guess", second, depth)
+            )
         return start
 
     def _bare_guess(
@@ -298,8 +299,9 @@ class _Runs:
         guess = cache(partial(_guessed, engine, case, guess))
 
         def attempt() -> FlowField:
-            is_under_way = bookmark is not None and bookmark.saved is not None
-            return run(engine, case, start=None if is_under_way else guess(), progress=progress, bookmark=bookmark)
+            found = None if bookmark is not None and bookmark.saved is not None else guess()
+            start = None if found is None else sampling.uniform(found)
+            return run(engine, case, start=start, progress=progress, bookmark=bookmark)
 
         for _ in range(CALMER_TRIES):
             try:
@@ -347,28 +349,23 @@ def _guessed(engine: AbstractEngine[Any], case: FlowCase, guess: Guess) -> FlowF
 def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowField:
     """Return a bare flow plus the change due to a screen on a coarser grid; if pulsatile, mean and last phase."""
     fields = start, bare, stented
-    velocity_m_s, pressure_Pa = _changed(*fields)
+    level = _changed(*fields)
     phases: tuple[Phase, ...] = ()
     if all(field.phases for field in fields):
-        end_m_s, end_Pa = _changed(*(field.at_phase(field.phases[-1]) for field in fields))
-        phases = (replace(start.phases[-1], velocity_m_s=end_m_s, pressure_Pa=end_Pa),)
-    return replace(
-        start,
-        velocity_m_s=velocity_m_s,
-        pressure_Pa=pressure_Pa,
-        phases=phases,
-        swing=None,
-        neck_inflow_mL_s=None,
-    )
+        end = _changed(*(field.at_phase(field.phases[-1]) for field in fields))
+        phases = (replace(start.phases[-1], velocity_m_s=(end.velocity_m_s,), pressure_Pa=(end.pressure_Pa,)),)
+    return replace(start, levels=(level,), phases=phases, mean_shear_Pa=None, neck_inflow_mL_s=None)
 
 
-def _changed(start: FlowField, bare: FlowField, stented: FlowField) -> tuple[Floats, Floats]:
-    """Return velocity and pressure of a flow plus the difference between two flows on a coarser grid."""
-    before, after = (sampling.values_at(field, start.centers_mm) for field in (bare, stented))
+def _changed(start: FlowField, bare: FlowField, stented: FlowField) -> Level:
+    """Return a flow plus the difference between two flows on a coarser grid."""
+    grid = start.finest
+    before, after = (sampling.values_at(field, grid.centers_mm) for field in (bare, stented))
     speed_before, speed_after = (np.linalg.norm(values[0], axis=1, keepdims=True) for values in (before, after))
     left = np.clip(speed_after / np.maximum(speed_before, 1e-9), 0.0, 1.0)
-    velocity_m_s = after[0] + left * (start.velocity_m_s - before[0])
-    return velocity_m_s, start.pressure_Pa + after[1] - before[1]
+    velocity_m_s = after[0] + left * (grid.velocity_m_s - before[0])
+    pressure_Pa = grid.pressure_Pa + after[1] - before[1]
+    return replace(grid, velocity_m_s=velocity_m_s, pressure_Pa=pressure_Pa, mean_speed_m_s=None)
 
 
 def _coarse_runs(engine: type[AbstractEngine[Any]], case: FlowCase, start: FlowField | None) -> int:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vstent.flow import sampling
-from vstent.flow.case import FlowField
+from vstent.flow.case import FlowField, Level
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 from vstent.kernels import sampling as lattice_sampling
@@ -42,8 +42,9 @@ def streamlines(field: FlowField, seeds_mm: Floats) -> Streamlines:
     The method is fourth-order Runge-Kutta in arc length on trilinearly interpolated velocity. Seeds outside the blood
     give no line. Lines end at the openings, because the extensions beyond them are not part of the vessel.
     """
-    mouths = _mouths(field.wall, field.cell_size_mm)
-    up, down = (_ways(field, mouths, seeds_mm, step_cells) for step_cells in (-STEP_CELLS, STEP_CELLS))
+    grid = sampling.uniform(field).finest
+    mouths = _mouths(field.wall, grid.cell_size_mm)
+    up, down = (_ways(grid, mouths, seeds_mm, step_cells) for step_cells in (-STEP_CELLS, STEP_CELLS))
     lines = [np.concatenate([back[:0:-1], ahead]) for back, ahead in zip(up, down, strict=True)]
     lines = [line for line in lines if len(line) > 2]
     starts = np.cumsum([0, *map(len, lines)])
@@ -51,12 +52,12 @@ def streamlines(field: FlowField, seeds_mm: Floats) -> Streamlines:
     return Streamlines(joined[:, :3], starts, joined[:, 3])
 
 
-def _ways(field: FlowField, mouths: Surface, seeds_mm: Floats, step_cells: float) -> list[Floats]:
+def _ways(grid: Level, mouths: Surface, seeds_mm: Floats, step_cells: float) -> list[Floats]:
     """Return points in mm and speed (p, 4) from every seed (s, 3) in one direction, within the vessel."""
-    seeds = np.ascontiguousarray((seeds_mm - field.origin_mm) / field.cell_size_mm)
-    most = int(LONGEST_MM / field.cell_size_mm / STEP_CELLS)
-    path, count = lattice_sampling.trace_all(field.index, field.velocity_m_s, seeds, step_cells, SLOWEST_M_S, most)
-    path[..., :3] = field.origin_mm + path[..., :3] * field.cell_size_mm
+    seeds = np.ascontiguousarray(grid.places(seeds_mm))
+    most = int(LONGEST_MM / grid.cell_size_mm / STEP_CELLS)
+    path, count = lattice_sampling.trace_all(grid.index, grid.velocity_m_s, seeds, step_cells, SLOWEST_M_S, most)
+    path[..., :3] = grid.origin_mm + path[..., :3] * grid.cell_size_mm
     return [_within(mouths, points[:n]) for points, n in zip(path, count, strict=True)]
 
 
@@ -81,11 +82,11 @@ def _within(mouths: Surface, way: Floats) -> Floats:
 
 def inlet_seeds_mm(field: FlowField, vessel: Vessel, count: int) -> Floats:
     """Return about `count` cell centres (s, 3) evenly drawn from the sections of all inlets."""
-    near = np.zeros(len(field.cells), dtype=bool)
+    near = np.zeros(len(field.centers_mm), dtype=bool)
     for inlet in vessel.inlets:
         offset = field.centers_mm - inlet.center_mm
         along = offset @ inlet.normal
-        near |= (np.abs(along + field.cell_size_mm) < 0.5 * field.cell_size_mm) & (
+        near |= (np.abs(along + field.sizes_mm) < 0.5 * field.sizes_mm) & (
             np.linalg.norm(offset, axis=1) < inlet.diameter_mm
         )
     return _drawn(field.centers_mm[near], count)
@@ -93,7 +94,7 @@ def inlet_seeds_mm(field: FlowField, vessel: Vessel, count: int) -> Floats:
 
 def neck_seeds_mm(field: FlowField, neck: Surface, count: int) -> Floats:
     """Return about `count` points (s, 3) evenly drawn from the neck."""
-    return _drawn(sampling.surface_samples(neck, field.cell_size_mm)[0], count)
+    return _drawn(sampling.surface_samples(neck, field.finest.cell_size_mm)[0], count)
 
 
 def _drawn(points: Floats, count: int) -> Floats:

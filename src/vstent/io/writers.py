@@ -91,21 +91,21 @@ def write_centerlines(path: Path, centerlines: Sequence[Centerline]) -> None:
 
 
 def write_cells(
-    path: Path, centers_mm: Floats, size_mm: float, cell_data: Arrays, point_data: Arrays = NOTHING
+    path: Path, centers_mm: Floats, sizes_mm: Floats, cell_data: Arrays, point_data: Arrays = NOTHING
 ) -> None:
-    """Write the used cells of a regular grid as VTU: hexahedra with shared corners.
+    """Write cells of one or more regular grids as VTU: hexahedra with shared corners.
 
     Parameters
     ----------
     path : the file.
-    centers_mm : (c, 3) centers of the cells, on one grid aligned with the axes.
-    size_mm : grid spacing.
+    centers_mm : (c, 3) centers of the cells, on grids aligned with the axes and with each other.
+    sizes_mm : (c,) edges of the cells, multiples of the smallest.
     cell_data : arrays (c, ...).
     point_data : arrays (p, ...) on the corners in the order of `grid_corners`.
     """
     from vtkmodules.vtkCommonDataModel import VTK_HEXAHEDRON, vtkUnstructuredGrid
 
-    corners_mm, cells = grid_corners(centers_mm, size_mm)
+    corners_mm, cells = grid_corners(centers_mm, sizes_mm)
     data = vtkUnstructuredGrid()
     data.SetPoints(points_of(corners_mm))
     data.SetCells(VTK_HEXAHEDRON, cells_of(cells))
@@ -118,13 +118,13 @@ _CORNERS: Final = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1
 """Corners of a unit cube in VTK's order of a hexahedron."""
 
 
-def grid_corners(centers_mm: Floats, size_mm: float) -> tuple[Floats, Ints]:
+def grid_corners(centers_mm: Floats, sizes_mm: Floats) -> tuple[Floats, Ints]:
     """Return the corners of grid cells, each once, and the corners of every cell.
 
     Parameters
     ----------
     centers_mm : (c, 3) centers of the cells.
-    size_mm : grid spacing.
+    sizes_mm : (c,) edges of the cells, multiples of the smallest.
 
     Returns
     -------
@@ -133,11 +133,16 @@ def grid_corners(centers_mm: Floats, size_mm: float) -> tuple[Floats, Ints]:
     cells : Ints
         (c, 8) numbers of the corners of every cell, in VTK's order of a hexahedron.
     """
-    origin = np.min(centers_mm, axis=0, initial=np.inf) if len(centers_mm) else np.zeros(3)
-    index = np.round((centers_mm - origin) / size_mm).astype(np.int64)
-    n = index.max(axis=0, initial=0) + 2
+    if not len(centers_mm):
+        return np.zeros((0, 3)), np.zeros((0, 8), dtype=np.int32)
+    size_mm = sizes_mm.min()
+    first_mm = centers_mm - 0.5 * (sizes_mm - size_mm)[:, None]  # centers of the smallest cells at the lowest corners
+    origin = first_mm.min(axis=0)
+    index = np.round((first_mm - origin) / size_mm).astype(np.int64)
+    width = np.round(sizes_mm / size_mm).astype(np.int64)
+    n = (index + width[:, None]).max(axis=0) + 1
     stride = np.array([n[1] * n[2], n[2], 1])
-    code, cells = np.unique((index @ stride)[:, None] + _CORNERS @ stride, return_inverse=True)
+    code, cells = np.unique((index @ stride)[:, None] + np.outer(width, _CORNERS @ stride), return_inverse=True)
     lattice = np.stack([code // stride[0], code // stride[1] % n[1], code % n[2]], axis=-1)
     return origin + (lattice - 0.5) * size_mm, cells.reshape(-1, 8).astype(np.int32)
 

@@ -336,7 +336,7 @@ def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer
 
 def _sac_shear(name: str, field: FlowField, sac: Surface) -> MeshLayer:
     """Return the wall of the sac colored by its shear stress, on a scale of its own."""
-    is_sac = on_sac(field.wall, sac, ON_SAC_CELLS * field.cell_size_mm)
+    is_sac = on_sac(field.wall, sac, ON_SAC_CELLS * field.finest.cell_size_mm)
     faces = field.wall.faces[is_sac[field.wall.faces].all(axis=1)]
     used = np.unique(faces)
     place = np.zeros(len(field.wall.vertices_mm), dtype=np.int32)

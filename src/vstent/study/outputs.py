@@ -143,14 +143,14 @@ def write_implant(folder: Path, deployment: Deployment) -> str:
 
 
 def write_field(folder: Path, field: FlowField) -> None:
-    """Write a flow: velocity and pressure on the grid, wall shear stress and pressure on the wall."""
+    """Write a flow: velocity and pressure in its cells, each place once, wall shear stress and pressure on the wall."""
     folder.mkdir(parents=True, exist_ok=True)
     of_cell = {"velocity_m_s": field.velocity_m_s, "pressure_Pa": field.pressure_Pa}
-    if field.swing:
+    if field.mean_shear_Pa is not None:
         of_cell["mean_speed_m_s"] = field.speed_m_s
-    writers.write_cells(folder / "field.vtu", field.centers_mm, field.cell_size_mm, of_cell)
+    writers.write_cells(folder / "field.vtu", field.centers_mm, field.sizes_mm, of_cell)
     of_vertex = {"wall_shear_stress_Pa": field.wall_shear_stress_Pa, "pressure_Pa": field.wall_pressure_Pa}
-    if field.phases or field.swing:
+    if field.phases or field.mean_shear_Pa is not None:
         of_vertex |= {
             "time_averaged_wall_shear_stress_Pa": field.shear_Pa,
             "oscillatory_shear_index": field.oscillatory_shear_index,

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from levels import with_values
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from shapes import sphere
@@ -17,9 +18,9 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.errors import FlowError, InputError
-from vstent.flow import domain
+from vstent.flow import domain, sampling
 from vstent.flow import simulation as flow
-from vstent.flow.case import FlowCase, FlowField, Sheet, Swing, Target
+from vstent.flow.case import FlowCase, FlowField, Level, Sheet, Target
 from vstent.flow.engines import AbstractEngine, run
 from vstent.flow.indices import indices
 from vstent.flow.lattice import close_up as close_ups
@@ -63,9 +64,10 @@ def at_rest(case: FlowCase, grid: domain.Domain) -> FlowField:
     """A flow of one outlet of which nothing but what goes through it is known."""
     still, lumen = np.zeros((len(grid.cells), 3)), case.vessel.lumen
     stress = np.zeros((len(lumen.vertices_mm), 3))
-    values = still, still[:, 0], lumen, stress, stress[:, 0], case.inlets_mL_s, case.inlets_mL_s, np.zeros(1)
+    values = lumen, stress, stress[:, 0], case.inlets_mL_s, case.inlets_mL_s, np.zeros(1)
     told = case.blood, True, 0.0, "", np.zeros(1), 1, 1.0, 1.0
-    return FlowField(grid.cells, grid.origin_mm, grid.cell_size_mm, *values, np.zeros(1), *told)
+    level = Level(grid.cells, grid.origin_mm, grid.cell_size_mm, still, still[:, 0])
+    return FlowField((level,), *values, np.zeros(1), *told)
 
 
 @cache
@@ -128,13 +130,13 @@ def test_a_close_up_of_womersleys_flow_is_womersleys_flow() -> None:
     )
     field = simulate_case(vessel_case(vessel, settings, target=Target(ball((0.0, 0.0, 24.0)), None)))
     assert field.is_converged
-    x, y, z = field.centers_mm.T
+    x, y, z = field.finest.centers_mm.T
     within = (z > 15) & (z < 25)
     peak_m_s = womersley_m_s(np.zeros(1), 0.0).max()
     for phase in field.phases:
         assert phase.inflow_mL_s == pytest.approx(inflow_mL_s * PULSE.factor(np.array([phase.time_s]))[0], rel=2e-3)
         exact = womersley_m_s(1e-3 * np.hypot(x, y), phase.time_s)[:, None] * [0, 0, 1]
-        error = (phase.velocity_m_s - exact)[within] / peak_m_s
+        error = (phase.velocity_m_s[-1] - exact)[within] / peak_m_s
         assert np.sqrt((error**2).sum(axis=1).mean()) < 0.004
         assert np.abs(error).max() < 0.01
 
@@ -190,10 +192,29 @@ def test_what_is_built_for_some_steps_serves_longer_ones_as_if_built_for_them() 
 
 def test_every_place_has_one_cell() -> None:
     field = of_tube()
-    assert len(np.unique(field.cells, axis=0)) == len(field.cells)
-    assert (np.lexsort(field.cells.T[::-1]) == np.arange(len(field.cells))).all()
+    coarse, fine = field.levels
+    assert coarse.cell_size_mm == 2 * fine.cell_size_mm
+    left = cKDTree(coarse.centers_mm[field.is_finest[0]])
+    assert left.query(fine.centers_mm, p=np.inf)[0].min() > 0.7 * coarse.cell_size_mm  # no fine cell in a coarse one
     whole = domain.build(tube(line(40.0), RADIUS_MM).vessel, 0.2)
-    assert len(field.cells) == pytest.approx(len(whole.cells), rel=1e-2)
+    assert (field.sizes_mm**3).sum() == pytest.approx(len(whole.cells) * 0.2**3, rel=1e-2)
+
+
+def test_through_a_slanting_plane_across_both_grids_passes_the_inflow() -> None:
+    """The grids meet at the cut, 11 mm from the inlet: a plane at 60 degrees to the axis crosses it."""
+    field = of_tube()
+    ring = np.arange(48) * np.pi / 24
+    normal, middle = np.array([np.sin(np.pi / 3), 0.0, np.cos(np.pi / 3)]), np.array([0.0, 0.0, 11.0])
+    rim = middle + 6.0 * (
+        np.outer(np.cos(ring), [0.0, 1.0, 0.0]) + np.outer(np.sin(ring), np.cross(normal, [0.0, 1.0, 0.0]))
+    )
+    fan = np.stack([np.zeros(48, int), 1 + np.arange(48), 1 + (1 + np.arange(48)) % 48], axis=1)
+    points_mm, area_mm2 = sampling.surface_samples(Surface(np.concatenate([middle[None], rim]), fan), 0.1)
+    through_mL_s = sampling.through_surface_mL_s(field, points_mm, area_mm2)
+    on_fine = cKDTree(field.finest.centers_mm).query(points_mm)[0] < 0.2
+    carried = np.abs(np.array([through_mL_s[on_fine].sum(), through_mL_s[~on_fine].sum()]))
+    assert (carried > 0.2 * INFLOW_ML_S).all()
+    assert carried.sum() == pytest.approx(INFLOW_ML_S, rel=0.01)
 
 
 def test_through_every_cut_passes_what_the_openings_beyond_it_take() -> None:
@@ -266,25 +287,29 @@ def test_what_a_swing_tells_is_the_close_ups_within_and_that_of_the_wide_cells_e
     vessel = tube(line(30.0), RADIUS_MM).vessel
     case = vessel_case(vessel, FlowSettings(inflow_mL_s=INFLOW_ML_S), target=Target(ball((0.0, 0.0, 15.0)), None))
     outer = at_rest(case, domain.build(vessel, 0.5))
-    outer = replace(outer, velocity_m_s=outer.velocity_m_s + np.array([0.0, 0.0, 0.3]))
+    outer = with_values(outer, velocity_m_s=outer.velocity_m_s + np.array([0.0, 0.0, 0.3]))
     chosen = close_ups.close_up(case, outer)
     inner = at_rest(case, close_ups.build(case, 0.25, chosen))
     of_wall = np.arange(len(vessel.lumen.vertices_mm), dtype=float)
-    swing = Swing(np.linspace(1.0, 2.0, len(inner.cells)), of_wall)
-    found = close_ups.assembled(chosen, replace(inner, swing=swing, neck_inflow_mL_s=3.0))
-    assert found.swing is not None
+    moving = with_values(inner, mean_speed_m_s=np.linspace(1.0, 2.0, len(inner.centers_mm)))
+    moving = replace(moving, mean_shear_Pa=of_wall, neck_inflow_mL_s=3.0)
+    found = close_ups.assembled(chosen, moving)
     assert found.neck_inflow_mL_s == 3.0
-    nearest_mm, of_inner = cKDTree(inner.centers_mm).query(found.centers_mm)
+    assert found.levels == (*outer.levels, *moving.levels)
+    outside_mm = np.array([[0.0, 0.0, 1.0], [0.5, 0.5, 29.0]])
+    np.testing.assert_allclose(sampling.values_at(found, outside_mm)[0], [[0.0, 0.0, 0.3]] * 2, rtol=1e-6)
+    grid = sampling.uniform(found).finest
+    nearest_mm, of_inner = cKDTree(inner.centers_mm).query(grid.centers_mm)
     is_inner = nearest_mm < 1e-6
-    np.testing.assert_array_equal(found.speed_m_s[is_inner], swing.speed_m_s[of_inner[is_inner]])
-    deep = ~is_inner & (np.linalg.norm(found.centers_mm[:, :2], axis=1) < 1.0)
-    deep &= np.abs(found.centers_mm[:, 2] - 15.0) < 14.0
+    np.testing.assert_array_equal(grid.speed_m_s[is_inner], moving.speed_m_s[of_inner[is_inner]])
+    deep = ~is_inner & (np.linalg.norm(grid.centers_mm[:, :2], axis=1) < 1.0)
+    deep &= np.abs(grid.centers_mm[:, 2] - 15.0) < 14.0
     assert deep.sum() > 1000
-    np.testing.assert_allclose(found.speed_m_s[deep], 0.3, rtol=1e-6)
+    np.testing.assert_allclose(grid.speed_m_s[deep], 0.3, rtol=1e-6)
     assert set(np.flatnonzero(found.shear_Pa != of_wall)) <= set(np.flatnonzero(found.shear_Pa == 0.0))
     assert (found.shear_Pa == of_wall).sum() > 1000
     assert (found.shear_Pa == 0.0).sum() > 1000
-    assert close_ups.assembled(chosen, inner).swing is None
+    assert close_ups.assembled(chosen, inner).mean_shear_Pa is None
 
 
 def test_a_recess_that_leads_nowhere_belongs_to_the_close_up() -> None:
@@ -332,7 +357,7 @@ def test_a_close_up_is_given_a_quarter_of_the_steps() -> None:
 def test_a_close_up_starts_from_a_similar_flow_at_the_pace_of_the_flow_around_it() -> None:
     case, outer = outer_of_demo()
     engine = LatticeBoltzmann(0.25, None, outer)
-    similar = replace(outer, velocity_m_s=0.5 * outer.velocity_m_s)
+    similar = with_values(outer, velocity_m_s=0.5 * outer.velocity_m_s)
     usual, from_similar = (engine.init(case, start) for start in (outer, similar))
     assert from_similar.scales.step_s == usual.scales.step_s
     usual_m_s, similar_m_s = (np.linalg.norm(snapshot(state).velocity, axis=1) for state in (usual, from_similar))
@@ -346,8 +371,8 @@ def test_a_refined_sac_starts_from_a_similar_flow_if_that_is_steady(monkeypatch:
     begun: list[FlowField] = []
     monkeypatch.setattr(flow._Runs, "_coarse", lambda *_: outer)
     monkeypatch.setattr(flow._Runs, "_run", lambda _, __, ___, guess, *____: begun.append(guess()))
-    steady = replace(outer, velocity_m_s=0.5 * outer.velocity_m_s)
-    swinging = replace(steady, swing=Swing(steady.speed_m_s, np.zeros(len(outer.wall.vertices_mm))))
+    steady = with_values(outer, velocity_m_s=0.5 * outer.velocity_m_s)
+    swinging = replace(steady, mean_shear_Pa=np.zeros(len(outer.wall.vertices_mm)))
     for similar in (None, steady, swinging):
         simulate_case(wanted, similar=similar)
     assert [one is two for one, two in zip(begun, (outer, steady, outer), strict=True)] == [True] * 3
@@ -359,7 +384,7 @@ def test_a_close_ups_time_step_goes_by_its_own_fastest_blood() -> None:
     part = close_ups.close_up(case, outer).part
     for is_faster, times in ((part >= 0, 1.0), (part < 0, 10.0)):
         velocity_m_s = np.where(is_faster[:, None], 10.0, 1.0) * outer.velocity_m_s
-        faster = replace(outer, velocity_m_s=velocity_m_s)
+        faster = with_values(outer, velocity_m_s=velocity_m_s)
         step_s = [LatticeBoltzmann(0.25, None, one).init(case, one).scales.step_s for one in (outer, faster)]
         assert step_s[0] == pytest.approx(times * step_s[1])
         assert step_s[0] * 1.1 * np.quantile(outer.speed_m_s[part < 0], 0.999) == pytest.approx(0.2 * 0.25e-3)
@@ -369,13 +394,13 @@ def test_a_little_blood_may_be_twice_as_fast_as_time_steps_go_by() -> None:
     """As in one narrow branch, which would cost all the vessel its time steps."""
     case, outer = outer_of_demo()
     usual_m_s = np.quantile(outer.speed_m_s, 0.999)
-    few = np.zeros(len(outer.cells), dtype=bool)
+    few = np.zeros(len(outer.centers_mm), dtype=bool)
     few[np.argsort(outer.speed_m_s)[-len(few) // 1500 :]] = True
     assert few.mean() < 1e-3
     for times, longer in ((1.9, 1.0), (4.0, 0.5)):
         speed_m_s = np.where(few, times * usual_m_s, outer.speed_m_s)
         velocity_m_s = outer.velocity_m_s * (speed_m_s / np.maximum(outer.speed_m_s, 1e-12))[:, None]
-        peak_m_s = peak_speed_m_s(case, replace(outer, velocity_m_s=velocity_m_s))
+        peak_m_s = peak_speed_m_s(case, with_values(outer, velocity_m_s=velocity_m_s))
         assert peak_m_s == pytest.approx(1.1 * usual_m_s / longer, rel=2e-3)
 
 

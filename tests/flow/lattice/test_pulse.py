@@ -88,9 +88,11 @@ def steps_of(waveform: Waveform, speed_m_s: np.ndarray | None, way_mm: float = 1
     case = vessel_case(
         trace(Vessel(field.wall)), FlowSettings(waveform=waveform, numerics=Numerics(lattice_speed=0.05))
     )
-    fastest_m_s = np.array([fast(np.linalg.norm(phase.velocity_m_s, axis=1)) for phase in field.phases])
+    fastest_m_s = np.array([fast(np.linalg.norm(phase.velocity_m_s[0], axis=1)) for phase in field.phases])
     phases = [] if speed_m_s is None else zip(field.phases, speed_m_s / fastest_m_s, strict=True)
-    known = replace(field, phases=tuple(replace(phase, velocity_m_s=s * phase.velocity_m_s) for phase, s in phases))
+    known = replace(
+        field, phases=tuple(replace(phase, velocity_m_s=(s * phase.velocity_m_s[0],)) for phase, s in phases)
+    )
     with pytest.MonkeyPatch.context() as patch:
         volume_mm3 = way_mm * case.vessel.inlet.area_mm2
         patch.setattr(lattice_pace, "extended_volume_mm3", lambda vessel: volume_mm3)

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import pi, sqrt
-from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -22,7 +21,7 @@ from scipy.spatial import cKDTree
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow import sampling
-from vstent.flow.case import FlowCase, FlowField, Phase, Swing
+from vstent.flow.case import FlowCase, FlowField, Level, Phase
 from vstent.flow.domain import BEYOND, Domain, Window
 from vstent.geometry.surface import Surface
 from vstent.kernels import sampling as lattice_sampling
@@ -81,7 +80,7 @@ class CloseUp:
     def _tree_beyond(self) -> tuple[cKDTree, Ints]:
         """Return a search tree over the coarse cells outside the region, and the part (n,) of each."""
         beyond = np.flatnonzero(self.part >= 0)
-        return cKDTree(self.outer.centers_mm[beyond]), self.part[beyond]
+        return cKDTree(self.outer.finest.centers_mm[beyond]), self.part[beyond]
 
     @cached_property
     def _sharpened_m_s(self) -> Floats:
@@ -90,7 +89,7 @@ class CloseUp:
         The error of linear interpolation is h^2 t (1 - t) / 2 times the second derivative, on average h^2 / 12 times
         it.
         """
-        outer = self.outer
+        outer = self.outer.finest
         speed, curve = outer.velocity_m_s, np.zeros((len(outer.cells), 3))
         for step in np.eye(3, dtype=np.int32):
             ahead, behind = (outer.index[tuple((outer.cells + sign * step).T)] for sign in (1, -1))
@@ -115,8 +114,8 @@ class CloseUp:
         surface : Surface
             Wall of the vessel, with the extensions of its openings.
         """
-        outer = self.outer
-        cells, weights = lattice_sampling.stencils(outer.index, (points_mm - outer.origin_mm) / outer.cell_size_mm)
+        outer = self.outer.finest
+        cells, weights = lattice_sampling.stencils(outer.index, outer.places(points_mm))
         share = np.where(cells >= 0, weights, 0.0)
         result = np.einsum("mk,mkd->md", share, self._sharpened_m_s[cells])
         beside = np.flatnonzero((cells < 0).any(axis=1))
@@ -160,11 +159,12 @@ def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
         When the vessel has no sac.
     """
     surface, _, sections = domains.extend(case.vessel)
-    graph = _neighbours(outer, surface)
-    sac = sampling.cells_inside(require_sac(case), outer.centers_mm, outer.cell_size_mm)
+    grid = outer.finest
+    graph = _neighbours(grid, surface)
+    sac = sampling.cells_inside(require_sac(case), grid.centers_mm, grid.cell_size_mm)
     distance_mm = dijkstra(graph, directed=False, indices=sac, min_only=True)
     diameter_mm = domains.mean_diameter_mm(case.vessel)
-    ends = _cells_at_ends(outer, sections)
+    ends = _cells_at_ends(grid, sections)
     whole_mm = np.full(len(distance_mm), np.inf)
     part = _parts(graph, distance_mm > DOWNSTREAM_DIAMETERS * diameter_mm, ends)
     near = CloseUp(outer, whole_mm, part, part[ends])
@@ -189,7 +189,7 @@ def volume_mm3(case: FlowCase) -> float:
     return min(abs(sac.volume_mm3) + pi / 4 * diameter_mm**2 * stretch_mm, abs(case.vessel.closed.volume_mm3))
 
 
-def _cells_at_ends(outer: FlowField, sections: Sequence[Floats]) -> Ints:
+def _cells_at_ends(outer: Level, sections: Sequence[Floats]) -> Ints:
     """Return the coarse cell (k,) at the end of every opening's extension, given its end polygon."""
     return np.asarray(cKDTree(outer.centers_mm).query([section.mean(axis=0) for section in sections])[1])
 
@@ -203,16 +203,16 @@ def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints) -> Ints:
     return np.where(np.isin(part, through), np.searchsorted(through, part), -1).astype(np.int32)
 
 
-def _neighbours(field: FlowField, surface: Surface) -> csr_matrix:
+def _neighbours(grid: Level, surface: Surface) -> csr_matrix:
     """Return the distances, mm, between neighbouring cells that are not separated by the wall."""
-    neighbour = domains.neighbours(field.index, field.cells)
+    neighbour = domains.neighbours(grid.index, grid.cells)
     is_open = neighbour >= 0
     is_open[:, 0::2] = False  # count every pair once
-    is_open[domains.septa(surface, neighbour, field.cells, field.origin_mm, field.cell_size_mm)] = False
+    is_open[domains.septa(surface, neighbour, grid.cells, grid.origin_mm, grid.cell_size_mm)] = False
     cell, direction = np.nonzero(is_open)
-    length_mm = field.cell_size_mm * np.linalg.norm(VELOCITIES, axis=1)[direction]
+    length_mm = grid.cell_size_mm * np.linalg.norm(VELOCITIES, axis=1)[direction]
     places = cell, neighbour[cell, direction]
-    return csr_matrix(coo_matrix((length_mm, places), shape=(len(field.cells),) * 2))
+    return csr_matrix(coo_matrix((length_mm, places), shape=(len(grid.cells),) * 2))
 
 
 def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:
@@ -241,7 +241,7 @@ def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:
 
 def _window(chosen: CloseUp, cell_size_mm: float) -> Window:
     """Return the fine grid points in coarse cells within the region, or next to one at the wall."""
-    outer = chosen.outer
+    outer = chosen.outer.finest
     inner = outer.cells[chosen.part < 0]
     low = inner.min(axis=0) - 2
     shape = inner.max(axis=0) - low + 3
@@ -256,41 +256,8 @@ def _window(chosen: CloseUp, cell_size_mm: float) -> Window:
     return Window(corner_mm, fine)
 
 
-class _Patchwork(NamedTuple):
-    """Combination of the refined region and the coarser flow around it into one field."""
-
-    outer: FlowField
-    """Flow on the coarser grid."""
-    around_mm: Floats
-    """(k, 3) centres of the fine cells into which the coarse cells outside the region are divided."""
-    order: Ints
-    """(n,) order of the combined field's cells: the region's cells, then those outside, by number."""
-    is_fine: Bools
-    """(v,) whether a wall vertex has fine cells all around."""
-
-    def at_moment(self, fine: Phase | FlowField, wide: FlowField) -> tuple[Floats, Floats, Floats]:
-        """Return velocity (n, 3), pressure (n,) and wall shear stress (v, 3) of the combined field at one moment."""
-        around = sampling.values_at(wide, self.around_mm)
-        within = fine.velocity_m_s, fine.pressure_Pa
-        velocity_m_s, pressure_Pa = (np.concatenate(pair)[self.order] for pair in zip(within, around, strict=True))
-        stress_Pa = np.where(self.is_fine[:, None], fine.wall_shear_stress_Pa, wide.wall_shear_stress_Pa)
-        return velocity_m_s, pressure_Pa, stress_Pa
-
-    def swing(self, fine: Swing) -> Swing:
-        """Return the mean magnitudes of an unsteady flow, from the region and elsewhere from the coarser flow."""
-        speed_m_s = np.concatenate([fine.speed_m_s, sampling.speed_at(self.outer, self.around_mm)])[self.order]
-        return Swing(speed_m_s, np.where(self.is_fine, fine.shear_Pa, self.outer.shear_Pa))
-
-    def phases(self, inner: FlowField) -> tuple[Phase, ...]:
-        """Return the phases of a pulse, with the flow rates of the openings from the coarser flow."""
-        return tuple(
-            Phase(fine.time_s, wide.inlets_mL_s, wide.outlets_mL_s, *self.at_moment(fine, self.outer.at_phase(wide)))
-            for fine, wide in zip(inner.phases, self.outer.phases, strict=True)
-        )
-
-
 def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
-    """Return one field on the fine grid: the refined region, and the interpolated coarser flow around it.
+    """Return one field of both grids: the whole vessel on the coarser one, and the refined region.
 
     Parameters
     ----------
@@ -299,26 +266,26 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
     inner : FlowField
         Flow in the region.
     """
-    outer = chosen.outer
-    beyond = outer.cells[chosen.part >= 0]
-    children = (WIDTH * beyond[:, None] + np.indices((WIDTH,) * 3).reshape(3, -1).T).reshape(-1, 3)
-    corner_mm = outer.origin_mm - 0.5 * (outer.cell_size_mm - inner.cell_size_mm)
-    shift = np.rint((inner.origin_mm - corner_mm) / inner.cell_size_mm).astype(np.int32)
-    cells = np.concatenate([inner.cells + shift, children])
-    order = np.lexsort(cells.T[::-1])
-    is_fine = _is_well_within(chosen, inner.wall)
-    whole = _Patchwork(outer, corner_mm + children * inner.cell_size_mm, order, is_fine)
-    velocity_m_s, pressure_Pa, stress_Pa = whole.at_moment(inner, outer)
+    outer, is_fine = chosen.outer, _is_well_within(chosen, inner.wall)
+
+    def of_wall(fine: Floats, wide: Floats) -> Floats:
+        return np.asarray(np.where(is_fine if fine.ndim == 1 else is_fine[:, None], fine, wide))
+
     return replace(
         inner,
-        cells=cells[order],
-        origin_mm=corner_mm,
-        velocity_m_s=velocity_m_s,
-        pressure_Pa=pressure_Pa,
-        wall_shear_stress_Pa=stress_Pa,
-        wall_pressure_Pa=np.where(is_fine, inner.wall_pressure_Pa, outer.wall_pressure_Pa),
-        phases=whole.phases(inner),
-        swing=None if inner.swing is None else whole.swing(inner.swing),
+        levels=(*outer.levels, *inner.levels),
+        wall_shear_stress_Pa=of_wall(inner.wall_shear_stress_Pa, outer.wall_shear_stress_Pa),
+        wall_pressure_Pa=of_wall(inner.wall_pressure_Pa, outer.wall_pressure_Pa),
+        mean_shear_Pa=None if inner.mean_shear_Pa is None else of_wall(inner.mean_shear_Pa, outer.shear_Pa),
+        phases=tuple(
+            replace(
+                wide,
+                velocity_m_s=(*wide.velocity_m_s, *fine.velocity_m_s),
+                pressure_Pa=(*wide.pressure_Pa, *fine.pressure_Pa),
+                wall_shear_stress_Pa=of_wall(fine.wall_shear_stress_Pa, wide.wall_shear_stress_Pa),
+            )
+            for fine, wide in zip(inner.phases, outer.phases, strict=True)
+        ),
         inlets_mL_s=outer.inlets_mL_s,
         outlets_mL_s=outer.outlets_mL_s,
         inlet_pressure_Pa=outer.inlet_pressure_Pa,
@@ -326,15 +293,15 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
         is_converged=inner.is_converged and outer.is_converged,
         unsettled_fraction=max(inner.unsettled_fraction, outer.unsettled_fraction),
         advice=(
-            f"{inner.advice} The grid spacing is {inner.cell_size_mm:.3g} mm in and near the sac and "
-            f"{outer.cell_size_mm:.3g} mm elsewhere; there: {outer.advice}"
+            f"{inner.advice} The grid spacing is {inner.finest.cell_size_mm:.3g} mm in and near the sac and "
+            f"{outer.finest.cell_size_mm:.3g} mm elsewhere; there: {outer.advice}"
         ),
     )
 
 
 def _is_well_within(chosen: CloseUp, wall: Surface) -> Bools:
     """Return whether each vertex (v,) of the wall has fine cells all around."""
-    outer = chosen.outer
+    outer = chosen.outer.finest
     behind_mm = wall.vertices_mm - 0.5 * outer.cell_size_mm * wall.vertex_normals
     nearest = cKDTree(outer.centers_mm).query(behind_mm)[1]
     return np.asarray(chosen.depth_mm[nearest] > RIM_CELLS * outer.cell_size_mm)

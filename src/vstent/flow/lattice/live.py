@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from vstent.flow.case import FlowCase, FlowField, Sheet, Target
+from vstent.flow.case import FlowCase, FlowField, Level, Sheet, Target
 from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
 from vstent.flow.engines import DivergenceError, Outcome, Saved, stepped
 from vstent.flow.lattice.checkpoint import pack
@@ -315,16 +315,12 @@ class LiveFlow:
     def field(self) -> FlowField:
         """Return the present flow in the refined region, for streamlines: only its velocity is meaningful."""
         now, domain, wall = snapshot(self.state), self.state.domain, self.case.vessel.lumen
-        n, outer = len(wall.vertices_mm), self.outer
+        n, outer, grid = len(wall.vertices_mm), self.outer, (domain.cells, domain.origin_mm, domain.cell_size_mm)
         return replace(
             outer,
-            cells=domain.cells,
-            origin_mm=domain.origin_mm,
-            cell_size_mm=domain.cell_size_mm,
-            velocity_m_s=now.velocity_m_s.astype(np.float64),
-            pressure_Pa=now.pressure_Pa.astype(np.float64),
+            levels=(Level(*grid, now.velocity_m_s.astype(np.float64), now.pressure_Pa.astype(np.float64)),),
             wall_shear_stress_Pa=np.zeros((n, 3)),
-            swing=None,
+            mean_shear_Pa=None,
         )
 
 

@@ -50,8 +50,7 @@ def peak_speed_m_s(case: FlowCase, start: FlowField | None, close_up: CloseUp | 
         Refined region: only the blood within it counts.
     """
     if start is not None:
-        within = slice(None) if close_up is None else close_up.part < 0
-        speed_m_s = start.speed_m_s[within]
+        speed_m_s = start.speed_m_s if close_up is None else start.finest.speed_m_s[close_up.part < 0]
         return FASTER * float(max(np.quantile(speed_m_s, 1 - FEW), speed_m_s.max() / HASTE))
     at_outlets_m_s = 3.0 * case.inflow_mL_s / sum(outlet.area_mm2 for outlet in case.vessel.outlets)
     return float(max(3.0 * case.inlet_speeds_m_s.max(), at_outlets_m_s))

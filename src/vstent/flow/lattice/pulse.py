@@ -43,7 +43,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
         for k, snapshot in enumerate(state.snapshots):
             flow = read(state, [snapshot])
             time_s = (k + 1) * state.check_s
-            moment = flow.velocity_m_s, flow.pressure_Pa, flow.wall_shear_stress_Pa
+            moment = (flow.velocity_m_s,), (flow.pressure_Pa,), flow.wall_shear_stress_Pa
             phases.append(Phase(time_s, flow.inlets_mL_s, flow.outlets_mL_s, *moment))
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])
         advice = cycles_advice(changes, len(state.history) // PHASES, is_converged=outcome.is_converged)

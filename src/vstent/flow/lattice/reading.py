@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.flow import domain as domains
-from vstent.flow.case import FlowField, Phase, Swing
+from vstent.flow.case import FlowField, Level, Phase
 from vstent.flow.engines import Outcome
 from vstent.flow.lattice import close_up as close_ups
 from vstent.flow.lattice.setup import CELL_REYNOLDS
@@ -32,8 +32,10 @@ class Reading:
     """(i,) flow rate into every inlet; nan where a refined region does not reach it."""
     outlets_mL_s: Floats
     """(k,) flow rate out of every outlet; nan likewise, 0 where no cell of the grid reaches it."""
-    swing: Swing | None = None
-    """Mean speed and mean wall shear magnitude of an unsteady flow; None for a steady one."""
+    mean_speed_m_s: Floats | None = None
+    """(n,) time-averaged speed of an unsteady flow; None for a steady one."""
+    mean_shear_Pa: Floats | None = None
+    """(v,) time-averaged magnitude of its wall shear stress; None for a steady one."""
     neck_inflow_mL_s: float | None = None
     """Time average of the neck inflow of an unsteady flow; None for a steady one."""
 
@@ -64,7 +66,7 @@ def read_moving(state: State, snapshots: Sequence[Snapshot]) -> Reading:
     shear_Pa = mean_shear_Pa(state.domain, flow.velocity_m_s, speed_m_s, lumen=case.vessel.lumen, blood=case.blood)
     checks = sum(one.checks for one in snapshots)
     inflow_mL_s = float(np.array(state.history)[-checks:, NECK_INFLOW:].mean(axis=0).sum())
-    return replace(flow, swing=Swing(speed_m_s, shear_Pa), neck_inflow_mL_s=inflow_mL_s)
+    return replace(flow, mean_speed_m_s=speed_m_s, mean_shear_Pa=shear_Pa, neck_inflow_mL_s=inflow_mL_s)
 
 
 def _mean(snapshots: Sequence[Snapshot], values: Iterable[Floats | NDArray[np.float32]]) -> Floats:
@@ -96,12 +98,9 @@ def field_of(
     domain, vessel = state.domain, state.case.vessel
     section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
+    grid = domain.cells, domain.origin_mm, domain.cell_size_mm
     field = FlowField(
-        cells=domain.cells,
-        origin_mm=domain.origin_mm,
-        cell_size_mm=domain.cell_size_mm,
-        velocity_m_s=flow.velocity_m_s,
-        pressure_Pa=flow.pressure_Pa,
+        levels=(Level(*grid, flow.velocity_m_s, flow.pressure_Pa, flow.mean_speed_m_s),),
         wall=vessel.lumen,
         wall_shear_stress_Pa=flow.wall_shear_stress_Pa,
         wall_pressure_Pa=flow.wall_pressure_Pa,
@@ -118,7 +117,7 @@ def field_of(
         seconds=outcome.seconds,
         updates_per_s=len(domain.cells) * state.steps / state.loop_seconds,
         phases=phases,
-        swing=flow.swing,
+        mean_shear_Pa=flow.mean_shear_Pa,
         neck_inflow_mL_s=flow.neck_inflow_mL_s,
     )
     return field if state.close_up is None else close_ups.assembled(state.close_up, field)
@@ -136,5 +135,6 @@ def _of_the_grid(state: State, flow: Reading, phases: tuple[Phase, ...]) -> str:
         narrow = domains.too_narrow(state.case, state.domain.cell_size_mm)
         narrow += domains.unreached(state.case.vessel, state.domain)
     is_vessel = np.repeat(state.limit, state.addressing.length) == CELL_REYNOLDS
-    speed_m_s = np.max([np.linalg.norm(moment.velocity_m_s, axis=1) for moment in phases or (flow,)], axis=0)
+    moments_m_s = [phase.velocity_m_s[0] for phase in phases] or [flow.velocity_m_s]
+    speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)
     return narrow + domains.too_fast(state.domain, np.where(is_vessel, speed_m_s, 0.0), state.case.blood, CELL_REYNOLDS)

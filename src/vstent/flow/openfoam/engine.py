@@ -14,7 +14,7 @@ import numpy as np
 
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
-from vstent.flow.case import PHASES, FlowCase, FlowField, Phase, Swing
+from vstent.flow.case import PHASES, FlowCase, FlowField, Level, Phase
 from vstent.flow.cycles import cycle_change, cycles_advice, pulse_of
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.openfoam import folder as folders
@@ -226,13 +226,11 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
     pressure_Pa, outflow_mL_s = mean("pressure_Pa"), mean("outflow_mL_s")
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(domains.section_pressure_Pa(vessel, domain, pressure_Pa))
     backwards_mL_s, outlets_mL_s = vessel.of_inlets_and_outlets(outflow_mL_s)
+    grid = domain.cells, domain.origin_mm, domain.cell_size_mm
+    speed_m_s, shear_Pa = (None, None) if state.is_pulse or len(kept) == 1 else mean_magnitudes(kept)
     steps = len(state.history) * (1 if state.is_pulse else CHECK_ITERATIONS)
     return FlowField(
-        cells=domain.cells,
-        origin_mm=domain.origin_mm,
-        cell_size_mm=domain.cell_size_mm,
-        velocity_m_s=mean("velocity_m_s"),
-        pressure_Pa=pressure_Pa,
+        levels=(Level(*grid, mean("velocity_m_s"), pressure_Pa, speed_m_s),),
         wall=vessel.lumen,
         wall_shear_stress_Pa=mean("wall_shear_stress_Pa"),
         wall_pressure_Pa=mean("wall_pressure_Pa"),
@@ -249,16 +247,16 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
         seconds=outcome.seconds,
         updates_per_s=state.bridge.n_cells * steps / max(state.loop_seconds, 1e-9),
         phases=_phases(state.case, kept) if state.is_pulse else (),
-        swing=None if state.is_pulse or len(kept) == 1 else swing_of(kept),
+        mean_shear_Pa=shear_Pa,
         neck_inflow_mL_s=float(mean("neck_inflow_mL_s")),
     )
 
 
-def swing_of(kept: list[Snapshot]) -> Swing:
-    """Return the mean magnitudes over the last checks of a steady solver that does not converge."""
+def mean_magnitudes(kept: list[Snapshot]) -> tuple[Floats, Floats]:
+    """Return mean speed (n,) and mean wall shear stress (v,) of the checks of a steady solver that did not converge."""
     speed_m_s = np.mean([np.linalg.norm(one.velocity_m_s, axis=1) for one in kept], axis=0)
     shear_Pa = np.mean([np.linalg.norm(one.wall_shear_stress_Pa, axis=1) for one in kept], axis=0)
-    return Swing(speed_m_s, shear_Pa)
+    return np.asarray(speed_m_s), np.asarray(shear_Pa)
 
 
 def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
@@ -267,7 +265,7 @@ def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
 
     def phase(k: int, one: Snapshot) -> Phase:
         backwards_mL_s, outlets_mL_s = case.vessel.of_inlets_and_outlets(one.outflow_mL_s)
-        moment = one.velocity_m_s, one.pressure_Pa, one.wall_shear_stress_Pa
+        moment = (one.velocity_m_s,), (one.pressure_Pa,), one.wall_shear_stress_Pa
         return Phase((k + 1) * phase_s, -backwards_mL_s, outlets_mL_s, *moment, one.neck_inflow_mL_s)
 
     return tuple(phase(k, one) for k, one in enumerate(cycle))
