@@ -22,7 +22,7 @@ TEXTS = [HERE / "README.md", HERE / "CONTRIBUTING.md"]
 PAGES = [page for page in sorted((HERE / "docs").rglob("*.rst")) if not {"_build", "examples"} & set(page.parts)]
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 LITERAL = re.compile(r"(?:::|^ *\.\. (?:code-block|doctest):: ?(\w*))\n\n((?:(?: +.*)?\n)+)", re.MULTILINE)
-COARSE = vstent.FlowSettings(cell_size_mm=0.5)
+COARSE = vstent.FlowSettings(numerics=vstent.Numerics(cell_size_mm=0.5))
 
 
 def blocks(path: Path, language: str) -> list[str]:
@@ -70,21 +70,20 @@ def test_readme_says_the_number_of_a_run(
     monkeypatch.setattr(simulation, "simulate", partial(simulation.simulate, settings=COARSE))
     monkeypatch.chdir(inputs)
     names, (line,) = play(HERE / "README.md", capsys)
-    studied = vstent.run(
-        Path("3dra"), tmp_path, vstent.Settings(devices=("silk",), flow=None), lambda stage, fraction, detail: None
-    )
+    settings = vstent.Settings(treatments=(vstent.read_treatment("silk"),), flow=None)
+    studied = vstent.run(Path("3dra"), tmp_path, settings, lambda stage, fraction, detail: None)
     anatomy, silk, change = (names[key] for key in ("anatomy", "silk", "change"))
     assert studied.metrics["vessel"] == vstent.morphology(anatomy)
-    assert studied.metrics["stents"]["silk"]["deployment"] == vstent.measure(anatomy, silk)
+    deployed = studied.metrics["treatments"]["silk"]["implants"]["silk"]
+    assert deployed == {"bands": deployed["bands"]} | vstent.measure(anatomy, silk)
     flows = {"bare": names["before"], "silk": names["after"]}
-    measured = measure_all(studied.anatomy, studied.deployments, flows, COARSE)
-    stent = measured["stents"]["silk"]
-    left = {key: measured["bare"][key] for key in measured["bare"].keys() - change.keys()}
-    assert left.keys() == {"unsettled_fraction"}
-    assert {key: one.before for key, one in change.items()} | left == measured["bare"]
-    assert {key: one.after for key, one in change.items()}.items() <= stent["flow"].items()
-    assert {f"{key}_ratio": one.ratio for key, one in change.items()} == stent["ratios"]
-    assert line == f"neck inflow with Silk / without: {stent['ratios']['neck_inflow_mL_s_ratio']:.2f}"
+    measured = measure_all(studied.anatomy, studied.implants, flows, COARSE)["treatments"]
+    bare, stented = (measured[name] for name in flows)
+    assert {key: one.before for key, one in change.items()}.items() <= bare["flow"].items()
+    assert bare["flow"].keys() - change.keys() == {"unsettled_fraction"}
+    assert {key: one.after for key, one in change.items()}.items() <= stented["flow"].items()
+    assert {f"{key}_ratio": one.ratio for key, one in change.items()} == stented["change"]
+    assert line == f"neck inflow with Silk / without: {stented['change']['neck_inflow_mL_s_ratio']:.2f}"
     assert 0.5 < change["neck_inflow_mL_s"].ratio < 0.8
 
 

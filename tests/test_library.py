@@ -30,11 +30,17 @@ from vstent.geometry.vessel import Anatomy, Vessel
 
 API = Path(__file__).parents[1] / "docs" / "reference" / "api.rst"
 NAMES = (
+    "AnatomySettings",
     "AngiogramSettings",
     "FlowSettings",
     "Image",
+    "Implant",
+    "InputSettings",
     "Landing",
+    "Numerics",
+    "Placing",
     "Settings",
+    "Treatment",
     "angiogram",
     "catalogue",
     "compare",
@@ -47,6 +53,7 @@ NAMES = (
     "ostium",
     "rank",
     "read_image",
+    "read_treatment",
     "read_vessel",
     "report",
     "restore",

@@ -13,7 +13,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import vstent
-from vstent.flow.settings import FlowSettings, Numerics
 from vstent.phantoms import Scanner, demo_phantom, scan
 
 phantom = demo_phantom()
@@ -59,7 +58,7 @@ axes.legend()
 # %%
 # The flow before and after, on cells far too coarse for a result (0.45 mm) but quick.
 
-settings = FlowSettings(numerics=Numerics(cell_size_mm=0.45))
+settings = vstent.FlowSettings(numerics=vstent.Numerics(cell_size_mm=0.45))
 before, after = vstent.simulate(anatomy, [None, silk], settings)
 change = vstent.compare(anatomy, before, after)["mean_sac_velocity_m_s"]
 print(f"mean velocity in the sac, with over without the device: {change.ratio:.2f}")

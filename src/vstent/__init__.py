@@ -22,16 +22,23 @@ if TYPE_CHECKING:
     from vstent.devices.catalogue import find_design as find_design
     from vstent.devices.catalogue import find_size as find_size
     from vstent.devices.stent import Landing as Landing
+    from vstent.devices.treatment import Implant as Implant
+    from vstent.devices.treatment import Placing as Placing
+    from vstent.devices.treatment import Treatment as Treatment
+    from vstent.devices.treatment import read_treatment as read_treatment
     from vstent.flow.indices import compare as compare
     from vstent.flow.indices import indices as indices
     from vstent.flow.ostium import ostium as ostium
     from vstent.flow.settings import FlowSettings as FlowSettings
+    from vstent.flow.settings import Numerics as Numerics
     from vstent.flow.simulation import simulate as simulate
     from vstent.geometry.image import Image as Image
     from vstent.io.images import read_image as read_image
     from vstent.plan.rank import rank as rank
     from vstent.reporting.page import report as report
     from vstent.study.pipeline import run as run
+    from vstent.study.types import AnatomySettings as AnatomySettings
+    from vstent.study.types import InputSettings as InputSettings
     from vstent.study.types import Settings as Settings
 
 _HOMES = {
@@ -54,12 +61,19 @@ _HOMES = {
     "ostium": "vstent.flow.ostium",
     "angiogram": "vstent.angiography.angiogram",
     "rank": "vstent.plan.rank",
+    "read_treatment": "vstent.devices.treatment",
     "run": "vstent.study.pipeline",
     "report": "vstent.reporting.page",
     "Image": "vstent.geometry.image",
     "Landing": "vstent.devices.stent",
     "FlowSettings": "vstent.flow.settings",
+    "Numerics": "vstent.flow.settings",
     "AngiogramSettings": "vstent.angiography.angiogram",
+    "Treatment": "vstent.devices.treatment",
+    "Implant": "vstent.devices.treatment",
+    "Placing": "vstent.devices.treatment",
+    "InputSettings": "vstent.study.types",
+    "AnatomySettings": "vstent.study.types",
     "Settings": "vstent.study.types",
 }
 """Module that defines each public function and data class."""
