@@ -44,12 +44,6 @@ EXCEPTIONS = {
     ("CHANGELOG.md", r"(?<!shear-)(?<!shear )\bthinning\b"): "the list of old names",
     ("src/vstent/io/archive.py", r"\bnouns?\b"): "a key of the files",
     ("src/vstent/reporting/page.py", r"(?<!shear-)(?<!shear )\bthinning\b"): "a key of run.json",
-    (
-        "src/vstent/cli/options.py",
-        r"--(cell-size|close-up|device-gpu|uncertain-flows|crate)\b",
-    ): "the table of old names",
-    ("src/vstent/cli/options.py", r"(?<!shear-)--thinning\b"): "the table of old names",
-    ("src/vstent/cli/options.py", r"(?<!shear-)(?<!shear )\bthinning\b"): "the table of old names",
 }
 """File and expression -> why it may stand there."""
 

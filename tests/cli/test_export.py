@@ -10,13 +10,14 @@ from shapes import sphere
 
 from vstent import phantoms
 from vstent.cli import main
+from vstent.devices.treatment import with_device
 from vstent.flow.openfoam.dictionary import parse
 from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.io.vtk_child import read_apart
 from vstent.io.writers import write_stl
 from vstent.study.pipeline import run
-from vstent.study.types import Settings
+from vstent.study.types import InputSettings, Settings
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,8 @@ def artery(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def studied(artery: Path) -> Path:
     out = artery.parent / "case"
-    run(artery, out, Settings(devices=("enterprise",), units="mm", center_mm=26.0, flow=None), lambda *_: None)
+    placed = with_device("enterprise", center_mm=26.0)
+    run(artery, out, Settings(InputSettings(units="mm"), treatments=(placed,), flow=None), lambda *_: None)
     return out
 
 
@@ -38,7 +40,7 @@ def test_where_a_device_lies_is_not_guessed(studied: Path, tmp_path: Path, capsy
     (tmp_path / "case" / "run.json").write_text("{")
     words = ["export", "openfoam", str(tmp_path / "case"), "--device", "enterprise", "--out", str(tmp_path / "foam")]
     assert main(words) == 2
-    assert "so the position of the device is unknown" in " ".join(capsys.readouterr().err.split())
+    assert "run the case again" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "foam").exists()
 
 
@@ -70,7 +72,7 @@ def test_an_openfoam_case_of_a_studied_case_has_its_device_over_the_neck(studied
     assert not (out / ".vstent").exists()
     geometry = parse((out / "system" / "snappyHexMeshDict").read_text())["geometry"]
     assert set(geometry) == {"lumen", "neck", "struts", "before_outlet_2"}  # the branch is narrow
-    whole = Surface(*read_apart(studied / "stents" / "enterprise" / "struts.stl")[:2])
+    whole = Surface(*read_apart(studied / "treatments" / "enterprise" / "implants" / "enterprise" / "struts.stl")[:2])
     near = Surface(*read_apart(out / "constant" / "triSurface" / "struts.stl")[:2])
     assert 0.2 < near.area_mm2 * 1e6 / whole.area_mm2 < 0.5
     assert whole.closest(near.vertices_mm * 1e3)[1].max() < 0.01  # the last section before a cut turns a little
@@ -86,9 +88,30 @@ def test_an_openfoam_case_of_a_studied_case_has_its_device_over_the_neck(studied
 def test_a_studied_vessel_is_not_found_otherwise(
     what: str, studied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--upstream", "9", "--at", "1,2,3"]
+    words = ["--upstream", "9", "--downstream", "9", "--frame", "ras", "--acquisition", "2", "--units", "mm"]
+    words += ["--crop", "0,0,0,9,9,9", "--spacing", "0.2", "--shape", "9,9,9", "--threshold", "5"]
+    words += ["--at", "1,2,3", "--inlet", "1,2,3", "--outlet", "1,2,3"]
     assert main(["export", what, str(studied), "--out", str(tmp_path / "out"), *words]) == 2
-    assert "leave out --at (at_mm), --upstream (upstream_mm)" in " ".join(capsys.readouterr().err.split())
+    named = " ".join(capsys.readouterr().err.split()).split("leave out ")[1].split(", ")
+    assert sorted(named) == sorted(word for word in words if word.startswith("--"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_size_that_is_given_is_not_that_of_the_case(
+    studied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--treatment", "enterprise 9x9"]
+    assert main(["export", "openfoam", str(studied), "--out", str(tmp_path / "out"), *words]) == 2
+    assert "Enterprise is not made in 9 mm x 9 mm" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_openfoam_case_holds_one_treatment(
+    studied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--device", "silk", "--device", "enterprise"]
+    assert main(["export", "openfoam", str(studied), "--out", str(tmp_path / "out"), *words]) == 2
+    assert "give one --device or --treatment" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

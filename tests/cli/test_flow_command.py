@@ -97,8 +97,8 @@ def test_what_excludes_each_other_is_refused(words: list[str], capsys: pytest.Ca
     ("words", "said"),
     [
         (["--engine", "nonsense"], "There is no 'nonsense'"),
-        (["--engine", "openfoam", "--close-up"], "does not support a finer grid"),
-        (["--engine", "openfoam", "--device-gpu"], "does not support a GPU"),
+        (["--engine", "openfoam", "--refine-sac"], "does not support a finer grid"),
+        (["--engine", "openfoam", "--gpu"], "does not support a GPU"),
     ],
 )
 def test_an_engine_is_refused_before_anything_is_read(

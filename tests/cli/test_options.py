@@ -1,41 +1,13 @@
-"""Options: old names are accepted with a notice, and every command's help has an example that parses."""
+"""Options: every help has an example that parses, every option is explained, and a device is given once."""
 
 import argparse
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 
 from vstent import cli
-from vstent.cli.options import RENAMED, renamed
-
-VALUES = {"--cell-size": ["0.2"], "--uncertain-flows": ["2"]}
-"""Values of the options that take one."""
-COMMAND_OF = {"--files": "batch"}
-"""Command that has the option, where that is not ``run``."""
-
-
-@pytest.mark.parametrize("joined", [False, True])
-@pytest.mark.parametrize("old", RENAMED)
-def test_an_old_name_gives_what_the_new_one_gives_and_a_notice(old: str, joined: bool) -> None:
-    values = VALUES.get(old, [])
-    words = [COMMAND_OF.get(old, "run"), "input", "--out", "out"]
-    given = [f"{old}={values[0]}"] if joined and values else [old, *values]
-    now, notices = renamed([*words, *given])
-    assert vars(cli._parser().parse_args(now)) == vars(cli._parser().parse_args([*words, RENAMED[old], *values]))
-    assert notices == [f"{old} is now called {RENAMED[old]}; the old name is accepted until version 0.3."]
-    with pytest.raises(SystemExit):
-        cli._parser().parse_args([*words, old, *values])  # only through the notice
-
-
-def test_the_notice_is_printed_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["run", "no.stl", "--out", "out", "--device-gpu", "--no-flow"]) == 2
-    assert "vstent: note: --device-gpu is now called --gpu" in capsys.readouterr().err
-
-
-def test_new_names_get_no_notice() -> None:
-    words = ["run", "in", "--grid-spacing", "0.1", "--gpu"]
-    assert renamed(words) == (words, [])
 
 
 def parsers(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
@@ -53,6 +25,17 @@ def test_every_help_has_a_summary_and_an_example_that_parses(command: argparse.A
     assert example[1].startswith(command.prog.removeprefix("vstent "))
     assert cli._parser().parse_args(shlex.split(example[1])).command
     assert "Research use only" in text
+
+
+@pytest.mark.parametrize("command", ["run", "flow", "rank"])
+@pytest.mark.parametrize("names", [("silk", "silk"), ("silk", "Silk")])
+def test_a_device_that_is_given_twice_is_refused(
+    command: str, names: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [word for name in names for word in ("--device", name)]
+    assert cli.main([command, str(tmp_path / "none.stl"), "--out", str(tmp_path / "out"), *words]) == 2
+    said = "give each --device once" if command == "rank" else "treatments are called silk: give each a name of its own"
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", parsers(cli._parser())[1:], ids=lambda one: one.prog)

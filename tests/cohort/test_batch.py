@@ -229,6 +229,7 @@ BAD_LISTS = {
     "a name with a slash": ("case,input\n../up,a.stl\n", "without slashes"),
     "one name twice": ("case,input\nx,a.stl\nx,b.stl\n", "two cases called x"),
     "no case at all": ("case,input\n", "holds no case"),
+    "one device twice": ("input,devices\na.stl,silk silk\n", "list.csv: two treatments are called silk"),
     "a device that does not exist": ("input,devices\na.stl,slik\n", "silk"),
 }
 

@@ -12,7 +12,7 @@ from typing import Final
 
 from vstent.cli import angiogram, app, batch, demo, devices, export, flow, rank, restore, run, trace
 from vstent.cli.interrupt import borne_interrupts
-from vstent.cli.options import EPILOG, renamed
+from vstent.cli.options import EPILOG
 from vstent.errors import InputError, VstentError
 
 COMMANDS: Final = (run, app, trace, restore, rank, batch, flow, angiogram, export, demo, devices)
@@ -42,10 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # The linear systems are too small for several threads of the linear algebra library.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with borne_interrupts():
-        words, notices = renamed(sys.argv[1:] if argv is None else argv)
-        for notice in notices:
-            print(f"vstent: note: {notice}", file=sys.stderr)
-        return _done(_parser().parse_args(words))
+        return _done(_parser().parse_args(argv))
 
 
 def _done(arguments: argparse.Namespace) -> int:

@@ -20,16 +20,8 @@ if TYPE_CHECKING:
 
 EPILOG: Final = "Lengths are in mm, coordinates are LPS. Research use only: not cleared for diagnosis or treatment."
 """Last line of every help text."""
-RENAMED: Final = {
-    "--cell-size": "--grid-spacing",
-    "--close-up": "--refine-sac",
-    "--thinning": "--shear-thinning",
-    "--device-gpu": "--gpu",
-    "--uncertain-flows": "--uncertainty-flows",
-    "--files": "--keep-files",
-    "--crate": "--ro-crate",
-}
-"""Option names of version 0.1 that are accepted until version 0.3, and their present names."""
+DEVICES: Final = ("silk", "enterprise")
+"""Devices where none is given: those of the paper."""
 PUBLISHED: Final = "published"
 """Value of ``--pulsatile`` without a file: the published waveform."""
 LONGEST_CYCLE_S: Final = 3.0
@@ -39,17 +31,6 @@ SHORTEST_CYCLE_S: Final = 0.2
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Parser to which every command adds itself."""
-
-
-def renamed(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a command line with present option names, and a notice for every old name in it."""
-    words, notices = [], []
-    for word in argv:
-        name, equals, value = word.partition("=")
-        words.append(RENAMED.get(name, name) + equals + value)
-        if name in RENAMED:
-            notices.append(f"{name} is now called {RENAMED[name]}; the old name is accepted until version 0.3.")
-    return words, notices
 
 
 def number(text: str) -> float:
@@ -509,15 +490,8 @@ def _neck(path: Path | None) -> tuple[tuple[float, float, float], ...] | None:
     return None if path is None else tuple((x, y, z) for x, y, z in read_columns(path, 3).tolist())
 
 
-def given_devices(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """Return the names of the devices; by default silk and enterprise, the devices of the paper."""
-    return tuple(arguments.device or ("silk", "enterprise"))
-
-
-def given_treatments(
-    arguments: argparse.Namespace, usual: Sequence[str] = ("silk", "enterprise")
-) -> "tuple[Treatment, ...]":
-    """Return the treatments that the options state; where none is, those of the usual devices (of the paper)."""
+def given_treatments(arguments: argparse.Namespace, usual: Sequence[str] = DEVICES) -> "tuple[Treatment, ...]":
+    """Return the treatments that the options state; where none is, those of the usual devices."""
     from vstent.devices.treatment import with_device
 
     size = {

@@ -66,7 +66,10 @@ def _rank(arguments: argparse.Namespace) -> int:
         raise InputError("Contrast moves with a flow. Give --flow N with --retention.")
     if (arguments.scheduler or arguments.slurm) and not arguments.flow_count:
         raise InputError("A cluster computes the flows of a ranking. Give --flow N with --scheduler or --slurm.")
-    designs = [find_design(name) for name in options.given_devices(arguments)]
+    devices = arguments.device or options.DEVICES
+    designs = {design.key: design for design in map(find_design, devices)}
+    if len(designs) < len(devices):
+        raise InputError("A device is given twice, and all its sizes are ranked at once: give each --device once.")
     criteria = read_criteria(arguments.criteria) if arguments.criteria else default_criteria()
     console = Console()
     settings = Settings(treatments=(), flow=None, **options.given_geometry(arguments))
@@ -76,7 +79,7 @@ def _rank(arguments: argparse.Namespace) -> int:
         )
         ranking = rank(
             anatomy,
-            designs,
+            tuple(designs.values()),
             criteria=criteria,
             shifts_mm=arguments.shift,
             jobs=arguments.jobs,

@@ -129,17 +129,20 @@ def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Cas
     name = given.get("case", _name(path))
     if Path(name).name != name:
         raise InputError(f"{where} names its case {name!r}: give a name without slashes")
-    changed = replace(
-        settings,
-        input=replace(settings.input, **found["input"]),
-        anatomy=replace(settings.anatomy, **found["anatomy"]),
-        treatments=_treatments(settings.treatments, **found["treatments"]),
-    )
+    try:
+        changed = replace(
+            settings,
+            input=replace(settings.input, **found["input"]),
+            anatomy=replace(settings.anatomy, **found["anatomy"]),
+            treatments=_treatments(settings.treatments, **found["treatments"]),
+        )
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
     return Case(name, path, changed)
 
 
 def _treatments(
-    usual: tuple[Treatment, ...], *, devices: tuple[str, ...] | None = None, **size: float
+    usual: tuple[Treatment, ...], *, devices: Sequence[str] | None = None, **size: float
 ) -> tuple[Treatment, ...]:
     """Return the treatments with the devices of a row, or the usual ones, each with the size and place of the row."""
     if devices is None and not size:
@@ -196,13 +199,8 @@ def _points(text: str) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(values[k : k + 3]) for k in range(0, len(values), 3))
 
 
-def _devices(text: str) -> tuple[str, ...]:
-    """Return names of devices read from text, each once."""
-    return tuple(dict.fromkeys(_words(text)))
-
-
 COLUMNS: Final[dict[str, tuple[str, str, Callable[[str], Any]]]] = {
-    "devices": ("treatments", "devices", _devices),
+    "devices": ("treatments", "devices", _words),
     "units": ("input", "units", _units),
     "threshold": ("input", "threshold", finite),
     "at": ("anatomy", "at_mm", _three(finite)),

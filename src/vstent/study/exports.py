@@ -123,7 +123,7 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
         if getattr(part, field.name) is not None
     ]
     if given:
-        words = ", ".join(name.removesuffix("_mm").replace("_", " ") for name in given)
+        words = ", ".join(f"--{name.removesuffix('_mm')}" for name in given)
         raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
     with ledger.stage("anatomy") as tell:
         anatomy = load_data(kept[-1], Anatomy)
@@ -132,12 +132,13 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
 
 
 def _implants(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> list[Stent]:
-    """Return the implants of the first treatment, sized and placed as in the case folder's own run, or as proposed."""
+    """Return the implants of the first treatment, as given, else as in the case folder's own run, else as proposed."""
     if not settings.treatments:
         return []
     treatment = settings.treatments[0]
-    if (path / RUN).exists():
-        treatment = next((one for one in finished_run(path)[1].treatments if one.name == treatment.name), treatment)
+    if treatment.is_proposed and (path / RUN).exists():
+        found = {one.name: one for one in finished_run(path)[1].treatments if one.devices == treatment.devices}
+        treatment = found.get(treatment.name, treatment)
     stents: dict[str, Stent] = {}
     for implant in treatment.implants:
         with ledger.stage(f"deploy {implant.id}") as tell:

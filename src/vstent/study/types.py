@@ -69,10 +69,10 @@ class Settings:
     """Ranges of the uncertainty study; None: no uncertainty study."""
 
     def __post_init__(self) -> None:
-        names = [treatment.name for treatment in self.treatments]
+        names = [treatment.name.casefold() for treatment in self.treatments]
         twice = [name for name in names if names.count(name) > 1]
         if twice:
-            raise InputError(f"Two treatments are called {twice[0]}: give each a name of its own, or leave one out.")
+            raise InputError(f"two treatments are called {twice[0]}: give each a name of its own, or leave one out")
 
     @property
     def devices(self) -> tuple[str, ...]:
