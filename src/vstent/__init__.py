@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from vstent.devices.catalogue import find_design as find_design
     from vstent.devices.catalogue import find_size as find_size
     from vstent.devices.stent import Landing as Landing
-    from vstent.flow.settings import FlowSettings as FlowSettings
     from vstent.flow.indices import compare as compare
     from vstent.flow.indices import indices as indices
     from vstent.flow.ostium import ostium as ostium
+    from vstent.flow.settings import FlowSettings as FlowSettings
     from vstent.flow.simulation import simulate as simulate
     from vstent.geometry.image import Image as Image
     from vstent.io.images import read_image as read_image

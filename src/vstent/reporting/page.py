@@ -143,7 +143,7 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
     drawing : its pictures, if they are being drawn already.
     """
     with drawing or Drawing() as drawn:
-        scene, metrics = drawn.begin(case.anatomy, case.implants, case.fields, case.whole), case.metrics
+        scene, metrics = drawn.begin(case), case.metrics
         pictures = drawn.pictures()
     return Contents(
         name=case.name,
