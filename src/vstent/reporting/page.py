@@ -182,10 +182,10 @@ def limits_of(case: "CaseResult") -> tuple[str, ...]:
 
 def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
     """Return the limits of a flow with these settings, one sentence each."""
-    thins = flow["blood"]["thinning"] is not None
+    thins, engine = flow["blood"]["thinning"] is not None, flow["numerics"]["engine"]
     blood = "Blood is shear-thinning, with parameters from the literature" if thins else "Blood is Newtonian"
     told = [f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
-    return [*told, OF_DEVICE[flow["engine"]]] if flow["engine"] in OF_DEVICE else told
+    return [*told, OF_DEVICE[engine]] if engine in OF_DEVICE else told
 
 
 def as_html(told: Contents) -> str:
