@@ -20,7 +20,6 @@ from vstent import phantoms
 from vstent.angiography.history import History
 from vstent.app import cuts, intake, ranking, sheets
 from vstent.app.cases import STEPS, Store, load
-from vstent.app.choices import DeviceChoice
 from vstent.app.desk import Desk
 from vstent.app.finished import kept_flows
 from vstent.cli import main
@@ -28,6 +27,7 @@ from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
 from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Landing
+from vstent.devices.treatment import with_device
 from vstent.errors import ReadError
 from vstent.flow.case import FlowField, Phase
 from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics, Waveform
@@ -41,10 +41,21 @@ from vstent.study.flow_store import FlowStore
 from vstent.study.folder import CACHE, history_path
 from vstent.study.ledger import Ledger, hash_of
 from vstent.study.repeat import settings_of
-from vstent.study.stages import flow_key
-from vstent.study.types import Settings
+from vstent.study.stages import flow_keys
+from vstent.study.types import InputSettings, Settings
 
-SILK = {"name": "silk"}
+
+def alone(device, **given):
+    """A treatment of one device, as a client states it."""
+    return {"name": device, "implants": [{"id": device, "device": device} | given]}
+
+
+def wanted(treatment, **given):
+    """What is asked of a treatment of one device."""
+    return {"treatment": treatment, "implant": treatment["name"]} | given
+
+
+SILK = alone("silk")
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +91,7 @@ def case(client, artery):
     case = client.post("/api/cases", json={"name": "Phantom"}).json()
     answer = client.put(f"/api/cases/{case['id']}/input", params={"name": "phantom.stl"}, content=artery.read_bytes())
     assert answer.json() == {"taken": True}
-    choices = case["choices"] | {"devices": [SILK], "flow": {"is_wanted": False}, "units": "mm"}
+    choices = case["choices"] | {"treatments": [SILK], "flow": {"is_wanted": False}, "units": "mm"}
     client.put(f"/api/cases/{case['id']}/choices", json={"revision": case["revision"], "choices": choices})
     client.post(f"/api/cases/{case['id']}/input/done")
     view = app_case.wait(client, case["id"])
@@ -106,11 +117,11 @@ def test_command_line_rest_and_python_find_the_same_numbers(client, case, artery
     assert set(view["steps"].values()) == {"done"}
     by_rest = client.get(f"{case}/files/metrics.json").json()
     by_cli = json.loads((study / "metrics.json").read_text())
-    settings = Settings(devices=("silk",), units="mm", flow=None)
+    settings = Settings(InputSettings(units="mm"), treatments=(with_device("silk"),), flow=None)
     vstent.run(artery, tmp_path / "python", settings, lambda *_: None)
     by_python = json.loads((tmp_path / "python" / "metrics.json").read_text())
     assert by_rest == by_cli == by_python
-    assert by_rest["stents"]["silk"]["deployment"]["deployed_length_mm"] > 10
+    assert by_rest["treatments"]["silk"]["implants"]["silk"]["deployed_length_mm"] > 10
     report = client.get(f"{case}/files/report.html")
     assert "Silk" in report.text
     assert "sandbox" in report.headers["content-security-policy"]
@@ -172,7 +183,7 @@ def test_what_is_not_there_and_what_is_no_number_is_said_so(client, case, worksp
 
 
 def test_a_place_for_a_deployment_is_one_of_the_choices(client, case):
-    assert client.post(f"{case}/deployment", json={"device": SILK, "abscissa_mm": 12.0}).status_code == 422
+    assert client.post(f"{case}/deployment", json=wanted(SILK, abscissa_mm=12.0)).status_code == 422
 
 
 def test_a_case_without_a_scan_says_so(client):
@@ -205,7 +216,11 @@ def test_a_second_tab_cannot_undo_what_the_first_has_done(client, case):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"devices": [{"name": "silk"}, {"name": "silk"}]},
+        {"treatments": [SILK, SILK]},
+        {"treatments": [{"name": "silk", "implants": []}]},
+        {"treatments": [alone("silk", nonsense=1)]},
+        {"treatments": [alone("silk", inside=["enterprise"])]},
+        {"treatments": [{"name": "../silk", "implants": SILK["implants"]}]},
         {"inlet_mm": [1.0, 2.0]},
         {"inlet_mm": [1.0, 2.0, 1e9]},
         {"flow": {"cell_size_mm": 0.001}},
@@ -224,11 +239,11 @@ def test_a_dragged_end_lies_where_the_hand_is_and_where_the_deployment_puts_it(c
     anatomy = anatomy_of(client, case, workspace)
     design = find_design("silk")
     for anchor, end in (("proximal", 0), ("distal", 1)):
-        start, _ = app_case.opened(client.post(f"{case}/sketch", json={"device": SILK}))
-        wanted = start["ends_mm"][end] + 1.3
-        answer = client.post(f"{case}/sketch", json={"device": SILK, "anchor": anchor, "abscissa_mm": wanted})
+        start, _ = app_case.opened(client.post(f"{case}/sketch", json=wanted(SILK)))
+        there_mm = start["ends_mm"][end] + 1.3
+        answer = client.post(f"{case}/sketch", json=wanted(SILK, anchor=anchor, abscissa_mm=there_mm))
         sketched, data = app_case.opened(answer)
-        assert sketched["ends_mm"][end] == pytest.approx(wanted, abs=1e-3)
+        assert sketched["ends_mm"][end] == pytest.approx(there_mm, abs=1e-3)
         stent = deploy(design, anatomy, landing=Landing(sketched["center_mm"])).stent
         ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
         np.testing.assert_allclose(sketched["ends_mm"], ends, atol=0.1)
@@ -248,23 +263,24 @@ def test_a_dragged_end_lies_where_the_hand_is_and_where_the_deployment_puts_it(c
     [("proximal", -5, "is not on the parent artery"), ("distal", 5, "beyond the proximal end")],
 )
 def test_a_device_dragged_out_of_the_artery_is_refused_with_a_sentence(client, case, anchor, abscissa_mm, said):
-    answer = client.post(f"{case}/sketch", json={"device": SILK, "anchor": anchor, "abscissa_mm": abscissa_mm})
+    answer = client.post(f"{case}/sketch", json=wanted(SILK, anchor=anchor, abscissa_mm=abscissa_mm))
     assert answer.status_code == 422
     assert said in answer.json()["detail"]
 
 
 def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     anatomy = anatomy_of(client, case, workspace)
-    device = SILK | {"center_mm": round(anatomy.parent.axis.length_mm / 2, 3)}
-    assert choose(client, case, devices=[device]).status_code == 200
-    told, data = app_case.opened(client.post(f"{case}/deployment", json={"device": device, "colour": "coverage"}))
-    deployment = deploy(find_design("silk"), anatomy, landing=Landing(device["center_mm"]))
+    center_mm = round(anatomy.parent.axis.length_mm / 2, 3)
+    silk = alone("silk", placing={"position_mm": center_mm})
+    assert choose(client, case, treatments=[silk]).status_code == 200
+    told, data = app_case.opened(client.post(f"{case}/deployment", json=wanted(silk, colour="coverage")))
+    deployment = deploy(find_design("silk"), anatomy, landing=Landing(center_mm))
     measures = measure(anatomy, deployment)
     assert told["length_mm"] == pytest.approx(measures["deployed_length_mm"], rel=1e-9)
-    row = next(row for row in told["measures"]["rows"] if row["key"] == "deployed_length_mm")
+    row = next(row for row in told["measures"][0]["rows"] if row["key"] == "deployed_length_mm")
     assert float(row["cells"][0].split("\u202f")[0]) == pytest.approx(measures["deployed_length_mm"], rel=5e-3)
     assert row["meaning"]
-    sheet = client.post(f"{case}/bands", json={"device": device}).json()
+    sheet = client.post(f"{case}/bands", json=wanted(silk)).json()
     lengths = next(row for row in sheet["rows"] if row[0] == "Deployed length")
     low, value, high = (float(lengths[k].split("\u202f")[0]) for k in (2, 1, 3))
     assert low < value < high
@@ -274,13 +290,13 @@ def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     assert coverage.mean() == pytest.approx(100 * measures["metal_coverage_fraction"], rel=0.05)
     steps = client.get(case).json()["steps"]
     assert (steps["device"], steps["deploy"]) == ("done", "done")
-    choose(client, case, devices=[SILK])
+    choose(client, case, treatments=[SILK])
 
 
 def test_the_section_has_the_phantoms_radius(client, case):
-    start, _ = app_case.opened(client.post(f"{case}/sketch", json={"device": SILK}))
+    start, _ = app_case.opened(client.post(f"{case}/sketch", json=wanted(SILK)))
     place = start["ends_mm"][0] + 1.0
-    section = client.get(f"{case}/section", params={"abscissa_mm": place, "device": "silk"}).json()
+    section = client.get(f"{case}/section", params={"abscissa_mm": place, "treatment": "silk", "implant": "silk"}).json()
     segments = np.array(section["landing"]).reshape(-1, 2, 2)
     near = np.linalg.norm(segments, axis=2).max(axis=1) < section["artery_diameter_mm"]
     length = np.linalg.norm(segments[near, 1] - segments[near, 0], axis=1).sum()
@@ -289,7 +305,7 @@ def test_the_section_has_the_phantoms_radius(client, case):
 
 
 def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
-    choose(client, case, devices=[{"name": "enterprise"}])
+    choose(client, case, treatments=[alone("enterprise")])
     client.post(f"{case}/jobs/rank")
     view = app_case.wait(client, case.rpartition("/")[2])
     assert view["failed"] == {}
@@ -305,26 +321,27 @@ def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
     columns = {column["key"]: column for column in found["columns"]}
     assert columns["landing_length_mm"]["meaning"]
     assert all(column["meaning"] and key in first for key, column in columns.items())
-    choose(client, case, devices=[SILK])
+    choose(client, case, treatments=[SILK])
     assert not client.get(f"{case}/ranking").json()["is_current"]
 
 
 def test_sizes_side_by_side_are_the_deployments_on_one_scale(client, case):
-    devices = [SILK | {"diameter_mm": 4.0, "length_mm": length} for length in (15.0, 20.0)] + [{"name": "enterprise"}]
-    wanted = {"devices": devices, "colour": "wall_gap"}
-    told, data = app_case.opened(client.post(f"{case}/comparison", json=wanted))
+    sizes = [alone("silk", diameter_mm=4.0, length_mm=length) for length in (15.0, 20.0)]
+    treatments = [*sizes, alone("enterprise")]
+    asked = {"treatments": treatments, "colour": "wall_gap"}
+    told, data = app_case.opened(client.post(f"{case}/comparison", json=asked))
     assert [one["pane"] for one in told["compared"]] == ["compared 0", "compared 1", "compared 2"]
     assert [scale["id"] for scale in told["scales"]] == ["wall_gap"]
     assert told["compared"][0]["title"] == "Silk 4 × 15 mm"
-    for device, one in zip(devices, told["compared"], strict=True):
-        alone, alone_data = app_case.opened(client.post(f"{case}/deployment", json={"device": device}))
-        assert one["measures"] == alone["measures"]
+    for treatment, one in zip(treatments, told["compared"], strict=True):
+        single, single_data = app_case.opened(client.post(f"{case}/deployment", json=wanted(treatment)))
+        assert one["measures"] == single["measures"]
         both = [
             app_case.numbers(next(x for x in said["layers"] if (x["id"], x["pane"]) == ("wires", pane))["points"], raw)
-            for said, raw, pane in ((told, data, one["pane"]), (alone, alone_data, device["name"]))
+            for said, raw, pane in ((told, data, one["pane"]), (single, single_data, treatment["name"]))
         ]
         np.testing.assert_allclose(*both, atol=2e-3)
-    assert client.post(f"{case}/comparison", json={"devices": 5 * [SILK]}).status_code == 422
+    assert client.post(f"{case}/comparison", json={"treatments": 5 * [SILK]}).status_code == 422
 
 
 def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp_path, monkeypatch):
@@ -341,11 +358,11 @@ def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp
     case = Store(tmp_path).create("ranked")
     folder = case.folder
     shutil.copy(artery, folder / "artery.stl")
-    choices = case.state.choices.model_copy(update={"devices": (DeviceChoice(name="enterprise"),), "ranking_flows": 2})
+    choices = case.state.choices.model_copy(update={"treatments": (with_device("enterprise"),), "ranking_flows": 2})
     case.update(input="artery.stl", source=hash_of(folder / "artery.stl"), choices=choices)
     monkeypatch.setattr(ranking, "rank_flows", flows)
     said = []
-    ranking.rank_sizes(case, lambda stage, fraction, detail: said.append((stage, fraction, detail)))
+    ranking.rank_sizes(case, lambda now: said.append((now.stage, now.fraction, now.detail)))
     assert asked["count"] == 2
     assert asked["store"] is FlowStore
     after = json.loads((folder / "ranking.json").read_text())
@@ -359,7 +376,7 @@ def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp
 def test_a_job_computes_what_was_chosen_when_it_was_started(client, case):
     before = client.get(case).json()
     client.post(f"{case}/jobs/flow")
-    changed = choose(client, case, devices=[{"name": "enterprise"}]).json()  # before the job has loaded its modules
+    changed = choose(client, case, treatments=[alone("enterprise")]).json()  # before the job has loaded its modules
     assert changed["job"]["stage"] == ""
     while client.get(case).json()["job"]["stage"] == "":
         time.sleep(0.02)
@@ -367,21 +384,21 @@ def test_a_job_computes_what_was_chosen_when_it_was_started(client, case):
     view = app_case.wait(client, case.rpartition("/")[2])
     assert view["choices"] == before["choices"]
     assert set(view["steps"].values()) == {"done"}
-    assert list(client.get(f"{case}/files/metrics.json").json()["stents"]) == ["silk"]
+    assert list(client.get(f"{case}/files/metrics.json").json()["treatments"]) == ["silk"]
 
 
 def test_a_failure_is_told_while_what_caused_it_is_chosen(client, case):
-    choose(client, case, devices=[{"name": "unheard of"}])
+    choose(client, case, treatments=[alone("unheard-of")])
     client.post(f"{case}/jobs/flow")
     failed = app_case.wait(client, case.rpartition("/")[2])
-    assert "unheard of" in failed["failed"]["flow"]
+    assert "unheard-of" in failed["failed"]["flow"]
     assert failed["steps"]["flow"] == "failed"
-    chosen = choose(client, case, devices=[SILK]).json()
+    chosen = choose(client, case, treatments=[SILK]).json()
     assert chosen["failed"] == {}
     assert "failed" not in chosen["steps"].values()
     undone = client.post(f"{case}/undo", json={"revision": chosen["revision"]}).json()
     assert undone["failed"] == failed["failed"]
-    choose(client, case, devices=[SILK])
+    choose(client, case, treatments=[SILK])
 
 
 def test_a_flow_after_another_choice_of_the_vessel_finds_the_vessel_first(client, case):
@@ -438,18 +455,18 @@ def test_a_folder_of_vstent_run_opens_with_all_that_it_holds(study, tmp_path):
     with app_case.served(tmp_path / "cases", study) as client:
         case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
         view = client.get(case).json()
-        assert [device["name"] for device in view["choices"]["devices"]] == ["silk"]
+        assert [treatment["name"] for treatment in view["choices"]["treatments"]] == ["silk"]
         assert view["choices"]["units"] == "mm"
         assert not view["choices"]["flow"]["is_wanted"]
         assert [step for step in STEPS if view["steps"][step] == "done"] == list(STEPS[:5])
-        told, _ = app_case.opened(client.post(f"{case}/deployment", json={"device": SILK}))
-        measured = json.loads((study / "metrics.json").read_text())["stents"]["silk"]["deployment"]
+        told, _ = app_case.opened(client.post(f"{case}/deployment", json=wanted(SILK)))
+        measured = json.loads((study / "metrics.json").read_text())["treatments"]["silk"]["implants"]["silk"]
         assert told["length_mm"] == pytest.approx(measured["deployed_length_mm"], rel=1e-6)
 
 
 def keep_flow(folder, source, settings, name):
     """Keep a flow as a study of these settings does."""
-    key = flow_key(source, settings, name, None if name == "bare" else find_design(name))
+    key = flow_keys(source, settings)[name]
     Ledger(folder / CACHE, lambda *_: None).keep(f"flow {name}", key, report_case.field(1.0))
 
 
@@ -494,19 +511,19 @@ def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_
     pulse = Waveform(0.8, (0.2,), (0.1,))
     blood = Blood(1050.0, 0.0035, CarreauYasuda())
     flow = FlowSettings(inflow_mL_s=1.0, blood=blood, waveform=pulse, numerics=Numerics(close_up=True))
-    given = replace(settings_of(told["settings"]), flow=flow, uncertainty=Ranges(16, landing_mm=2.0), length_mm=20.0)
+    given = replace(settings_of(told["settings"]), flow=flow, uncertainty=Ranges(16, landing_mm=2.0))
     told["settings"] = asdict(given)
     (folder / "run.json").write_text(json.dumps(told))
     with app_case.served(tmp_path / "cases", folder) as client:
         case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
         view = client.get(case).json()
-        assert {"flow blood viscosity_Pa_s 0.0035", "flow blood thinning", "flow close_up True"} < set(view["unseen"])
+        assert {"flow blood viscosity_Pa_s 0.0035", "flow blood thinning", "flow numerics close_up True"} < set(view["unseen"])
         assert client.get("/api/waveform", params={"case_id": case.rpartition("/")[2]}).json()["time_s"][-1] == 0.8
-        choose(client, case, flow=view["choices"]["flow"] | {"inflow_mL_s": 2.0}, devices=[{"name": "enterprise"}])
+        choose(client, case, flow=view["choices"]["flow"] | {"inflow_mL_s": 2.0}, treatments=[alone("enterprise")])
         asked = load("flown", folder).state.settings()
     assert asdict(asked.flow) == asdict(replace(flow, inflow_mL_s=2.0))
     assert asdict(asked.uncertainty) == asdict(given.uncertainty)
-    assert asked.placing("enterprise").length_mm is None  # that of Silk alone
+    assert asked.treatments == (with_device("enterprise"),)
 
 
 def test_a_setting_that_the_page_does_not_take_is_named(flown, tmp_path):
@@ -596,7 +613,7 @@ def test_the_interface_is_described_and_its_page_needs_no_network(client):
         assert "https://" not in client.get(path).text
 
 
-def test_uncertainty_is_told_in_the_order_of_the_devices_with_its_causes():
+def test_uncertainty_is_told_in_the_order_of_the_treatments_with_its_causes():
     def varied(low, high):
         ends = {"mean": 0.5 * (low + high), "low": low, "high": high}
         shares = {"landing_fraction": 0.2, "device_fraction": 0.7, "rest_fraction": 0.1}
@@ -610,7 +627,7 @@ def test_uncertainty_is_told_in_the_order_of_the_devices_with_its_causes():
         }
 
     metrics = {
-        "stents": {"enterprise": {"uncertainty": varied(12.0, 14.0)}, "silk": {"uncertainty": varied(15.0, 18.0)}}
+        "treatments": {"enterprise": {"uncertainty": varied(12.0, 14.0)}, "silk": {"uncertainty": varied(15.0, 18.0)}}
     }
     silk, enterprise = sheets.uncertainty(metrics, {"silk": "Silk 4 x 15 mm", "enterprise": "Enterprise"})
     assert (silk["title"], enterprise["title"]) == ("Silk 4 x 15 mm", "Enterprise")
@@ -618,7 +635,7 @@ def test_uncertainty_is_told_in_the_order_of_the_devices_with_its_causes():
     assert [row[key].replace("\u202f", " ") for key in ("mean", "low", "high")] == ["16.5 mm", "15.0 mm", "18.0 mm"]
     assert [cause for cause, _ in row["shares"]] == ["manufacturing tolerance", "landing", "interplay and chance"]
     assert "16 deployments, of which 1 did not fit" in silk["words"]
-    assert sheets.uncertainty({"stents": {"silk": {}}}, {"silk": "Silk"}) == []
+    assert sheets.uncertainty({"treatments": {"silk": {}}}, {"silk": "Silk"}) == []
 
 
 def test_the_first_page_waits_for_nothing_that_only_results_need():
@@ -649,7 +666,7 @@ def test_with_flow_all_ways_in_agree_too(tmp_path):
     with app_case.served(tmp_path / "cases", path) as client:
         case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
         app_case.wait(client, case.rpartition("/")[2])
-        assert choose(client, case, devices=[SILK], flow={"cell_size_mm": 0.35}).status_code == 200
+        assert choose(client, case, treatments=[SILK], flow={"cell_size_mm": 0.35}).status_code == 200
         client.post(f"{case}/jobs/flow")
         app_case.wait(client, case.rpartition("/")[2], 1200)
         by_rest = client.get(f"{case}/files/metrics.json").json()
@@ -663,7 +680,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 import httpx, uvicorn
 from vstent.app.cases import Store
-from vstent.app.choices import DeviceChoice
 from vstent.app.desk import Desk
 from vstent.app.server import create
 

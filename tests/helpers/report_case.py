@@ -158,19 +158,19 @@ def flow_metrics(strength):
 
 
 def metrics():
-    bare = flow_metrics(1.0)
-    stents = {}
+    treatments = {"bare": {"flow": flow_metrics(1.0)}}
     for name, strength in (("silk", 0.62), ("enterprise", 0.87)):
         flow = flow_metrics(strength)
-        stents[name] = {
-            "deployment": {
-                "deployed_length_mm": 13.47,
-                "largest_wall_gap_mm": 0.281,
-                "n_nodes": 2160,
-                "coverage_fraction": 0.2816,
-            },
+        measures = {
+            "deployed_length_mm": 13.47,
+            "largest_wall_gap_mm": 0.281,
+            "n_nodes": 2160,
+            "coverage_fraction": 0.2816,
+        }
+        treatments[name] = {
+            "implants": {name: measures},
             "flow": flow,
-            "ratios": {"neck_inflow_ratio": strength, "mean_sac_velocity_ratio": strength},
+            "change": {"neck_inflow_ratio": strength, "mean_sac_velocity_ratio": strength},
         }
     vessel = {
         "sac_volume_mm3": 111.9,
@@ -179,7 +179,7 @@ def metrics():
         "bend_angle_rad": 1.31,
         "n_outlets": 1,
     }
-    return {"vessel": vessel, "bare": bare, "stents": stents}
+    return {"vessel": vessel, "treatments": treatments}
 
 
 def case(name="Bent tube with a sac"):
@@ -187,7 +187,7 @@ def case(name="Bent tube with a sac"):
     return SimpleNamespace(
         name=name,
         anatomy=anatomy(),
-        deployments={"silk": deployment("silk", 24), "enterprise": deployment("enterprise", 5)},
+        implants={"silk": {"silk": deployment("silk", 24)}, "enterprise": {"enterprise": deployment("enterprise", 5)}},
         fields=fields,
         metrics=metrics(),
         provenance={
@@ -205,7 +205,7 @@ def case(name="Bent tube with a sac"):
 @cache
 def scene():
     shown = case()
-    return scene_of(shown.anatomy, shown.deployments, shown.fields)
+    return scene_of(shown.anatomy, shown.implants, shown.fields)
 
 
 @cache

@@ -107,9 +107,9 @@ export class SectionChart {
       svg("path", { d: pieces(section.lumen), class: "cut lumen" }),
       svg("path", { d: pieces(section.landing), class: "cut landing" }),
     ];
-    if (section.device) {
+    for (const ring of section.rings || []) {
       const points = [];
-      for (let i = 0; i < section.device.length; i += 2) points.push(`${section.device[i]} ${-section.device[i + 1]}`);
+      for (let i = 0; i < ring.length; i += 2) points.push(`${ring[i]} ${-ring[i + 1]}`);
       parts.push(svg("path", { d: `M${points.join("L")}`, class: "cut device" }));
     }
     const bar = half > 5 ? 2 : 1;
@@ -125,7 +125,7 @@ export class SectionChart {
       ["Position", `${section.abscissa_mm.toFixed(1)} mm`],
       ["Artery", `⌀ ${section.artery_diameter_mm.toFixed(2)} mm`],
     ];
-    if (section.device) {
+    if ("device_diameter_mm" in section) {
       rows.push(["Device", `⌀ ${section.device_diameter_mm.toFixed(2)} mm`]);
       rows.push(["Free device", `⌀ ${section.free_diameter_mm.toFixed(2)} mm`]);
       rows.push(["Largest gap", `${section.max_gap_mm.toFixed(2)} mm`]);

@@ -1,6 +1,7 @@
 // Sizes side by side: those ticked in the ranking are deployed, each in a pane, on one colour scale, with their numbers.
 import { make } from "../src/dom.js";
 import { Newest, postBinary } from "./api.js";
+import { withDevice } from "./treatments.js";
 
 export const MOST = 4;
 
@@ -57,9 +58,9 @@ export class Comparing {
   }
 
   ask() {
-    const devices = this.rows.map(({ device, label_diameter_mm, label_length_mm }) => ({ name: device, diameter_mm: label_diameter_mm, length_mm: label_length_mm, center_mm: null }));
-    const colour = this.page.colour;
-    this.asked.ask(() => postBinary(`${this.page.path}/comparison`, { devices, colour }));
+    const treatments = this.rows.map(({ device, label_diameter_mm, label_length_mm }) => withDevice(device, { diameter_mm: label_diameter_mm, length_mm: label_length_mm }));
+    const { colour } = this.page;
+    this.asked.ask(() => postBinary(`${this.page.path}/comparison`, { treatments, colour }));
   }
 
   take(answer) {
@@ -76,7 +77,7 @@ export class Comparing {
   }
 
   panes() {
-    const value = (measures, key) => measures.rows.find((row) => row.key === key)?.cells[0];
+    const value = ([measures], key) => measures.rows.find((row) => row.key === key)?.cells[0];
     return this.shown.map(({ pane, title, measures }) => {
       const said = [["length", "deployed_length_mm"], ["coverage of the neck", "neck_metal_coverage_fraction"], ["gap", "max_wall_gap_mm"]];
       const note = said.filter(([, key]) => value(measures, key)).map(([word, key]) => `${word} ${value(measures, key)}`).join(", ");
@@ -85,6 +86,6 @@ export class Comparing {
   }
 
   sheets() {
-    return this.shown.map(({ measures }) => measures);
+    return this.shown.flatMap(({ measures }) => measures);
   }
 }

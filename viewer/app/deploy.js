@@ -1,4 +1,4 @@
-// A device on the parent axis: handles at both ends that slide along it, the stent that follows, the cursor of the section.
+// An implant on the parent axis: handles at both ends that slide along it, the stent that follows, the cursor of the section.
 import { make } from "../src/dom.js";
 import { get, Newest, post, postBinary } from "./api.js";
 import { label, makeHandle } from "./handles.js";
@@ -7,10 +7,10 @@ const STEP_MM = 0.2;
 const REST_MS = 400; // the bands are asked for when the device has lain still for so long, so that a drag never waits for them
 
 export class Deploying {
-  /** @param host {path, picture, along, section, colour(), choice(name), chosen(name, centerMm), told(name, manifest), banded(sheet or null), failed} */
+  /** @param host {path, picture, along, section, colour(), choice(name), chosen(name, id, centerMm), told(manifest, isWhole), banded(sheet or null), failed} */
   constructor(host) {
     this.host = host;
-    this.name = null;
+    this.name = this.id = null; // of the treatment, and of the implant in it
     this.place = null;
     this.sketches = new Newest((answer) => this.sketched(answer), host.failed);
     this.whole = new Newest((answer) => this.deployed(answer), host.failed);
@@ -39,17 +39,21 @@ export class Deploying {
     this.wanted = mm;
     if (!this.isDragging) this.host.banded(null);
     this.isDragging = true;
-    const [device, colour] = [this.host.choice(this.name), this.host.colour()];
-    this.sketches.ask(() =>
-      postBinary(`${this.host.path()}/sketch`, { device, anchor, abscissa_mm: mm, colour }),
-    );
+    const wanted = { ...this.wantedNow(), colour: this.host.colour(), anchor, abscissa_mm: mm };
+    this.sketches.ask(() => postBinary(`${this.host.path()}/sketch`, wanted));
   }
 
   release() {
     this.wanted = undefined;
     if (!this.isDragging) return;
     this.isDragging = false;
-    this.host.chosen(this.name, this.atRest());
+    this.host.chosen(this.name, this.id, this.atRest());
+  }
+
+  /** The treatment in view as it is chosen, and the implant in it; nothing where it is not chosen any more. */
+  wantedNow() {
+    const treatment = this.host.choice(this.name);
+    return treatment && { treatment, implant: this.id };
   }
 
   /** Where the device is let go: the last sketch may still be under way, and its place is the one to keep. */
@@ -58,33 +62,32 @@ export class Deploying {
     return this.place.center_mm;
   }
 
-  /** Whether the device in view is the one whose place is known. */
+  /** Whether the implant in view is the one whose place is known. */
   get isHere() {
-    return this.place?.device === this.name;
+    return this.place?.treatment === this.name && this.place.implant === this.id;
   }
 
-  /** Show a device as it is chosen: deployed, with its numbers. */
-  show(name) {
-    if (name !== this.name) this.host.along.set({ device: null });
-    this.name = name;
-    const [device, colour] = [this.host.choice(name), this.host.colour()];
-    if (!device) return;
-    this.whole.ask(() => postBinary(`${this.host.path()}/deployment`, { device, colour }));
+  /** Show an implant as it is chosen: its treatment deployed, with its numbers. */
+  show(name, id) {
+    if (name !== this.name || id !== this.id) this.host.along.set({ device: null });
+    [this.name, this.id] = [name, id];
+    const wanted = { ...this.wantedNow(), colour: this.host.colour() };
+    this.whole.ask(() => postBinary(`${this.host.path()}/deployment`, wanted));
   }
 
   sketched(answer) {
     this.take(answer);
-    this.host.told(this.name, answer.manifest, false);
+    this.host.told(answer.manifest, false);
   }
 
   deployed(answer) {
     if (this.isDragging) return;
     this.take(answer);
-    this.host.told(this.name, answer.manifest, true);
-    const device = this.host.choice(this.name);
+    this.host.told(answer.manifest, true);
+    const wanted = this.wantedNow();
     clearTimeout(this.rest);
     this.rest = setTimeout(() => {
-      if (!this.isDragging && device) this.bands.ask(() => post(`${this.host.path()}/bands`, { device }));
+      if (!this.isDragging && wanted) this.bands.ask(() => post(`${this.host.path()}/bands`, wanted));
     }, REST_MS);
   }
 
@@ -105,7 +108,8 @@ export class Deploying {
     this.cursor = mm;
     this.host.along.set({ cursor: mm });
     this.host.picture.stage?.redraw();
-    const device = this.name && !this.isDragging ? `&device=${encodeURIComponent(this.name)}` : "";
-    this.sections.ask(() => get(`${this.host.path()}/section?abscissa_mm=${mm.toFixed(3)}${device}`));
+    const query = new URLSearchParams({ abscissa_mm: mm.toFixed(3) });
+    if (this.wantedNow() && !this.isDragging) for (const [key, value] of [["treatment", this.name], ["implant", this.id]]) query.set(key, value);
+    this.sections.ask(() => get(`${this.host.path()}/section?${query}`));
   }
 }

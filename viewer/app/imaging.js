@@ -69,13 +69,13 @@ export class Imaging {
   /** Show what was chosen, here or in another window. */
   follow(view) {
     if (!this.slices) return;
-    const { at_mm, crop_mm, devices } = view.choices;
+    const { at_mm, crop_mm, treatments } = view.choices;
     this.slices.setSeed(at_mm);
     this.slices.bar.renderChips();
     this.slices.setCrop(crop_mm);
-    const device = view.steps.deploy === "done" ? devices[0] : null;
+    const treatment = view.steps.deploy === "done" ? treatments[0] : null;
     this.slices.hasSac = Boolean(this.page.anatomy?.neck.length);
-    this.slices.setFound(view.has_anatomy ? view.anatomy : null, device?.name ?? null, device && JSON.stringify(device));
+    this.slices.setFound(view.has_anatomy ? view.anatomy : null, treatment?.name ?? null, treatment && JSON.stringify(treatment));
     const crop = JSON.stringify(crop_mm);
     if (this.cropKey !== undefined && crop !== this.cropKey) {
       this.page.scan.proposed_threshold = undefined;

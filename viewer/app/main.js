@@ -18,6 +18,7 @@ import { Ranking } from "./ranking.js";
 import { redraw } from "./redraw.js";
 import { startPage } from "./start.js";
 import { listenForTips } from "./tips.js";
+import { implantWith, Names, placedAt } from "./treatments.js";
 import { Trimming } from "./trimming.js";
 import { Portrait } from "./portrait.js";
 
@@ -52,6 +53,7 @@ class Page {
 
   async begin() {
     this.catalogue = await get("/api/catalogue").catch((problem) => this.complain(problem)) || [];
+    this.names = new Names(this.catalogue, () => this.view?.choices.treatments || []);
     if (!location.hash) {
       const { opened } = await get("/api/cases").catch(() => ({})); // the list of cases asks again
       if (opened) history.replaceState(null, "", `#${opened}`);
@@ -151,9 +153,9 @@ class Page {
       along: this.along,
       section: this.section,
       colour: () => this.colour,
-      choice: (name) => this.view.choices.devices.find((device) => device.name === name),
-      chosen: (name, center) => this.choose(center.then((mm) => deviceWith(name, { center_mm: Number(mm.toFixed(3)) }))),
-      told: (name, manifest, isWhole) => this.toldDevice(name, manifest, isWhole),
+      choice: (name) => this.view.choices.treatments.find((treatment) => treatment.name === name),
+      chosen: (name, id, center) => this.choose(center.then((mm) => this.moved(name, id, Number(mm.toFixed(3))))),
+      told: (manifest, isWhole) => this.toldTreatment(manifest, isWhole),
       banded: (sheet) => this.toldBands(sheet),
       failed: (problem) => this.complain(problem),
     });
@@ -165,7 +167,7 @@ class Page {
       failed: (problem) => this.complain(problem),
     });
     this.portrait = new Portrait(this);
-    this.films = new Films({ path: () => this.path, title: (name) => (name === "bare" ? "Before" : this.deviceTitle(name)), changed: () => this.view && this.renderFilms(), failed: (problem) => this.complain(problem) });
+    this.films = new Films({ path: () => this.path, title: (name) => (name === "bare" ? "Before" : this.names.treatment(name)), changed: () => this.view && this.renderFilms(), failed: (problem) => this.complain(problem) });
     this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.imaging = new Imaging(this);
@@ -366,13 +368,16 @@ class Page {
     this.renderNumbers();
   }
 
-  get device() {
-    const names = this.view.choices.devices.map(({ name }) => name);
-    return names.includes(this.active) ? this.active : names[0];
+  /** The treatment in view; none where none is chosen. */
+  get treatment() {
+    const { treatments } = this.view.choices;
+    return treatments.find(({ name }) => name === this.active) ?? treatments[0];
   }
 
-  deviceTitle(name) {
-    return this.catalogue.find(({ key }) => key === name)?.name || name;
+  /** The implant of it that is told of and moved. */
+  get implant() {
+    const implants = this.treatment?.implants;
+    return implants?.find(({ id }) => id === this.activeImplant) ?? implants?.[0];
   }
 
   renderScene() {
@@ -416,7 +421,7 @@ class Page {
       return [...this.neck.handles, ...outlets, this.sacLabel.mark];
     }
     if (this.step === "device" && !this.isComparing) return [this.sacLabel.mark];
-    return this.step === "deploy" && this.device ? [...this.deploying.handles, this.deploying.cursorMark] : [];
+    return this.step === "deploy" && this.treatment ? [...this.deploying.handles, this.deploying.cursorMark] : [];
   }
 
   get isComparing() {
@@ -425,7 +430,7 @@ class Page {
 
   panes() {
     if (this.isComparing) return this.ranking.comparing.panes();
-    return this.step === "flow" || this.step === "report" ? this.flowPanesShown() : [{ id: this.device || "one", title: "" }];
+    return this.step === "flow" || this.step === "report" ? this.flowPanesShown() : [{ id: this.treatment?.name || "one", title: "" }];
   }
 
   flowPanesShown() {
@@ -436,7 +441,7 @@ class Page {
       const i = sheet?.names.indexOf(name) ?? -1;
       const said = i < 0 ? row?.cells[0] : `${row?.cells[1 + 2 * i]} (${row?.cells[2 + 2 * i]})`;
       const note = row && (i >= 0 || name === "bare") ? `${row.name} ${said}` : "";
-      return { id: name, title: name === "bare" ? "Before (no device)" : this.deviceTitle(name), note };
+      return { id: name, title: name === "bare" ? "Before (no device)" : this.names.treatment(name), note };
     });
   }
 
@@ -465,13 +470,13 @@ class Page {
   }
 
   renderDeploy() {
-    const name = this.device;
-    if (!name) return;
+    const { treatment, implant } = this;
+    if (!treatment) return;
     this.picture.moved = (event) => this.deploying.look(this.axis.under(event, null));
-    const key = JSON.stringify([this.deploying.host.choice(name), this.colour, this.view.anatomy]);
-    if (this.shownDevice !== key || this.deploying.name !== name || !this.measures[name]) {
-      this.shownDevice = key;
-      this.deploying.show(name);
+    const key = JSON.stringify([treatment, implant.id, this.colour, this.view.anatomy]);
+    if (this.shownTreatment !== key || !this.measures[treatment.name]) {
+      this.shownTreatment = key;
+      this.deploying.show(treatment.name, implant.id);
     }
   }
 
@@ -502,7 +507,7 @@ class Page {
     const { job } = this.view;
     if (this.isFilm && this.films.hasFilm) return this.films.strip;
     if (job?.kind !== "flow") return [];
-    const box = make("div", { className: "residual" }, [residualChart(job.residual)]);
+    const box = make("div", { className: "residual" }, [residualChart(job.residuals)]);
     box.append(chartButton("convergence", box));
     return [box];
   }
@@ -513,7 +518,7 @@ class Page {
     if (!job) return this.work.replaceChildren();
     const bar = make("i");
     bar.style.width = `${Math.max(2, 100 * job.fraction)}%`;
-    const words = make("div", { className: "work-words" }, [make("b", {}, [job.stage ? this.spoken(job.stage) : "Starting"]), make("span", {}, [job.detail || "…"])]);
+    const words = make("div", { className: "work-words" }, [make("b", {}, [job.stage ? this.spoken(job.stage) : "Starting"]), make("span", {}, [progressWords(job) || "…"])]);
     const stop = make("button", { type: "button", onClick: () => drop(`${this.path}/jobs`).catch((problem) => this.complain(problem)) }, ["Cancel"]);
     const done = job.finished.map(({ stage }) => this.spoken(stage));
     const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "The work continues when this tab is closed."]);
@@ -530,11 +535,11 @@ class Page {
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
       const stale = this.view.steps.flow !== "done" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
-      parts.push(head("Before and after"), ...stale, qualitySheet(flow), changeSheet(flow, this.isWhole, (name) => this.deviceTitle(name)));
+      parts.push(head("Before and after"), ...stale, qualitySheet(flow), changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)));
     }
     if (this.isComparing) parts.push(head("Compared"), plainSheet(this.ranking.comparing.sheets(), this.isWhole));
     else if (["device", "deploy"].includes(this.step)) {
-      const sheets = this.view.choices.devices.map(({ name }) => this.measures[name]).filter(Boolean);
+      const sheets = this.view.choices.treatments.flatMap(({ name }) => this.measures[name] || []);
       if (sheets.length) parts.push(head("Deployed"), plainSheet(sheets, this.isWhole));
     }
     if (this.step === "report") for (const varied of this.sheets?.uncertainty || []) parts.push(...sureSheet(varied));
@@ -544,13 +549,13 @@ class Page {
     redraw(this.numbers, ...parts);
   }
 
-  toldDevice(name, manifest, isWhole) {
+  toldTreatment(manifest, isWhole) {
     this.place = manifest;
     if (isWhole) {
-      this.measures[name] = manifest.measures;
+      this.measures[manifest.treatment] = manifest.measures;
       this.advice = manifest.advice;
       this.renderNumbers();
-      this.portrait.take(`${name} ${JSON.stringify(manifest.ends_mm)}`);
+      this.portrait.take(`${manifest.treatment} ${JSON.stringify(manifest.ends_mm)}`);
       this.panel.querySelector(".advice")?.replaceChildren(manifest.advice);
       if (this.deploying.cursor === undefined && this.anatomy.neck.length) this.deploying.look((this.anatomy.neck[0] + this.anatomy.neck[1]) / 2);
       else this.deploying.look(this.deploying.cursor);
@@ -566,12 +571,12 @@ class Page {
     if (bands) redraw(bands, ...bandWords(sheet));
   }
 
-  /** A stage of a job in words: ``flow silk``. */
+  /** A stage of a job in words: ``flow silk``, ``deploy silk+silk_2 silk_2``. */
   spoken(stage) {
-    const [first, device] = stage.split(" ");
+    const [first, name, id] = stage.split(" ");
     const words = SPOKEN[first] || stage;
-    if (!device || first === "plan") return words;
-    return `${words} ${device === "bare" ? "before" : this.deviceTitle(device)}`;
+    if (!name || first === "plan") return words;
+    return `${words} ${name === "bare" ? "before" : this.names.treatment(name)}${id ? `: ${this.names.implant(name, id)}` : ""}`;
   }
 
   /** The inlet's pulse, for the left side. */
@@ -610,8 +615,13 @@ class Page {
     }
   }
 
-  changeDevice(name, changes) {
-    return this.choose(deviceWith(name, changes));
+  changeImplant(name, id, changes) {
+    return this.choose(implantWith(name, id, changes));
+  }
+
+  /** What the choices become when the middle of an implant is put to a place, or left to be proposed again (null). */
+  moved(name, id, mm) {
+    return (choices) => implantWith(name, id, placedAt(choices.treatments.find((one) => one.name === name).implants.find((one) => one.id === id), mm))(choices);
   }
 
   chooseFlow(changes) {
@@ -692,10 +702,11 @@ class Page {
   }
 }
 
-/** What changes of one device make of the choices. */
-const deviceWith = (name, changes) => ({ devices }) => ({
-  devices: devices.map((device) => (device.name === name ? { ...device, ...changes } : device)),
-});
+/** What a job does, how far its flow is from convergence, and how long it will take. */
+function progressWords({ detail, residual, seconds_left }) {
+  const away = residual === null ? "" : `${(100 * residual).toFixed(1)} % from convergence`;
+  return [detail, away, seconds_left === null ? "" : `${seconds_left.toFixed(0)} s left`].filter(Boolean).join(", ");
+}
 const SPOKEN = {
   scan: "Scan", vessel: "Vessel", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes", rank_flow: "Flow of the best sizes",
   deploy: "Deploying", struts: "Wires of", plan: "Run time of the flow", flow: "Flow,", vary: "Uncertainty of", measure: "Metrics", report: "Report", angiogram: "Angiogram,", film: "Films",

@@ -1,6 +1,7 @@
 // The left side: what each step is, what can be chosen in it, and its one main button.
 import { make } from "../src/dom.js";
 import { bandWords, placeWords } from "./numbers.js";
+import { isOfDevice, withDevice } from "./treatments.js";
 
 /** Position of an opening, in the form of a study's settings. */
 export const placeOf = ({ center_mm }) => center_mm.map((x) => Number(x.toFixed(2)));
@@ -134,35 +135,29 @@ export const panels = {
 
   device(page) {
     const { job, choices, has_ranking } = page.view;
-    const chosen = new Map(choices.devices.map((device) => [device.name, device]));
+    const chosen = choices.treatments;
     const parts = [...title("Device", "Choose up to three devices to compare. Every size of each is deployed in this artery and ranked."), ...earlier(page)];
-    parts.push(make("div", { className: "devices" }, page.catalogue.map((design) => deviceBox(page, design, chosen))));
+    const others = chosen.filter((treatment) => !isOfDevice(treatment));
+    parts.push(make("div", { className: "devices" }, [...others.map((treatment) => treatmentBox(page, treatment)), ...page.catalogue.map((design) => deviceBox(page, design))]));
     parts.push(...failure(page), ...flowsOfRanking(page));
-    if (!job) parts.push(main(page, has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !chosen.size));
+    if (!job) parts.push(main(page, has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !chosen.length));
     parts.push(next(page, "deploy", "Deploy →"));
     return parts;
   },
 
   deploy(page) {
-    const { choices } = page.view;
+    const { treatment, implant } = page;
     const parts = [...title("Deploy", "Drag either end along the artery. The deployed length follows, because the wires cannot stretch."), ...earlier(page)];
-    if (!page.device) return [...parts, make("p", { className: "note" }, ["Choose a device first."]), next(page, "device", "← Device")];
-    const tabs = choices.devices.map(({ name }) => {
-      const button = make("button", { type: "button", ariaPressed: String(name === page.device) }, [page.deviceTitle(name)]);
-      button.addEventListener("click", () => {
-        page.active = name;
-        page.render();
-      });
-      return button;
-    });
-    parts.push(make("div", { className: "tabs", role: "group", ariaLabel: "Device" }, tabs), ...sizes(page));
+    if (!treatment) return [...parts, make("p", { className: "note" }, ["Choose a device first."]), next(page, "device", "← Device")];
+    const isHere = (told) => told?.treatment === treatment.name && told.implant === implant.id;
+    parts.push(...tabs(page), ...sizes(page));
     const place = make("div", { className: "place" });
-    if (page.place && page.deploying.name === page.device) place.append(...placeWords(page.place));
+    if (isHere(page.place)) place.append(...placeWords(page.place));
     const bands = make("div", { className: "bands" });
-    if (page.bands?.device === page.device) bands.append(...bandWords(page.bands));
+    if (isHere(page.bands)) bands.append(...bandWords(page.bands));
     parts.push(place, bands, ...colours(page), expansion(page));
     if (page.anatomy?.neck?.length) parts.push(page.flowing.element);
-    parts.push(make("p", { className: "advice" }, [page.advice && page.deploying.name === page.device ? page.advice : ""]), ...failure(page));
+    parts.push(make("p", { className: "advice" }, [page.advice && isHere(page.place) ? page.advice : ""]), ...failure(page));
     parts.push(make("a", { className: "button wide", href: `${page.path}/plan.pdf`, target: "_blank", rel: "noopener" }, ["One-page plan (PDF)"]));
     parts.push(next(page, "flow", "Flow →"));
     return parts;
@@ -179,7 +174,7 @@ export const panels = {
       select("outlets", "Outlets", flow.outlets, [["zero_pressure", "zero pressure"], ["murray", "split by r³ (Murray)"]], (value) => page.chooseFlow({ outlets: value })),
     );
     parts.push(page.pulseChart(), ...unseen(page), ...failure(page), ...staleness(page));
-    if (!job) parts.push(main(page, steps.flow === "done" ? "Run again" : "Run the flow", () => page.start("flow"), !page.view.has_anatomy || !page.device));
+    if (!job) parts.push(main(page, steps.flow === "done" ? "Run again" : "Run the flow", () => page.start("flow"), !page.view.has_anatomy || !page.treatment));
     if (page.flowPanes?.length) parts.push(modes(page), ...films(page));
     if (page.view.has_report && steps.report === "done") parts.push(next(page, "report", "Report →"));
     return parts;
@@ -336,15 +331,33 @@ function near(page) {
   return (given && nearest(farEnds(page), given)?.role) || "";
 }
 
-function deviceBox(page, design, chosen) {
-  const device = chosen.get(design.key);
-  const box = make("input", { type: "checkbox", checked: Boolean(device) });
-  box.dataset.key = `device-${design.key}`;
-  box.disabled = !device && chosen.size >= 3;
+/** Tick or untick a treatment. */
+function treatmentTick(page, key, treatment, isChosen) {
+  const box = make("input", { type: "checkbox", checked: isChosen });
+  box.dataset.key = `device-${key}`;
+  box.disabled = !isChosen && page.view.choices.treatments.length >= 3;
   box.addEventListener("change", () => {
-    const others = (devices) => devices.filter(({ name }) => name !== design.key);
-    page.choose(({ devices }) => ({ devices: box.checked ? [...others(devices), { name: design.key }] : others(devices) }));
+    const others = (treatments) => treatments.filter(({ name }) => name !== treatment.name);
+    page.choose(({ treatments }) => ({ treatments: box.checked ? [...others(treatments), treatment] : others(treatments) }));
   });
+  return box;
+}
+
+const sizeWords = ({ diameter_mm, length_mm }) => (diameter_mm ? `${diameter_mm} × ${length_mm} mm` : "proposed");
+
+/** A treatment of several devices, or one with a name of its own, as the study that the case was opened from had it. */
+function treatmentBox(page, treatment) {
+  return make("label", { className: "device", title: `Treatment ${treatment.name}` }, [
+    treatmentTick(page, treatment.name, treatment, true),
+    make("span", {}, [make("b", {}, [page.names.treatment(treatment.name)]), make("small", {}, [treatment.implants.map(({ id }) => page.names.implant(treatment.name, id)).join(", ")])]),
+    make("em", {}, [treatment.implants.map(sizeWords).join(" + ")]),
+  ]);
+}
+
+function deviceBox(page, design) {
+  const treatment = page.view.choices.treatments.find((one) => one.name === design.key && isOfDevice(one));
+  const device = treatment?.implants[0];
+  const box = treatmentTick(page, design.key, withDevice(design.key), Boolean(treatment));
   const size = device?.diameter_mm ? `${device.diameter_mm} × ${device.length_mm} mm` : device ? page.proposed?.sizes[design.key]?.replace(" x ", " × ") ?? "" : design.kind;
   const mark = device && !device.diameter_mm ? [make("small", {}, ["proposed"])] : [];
   const sure = `${design.n_facts - design.n_estimated} of ${design.n_facts} numbers are cited or derived, the rest estimated`;
@@ -355,21 +368,32 @@ function deviceBox(page, design, chosen) {
   ]);
 }
 
+/** The treatments, and the implants of the one in view where it has several. */
+function tabs(page) {
+  const { treatment, implant } = page;
+  const row = (label, items) => make("div", { className: "tabs", role: "group", ariaLabel: label }, items);
+  const tab = (words, isShown, show) => make("button", { type: "button", ariaPressed: String(isShown), onClick: () => (show(), page.render()) }, [words]);
+  const names = page.view.choices.treatments.map(({ name }) => tab(page.names.treatment(name), name === treatment.name, () => (page.active = name)));
+  const ids = treatment.implants.map(({ id }) => tab(page.names.implant(treatment.name, id), id === implant.id, () => (page.activeImplant = id)));
+  return [row("Treatment", names), ...(ids.length > 1 ? [row("Implant", ids)] : [])];
+}
+
 function sizes(page) {
-  const device = page.view.choices.devices.find(({ name }) => name === page.device);
-  const design = page.catalogue.find(({ key }) => key === page.device);
-  const proposed = page.place && page.deploying.name === page.device ? page.place.size.match(/([\d.]+) x ([\d.]+)/) : null;
+  const { treatment, implant: device } = page;
+  const design = page.catalogue.find(({ key }) => key === device.device);
+  const isHere = page.place?.treatment === treatment.name && page.place.implant === device.id;
+  const proposed = isHere ? page.place.size.match(/([\d.]+) x ([\d.]+)/) : null;
   const now = [device.diameter_mm ?? Number(proposed?.[1] ?? 0), device.length_mm ?? Number(proposed?.[2] ?? 0)];
   const options = design.sizes.map(([d, l]) => [`${d},${l}`, `${d.toFixed(2)} × ${l} mm`]);
   const value = device.diameter_mm ? now.join(",") : "";
   const words = proposed ? `${now[0].toFixed(2)} × ${now[1]} mm (proposed)` : "proposed";
   const change = (text) => {
     const [diameter_mm, length_mm] = text ? text.split(",").map(Number) : [null, null];
-    page.changeDevice(page.device, { diameter_mm, length_mm });
+    page.changeImplant(treatment.name, device.id, { diameter_mm, length_mm });
   };
   const parts = [select("size", "Size", value, [["", words], ...options], change)];
-  if (device.center_mm !== null) {
-    parts.push(make("button", { type: "button", className: "link", onClick: () => page.changeDevice(page.device, { center_mm: null }) }, ["Center it on the neck again"]));
+  if (device.placing.position_mm !== null) {
+    parts.push(make("button", { type: "button", className: "link", onClick: () => page.choose(page.moved(treatment.name, device.id, null)) }, ["Center it on the neck again"]));
   }
   return parts;
 }

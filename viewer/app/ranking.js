@@ -3,6 +3,7 @@ import { make } from "../src/dom.js";
 import { get } from "./api.js";
 import { Comparing } from "./comparing.js";
 import { redraw } from "./redraw.js";
+import { isOfDevice, withDevice } from "./treatments.js";
 
 const percent = (v) => `${(100 * v).toFixed(0)} %`;
 const change = (v) => `${v > 0 ? "+" : v < 0 ? "−" : ""}${Math.abs(100 * v).toFixed(0)} %`;
@@ -137,7 +138,8 @@ export class Ranking {
 
   line(row) {
     const { page } = this;
-    const chosen = page.view.choices.devices.find(({ name }) => name === row.device);
+    const ofDevice = (treatment) => treatment.name === row.device && isOfDevice(treatment);
+    const chosen = page.view.choices.treatments.find(ofDevice)?.implants[0];
     const isChosen = chosen && chosen.diameter_mm === row.label_diameter_mm && chosen.length_mm === row.label_length_mm;
     const score = make("i", { className: "score" });
     score.style.width = `${48 * row.score}px`;
@@ -152,7 +154,9 @@ export class Ranking {
       ...(this.found.columns || []).map(({ key }) => make("td", {}, [row[key] === undefined ? "–" : FORMATS[key](row[key])])),
       make("td", { className: "reason" }, [row.is_suitable ? row.reason.replace(COSTS, "") : `Ruled out: ${row.reason[0].toLowerCase()}${row.reason.slice(1)}`]),
     ];
-    const choose = () => page.changeDevice(row.device, { diameter_mm: row.label_diameter_mm, length_mm: row.label_length_mm, center_mm: null }).then(() => page.goTo(row.device));
+    const sized = withDevice(row.device, { diameter_mm: row.label_diameter_mm, length_mm: row.label_length_mm });
+    const put = ({ treatments }) => ({ treatments: treatments.some(ofDevice) ? treatments.map((one) => (ofDevice(one) ? sized : one)) : [...treatments, sized] });
+    const choose = () => page.choose(put).then(() => page.goTo(row.device));
     const element = make("tr", { className: `${row.is_suitable ? "" : "unsuitable"} ${isChosen ? "chosen" : ""}` }, cells);
     element.addEventListener("click", (event) => event.target.closest("input, label") || choose());
     return element;

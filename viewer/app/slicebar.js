@@ -132,7 +132,7 @@ export class SliceBar {
   renderChips() {
     const { slices } = this;
     const found = Boolean(slices.found);
-    const has = { threshold: slices.threshold !== null, lumen: found, parent: found, sac: found && slices.hasSac, neck: found && slices.hasSac, wires: found && Boolean(slices.device) };
+    const has = { threshold: slices.threshold !== null, lumen: found, parent: found, sac: found && slices.hasSac, neck: found && slices.hasSac, wires: found && Boolean(slices.treatment) };
     const chips = Object.entries(LINES)
       .filter(([name]) => has[name])
       .map(([name, { title, colour, dash, width }]) => {

@@ -168,12 +168,12 @@ export class Slices {
     this.bar.say();
   }
 
-  /** The anatomy that was found, and the name and place of a device in it: their outlines are drawn from here on. */
-  setFound(anatomy, device, place) {
-    const found = anatomy ? [anatomy, device, place].join(" ") : null;
+  /** The anatomy that was found, and the name and places of a treatment in it: their outlines are drawn from here on. */
+  setFound(anatomy, treatment, places) {
+    const found = anatomy ? [anatomy, treatment, places].join(" ") : null;
     if (found === this.found) return;
     this.found = found;
-    this.device = device;
+    this.treatment = treatment;
     this.reloadOutlines();
     this.bar.renderChips();
   }
@@ -191,9 +191,9 @@ export class Slices {
 
   loadOutlines(view) {
     if (!this.found) return;
-    const [index, { outlineKey: found, device }] = [view.index, this];
+    const [index, { outlineKey: found, treatment }] = [view.index, this];
     if (view.outlines?.index === index && view.outlines.found === found) return;
-    const wires = device && this.on.wires ? `&device=${encodeURIComponent(device)}` : "";
+    const wires = treatment && this.on.wires ? `&treatment=${encodeURIComponent(treatment)}` : "";
     this.outlineLines[view.axis].ask(async () => {
       if (index !== view.index) return null;
       return { view, index, found, answer: await getBinary(`${this.host.path()}/image/outlines?axis=${view.axis}&index=${index}${wires}${this.asked}`) };

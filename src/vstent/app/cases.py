@@ -110,23 +110,21 @@ def _differences(given: dict[str, Any], usual: dict[str, Any], before: str = "")
             yield f"{before}{name}" + ("" if isinstance(value, dict | tuple) else f" {value}")
 
 
-OF_IMAGE: Final = ("units", "spacing_mm", "shape", "threshold", "at_mm")
+OF_IMAGE: Final = ("units", "frame", "spacing_mm", "shape", "crop_mm", "threshold", "at_mm")
 """Choices on which the step Image depends."""
 
 
 def dependencies(state: State) -> dict[str, str]:
     """Return a digest of everything that each step depends on, by step."""
     chosen = state.choices.model_dump(mode="json")
-    # Absent by default, so that older cases keep their digests.
-    later = [chosen[name] for name in ("frame", "crop_mm") if chosen[name]]
-    sizes = [[device.name, device.diameter_mm, device.length_mm] for device in state.choices.devices]
-    centers = [device.center_mm for device in state.choices.devices]
+    treatments = chosen["treatments"]
+    placings = [[implant.pop("placing") for implant in treatment["implants"]] for treatment in treatments]
     parts: dict[str, Any] = {
-        "image": [state.source, *(chosen[name] for name in OF_IMAGE), *later],
+        "image": [state.source, *(chosen[name] for name in OF_IMAGE)],
         "vessel": [chosen[name] for name in ("inlet_mm", "upstream_mm", "downstream_mm")],
         "sac": [chosen["outlet_mm"], chosen["neck_mm"]],
-        "device": sizes,
-        "deploy": centers,
+        "device": treatments,
+        "deploy": placings,
         "flow": chosen["flow"],
         "report": chosen["uncertainty_samples"],
     }
@@ -291,8 +289,10 @@ def load(case_id: str, folder: Path) -> Case:
         state = State.model_validate_json((folder / STATE).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ReadError(f"{folder} is not a case of the page: it has no {STATE}.") from None
-    except (OSError, ValidationError, UnicodeDecodeError):
-        raise ReadError(f"{folder / STATE} is damaged. Delete it and open the scan again.") from None
+    except (OSError, ValidationError, UnicodeDecodeError, InputError):
+        raise ReadError(
+            f"{folder / STATE} is damaged or from another version of vstent: open the scan of the case again."
+        ) from None
     return Case(case_id, folder, state)
 
 

@@ -1,15 +1,17 @@
 """The user's choices as the page and the REST interface state them, and their conversion to settings of a study."""
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-if (
-    TYPE_CHECKING
-):  # the modules of a study are imported only when its settings are needed, so that the page appears at once
+from vstent.devices.treatment import Treatment, with_device
+
+if TYPE_CHECKING:  # imported only when the settings of a study are needed, so that the page appears at once
     from vstent.flow.settings import FlowSettings, Waveform
-    from vstent.study.types import Placing, Settings
+    from vstent.study.types import AnatomySettings, InputSettings, Settings
+
+Part = TypeVar("Part", "InputSettings", "AnatomySettings")
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
 """A coordinate or position in mm."""
@@ -24,22 +26,9 @@ Point = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class Strict(BaseModel):
-    """A model that rejects unknown fields."""
+    """A model that rejects unknown fields and numbers that are not finite, also in data classes of its fields."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class DeviceChoice(Strict):
-    """A device with its size and the position of its middle; missing values are proposed."""
-
-    name: str = Field(max_length=60)
-    """Name in the catalogue."""
-    diameter_mm: Length | None = None
-    """Label diameter."""
-    length_mm: Length | None = None
-    """Label length."""
-    center_mm: Coordinate | None = None
-    """Position of the device's middle along the parent axis."""
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class FlowChoice(Strict):
@@ -133,10 +122,8 @@ class Choices(Strict):
     """Length of artery to keep proximal to the sac."""
     downstream_mm: Length | None = None
     """Length of vessel to keep distal to the sac."""
-    devices: tuple[DeviceChoice, ...] = Field(
-        default=(DeviceChoice(name="silk"), DeviceChoice(name="enterprise")), max_length=3
-    )
-    """Devices with their sizes and positions."""
+    treatments: tuple[Treatment, ...] = Field(default=(with_device("silk"), with_device("enterprise")), max_length=3)
+    """Treatments to compare, each under a name of its own; one of a single device has the name of the device."""
     flow: FlowChoice = FlowChoice()
     """Settings of the flow."""
     ranking_flows: Annotated[int, Field(ge=1, le=24)] | None = None
@@ -148,43 +135,35 @@ class Choices(Strict):
     ranges: Annotated[tuple[ColourRange, ...], Field(max_length=40)] = ()
     """Ranges of color scales that were chosen; no result depends on them."""
 
-    @field_validator("devices")
+    @field_validator("treatments")
     @classmethod
-    def _each_once(cls, devices: tuple[DeviceChoice, ...]) -> tuple[DeviceChoice, ...]:
-        """Return the devices; ValueError is raised where one is chosen twice."""
-        if len({device.name for device in devices}) < len(devices):
+    def _each_once(cls, treatments: tuple[Treatment, ...]) -> tuple[Treatment, ...]:
+        """Return the treatments; ValueError is raised where two have the same name, or one has no implant."""
+        if len({treatment.name for treatment in treatments}) < len(treatments):
             raise ValueError("a device can be chosen only once")
-        return devices
+        if not all(treatment.implants for treatment in treatments):
+            raise ValueError("a treatment needs an implant")
+        return treatments
 
     def settings(self, former: "Settings") -> "Settings":
         """Return the settings of the study; settings that the page cannot change are taken from `former`."""
         from vstent.flow.settings import FlowSettings
         from vstent.plan.uncertainty import Ranges
-        from vstent.study.types import Placing
 
         samples = self.uncertainty_samples
         return replace(
             former,
-            diameter_mm=None,  # every device gets its own below
-            length_mm=None,
-            center_mm=None,
-            devices=tuple(device.name for device in self.devices),
-            units=self.units,
-            frame=self.frame,
-            spacing_mm=self.spacing_mm,
-            shape=self.shape,
-            crop_mm=self.crop_mm,
-            threshold=self.threshold,
-            at_mm=self.at_mm,
-            inlet_mm=self.inlet_mm,
-            outlet_mm=self.outlet_mm,
-            neck_mm=self.neck_mm,
-            upstream_mm=self.upstream_mm,
-            downstream_mm=self.downstream_mm,
+            input=self._changed(former.input),
+            anatomy=self._changed(former.anatomy),
+            treatments=self.treatments,
             flow=self.flow.settings(former.flow or FlowSettings()),
-            placings={device.name: placing for device in self.devices if (placing := placing_of(device)) != Placing()},
             uncertainty=None if samples is None else replace(former.uncertainty or Ranges(), samples=samples),
         )
+
+    def _changed(self, former: Part) -> Part:
+        """Return a part of the settings with the fields that can be chosen on the page."""
+        names = {field.name for field in fields(former)} & type(self).model_fields.keys()
+        return replace(former, **{name: getattr(self, name) for name in names})
 
 
 def pulse_of(former: "FlowSettings") -> "Waveform":
@@ -192,10 +171,3 @@ def pulse_of(former: "FlowSettings") -> "Waveform":
     from vstent.flow.waveform import OLDER_ADULT_ICA
 
     return former.waveform or OLDER_ADULT_ICA
-
-
-def placing_of(device: DeviceChoice) -> "Placing":
-    """Return size and position of a device for the study."""
-    from vstent.study.types import Placing
-
-    return Placing(device.diameter_mm, device.length_mm, device.center_mm)

@@ -24,7 +24,7 @@ def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
     field : the flow.
     anatomy : vessel, parent artery and sacs.
     """
-    right, up = views_of(anatomy, {})[0].axes[:2]
+    right, up = views_of(anatomy)[0].axes[:2]
     sacs = anatomy.aneurysms
     middle = sacs[0].sac.vertices_mm.mean(axis=0) if sacs else anatomy.parent.axis.points_mm.mean(axis=0)
     step_mm = STEP_CELLS * field.finest.cell_size_mm

@@ -10,10 +10,11 @@ from typing import Any, Final, Literal
 
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Absent, Case, Conflict, Store, dependencies, failures, statuses
-from vstent.app.choices import DeviceChoice, Point, pulse_of
+from vstent.app.choices import Point, pulse_of
 from vstent.app.finished import REPORT, RUN, kept_flows, kept_histories, lost_steps
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.app.reopening import reopened, stem
+from vstent.devices.treatment import BARE, Treatment
 from vstent.errors import InputError, ReadError
 from vstent.io.files import atomic, existing
 
@@ -162,7 +163,7 @@ class Desk:
         """
         if not case.input.exists():
             raise ReadError(f"The scan of {case.state.name} has been moved from {case.input}. Put it back there.")
-        if kind != "anatomy" and not case.state.choices.devices:
+        if kind != "anatomy" and not case.state.choices.treatments:
             raise InputError("No device is chosen. Choose one in the step Device.")
         if kind == "angiogram" and not _has_flow(case):
             raise InputError("The flow is out of date or not computed, and contrast moves with it. Run the step Flow.")
@@ -175,10 +176,10 @@ class Desk:
         if case.state.job in KINDS and job is None and case.state.source:
             self.start(case, case.state.job)
 
-    def note_deployed(self, case: Case, device: DeviceChoice) -> None:
-        """Mark the steps device and deploy as finished after the deployed device was sent to the page."""
+    def note_deployed(self, case: Case, treatment: Treatment) -> None:
+        """Mark the steps device and deploy as finished after a deployed treatment was sent to the page."""
         keys = dependencies(case.state)
-        is_current = device in case.state.choices.devices and case.state.done.get("sac") == keys["sac"]
+        is_current = treatment in case.state.choices.treatments and case.state.done.get("sac") == keys["sac"]
         chosen = {step: keys[step] for step in ("device", "deploy")}
         if is_current and any(case.state.done.get(step) != key for step, key in chosen.items()):
             case.update(done=case.state.done | chosen)
@@ -282,13 +283,13 @@ class Desk:
                 self._scans[case.id] = (grid, crop), found
             return found
 
-    def outlines(self, case: Case, device: str | None, axis: int, index: int, *, is_upright: bool = False) -> bytes:
+    def outlines(self, case: Case, treatment: str | None, axis: int, index: int, *, is_upright: bool = False) -> bytes:
         """Return the outlines on a slice as a message for the page.
 
         Parameters
         ----------
         case : the case.
-        device : chosen device whose wires are cut; None: none.
+        treatment : chosen treatment whose wires are cut; None: none.
         axis : voxel axis across the slice.
         index : voxel index along that axis.
         is_upright : whether the slice is an anatomical plane of an oblique scan.
@@ -296,8 +297,8 @@ class Desk:
         from vstent.app.outlines import outlines
 
         live = self.live(case)
-        stent = None if device is None else live.deployment(live.choice(device)).stent
-        return outlines(self.scan(case).grid(is_upright=is_upright), live.anatomy, stent, axis, index)
+        stents = [] if treatment is None else live.stents(live.choice(treatment))
+        return outlines(self.scan(case).grid(is_upright=is_upright), live.anatomy, stents, axis, index)
 
     def input_surface(self, case: Case) -> bytes:
         """Return the surface of the input as read, as a message for the page.
@@ -454,7 +455,7 @@ def ranking(case: Case) -> dict[str, Any]:
     if not path.is_file():
         return {"rows": [], "is_current": False}
     found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    names = sorted(device.name for device in case.state.choices.devices)
+    names = sorted({device for treatment in case.state.choices.treatments for device in treatment.devices})
     is_current = found.get("anatomy") == case.state.anatomy and found.get("devices") == names
     return found | {"is_current": is_current}
 
@@ -475,11 +476,11 @@ def pulse(case: Case | None) -> dict[str, Any]:
 
 
 def _titles(metrics: dict[str, Any], case: Case) -> dict[str, str]:
-    """Return the titles of the devices with their sizes, in the order in which they were chosen."""
-    order = [device.name for device in case.state.choices.devices]
-    found = {name: stent["deployment"] for name, stent in metrics.get("stents", {}).items()}
+    """Return the titles of the treatments, devices with their sizes, in the order in which they were chosen."""
+    order = [treatment.name for treatment in case.state.choices.treatments]
+    found = {name: one["implants"].values() for name, one in metrics["treatments"].items() if name != BARE}
     names = sorted(found, key=lambda name: order.index(name) if name in order else len(order))
-    return {name: f"{found[name]['device']} {found[name]['size']}" for name in names}
+    return {name: " + ".join(f"{one['device']} {one['size']}" for one in found[name]) for name in names}
 
 
 def _is_surface(case: Case) -> bool:

@@ -1,7 +1,7 @@
 """Films of the page: every flow along one C-arm direction, from the stored contrast."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -49,7 +49,7 @@ def films_message(
     histories: Mapping[str, History],
     angles_rad: tuple[float, float],
     *,
-    stents: Mapping[str, Stent],
+    stents: Mapping[str, Sequence[Stent]],
     moment: int | None = None,
     **more: Any,
 ) -> bytes:
@@ -59,7 +59,7 @@ def films_message(
     ----------
     histories : contrast by name, ``bare`` first.
     angles_rad : primary and secondary angle.
-    stents : devices whose wires are shown, by name.
+    stents : implants whose wires are shown, by treatment.
     moment : number of the only frame to return, with coarse pixels; None: all frames.
     more : further entries of the manifest.
     """
@@ -70,7 +70,8 @@ def films_message(
     window = max(_bound(projectors[name], history) for name, history in histories.items())
     for name, history in histories.items():
         film = _film(history, projectors[name], moment)
-        wires = wire_shadow(view, stents[name]) if name in stents else None
+        shadows = [wire_shadow(view, stent) for stent in stents.get(name, ())]
+        wires = np.sum(shadows, axis=0) if shadows else None
         levels = np.stack([np.rint(LEVELS * one) for one in levels_of(film, window, wires=wires)]).astype(np.uint8)
         panes.append({"id": name, "frames": packer.add(levels)})
         times_s = history.time_s

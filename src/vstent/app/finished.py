@@ -76,13 +76,10 @@ def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
 
 def _paths(folder: Path, source: str, settings: "Settings") -> dict[str, Path]:
     """Return the files in which a study stores its flows, by name."""
-    from vstent.devices.catalogue import find_design
-    from vstent.devices.design import BARE
     from vstent.study.folder import CACHE
-    from vstent.study.stages import flow_key
+    from vstent.study.stages import flow_keys
 
     if settings.flow is None:
         return {}
-    designs = {BARE: None} | {name: find_design(name) for name in settings.devices}
-    keys = {name: flow_key(source, settings, name, design) for name, design in designs.items()}
+    keys = flow_keys(source, settings)
     return {name: folder / CACHE / f"flow {name}-{key}.npz" for name, key in keys.items()}

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -44,8 +43,6 @@ STAGES: Final = {
     "report": "report",
 }
 """Step of the page for the first word of a study's stage."""
-SETTLING: Final = re.compile(r"([\d.]+)% from convergence, (?:.*?)(\d+) s left")
-"""Form of the progress message of a flow (`vstent.study.ledger.Ledger.teller`)."""
 STOPPED: Final = "Stopped. Finished results are kept."
 """Message of a step that the user stopped."""
 LAST_WORDS: Final = ".worker.log"
@@ -68,9 +65,9 @@ class Job:
     def __init__(self, case: Case, kind: str) -> None:
         self.case, self.kind = case, kind
         self.began = time.time()
-        self.stage, self.fraction, self.detail = "", 0.0, ""
+        self.now: dict[str, Any] = {"stage": "", "fraction": 0.0, "detail": "", "residual": None, "seconds_left": None}
         self.finished: list[dict[str, Any]] = []
-        self.residual: deque[tuple[float, float]] = deque(maxlen=POINTS_KEPT)
+        self.residuals: deque[tuple[float, float]] = deque(maxlen=POINTS_KEPT)
         self._given = case.state
         keys = dependencies(self._given)
         self._has_anatomy = all(self._given.done.get(step) == keys[step] for step in KINDS["anatomy"])
@@ -94,7 +91,7 @@ class Job:
         """Current step of the page; empty when all are finished."""
         if self._process.poll() is not None and not self._thread.is_alive():
             return ""
-        step = STAGES.get(self.stage.partition(" ")[0], FIRST[self.kind])
+        step = STAGES.get(self.now["stage"].partition(" ")[0], FIRST[self.kind])
         is_past = self._has_anatomy and step not in KINDS[self.kind]  # the stored anatomy is being loaded
         return FIRST[self.kind] if is_past else step
 
@@ -107,13 +104,10 @@ class Job:
         """Return the progress as clients read it."""
         return {
             "kind": self.kind,
-            "stage": self.stage,
-            "fraction": self.fraction,
-            "detail": self.detail,
             "seconds": time.time() - self.began,
             "finished": self.finished,
-            "residual": list(self.residual),
-        }
+            "residuals": list(self.residuals),
+        } | self.now
 
     def stop(self) -> None:
         """Stop at once; finished results are kept."""
@@ -148,7 +142,7 @@ class Job:
             elif "anatomy" in told:
                 self._take_anatomy(told["anatomy"])
             else:
-                self._take(told["stage"], told["fraction"], told["detail"])
+                self._take(told)
         self._process.stdout.close()
         with suppress(BrokenPipeError):
             self._process.stdin.close()
@@ -169,16 +163,15 @@ class Job:
         failed = {step: why for step, why in state.failed.items() if step not in steps}
         self.case.update(anatomy=key, done=state.done | {step: keys[step] for step in steps}, failed=failed)
 
-    def _take(self, stage: str, fraction: float, detail: str) -> None:
-        """Record a progress message and notify the clients."""
-        if stage != self.stage:
-            self.residual.clear()
-        self.stage, self.fraction, self.detail = stage, fraction, detail
-        settling = SETTLING.search(detail)
-        if settling:
-            self.residual.append((fraction, float(settling[1]) / 100))
-        if fraction >= 1.0:
-            self.finished.append({"stage": stage, "detail": detail})
+    def _take(self, now: dict[str, Any]) -> None:
+        """Record the progress of a stage (`vstent.study.types.Progress`) and notify the clients."""
+        if now["stage"] != self.now["stage"]:
+            self.residuals.clear()
+        self.now = now
+        if now["residual"] is not None:
+            self.residuals.append((now["fraction"], now["residual"]))
+        if now["fraction"] >= 1.0:
+            self.finished.append({"stage": now["stage"], "detail": now["detail"]})
         self._pass()
         self.case.tell()
 

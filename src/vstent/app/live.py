@@ -18,7 +18,6 @@ from vstent.angiography.view import angles_of
 from vstent.angiography.working_projection import working_projection
 from vstent.app import necks, sheets
 from vstent.app.cases import Case
-from vstent.app.choices import DeviceChoice, placing_of
 from vstent.app.cuts import cut
 from vstent.app.films import films_message, kept_curves
 from vstent.app.finished import kept_flows, kept_histories
@@ -30,7 +29,7 @@ from vstent.deployment.sketch import Bed, Sketch, bed, sketch
 from vstent.devices.catalogue import find_design
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.devices.treatment import BARE
+from vstent.devices.treatment import BARE, Implant, Treatment
 from vstent.errors import InputError, ReadError, VstentError
 from vstent.flow.case import FlowField
 from vstent.flow.domain import default_cell_size_mm
@@ -53,12 +52,12 @@ from vstent.reporting.scene import (
     flow_layers,
     node_coverage,
     scales_of,
+    treatment_title,
     view_of,
     views_of,
 )
 from vstent.study.folder import CACHE
-from vstent.study.stages import bands_of, deploy_one, size_of
-from vstent.study.types import Placing
+from vstent.study.stages import bands_of, deploy_implant, landing_of, on_path, size_of
 
 Colour = Literal["wall_gap", "coverage", "diameter"]
 """Quantity that colors the wires."""
@@ -91,8 +90,8 @@ class Live:
 
     def __init__(self, case: Case) -> None:
         self.case = case
-        self.shown: Stent | None = None  # the device that was drawn last
-        self._follow: Callable[[Stent], None] | None = None
+        self.shown: tuple[Stent, ...] = ()  # the devices that were drawn last
+        self._follow: Callable[[tuple[Stent, ...]], None] | None = None
         self._memory: dict[Hashable, Any] = {}
 
     def remembered(self, key: Hashable, find: Callable[[], Found]) -> Found:
@@ -121,93 +120,127 @@ class Live:
             raise ReadError("The vessel has not been found yet. Run the first three steps.")
         return self.remembered(("anatomy", key), lambda: load_data(path, Anatomy))
 
-    def choice(self, name: str) -> DeviceChoice:
-        """Return the choice of size and position for a device.
+    def choice(self, name: str) -> Treatment:
+        """Return a chosen treatment by its name.
 
         Raises
         ------
         ReadError
-            The device is not chosen.
+            It is not chosen.
         """
-        for device in self.case.state.choices.devices:
-            if device.name == name:
-                return device
-        raise ReadError(f"{name} is not among the chosen devices.")
+        for treatment in self.case.state.choices.treatments:
+            if treatment.name == name:
+                return treatment
+        raise ReadError(f"{name} is not among the chosen treatments.")
 
-    def bed(self, choice: DeviceChoice) -> Bed:
-        """Return the artery prepared for a device of the chosen size."""
-        key = ("bed", self.case.state.anatomy, choice.name, choice.diameter_mm, choice.length_mm)
+    def bed(self, implant: Implant) -> Bed:
+        """Return the artery prepared for an implant of the chosen size."""
+        path, asked = implant.placing.path, (implant.device, implant.diameter_mm, implant.length_mm)
 
         def find() -> Bed:
-            design = find_design(choice.name)
-            return bed(design, size_of(design, self.anatomy, placing_of(choice)), self.anatomy)
+            anatomy = on_path(self.anatomy, path)
+            return bed(find_design(implant.device), size_of(implant, anatomy), anatomy)
 
-        return self.remembered(key, find)
+        return self.remembered(("bed", self.case.state.anatomy, path, *asked), find)
 
-    def sketch(self, choice: DeviceChoice, landing: Landing | None) -> Sketch:
-        """Return the expected position of a device.
+    def sketch(self, implant: Implant, landing: Landing | None) -> Sketch:
+        """Return the expected position of an implant, as if it opened against the wall of the artery.
 
         Parameters
         ----------
-        choice : the device.
+        implant : the implant.
         landing : its position; None: the chosen position, or the proposed one where none is chosen.
         """
         with LOCK:
-            wall = self.bed(choice)
-            if landing is None and choice.center_mm is not None:
-                landing = Landing(choice.center_mm)
+            wall, anatomy = self.bed(implant), on_path(self.anatomy, implant.placing.path)
             lay = partial(sketch, wall)
+            landing = landing or landing_of(implant, anatomy, wall.size)
             if landing is None:
-                return laid_inside(lay, propose_landing(wall.design, self.anatomy, wall.size))
+                return laid_inside(lay, propose_landing(wall.design, anatomy, wall.size))
             return lay(landing)
 
-    def _of_device(self, what: str, choice: DeviceChoice, find: Callable[[], Found]) -> Found:
-        """Return a cached result of a device in this anatomy; where there is none, compute and cache it."""
-        return self.remembered((what, self.case.state.anatomy, *choice.model_dump().values()), find)
+    def _of_implant(self, what: str, treatment: Treatment, implant: Implant, find: Callable[[], Found]) -> Found:
+        """Return a cached result of a deployed implant; where there is none, compute and cache it."""
+        return self.remembered((what, self.case.state.anatomy, *_before(treatment, implant), implant), find)
 
-    def deployment(self, choice: DeviceChoice) -> Deployment:
-        """Return the deployed device."""
-        return self._of_device(
-            "deployment", choice, lambda: deploy_one(find_design(choice.name), self.anatomy, placing_of(choice))
+    def deployment(self, treatment: Treatment, implant: Implant) -> Deployment:
+        """Return a deployed implant; those that it opens inside are deployed before it."""
+
+        def find() -> Deployment:
+            inside = [self.deployment(treatment, _one(treatment, name)).stent for name in implant.inside]
+            return deploy_implant(implant, self.anatomy, inside)
+
+        return self._of_implant("deployment", treatment, implant, find)
+
+    def deployed(self, treatment: Treatment) -> dict[str, Deployment]:
+        """Return the deployed implants of a treatment by id."""
+        return {implant.id: self.deployment(treatment, implant) for implant in treatment.implants}
+
+    def stents(self, treatment: Treatment) -> tuple[Stent, ...]:
+        """Return the devices of a deployed treatment in their order."""
+        return tuple(one.stent for one in self.deployed(treatment).values())
+
+    def measures(self, treatment: Treatment, implant: Implant) -> Measures:
+        """Return the measures of a deployed implant."""
+        return self._of_implant(
+            "measures", treatment, implant, lambda: measure(self.anatomy, self.deployment(treatment, implant))
         )
 
-    def measures(self, choice: DeviceChoice) -> Measures:
-        """Return the measures of the deployed device."""
-        return self._of_device("measures", choice, lambda: measure(self.anatomy, self.deployment(choice)))
+    def metrics(self, treatment: Treatment, implant: Implant) -> dict[str, Any]:
+        """Return the measures of a deployed implant with its bands, as in the metrics of a study."""
 
-    def bands(self, choice: DeviceChoice) -> dict[str, Any]:
-        """Return the bands of the deployed device and how sure it is, as in the metrics of a study."""
-        return self._of_device(
-            "bands",
-            choice,
-            lambda: bands_of(self.anatomy, self.deployment(choice), self.measures(choice), placing_of(choice)),
-        )
+        def find() -> dict[str, Any]:
+            measures = self.measures(treatment, implant)
+            return measures | {"bands": bands_of(self.anatomy, self.deployment(treatment, implant), measures, implant)}
 
-    def _drawn(self, pane: str, choice: DeviceChoice, colour: Colour) -> list[MeshLayer | LineLayer]:
-        """Return wires and contour of the deployed device in a pane."""
-        deployment = self.deployment(choice)
-        stent = deployment.stent
-        measured = partial(self._of_device, "coverage", choice, partial(node_coverage, stent))
-        wires = _wires(pane, stent, deployment.wall_gap_mm, colour, measured)
-        return [wires, device_layers(pane, deployment, self.anatomy)[0]]
+        return self._of_implant("metrics", treatment, implant, find)
 
-    def bands_sheet(self, choice: DeviceChoice) -> dict[str, Any]:
-        """Return the bands of the deployed device as the page shows them."""
+    def _wires(self, pane: str, treatment: Treatment, colour: Colour, but: str = "") -> list[LineLayer]:
+        """Return the wires of the deployed implants of a treatment, without those of the implant `but`."""
+        layers = []
+        for implant in treatment.implants:
+            if implant.id != but:
+                found = self.deployment(treatment, implant)
+                coverage = partial(
+                    self._of_implant, "coverage", treatment, implant, partial(node_coverage, found.stent)
+                )
+                layers.append(_wires(pane, found.stent, found.wall_gap_mm, colour, coverage))
+        return layers
+
+    def _drawn(self, pane: str, treatment: Treatment, colour: Colour) -> list[MeshLayer | LineLayer]:
+        """Return wires and contours of a deployed treatment in a pane."""
+        contours = [device_layers(pane, one, self.anatomy)[0] for one in self.deployed(treatment).values()]
+        return [*self._wires(pane, treatment, colour), *contours]
+
+    def _sheets(self, treatment: Treatment) -> list[dict[str, Any]]:
+        """Return the tables of the deployed implants of a treatment; those of several are numbered in their order."""
+        several = len(treatment.implants) > 1
+        return [
+            sheets.device(
+                (f"{number}. " if several else "") + device_title(self.deployment(treatment, implant)),
+                self.measures(treatment, implant),
+            )
+            for number, implant in enumerate(treatment.implants, start=1)
+        ]
+
+    def bands_sheet(self, treatment: Treatment, implant: str) -> dict[str, Any]:
+        """Return the bands of a deployed implant as the page shows them."""
         with LOCK:
-            metrics = {"deployment": self.measures(choice), "bands": self.bands(choice)}
-        return {"device": choice.name, "sentence": words.how_sure(metrics), "rows": words.rows(metrics)}
+            metrics = self.metrics(treatment, _one(treatment, implant))
+        told = {"treatment": treatment.name, "implant": implant}
+        return told | {"sentence": words.how_sure(metrics), "rows": words.rows(metrics)}
 
-    def follow(self, take: Callable[[Stent], None] | None) -> None:
-        """Hand the device that is drawn, and every later one, to the live flow; None: to nobody."""
+    def follow(self, take: Callable[[tuple[Stent, ...]], None] | None) -> None:
+        """Hand the devices that are drawn, and all later ones, to the live flow; None: to nobody."""
         self._follow = take
-        if take is not None and self.shown is not None:
+        if take is not None and self.shown:
             take(self.shown)
 
-    def _show(self, stent: Stent) -> None:
-        """Note the device that is drawn, and tell the live flow."""
-        self.shown = stent
+    def _show(self, stents: tuple[Stent, ...]) -> None:
+        """Note the devices that are drawn, and tell the live flow."""
+        self.shown = stents
         if self._follow is not None:
-            self._follow(stent)
+            self._follow(stents)
 
     def _field(self, path: Path, moment: int | None) -> FlowField:
         """Return a flow: its mean, or one moment of its last cycle."""
@@ -225,7 +258,7 @@ class Live:
         return self.remembered(key, find)
 
     def plan(self) -> bytes:
-        """Return the plan of the chosen devices as PDF, one page each.
+        """Return the plan of the chosen treatments as PDF, one page per implant.
 
         Raises
         ------
@@ -235,13 +268,13 @@ class Live:
         from vstent.reporting.plan_sheet import Planned, plan_pdf
 
         state, day = self.case.state, date.today().isoformat()
-        if not state.choices.devices:
+        chosen = state.choices.treatments
+        if not chosen:
             raise InputError("No device is chosen. Choose one in the step Device.")
         with LOCK:
-            found = {choice.name: self.deployment(choice) for choice in state.choices.devices}
-            measures = {choice.name: self.measures(choice) for choice in state.choices.devices}
-            told = {choice.name: self.bands(choice) for choice in state.choices.devices}
-            return plan_pdf(Planned(state.name, self.anatomy, found, measures, state.source, day, told))
+            found = {one.name: self.deployed(one) for one in chosen}
+            metrics = {one.name: {part.id: self.metrics(one, part) for part in one.implants} for one in chosen}
+            return plan_pdf(Planned(state.name, self.anatomy, found, metrics, state.source, day))
 
     # -- messages for the page -----------------------------------------------------------------------------------------
 
@@ -283,7 +316,7 @@ class Live:
 
     def proposed(self) -> dict[str, Any]:
         """Return the values that the study proposes where none is chosen: inflow, grid spacing and device sizes."""
-        key = ("proposed", self.case.state.anatomy, *(choice.name for choice in self.case.state.choices.devices))
+        devices = dict.fromkeys(key for one in self.case.state.choices.treatments for key in one.devices)
 
         def find() -> dict[str, Any]:
             given = self.case.state.former_settings().flow or FlowSettings()
@@ -292,68 +325,74 @@ class Live:
                 replace(given, inflow_mL_s=None, numerics=replace(given.numerics, cell_size_mm=None)),
             )
             sizes = {}
-            for choice in self.case.state.choices.devices:
+            for key in devices:
                 with suppress(VstentError):
-                    design = find_design(choice.name)
-                    sizes[choice.name] = size_of(design, self.anatomy, Placing()).label
+                    sizes[key] = size_of(Implant(key, key), self.anatomy).label
             return {"inflow_mL_s": case.inflow_mL_s, "cell_size_mm": default_cell_size_mm(case), "sizes": sizes}
 
-        return self.remembered(key, find)
+        return self.remembered(("proposed", self.case.state.anatomy, *devices), find)
 
-    def sketch_message(self, choice: DeviceChoice, landing: Landing | None, colour: Colour) -> bytes:
-        """Return the wires of a device at its expected position.
+    def sketch_message(self, treatment: Treatment, implant: str, landing: Landing | None, colour: Colour) -> bytes:
+        """Return the wires of an implant at its expected position, with the others of its treatment as deployed.
 
         Parameters
         ----------
-        choice : the device.
+        treatment : the treatment.
+        implant : id of the implant.
         landing : its position; None: the chosen or proposed one.
         colour : quantity that colors the wires.
         """
         with LOCK:
-            found = self.sketch(choice, landing)
-            self._show(found.stent)
-            wires = _wires(choice.name, found.stent, found.gap_mm, colour, lambda: _formula_coverage(found.stent))
-            return message([wires], scales_of([wires], self.anatomy), **_place(found, found.stent))
+            pane, found = treatment.name, self.sketch(_one(treatment, implant), landing)
+            others = {one.id: self.deployment(treatment, one).stent for one in treatment.implants if one.id != implant}
+            self._show(tuple(others.get(one.id, found.stent) for one in treatment.implants))
+            wires = _wires(pane, found.stent, found.gap_mm, colour, lambda: _formula_coverage(found.stent))
+            layers = [wires, *self._wires(pane, treatment, colour, but=implant)]
+            place = _place(found, found.stent)
+            return message(layers, scales_of(layers, self.anatomy), treatment=pane, implant=implant, **place)
 
-    def deployment_message(self, choice: DeviceChoice, colour: Colour) -> bytes:
-        """Return a deployed device with its expansion and its metrics, as a message for the page.
+    def deployment_message(self, treatment: Treatment, implant: str, colour: Colour) -> bytes:
+        """Return a deployed treatment with its expansion and its metrics, and the place of one of its implants.
 
         Parameters
         ----------
-        choice : the device.
+        treatment : the treatment.
+        implant : id of the implant.
         colour : quantity that colors the wires.
         """
         with LOCK:
-            deployment = self.deployment(choice)
-            stent = deployment.stent
-            self._show(stent)
-            layers = self._drawn(choice.name, choice, colour)
-            center_mm = choice.center_mm if choice.center_mm is not None else _center_mm(stent)
-            found = laid_inside(partial(sketch, self.bed(choice)), Landing(center_mm))
+            one, deployed = _one(treatment, implant), self.deployed(treatment)
+            stent = deployed[implant].stent
+            self._show(self.stents(treatment))
+            layers = self._drawn(treatment.name, treatment, colour)
+            landing = landing_of(one, on_path(self.anatomy, one.placing.path), stent.size)
+            found = laid_inside(partial(sketch, self.bed(one)), landing or Landing(_center_mm(stent)))
             return message(
                 layers,
                 scales_of(layers, self.anatomy),
+                treatment=treatment.name,
+                implant=implant,
                 **_place(found, stent),
-                title=device_title(deployment),
-                advice=deployment.advice,
-                measures=sheets.device(device_title(deployment), self.measures(choice)),
+                title=treatment_title(deployed),
+                advice=deployed[implant].advice,
+                measures=self._sheets(treatment),
             )
 
-    def comparison_message(self, choices: Sequence[DeviceChoice], colour: Colour) -> bytes:
-        """Return several deployed devices or sizes, each in a pane of its own, on common color scales.
+    def comparison_message(self, treatments: Sequence[Treatment], colour: Colour) -> bytes:
+        """Return several deployed treatments, each in a pane of its own, on common color scales.
 
         Parameters
         ----------
-        choices : the devices, in the order of the panes ``compared 0``, ``compared 1`` and so on.
+        treatments : the treatments, in the order of the panes ``compared 0``, ``compared 1`` and so on.
         colour : quantity that colors the wires.
         """
         with LOCK:
             layers: list[MeshLayer | LineLayer] = []
             told = []
-            for number, choice in enumerate(choices):
-                pane, title = f"compared {number}", device_title(self.deployment(choice))
-                layers += self._drawn(pane, choice, colour)
-                told.append({"pane": pane, "title": title, "measures": sheets.device(title, self.measures(choice))})
+            for number, treatment in enumerate(treatments):
+                pane, title = f"compared {number}", treatment_title(self.deployed(treatment))
+                layers += self._drawn(pane, treatment, colour)
+                told.append({"pane": pane, "title": title, "measures": self._sheets(treatment)})
             return message(layers, scales_of(layers, self.anatomy), compared=told)
 
     def flow_message(self, moment: int | None) -> bytes:
@@ -397,8 +436,8 @@ class Live:
             if not paths:
                 raise ReadError("The angiogram has not been computed for these flows. Compute it in the step Flow.")
             histories = {name: self._history(path) for name, path in paths.items()}
-            chosen = {choice.name: choice for choice in self.case.state.choices.devices if has_wires}
-            stents = {name: self.deployment(chosen[name]).stent for name in histories if name in chosen}
+            chosen = {one.name: one for one in self.case.state.choices.treatments if has_wires}
+            stents = {name: self.stents(chosen[name]) for name in histories if name in chosen}
             angles = angles_of(direction) if direction else self._working_projection()
             curves = kept_curves(self.case.folder) if moment is None else None
             return films_message(histories, angles, stents=stents, moment=moment, curves=curves)
@@ -411,12 +450,13 @@ class Live:
         """Return the angles of the proposed direction."""
         return self.remembered(("direction", self.case.state.anatomy), lambda: working_projection(self.anatomy))
 
-    def section(self, name: str | None, abscissa_mm: float) -> dict[str, Any]:
+    def section(self, name: str | None, implant: str | None, abscissa_mm: float) -> dict[str, Any]:
         """Return the section by a plane across the parent axis: curves in the plane, in mm, and diameters.
 
         Parameters
         ----------
-        name : device to include; None: none.
+        name : treatment to include; None: none.
+        implant : id of the implant whose diameters are told; None: the first.
         abscissa_mm : position of the plane along the parent axis.
         """
         with LOCK:
@@ -433,13 +473,29 @@ class Live:
             }
             if name is None:
                 return shown
-            deployment = self.deployment(self.choice(name))
-            return shown | _row(deployment, at_mm, center, frame)
+            deployed = self.deployed(self.choice(name))
+            rings = [ring for one in deployed.values() if (ring := _ring(one.stent, at_mm, center, frame))]
+            told = deployed.get(implant or "", next(iter(deployed.values())))
+            return shown | {"rings": rings} | _row(told, at_mm)
+
+
+def _one(treatment: Treatment, name: str) -> Implant:
+    """Return an implant of a treatment by its id; ReadError is raised where it has none."""
+    for implant in treatment.implants:
+        if implant.id == name:
+            return implant
+    raise ReadError(f"{name} is not among the implants of {treatment.name}.")
+
+
+def _before(treatment: Treatment, implant: Implant) -> tuple[Implant, ...]:
+    """Return the implants on which the deployment of an implant depends: it is inside of them, or they are."""
+    inside = [_one(treatment, name) for name in implant.inside]
+    return tuple(found for one in inside for found in (*_before(treatment, one), one))
 
 
 def _views(anatomy: Anatomy) -> list[View]:
     """Return the views: the profile around the neck, the whole vessel from the same side, and those of the report."""
-    profile, *others = views_of(anatomy, {})
+    profile, *others = views_of(anatomy)
     axis, span = anatomy.parent.axis, _neck_span(anatomy) or [0.0, anatomy.parent.axis.length_mm]
     is_near = (axis.abscissa_mm > span[0] - BESIDE_MM) & (axis.abscissa_mm < span[1] + BESIDE_MM)
     sacs = [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
@@ -571,16 +627,28 @@ def _cut(surface: Surface, center: Floats, frame: Floats) -> list[float]:
     return np.round(segments @ frame[1:].T, 3).ravel().tolist()
 
 
-def _row(deployment: Deployment, at_mm: float, center: Floats, frame: Floats) -> dict[str, Any]:
-    """Return the section of a device, its diameters and its largest gap; empty where the plane misses it."""
+def _row_at(stent: Stent, at_mm: float) -> int | None:
+    """Return the row of a device nearest to a plane across the parent axis; None where the plane misses it."""
+    is_there = stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm
+    return int(np.argmin(np.abs(stent.row_abscissa_mm - at_mm))) if is_there else None
+
+
+def _ring(stent: Stent, at_mm: float, center: Floats, frame: Floats) -> list[float]:
+    """Return the section of a device as points x, y in the plane; empty where the plane misses it."""
+    row = _row_at(stent, at_mm)
+    if row is None:
+        return []
+    ring = (stent.nodes_mm[row] - center) @ frame[1:].T
+    return np.round(np.append(ring, ring[:1], axis=0), 3).ravel().tolist()
+
+
+def _row(deployment: Deployment, at_mm: float) -> dict[str, Any]:
+    """Return the diameters and the largest gap of a device at a plane; empty where the plane misses it."""
     stent = deployment.stent
-    if not stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm:
+    row = _row_at(stent, at_mm)
+    if row is None:
         return {}
-    row = int(np.argmin(np.abs(stent.row_abscissa_mm - at_mm)))
-    ring = (stent.nodes_mm[row] - stent.nodes_mm[row].mean(axis=0)) @ frame[1:].T
-    middle = (stent.nodes_mm[row].mean(axis=0) - center) @ frame[1:].T
     return {
-        "device": np.round(np.append(ring, ring[:1], axis=0) + middle, 3).ravel().tolist(),
         "device_diameter_mm": float(stent.row_diameter_mm[row]),
         "free_diameter_mm": float(free_diameters_mm(stent.design, stent.size)[row]),
         "max_gap_mm": float(deployment.wall_gap_mm[row].max()),

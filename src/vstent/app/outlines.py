@@ -1,5 +1,6 @@
 """Outlines on a slice of the scan: where its plane cuts the surfaces and the wires that were found."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from vstent.kernels.arrays import Floats
 from vstent.reporting.packing import Packer
 
 
-def outlines(image: Image | Grid, anatomy: Anatomy, stent: Stent | None, axis: int, index: int) -> bytes:
+def outlines(image: Image | Grid, anatomy: Anatomy, stents: Sequence[Stent], axis: int, index: int) -> bytes:
     """Return the exact sections of all surfaces and wires by the plane of a slice, as a message for the page.
 
     Positions are voxel indices (column, row) in the slice. Surfaces give segments, wires give the points where their
@@ -24,7 +25,7 @@ def outlines(image: Image | Grid, anatomy: Anatomy, stent: Stent | None, axis: i
     ----------
     image : the scan, or another grid of its slices.
     anatomy : vessel, parent artery and sacs.
-    stent : device with wires; None: none.
+    stents : devices with wires.
     axis : voxel axis across the slice: 0, 1 or 2.
     index : voxel index along that axis.
     """
@@ -35,8 +36,8 @@ def outlines(image: Image | Grid, anatomy: Anatomy, stent: Stent | None, axis: i
         if surfaces
     }
     told: dict[str, Any] = {"segments": curves}
-    if stent is not None:
-        told["wires"] = packer.add_numbers(crossings(image, stent, axis, index))
+    if stents:
+        told["wires"] = packer.add_numbers(np.concatenate([crossings(image, one, axis, index) for one in stents]))
     return packer.framed(told)
 
 

@@ -30,6 +30,9 @@ from vstent.study.ledger import Ledger, key_of
 if TYPE_CHECKING:  # imported by the process, so that the server does not wait for it
     from vstent.flow.lattice.live import LiveFlow
 
+Stents = tuple[Stent, ...]
+"""Devices of a treatment in the order of their deployment."""
+
 NICE: Final = 10
 """Priority of the process, below that of the server."""
 SLICE_S: Final = 0.15
@@ -93,12 +96,12 @@ class _Post:
 
     def __init__(self, pipe: Connection, anatomy: Anatomy) -> None:
         self._pipe, self._ready, self._anatomy = pipe, Condition(), anatomy
-        self._device: tuple[int, Stent] | None = None
+        self._device: tuple[int, Stents] | None = None
         self._is_asked = self._is_over = False
         Thread(target=self._run, daemon=True).start()
 
-    def put(self, device: tuple[int, Stent] | None) -> None:
-        """Send a device with its number, or None as a request to go on, as soon as the process reads."""
+    def put(self, device: tuple[int, Stents] | None) -> None:
+        """Send the devices with their number, or None as a request to go on, as soon as the process reads."""
         with self._ready:
             self._device, self._is_asked = device or self._device, True
             self._ready.notify()
@@ -158,7 +161,7 @@ class Preview:
             raise InputError("Live flow needs a sac, and none was found. Choose one in the step Sac and parent.")
         self.anatomy, self.settings, self.shelf = anatomy, settings, shelf
         self._lock, self._serial = Lock(), 0
-        self._stent: Stent | None = None
+        self._stents: Stents | None = None
         self._watched_s = -WATCHED_S
         self._begin()
 
@@ -208,19 +211,19 @@ class Preview:
         """Whether the process computes although nobody watches."""
         return not self.is_watched and not self._said.is_prepared and self._process.is_alive()
 
-    def place(self, stent: Stent) -> None:
-        """Put a device into the flow in place of the last one; while nobody watches it is only noted."""
+    def place(self, stents: Stents) -> None:
+        """Put the devices of a treatment into the flow in place of the last ones; unwatched they are only noted."""
         with self._lock:
             self._serial += 1
-            self._stent = stent
+            self._stents = stents
         if self.is_watched:
             self._send()
 
     def _send(self) -> None:
-        """Send the device where the process does not have it, else the request to go on."""
+        """Send the devices where the process does not have them, else the request to go on."""
         with self._lock:
             is_new, self._sent = self._sent != self._serial, self._serial
-            device = (self._serial, self._stent) if is_new and self._stent is not None else None
+            device = (self._serial, self._stents) if is_new and self._stents is not None else None
         self._post.put(device)
 
     def message(self, seen: int = 0) -> bytes:
@@ -272,7 +275,7 @@ def work(pipe: Connection, settings: FlowSettings, shelf: Shelf | None) -> None:
 
     Parameters
     ----------
-    pipe : receives the anatomy, then (number, stent) for a new device and None for a request; sends `Said`.
+    pipe : receives the anatomy, then (number, stents) for new devices and None for a request; sends `Said`.
     settings : settings of the flow.
     shelf : where the flow without a device is stored; None: nowhere.
     """
@@ -353,7 +356,7 @@ class _Worker:
         return is_asked
 
     def _take(self) -> None:
-        """Take the newest device."""
+        """Take the newest devices."""
         newest = None
         while self.pipe.poll():
             newest = self.pipe.recv() or newest
@@ -361,8 +364,8 @@ class _Worker:
         if newest is not None:
             from vstent.flow.media import media
 
-            self.serial, stent = newest
-            self.live.place(media(stent, self.settings.blood))
+            self.serial, stents = newest
+            self.live.place(tuple(medium for stent in stents for medium in media(stent, self.settings.blood)))
 
     def _say(self, steps_per_s: float) -> None:
         """Send the present numbers, and from time to time streamlines after them."""

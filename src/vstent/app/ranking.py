@@ -16,7 +16,7 @@ from vstent.study.flow_store import FlowStore
 from vstent.study.folder import CACHE
 from vstent.study.ledger import Ledger, anatomy_key
 from vstent.study.stages import find_anatomy
-from vstent.study.types import Progress
+from vstent.study.types import OnProgress, Progress
 
 MOST_PROCESSES: Final = 4
 """Largest number of parallel processes."""
@@ -39,7 +39,7 @@ COLUMNS: Final = {
 """Heading and meaning of every column of measures; an empty meaning is that of `DEFINITIONS`."""
 
 
-def rank_sizes(case: Case, progress: Progress) -> None:
+def rank_sizes(case: Case, progress: OnProgress) -> None:
     """Rank every size of the chosen devices and store the ranking in the case folder.
 
     The ranking by geometry is stored before the first flow. Finished flows are kept, so that a stopped ranking goes on.
@@ -61,31 +61,33 @@ def rank_sizes(case: Case, progress: Progress) -> None:
     anatomy = find_anatomy(case.input, case.state.source, settings, ledger)
 
     def told(n_done: int, n_all: int) -> None:
-        progress("rank", min(n_done / n_all, 0.99), f"{n_done} of {n_all} sizes")
+        progress(Progress("rank", min(n_done / n_all, 0.99), f"{n_done} of {n_all} sizes"))
 
-    progress("rank", 0.0, "")
+    progress(Progress("rank", 0.0))
     designs = [find_design(name) for name in settings.devices]
     n_sizes = sum(len(design.sizes) for design in designs)
     jobs = min(os.cpu_count() or 1, MOST_PROCESSES, 1 + n_sizes // WORTH_A_PROCESS)
     found = rank(anatomy, designs, jobs=jobs, progress=told)
     key = anatomy_key(case.state.source, settings)
     _write(case, key, found)
-    progress("rank", 1.0, f"{len(found.suitable)} of {len(found.candidates)} sizes are suitable.")
+    progress(Progress("rank", 1.0, f"{len(found.suitable)} of {len(found.candidates)} sizes are suitable."))
     if case.state.choices.ranking_flows:
         _write(case, key, _with_flows(case, anatomy, found, settings.flow or FlowSettings(), progress))
-        progress("rank_flow", 1.0, "")
+        progress(Progress("rank_flow", 1.0))
 
 
-def _with_flows(case: Case, anatomy: Anatomy, found: Ranking, settings: FlowSettings, progress: Progress) -> Ranking:
+def _with_flows(case: Case, anatomy: Anatomy, found: Ranking, settings: FlowSettings, progress: OnProgress) -> Ranking:
     """Return the ranking with the flows of its best sizes."""
-    progress("rank_flow", 0.0, "")
+    progress(Progress("rank_flow", 0.0))
     return rank_flows(
         anatomy,
         found,
         settings,
         case.state.choices.ranking_flows or 0,
         stored=FlowStore(case.folder, anatomy, settings),
-        progress=lambda done, n_all, name: progress("rank_flow", min(done / n_all, 0.99), f"{done} of {n_all}: {name}"),
+        progress=lambda done, n_all, name: progress(
+            Progress("rank_flow", min(done / n_all, 0.99), f"{done} of {n_all}: {name}")
+        ),
     )
 
 

@@ -1,7 +1,7 @@
 """Open a case folder of `vstent run` as a case of the page, with all its results."""
 
 import json
-from dataclasses import asdict
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -16,11 +16,6 @@ from vstent.io.files import suffix
 if TYPE_CHECKING:  # loaded when a folder is opened, as in `vstent.app.choices`
     from vstent.study.types import Settings
 
-GEOMETRY: Final = (
-    *("units", "frame", "spacing_mm", "shape", "threshold", "at_mm", "inlet_mm", "outlet_mm"),
-    *("neck_mm", "upstream_mm", "downstream_mm"),
-)
-"""Settings of the vessel that the page can change."""
 FLOW: Final = ("inflow_mL_s", "outlets")
 """Settings of the flow that the page can change, besides grid spacing and waveform."""
 
@@ -70,9 +65,10 @@ def reopened(store: Store, folder: Path) -> Case:
 def _choices(settings: "Settings", folder: Path) -> Choices:
     """Return the settings of a study that the page can change; ReadError is raised for an unsupported value."""
     flow, varied = settings.flow, settings.uncertainty
-    chosen = {name: getattr(settings, name) for name in GEOMETRY}
-    chosen["devices"] = [{"name": name} | asdict(settings.placing(name)) for name in settings.devices]
-    chosen["flow"] = {"is_wanted": False}
+    parts = (settings.input, settings.anatomy)
+    told = {field.name: getattr(part, field.name) for part in parts for field in fields(part)}
+    chosen = {name: value for name, value in told.items() if name in Choices.model_fields}
+    chosen |= {"treatments": settings.treatments, "flow": {"is_wanted": False}}
     if flow is not None:
         chosen["flow"] = {name: getattr(flow, name) for name in FLOW}
         chosen["flow"] |= {"cell_size_mm": flow.numerics.cell_size_mm, "is_pulsatile": flow.waveform is not None}

@@ -17,9 +17,10 @@ from pydantic import Field
 
 from vstent.app import desk as desks
 from vstent.app.cases import Absent
-from vstent.app.choices import NECK_HANDLES, Choices, DeviceChoice, Point, Strict
+from vstent.app.choices import NECK_HANDLES, Choices, Point, Strict
 from vstent.app.desk import Desk
 from vstent.app.security import REPORT_POLICY, Guard
+from vstent.devices.treatment import Treatment
 from vstent.errors import ReadError, VstentError
 
 MEDIA: Final = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css"}
@@ -60,24 +61,25 @@ class Seen(Strict):
     revision: Revision
 
 
-class DeviceWanted(Strict):
-    """A device to draw."""
+class ImplantWanted(Strict):
+    """A treatment to draw, and the implant whose place is told."""
 
-    device: DeviceChoice
+    treatment: Treatment
+    implant: str = Field(max_length=60)
     colour: Literal["wall_gap", "coverage", "diameter"] = "wall_gap"
 
 
-class SketchWanted(DeviceWanted):
-    """A device at a position, to draw."""
+class SketchWanted(ImplantWanted):
+    """An implant at a position, to draw."""
 
     anchor: Literal["proximal", "center", "distal"] = "center"
     abscissa_mm: float | None = Field(default=None, ge=-1000, le=1000)
 
 
 class ComparisonWanted(Strict):
-    """Devices or sizes to draw side by side."""
+    """Treatments to draw side by side."""
 
-    devices: tuple[DeviceChoice, ...] = Field(min_length=1, max_length=4)
+    treatments: tuple[Treatment, ...] = Field(min_length=1, max_length=4)
     colour: Literal["wall_gap", "coverage", "diameter"] = "wall_gap"
 
 
@@ -297,10 +299,10 @@ def _add_input(api: APIRouter, desk: Desk) -> None:
         scan = desk.scan(desk.store.get(case_id))
         return Response(scan.slice(axis, index, slab, is_upright=upright), media_type=BINARY)
 
-    @api.get("/api/cases/{case_id}/image/outlines", summary="Sections of vessel, sac, neck and device (binary)")
-    def outlines(case_id: str, axis: Axis, index: int, device: str | None = None, upright: bool = False) -> Response:
+    @api.get("/api/cases/{case_id}/image/outlines", summary="Sections of vessel, sac, neck and wires (binary)")
+    def outlines(case_id: str, axis: Axis, index: int, treatment: str | None = None, upright: bool = False) -> Response:
         found = desk.store.get(case_id)
-        return Response(desk.outlines(found, device, axis, index, is_upright=upright), media_type=BINARY)
+        return Response(desk.outlines(found, treatment, axis, index, is_upright=upright), media_type=BINARY)
 
     @api.get("/api/cases/{case_id}/image/surface", summary="The surface at a threshold (binary)")
     def surface(case_id: str, threshold: Finite) -> Response:
@@ -355,26 +357,30 @@ def _add_scenes(api: APIRouter, desk: Desk) -> None:
     def neck(case_id: str, wanted: NeckWanted) -> Response:
         return Response(desk.neck(desk.store.get(case_id), *wanted.model_dump().values()), media_type=BINARY)
 
-    @api.post("/api/cases/{case_id}/sketch", summary="The expected position of a device (binary)")
+    @api.post("/api/cases/{case_id}/sketch", summary="The expected position of an implant (binary)")
     def sketch(case_id: str, wanted: SketchWanted) -> Response:
         live = desk.live(desk.store.get(case_id))
         landing = desks.landing(wanted.abscissa_mm, wanted.anchor)
-        return Response(live.sketch_message(wanted.device, landing, wanted.colour), media_type=BINARY)
+        return Response(
+            live.sketch_message(wanted.treatment, wanted.implant, landing, wanted.colour), media_type=BINARY
+        )
 
-    @api.post("/api/cases/{case_id}/deployment", summary="A deployed device, with its expansion and numbers (binary)")
-    def deployment(case_id: str, wanted: DeviceWanted) -> Response:
+    @api.post("/api/cases/{case_id}/deployment", summary="A deployed treatment: expansion and numbers (binary)")
+    def deployment(case_id: str, wanted: ImplantWanted) -> Response:
         found = desk.store.get(case_id)
-        answer = desk.live(found).deployment_message(wanted.device, wanted.colour)
-        desk.note_deployed(found, wanted.device)
+        answer = desk.live(found).deployment_message(wanted.treatment, wanted.implant, wanted.colour)
+        desk.note_deployed(found, wanted.treatment)
         return Response(answer, media_type=BINARY)
 
-    @api.post("/api/cases/{case_id}/bands", summary="Bands of a deployed device from the ranges of its numbers")
-    def bands(case_id: str, wanted: DeviceWanted) -> dict[str, Any]:
-        return desk.live(desk.store.get(case_id)).bands_sheet(wanted.device)
+    @api.post("/api/cases/{case_id}/bands", summary="Bands of a deployed implant from the ranges of its numbers")
+    def bands(case_id: str, wanted: ImplantWanted) -> dict[str, Any]:
+        return desk.live(desk.store.get(case_id)).bands_sheet(wanted.treatment, wanted.implant)
 
     @api.get("/api/cases/{case_id}/section", summary="The section by a plane across the parent axis")
-    def section(case_id: str, abscissa_mm: Finite, device: str | None = None) -> dict[str, Any]:
-        return desk.live(desk.store.get(case_id)).section(device, abscissa_mm)
+    def section(
+        case_id: str, abscissa_mm: Finite, treatment: str | None = None, implant: str | None = None
+    ) -> dict[str, Any]:
+        return desk.live(desk.store.get(case_id)).section(treatment, implant, abscissa_mm)
 
 
 def _add_flows(api: APIRouter, desk: Desk) -> None:
@@ -415,11 +421,11 @@ def _add_planning(api: APIRouter, desk: Desk) -> None:
         desk.end_preview(desk.store.get(case_id))
         return {"is_on": False}
 
-    @api.post("/api/cases/{case_id}/comparison", summary="Up to four devices or sizes, deployed, on one scale (binary)")
+    @api.post("/api/cases/{case_id}/comparison", summary="Up to four treatments, deployed, on one scale (binary)")
     def comparison(case_id: str, wanted: ComparisonWanted) -> Response:
         live = desk.live(desk.store.get(case_id))
-        return Response(live.comparison_message(wanted.devices, wanted.colour), media_type=BINARY)
+        return Response(live.comparison_message(wanted.treatments, wanted.colour), media_type=BINARY)
 
-    @api.get("/api/cases/{case_id}/plan.pdf", summary="The plan of the chosen devices, one page each")
+    @api.get("/api/cases/{case_id}/plan.pdf", summary="The plan of the chosen treatments, one page per implant")
     def plan(case_id: str) -> Response:
         return Response(desk.live(desk.store.get(case_id)).plan(), media_type="application/pdf")

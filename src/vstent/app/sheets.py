@@ -8,7 +8,7 @@ from vstent.reporting.quantities import Quantity, compare, flatten
 from vstent.reporting.uncertainty import uncertainty_of
 
 Sheet = dict[str, Any]
-"""Title, devices and rows of one table."""
+"""Title, treatments and rows of one table."""
 
 FIRST: Final = {
     "anatomy": (
@@ -44,7 +44,7 @@ def anatomy(measures: dict[str, Any]) -> list[Sheet]:
 
 
 def device(title: str, measures: dict[str, Any]) -> Sheet:
-    """Return the table of one deployed device."""
+    """Return the table of one deployed implant."""
     numbers = {key: value for key, value in measures.items() if not isinstance(value, str)}
     return _plain(title, flatten(numbers), FIRST["device"])
 
@@ -55,7 +55,7 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
     Parameters
     ----------
     metrics : metrics of the case.
-    titles : titles of the devices by name, in order.
+    titles : titles of the treatments by name, in order.
     """
     changes = compare(metrics, unusable(metrics))
     rows = []
@@ -74,14 +74,14 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
 
 
 def uncertainty(metrics: dict[str, Any], titles: dict[str, str]) -> list[dict[str, Any]]:
-    """Return the uncertainty intervals of every device with an uncertainty study.
+    """Return the uncertainty intervals of every treatment with an uncertainty study.
 
     Parameters
     ----------
     metrics : metrics of the case.
-    titles : titles of the devices by name, in order.
+    titles : titles of the treatments by name, in order.
     """
-    ordered = {"stents": {name: metrics["stents"][name] for name in titles}}
+    ordered = {"treatments": {name: metrics["treatments"][name] for name in titles}}
     return [
         {"title": varied.title, "words": varied.words, "rows": [row._asdict() for row in varied.rows]}
         for varied in uncertainty_of(ordered, titles)

@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +19,7 @@ from vstent.app.cases import Case, State
 from vstent.errors import VstentError
 from vstent.study.ledger import anatomy_key, hash_of
 from vstent.study.pipeline import run
+from vstent.study.types import Progress
 
 WINDOW_S: Final = 8.0
 """Time that the angiogram of the page covers, in s: five seconds after the peak of the usual injection, and more."""
@@ -37,9 +39,9 @@ def tell(**told: Any) -> None:
     sys.stdout.flush()
 
 
-def progress(stage: str, fraction: float, detail: str) -> None:
-    """Report the progress of a stage."""
-    tell(stage=stage, fraction=fraction, detail=detail)
+def progress(now: Progress) -> None:
+    """Send the progress of a stage, without what has been computed."""
+    tell(**{field.name: getattr(now, field.name) for field in fields(now) if field.name != "computed"})
 
 
 def find_anatomy(case: Case) -> None:
@@ -62,9 +64,9 @@ def compute(case: Case) -> None:
     if _anatomy_key(case) != case.state.anatomy:
         find_anatomy(case)  # reported before the flow, since it has replaced the stored anatomy by then
     result = run(case.input, case.folder, case.state.settings(), progress, replaces=True)
-    progress("report", 0.0, "")
+    progress(Progress("report", 0.0))
     write_report(result, case.folder, is_printed=True)
-    progress("report", 1.0, "")
+    progress(Progress("report", 1.0))
 
 
 def carry_contrast(case: Case) -> None:

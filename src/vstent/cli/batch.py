@@ -62,7 +62,9 @@ def _teller(console: Any) -> Any:
     """Return a function that prints a line for every finished case."""
 
     def tell(done: int, total: int, name: str, rows: Sequence[dict[str, Any]]) -> None:
-        faults = [f" {row['device']}, {row['outcome']}: {row['sentence']}" for row in rows if row["outcome"] != "done"]
+        faults = [
+            f" {row['treatment']}, {row['outcome']}: {row['sentence']}" for row in rows if row["outcome"] != "done"
+        ]
         console.say(f"{done}/{total} {name} {_seconds(rows)}{''.join(faults)}")
 
     return tell

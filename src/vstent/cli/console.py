@@ -19,6 +19,7 @@ from vstent.flow.convergence import Refinement
 from vstent.flow.positions import POSITIONS, Scatter
 from vstent.geometry.vessel import Opening
 from vstent.plan.rank import Candidate, Ranking
+from vstent.study.types import Progress
 
 ROWS: Final = (
     ("Neck inflow", "neck_inflow_mL_s"),
@@ -78,25 +79,18 @@ class Console:
             yield
             self._status = None
 
-    def progress(self, stage: str, fraction: float, detail: str) -> None:
-        """Show the progress of a stage.
-
-        Parameters
-        ----------
-        stage : name of the stage.
-        fraction : completed fraction, from 0 (starts) to 1 (done).
-        detail : result of a finished stage, or remaining time.
-        """
-        now = time.monotonic()
+    def progress(self, told: Progress) -> None:
+        """Show the progress of a stage."""
+        now, stage = time.monotonic(), told.stage
         began = self._began.setdefault(stage, now)
-        if fraction >= 1.0:
-            self._err.print(f"[bold]{stage:18}[/] {now - began:6.1f} s  [dim]{detail}[/]", soft_wrap=True)
+        if told.fraction >= 1.0:
+            self._err.print(f"[bold]{stage:18}[/] {now - began:6.1f} s  [dim]{told.detail}[/]", soft_wrap=True)
             del self._began[stage]
         elif self._err.is_terminal and self._status is not None:
-            self._status.update(f"{stage} {fraction:4.0%} {detail}")
-        elif now - self._told > QUIET_S and fraction > 0:
+            self._status.update(f"{stage} {told.fraction:4.0%} {_state(told)}")
+        elif now - self._told > QUIET_S and told.fraction > 0:
             self._told = now
-            self._err.print(f"{stage:18} {fraction:4.0%} {detail}", soft_wrap=True)
+            self._err.print(f"{stage:18} {told.fraction:4.0%} {_state(told)}", soft_wrap=True)
 
     def say(self, text: str) -> None:
         """Print a line on standard error."""
@@ -108,6 +102,16 @@ class Console:
         with self._out.capture() as again:
             self._out.print(item)
         self.printed += again.get()
+
+
+def _state(told: Progress) -> str:
+    """Return what an unfinished stage does, how far a flow is from convergence, and the remaining time."""
+    parts = [told.detail]
+    if told.residual is not None:
+        parts.append(f"{told.residual:.1%} from convergence")
+    if told.seconds_left is not None:
+        parts.append(f"{told.seconds_left:.0f} s left")
+    return ", ".join(part for part in parts if part)
 
 
 def comparison_table(metrics: Mapping[str, Any]) -> Table:

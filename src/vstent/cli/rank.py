@@ -60,7 +60,7 @@ def _rank(arguments: argparse.Namespace) -> int:
     from vstent.plan.rank import rank
     from vstent.study.outputs import write_ranking
     from vstent.study.pipeline import restore_vessel
-    from vstent.study.types import Settings
+    from vstent.study.types import Progress, Settings
 
     if arguments.retention and not arguments.flow_count:
         raise InputError("Contrast moves with a flow. Give --flow N with --retention.")
@@ -83,7 +83,7 @@ def _rank(arguments: argparse.Namespace) -> int:
             criteria=criteria,
             shifts_mm=arguments.shift,
             jobs=arguments.jobs,
-            progress=lambda done, total: console.progress("rank", done / total, f"{done} of {total}"),
+            progress=lambda done, total: console.progress(Progress("rank", done / total, f"{done} of {total}")),
         )
         if arguments.flow_count:
             ranking = _with_flows(arguments, anatomy, ranking, console)
@@ -99,9 +99,10 @@ def _with_flows(arguments: argparse.Namespace, anatomy: "Anatomy", ranking: "Ran
     from vstent.plan.rank_flow import chosen_of, rank_flows
     from vstent.study.flow_crew import compute_missing, parallel_flows
     from vstent.study.flow_store import FlowStore
+    from vstent.study.types import Progress
 
     def told(done: int, total: int, name: str) -> None:
-        console.progress("rank by flow", done / total, f"{done} of {total}: {name}")
+        console.progress(Progress("rank by flow", done / total, f"{done} of {total}: {name}"))
 
     settings, has_contrast = options.given_flow(arguments), arguments.retention
     stored, chosen = FlowStore(arguments.out, anatomy, settings), chosen_of(ranking, arguments.flow_count)

@@ -13,7 +13,7 @@ from vstent.errors import InputError
 if TYPE_CHECKING:
     from vstent.angiography.angiogram import AngiogramSettings
     from vstent.cli.console import Console
-    from vstent.study.types import CaseResult, Progress, Settings
+    from vstent.study.types import CaseResult, OnProgress, Settings
 
 
 def add(commands: options.Commands) -> None:
@@ -115,14 +115,20 @@ def study(
     from vstent.reporting.drawing import Drawing
     from vstent.reporting.write import write_report
     from vstent.study.pipeline import run
+    from vstent.study.types import Progress
+
+    def told(now: Progress) -> None:
+        console.progress(now)
+        if now.computed is not None:  # the pictures are drawn while the measures are computed
+            drawing.begin(now.computed)
 
     with console.live(), Drawing() as drawing:
-        case = run(path, out, settings, console.progress, replaces=replaces, before_measures=drawing.begin)
+        case = run(path, out, settings, told, replaces=replaces)
         if injected is not None:
             _film(case, out, injected, console.progress)
-        console.progress("report", 0.0, "")
+        console.progress(Progress("report", 0.0))
         write_report(case, out, is_printed=is_printed, drawing=drawing)
-        console.progress("report", 1.0, str(out / "report.html"))
+        console.progress(Progress("report", 1.0, str(out / "report.html")))
     console.print(comparison_table(case.metrics))
     for sentence in device_sentences(case.metrics):
         console.print(sentence)
@@ -136,7 +142,7 @@ def study(
     return case
 
 
-def _film(case: "CaseResult", out: Path, injected: "AngiogramSettings", progress: "Progress") -> None:
+def _film(case: "CaseResult", out: Path, injected: "AngiogramSettings", progress: "OnProgress") -> None:
     """Carry contrast through the flows of a study and film it; add its measures to the metrics."""
     from vstent.angiography.filming import FilmSettings
     from vstent.reporting.film_case import film_case

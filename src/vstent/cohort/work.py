@@ -17,7 +17,7 @@ from vstent.io.writers import write_json, write_text
 from vstent.reporting.figures import patient_picture
 from vstent.study.crews import alone
 from vstent.study.pipeline import restore_vessel, run
-from vstent.study.types import Progress, Settings
+from vstent.study.types import OnProgress, Progress, Settings
 from vstent.units import BYTES_PER_MB
 
 Row = dict[str, Any]
@@ -52,8 +52,8 @@ class _Watch:
 
     stage = "read"
 
-    def __call__(self, stage: str, fraction: float, detail: str) -> None:
-        self.stage = stage
+    def __call__(self, now: Progress) -> None:
+        self.stage = now.stage
 
 
 def row_path(folder: Path, treatment: str) -> Path:
@@ -102,7 +102,7 @@ def _rows(task: Task) -> dict[str, Row]:
     for treatment in treatments:
         name, alone = treatment.name, replace(case.settings, treatments=(treatment,))
 
-        def with_treatment(watch: Progress, name: str = name, alone: Settings = alone) -> None:
+        def with_treatment(watch: OnProgress, name: str = name, alone: Settings = alone) -> None:
             found = run(case.path, study, alone, watch, replaces=True)
             implants = list(found.implants[name].values())
             with atomic(picture_path(task.folder, name)) as partial:
@@ -116,7 +116,7 @@ def _rows(task: Task) -> dict[str, Row]:
     return rows
 
 
-def _failure(task: Task, do: Callable[[Progress], object]) -> Row:
+def _failure(task: Task, do: Callable[[OnProgress], object]) -> Row:
     """Call a function and return the row of its failure; empty where it succeeds."""
     watch = _Watch()
     try:

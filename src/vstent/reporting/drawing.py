@@ -1,17 +1,18 @@
 """Draw the pictures of a case on threads, while its measures are computed."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar
 
 from numba import config
 
-from vstent.flow.case import FlowField
-from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.reporting.figures import Picture, plates
 from vstent.reporting.method import method_plates
-from vstent.reporting.scene import Implants, Scene, scene_of
+from vstent.reporting.scene import Scene, scene_of
+
+if TYPE_CHECKING:
+    from vstent.study.types import Computed
 
 Item = TypeVar("Item")
 Found = TypeVar("Found")
@@ -52,26 +53,17 @@ class Drawing:
         """Drop the pictures that are not begun."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def begin(
-        self,
-        anatomy: Anatomy,
-        implants: Implants,
-        fields: Mapping[str, FlowField],
-        whole: Vessel | None,
-    ) -> Scene:
+    def begin(self, case: "Computed") -> Scene:
         """Begin to draw all pictures of a case, unless this has been done; return its scene.
 
         Parameters
         ----------
-        anatomy : vessel, parent artery and sacs.
-        implants : deployed implants by treatment and id.
-        fields : flows by treatment; empty: no flow is shown.
-        whole : the vessel before it was trimmed; None: it is not shown.
+        case : what a study has computed.
         """
         if self._scene is None:
-            self._scene = scene_of(anatomy, implants, fields)
+            self._scene = scene_of(case.anatomy, case.implants, case.fields)
             before, *after = plates(self._scene)
-            wanted = [before, *method_plates(anatomy, implants, self._scene, whole), *after]
+            wanted = [before, *method_plates(case.anatomy, case.implants, self._scene, case.whole), *after]
             self._begun = [self._pool.submit(plate.drawn) for plate in wanted]
         return self._scene
 

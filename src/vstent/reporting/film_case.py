@@ -17,14 +17,14 @@ from vstent.study.folder import claimed
 from vstent.study.pipeline import run
 from vstent.study.provenance import RUN
 from vstent.study.repeat import finished_run, read_record
-from vstent.study.types import Progress
+from vstent.study.types import OnProgress, Progress
 
 
 def film_case(
     out: Path,
     settings: AngiogramSettings,
     film: FilmSettings,
-    progress: Progress,
+    progress: OnProgress,
     study: Mapping[str, Any] | None = None,
 ) -> dict[str, Angiogram]:
     """Carry contrast through the flows of a case folder, and film it into the subfolder ``angiogram``.
@@ -53,7 +53,7 @@ def film_case(
     """
     recording = Recording(replace(settings, frames_per_s=max(settings.frames_per_s, film.frame_rate_Hz)))
     found = angiograms(out, recording.settings, progress, record=recording)
-    progress("film", 0.0, "")
+    progress(Progress("film", 0.0))
     anatomy, stents = stents_of(out, found if film.has_wires else ())
     treatments = finished_run(out)[1].treatments
     titles = {BARE: "Before"} | {
@@ -66,11 +66,12 @@ def film_case(
     with claimed(out):
         write_films(out / FOLDER, shown, densities, study=study)
     view = shown[BARE].film.view
-    progress("film", 1.0, f"{view.name}, {view.columns} x {view.rows} pixels of {view.pixel_mm:g} mm.")
+    told = f"{view.name}, {view.columns} x {view.rows} pixels of {view.pixel_mm:g} mm."
+    progress(Progress("film", 1.0, told))
     return found
 
 
-def write_report_again(out: Path, progress: Progress) -> None:
+def write_report_again(out: Path, progress: OnProgress) -> None:
     """Write the report of a finished case folder with its films; the PDF too where there is one.
 
     Parameters
@@ -85,6 +86,6 @@ def write_report_again(out: Path, progress: Progress) -> None:
     """
     record = read_record(out / RUN)
     case = run(record.input, out, record.settings, progress)
-    progress("report", 0.0, "")
+    progress(Progress("report", 0.0))
     write_report(case, out, is_printed=(out / "report.pdf").is_file())
-    progress("report", 1.0, "")
+    progress(Progress("report", 1.0))

@@ -143,7 +143,7 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
     drawing : its pictures, if they are being drawn already.
     """
     with drawing or Drawing() as drawn:
-        scene, metrics = drawn.begin(case.anatomy, case.implants, case.fields, case.whole), case.metrics
+        scene, metrics = drawn.begin(case), case.metrics
         pictures = drawn.pictures()
     return Contents(
         name=case.name,
@@ -182,7 +182,7 @@ def limits_of(case: "CaseResult") -> tuple[str, ...]:
 
 def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
     """Return the limits of a flow with these settings, one sentence each."""
-    thins = flow["blood"]["thinning"] is not None
+    thins, engine = flow["blood"]["thinning"] is not None, flow["numerics"]["engine"]
     blood = "Blood is shear-thinning, with parameters from the literature" if thins else "Blood is Newtonian"
     told = [f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
     engine = flow["numerics"]["engine"]

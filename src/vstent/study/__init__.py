@@ -4,6 +4,6 @@ Open ``pipeline.py`` first; ``stages.py`` holds the stages in their order.
 """
 
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
-from vstent.study.types import CaseResult, Progress, Settings
+from vstent.study.types import CaseResult, OnProgress, Progress, Settings
 
-__all__ = ["CaseResult", "Progress", "Settings", "refine_flow", "restore_vessel", "run", "trace_vessel"]
+__all__ = ["CaseResult", "OnProgress", "Progress", "Settings", "refine_flow", "restore_vessel", "run", "trace_vessel"]

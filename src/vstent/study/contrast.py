@@ -22,7 +22,7 @@ from vstent.study.ledger import ANATOMY, CONTRAST_VERSION, Ledger, anatomy_key, 
 from vstent.study.provenance import METRICS
 from vstent.study.repeat import UNTOLD, finished_run
 from vstent.study.stages import flow_keys
-from vstent.study.types import Progress, Settings
+from vstent.study.types import OnProgress, Settings
 
 FOLDER: Final = "angiogram"
 """Subfolder of the case folder with the results."""
@@ -37,7 +37,7 @@ watches the frames, or None."""
 
 
 def angiograms(
-    out: Path, settings: AngiogramSettings, progress: Progress, *, record: Record | None = None
+    out: Path, settings: AngiogramSettings, progress: OnProgress, *, record: Record | None = None
 ) -> dict[str, Angiogram]:
     """Compute the angiogram of every flow of a case folder, and write curves, numbers and metrics.
 
@@ -112,8 +112,8 @@ def _teller(ledger: Ledger, stage: str) -> Callable[[float], None]:
     began = time.monotonic()
 
     def tell(part: float) -> None:
-        left_s = (time.monotonic() - began) * (1 - part) / max(part, 1e-3)
-        ledger.progress(stage, 0.99 * part, f"{left_s:.0f} s left" if part > 0 else "")
+        left_s = (time.monotonic() - began) * (1 - part) / part if part > 0 else None
+        ledger.progress(stage, 0.99 * part, "", seconds_left=left_s)
 
     return tell
 

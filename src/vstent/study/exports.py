@@ -25,11 +25,11 @@ from vstent.study.ledger import Ledger, hash_of
 from vstent.study.provenance import RUN
 from vstent.study.repeat import finished_run
 from vstent.study.stages import check_inflow, deploy_implant, find_anatomy
-from vstent.study.types import Progress, Settings
+from vstent.study.types import OnProgress, Settings
 
 
 def export_openfoam(
-    path: Path, out: Path, settings: Settings, foam: Mapping[str, Any], progress: Progress
+    path: Path, out: Path, settings: Settings, foam: Mapping[str, Any], progress: OnProgress
 ) -> tuple[FlowCase, FoamCase]:
     """Write an OpenFOAM case folder.
 
@@ -66,7 +66,7 @@ def export_openfoam(
     return case, written
 
 
-def export_patches(path: Path, out: Path, settings: Settings, progress: Progress) -> list[dict[str, Any]]:
+def export_patches(path: Path, out: Path, settings: Settings, progress: OnProgress) -> list[dict[str, Any]]:
     """Write the boundary of the lumen as watertight named patches; return name, id, area, center and normal of each.
 
     ``patches.stl`` has one named solid per patch, ``patches.vtp`` the same faces with their ``patch_id``, both in mm.

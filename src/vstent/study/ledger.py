@@ -17,7 +17,7 @@ from vstent.flow.engines import Progress as FlowProgress
 from vstent.io.archive import load_data, save_data
 from vstent.io.images import files_of
 from vstent.io.writers import write_json
-from vstent.study.types import Progress, Settings
+from vstent.study.types import OnProgress, Progress, Settings
 
 Kept = TypeVar("Kept")
 RESULTS_VERSION: Final = "0.1.0"
@@ -42,11 +42,15 @@ class Ledger:
     progress : called at every stage.
     """
 
-    def __init__(self, folder: Path, progress: Progress) -> None:
-        self.folder, self.progress = folder, progress
+    def __init__(self, folder: Path, progress: OnProgress) -> None:
+        self.folder, self._watch = folder, progress
         self.seconds: dict[str, float] = {}
         self._held: list[tuple[str, str, Any, dict[str, float]]] = []
         self._before: dict[str, set[str]] = {}
+
+    def progress(self, stage: str, fraction: float, detail: str, **more: Any) -> None:
+        """Report the progress of a stage; the arguments are the fields of a `Progress`."""
+        self._watch(Progress(stage, fraction, detail, **more))
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Callable[[str], None]]:
@@ -65,9 +69,9 @@ class Ledger:
         """Return a function that reports the progress of a flow under a stage name."""
 
         def tell(progress: FlowProgress) -> None:
-            fraction = min(progress.fraction, 0.99)
-            settling = f"{progress.residual:.1%} from convergence, " if isfinite(progress.residual) else ""
-            self.progress(name, fraction, f"{settling}{progress.seconds_left:.0f} s left")
+            residual = progress.residual if isfinite(progress.residual) else None
+            left_s = progress.seconds_left
+            self.progress(name, min(progress.fraction, 0.99), "", residual=residual, seconds_left=left_s)
 
         return tell
 

@@ -5,7 +5,7 @@ no files. After that each finished stage is stored in the folder under a key of 
 same study reads it instead of computing it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -48,13 +48,11 @@ from vstent.study.stages import (
     stage_name,
     vary_all,
 )
-from vstent.study.types import CaseResult, Progress, Settings
+from vstent.study.types import CaseResult, Computed, OnProgress, Progress, Settings
 from vstent.study.written import code_key, compute_once, write_once
 
 Implants = Mapping[str, Mapping[str, Deployment]]
 """Deployed implants by treatment and id."""
-BeforeMeasures = Callable[[Anatomy, Implants, Mapping[str, FlowField], Vessel | None], object]
-"""Takes anatomy, deployed implants, flows, and the vessel before it was trimmed (None: not stored)."""
 
 
 @claiming
@@ -62,10 +60,9 @@ def run(
     path: Path,
     out: Path,
     settings: Settings,
-    progress: Progress,
+    progress: OnProgress,
     *,
     replaces: bool = False,
-    before_measures: BeforeMeasures | None = None,
 ) -> CaseResult:
     """Run one study and write its folder; a study that was stopped there resumes.
 
@@ -77,10 +74,8 @@ def run(
     path : a scan or a surface.
     out : the case folder.
     settings : settings of the study; missing values are proposed.
-    progress : called at every stage.
+    progress : called at every stage. Where the stage ``measure`` begins, it gets what has been computed.
     replaces : whether results of another input or of other settings are replaced.
-    before_measures : called with anatomy, implants, flows and untrimmed vessel before their measures are computed,
-        unless these are stored; None: nothing is called.
 
     Returns
     -------
@@ -123,12 +118,10 @@ def run(
     fields, unflown = compute_flows(out, anatomy, implants, settings, ledger, source)
     failures |= unflown
     varied = vary_all(anatomy, implants, settings, ledger, source)
-
-    whole = ledger.stored("vessel", vessel_key(source, settings), Vessel)
+    found = Computed(anatomy, implants, fields, ledger.stored("vessel", vessel_key(source, settings), Vessel))
 
     def measures() -> dict[str, Any]:
-        if before_measures is not None:
-            before_measures(anatomy, implants, fields, whole)
+        progress(Progress("measure", 0.0, computed=found))
         return _measures(anatomy, implants, fields, settings, varied, failures)
 
     metrics = compute_once(ledger, "measure", key_of(code_key(), told, failures), measures)
@@ -139,7 +132,9 @@ def run(
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
     notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
-    return CaseResult(out.resolve().name, anatomy, implants, fields, metrics, told, failures, notes, whole)
+    return CaseResult(
+        **vars(found), name=out.resolve().name, metrics=metrics, provenance=told, failures=failures, notes=notes
+    )
 
 
 def _measures(
@@ -159,7 +154,7 @@ def _measures(
 
 
 @claiming
-def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False) -> Vessel:
+def trace_vessel(path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool = False) -> Vessel:
     """Find the vessel, its openings and its centerlines, untrimmed, and write them.
 
     Parameters
@@ -188,7 +183,7 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress, 
 
 @claiming
 def restore_vessel(
-    path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False
+    path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool = False
 ) -> tuple[Anatomy, dict[str, Any]]:
     """Remove the sac, restore the parent artery, measure both, and write them.
 
@@ -229,7 +224,7 @@ def restore_vessel(
 
 @claiming
 def refine_flow(
-    path: Path, out: Path, settings: Settings, progress: Progress, *, replaces: bool = False
+    path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool = False
 ) -> Sensitivity:
     """Compute the flow without a device on three grids, time steps and grid positions; write ``convergence.json``.
 

@@ -256,15 +256,28 @@ def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] =
     anatomy : vessel, sacs and paths.
     inside : implants that are there before it, in the order of their deployment.
     """
-    design, placing = find_design(implant.device), implant.placing
-    anatomy = on_path(anatomy, placing.path)
-    size, landing = size_of(implant, anatomy), None
+    anatomy = on_path(anatomy, implant.placing.path)
+    size = size_of(implant, anatomy)
+    landing = landing_of(implant, anatomy, size)
+    return deploy(find_design(implant.device), anatomy, size=size, landing=landing, inside=inside)
+
+
+def landing_of(implant: Implant, anatomy: Anatomy, size: Size) -> Landing | None:
+    """Return the given place of an implant, or the proposed one with the given shift; None where neither is given.
+
+    Parameters
+    ----------
+    implant : the implant.
+    anatomy : vessel, sacs and paths, that of the implant in the first place.
+    size : size of the implant.
+    """
+    placing = implant.placing
     if placing.position_mm is not None:
-        landing = Landing(placing.position_mm, placing.anchor)
-    elif placing.shift_mm:
-        proposed = propose_landing(design, anatomy, size)
-        landing = replace(proposed, abscissa_mm=proposed.abscissa_mm + placing.shift_mm)
-    return deploy(design, anatomy, size=size, landing=landing, inside=inside)
+        return Landing(placing.position_mm, placing.anchor)
+    if not placing.shift_mm:
+        return None
+    proposed = propose_landing(find_design(implant.device), anatomy, size)
+    return replace(proposed, abscissa_mm=proposed.abscissa_mm + placing.shift_mm)
 
 
 def on_path(anatomy: Anatomy, name: str) -> Anatomy:

@@ -1,7 +1,8 @@
 """Settings and result of a study."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from vstent.devices.stent import Deployment
 from vstent.devices.treatment import Treatment, with_device
@@ -80,25 +81,48 @@ class Settings:
         return tuple(dict.fromkeys(device for treatment in self.treatments for device in treatment.devices))
 
 
-class Progress(Protocol):
-    """Called at every stage of a study."""
+@dataclass(frozen=True, eq=False)
+class Computed:
+    """What a study has computed before it is measured; enough to draw it."""
 
-    def __call__(self, stage: str, fraction: float, detail: str) -> None:
-        """Report that `stage` is complete to `fraction` (1: done); `detail` is its result, or the remaining time."""
+    anatomy: Anatomy
+    """Vessel, sacs and paths."""
+    implants: Mapping[str, Mapping[str, Deployment]]
+    """Deployed implants by treatment and id."""
+    fields: Mapping[str, FlowField]
+    """Flows by treatment, ``bare`` first; empty where no flow was requested."""
+    whole: Vessel | None
+    """The vessel before it was trimmed; None where it is not stored."""
 
 
 @dataclass(frozen=True, eq=False)
-class CaseResult:
+class Progress:
+    """State of a stage of a study."""
+
+    stage: str
+    """Name of the stage: a word, and the treatment and implant it is about, such as ``deploy silk``."""
+    fraction: float
+    """Completed fraction: 0 as the stage begins, 1 as it ends."""
+    detail: str = ""
+    """Result of a finished stage, or what is being done, in words."""
+    residual: float | None = None
+    """Largest expected remaining change of any monitored quantity of a flow, as a fraction; None: unknown."""
+    seconds_left: float | None = None
+    """Estimated remaining run time in s; None: unknown."""
+    computed: Computed | None = None
+    """What is about to be measured, where the stage ``measure`` begins."""
+
+
+OnProgress = Callable[[Progress], None]
+"""Called at every stage of a study."""
+
+
+@dataclass(frozen=True, eq=False)
+class CaseResult(Computed):
     """Result of a study."""
 
     name: str
     """Name of the case folder (the name of a scan may be the patient's)."""
-    anatomy: Anatomy
-    """Vessel, parent artery and sacs."""
-    implants: dict[str, dict[str, Deployment]]
-    """Deployed implants by treatment and id."""
-    fields: dict[str, FlowField]
-    """Flows by treatment, ``bare`` first; empty where no flow was requested."""
     metrics: dict[str, Any]
     """Metrics: ``vessel``, ``treatments.NAME.{implants.ID,flow,change,quality}``; the end of each key is its unit."""
     provenance: dict[str, Any]
@@ -107,5 +131,3 @@ class CaseResult:
     """Reason why a treatment was not deployed or its flow not computed, by treatment."""
     notes: tuple[str, ...]
     """Findings, assumptions and repairs, and the reliability of every flow, one sentence each."""
-    whole: Vessel | None = None
-    """The vessel before it was trimmed; None where it is not stored."""

@@ -1,0 +1,46 @@
+// Treatments: what is chosen, one or several devices one after the other, and what they are called.
+
+/** A treatment of one device, in the form of a study's settings; a missing size is proposed. */
+export function withDevice(device, { diameter_mm = null, length_mm = null } = {}) {
+  return { name: device, implants: [{ id: device, device, diameter_mm, length_mm }] };
+}
+
+/** Whether a treatment is that of a single device, as the list of devices offers it. */
+export const isOfDevice = ({ name, implants }) => implants.length === 1 && implants[0].device === name;
+
+/** What changes of one implant make of the choices. */
+export const implantWith = (name, id, changes) => ({ treatments }) => ({
+  treatments: treatments.map((treatment) =>
+    treatment.name === name ? { ...treatment, implants: treatment.implants.map((implant) => (implant.id === id ? { ...implant, ...changes } : implant)) } : treatment,
+  ),
+});
+
+/** The place of an implant whose middle was put somewhere, or which is left to be proposed (null). */
+export const placedAt = ({ placing }, mm) => ({ placing: { ...placing, position_mm: mm, anchor: "center", shift_mm: 0 } });
+
+export class Names {
+  /** @param catalogue the designs @param chosen() the chosen treatments */
+  constructor(catalogue, chosen) {
+    this.catalogue = catalogue;
+    this.chosen = chosen;
+  }
+
+  device(key) {
+    return this.catalogue.find((design) => design.key === key)?.name || key;
+  }
+
+  /** A treatment by its name: its devices, or the name that it was given. */
+  treatment(name) {
+    const implants = this.chosen().find((treatment) => treatment.name === name)?.implants;
+    const isNamed = implants && name !== implants.map(({ id }) => id).join("+");
+    return implants && !isNamed ? implants.map(({ device }) => this.device(device)).join(" + ") : this.device(name);
+  }
+
+  /** An implant of a treatment: its device, with its place in the order where there are several. */
+  implant(name, id) {
+    const implants = this.chosen().find((treatment) => treatment.name === name)?.implants || [];
+    const place = implants.findIndex((implant) => implant.id === id);
+    if (place < 0) return id;
+    return `${implants.length > 1 ? `${place + 1}. ` : ""}${this.device(implants[place].device)}`;
+  }
+}
