@@ -45,7 +45,7 @@ STAGES: Final = {
 }
 """Step of the page for the first word of a study's stage."""
 SETTLING: Final = re.compile(r"([\d.]+)% from convergence, (?:.*?)(\d+) s left")
-"""Form of the progress message of a flow (`vstent.study.ledger.Ledger.teller`)."""
+"""Form of the progress message of a flow (`vstent.study.store.Store.teller`)."""
 STOPPED: Final = "Stopped. Finished results are kept."
 """Message of a step that the user stopped."""
 LAST_WORDS: Final = ".worker.log"

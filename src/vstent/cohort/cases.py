@@ -11,7 +11,7 @@ from vstent.devices.catalogue import find_design
 from vstent.errors import InputError, ReadError
 from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
 from vstent.io.tables import finite
-from vstent.study.ledger import DEPLOYMENT_VERSION, hash_of, key_of, refuse_missing
+from vstent.study.keys import hash_of, measures_key, refuse_missing, study_keys
 from vstent.study.types import Settings
 from vstent.units import MM_PER
 
@@ -32,11 +32,11 @@ class Case:
     @cached_property
     def keys(self) -> dict[str, str]:
         """Key of the row of every device; it covers everything that the row depends on."""
-        common = DEPLOYMENT_VERSION, hash_of(self.path)
-        return {
-            name: key_of(*common, find_design(name), replace(self.settings, devices=(name,)))
-            for name in self.settings.devices
-        }
+        source, keys = hash_of(self.path), {}
+        for name in self.settings.devices:
+            alone = replace(self.settings, devices=(name,))
+            keys[name] = str(measures_key(alone, study_keys(source, alone), {}))
+        return keys
 
 
 def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:

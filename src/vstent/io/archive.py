@@ -24,19 +24,6 @@ _ROOT: Final = "vstent."
 """Prefix of the modules whose data classes may be loaded."""
 _KIND: Final = "is"
 """Key of the JSON text that states the kind of a value."""
-_FORMER_HOMES: Final = {
-    "vstent.device": "vstent.devices.design",
-    "vstent.flow.types": "vstent.flow.case",
-    "vstent.image": "vstent.geometry.image",
-    "vstent.rank": "vstent.plan.rank",
-    "vstent.rank.criteria": "vstent.plan.criteria",
-    "vstent.segment": "vstent.anatomy.segment",
-    "vstent.stent": "vstent.devices.stent",
-    "vstent.surface": "vstent.geometry.surface",
-    "vstent.uncertainty": "vstent.plan.uncertainty",
-    "vstent.vessel": "vstent.geometry.vessel",
-}
-"""Modules named in archives of version 0.1, and the modules that define the same classes."""
 DAMAGE: Final = (
     OSError,
     ValueError,
@@ -154,8 +141,7 @@ def _class_of(module: str, name: str) -> type:
     """Return a data class of vstent by module and name; ValueError is raised for anything else."""
     if not module.startswith(_ROOT):
         raise ValueError(f"{module}.{name} is not a data class of vstent")
-    home = _FORMER_HOMES.get(module, module)
-    found = getattr(importlib.import_module(home), name)
-    if not (isinstance(found, type) and dataclasses.is_dataclass(found) and found.__module__ == home):
+    found = getattr(importlib.import_module(module), name)
+    if not (isinstance(found, type) and dataclasses.is_dataclass(found) and found.__module__ == module):
         raise ValueError(f"{module}.{name} is not a data class of vstent")
     return found

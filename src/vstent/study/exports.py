@@ -21,11 +21,11 @@ from vstent.flow.simulation import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.io import writers
 from vstent.io.archive import load_data
-from vstent.study.folder import CACHE
-from vstent.study.ledger import Ledger, hash_of
-from vstent.study.provenance import RUN
-from vstent.study.repeat import UNTOLD, told_in
+from vstent.study.folder import CACHE, RUN
+from vstent.study.keys import anatomy_keys, hash_of
+from vstent.study.repeat import told_in
 from vstent.study.stages import check_inflow, deploy_one, find_anatomy
+from vstent.study.store import UNREADABLE, Store
 from vstent.study.types import Progress, Settings
 
 GEOMETRY: Final = (
@@ -60,13 +60,13 @@ def export_openfoam(
     InputError
         An input or option cannot be used; nothing has been written.
     """
-    ledger = Ledger(out / CACHE, progress)
-    anatomy = _anatomy(path, settings, ledger)
+    store = Store(out / CACHE, progress)
+    anatomy = _anatomy(path, settings, store)
     check_inflow(anatomy, settings.flow)
-    case = flow_case(anatomy, _stent(path, anatomy, settings, ledger), settings.flow or FlowSettings())
+    case = flow_case(anatomy, _stent(path, anatomy, settings, store), settings.flow or FlowSettings())
     setup = FoamSetup(default_cell_size_mm(case))
     setup = replace(setup, **{"flavour": _flavour_here(), **foam}, struts=strut_solids(case))
-    with ledger.stage("export") as tell:
+    with store.stage("export") as tell:
         written = foam_case(case, setup)
         write(out, written)
         tell(f"{len(written.files)} files for {written.application}, grid spacing {setup.cell_size_mm:.3g} mm.")
@@ -91,9 +91,9 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: Progress
     InputError
         An input or option cannot be used; nothing has been written.
     """
-    ledger = Ledger(out / CACHE, progress)
-    case = flow_case(_anatomy(path, settings, ledger), None, FlowSettings())
-    with ledger.stage("export") as tell:
+    store = Store(out / CACHE, progress)
+    case = flow_case(_anatomy(path, settings, store), None, FlowSettings())
+    with store.stage("export") as tell:
         patches, _ = named_patches(case)
         patch_id = np.zeros(len(patches[0].surface.faces), dtype=np.int32)
         said = []
@@ -118,27 +118,27 @@ def _middle(corners_mm: np.ndarray) -> dict[str, Any]:
     return {"center_mm": center_mm, "normal": total / max(float(np.linalg.norm(total)), 1e-12)}
 
 
-def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
+def _anatomy(path: Path, settings: Settings, store: Store) -> Anatomy:
     """Return the anatomy stored in a case folder, or that of an input."""
     kept = sorted((path / CACHE).glob("anatomy-*.npz")) if path.is_dir() else []
     if not kept:
-        return find_anatomy(path, hash_of(path), settings, ledger)
+        return find_anatomy(path, settings, store, anatomy_keys(hash_of(path), settings))
     given = [name for name in GEOMETRY if getattr(settings, name) is not None]
     if given:
         words = ", ".join(f"--{name.removesuffix('_mm')} ({name})" for name in given)
         raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
-    with ledger.stage("anatomy") as tell:
+    with store.stage("anatomy") as tell:
         anatomy = load_data(kept[-1], Anatomy)
         tell(f"taken from {path}")
     return anatomy
 
 
-def _stent(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Stent | None:
+def _stent(path: Path, anatomy: Anatomy, settings: Settings, store: Store) -> Stent | None:
     """Return the first device with the size and position of the case folder's own run, or as proposed."""
     if not settings.devices:
         return None
     name = settings.devices[0]
-    with ledger.stage(f"deploy {name}") as tell:
+    with store.stage(f"deploy {name}") as tell:
         deployment = deploy_one(find_design(name), anatomy, _told(path, settings).placing(name))
         tell(deployment.advice)
     return deployment.stent
@@ -151,7 +151,7 @@ def _told(path: Path, settings: Settings) -> Settings:
         return settings
     try:
         return told_in(run)[1]
-    except UNTOLD:
+    except UNREADABLE:
         raise ReadError(
             f"{run} is from another version, so the position of the device is unknown: run the case again"
         ) from None

@@ -12,30 +12,20 @@ from typing import Any, Final
 
 from vstent.errors import InputError
 from vstent.io.writers import write_json
-from vstent.study.folder import CACHE
-from vstent.study.provenance import RUN
-from vstent.study.repeat import UNTOLD, former_source, settings_of
+from vstent.study.folder import CACHE, RUN
+from vstent.study.keys import OF_DEVICES
+from vstent.study.repeat import former_source, settings_of
+from vstent.study.store import UNREADABLE
 from vstent.study.types import Placing, Settings
 
 BEGUN: Final = "settings.json"
 """File in the cache folder with the settings of the last run that was started, finished or not."""
-_OF_DEVICES: Final = (
-    "devices",
-    "diameter_mm",
-    "length_mm",
-    "center_mm",
-    "placings",
-    "flow",
-    "without_flow",
-    "uncertainty",
-)
-"""Settings that do not change the anatomy."""
 
 
 def former_settings(out: Path) -> Settings | None:
     """Return the settings of the last run of a case folder; None where there is none, or they cannot be read."""
     for path in (out / CACHE / BEGUN, out / RUN):
-        with suppress(*UNTOLD):
+        with suppress(*UNREADABLE):
             told = json.loads(path.read_text(encoding="utf-8"))
             return settings_of(told["settings"])
     return None
@@ -113,7 +103,7 @@ def refuse_other_anatomy(out: Path, settings: Settings, former: Settings | None 
     if former is None:
         return
     before, now = (
-        {key: value for key, value in asdict(one).items() if key not in _OF_DEVICES} for one in (former, settings)
+        {key: value for key, value in asdict(one).items() if key not in OF_DEVICES} for one in (former, settings)
     )
     changed = [key for key in now if now[key] != before[key]]
     if changed:

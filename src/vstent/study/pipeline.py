@@ -20,9 +20,9 @@ from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
 from vstent.study.contrast import add_measures, kept_measures
 from vstent.study.crate import NAME as CRATE
-from vstent.study.folder import CACHE, claiming
+from vstent.study.folder import CACHE, INPUT, LAYOUT, RUN, claiming
 from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
-from vstent.study.ledger import ANATOMY, Ledger, hash_of, key_of, vessel_key
+from vstent.study.keys import ANATOMY, VESSEL, anatomy_keys, hash_of, key_of, measures_key, study_keys
 from vstent.study.outputs import (
     STENT,
     take_away_measures,
@@ -32,23 +32,21 @@ from vstent.study.outputs import (
     write_stent,
     write_vessel,
 )
-from vstent.study.provenance import INPUT, METRICS, RUN, provenance
+from vstent.study.provenance import METRICS, provenance
 from vstent.study.repeat import SECONDS, former_source, is_of_another
 from vstent.study.stages import (
-    band_all,
     check_inflow,
     compute_flows,
     deploy_all,
-    deployment_key,
     engine_folders,
     find_anatomy,
     find_vessel,
-    measure_all,
+    measure_study,
     refine,
     vary_all,
 )
+from vstent.study.store import Store
 from vstent.study.types import CaseResult, Progress, Settings
-from vstent.study.written import code_key, compute_once, write_once
 
 BeforeMeasures = Callable[[Anatomy, Mapping[str, Deployment], Mapping[str, FlowField], Vessel | None], object]
 """Takes anatomy, deployments, flows, and the vessel before it was trimmed (None: not stored)."""
@@ -94,61 +92,48 @@ def run(
     FolderError
         Another process uses the folder, or it cannot be written.
     """
-    ledger = Ledger(out / CACHE, progress)
+    store = Store(out / CACHE, progress)
     source = hash_of(path)
     if not replaces:
         settings = merged(out, source, settings)
     designs = {name: find_design(name) for name in settings.devices}
-    anatomy = find_anatomy(path, source, settings, ledger)
+    keys = study_keys(source, settings)
+    store.foretell(keys)
+    anatomy = find_anatomy(path, settings, store, keys)
     check_inflow(anatomy, settings.flow)
-    deployments, failures = deploy_all(designs, anatomy, settings, ledger, source)
+    deployments, failures = deploy_all(designs, anatomy, settings, store, keys)
     told = provenance(path, source, settings)
     has_former = replaces and is_of_another(out, told)
-    _settle(path, out, source, ledger)
+    _settle(path, out, source, store)
     note_begun(out, settings)
     if has_former:
         take_away_study(out, engine_folders(out, settings).values())
     (out / CRATE).unlink(missing_ok=True)  # it describes files that this run replaces
     write_anatomy(out, anatomy)
     for name, deployment in deployments.items():
-        folder, key = out / "stents" / name, deployment_key(source, settings, name, designs[name])
-        write_once(ledger, f"struts {name}", key, folder, STENT, partial(write_stent, folder, deployment))
-    fields, unflown = compute_flows(out, anatomy, deployments, settings, ledger, source)
+        folder = out / "stents" / name
+        key = key_of("vstent.study.outputs:write_stent", keys[f"deploy {name}"])
+        store.write_once(f"struts {name}", key, folder, STENT, partial(write_stent, folder, deployment))
+    fields, unflown = compute_flows(out, anatomy, deployments, settings, store, keys)
     failures |= unflown
-    varied = vary_all(anatomy, deployments, settings, ledger, source)
+    varied = vary_all(anatomy, deployments, settings, store, keys)
 
-    whole = ledger.stored("vessel", vessel_key(source, settings), Vessel)
+    whole = store.peek(VESSEL, keys[VESSEL], Vessel)
 
     def measures() -> dict[str, Any]:
         if before_measures is not None:
             before_measures(anatomy, deployments, fields, whole)
-        return _measures(anatomy, deployments, fields, settings, varied, failures)
+        return measure_study(anatomy, deployments, fields, settings, varied, failures)
 
-    metrics = compute_once(ledger, "measure", key_of(code_key(), told, failures), measures)
-    add_measures(metrics, kept_measures(out, source, settings) if fields else {})
+    metrics = store.compute_once("measure", measures_key(settings, keys, failures), measures)
+    add_measures(metrics, kept_measures(out, keys) if fields else {})
     writers.write_json(out / METRICS, metrics)
-    told[SECONDS] = ledger.seconds
+    told[SECONDS] = store.seconds
     writers.write_json(out / RUN, told, is_exact=True)
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
     notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
-    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, failures, notes, whole)
-
-
-def _measures(
-    anatomy: Anatomy,
-    deployments: Mapping[str, Deployment],
-    fields: Mapping[str, FlowField],
-    settings: Settings,
-    varied: Mapping[str, Any],
-    failures: Mapping[str, str],
-) -> dict[str, Any]:
-    """Return all metrics of a study: of vessel, devices and flows, with bands, uncertainties and failures."""
-    metrics = measure_all(anatomy, deployments, fields, settings.flow)
-    band_all(anatomy, deployments, metrics, settings)
-    for name, spread in varied.items():
-        metrics["stents"][name]["uncertainty"] = spread
-    return metrics | ({"failures": dict(failures)} if failures else {})
+    return CaseResult(out.resolve().name, anatomy, deployments, fields, metrics, told, failures, notes, whole, keys)
 
 
 @claiming
@@ -170,11 +155,11 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: Progress, 
     FolderError
         Another process uses the folder, or it cannot be written.
     """
-    ledger = Ledger(out / CACHE, progress)
+    store = Store(out / CACHE, progress)
     source = hash_of(path)
     _refuse_loss(out, source, settings, replaces)
-    vessel = find_vessel(path, source, settings, ledger)
-    _settle(path, out, source, ledger)
+    vessel = find_vessel(path, settings, store, anatomy_keys(source, settings))
+    _settle(path, out, source, store)
     write_vessel(out, vessel)
     return vessel
 
@@ -209,12 +194,12 @@ def restore_vessel(
     FolderError
         Another process uses the folder, or it cannot be written.
     """
-    ledger = Ledger(out / CACHE, progress)
+    store = Store(out / CACHE, progress)
     source = hash_of(path)
     _refuse_loss(out, source, settings, replaces)
-    anatomy = find_anatomy(path, source, settings, ledger)
+    anatomy = find_anatomy(path, settings, store, anatomy_keys(source, settings))
     measures = morphology(anatomy)
-    _settle(path, out, source, ledger)
+    _settle(path, out, source, store)
     write_anatomy(out, anatomy)
     writers.write_json(out / "morphology.json", measures)
     return anatomy, measures
@@ -243,13 +228,13 @@ def refine_flow(
     FolderError
         Another process uses the folder, or it cannot be written.
     """
-    ledger = Ledger(out / CACHE, progress)
+    store = Store(out / CACHE, progress)
     source = hash_of(path)
     _refuse_loss(out, source, settings, replaces)
-    anatomy = find_anatomy(path, source, settings, ledger)
+    anatomy = find_anatomy(path, settings, store, anatomy_keys(source, settings))
     check_inflow(anatomy, settings.flow)
-    _settle(path, out, source, ledger)
-    found = refine(out, anatomy, settings, ledger)
+    _settle(path, out, source, store)
+    found = refine(out, anatomy, settings, store)
     kept = {one.name: asdict(one) for one in found.refinements}
     kept["grid_position"] = {key: asdict(one) for key, one in found.positions.items()}
     writers.write_json(out / "convergence.json", kept)
@@ -263,12 +248,12 @@ def _refuse_loss(out: Path, source: str, settings: Settings, replaces: bool) -> 
         refuse_other_anatomy(out, settings)
 
 
-def _settle(path: Path, out: Path, source: str, ledger: Ledger) -> None:
+def _settle(path: Path, out: Path, source: str, store: Store) -> None:
     """Store the results held in memory, and remove results of another input or of a replaced anatomy."""
     former = former_source(out)
     if former not in (source, None):
         take_away_results(out)
-    elif former is not None and ledger.is_held(ANATOMY):
+    elif former is not None and store.is_held(ANATOMY):
         take_away_measures(out)
-    ledger.settle()
-    writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve()), "sha256": source})
+    writers.write_json(out / CACHE / INPUT, {"layout": LAYOUT, "path": str(path.resolve()), "sha256": source})
+    store.settle()

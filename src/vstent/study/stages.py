@@ -1,8 +1,8 @@
-"""Stages of a study; the ledger measures and reports each of them."""
+"""Stages of a study; the store measures and reports each of them, and keeps their results."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -31,7 +31,7 @@ from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.grade import QUALITY, computation_of, grade
 from vstent.flow.indices import compare, indices
 from vstent.flow.ostium import ostium
-from vstent.flow.simulation import flow_case, foretell_cost, simulate_case
+from vstent.flow.simulation import OnProgress, flow_case, foretell_cost, simulate_case
 from vstent.geometry.image import Image
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
@@ -40,11 +40,10 @@ from vstent.io.surfaces import read_surface
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
 from vstent.plan.uncertainty import Uncertainty, vary
-from vstent.study.checkpoint import FlowCheckpoint
-from vstent.study.ledger import ANATOMY, DEPLOYMENT_VERSION, Ledger, anatomy_key, key_of, vessel_key
+from vstent.study.keys import ANATOMY, VESSEL
 from vstent.study.outputs import write_field
+from vstent.study.store import Key, Store, Unfinished
 from vstent.study.types import Placing, Point, Settings
-from vstent.study.written import code_key
 from vstent.units import counted
 
 SLOWEST_M_S: Final = 0.01
@@ -56,17 +55,17 @@ NEAR_MM: Final = 3.0
 """Largest distance from the vessel wall, in mm, at which another interpretation of a point is proposed."""
 
 
-def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) -> Anatomy:
+def find_anatomy(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Anatomy:
     """Read, segment, repair, trace, trim and restore; a result stored for this input is returned without computation.
 
-    The ledger keeps the result in memory until its `settle` stores it.
+    The store keeps the result in memory until its `settle` writes it.
 
     Parameters
     ----------
     path : a scan or a surface.
-    source : SHA-256 of the input.
     settings : settings of the study.
-    ledger : record of the study.
+    store : results of the study.
+    keys : keys of its stages, of `vstent.study.keys`.
 
     Raises
     ------
@@ -74,12 +73,11 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
         An input or option cannot be used. Where no vessel is found at the point `at_mm`, the message proposes the same
         point in another frame or as a voxel index, if there is a vessel.
     """
-    key = anatomy_key(source, settings)
-    kept = ledger.recall(ANATOMY, key, Anatomy)
+    kept = store.find(ANATOMY, keys[ANATOMY], Anatomy)
     if kept is not None:
         return kept
     try:
-        return _find_anatomy(path, source, settings, ledger, key)
+        return _find_anatomy(path, settings, store, keys)
     except InputError as error:
         if settings.at_mm is None or settings.neck_mm is not None:
             raise
@@ -113,49 +111,48 @@ def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
     yield "with the second sign changed", (x, -y, z)
 
 
-def _find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger, key: str) -> Anatomy:
+def _find_anatomy(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Anatomy:
     """Return the anatomy of an input, computed."""
-    whole = find_vessel(path, source, settings, ledger)
+    whole = find_vessel(path, settings, store, keys)
     neck_mm = None if settings.neck_mm is None else np.array(settings.neck_mm, dtype=np.float64)
     at_mm = _array(settings.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
     outlet_mm = _array(settings.outlet_mm)
     if outlet_mm is not None:
         opening_at(whole, outlet_mm)  # checked before trimming, which may cut this outlet off
-    with ledger.stage("trim") as tell:
+    with store.stage("trim") as tell:
         traced = trim(whole, at_mm=at_mm, upstream_mm=settings.upstream_mm, downstream_mm=settings.downstream_mm)
         tell(" ".join(traced.notes[len(whole.notes) :]))
-    with ledger.stage("restore") as tell:
+    with store.stage("restore") as tell:
         anatomy = restore(traced, at_mm=_array(settings.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
         tell(" ".join([*anatomy.notes, *(f"Sac volume {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
-    ledger.hold(ANATOMY, key, anatomy)
+    store.hold(ANATOMY, keys[ANATOMY], anatomy)
     return anatomy
 
 
-def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> Vessel:
+def find_vessel(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Vessel:
     """Read, segment, repair and trace; a result stored for this input is returned without computation.
 
-    The ledger keeps the result in memory until its `settle` stores it.
+    The store keeps the result in memory until its `settle` writes it.
 
     Parameters
     ----------
     path : a scan or a surface.
-    source : SHA-256 of the input.
     settings : settings of the study.
-    ledger : record of the study.
+    store : results of the study.
+    keys : keys of its stages, of `vstent.study.keys`.
     """
-    key = vessel_key(source, settings)
-    kept = ledger.recall("vessel", key, Vessel)
+    kept = store.find(VESSEL, keys[VESSEL], Vessel)
     if kept is not None:
         return kept
-    with ledger.stage("segment") as tell:
+    with store.stage("segment") as tell:
         vessel = _vessel(path, settings)
         tell(" ".join(vessel.notes))
-    with ledger.stage("trace") as tell:
+    with store.stage("trace") as tell:
         traced = trace(vessel, inlet_mm=_array(settings.inlet_mm))
         widths = ", ".join(f"{inlet.role} {inlet.diameter_mm:.1f} mm wide" for inlet in traced.inlets)
         found = f"{counted(len(traced.outlets), 'outlet')}; {widths}."
         tell(" ".join([found, *traced.notes[len(vessel.notes) :]]))
-    ledger.hold("vessel", key, traced)
+    store.hold(VESSEL, keys[VESSEL], traced)
     return traced
 
 
@@ -179,7 +176,7 @@ def _image(path: Path, settings: Settings) -> Image:
 
 
 def deploy_all(
-    designs: Mapping[str, Design], anatomy: Anatomy, settings: Settings, ledger: Ledger, source: str
+    designs: Mapping[str, Design], anatomy: Anatomy, settings: Settings, store: Store, keys: Mapping[str, Key]
 ) -> tuple[dict[str, Deployment], dict[str, str]]:
     """Deploy every device in the given or the proposed size; a stored deployment is returned without computation.
 
@@ -188,8 +185,8 @@ def deploy_all(
     designs : designs by device name.
     anatomy : vessel, parent artery and sacs.
     settings : settings of the study.
-    ledger : record of the study; it keeps new deployments in memory until its `settle` stores them.
-    source : SHA-256 of the input.
+    store : results of the study; it keeps new deployments in memory until its `settle` writes them.
+    keys : keys of its stages.
 
     Returns
     -------
@@ -206,35 +203,22 @@ def deploy_all(
     deployments: dict[str, Deployment] = {}
     failures: dict[str, str] = {}
     for name, design in designs.items():
-        stage, key = f"deploy {name}", deployment_key(source, settings, name, design)
-        kept = ledger.recall(stage, key, Deployment)
+        stage = f"deploy {name}"
+        kept = store.find(stage, keys[stage], Deployment)
         if kept is not None:
             deployments[name] = kept
             continue
         try:
-            with ledger.stage(stage) as tell:
+            with store.stage(stage) as tell:
                 deployments[name] = deploy_one(design, anatomy, settings.placing(name))
                 tell(deployments[name].advice)
-            ledger.hold(stage, key, deployments[name])
+            store.hold(stage, keys[stage], deployments[name])
         except (DeviceError, LandingError) as error:
             if len(failures) + 1 == len(designs):  # the last one too
                 raise
             failures[name] = f"not deployed: {error}"
-            ledger.progress(stage, 1.0, failures[name])
+            store.progress(stage, 1.0, failures[name])
     return deployments, failures
-
-
-def deployment_key(source: str, settings: Settings, name: str, design: Design) -> str:
-    """Return the key of one deployment.
-
-    Parameters
-    ----------
-    source : SHA-256 of the input.
-    settings : settings of the study.
-    name : name of the device.
-    design : the device.
-    """
-    return key_of(code_key(), anatomy_key(source, settings), name, design, settings.placing(name))
 
 
 def deploy_one(design: Design, anatomy: Anatomy, placing: Placing) -> Deployment:
@@ -309,8 +293,8 @@ def compute_flows(
     anatomy: Anatomy,
     deployments: Mapping[str, Deployment],
     settings: Settings,
-    ledger: Ledger,
-    source: str,
+    store: Store,
+    keys: Mapping[str, Key],
 ) -> tuple[dict[str, FlowField], dict[str, str]]:
     """Compute the flow without and with each device; each is stored as soon as it is finished.
 
@@ -322,8 +306,8 @@ def compute_flows(
     anatomy : vessel, parent artery and sacs.
     deployments : deployments by device name.
     settings : settings of the study.
-    ledger : record of the study.
-    source : SHA-256 of the input.
+    store : results of the study.
+    keys : keys of its stages.
 
     Returns
     -------
@@ -346,57 +330,71 @@ def compute_flows(
     with Beside(settings.flow) as beside:
         for name in (BARE, *(name for name in deployments if name not in settings.without_flow)):
             stent = None if name == BARE else deployments[name].stent
-            stage, key = f"flow {name}", flow_key(source, settings, name, stent.design if stent else None)
-            field, store = ledger.recall(stage, key, FlowField), None
+            stage, keep = f"flow {name}", None
+            field = store.find(stage, keys[stage], FlowField)
             if field is None:
                 if name == BARE:
-                    _plan(anatomy, {name: one.stent for name, one in deployments.items()}, settings.flow, ledger)
+                    _plan(anatomy, {name: one.stent for name, one in deployments.items()}, settings.flow, store)
                 try:
-                    with ledger.stage(stage) as tell:
-                        field = simulate_case(
-                            flow_case(anatomy, stent, settings.flow),
+                    with store.stage(stage) as tell:
+                        field = compute_flow(
+                            anatomy,
+                            stent,
+                            settings.flow,
                             start=fields.get(BARE),
                             folder=folders[name],
-                            progress=ledger.teller(stage),
-                            checkpoint=FlowCheckpoint(ledger.folder, stage, key),
+                            progress=store.teller(stage),
+                            unfinished=store.unfinished(stage, keys[stage]),
                         )
                         tell(field.advice)
                 except FlowError as error:
                     if name == BARE:
                         raise
                     failures[name] = f"flow not computed: {error}"
-                    ledger.progress(stage, 1.0, failures[name])
+                    store.progress(stage, 1.0, failures[name])
                     continue
-                store = ledger.keeping(stage, key, field)
+                keep = store.keeping(stage, keys[stage], field)
             fields[name] = field
-            stored.append(beside.do(partial(_store, store, out / "flow" / name, field)))
+            stored.append(beside.do(partial(_keep, keep, out / "flow" / name, field)))
     for done in stored:
         done()
     return fields, failures
 
 
-def _store(store: Callable[[], None] | None, folder: Path, field: FlowField) -> None:
-    """Store a flow in the ledger, unless it was read from there, and write its files."""
-    if store is not None:
-        store()
+def _keep(keep: Callable[[], None] | None, folder: Path, field: FlowField) -> None:
+    """Store a flow, unless it was read from the store, and write its files."""
+    if keep is not None:
+        keep()
     write_field(folder, field)
 
 
-def flow_key(source: str, settings: Settings, name: str, design: Design | None) -> str:
-    """Return the key of one flow.
+def compute_flow(
+    anatomy: Anatomy,
+    stent: Stent | None,
+    settings: FlowSettings,
+    *,
+    start: FlowField | None,
+    folder: Path,
+    progress: OnProgress,
+    unfinished: Unfinished,
+) -> FlowField:
+    """Compute one flow; an unfinished one resumes.
 
     Parameters
     ----------
-    source : SHA-256 of the input.
-    settings : settings of the study.
-    name : ``bare``, or the name of the device.
-    design : the device; None: no device.
+    anatomy : vessel, parent artery and sacs.
+    stent : the deployed device; None: no device.
+    settings : settings of the flow.
+    start : the flow without a device, where it is known.
+    folder : folder of the engine's own files.
+    progress : called at every check.
+    unfinished : saved states of its runs.
     """
-    placed = (DEPLOYMENT_VERSION, design, settings.placing(name)) if design else ()
-    return key_of(anatomy_key(source, settings), settings.flow, name, *placed)
+    case = flow_case(anatomy, stent, settings)
+    return simulate_case(case, start=start, folder=folder, progress=progress, checkpoint=unfinished)
 
 
-def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Sensitivity:
+def refine(out: Path, anatomy: Anatomy, settings: Settings, store: Store) -> Sensitivity:
     """Compute the flow without a device on three grids, with three time steps and in three positions on the grid.
 
     Parameters
@@ -404,16 +402,16 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
     out : the case folder.
     anatomy : vessel, parent artery and sacs.
     settings : settings of the study; the grid spacing is that of the finest grid.
-    ledger : record of the study.
+    store : results of the study.
     """
     flow = settings.flow or FlowSettings()
-    _plan(anatomy, {}, flow, ledger)
-    with ledger.stage("convergence") as tell:
+    _plan(anatomy, {}, flow, store)
+    with store.stage("convergence") as tell:
         done: list[str] = []
 
         def told(fraction: float, sentence: str) -> None:
             done.append(sentence)
-            ledger.progress("convergence", 0.99 * fraction, sentence)
+            store.progress("convergence", 0.99 * fraction, sentence)
 
         folder = out / "flow" / "convergence" / flow.engine
         found = convergence(flow_case(anatomy, None, flow), folder=folder, told=told)
@@ -421,9 +419,9 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
     return found
 
 
-def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings, ledger: Ledger) -> None:
+def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings, store: Store) -> None:
     """Report run time and memory of the flows; an error is raised where one does not fit in the memory."""
-    with ledger.stage("plan flow") as tell:
+    with store.stage("plan flow") as tell:
         bare = flow_case(anatomy, None, settings)
         said = foretell_cost(bare)
         costs = {name: foretell_cost(replace(bare, stent=over_restored(one, anatomy))) for name, one in stents.items()}
@@ -431,7 +429,11 @@ def _plan(anatomy: Anatomy, stents: Mapping[str, Stent], settings: FlowSettings,
 
 
 def vary_all(
-    anatomy: Anatomy, deployments: Mapping[str, Deployment], settings: Settings, ledger: Ledger, source: str
+    anatomy: Anatomy,
+    deployments: Mapping[str, Deployment],
+    settings: Settings,
+    store: Store,
+    keys: Mapping[str, Key],
 ) -> dict[str, dict[str, Any]]:
     """Vary the uncertain inputs of every deployment.
 
@@ -440,8 +442,8 @@ def vary_all(
     anatomy : vessel, parent artery and sacs.
     deployments : deployments by device name.
     settings : settings of the study.
-    ledger : record of the study.
-    source : SHA-256 of the input.
+    store : results of the study.
+    keys : keys of its stages.
 
     Returns
     -------
@@ -454,25 +456,47 @@ def vary_all(
     found = {}
     for name, deployment in deployments.items():
         stage = f"vary {name}"
-        design = deployment.stent.design
-        numbers = [asdict(one) for one in settings.uncertainty.numbers_of(design)]
-        placed = DEPLOYMENT_VERSION, design, settings.placing(name), numbers
-        key = key_of(anatomy_key(source, settings), settings.uncertainty, flow, name, *placed)
-        varied = ledger.recall(stage, key, Uncertainty)
+        varied = store.find(stage, keys[stage], Uncertainty)
         if varied is None:
-            with ledger.stage(stage) as tell:
-                told = partial(_tell_count, ledger, stage)
-                begun = FlowCheckpoint(ledger.folder, stage, key)
+            with store.stage(stage) as tell:
+                told = partial(_tell_count, store, stage)
+                begun = store.unfinished(stage, keys[stage])
                 varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
-            ledger.keep(stage, key, varied)
+            store.keep(stage, keys[stage], varied)
         found[name] = varied.metrics()
     return found
 
 
-def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
+def _tell_count(store: Store, stage: str, done: int, total: int) -> None:
     """Report that `done` of `total` deployments of a stage are finished."""
-    ledger.progress(stage, 0.99 * done / total, f"{done} of {total}")
+    store.progress(stage, 0.99 * done / total, f"{done} of {total}")
+
+
+def measure_study(
+    anatomy: Anatomy,
+    deployments: Mapping[str, Deployment],
+    fields: Mapping[str, FlowField],
+    settings: Settings,
+    varied: Mapping[str, Any],
+    failures: Mapping[str, str],
+) -> dict[str, Any]:
+    """Return all metrics of a study: of vessel, devices and flows, with bands, uncertainties and failures.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployments by device name.
+    fields : flows by name, ``bare`` first.
+    settings : settings of the study.
+    varied : uncertainty metrics by device name.
+    failures : reasons why a device was not deployed or its flow not computed, by name.
+    """
+    metrics = measure_all(anatomy, deployments, fields, settings.flow)
+    band_all(anatomy, deployments, metrics, settings)
+    for name, spread in varied.items():
+        metrics["stents"][name]["uncertainty"] = spread
+    return metrics | ({"failures": dict(failures)} if failures else {})
 
 
 def measure_all(

@@ -7,6 +7,7 @@ from vstent.devices.stent import Deployment
 from vstent.flow.case import FlowField, FlowSettings
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.plan.uncertainty import Ranges
+from vstent.study.store import Key
 
 Point = tuple[float, float, float]
 """Three lengths in mm: a point or voxel edges."""
@@ -106,3 +107,5 @@ class CaseResult:
     """Findings, assumptions and repairs, and the reliability of every flow, one sentence each."""
     whole: Vessel | None = None
     """The vessel before it was trimmed; None where it is not stored."""
+    keys: dict[str, Key] = field(default_factory=dict)
+    """Keys of the stages by name."""
